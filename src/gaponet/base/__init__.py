@@ -1,1 +1,3 @@
-"""Shared by all sub-packages: errors, files, validation, text, progress, executors and the sandbox."""
+"""Shared by all sub-packages: errors, files, validation, text, progress, executors and the
+sandbox.
+"""

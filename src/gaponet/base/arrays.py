@@ -1,4 +1,6 @@
-"""The array type of annotations (docstrings state shapes and units), and operations common to numpy and torch."""
+"""The array type of annotations (docstrings state shapes and units), and operations common to
+numpy and torch.
+"""
 
 from __future__ import annotations
 

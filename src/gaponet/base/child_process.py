@@ -1,8 +1,8 @@
 """Command lines of child processes that never import modules from the current folder.
 
-Python puts the current folder first on the path of `python -c` and `python -m`: a numpy.py beside somebody's logs would
-be imported. A child runs isolated (-I). It receives this process's module path, because an isolated Python ignores
-PYTHONPATH and the user's site-packages.
+Python puts the current folder first on the path of `python -c` and `python -m`: a numpy.py beside
+somebody's logs would be imported. A child runs isolated (-I). It receives this process's module
+path, because an isolated Python ignores PYTHONPATH and the user's site-packages.
 """
 
 from __future__ import annotations
@@ -18,22 +18,26 @@ RUN_MODULE = (
 
 
 def module_command(module: str, *arguments: str) -> list[str]:
-    """Return the command line of `python -m MODULE ARGUMENTS …`, without modules of the current folder."""
+    """Return the command line of `python -m MODULE ARGUMENTS …`, without modules of the current
+    folder.
+    """
     return [sys.executable, "-I", "-c", RUN_MODULE, "\n".join(_module_path()), module, *arguments]
 
 
 def exclude_current_folder() -> None:
-    """Import no module from the current folder from now on, here and in every Python that this process starts."""
+    """Import no module from the current folder from now on, here and in every Python that this
+    process starts.
+    """
     os.environ[SAFE_PATH_VARIABLE] = "1"
     sys.path[:] = _module_path()
 
 
 def _module_path() -> list[str]:
-    """Return sys.path without relative entries and the current folder, unless gaponet itself is installed there."""
-    current, home = (
-        _real("."),
-        os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__)))),
-    )
+    """Return sys.path without relative entries and the current folder, unless gaponet itself is
+    installed there.
+    """
+    current = _real(".")
+    home = os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
     return [
         p for p in sys.path if os.path.isabs(p) and (_real(p) != current or current == _real(home))
     ]

@@ -1,15 +1,20 @@
 """Errors that a user can correct: the message says what is wrong, where, and what to do.
 
-Every error raised on bad input derives from `GAPONetError`; the command line prints it in one line and exits with 2.
+Every error raised on bad input derives from `GAPONetError`; the command line prints it in one line
+and exits with 2.
 """
 
 from gaponet.base.text import remove_credentials
 
-MAX_CHARACTERS = 1000  # of a message; the middle of a longer one is omitted, as its ends say where and what to do
+# of a message; the middle of a longer one is omitted, as its ends say where and what to do
+MAX_CHARACTERS = 1000
 
 
 class GAPONetError(Exception):
-    """Base class of errors that input causes. The message is one line of printable characters without credentials."""
+    """Base class of errors that input causes.
+
+    The message is one line of printable characters without credentials.
+    """
 
     def __init__(self, text: str) -> None:
         text = remove_credentials(text)
@@ -56,12 +61,32 @@ class UsageError(GAPONetError):
 
 # Modules of optional dependencies → the extra that brings them.
 EXTRAS = {
-    "torch": "train", "onnx": "train", "onnxruntime": "deploy", "matplotlib": "report", "jinja2": "report",
-    "markupsafe": "report", "cyclonedds": "dds", "serial": "so101", "gymnasium": "gym", "PIL": "view",
-    "imageio_ffmpeg": "view", "viser": "view", "trimesh": "view", "rosbags": "ros", "h5py": "hdf5",
-    "huggingface_hub": "hub", "fsspec": "hub", "s3fs": "s3", "gcsfs": "gs", "tensorboard": "tensorboard",
-    "wandb": "wandb", "zmq": "zmq", "warp": "warp", "mujoco_warp": "warp", "ray": "ray",
-}  # fmt: skip
+    "torch": "train",
+    "onnx": "train",
+    "onnxruntime": "deploy",
+    "matplotlib": "report",
+    "jinja2": "report",
+    "markupsafe": "report",
+    "cyclonedds": "dds",
+    "serial": "so101",
+    "gymnasium": "gym",
+    "PIL": "view",
+    "imageio_ffmpeg": "view",
+    "viser": "view",
+    "trimesh": "view",
+    "rosbags": "ros",
+    "h5py": "hdf5",
+    "huggingface_hub": "hub",
+    "fsspec": "hub",
+    "s3fs": "s3",
+    "gcsfs": "gs",
+    "tensorboard": "tensorboard",
+    "wandb": "wandb",
+    "zmq": "zmq",
+    "warp": "warp",
+    "mujoco_warp": "warp",
+    "ray": "ray",
+}
 
 
 def missing_extra(error: ModuleNotFoundError) -> str | None:

@@ -1,7 +1,8 @@
 """Jobs in other processes of this machine or of a cluster, on any concurrent.futures.Executor.
 
-An exception of a job is its outcome. An exception of the executor means that the worker died (out of memory, kill -9,
-machine lost): the job is then repeated, up to MAX_RETRIES times. Ray is imported only on request.
+An exception of a job is its outcome. An exception of the executor means that the worker died (out
+of memory, kill -9, machine lost): the job is then repeated, up to MAX_RETRIES times. Ray is
+imported only on request.
 """
 
 from __future__ import annotations
@@ -35,7 +36,9 @@ THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"
 
 @dataclass(frozen=True)
 class _Outcome(Generic[Job, Result]):
-    """Result of one job, or its error: the exception of the job, or a WorkerError if its workers died."""
+    """Result of one job, or its error: the exception of the job, or a WorkerError if its workers
+    died.
+    """
 
     job: Job
     value: Result | None
@@ -69,10 +72,11 @@ class Pool:
             work: A module's function, or a partial of one.
             jobs: Consumed as workers become free.
             on_poll: Called every POLL_INTERVAL_S.
-            request_stop: Called for each job that is left if the caller leaves the loop early. It asks the job to end
-                and returns True if the job has begun; those jobs are awaited.
+            request_stop: Called for each job that is left if the caller leaves the loop early. It
+                asks the job to end and returns True if the job has begun; those jobs are awaited.
         """
-        waiting, running = iter(jobs), dict[Future[Any], tuple[Job, int]]()
+        waiting = iter(jobs)
+        running = dict[Future[Any], tuple[Job, int]]()
 
         def submit(job: Job, deaths: int) -> None:
             with _child_environment(self.threads):
@@ -199,7 +203,9 @@ def _call(fn: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
 def _connect_ray(
     stack: ExitStack, address: str, workers: int, threads: int
 ) -> tuple[Executor, int]:
-    """Connect to the cluster at an address or $RAY_ADDRESS, or start Ray here, closed to other machines."""
+    """Connect to the cluster at an address or $RAY_ADDRESS, or start Ray here, closed to other
+    machines.
+    """
     address = address or os.environ.get("RAY_ADDRESS") or LOCAL
     if address == LOCAL:
         os.environ["RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"] = (
@@ -222,7 +228,9 @@ def _connect_ray(
 
 @contextmanager
 def _child_environment(threads: int) -> Iterator[None]:
-    """Set the environment that a process started in the block inherits; Ctrl-C reaches its parent only."""
+    """Set the environment that a process started in the block inherits; Ctrl-C reaches its parent
+    only.
+    """
     variables = dict.fromkeys(THREAD_VARIABLES, str(threads)) | {SAFE_PATH_VARIABLE: "1"}
     before = {name: os.environ.get(name) for name in variables}
     main = threading.current_thread() is threading.main_thread()

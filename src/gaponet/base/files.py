@@ -1,9 +1,11 @@
-"""Files and folders of the user: atomic writes, one writer per folder, no writes into other people's folders.
+"""Files and folders of the user: atomic writes, one writer per folder, no writes into other
+people's folders.
 
-Each folder that gaponet writes into holds a marker file `.gaponet`. Its first line is the kind of folder. The file is
-also the lock of the writer: the system releases it when the process ends, however that happens. A file is written as
-`.gaponet-PROCESS-NAME` beside its place and then renamed. The next writer removes those of killed processes; gaponet
-removes nothing else. Differences of Windows are handled here and in `deploy/stop.py` only.
+Each folder that gaponet writes into holds a marker file `.gaponet`. Its first line is the kind of
+folder. The file is also the lock of the writer: the system releases it when the process ends,
+however that happens. A file is written as `.gaponet-PROCESS-NAME` beside its place and then
+renamed. The next writer removes those of killed processes; gaponet removes nothing else.
+Differences of Windows are handled here and in `deploy/stop.py` only.
 """
 
 from __future__ import annotations
@@ -25,9 +27,8 @@ from gaponet.base.errors import FolderError
 WINDOWS = os.name == "nt"
 FOLDER_MARKER = ".gaponet"
 LOCK_RETRY_S = 0.05
-LOCKED_BYTE = (
-    1 << 30
-)  # Windows: a locked byte cannot be read, so it lies far behind the end of the file
+# Windows: a locked byte cannot be read, so it lies far behind the end of the file
+LOCKED_BYTE = 1 << 30
 # Files by which a folder without a marker is recognised: older versions wrote none.
 UNMARKED_FOLDERS = {
     "dataset": ("dataset.json",),
@@ -40,10 +41,12 @@ _locked_here: set[tuple[str, int]] = set()  # (folder, thread) of this process
 
 @contextmanager
 def atomic_write(path: Path, named: bool = True) -> Iterator[Path]:
-    """Yield a temporary path; when the block succeeds, its file replaces `path` and is flushed to the disk.
+    """Yield a temporary path; when the block succeeds, its file replaces `path` and is flushed to
+    the disk.
 
     Args:
-        named: Flush the folder's entry too. For many files, pass False and call `flush_to_disk(path.parent)` once.
+        named: Flush the folder's entry too. For many files, pass False and call
+            `flush_to_disk(path.parent)` once.
 
     Raises:
         OSError: It could not be written; `path` is unchanged.
@@ -76,7 +79,9 @@ def write_json(path: Path, value: Any) -> None:
 
 
 def json_compatible(value: Any) -> Any:
-    """Convert to valid JSON values: NaN and infinity to None, numpy to Python, dataclasses to dicts."""
+    """Convert to valid JSON values: NaN and infinity to None, numpy to Python, dataclasses to
+    dicts.
+    """
     if isinstance(value, str):  # a file name may hold bytes that are no characters
         return value.encode("utf-8", "backslashreplace").decode()
     if isinstance(value, dict):
@@ -93,7 +98,9 @@ def json_compatible(value: Any) -> Any:
 
 
 def flush_to_disk(path: Path) -> None:
-    """Return when the content of a file, or the entries of a folder, are on the disk (on Windows, files only)."""
+    """Return when the content of a file, or the entries of a folder, are on the disk (on Windows,
+    files only).
+    """
     if WINDOWS and path.is_dir():
         return
     descriptor = os.open(path, os.O_RDWR if WINDOWS else os.O_RDONLY)
@@ -128,21 +135,27 @@ def require_own_folder(folder: Path, kind: str) -> None:
     if others:
         more = f" and {len(others) - 3} more" if len(others) > 3 else ""
         raise FolderError(
-            f"{folder}: holds {', '.join(others[:3])}{more}, so it is no {kind} of gaponet; choose an empty folder"
+            f"{folder}: holds {', '.join(others[:3])}{more}, so it is no {kind} of gaponet; "
+            "choose an empty folder"
         )
 
 
 def _marker_lines(folder: Path) -> list[str]:
-    """Return the kind of a folder and the process that writes into it, as far as the marker states them."""
+    """Return the kind of a folder and the process that writes into it, as far as the marker states
+    them.
+    """
     marker = folder / FOLDER_MARKER
     return marker.read_text(encoding="utf-8", errors="replace").split() if marker.is_file() else []
 
 
 @contextmanager
 def lock_folder(folder: Path, kind: str, wait: float = 0.0) -> Iterator[None]:
-    """Lock a folder for this thread, the only writer; the folder is created if missing. Nested calls do nothing.
+    """Lock a folder for this thread, the only writer; the folder is created if missing.
 
-    If the block fails before it wrote anything, a folder or marker that was created here is removed.
+    Nested calls do nothing.
+
+    If the block fails before it wrote anything, a folder or marker that was created here is
+    removed.
 
     Args:
         kind: One word: dataset, run, model, …
@@ -156,7 +169,8 @@ def lock_folder(folder: Path, kind: str, wait: float = 0.0) -> Iterator[None]:
         yield
         return
     created = [p for p in (folder, *folder.parents) if not p.exists()]
-    new, kind_line = not (folder / FOLDER_MARKER).exists(), f"{kind}\n".encode()
+    new = not (folder / FOLDER_MARKER).exists()
+    kind_line = f"{kind}\n".encode()
     descriptor = _lock_marker(folder, kind, wait)
     _locked_here.add(key)
     succeeded = False
@@ -186,10 +200,11 @@ def lock_folder(folder: Path, kind: str, wait: float = 0.0) -> Iterator[None]:
 def whole_folder(
     folder: Path, kind: str, last: str, obsolete: tuple[str, ...] = ()
 ) -> Iterator[Path]:
-    """Lock a folder and yield an empty one; when the block succeeds, its files replace those of `folder`.
+    """Lock a folder and yield an empty one; when the block succeeds, its files replace those of
+    `folder`.
 
-    The folder is complete if `last` is there: this file is taken away first and put back last. If the process is killed
-    before, or the block fails, `folder` stays as it was.
+    The folder is complete if `last` is there: this file is taken away first and put back last. If
+    the process is killed before, or the block fails, `folder` stays as it was.
 
     Args:
         kind: As of `lock_folder`.
@@ -251,7 +266,8 @@ def _lock_marker(folder: Path, kind: str, wait: float) -> int:
 def lock_file(path: Path, opener: Callable[[Path], int] | None = None) -> int | None:
     """Lock a file against other processes; the file is created if missing.
 
-    A descriptor, unlike the locks of libraries, may be inherited by a child and may be of another user's file.
+    A descriptor, unlike the locks of libraries, may be inherited by a child and may be of another
+    user's file.
 
     Args:
         opener: Opens the file; by default it is opened for reading and writing.
@@ -300,9 +316,8 @@ def _process_runs(process: int) -> bool:
         import ctypes
 
         kernel = ctypes.windll.kernel32  # type: ignore[attr-defined]
-        handle = kernel.OpenProcess(
-            0x100000, False, process
-        )  # SYNCHRONIZE: the right to wait for its end
+        # SYNCHRONIZE: the right to wait for its end
+        handle = kernel.OpenProcess(0x100000, False, process)
         try:
             return bool(handle) and kernel.WaitForSingleObject(handle, 0) == 0x102  # WAIT_TIMEOUT
         finally:

@@ -41,7 +41,9 @@ def with_note(progress: Progress, note: str) -> Callable[[int, int], None]:
 
 @contextmanager
 def progress_bar(title: str) -> Iterator[Callable[[float, float, str], None]]:
-    """Show a progress bar on stderr; yields update(done, total, note), to be given as `progress`."""
+    """Show a progress bar on stderr; yields update(done, total, note), to be given as
+    `progress`.
+    """
     with _progress(title) as show:
 
         def update(done: float, total: float, note: str = "") -> None:
@@ -70,10 +72,14 @@ def _progress(title: str) -> Iterator[_Show]:
             yield lines
         return
     columns: tuple[ProgressColumn, ...] = (
-        TextColumn("{task.description}", style="bold", markup=False), BarColumn(),
-        TextColumn("{task.percentage:3.0f} %"), TimeElapsedColumn(), TextColumn("left"),
-        TimeRemainingColumn(), TextColumn("{task.fields[note]}", markup=False),
-    )  # fmt: skip
+        TextColumn("{task.description}", style="bold", markup=False),
+        BarColumn(),
+        TextColumn("{task.percentage:3.0f} %"),
+        TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(),
+        TextColumn("{task.fields[note]}", markup=False),
+    )
     with Bars(*columns, console=console, speed_estimate_period=600) as progress:
         whole = progress.add_task(title, total=None, note="")
         shown: dict[str, TaskID] = {}
@@ -96,7 +102,9 @@ def _progress(title: str) -> Iterator[_Show]:
 
 @contextmanager
 def _lines(title: str, console: Console) -> Iterator[_Show]:
-    """Print progress as lines: the first update, one every LINE_INTERVAL_S even if nothing is reported, and the end."""
+    """Print progress as lines: the first update, one every LINE_INTERVAL_S even if nothing is
+    reported, and the end.
+    """
     interval = float(os.environ.get(LINE_INTERVAL_VARIABLE, LINE_INTERVAL_S))
     lines = _Lines(title, console, interval)
     done = threading.Event()

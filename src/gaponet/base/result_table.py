@@ -24,7 +24,9 @@ class MeanStd:
 
     @classmethod
     def from_values(cls, values: Iterable[float], scale: float = 1.0) -> MeanStd:
-        """Summarise the finite values, times `scale` (1e3 turns rad into mrad); without any, the mean is NaN."""
+        """Summarise the finite values, times `scale` (1e3 turns rad into mrad); without any, the
+        mean is NaN.
+        """
         finite = np.array([v for v in values if math.isfinite(v)]) * scale
         std = float(finite.std(ddof=1)) if len(finite) > 1 else math.nan
         return cls(float(finite.mean()) if len(finite) else math.nan, std, len(finite))
@@ -50,7 +52,8 @@ class ResultTable:
         for row in self.rows:
             if len(row) != len(self.columns):
                 raise ValueError(
-                    f"table '{self.name}': {len(row)} cells under {len(self.columns)} columns: {row}"
+                    f"table '{self.name}': {len(row)} cells under {len(self.columns)} columns: "
+                    f"{row}"
                 )
 
     def texts(self) -> list[list[str]]:
@@ -60,8 +63,13 @@ class ResultTable:
     def record(self) -> dict[str, Any]:
         """Return the table as JSON values; a MeanStd becomes an object."""
         rows = [[asdict(c) if isinstance(c, MeanStd) else c for c in row] for row in self.rows]
-        return {"name": self.name, "caption": self.caption, "columns": list(self.columns), "rows": rows,
-                "texts": self.texts()}  # fmt: skip
+        return {
+            "name": self.name,
+            "caption": self.caption,
+            "columns": list(self.columns),
+            "rows": rows,
+            "texts": self.texts(),
+        }
 
     def markdown(self) -> str:
         """Return the table in Markdown, with the caption below."""
@@ -75,7 +83,9 @@ class ResultTable:
         return f"{table}\n\n{escape_markdown(self.caption)}" if self.caption else table
 
     def csv(self) -> str:
-        """Return the table as CSV at full precision; a column with MeanStd is followed by its std and count."""
+        """Return the table as CSV at full precision; a column with MeanStd is followed by its std
+        and count.
+        """
         with_std = [
             any(isinstance(cell, MeanStd) for cell in column)
             for column in zip(*self.rows, strict=True)
@@ -109,7 +119,8 @@ class ResultTable:
 def format_cell(cell: Any, digits: int = 2) -> str:
     """Format a cell of a table: 12.28 ± 0.08 (mean ± standard deviation), 1,234, yes, or blank."""
     if isinstance(cell, MeanStd):
-        mean, std = format_cell(cell.mean, digits), format_cell(cell.std, digits)
+        mean = format_cell(cell.mean, digits)
+        std = format_cell(cell.std, digits)
         return f"{mean} ± {std}" if mean and std else mean
     if cell is None or isinstance(cell, str):
         return cell or ""

@@ -1,9 +1,11 @@
-"""Sandbox for untrusted files: one child process parses them within limits of memory, time and open files.
+"""Sandbox for untrusted files: one child process parses them within limits of memory, time and
+open files.
 
-A file of a few bytes can demand gigabytes or never end, and no parser can tell beforehand. The child is started on
-demand, serves until it is idle for IDLE_S or this process ends, and is restarted when a file was its end. Memory and
-processor time are limited where the system allows it (Linux; macOS limits the time only). Elsewhere a file that does
-not end is given up after MAX_WALL_FACTOR times its processor time.
+A file of a few bytes can demand gigabytes or never end, and no parser can tell beforehand. The
+child is started on demand, serves until it is idle for IDLE_S or this process ends, and is
+restarted when a file was its end. Memory and processor time are limited where the system allows it
+(Linux; macOS limits the time only). Elsewhere a file that does not end is given up after
+MAX_WALL_FACTOR times its processor time.
 """
 
 from __future__ import annotations
@@ -64,7 +66,8 @@ CHILD_VARIABLES = {
 def sandboxed(
     error: type[GAPONetError], library: str, seconds_per_mb: float = 1.0
 ) -> Callable[[Callable[..., T]], Callable[..., T]]:
-    """Decorate a module's function, whose first argument is an untrusted file, to run in the sandbox.
+    """Decorate a module's function, whose first argument is an untrusted file, to run in the
+    sandbox.
 
     Arguments and results are pickled. An exception of the function is raised in the caller.
 
@@ -115,11 +118,13 @@ def _run(
             answer, failure = _Child.current_or_new().request(request, seconds)
     if failure == "memory":
         raise error(
-            f"{file}: takes more than {MEMORY_BYTES >> 20} MiB to be read, more than a file may; cut it"
+            f"{file}: takes more than {MEMORY_BYTES >> 20} MiB to be read, more than a file may; "
+            "cut it"
         )
     if failure == "time":
         raise error(
-            f"{file}: is not read after {seconds:.0f} s, longer than a file of its size may take; cut it"
+            f"{file}: is not read after {seconds:.0f} s, longer than a file of its size may take; "
+            "cut it"
         )
     if failure:
         raise error(f"{file}: is not readable ({failure}); copy or make it again")
@@ -129,7 +134,9 @@ def _run(
 
 
 def _size(path: Path) -> int:
-    """Return the bytes of a file or folder; a model counts with the files around it, which it may name."""
+    """Return the bytes of a file or folder; a model counts with the files around it, which it may
+    name.
+    """
     with suppress(OSError):
         if path.is_dir() or path.suffix in (".xml", ".urdf"):
             folder = path if path.is_dir() else path.parent
@@ -152,9 +159,13 @@ class _Child:
         inherited = {name: os.environ[name] for name in INHERITED_VARIABLES if name in os.environ}
         self.owner = os.getpid()
         self.process = subprocess.Popen(
-            module_command(__name__), stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
-            cwd=tempfile.gettempdir(), env=inherited | CHILD_VARIABLES,
-        )  # fmt: skip
+            module_command(__name__),
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            cwd=tempfile.gettempdir(),
+            env=inherited | CHILD_VARIABLES,
+        )
 
     @classmethod
     def current_or_new(cls) -> _Child:
@@ -209,7 +220,10 @@ def _close() -> None:
 
 
 def _write(stream: IO[bytes], value: Any) -> None:
-    """Write a pickle. Of protocol 5 arrays are written without a copy, which would count as the child's memory."""
+    """Write a pickle.
+
+    Of protocol 5 arrays are written without a copy, which would count as the child's memory.
+    """
     pickle.dump(value, stream, 5)
     stream.flush()
 
@@ -271,6 +285,5 @@ def _set_limit(kind: int, soft: int) -> None:
 
 
 if __name__ == "__main__":
-    import_module(
-        "gaponet.base.sandbox"
-    )._serve()  # not as __main__: functions know this module by its name
+    # not as __main__: functions know this module by its name
+    import_module("gaponet.base.sandbox")._serve()

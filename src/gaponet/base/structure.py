@@ -1,8 +1,9 @@
-"""Validation of file contents: a value of the stated type, or a one-line error with the file and the field.
+"""Validation of file contents: a value of the stated type, or a one-line error with the file and
+the field.
 
-A type is a dataclass or a TypedDict; its annotations hold ranges and sizes (annotated_types: Ge, Interval, Len).
-pydantic validates strictly: no text for a number, no NaN or infinity unless the annotation allows it, no unknown field
-unless the caller allows it. Only this module uses pydantic.
+A type is a dataclass or a TypedDict; its annotations hold ranges and sizes (annotated_types: Ge,
+Interval, Len). pydantic validates strictly: no text for a number, no NaN or infinity unless the
+annotation allows it, no unknown field unless the caller allows it. Only this module uses pydantic.
 """
 
 from __future__ import annotations
@@ -68,9 +69,8 @@ Name = Annotated[str, AfterValidator(_name)]  # may become the name of a file
 Sha256 = Annotated[str, AfterValidator(_hex)]
 Count = Annotated[int, Interval(ge=0, le=10**15)]
 Angle = Annotated[float, Interval(ge=-1e3, le=1e3)]  # rad
-Extended = Annotated[
-    float, AllowInfNan(True), Interval(ge=-math.inf, le=math.inf)
-]  # infinity too, but no NaN
+# infinity too, but no NaN
+Extended = Annotated[float, AllowInfNan(True), Interval(ge=-math.inf, le=math.inf)]
 # A measured number; in a file, None stands for a missing one.
 Number = Annotated[
     Annotated[float, AllowInfNan(True)] | None,
@@ -90,7 +90,8 @@ def validated(
     """Convert plain data (dict, list, text, numbers) to a value of type `kind`.
 
     Args:
-        kind: Dataclass, TypedDict, or any other type that pydantic supports, such as dict[str, float].
+        kind: Dataclass, TypedDict, or any other type that pydantic supports, such as dict[str,
+            float].
         where: Source of the data, for the error.
         error: Class of the error.
         hint: What the user can do, for the error.
@@ -141,11 +142,14 @@ def read_json(
 def read_format(
     kind: type[T], path: Path, newest: int, error: type[GAPONetError], hint: str = ""
 ) -> T:
-    """Read a JSON file with a "format" of at most `newest`; fields that `kind` does not name are kept."""
+    """Read a JSON file with a "format" of at most `newest`; fields that `kind` does not name are
+    kept.
+    """
     table = read_json(_Format, path, error, hint, allow_extra=True)
     if table["format"] > newest:
         raise error(
-            f"{path}: format {table['format']} is newer than this gaponet reads ({newest}); upgrade gaponet"
+            f"{path}: format {table['format']} is newer than this gaponet reads ({newest}); "
+            "upgrade gaponet"
         )
     return validated(kind, table, path, error, hint, allow_extra=True)
 
@@ -193,9 +197,21 @@ def read_npz(
             return {name: np.asarray(file[name]) for name in file.files}
     # NumPy parses a header as Python text; zipfile passes on errors of zlib and struct.
     except (
-        OSError, ValueError, KeyError, EOFError, MemoryError, SyntaxError, TypeError, NotImplementedError,
-        OverflowError, RuntimeError, tokenize.TokenError, struct.error, zlib.error, zipfile.BadZipFile,
-    ) as invalid:  # fmt: skip
+        OSError,
+        ValueError,
+        KeyError,
+        EOFError,
+        MemoryError,
+        SyntaxError,
+        TypeError,
+        NotImplementedError,
+        OverflowError,
+        RuntimeError,
+        tokenize.TokenError,
+        struct.error,
+        zlib.error,
+        zipfile.BadZipFile,
+    ) as invalid:
         reason = " ".join(str(invalid).split())[:120] or type(invalid).__name__
         raise error(_message(path, f"not readable ({reason})", hint)) from None
 
@@ -213,14 +229,16 @@ def read_limited(
 
 @functools.cache
 def _type_adapter(kind: Any) -> Any:
-    # pydantic accepts no configuration for a dataclass, but passes that of a union on to its members.
+    # pydantic accepts no configuration for a dataclass, but passes that of a union on to its
+    # members.
     return TypeAdapter(kind | None, config=ConfigDict(strict=True, allow_inf_nan=False))
 
 
 def _first_error(invalid: ValidationError) -> str:
     """Describe the first error (field, reason, value) and count the others."""
     errors = invalid.errors(include_url=False)
-    kind, given = errors[0]["type"], errors[0]["input"]
+    kind = errors[0]["type"]
+    given = errors[0]["input"]
     field = "".join(
         f"[{part}]" if isinstance(part, int) else f".{part}" for part in errors[0]["loc"]
     ).lstrip(".")

@@ -1,4 +1,6 @@
-"""Text for people: names that other people chose may hold any character; measured numbers carry their uncertainty."""
+"""Text for people: names that other people chose may hold any character; measured numbers carry
+their uncertainty.
+"""
 
 from __future__ import annotations
 
@@ -9,11 +11,16 @@ MAX_PRINTED_ERROR = 1e4  # in the unit of the text; the number then says nothing
 
 
 def format_uncertainty(value: float, standard_error: float) -> str:
-    """Format a number and its standard error, rounded to two digits of the error: 0.0 ± 1.3, 320 ± 170; 5 ± ?."""
+    """Format a number and its standard error, rounded to two digits of the error: 0.0 ± 1.3, 320 ±
+    170; 5 ± ?.
+    """
     if standard_error > MAX_PRINTED_ERROR:
         return f"{value:.3g} ± ?"
     digits = 1 - math.floor(math.log10(standard_error)) if 0 < standard_error < math.inf else 3
-    return f"{round(value, digits) + 0.0:.{max(digits, 0)}f} ± {round(standard_error, digits):.{max(digits, 0)}f}"
+    return (
+        f"{round(value, digits) + 0.0:.{max(digits, 0)}f} ± "
+        f"{round(standard_error, digits):.{max(digits, 0)}f}"
+    )
 
 
 def escape(text: str) -> str:
@@ -22,7 +29,9 @@ def escape(text: str) -> str:
 
 
 def escape_markdown(text: str) -> str:
-    """Return the text so that Markdown shows it literally: no markup, no HTML, no end of a table cell."""
+    """Return the text so that Markdown shows it literally: no markup, no HTML, no end of a table
+    cell.
+    """
     return re.sub(r"([\\`*\[\]<>|&$~])", r"\\\1", escape(text))
 
 

@@ -1,1 +1,3 @@
-"""Networks: observation, sensors, operator, baselines, the loop around them, the artifact that ships, training."""
+"""Networks: observation, sensors, operator, baselines, the loop around them, the artifact that
+ships, training.
+"""

@@ -1,7 +1,9 @@
-"""Adaptation of a trained model to one unit (one physical robot): a file per unit in RUN/adaptation/.
+"""Adaptation of a trained model to one unit (one physical robot): a file per unit in
+RUN/adaptation/.
 
-Units differ in gain, damping, friction, zero offsets and delay. These servo parameters of the simulator are fitted to
-half a minute of the unit's log, with the trained correction (sysid/adapt.py). The network does not change.
+Units differ in gain, damping, friction, zero offsets and delay. These servo parameters of the
+simulator are fitted to half a minute of the unit's log, with the trained correction
+(sysid/adapt.py). The network does not change.
 """
 
 from __future__ import annotations
@@ -36,7 +38,8 @@ class Adaptation:
         logs: Content hashes of the recordings.
         seconds: Duration of the fitted windows.
         before, after: RMS error of the fitted windows, rad.
-        doctor: What the doctor found in the recordings: despite_errors and warnings, a sentence each.
+        doctor: What the doctor found in the recordings: despite_errors and warnings, a sentence
+            each.
     """
 
     unit_id: str
@@ -55,7 +58,10 @@ class Adaptation:
         )
 
     def save(self, run: Path) -> Path:
-        """Write RUN/adaptation/UNIT.json and return its path. It replaces an earlier file of this unit."""
+        """Write RUN/adaptation/UNIT.json and return its path.
+
+        It replaces an earlier file of this unit.
+        """
         path = run / FOLDER / f"{re.sub(r'[^A-Za-z0-9._-]', '_', self.unit_id)}.json"
         with lock_folder(run, "run"):
             path.parent.mkdir(exist_ok=True)
@@ -83,7 +89,8 @@ class Adaptation:
         units = sorted({s.meta.unit_id for s in sequences})
         if len(units) != 1:
             raise UsageError(
-                f"these recordings are of units {', '.join(units) or '(none)'}; give those of one unit"
+                f"these recordings are of units {', '.join(units) or '(none)'}; give those of one "
+                "unit"
             )
         fitted = adapt(sequences, simulator, seconds, model.corrector(simulator), progress)
         servos = {
@@ -107,7 +114,8 @@ class Adaptation:
             adaptation = read_json(Adaptation, path, ModelError, "run gaponet adapt again")
             if adaptation.weights != weights:
                 raise ModelError(
-                    f"{path}: made for another model ({adaptation.weights}); delete it or run gaponet adapt again"
+                    f"{path}: made for another model ({adaptation.weights}); delete it or run "
+                    "gaponet adapt again"
                 )
             adaptations[adaptation.unit_id] = adaptation
         return adaptations

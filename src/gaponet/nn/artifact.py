@@ -1,4 +1,6 @@
-"""GapModel: a trained model as a folder with model.onnx (normalisers inside) and card.json. It does not need torch.
+"""GapModel: a trained model as a folder with model.onnx (normalisers inside) and card.json.
+
+It does not need torch.
 
 The package has some of them by name (nn/packaged_networks.py).
 """
@@ -36,12 +38,22 @@ if TYPE_CHECKING:
 
 WEIGHTS = "model.onnx"
 FORMAT = 1
-# Fields of the card that export also writes into the ONNX file: what the network's inputs and outputs mean, and for
-# which robots they hold.
+# Fields of the card that export also writes into the ONNX file: what the network's inputs and
+# outputs mean, and for which robots they hold.
 FACTS_IN_NETWORK = (
-    "robot", "joint_names", "kp", "kd", "qpos_range", "dt", "payload_seen", "recorded", "model", "context",
-)  # fmt: skip
-MAX_DISTANCE = 0.1  # beyond the answers of training, as a share of their range, at which the network is still used
+    "robot",
+    "joint_names",
+    "kp",
+    "kd",
+    "qpos_range",
+    "dt",
+    "payload_seen",
+    "recorded",
+    "model",
+    "context",
+)
+# beyond the answers of training, as a share of their range, at which the network is still used
+MAX_DISTANCE = 0.1
 MIN_WIDTH_RAD = 1e-4  # narrower ranges of training are taken to be this wide
 GAIN_TOLERANCE = 0.02  # relative, between recorded and real gains
 RATE_TOLERANCE = 0.02  # relative: a clock of 49.85 Hz counts as 50 Hz
@@ -53,7 +65,8 @@ def make_card(config: ModelConfig, robot: RobotSpec, **facts: Any) -> dict[str, 
 
     Args:
         robot: The simulator that the model corrects.
-        facts: Further fields, such as dt [s], payload_seen [kg], dataset_hash, units, virtual and versions.
+        facts: Further fields, such as dt [s], payload_seen [kg], dataset_hash, units, virtual and
+            versions.
     """
     from gaponet.sim.model import model_hash
 
@@ -125,7 +138,9 @@ class _Card(TypedDict):
 def _require_output(
     network: Network, inputs: int, outputs: int, largest: float, file: Path
 ) -> None:
-    """Refuse a network whose output for inputs (k, inputs) is not (k, outputs), finite, and at most `largest` rad."""
+    """Refuse a network whose output for inputs (k, inputs) is not (k, outputs), finite, and at
+    most `largest` rad.
+    """
     try:
         deltas = [network(np.zeros((k, inputs), np.float32)) for k in (1, 2)]
         fits = all(delta.shape == (k, outputs) for k, delta in enumerate(deltas, 1))
@@ -134,7 +149,8 @@ def _require_output(
         )
         reason = f"{inputs} numbers in do not give {outputs} finite ones up to {largest:g} rad out"
     except Exception as error:  # an unknown network can raise anything
-        fits, reason = False, f"it does not run: {' '.join(str(error).split())[:120]}"
+        fits = False
+        reason = f"it does not run: {' '.join(str(error).split())[:120]}"
     if not fits:
         raise ModelError(f"{file}: does not fit its card ({reason}); copy or train the model again")
 
@@ -157,8 +173,9 @@ def _require_stored_facts(network: OnnxNetwork, card: dict[str, Any], folder: Pa
     for name in FACTS_IN_NETWORK:
         if stored.get(name) != given.get(name):
             raise ModelError(
-                f"{folder / CARD}: {name} is {_short(given.get(name))}, but {WEIGHTS} was exported with "
-                f"{_short(stored.get(name))}; restore the card, or run gaponet export RUN again"
+                f"{folder / CARD}: {name} is {_short(given.get(name))}, but {WEIGHTS} was "
+                f"exported with {_short(stored.get(name))}; restore the card, or run gaponet "
+                "export RUN again"
             )
 
 
@@ -182,18 +199,24 @@ class KnownSimulators:
 
     @classmethod
     def of(cls, nominal: Array, trained: Array) -> KnownSimulators:
-        """Return the range of the robot's own answers, (8n), and those of training, (simulators, 8n)."""
+        """Return the range of the robot's own answers, (8n), and those of training, (simulators,
+        8n).
+        """
         answers = np.vstack([nominal, trained])
         return cls(nominal, answers.min(axis=0), answers.max(axis=0))
 
     def distance(self, context: Array) -> float:
-        """Return how far answers (…, 8n) lie outside those of training: 0 within, 1 a whole width of the range away."""
+        """Return how far answers (…, 8n) lie outside those of training: 0 within, 1 a whole width
+        of the range away.
+        """
         beyond = np.maximum(self.low - context, context - self.high)
         width = np.maximum(self.high - self.low, MIN_WIDTH_RAD)
         return float(np.maximum(beyond / width, 0.0).max())
 
     def include(self, context: Array) -> bool:
-        """Return true if answers (…, 8n) are so close to those of training that the network can be used."""
+        """Return true if answers (…, 8n) are so close to those of training that the network can be
+        used.
+        """
         return self.distance(context) <= MAX_DISTANCE
 
     def to_card(self) -> dict[str, list[float]]:
@@ -210,8 +233,8 @@ class KnownSimulators:
 class GapModel:
     """Delta-action model and its card. It has no state and can be shared.
 
-    `loop` is for control loops and has a history. `corrector` is for rollouts of sim.replay. deploy.AlignedSim is a
-    simulator with a loop.
+    `loop` is for control loops and has a history. `corrector` is for rollouts of sim.replay.
+    deploy.AlignedSim is a simulator with a loop.
     """
 
     path: Path
@@ -224,13 +247,16 @@ class GapModel:
         """Load a model: of the package by name, or of a run or export folder.
 
         Args:
-            path: Name of a network of the package, such as those of gaponet.networks(), or a folder.
-            threads: Threads of onnxruntime; 0 for all cores, which is faster for hundreds of robots at once.
+            path: Name of a network of the package, such as those of gaponet.networks(), or a
+                folder.
+            threads: Threads of onnxruntime; 0 for all cores, which is faster for hundreds of robots
+                at once.
 
         Raises:
-            ModelError: A file is missing, damaged, or from a newer version; or the card contradicts the network in
-                shapes, joints, gains, ranges, rate, payload or largest correction.
-            UsageError: The name is that of a network of the package and of a folder in the working directory.
+            ModelError: A file is missing, damaged, or from a newer version; or the card contradicts
+                the network in shapes, joints, gains, ranges, rate, payload or largest correction.
+            UsageError: The name is that of a network of the package and of a folder in the working
+                directory.
         """
         folder = network_folder(path)
         folder = folder / "model" if (folder / "model" / CARD).is_file() else folder
@@ -247,13 +273,16 @@ class GapModel:
         _require_stored_facts(network, card, folder)
         if card.get("sha256", {}).get(WEIGHTS, digest := sha256(file)) != digest:
             raise ModelError(
-                f"{file}: is not of its {CARD}: an export was cut short; run gaponet export RUN again"
+                f"{file}: is not of its {CARD}: an export was cut short; run gaponet export RUN "
+                "again"
             )
         return cls(folder, card, config, network)
 
     @property
     def qpos_range(self) -> Array:
-        """Limits of the operated joints, (n, 2) rad; ±inf where there is none, or the card does not have them."""
+        """Limits of the operated joints, (n, 2) rad; ±inf where there is none, or the card does
+        not have them.
+        """
         limits = self.card.get("qpos_range", [[None, None]] * len(self.card["joint_names"]))
         return np.array(
             [[-np.inf if a is None else a, np.inf if b is None else b] for a, b in limits]
@@ -268,12 +297,15 @@ class GapModel:
 
     @property
     def nominal_context(self) -> Array:
-        """Answers of the robot's own simulator to fixed probes, (8n) rad; (0) if the network is not told them."""
+        """Answers of the robot's own simulator to fixed probes, (8n) rad; (0) if the network is
+        not told them.
+        """
         known = self.known_simulators
         return np.zeros(0, np.float32) if known is None else known.nominal
 
     def knows(self, robot: RobotSpec, dt: float) -> bool:
-        """Return true if the network was trained for this simulator: in it, or in simulators with such answers.
+        """Return true if the network was trained for this simulator: in it, or in simulators with
+        such answers.
 
         Raises:
             ModelError: This is another robot.
@@ -284,7 +316,9 @@ class GapModel:
         return known is not None and known.include(self.context_of(robot, dt))
 
     def context_of(self, robot: RobotSpec, dt: float) -> Array:
-        """Measure a simulator's answers to fixed probes with empty hands, (8n) rad; dt is the control period, s."""
+        """Measure a simulator's answers to fixed probes with empty hands, (8n) rad; dt is the
+        control period, s.
+        """
         from gaponet.sim.batch import Condition
 
         return self.contexts_of(robot, [Condition(0.0, "both", dt)])[0]
@@ -302,16 +336,16 @@ class GapModel:
         Joints are those of the card (joint_names), in that order.
 
         Args:
-            context: Answers of the simulators to fixed probes, (num_envs, 8n) or (8n) rad, for a network that is told
-                them; default: those of the robot's own simulator.
+            context: Answers of the simulators to fixed probes, (num_envs, 8n) or (8n) rad, for a
+                network that is told them; default: those of the robot's own simulator.
 
         Raises:
             ModelError: The model needs its simulator, which a control loop does not have.
         """
         if self.config.needs_simulator:
             raise ModelError(
-                f"{self.path}: its sensor values are the simulator's answers (sensor_source fixed), for gaponet eval "
-                "alone; train with --model.sensor-source predicted"
+                f"{self.path}: its sensor values are the simulator's answers (sensor_source "
+                "fixed), for gaponet eval alone; train with --model.sensor-source predicted"
             )
         loop = DeltaLoop(self.config, self.qpos_range, num_envs, self.infer)
         if self.config.context:
@@ -329,20 +363,25 @@ class GapModel:
         card = self.card
         if card["robot"] != robot.name or tuple(card["joint_names"]) != robot.operated:
             raise ModelError(
-                f"{self.path}: made for {card['robot']} with joints {', '.join(card['joint_names'])}; "
-                f"this is {robot.name} with {', '.join(robot.operated)}. Use the robot the model was trained for"
+                f"{self.path}: made for {card['robot']} with joints "
+                f"{', '.join(card['joint_names'])}; this is {robot.name} with "
+                f"{', '.join(robot.operated)}. Use the robot the model was trained for"
             )
         return bool(card["simulator"] == model_hash(robot))
 
     def require(self, robot: RobotSpec, dt: float | None = None) -> None:
-        """Refuse another simulator, with other gains or limits, or another control period dt, s, than in training."""
+        """Refuse another simulator, with other gains or limits, or another control period dt, s,
+        than in training.
+        """
         from gaponet.sim.model import model_hash
 
         if not self.is_trained_in(robot):
-            trained, given = self.card["simulator"], model_hash(robot)
+            trained = self.card["simulator"]
+            given = model_hash(robot)
             raise ModelError(
-                f"{self.path}: trained in simulator {trained}, but robot '{robot.name}' in {robot.folder} is {given} "
-                f"(MJCF, gains or limits differ, or it is of before friction held); {self._how_to_get_simulator()}"
+                f"{self.path}: trained in simulator {trained}, but robot '{robot.name}' in "
+                f"{robot.folder} is {given} (MJCF, gains or limits differ, or it is of before "
+                f"friction held); {self._how_to_get_simulator()}"
             )
         if dt is not None:
             self.require_rate(dt)
@@ -354,20 +393,22 @@ class GapModel:
             return "use the robot folder that the run keeps, or train again"
         version = self.card.get("versions", {}).get("gaponet", "of its training")
         return (
-            f"it needs the package's {packaged.name} with gain_scale {packaged.gain_scale:g}, as in gaponet {version}: "
-            "use that robot or that version, or train again"
+            f"it needs the package's {packaged.name} with gain_scale {packaged.gain_scale:g}, as "
+            f"in gaponet {version}: use that robot or that version, or train again"
         )
 
     def simulator(self) -> RobotSpec:
-        """Load the simulator of training: of the run or export folder, or for a network of the package of the package.
+        """Load the simulator of training: of the run or export folder, or for a network of the
+        package of the package.
 
         Raises:
             ModelError: The folder has no simulator, or another one.
         """
         if not has_stored_robot(stored_robot_holder(self.path)):
             raise ModelError(
-                f"{self.path}: trained in simulator {self.card['simulator']}, which does not lie beside it; "
-                "commands cannot be transferred to another simulator or rate; give the run folder, or an export (--out)"
+                f"{self.path}: trained in simulator {self.card['simulator']}, which does not lie "
+                "beside it; commands cannot be transferred to another simulator or rate; give the "
+                "run folder, or an export (--out)"
             )
         robot = load_stored_robot(stored_robot_holder(self.path), self.card["robot"])
         self.require(robot)
@@ -375,11 +416,15 @@ class GapModel:
 
     @property
     def max_payload(self) -> float:
-        """Largest payload in the training data, kg; the largest possible input if the card does not have it."""
+        """Largest payload in the training data, kg; the largest possible input if the card does
+        not have it.
+        """
         return float(max(self.card.get("payload_seen", [self.config.payload_max])))
 
     def require_payload(self, payload_mass: Array | float, extrapolate: bool = False) -> None:
-        """Refuse payloads, kg, that are not physical, and, unless `extrapolate`, those outside the training data."""
+        """Refuse payloads, kg, that are not physical, and, unless `extrapolate`, those outside the
+        training data.
+        """
         mass = np.asarray(payload_mass, float)
         if not (np.isfinite(mass) & (mass >= 0)).all():
             raise UsageError(f"payload_mass is {payload_mass}; give kg, 0 when empty")
@@ -387,21 +432,25 @@ class GapModel:
         beyond = mass[(mass > self.max_payload * (1 + 1e-6)) | (mass < least * (1 - 1e-6))]
         if beyond.size and not extrapolate:
             raise ModelError(
-                f"{self.path}: trained with {least:g} to {self.max_payload:g} kg; {beyond.flat[0]:g} kg is outside; "
-                "train on such payloads, or extrapolate (--extrapolate, extrapolate=True)"
+                f"{self.path}: trained with {least:g} to {self.max_payload:g} kg; "
+                f"{beyond.flat[0]:g} kg is outside; train on such payloads, or extrapolate "
+                "(--extrapolate, extrapolate=True)"
             )
 
     def require_gains(self, joint_names: tuple[str, ...], kp: Array, kd: Array) -> None:
-        """Refuse a real robot whose servo gains, (n,), differ from those of the training recordings."""
+        """Refuse a real robot whose servo gains, (n,), differ from those of the training
+        recordings.
+        """
         for name, gains in (("kp", kp), ("kd", kd)):
             recorded = self.card.get("recorded", {}).get(name)
             for joint, was in zip(self.card["joint_names"], recorded or (), strict=False):
                 now = float(gains[joint_names.index(joint)])
                 if abs(now - was) > GAIN_TOLERANCE * max(was, now):
                     raise ModelError(
-                        f"{self.path}: its data were recorded with {name} {was:g} of {joint}, the servo has {now:.4g}; "
-                        "set the servos as they were, train on recordings with these gains (import with --kp and --kd "
-                        "if the data say them wrongly), or extrapolate (--extrapolate)"
+                        f"{self.path}: its data were recorded with {name} {was:g} of {joint}, the "
+                        f"servo has {now:.4g}; set the servos as they were, train on recordings "
+                        "with these gains (import with --kp and --kd if the data say them "
+                        "wrongly), or extrapolate (--extrapolate)"
                     )
 
     def require_rate(self, dt: float) -> None:
@@ -410,12 +459,14 @@ class GapModel:
         if rates and min(abs(dt / r - 1) for r in rates) > RATE_TOLERANCE:
             seen = ", ".join(f"{1 / r:.1f}" for r in rates)
             raise ModelError(
-                f"{self.path}: trained at {seen} Hz, the loop has {1 / dt:.1f} Hz; run it at a trained rate, "
-                "or train on logs of this rate"
+                f"{self.path}: trained at {seen} Hz, the loop has {1 / dt:.1f} Hz; run it at a "
+                "trained rate, or train on logs of this rate"
             )
 
     def corrector(self, robot: RobotSpec) -> DeltaCorrector:
-        """Return the corrections for rollouts of sim.replay; refuse a simulator that the network does not know."""
+        """Return the corrections for rollouts of sim.replay; refuse a simulator that the network
+        does not know.
+        """
         if not self.knows(robot, robot.dt):
             self.require(robot)
         return DeltaCorrector(self.infer, self.config, robot)
@@ -460,7 +511,8 @@ class GapModel:
         if "stages" not in card:
             return "by an older gaponet, which did not store the training stages"
         stages = card["stages"]
-        (done, planned), updates = stages.get("pretraining_rounds", (0, 0)), stages["ppo_updates"]
+        done, planned = stages.get("pretraining_rounds", (0, 0))
+        updates = stages["ppo_updates"]
         if not planned and updates:
             return (
                 f"{updates} updates of PPO from the untrained network, no supervised pre-training"
@@ -468,7 +520,10 @@ class GapModel:
         rounds = f"{done} rounds" if done >= planned else f"{done} of {planned} rounds"
         pretraining = f"supervised pre-training ({rounds})"
         if stages.get("ppo_from_untrained"):
-            return f"{pretraining}, worse than no correction; {updates} updates of PPO from the untrained network"
+            return (
+                f"{pretraining}, worse than no correction; {updates} updates of PPO from the "
+                "untrained network"
+            )
         return f"{pretraining}, {updates} updates of PPO" if updates else f"{pretraining}, no PPO"
 
 

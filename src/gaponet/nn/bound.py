@@ -1,8 +1,10 @@
-"""Bound of a network's answers at run time: within ±delta_max, and zero where an answer is not finite.
+"""Bound of a network's answers at run time: within ±delta_max, and zero where an answer is not
+finite.
 
-A network that was tested on some inputs may give anything for others: NaN, infinity, or a correction far beyond the
-training data. Everything that evaluates a network in a control loop therefore uses its answer through AnswerBound. The
-step that gaponet export writes for torch (export/torch_program.py) does the same.
+A network that was tested on some inputs may give anything for others: NaN, infinity, or a
+correction far beyond the training data. Everything that evaluates a network in a control loop
+therefore uses its answer through AnswerBound. The step that gaponet export writes for torch
+(export/torch_program.py) does the same.
 """
 
 from __future__ import annotations
@@ -18,8 +20,9 @@ from gaponet.base.arrays import array_module
 class AnswerBound:
     """Limits the answers of one network.
 
-    An answer is what the network returns for one robot, (n,) rad. If one of its numbers is not finite, the whole answer
-    counts as no correction: the joints then follow their targets as without a model.
+    An answer is what the network returns for one robot, (n,) rad. If one of its numbers is not
+    finite, the whole answer counts as no correction: the joints then follow their targets as
+    without a model.
 
     Attributes:
         delta_max: Largest correction of the model's card, rad.
@@ -42,7 +45,8 @@ class AnswerBound:
         count = int((~finite).sum())
         if count and not self.refused:
             warnings.warn(
-                "the network's answer is not finite (NaN or infinity); zero is used instead: no correction",
+                "the network's answer is not finite (NaN or infinity); zero is used instead: no "
+                "correction",
                 RuntimeWarning,
                 stacklevel=2,
             )

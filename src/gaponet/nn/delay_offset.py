@@ -47,14 +47,16 @@ class DelayOffset:
     def fit(cls, sequences: ListOf[Sequence], robot: RobotSpec, nthread: int = 0) -> DelayOffset:
         """Fit delay and offset of each joint by rollouts with all delays in whole control periods.
 
-        All joints have the same delay in a rollout. Each joint takes the delay with the least error after its offset:
-        the coupling between joints is small compared with delay and sag.
+        All joints have the same delay in a rollout. Each joint takes the delay with the least error
+        after its offset: the coupling between joints is small compared with delay and sag.
         """
         pieces = DelayOffset.pieces(sequences)
-        op, names = robot.operated_index, robot.operated
+        op = robot.operated_index
+        names = robot.operated
         dt = float(np.median([s.dt for s in pieces]))
         delays = dt * np.arange(int(MAX_DELAY_S / dt) + 1)
-        error, offset = np.empty((len(delays), len(op))), np.empty((len(delays), len(op)))
+        error = np.empty((len(delays), len(op)))
+        offset = np.empty((len(delays), len(op)))
         zero = dict.fromkeys(names, 0.0)
         for i, delay in enumerate(delays):
             candidate = DelayOffset(dict.fromkeys(names, float(delay)), zero)
@@ -95,7 +97,8 @@ class DelayOffsetCorrector:
         for joint in robot.operated:
             if joint not in values.delay or joint not in values.offset:
                 raise ModelError(
-                    f"delay and offset of joint '{joint}' are not known (delay_offset.json); train again"
+                    f"delay and offset of joint '{joint}' are not known (delay_offset.json); "
+                    "train again"
                 )
         self.delay = np.array([values.delay[j] for j in robot.operated])
         self.offset = np.array([values.offset[j] for j in robot.operated])

@@ -1,7 +1,8 @@
-"""Parts of all networks: dense layers, features of the input x, the limit of Δa, and their common base class.
+"""Parts of all networks: dense layers, features of the input x, the limit of Δa, and their common
+base class.
 
-All networks map x = [o_t | a_t | …] (nn/observation.py) to Δa_t. Normalisers are buffers, so the exported file is
-complete.
+All networks map x = [o_t | a_t | …] (nn/observation.py) to Δa_t. Normalisers are buffers, so the
+exported file is complete.
 """
 
 from __future__ import annotations
@@ -25,10 +26,11 @@ def dense(
     """Return linear layers with ELU between them. With zero_output, the initial output is 0."""
     layers: list[nn.Module] = []
     for width in hidden:
+        # in place: half the memory traffic
         layers += [
             nn.Linear(inputs, width),
             nn.ELU(inplace=True),
-        ]  # in place: half the memory traffic
+        ]
         inputs = width
     head = nn.Linear(inputs, outputs)
     if zero_output:
@@ -65,10 +67,12 @@ class Standardise(nn.Module):
 class Features(nn.Module):
     """[o_t | a_t] with history and action relative to the present position, standardised.
 
-    A lag of 10 mrad is hard to see in joint angles that span a radian. Relative to q_t it is the signal.
+    A lag of 10 mrad is hard to see in joint angles that span a radian. Relative to q_t it is the
+    signal.
 
     Attributes:
-        noise_std: σ of the noise during supervised pre-training, in standard deviations of each feature; else 0.
+        noise_std: σ of the noise during supervised pre-training, in standard deviations of each
+            feature; else 0.
         position_column: Column of x with the position of the same joint, per feature.
         is_position: 1 for features that are relative to that position, else 0.
     """
@@ -82,9 +86,8 @@ class Features(nn.Module):
         self.layout = Layout(config, n)
         self.dim = self.layout.query.stop
         self.standardise = Standardise(self.dim)
-        moved = self.layout.shifted(np.eye(n))[
-            :, self.layout.query
-        ]  # features that a shift of each joint changes
+        # features that a shift of each joint changes
+        moved = self.layout.shifted(np.eye(n))[:, self.layout.query]
         moved[:, self.layout.q] = 0.0
         self.register_buffer("position_column", torch.from_numpy(moved.argmax(0)), persistent=False)
         self.register_buffer(
@@ -96,23 +99,28 @@ class Features(nn.Module):
         return x[:, self.layout.query] - x.index_select(1, self.position_column) * self.is_position
 
     def forward(self, x: Tensor) -> Tensor:
-        """Return standardised features within ±MAX_FEATURE, because a network cannot extrapolate to 50 σ."""
+        """Return standardised features within ±MAX_FEATURE, because a network cannot extrapolate
+        to 50 σ.
+        """
         z = self.standardise(self.relative(x)).clamp(-MAX_FEATURE, MAX_FEATURE)
         return z + self.noise_std * torch.randn_like(z) if self.noise_std else z
 
 
 class BoundedOutput(nn.Module):
-    """Δa = Δ_max · tanh(gain · scale · y / Δ_max): gain · scale · y for small corrections, and never above Δ_max.
+    """Δa = Δ_max · tanh(gain · scale · y / Δ_max): gain · scale · y for small corrections, and
+    never above Δ_max.
 
     A hard bound is gain · scale · y, clipped outside training. The environment clips in training.
     """
 
-    gain: Tensor  # 1 in training; nn/training/validation.py lowers it if a smaller correction has a smaller error
+    # 1 in training; nn/training/validation.py lowers it if a smaller correction has a smaller error
+    gain: Tensor
     scale: Tensor  # RMS of the labels, rad, so that y is of order 1 for any robot
 
     def __init__(self, delta_max: float, hard: bool) -> None:
         super().__init__()
-        self.delta_max, self.hard = delta_max, hard
+        self.delta_max = delta_max
+        self.hard = hard
         self.register_buffer("gain", torch.tensor(1.0))
         self.register_buffer("scale", torch.tensor(1.0))
 
@@ -126,18 +134,20 @@ class BoundedOutput(nn.Module):
 class DeltaNet(nn.Module):
     """Base class of the networks: x = [o_t | a_t | …] → Δa, (B, n) rad, within ±Δ_max.
 
-    `prepare` has no parameters that PPO trains, so PPO evaluates it once per sample. `correct` has them.
+    `prepare` has no parameters that PPO trains, so PPO evaluates it once per sample. `correct` has
+    them.
 
     Attributes:
-        predictor: Network that predicts the simulator's answers, or None. It is fitted before the other training
-            (nn/training/sensor_fit.py), and then frozen.
+        predictor: Network that predicts the simulator's answers, or None. It is fitted before the
+            other training (nn/training/sensor_fit.py), and then frozen.
     """
 
     predictor: Any
 
     def __init__(self, config: ModelConfig, n: int) -> None:
         super().__init__()
-        self.config, self.n = config, n
+        self.config = config
+        self.n = n
         self.features = Features(config, n)
         self.bounded = BoundedOutput(config.delta_max, hard=config.kind in ("paper", "trees"))
         self.predictor = None

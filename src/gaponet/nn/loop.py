@@ -1,7 +1,9 @@
-"""Control loop around a network: history, held values and joint limits. Training, rollouts, simulators and robots
-share it.
+"""Control loop around a network: history, held values and joint limits.
 
-Arrays are numpy's or, if the loop's buffers are tensors, torch's. They have the operated joints, (num_envs, n).
+Training, rollouts, simulators and robots share it.
+
+Arrays are numpy's or, if the loop's buffers are tensors, torch's. They have the operated joints,
+(num_envs, n).
 """
 
 from __future__ import annotations
@@ -28,8 +30,9 @@ class DeltaLoop:
 
     Attributes:
         x: Input of the network, (num_envs, dim) float32; `observe` updates it.
-        extra: Returns the columns of x after [o_t | a_t], (num_envs, k): the simulator's answers, then the recorded
-            state's 2n + 1 numbers (nn/observation.py). Missing columns stay zero; all do if extra is None.
+        extra: Returns the columns of x after [o_t | a_t], (num_envs, k): the simulator's answers,
+            then the recorded state's 2n + 1 numbers (nn/observation.py). Missing columns stay zero;
+            all do if extra is None.
         held: The correction that is held, (num_envs, n) rad, or (n,) for one robot.
         age: Control periods since the start, (num_envs,).
         fresh: Robots without a history, (num_envs,).
@@ -50,13 +53,16 @@ class DeltaLoop:
             like: A float32 array or tensor. All buffers are of its kind and device; default numpy.
         """
         n = len(qpos_range)
-        self.config, self.n, self.num_envs = config, n, num_envs
+        self.config = config
+        self.n = n
+        self.num_envs = num_envs
         self.layout = layout = Layout(config, n)
         self.x = x = zeros_like(
             np.empty(0, np.float32) if like is None else like, num_envs, layout.dim
         )
         self.history = History(config, n, x)
-        self._numpy, self._xp = isinstance(x, np.ndarray), array_module(x)
+        self._numpy = isinstance(x, np.ndarray)
+        self._xp = array_module(x)
         # Internal arrays of one robot have one dimension: numpy needs half the time.
         shape = (n,) if num_envs == 1 else (num_envs, n)
         self._shapes = {shape, (num_envs, n)}
@@ -72,7 +78,8 @@ class DeltaLoop:
             for side in np.transpose(qpos_range)
         )
         self._applied: Any = zeros_like(x, *shape)
-        self.holds, self.age = config.holds, zeros_like(x, num_envs)
+        self.holds = config.holds
+        self.age = zeros_like(x, num_envs)
         self.held: Any = zeros_like(x, *shape)
         self.extra: Callable[[], Any] | None = None
         self.fresh = np.ones(num_envs, bool)
@@ -80,16 +87,23 @@ class DeltaLoop:
 
     @property
     def applied(self) -> Any:
-        """Targets of the last period: ctrl + Δa within the joint limits, (num_envs, n) rad. Send these."""
+        """Targets of the last period: ctrl + Δa within the joint limits, (num_envs, n) rad.
+
+        Send these.
+        """
         return self._applied.reshape(self.num_envs, self.n)
 
     @property
     def refused_answers(self) -> int:
-        """Number of the network's answers that were not finite, for which no correction was used (nn/bound.py)."""
+        """Number of the network's answers that were not finite, for which no correction was used
+        (nn/bound.py).
+        """
         return self._bound.refused
 
     def set_context(self, context: Any) -> None:
-        """Set the answers of each robot's simulator to fixed probes, (num_envs, 8n) or (8n) rad (sim/context.py)."""
+        """Set the answers of each robot's simulator to fixed probes, (num_envs, 8n) or (8n) rad
+        (sim/context.py).
+        """
         if self._numpy:
             self.x[:, self.layout.context] = context
         else:
@@ -98,12 +112,16 @@ class DeltaLoop:
     # ---- history
 
     def reset(self, ids: Array | slice = slice(None)) -> None:
-        """Delete the history of robots `ids`. At the next observation, their present frame is repeated as history."""
+        """Delete the history of robots `ids`.
+
+        At the next observation, their present frame is repeated as history.
+        """
         self.fresh[ids] = True
         self.any_fresh = True
 
     def begin(self, ids: Array | slice, qpos: Any, qvel: Any, u: Any) -> None:
-        """Set the history of robots `ids`: frames (k, depth, n), newest first, or (k, 1, n), repeated; rad, rad/s, rad.
+        """Set the history of robots `ids`: frames (k, depth, n), newest first, or (k, 1, n),
+        repeated; rad, rad/s, rad.
 
         u: Applied targets.
         """
@@ -115,7 +133,9 @@ class DeltaLoop:
             self.any_fresh = bool(self.fresh.any())
 
     def push(self, qpos: Any, qvel: Any, u: Any) -> None:
-        """End a control period: append the state before it and its target, (num_envs, n) each, to the history."""
+        """End a control period: append the state before it and its target, (num_envs, n) each, to
+        the history.
+        """
         self.history.push(qpos, qvel, u)
         if self.holds:
             self.age += 1
@@ -134,7 +154,8 @@ class DeltaLoop:
             frames = (x.reshape(-1, 1, self.n)[self.fresh] for x in (qpos, qvel, ctrl))
             self.begin(self.fresh.copy(), *frames)
         if self.config.sensor_hold == 1:
-            self._q[...], self._v[...] = qpos, qvel
+            self._q[...] = qpos
+            self._v[...] = qvel
             self.history.write()
         else:  # the sensor predictor's input is the observation of the last refresh
             due, column = self._due(self.config.sensor_hold)
@@ -145,15 +166,17 @@ class DeltaLoop:
         if self._payload is not None:
             self._payload[...] = payload_mass / self.config.payload_max
         if self.extra is not None and (due := self._due(self.config.sensor_hold)[0]).any():
-            extra, start = self.extra(), self.layout.query.stop
+            extra = self.extra()
+            start = self.layout.query.stop
             self.x[due, start : start + extra.shape[1]] = extra[due]
         return self.x
 
     def delta(self, qpos: Any, qvel: Any, ctrl: Any, payload_mass: Any) -> Any:
         """Return the correction of the coming control period. Call this once per period.
 
-        The history then contains ctrl + Δa as the target of this period, so apply that. A target that is not finite is
-        replaced by the last applied one: `applied` is finite, while ctrl + Δa is not.
+        The history then contains ctrl + Δa as the target of this period, so apply that. A target
+        that is not finite is replaced by the last applied one: `applied` is finite, while ctrl + Δa
+        is not.
 
         Args:
             qpos, qvel: Present state, (num_envs, n) or, for one robot, (n,); rad, rad/s.
@@ -161,23 +184,25 @@ class DeltaLoop:
             payload_mass: kg, one number or (num_envs,).
 
         Returns:
-            Δa, shape of ctrl, rad. It is within ±delta_max of the model, and ctrl + Δa is within the joint limits.
-            Where the network's answer is not finite, it is zero.
+            Δa, shape of ctrl, rad. It is within ±delta_max of the model, and ctrl + Δa is within
+            the joint limits. Where the network's answer is not finite, it is zero.
 
         Raises:
             UsageError: Arrays have another shape.
         """
         if self._numpy:
-            qpos, qvel, ctrl = np.asarray(qpos), np.asarray(qvel), np.asarray(ctrl)
+            qpos = np.asarray(qpos)
+            qvel = np.asarray(qvel)
+            ctrl = np.asarray(ctrl)
         if not qpos.shape == qvel.shape == ctrl.shape or ctrl.shape not in self._shapes:
             q, v, a = (tuple(values.shape) for values in (qpos, qvel, ctrl))
             raise UsageError(
-                f"delta: qpos {q}, qvel {v}, ctrl {a}; give the {self.n} operated joints of {self.num_envs} robots "
-                "each, or make another loop for another number of robots: model.loop(num_envs)"
+                f"delta: qpos {q}, qvel {v}, ctrl {a}; give the {self.n} operated joints of "
+                f"{self.num_envs} robots each, or make another loop for another number of robots: "
+                "model.loop(num_envs)"
             )
-        if not (
-            self._numpy and np.vdot(ctrl, ctrl) < np.inf
-        ):  # the fastest test for finite numbers
+        # the fastest test for finite numbers
+        if not (self._numpy and np.vdot(ctrl, ctrl) < np.inf):
             ctrl = self._finite(qpos, ctrl)
         self.observe(qpos, qvel, ctrl, payload_mass)
         delta = self.answer()
@@ -204,14 +229,17 @@ class DeltaLoop:
         gain: float,
         iterations: int,
     ) -> Array:
-        """Invert the correction: return u with u + Δa(u) = wanted. Call this instead of `delta`, once per period.
+        """Invert the correction: return u with u + Δa(u) = wanted.
+
+        Call this instead of `delta`, once per period.
 
         The fixed-point iteration is u ← u + gain (wanted − u − Δa(u)).
 
         Args:
             qpos, qvel, wanted: (num_envs, n) rad, rad/s, rad.
             payload_mass: (num_envs,) kg.
-            offset: u − wanted of the last period, (num_envs, n) rad; changed in place to that of this period.
+            offset: u − wanted of the last period, (num_envs, n) rad; changed in place to that of
+                this period.
             gain: In (0, 1].
             iterations: Number of evaluations of the network.
         """
@@ -225,7 +253,9 @@ class DeltaLoop:
     # ---- internals
 
     def _bind(self, network: Network | None, shape: tuple[int, ...]) -> Callable[[], Any]:
-        """Return a function without arguments: present x → Δa of this shape, rad, finite and within ±delta_max."""
+        """Return a function without arguments: present x → Δa of this shape, rad, finite and
+        within ±delta_max.
+        """
         if network is None:
             return partial(zeros_like, self.x, *shape)
         bound = self._bound
@@ -235,26 +265,35 @@ class DeltaLoop:
         return lambda: bound(network(self.x).reshape(shape))
 
     def _finite(self, qpos: Any, ctrl: Any) -> Any:
-        """Replace targets that are not finite by the last applied ones, or by the positions of robots without history.
+        """Replace targets that are not finite by the last applied ones, or by the positions of
+        robots without history.
 
         Without this, the correction and the history would stay NaN.
         """
-        rows, last = ctrl.reshape(-1, self.n), copy_array(self.history.frames[:, 0, 2 * self.n :])
+        rows = ctrl.reshape(-1, self.n)
+        last = copy_array(self.history.frames[:, 0, 2 * self.n :])
         if self.any_fresh:
             last[self.fresh] = qpos.reshape(-1, self.n)[self.fresh]
         return self._xp.where(self._xp.isfinite(rows), rows, last).reshape(ctrl.shape)
 
     def _due(self, hold: int) -> tuple[Any, Any]:
-        """Return the mask of robots at a multiple of `hold` control periods, (num_envs,), and the mask for joints."""
+        """Return the mask of robots at a multiple of `hold` control periods, (num_envs,), and the
+        mask for joints.
+        """
         due = self.age % hold == 0
         return due, due if self.num_envs == 1 else due[:, None]
 
 
 class DeltaCorrector:
-    """Corrections in rollouts of sim.replay: target → target + Δa, within the joint range. One loop per rollout."""
+    """Corrections in rollouts of sim.replay: target → target + Δa, within the joint range.
+
+    One loop per rollout.
+    """
 
     def __init__(self, network: Network, config: ModelConfig, robot: RobotSpec) -> None:
-        self.network, self.config, self.robot = network, config, robot
+        self.network = network
+        self.config = config
+        self.robot = robot
         self.operated = robot.operated_index
         self.loop: DeltaLoop | None = None
         self.payload = np.zeros(0, np.float32)
@@ -287,7 +326,8 @@ class DeltaCorrector:
     def correct(self, t: int, target: Array, qpos: Array, qvel: Array) -> Array:
         """Return corrected targets, (k, n_all) rad."""
         assert self.loop is not None
-        op, self._state = self.operated, (qpos, qvel)
+        op = self.operated
+        self._state = (qpos, qvel)
         self.loop.delta(qpos[:, op], qvel[:, op], target[:, op], self.payload)
         corrected = np.array(target, float)
         corrected[:, op] = self.loop.applied

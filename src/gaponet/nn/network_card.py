@@ -16,9 +16,15 @@ from gaponet.robot.folder import PackagedRobot
 
 PUBLISHED = "published"  # field of card.json with a Published
 HEADINGS = (
-    "name", "robot, model", "data", "motions of the test", "nominal → with it, mrad", "payload, kg", "rate, Hz",
+    "name",
+    "robot, model",
+    "data",
+    "motions of the test",
+    "nominal → with it, mrad",
+    "payload, kg",
+    "rate, Hz",
     "training",
-)  # fmt: skip
+)
 
 Text = Annotated[str, Len(1)]
 
@@ -65,8 +71,9 @@ class Published:
         data: Data set.
         test: Error on its test motions.
         limits_of_use: What the network is not for, in a sentence.
-        largest_difference_rad: Largest difference between this network and the one that was trained, whose weights
-            have more digits, over states of the training data, rad. 0 if all weights are equal.
+        largest_difference_rad: Largest difference between this network and the one that was
+            trained, whose weights have more digits, over states of the training data, rad. 0 if all
+            weights are equal.
     """
 
     licence: Text
@@ -168,7 +175,9 @@ class NetworkCard:
         ]
 
     def details(self) -> str:
-        """Return a line below the table: licence, version, data, units, limits of use, and what storage changed."""
+        """Return a line below the table: licence, version, data, units, limits of use, and what
+        storage changed.
+        """
         published = self.published
         text = (
             f"licence {published.licence}, gaponet {self.gaponet}; data: {published.data.address}, "
@@ -191,7 +200,9 @@ def network_cards() -> tuple[NetworkCard, ...]:
 
 
 def markdown_table(cards: tuple[NetworkCard, ...]) -> str:
-    """Return the cards as the text of docs/network.md: a table, and a line with the details of each network."""
+    """Return the cards as the text of docs/network.md: a table, and a line with the details of
+    each network.
+    """
     if not cards:
         return "This version of the package has no networks.\n"
     lines = [f"| {' | '.join(HEADINGS)} |", "|---" * len(HEADINGS) + "|"]

@@ -1,4 +1,6 @@
-"""Networks: the operator (branch and trunk), its baselines, and `build_network` for any configuration."""
+"""Networks: the operator (branch and trunk), its baselines, and `build_network` for any
+configuration.
+"""
 
 from __future__ import annotations
 
@@ -24,12 +26,12 @@ MAX_CONTEXT = 3.0  # standard deviations; a product of two networks extrapolates
 class OperatorNet(DeltaNet):
     """DeepONet: Δa_j = bounded(⟨branch(inputs of joint j), trunk(a_j − q_j, P)⟩ + c_j).
 
-    All joints share one branch and one trunk net. The branch input of joint j is its one-hot index, its sensor values,
-    its state and history, the payload P, and q, q̇ and a − q of all joints. The trunk input is the one-hot index,
-    a_j − q_j and the payload.
+    All joints share one branch and one trunk net. The branch input of joint j is its one-hot index,
+    its sensor values, its state and history, the payload P, and q, q̇ and a − q of all joints. The
+    trunk input is the one-hot index, a_j − q_j and the payload.
 
-    With a context (sim/context.py), the branch input is the one-hot index and the context of joint j, and the trunk has
-    all other inputs.
+    With a context (sim/context.py), the branch input is the one-hot index and the context of joint
+    j, and the trunk has all other inputs.
     """
 
     columns: Tensor
@@ -43,7 +45,8 @@ class OperatorNet(DeltaNet):
         self.register_buffer(
             "columns", torch.from_numpy(np.hstack([branch, trunk]).ravel()), persistent=False
         )
-        self.branch_inputs, self.trunk_inputs = branch.shape[1], trunk.shape[1]
+        self.branch_inputs = branch.shape[1]
+        self.trunk_inputs = trunk.shape[1]
         branch_hidden = config.branch_hidden
         trunk_hidden = config.trunk_hidden
         if config.context:  # the trunk has the many inputs
@@ -75,14 +78,22 @@ class OperatorNet(DeltaNet):
         if config.context:
             branch = [joint_onehot, per_joint(slice(layout.query.stop, None))]
             trunk = [
-                joint_onehot, per_joint(slice(layout.past.stop)), all_joints(layout.payload),
-                all_joints(layout.state), all_joints(layout.action), per_joint(layout.action),
-            ]  # fmt: skip
+                joint_onehot,
+                per_joint(slice(layout.past.stop)),
+                all_joints(layout.payload),
+                all_joints(layout.state),
+                all_joints(layout.action),
+                per_joint(layout.action),
+            ]
             return np.hstack(branch), np.hstack(trunk)
         branch = [
-            joint_onehot, per_joint(slice(layout.query.stop, None)), per_joint(slice(layout.past.stop)),
-            all_joints(layout.payload), all_joints(layout.state), all_joints(layout.action),
-        ]  # fmt: skip
+            joint_onehot,
+            per_joint(slice(layout.query.stop, None)),
+            per_joint(slice(layout.past.stop)),
+            all_joints(layout.payload),
+            all_joints(layout.state),
+            all_joints(layout.action),
+        ]
         trunk = [joint_onehot, per_joint(layout.action), all_joints(layout.payload)]
         return np.hstack(branch), np.hstack(trunk)
 
@@ -98,14 +109,18 @@ class OperatorNet(DeltaNet):
         return self.arrange(z)
 
     def context(self, x: Tensor) -> Tensor:
-        """x → standardised answers of the simulator, (B, 8n), within the range in which they were trained."""
+        """x → standardised answers of the simulator, (B, 8n), within the range in which they were
+        trained.
+        """
         z = self.context_scale(x[:, self.features.layout.context]).clamp(-MAX_CONTEXT, MAX_CONTEXT)
         if self.features.noise_std:
             z = z + self.features.noise_std * torch.randn_like(z)
         return z
 
     def arrange(self, z: Tensor) -> Tensor:
-        """Features, and the context if there is one → [branch inputs | trunk inputs] of each joint, (B, n, both)."""
+        """Features, and the context if there is one → [branch inputs | trunk inputs] of each
+        joint, (B, n, both).
+        """
         if self.config.sensors != "off":
             z = torch.cat([z, self.sensors(z)], dim=1)
         z = pad(pad(z, (0, 1)), (0, 1), value=1.0)
@@ -116,16 +131,17 @@ class OperatorNet(DeltaNet):
     def correct(self, prepared: Tensor) -> Tensor:
         """⟨branch, trunk⟩ + c → Δa, (B, n) rad."""
         rows = prepared.flatten(0, -2)  # two-dimensional, so that linear layers copy nothing
-        branch_rows, trunk_rows = rows[:, : self.branch_inputs], rows[:, self.branch_inputs :]
+        branch_rows = rows[:, : self.branch_inputs]
+        trunk_rows = rows[:, self.branch_inputs :]
         shape = (-1, self.n, self.config.num_basis)
-        branch, trunk = (
-            self.branch(branch_rows).reshape(shape),
-            self.trunk(trunk_rows).reshape(shape),
-        )
+        branch = self.branch(branch_rows).reshape(shape)
+        trunk = self.trunk(trunk_rows).reshape(shape)
         return self.bounded((branch * trunk).sum(-1) + self.bias)
 
     def sensors(self, z: Tensor) -> Tensor:
-        """Features → predicted sensor values, standardised, (B, 2nm): n positions and n velocities per probe."""
+        """Features → predicted sensor values, standardised, (B, 2nm): n positions and n velocities
+        per probe.
+        """
         return self.predictor.mean(z[:, self.features.layout.observation])
 
 
@@ -156,9 +172,11 @@ class DeltaMLP(DeltaNet):
             with torch.device("meta"):  # shapes only
                 return num_parameters(build(scaled(width))) - parameters
 
-        low, high = 1, 1
+        low = 1
+        high = 1
         while excess(high) < 0:
-            low, high = high, 2 * high
+            low = high
+            high = 2 * high
         while high - low > 1:
             middle = (low + high) // 2
             low, high = (middle, high) if excess(middle) < 0 else (low, middle)
@@ -166,9 +184,11 @@ class DeltaMLP(DeltaNet):
 
 
 class SharedMLP(OperatorNet):
-    """Baseline: one plain network with the inputs and sensors of the operator, shared by the joints.
+    """Baseline: one plain network with the inputs and sensors of the operator, shared by the
+    joints.
 
-    It has as many weights as branch and trunk together. The only difference to the operator is the missing product.
+    It has as many weights as branch and trunk together. The only difference to the operator is the
+    missing product.
     """
 
     def __init__(self, config: ModelConfig, n: int) -> None:
@@ -186,8 +206,12 @@ class SharedMLP(OperatorNet):
 
 
 NETWORKS: dict[ModelKind, Callable[[ModelConfig, int], DeltaNet]] = {
-    "gaponet": OperatorNet, "paper": PaperNet, "shared_mlp": SharedMLP, "mlp": DeltaMLP, "trees": TreesNet,
-}  # fmt: skip
+    "gaponet": OperatorNet,
+    "paper": PaperNet,
+    "shared_mlp": SharedMLP,
+    "mlp": DeltaMLP,
+    "trees": TreesNet,
+}
 
 
 def build_network(config: ModelConfig, n: int) -> DeltaNet:

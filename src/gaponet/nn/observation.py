@@ -1,11 +1,13 @@
 """Observation of the networks: the same code for training, aligned simulators and robots.
 
-o_t = [ q_t | q̇_t | h_{t-1} | … | h_{t-H} | (P / P_max) ],  h_s = [ q_s | q̇_s | u_s ],  u_s the target applied over
-[s, s+1), correction included. n operated joints; 2n + 3nH (+1) numbers. With a stride k, the frames are t-1, t-1-k, ….
+o_t = [ q_t | q̇_t | h_{t-1} | … | h_{t-H} | (P / P_max) ],  h_s = [ q_s | q̇_s | u_s ],  u_s the
+target applied over [s, s+1), correction included. n operated joints; 2n + 3nH (+1) numbers. With a
+stride k, the frames are t-1, t-1-k, ….
 
-x = [ o_t | a_t ] is the input of a network. The paper's network (nn/paper.py) can have more columns: with fixed probes
-S_t, then, if it observes the recorded state, [ q_real − q | q̇_real − q̇ | 1 ], all zero where that state is hidden.
-A network for many simulators has the context of sim/context.py as last columns.
+x = [ o_t | a_t ] is the input of a network. The paper's network (nn/paper.py) can have more
+columns: with fixed probes S_t, then, if it observes the recorded state, [ q_real − q | q̇_real − q̇
+| 1 ], all zero where that state is hidden. A network for many simulators has the context of
+sim/context.py as last columns.
 """
 
 from __future__ import annotations
@@ -27,7 +29,8 @@ class Layout:
     """
 
     def __init__(self, config: ModelConfig, n: int) -> None:
-        self.n, self.history = n, config.history
+        self.n = n
+        self.history = config.history
         answers = config.sensor_dim(n) if config.needs_simulator else 0
         sizes = {
             "q": n,
@@ -58,7 +61,9 @@ class Layout:
         self.dim = config.input_dim(n)
 
     def shifted(self, shift: Array) -> Array:
-        """Return the change of x, (k, dim), when positions and targets of [o_t | a_t] change by shift, (k, n) rad."""
+        """Return the change of x, (k, dim), when positions and targets of [o_t | a_t] change by
+        shift, (k, n) rad.
+        """
         k, n = shift.shape
         out = np.zeros((k, self.dim))
         out[:, self.q] = out[:, self.action] = shift
@@ -91,16 +96,12 @@ class History:
         self._numpy = isinstance(x, np.ndarray)
         # Internal arrays of one robot have one dimension: numpy needs half the time.
         memory, self._present = (a[0] if len(x) == 1 else a for a in (memory, x[:, layout.state]))
-        self._q, self._v, self._u = (
-            memory[..., :n],
-            memory[..., n : 2 * n],
-            memory[..., 2 * n : 3 * n],
-        )
-        self._state, self._newer, self._older = (
-            memory[..., : 2 * n],
-            memory[..., : -3 * n],
-            memory[..., 3 * n :],
-        )
+        self._q = memory[..., :n]
+        self._v = memory[..., n : 2 * n]
+        self._u = memory[..., 2 * n : 3 * n]
+        self._state = memory[..., : 2 * n]
+        self._newer = memory[..., : -3 * n]
+        self._older = memory[..., 3 * n :]
 
     def reset(self, ids: Any, qpos: Any, qvel: Any, u: Any) -> None:
         """Fill histories with frames from before the start, never with zeros.
@@ -115,13 +116,17 @@ class History:
         self.frames[ids, :, 2 * n :] = u
 
     def push(self, qpos: Any, qvel: Any, u: Any) -> None:
-        """Append a frame: state at t and target applied over [t, t+1), (num_envs, n) each. None is the state in x."""
+        """Append a frame: state at t and target applied over [t, t+1), (num_envs, n) each.
+
+        None is the state in x.
+        """
         # numpy copies overlapping memory correctly, torch does not.
         self._older[...] = self._newer if self._numpy else copy_array(self._newer)
         if qpos is None:
             self._state[...] = self._present
         else:
-            self._q[...], self._v[...] = qpos, qvel
+            self._q[...] = qpos
+            self._v[...] = qvel
         self._u[...] = u
 
     def write(self, ids: Any = slice(None)) -> None:
@@ -132,5 +137,7 @@ class History:
 
     @staticmethod
     def rows_before(t: Array, depth: int) -> Array:
-        """Return rows of the `depth` frames before rows t, newest first, not below 0: (k,) → (k, depth)."""
+        """Return rows of the `depth` frames before rows t, newest first, not below 0: (k,) → (k,
+        depth).
+        """
         return np.maximum(np.asarray(t)[:, None] - 1 - np.arange(depth), 0)

@@ -52,7 +52,8 @@ def export(net: DeltaNet, folder: Path, card: dict[str, Any], samples: Array) ->
         difference = float(np.abs(expected - OnnxNetwork(content)(samples)).max())
         if not difference <= MAX_DIFFERENCE_RAD:
             raise ModelError(
-                f"{folder}: ONNX and torch differ by {difference:.2e} rad (limit {MAX_DIFFERENCE_RAD:.0e}); not written"
+                f"{folder}: ONNX and torch differ by {difference:.2e} rad (limit "
+                f"{MAX_DIFFERENCE_RAD:.0e}); not written"
             )
         with atomic_write(folder / WEIGHTS) as onnx:
             onnx.write_bytes(content)
@@ -64,20 +65,23 @@ def export(net: DeltaNet, folder: Path, card: dict[str, Any], samples: Array) ->
 
 
 class _FusedFeatures(nn.Module):
-    """Network with its features as one linear layer, with which onnxruntime needs a quarter less time."""
+    """Network with its features as one linear layer, with which onnxruntime needs a quarter less
+    time.
+    """
 
     weight: Tensor
     bias: Tensor
 
     def __init__(self, net: DeltaNet) -> None:
         super().__init__()
-        mean, std = net.features.standardise.mean, net.features.standardise.std
-        relative, zero = net.features.relative(torch.eye(len(mean))), torch.zeros(1, len(mean))
-        weight, bias = (
-            net.arrange(relative / std) - net.arrange(zero),
-            net.arrange(zero - mean / std),
-        )
-        self.net, self.shape = net, bias.shape[1:]
+        mean = net.features.standardise.mean
+        std = net.features.standardise.std
+        relative = net.features.relative(torch.eye(len(mean)))
+        zero = torch.zeros(1, len(mean))
+        weight = net.arrange(relative / std) - net.arrange(zero)
+        bias = net.arrange(zero - mean / std)
+        self.net = net
+        self.shape = bias.shape[1:]
         self.register_buffer("weight", weight.flatten(1).T)
         self.register_buffer("bias", bias.flatten())
 
@@ -87,20 +91,29 @@ class _FusedFeatures(nn.Module):
 
 
 def onnx_content(net: DeltaNet) -> bytes:
-    """Return a network in evaluation mode as an ONNX file: x (batch, dim) → delta (batch, n), float32."""
+    """Return a network in evaluation mode as an ONNX file: x (batch, dim) → delta (batch, n),
+    float32.
+    """
     config = net.config
     linear = (
         config.kind not in ("paper", "trees") and config.sensors == "off" and not config.context
     )
-    content, x = io.BytesIO(), torch.zeros(2, net.config.input_dim(net.n))
+    content = io.BytesIO()
+    x = torch.zeros(2, net.config.input_dim(net.n))
     exported: Any = _FusedFeatures(net) if linear else net
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        # dynamo=True writes the same function in 2 to 16 s instead of 0.1, and needs onnxscript; torch 2.14 has both.
+        # dynamo=True writes the same function in 2 to 16 s instead of 0.1, and needs onnxscript;
+        # torch 2.14 has both.
         torch.onnx.export(
-            exported, (x,), content, input_names=["x"], output_names=["delta"], dynamo=False,  # type: ignore[arg-type]
+            exported,
+            (x,),
+            content,  # type: ignore[arg-type]
+            input_names=["x"],
+            output_names=["delta"],
+            dynamo=False,
             dynamic_axes={name: {0: "batch"} for name in ("x", "delta")},
-        )  # fmt: skip
+        )
     return content.getvalue()
 
 
@@ -117,13 +130,15 @@ def _with_facts(content: bytes, card: dict[str, Any]) -> bytes:
 def with_small_matrices(content: bytes, *, int16: bool) -> bytes:
     """Return an ONNX file whose large matrices need less space.
 
-    A matrix that selects features has few elements; only these are stored, and all outputs stay equal bit for bit.
+    A matrix that selects features has few elements; only these are stored, and all outputs stay
+    equal bit for bit.
 
     Args:
         content: ONNX file with float32 matrices.
-        int16: Store other matrices of MIN_INT16_ELEMENTS and more as int16 with one float32 scale a row. Outputs then
-            change: a weight by up to 1/65,534 of the largest one in its row. float16 would change it by up to 1/4,096
-            of itself, which changes outputs some eight times as much.
+        int16: Store other matrices of MIN_INT16_ELEMENTS and more as int16 with one float32 scale a
+            row. Outputs then change: a weight by up to 1/65,534 of the largest one in its row.
+            float16 would change it by up to 1/4,096 of itself, which changes outputs some eight
+            times as much.
     """
     import onnx
 
@@ -161,7 +176,9 @@ def _sparse(name: str, matrix: Array) -> Any:
 
 
 def _as_int16(name: str, matrix: Array) -> tuple[list[Any], list[Any]]:
-    """Return a matrix as int16 steps with a scale for each row, and the nodes that compute it from these."""
+    """Return a matrix as int16 steps with a scale for each row, and the nodes that compute it from
+    these.
+    """
     import onnx
 
     scale = np.abs(matrix).max(axis=1, keepdims=True) / np.iinfo(np.int16).max
@@ -202,7 +219,9 @@ def trained_network(run: Path, config: ModelConfig, n: int) -> DeltaNet:
 
 
 def sample_inputs(net: DeltaNet, count: int = 256, seed: int = 0) -> Array:
-    """Return inputs x with the statistics of the training data, (count, dim) float32; sensor values are 0."""
+    """Return inputs x with the statistics of the training data, (count, dim) float32; sensor
+    values are 0.
+    """
     features = net.features
     generator = torch.Generator().manual_seed(seed)
     z = torch.randn(count, features.dim, generator=generator)

@@ -26,11 +26,11 @@ class OnnxNetwork:
         """threads: Threads of onnxruntime; 0 for all cores. One is fastest for one robot."""
         ort = _onnxruntime()
         options = ort.SessionOptions()
-        options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
+        options.intra_op_num_threads = threads
+        options.inter_op_num_threads = 1
         options.log_severity_level = 3
-        options.add_session_config_entry(
-            "session.intra_op.allow_spinning", "0"
-        )  # idle threads do not use a core
+        # idle threads do not use a core
+        options.add_session_config_entry("session.intra_op.allow_spinning", "0")
         self.session = ort.InferenceSession(content, options, providers=["CPUExecutionProvider"])
 
     def __call__(self, x: Array) -> Array:
@@ -38,7 +38,8 @@ class OnnxNetwork:
 
     @property
     def stored_facts(self) -> dict[str, Any]:
-        """Fields of the card that export wrote into the file; empty for a file of an older version or another program.
+        """Fields of the card that export wrote into the file; empty for a file of an older version
+        or another program.
 
         Raises:
             ValueError: What is stored there is not a JSON object.
@@ -53,19 +54,22 @@ class OnnxNetwork:
         return facts
 
     def bind(self, x: Array, shape: tuple[int, ...]) -> Callable[[], Array]:
-        """Return a function without arguments: present content of x → Δa, rad. This is faster than a plain call.
+        """Return a function without arguments: present content of x → Δa, rad.
+
+        This is faster than a plain call.
 
         Args:
             x: (B, dim) float32; its memory is read in each call.
             shape: Shape of the result. All calls return the same array.
         """
-        delta, binding = self(x), self.session.io_binding()
-        value = (
-            _onnxruntime().OrtValue.ortvalue_from_numpy
-        )  # on the CPU it shares the array's memory
+        delta = self(x)
+        binding = self.session.io_binding()
+        # on the CPU it shares the array's memory
+        value = _onnxruntime().OrtValue.ortvalue_from_numpy
         binding.bind_ortvalue_input("x", value(x))
         binding.bind_ortvalue_output(self.session.get_outputs()[0].name, value(delta))
-        run, result = self.session.run_with_iobinding, delta.reshape(shape)
+        run = self.session.run_with_iobinding
+        result = delta.reshape(shape)
 
         def answer() -> Array:
             run(binding)

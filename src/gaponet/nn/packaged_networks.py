@@ -1,8 +1,9 @@
 """Networks of the package by name, as load_robot has robots by name.
 
-PACKAGE_FOLDER/NAME/model.onnx           the network               card.json         what it is, and how good it is
-                    split.json           hashes of its recordings  delay_offset.json  the delay and offset baseline
-                    packaged_robot.json  its simulator: a robot of the package and the factor on its gains
+PACKAGE_FOLDER/NAME/model.onnx           the network               card.json         what it is, and
+                    how good it is split.json           hashes of its recordings  delay_offset.json
+                    the delay and offset baseline packaged_robot.json  its simulator: a robot of the
+                    package and the factor on its gains
 
 `benchmarks/ship_networks.py` makes such a folder from a run. Nothing writes into it afterwards.
 """
@@ -32,8 +33,9 @@ def packaged_networks() -> tuple[str, ...]:
 def network_folder(name_or_path: str | Path) -> Path:
     """Return the folder of a network of the package, or the path itself.
 
-    One word without a slash is a name if the package has a network of that name. All else is a path. The command line
-    drops the slash of "./so101-sage", so a folder of that name in the working directory needs its absolute path.
+    One word without a slash is a name if the package has a network of that name. All else is a
+    path. The command line drops the slash of "./so101-sage", so a folder of that name in the
+    working directory needs its absolute path.
 
     Raises:
         UsageError: The name is that of a network and of something in the working directory.
@@ -46,8 +48,8 @@ def network_folder(name_or_path: str | Path) -> Path:
     if text in packaged_networks():
         if path.exists():
             raise UsageError(
-                f"'{text}' is a network of the package and a folder here; for the folder give {path.absolute()}, "
-                "for the network work in another directory"
+                f"'{text}' is a network of the package and a folder here; for the folder give "
+                f"{path.absolute()}, for the network work in another directory"
             )
         return PACKAGE_FOLDER / text
     if not path.exists():
@@ -72,7 +74,8 @@ def require_run_folder(run: Path, action: str, instead: str) -> None:
     """
     if is_packaged(run):
         raise UsageError(
-            f"{action} needs a run folder of gaponet train, and '{run.name}' is a network of the package; {instead}"
+            f"{action} needs a run folder of gaponet train, and '{run.name}' is a network of the "
+            f"package; {instead}"
         )
 
 
@@ -85,6 +88,6 @@ def _unknown(name: str) -> str:
         )
     nearest = difflib.get_close_matches(name, names, n=1, cutoff=0.0)[0]
     return (
-        f"{name}: no such folder, and no network of the package, which has {', '.join(names)}; nearest: {nearest}; "
-        "or give a robot or run folder"
+        f"{name}: no such folder, and no network of the package, which has {', '.join(names)}; "
+        f"nearest: {nearest}; or give a robot or run folder"
     )

@@ -1,44 +1,52 @@
 """The network of the GAPONet paper in its literal form: `gaponet train … --model paper`.
 
     (μ, log σ²) = f(A, Q, V, P, J, Q_real, V_real),  S ~ N(μ, σ²)   (1)  sensor predictor, 128-128
-    b = Branch(S)                                                   (2)  branch, 256-256-256-16n, ELU after each layer
-    y = Trunk(A) or Trunk(P, A)                                     (3)  trunk, 128-128-128-16n, linear output
-    Δa_j = Σ_i b_ij y_ij,  i = 1 … p = 16                           (4)  no bias
+    b = Branch(S)                                                   (2)  branch, 256-256-256-16n,
+    ELU after each layer y = Trunk(A) or Trunk(P, A)                                     (3)  trunk,
+    128-128-128-16n, linear output Δa_j = Σ_i b_ij y_ij,  i = 1 … p = 16
+    (4)  no bias
 
-A is the target, Q and V are positions and velocities, P is the payload, J is the joint index. Q_real and V_real are the
-recorded state.
+A is the target, Q and V are positions and velocities, P is the payload, J is the joint index.
+Q_real and V_real are the recorded state.
 
-S holds the answers of the simulator to m = 20 probe targets (nn/sensor.py): positions and velocities of all n joints
-after one control period, (m, 2n). S is the only input of the branch, so it carries all information about the state.
-S is sampled in training and is the mean in evaluation and export.
+S holds the answers of the simulator to m = 20 probe targets (nn/sensor.py): positions and
+velocities of all n joints after one control period, (m, 2n). S is the only input of the branch, so
+it carries all information about the state. S is sampled in training and is the mean in evaluation
+and export.
 
 `predictor_inputs` says what the predictor of (1) sees:
 
-    observation   Q, V, P, and the H past frames of Q, V, A: 20 + 30 H numbers for n = 10, one more with P. J is the
-                  place in the output: one pass gives the sensor values of all joints.
-    equation_1    Also the present A, J, Q_real − Q, V_real − V, and 1 where the recorded state is visible. One network
-                  is shared by the joints: with the input J, it gives the 2m sensor values of joint J.
+    observation   Q, V, P, and the H past frames of Q, V, A: 20 + 30 H numbers for n = 10, one more
+                  with P. J is the place in the output: one pass gives the sensor values of all
+                  joints.
+    equation_1    Also the present A, J, Q_real − Q, V_real − V, and 1 where the recorded state is
+                  visible. One network is shared by the joints: with the input J, it gives the 2m
+                  sensor values of joint J.
 
-The predictor is fitted to the simulator's answers at the present state. They depend on Q, V and P. They do not depend
-on A, because a probe takes the place of the target, and they do not depend on Q_real and V_real. A good fit therefore
-ignores A, Q_real and V_real, and PPO does not train the predictor. `equation_1` exists because the paper has it, not
-because it can give the branch more information.
+The predictor is fitted to the simulator's answers at the present state. They depend on Q, V and P.
+They do not depend on A, because a probe takes the place of the target, and they do not depend on
+Q_real and V_real. A good fit therefore ignores A, Q_real and V_real, and PPO does not train the
+predictor. `equation_1` exists because the paper has it, not because it can give the branch more
+information.
 
 `sensor_source` says where S comes from. The probe targets are q + e_k, k = 1 … m:
 
     predicted   e_k are fixed; one predictor gives the answers to all.
-    fixed       e_k are fixed; the simulator itself gives S, which is the limit of a perfect predictor.
-    learned     e_k are parameters that PPO trains, within ±probe_limit. The predictor takes one e_k beside the state
-                and gives its 2n answers. It is fitted to random e_k, then frozen; gradients pass through it.
-    none        There is no S. The branch sees the observation, as the predictor would see it. Compare with `predicted`
-                to learn what the predictor costs and brings.
+    fixed       e_k are fixed; the simulator itself gives S, which is the limit of a perfect
+    predictor. learned     e_k are parameters that PPO trains, within ±probe_limit. The predictor
+    takes one e_k beside the state
+                and gives its 2n answers. It is fitted to random e_k, then frozen; gradients pass
+                through it.
+    none        There is no S. The branch sees the observation, as the predictor would see it.
+                Compare with `predicted` to learn what the predictor costs and brings.
 
-Three switches add inputs that the paper's branch and trunk do not have. `branch_observation` adds the observation with
-its history, relative to q, to the branch. `relative_action` gives A − q instead of A to the trunk. `real_state` adds
-Q_real − Q and V_real − V to the branch. The critic of PPO always observes the recorded state (nn/training/env.py).
+Three switches add inputs that the paper's branch and trunk do not have. `branch_observation` adds
+the observation with its history, relative to q, to the branch. `relative_action` gives A − q
+instead of A to the trunk. `real_state` adds Q_real − Q and V_real − V to the branch. The critic of
+PPO always observes the recorded state (nn/training/env.py).
 
-Δ_max is a safety limit: exact clipping in evaluation and export. Training reports how many corrections are at
-the limit.
+Δ_max is a safety limit: exact clipping in evaluation and export. Training reports how many
+corrections are at the limit.
 """
 
 from __future__ import annotations
@@ -91,16 +99,21 @@ class SensorPredictor(nn.Module):
         return self.mean_of(hidden(observed))
 
     def mean_of(self, hidden: Tensor) -> Tensor:
-        """Last hidden layer, (…, width) → the mean alone, (…, sensors). The log-variance is not computed."""
+        """Last hidden layer, (…, width) → the mean alone, (…, sensors).
+
+        The log-variance is not computed.
+        """
         head: Any = self.net[-1]
         weight, _ = head.weight.chunk(2)
         bias, _ = head.bias.chunk(2)
         return linear(hidden, weight, bias)
 
     def hidden_of_pairs(self, observed: Tensor, chosen: Tensor) -> Tensor:
-        """Return the last hidden layer for all pairs [row of observed | row of chosen], (B, k, width).
+        """Return the last hidden layer for all pairs [row of observed | row of chosen], (B, k,
+        width).
 
-        The first layer is linear, so it is evaluated once for each row instead of once for each pair.
+        The first layer is linear, so it is evaluated once for each row instead of once for each
+        pair.
 
         Args:
             observed: The first inputs, (B, inputs − c).
@@ -116,10 +129,12 @@ class SensorPredictor(nn.Module):
 
 
 class JointSensorPredictor(SensorPredictor):
-    """Equation (1) as written: one network for all joints, with the joint index J as its last input.
+    """Equation (1) as written: one network for all joints, with the joint index J as its last
+    input.
 
-    Given the state of the whole robot and J, one-hot, the net gives mean and log-variance of the 2m sensor values of
-    joint J. Results have the sensor values of all joints in the order of S, (m, 2n).
+    Given the state of the whole robot and J, one-hot, the net gives mean and log-variance of the 2m
+    sensor values of joint J. Results have the sensor values of all joints in the order of S, (m,
+    2n).
     """
 
     joint_index: Tensor
@@ -155,7 +170,8 @@ class PaperNet(DeltaNet):
 
     Attributes:
         observation: Columns of x with o_t.
-        predictor_columns: Columns of x for equation (1), the recorded state aside: o_t or [o_t | a_t].
+        predictor_columns: Columns of x for equation (1), the recorded state aside: o_t or [o_t |
+            a_t].
         query: Columns of x for the trunk: {P, A} or A.
         queries: Number of trunk inputs.
         probes: atanh(e_k / probe_limit) of learned probes, (m, n); else None.
@@ -193,8 +209,12 @@ class PaperNet(DeltaNet):
         self.trunk = dense(self.queries, TRUNK_HIDDEN, outputs, zero_output=True)
 
     def _add_sensors(self) -> int:
-        """Create what gives the sensor values. Return the number of values that the branch sees in their place."""
-        config, n = self.config, self.n
+        """Create what gives the sensor values.
+
+        Return the number of values that the branch sees in their place.
+        """
+        config = self.config
+        n = self.n
         observed = self.predictor_columns.stop
         sensors = config.sensor_dim(n)
         if config.sensor_source == "none":
@@ -240,7 +260,9 @@ class PaperNet(DeltaNet):
         return torch.cat(parts, dim=1)
 
     def sensor_inputs(self, x: Tensor) -> Tensor:
-        """x → inputs of equation (1), without J: standardised o_t, or [o_t | a_t | recorded state]."""
+        """x → inputs of equation (1), without J: standardised o_t, or [o_t | a_t | recorded
+        state].
+        """
         z = self.observation_scale(x[:, self.predictor_columns])
         if self.features.noise_std:
             z = z + self.features.noise_std * torch.randn_like(z)
@@ -249,16 +271,19 @@ class PaperNet(DeltaNet):
         return z
 
     def real_state(self, x: Tensor) -> Tensor:
-        """x → scaled [q_real − q | q̇_real − q̇ | 1], (B, 2n + 1), or zeros where the recorded state is hidden."""
+        """x → scaled [q_real − q | q̇_real − q̇ | 1], (B, 2n + 1), or zeros where the recorded
+        state is hidden.
+        """
         return x[:, self.features.layout.real] / self.real_state_scale
 
     def sensors(self, x: Tensor, z: Tensor) -> Tensor:
-        """Equation (1): S, standardised, (B, 2nm): a sample in training, else the mean, or the simulator's answers.
+        """Equation (1): S, standardised, (B, 2nm): a sample in training, else the mean, or the
+        simulator's answers.
 
         Without sensors, the result is z = sensor_inputs(x).
 
-        PPO changes learned probes after `prepare`. For them, the result is therefore the input of `probed`:
-        z and, in training, the noise of the sample.
+        PPO changes learned probes after `prepare`. For them, the result is therefore the input of
+        `probed`: z and, in training, the noise of the sample.
         """
         source = self.config.sensor_source
         if source == "none":

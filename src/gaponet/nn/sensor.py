@@ -1,7 +1,8 @@
 """Sensor values: the simulator's answers to m probes, which are targets near the present position.
 
-U_ξ(x) is the state of the simulator one control period after state ξ, with the target x. The probes are x_k = q + e_k.
-`ProbeOracle` steps the simulator. The sensor predictor (nn/paper.py) learns its answers.
+U_ξ(x) is the state of the simulator one control period after state ξ, with the target x. The probes
+are x_k = q + e_k. `ProbeOracle` steps the simulator. The sensor predictor (nn/paper.py) learns its
+answers.
 """
 
 from __future__ import annotations
@@ -17,7 +18,10 @@ from gaponet.sim.batch import BatchSim, Condition
 
 
 class ProbeOracle:
-    """Steps m copies of the simulator from each state. It is for training and rollouts, not for robots."""
+    """Steps m copies of the simulator from each state.
+
+    It is for training and rollouts, not for robots.
+    """
 
     def __init__(
         self,
@@ -27,16 +31,16 @@ class ProbeOracle:
         nthread: int = 0,
         locked: tuple[str, ...] = (),
     ) -> None:
-        """conditions: Payload, rate and gains of each state. States have the joints that are not in `locked`."""
+        """conditions: Payload, rate and gains of each state.
+
+        States have the joints that are not in `locked`.
+        """
         self.offsets = self.probe_offsets(config, len(robot.operated))
-        self.dt, self.absolute = (
-            np.array([c[2] for c in conditions]),
-            config.sensor_target == "absolute",
-        )
+        self.dt = np.array([c[2] for c in conditions])
+        self.absolute = config.sensor_target == "absolute"
         m = len(self.offsets)
-        no_delay = np.zeros(
-            len(robot.joint_names)
-        )  # a delayed servo would not respond within the control period
+        # a delayed servo would not respond within the control period
+        no_delay = np.zeros(len(robot.joint_names))
         copies = [c for c in conditions for _ in range(m)]
         self.sim = sim = BatchSim(replace(robot, delay=no_delay), copies, nthread, locked)
         self.operated = np.array([sim.joint_names.index(name) for name in robot.operated])
@@ -61,11 +65,17 @@ class ProbeOracle:
             offsets: e_k of each state, (k, m, n) rad; default: the fixed probes.
 
         Returns:
-            (k, m, 2n): [q' − q, Δt·(q̇' − q̇)] of the operated joints, or [q', Δt·q̇'] with an absolute target.
+            (k, m, 2n): [q' − q, Δt·(q̇' − q̇)] of the operated joints, or [q', Δt·q̇'] with an
+            absolute target.
         """
-        k, m, op, sim = len(qpos), len(self.offsets), self.operated, self.sim
-        rows, state = np.arange(k * m), np.repeat(np.arange(k), m)
-        q, v = qpos[state], qvel[state]
+        k = len(qpos)
+        m = len(self.offsets)
+        op = self.operated
+        sim = self.sim
+        rows = np.arange(k * m)
+        state = np.repeat(np.arange(k), m)
+        q = qpos[state]
+        v = qvel[state]
         target = q.astype(float)
         target[:, op] += (
             np.tile(self.offsets, (k, 1)) if offsets is None else offsets.reshape(k * m, -1)

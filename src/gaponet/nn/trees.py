@@ -1,7 +1,9 @@
-"""Gradient-boosted trees as a network: one ensemble per joint, on q, q̇ and a − q of all joints and the payload.
+"""Gradient-boosted trees as a network: one ensemble per joint, on q, q̇ and a − q of all joints
+and the payload.
 
-scikit-learn fits the trees (Friedman 2001; histograms as in Ke et al. 2017). Their nodes are tensors, so that
-checkpoints, ONNX files and torch programs of trees are like those of other networks and need no scikit-learn.
+scikit-learn fits the trees (Friedman 2001; histograms as in Ke et al. 2017). Their nodes are
+tensors, so that checkpoints, ONNX files and torch programs of trees are like those of other
+networks and need no scikit-learn.
 """
 
 from __future__ import annotations
@@ -18,13 +20,15 @@ from gaponet.base.errors import ModelError, UsageError
 from gaponet.nn.config import ModelConfig
 from gaponet.nn.layers import DeltaNet
 
-TREES, LEAVES, MAX_DEPTH = 120, 31, 8  # per joint; per tree
+# per joint; per tree
+TREES = 120
+LEAVES = 31
+MAX_DEPTH = 8
 NODES = 2 * LEAVES - 1
-MIN_LEAF_ROWS, MAX_ROWS, MEASURED_ROWS = (
-    60,
-    60_000,
-    2_000,
-)  # of a leaf; of the fit of a joint; of the error of a fit
+# of a leaf; of the fit of a joint; of the error of a fit
+MIN_LEAF_ROWS = 60
+MAX_ROWS = 60_000
+MEASURED_ROWS = 2_000
 # between scikit-learn and the stored trees, in units of the RMS of the labels
 MAX_DIFFERENCE = 1e-4
 
@@ -39,7 +43,8 @@ class TreesNet(DeltaNet):
 
     Attributes:
         feature, threshold: Input and limit of each node, (n · TREES · NODES,).
-        child: Nodes for inputs up to the limit and above, (2 · n · TREES · NODES,); a leaf is its own child.
+        child: Nodes for inputs up to the limit and above, (2 · n · TREES · NODES,); a leaf is its
+            own child.
         value, base: Δa of each leaf, and c_j, (n,), in units of bounded.scale.
     """
 
@@ -51,7 +56,8 @@ class TreesNet(DeltaNet):
 
     def __init__(self, config: ModelConfig, n: int) -> None:
         super().__init__(config, n)
-        layout, nodes = self.features.layout, n * TREES * NODES
+        layout = self.features.layout
+        nodes = n * TREES * NODES
         parts = (layout.q, layout.v, layout.action, layout.payload)
         columns = np.concatenate([np.arange(part.start, part.stop) for part in parts])
         self.register_buffer("columns", torch.from_numpy(columns), persistent=False)
@@ -95,13 +101,17 @@ class TreesNet(DeltaNet):
         from sklearn.ensemble import HistGradientBoostingRegressor as Ensemble
 
         rows = np.random.default_rng(seed).permutation(len(x))[: self.n * MAX_ROWS]
-        inputs, targets = self.prepare(x[rows]).cpu().numpy(), labels[rows].cpu().numpy()
+        inputs = self.prepare(x[rows]).cpu().numpy()
+        targets = labels[rows].cpu().numpy()
         for j, column in enumerate(targets.T / self.bounded.scale.item()):
             if len(some := np.flatnonzero(np.isfinite(column))[:MAX_ROWS]):
                 ensemble = Ensemble(
-                    max_iter=TREES, max_leaf_nodes=LEAVES, max_depth=MAX_DEPTH, min_samples_leaf=MIN_LEAF_ROWS,
+                    max_iter=TREES,
+                    max_leaf_nodes=LEAVES,
+                    max_depth=MAX_DEPTH,
+                    min_samples_leaf=MIN_LEAF_ROWS,
                     early_stopping=False,
-                ).fit(inputs[some], column[some])  # fmt: skip
+                ).fit(inputs[some], column[some])
                 self._store(j, ensemble)
                 stored = (
                     self._sums(torch.from_numpy(inputs[some[:MIN_LEAF_ROWS]]).to(x.device))[:, j]
@@ -121,17 +131,15 @@ class TreesNet(DeltaNet):
     def _store(self, j: int, ensemble: Any) -> None:
         """Copy the trees of joint j; scikit-learn has no public access to them."""
         for t, (tree,) in enumerate(ensemble._predictors):
-            nodes, start = tree.nodes, (j * TREES + t) * NODES
-            leaf, own, part = (
-                nodes["is_leaf"].astype(bool),
-                np.arange(len(nodes)),
-                slice(start, start + len(nodes)),
-            )
+            nodes = tree.nodes
+            start = (j * TREES + t) * NODES
+            leaf = nodes["is_leaf"].astype(bool)
+            own = np.arange(len(nodes))
+            part = slice(start, start + len(nodes))
             children = [start + np.where(leaf, own, nodes[side]) for side in ("left", "right")]
             limits = np.where(leaf, 0.0, nodes["num_threshold"])
-            near = limits.astype(
-                np.float32
-            )  # rounded down: float32 inputs then fall on the same side
+            # rounded down: float32 inputs then fall on the same side
+            near = limits.astype(np.float32)
             lower = np.where(near > limits, np.nextafter(near, np.float32(-np.inf)), near)
             self.feature[part] = torch.from_numpy(np.where(leaf, 0, nodes["feature_idx"]))
             self.threshold[part] = torch.from_numpy(lower)

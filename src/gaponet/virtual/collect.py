@@ -1,7 +1,7 @@
 """Record a recipe on a virtual fleet into a dataset, on all cores.
 
-A sequence depends only on seed, fleet, motion, unit, payload, rate and repetition. An interrupted recording continues
-if it is started again, and gives the same samples.
+A sequence depends only on seed, fleet, motion, unit, payload, rate and repetition. An interrupted
+recording continues if it is started again, and gives the same samples.
 """
 
 from __future__ import annotations
@@ -34,10 +34,11 @@ from gaponet.virtual.play import Job, library, play
 __all__ = ["CollectResult", "Recipe", "collect", "load_recipe"]
 
 COLLECT_FILE = "collect.json"  # fleet, seed and payloads of a collected dataset
+# least and most; more lose more when killed, fewer spend more time in numpy
 TAKES_PER_JOB = (
     36,
     144,
-)  # least and most; more lose more when killed, fewer spend more time in numpy
+)
 
 
 @dataclass(frozen=True)
@@ -65,9 +66,14 @@ class CollectResult:
     def to_dict(self) -> dict[str, Any]:
         """Return the result as plain data."""
         return {
-            "virtual": True, "times_real_time": self.times_real_time, "dataset": str(self.dataset),
-            "written": self.written, "present": self.present, "hours": self.hours, "wall_s": self.seconds,
-        }  # fmt: skip
+            "virtual": True,
+            "times_real_time": self.times_real_time,
+            "dataset": str(self.dataset),
+            "written": self.written,
+            "present": self.present,
+            "hours": self.hours,
+            "wall_s": self.seconds,
+        }
 
 
 def collect(
@@ -80,18 +86,19 @@ def collect(
     progress: Progress = no_progress,
     executor: str | Executor = LOCAL,
 ) -> CollectResult:
-    """Record every take of a recipe that the dataset at `out` lacks, with its simulated replay and the fleet's gains.
+    """Record every take of a recipe that the dataset at `out` lacks, with its simulated replay and
+    the fleet's gains.
 
     Arguments and errors as of gaponet.api.collect. No folder is shared with the executor.
     """
     start = time.monotonic()
     robot = robot.with_gain_scale(fleet.gain_scale or robot.gain_scale)
-    recipe = validated(
-        Recipe, asdict(recipe), "recipe", UsageError
-    )  # command-line options may have changed it
+    # command-line options may have changed it
+    recipe = validated(Recipe, asdict(recipe), "recipe", UsageError)
     if not 0 <= nproc <= MAX_WORKERS or not 0 <= seed < 2**63:
         raise UsageError(
-            f"--nproc {nproc}, --seed {seed}: up to {MAX_WORKERS} processes, 0 for one per core; seed ≥ 0"
+            f"--nproc {nproc}, --seed {seed}: up to {MAX_WORKERS} processes, 0 for one per core; "
+            "seed ≥ 0"
         )
     for unit in recipe.units:
         fleet.unit(unit)
@@ -110,14 +117,14 @@ def collect(
             for t in wanted
             if _key(t.motion, t.unit, t.payload, 1 / t.rate, t.repetition) not in present
         ]
-        written, seconds = 0, 0.0
+        written = 0
+        seconds = 0.0
         jobs = [
             Job(robot, fleet, recipe, files, seed, tuple(part))
             for part in _batches(missing, nproc or Pool.cores(1))
         ]
-        pair_dataset(
-            dataset, robot, lock_idle=True
-        )  # of sequences whose replay a killed run did not store
+        # of sequences whose replay a killed run did not store
+        pair_dataset(dataset, robot, lock_idle=True)
         for sequence, simulated in _play_jobs(jobs, nproc, executor):
             dataset.write_replay(dataset.append(sequence), simulated)
             written += 1
@@ -152,7 +159,9 @@ def _key(motion: str, unit: str, payload: float, dt: float, repetition: int) -> 
 def _require_same_source(
     dataset: Dataset, robot: RobotSpec, fleet: Fleet, recipe: Recipe, seed: int
 ) -> None:
-    """Write fleet, seed and payloads into a new dataset; refuse a dataset that was recorded with others."""
+    """Write fleet, seed and payloads into a new dataset; refuse a dataset that was recorded with
+    others.
+    """
     path = dataset.path / COLLECT_FILE
     source = {
         "virtual": True,
@@ -168,8 +177,8 @@ def _require_same_source(
         for key, value in source.items():
             if stored.get(key) != value:
                 raise DatasetError(
-                    f"{dataset.path}: was collected with {key} {stored.get(key)!r}, not {value!r} (collect.json); "
-                    "choose another folder"
+                    f"{dataset.path}: was collected with {key} {stored.get(key)!r}, not {value!r} "
+                    "(collect.json); choose another folder"
                 )
     elif len(dataset):
         raise DatasetError(

@@ -1,8 +1,9 @@
 """Fleets: virtual units sampled from documented distributions.
 
-A fleet file (fleets/*.toml) holds a seed and one [[distribution]] with its source per hidden parameter. All units of a
-type share the deviations of the type (type_spread, per joint). They differ by production tolerances (unit_spread for
-the whole unit, joint_spread per joint). Another distribution or seed makes another fleet.
+A fleet file (fleets/*.toml) holds a seed and one [[distribution]] with its source per hidden
+parameter. All units of a type share the deviations of the type (type_spread, per joint). They
+differ by production tolerances (unit_spread for the whole unit, joint_spread per joint). Another
+distribution or seed makes another fleet.
 """
 
 from __future__ import annotations
@@ -26,8 +27,21 @@ UNITS = 4
 SIGNIFICANT_DIGITS = 6  # of a sampled number, so that it does not depend on the machine
 MAX_DELAY_S = 1.0  # also the limit of the share of lost commands
 MAX_PARAMETER = 1e6  # of any other parameter, unless infinity means "no effect"
-SIGNED = ("friction_asymmetry", "drag_angle", "grip_x", "grip_z", "cable_angle", "cogging_phase", "tilt_roll",
-          "tilt_pitch", "com_x", "com_y", "com_z", "zero_offset", "current_offset")  # fmt: skip
+SIGNED = (
+    "friction_asymmetry",
+    "drag_angle",
+    "grip_x",
+    "grip_z",
+    "cable_angle",
+    "cogging_phase",
+    "tilt_roll",
+    "tilt_pitch",
+    "com_x",
+    "com_y",
+    "com_z",
+    "zero_offset",
+    "current_offset",
+)
 Spread = Annotated[float, Interval(ge=0, le=MAX_PARAMETER)]
 
 
@@ -84,7 +98,9 @@ class Fleet:
         return self.units[unit_id]
 
     def digest(self) -> str:
-        """Return a hash of the hidden numbers, 12 hex digits, so that datasets of different fleets are not mixed."""
+        """Return a hash of the hidden numbers, 12 hex digits, so that datasets of different fleets
+        are not mixed.
+        """
         sha = hashlib.sha256()
         for unit_id, unit in self.units.items():
             sha.update(unit_id.encode())
@@ -109,12 +125,15 @@ def load_fleet(name_or_path: str | Path, robot: RobotSpec) -> Fleet:
             gain_scale=file["gain_scale"],
         )
     table = validated(FleetTable, loaded, path, UsageError)
-    seed, distributions = table["seed"], table["distribution"]
-    parameters, names = [f.name for f in fields(Physics)], [d.name for d in distributions]
+    seed = table["seed"]
+    distributions = table["distribution"]
+    parameters = [f.name for f in fields(Physics)]
+    names = [d.name for d in distributions]
     for name in names:
         if name not in parameters or names.count(name) > 1:
             raise UsageError(
-                f"{path}: [[distribution]] names '{name}' twice, or not one of {', '.join(parameters)}"
+                f"{path}: [[distribution]] names '{name}' twice, or not one of "
+                f"{', '.join(parameters)}"
             )
     units = {
         f"virtual-{k}": sample_unit(robot, distributions, seed, k) for k in range(1, UNITS + 1)
@@ -129,18 +148,16 @@ def sample_unit(
 ) -> Physics:
     """Sample unit number `unit`, from 1; the deviations of the type depend on the seed only.
 
-    A parameter without a distribution has no effect. Every parameter has its own random stream, so that another
-    parameter does not change it.
+    A parameter without a distribution has no effect. Every parameter has its own random stream, so
+    that another parameter does not change it.
     """
     n = len(robot.joint_names)
     scope = {f.name: f.metadata["scope"] for f in fields(Physics)}
     values = {}
     for d in distributions:
         stream = int(hashlib.sha256(d.name.encode()).hexdigest()[:8], 16)
-        kind, own = (
-            np.random.default_rng([seed, stream, 0]),
-            np.random.default_rng([seed, stream, unit]),
-        )
+        kind = np.random.default_rng([seed, stream, 0])
+        own = np.random.default_rng([seed, stream, unit])
         size = n if scope[d.name] == "joint" else 1
         deviation = (
             d.type_spread * kind.standard_normal(size)

@@ -1,4 +1,5 @@
-"""Hidden parameters of a virtual robot: the effect of each, its unit, and its value for "no effect".
+"""Hidden parameters of a virtual robot: the effect of each, its unit, and its value for "no
+effect".
 
 The numbers and their sources are in fleets/*.toml.
 """
@@ -19,14 +20,17 @@ def _metadata(scope: str, effect: str, neutral: float, unit: str) -> dict[str, A
     return {"effect": effect, "neutral": neutral, "unit": unit, "scope": scope}
 
 
-_joint, _unit = partial(_metadata, "joint"), partial(_metadata, "unit")
+_joint = partial(_metadata, "joint")
+_unit = partial(_metadata, "unit")
 
 
 @dataclass(frozen=True)
 class Physics:
-    """One unit's hidden parameters: (n,) arrays in the robot's joint order, or one number for the whole unit.
+    """One unit's hidden parameters: (n,) arrays in the robot's joint order, or one number for the
+    whole unit.
 
-    `stack` makes (N, n) and (N, 1) arrays of it, one row per simulation, for the effects in motor.py.
+    `stack` makes (N, n) and (N, 1) arrays of it, one row per simulation, for the effects in
+    motor.py.
     """
 
     # Gain: stiffness and damping of the drive over those it was set to.
@@ -41,10 +45,12 @@ class Physics:
     winding_time: Array = field(metadata=_joint("thermal", 30.0, "s"))
     housing_resistance: Array = field(metadata=_joint("thermal", 1.0, "K/W"))
     housing_time: Array = field(metadata=_joint("thermal", 600.0, "s"))
-    # Temperature above ambient at the start of a recording: mean and standard deviation between recordings.
+    # Temperature above ambient at the start of a recording: mean and standard deviation between
+    # recordings.
     warmth: Array = field(metadata=_unit("thermal", 0.0, "K"))
     warmth_spread: Array = field(metadata=_unit("thermal", 0.0, "K"))
-    # Friction beyond that of the nominal model, and its difference between directions; Stribeck peak over it.
+    # Friction beyond that of the nominal model, and its difference between directions; Stribeck
+    # peak over it.
     friction: Array = field(metadata=_joint("friction", 0.0, "N·m"))
     friction_asymmetry: Array = field(metadata=_joint("friction", 0.0, "1"))
     stribeck: Array = field(metadata=_joint("stribeck", 0.0, "1"))
@@ -63,14 +69,16 @@ class Physics:
     windup: Array = field(metadata=_joint("compliance", 0.0, "rad"))
     # Current loop: time constant of the torque.
     current_time: Array = field(metadata=_joint("current_loop", 0.0, "s"))
-    # Torque against speed: no-load speed, and the share of it up to which the torque limit is constant.
+    # Torque against speed: no-load speed, and the share of it up to which the torque limit is
+    # constant.
     no_load_speed: Array = field(metadata=_joint("torque_speed", np.inf, "rad/s"))
     corner: Array = field(metadata=_joint("torque_speed", 0.0, "1"))
     # Command link: constant delay; jitter (uniform up to this) and lost packets.
     delay: Array = field(metadata=_unit("delay", 0.0, "s"))
     jitter: Array = field(metadata=_unit("jitter", 0.0, "s"))
     drop: Array = field(metadata=_unit("jitter", 0.0, "1"))
-    # Supply: nominal voltage, resistance of battery and leads, and share of the gain that follows the voltage.
+    # Supply: nominal voltage, resistance of battery and leads, and share of the gain that follows
+    # the voltage.
     supply_voltage: Array = field(metadata=_unit("supply", np.inf, "V"))
     supply_resistance: Array = field(metadata=_unit("supply", 0.0, "Ω"))
     supply_gain: Array = field(metadata=_unit("supply", 0.0, "1"))
@@ -89,7 +97,8 @@ class Physics:
     drag_angle: Array = field(metadata=_joint("drag", 0.0, "rad"))
     # Churning: resistance of grease with the square of the speed.
     churning: Array = field(metadata=_joint("churning", 0.0, "N·m·s²/rad²"))
-    # Limb current: loss of gain per unit of the sum of a chain's torques, each over its limit, beyond a budget.
+    # Limb current: loss of gain per unit of the sum of a chain's torques, each over its limit,
+    # beyond a budget.
     limb_loss: Array = field(metadata=_unit("limb_current", 0.0, "1"))
     limb_budget: Array = field(metadata=_unit("limb_current", 0.0, "1"))
     # Derating: loss of gain per kelvin of the winding above 40 °C.

@@ -24,7 +24,10 @@ from gaponet.virtual.virtual_robot import VirtualRobot
 
 @dataclass(frozen=True)
 class Job:
-    """Takes to be recorded together, all at one rate. The result of a take does not depend on the others."""
+    """Takes to be recorded together, all at one rate.
+
+    The result of a take does not depend on the others.
+    """
 
     robot: RobotSpec
     fleet: Fleet
@@ -72,10 +75,13 @@ def _resting_joints(robot: RobotSpec, motion: Motion) -> tuple[str, ...]:
 def _record(
     job: Job, group: list[Take], motions: dict[str, Motion], locked: tuple[str, ...]
 ) -> list[Sequence]:
-    """Record takes in parallel, longest first, so that the running ones are always the first rows."""
+    """Record takes in parallel, longest first, so that the running ones are always the first
+    rows.
+    """
     dt = 1.0 / group[0].rate
     ctrl = [motions[t.motion].sample(dt) for t in group]
-    lengths, longest = np.array([len(c) for c in ctrl]), len(ctrl[0])
+    lengths = np.array([len(c) for c in ctrl])
+    longest = len(ctrl[0])
     targets = np.stack(
         [np.concatenate([c, np.repeat(c[-1:], longest - len(c), axis=0)]) for c in ctrl], axis=1
     )

@@ -1,7 +1,8 @@
-"""A VIRTUAL SO-101: servos that answer like STS3215 with hidden physics, on a pseudo-terminal in real time.
+"""A VIRTUAL SO-101: servos that answer like STS3215 with hidden physics, on a pseudo-terminal in
+real time.
 
-Registers with an effect: torque enable, goal, P (stiffness), position limits, torque limit. The others are only stored.
-The calibration is that of LeRobot for an arm with the limits of the MJCF.
+Registers with an effect: torque enable, goal, P (stiffness), position limits, torque limit. The
+others are only stored. The calibration is that of LeRobot for an arm with the limits of the MJCF.
 """
 
 from __future__ import annotations
@@ -55,16 +56,17 @@ class VirtualSO101:
             link: Symbolic link to the port; an existing link is replaced.
             frame: Simulated time per goal position, s; default: real time.
         """
-        robot = replace(
-            robot, table=robot.table or Table(height=0.0)
-        )  # the arm rests on it while its torque is off
-        self.robot, self._frame = robot, None if frame is None else round(frame / PERIOD)
+        # the arm rests on it while its torque is off
+        robot = replace(robot, table=robot.table or Table(height=0.0))
+        self.robot = robot
+        self._frame = None if frame is None else round(frame / PERIOD)
         self.live = LiveUnit(robot, physics, payload, period=PERIOD)
         self._order = robot.index(JOINTS)  # servo number − 1 → joint
         self.calibration = ArmCalibration(_as_calibrated(robot), robot)
         self._master, slave = os.openpty()
         tty.setraw(slave)
-        self.port, self._slave = os.ttyname(slave), slave
+        self.port = os.ttyname(slave)
+        self._slave = slave
         self._link = link
         if link is not None:
             if link.is_symlink():
@@ -74,10 +76,17 @@ class VirtualSO101:
         for joint, memory in zip(JOINTS, self.memory, strict=True):
             row = self.calibration.rows[joint]
             for register, value in (
-                (reg.MODEL, reg.STS3215), (reg.MIN_POSITION, row.range_min), (reg.MAX_POSITION, row.range_max),
-                (reg.HOMING_OFFSET, row.homing_offset), (reg.MAX_TORQUE, FULL_TORQUE), (reg.TORQUE_LIMIT, FULL_TORQUE),
-                (reg.P, 32), (reg.D, 32), (reg.PROTECTION_CURRENT, 500), (reg.PRESENT_VOLTAGE, 120),
-            ):  # fmt: skip
+                (reg.MODEL, reg.STS3215),
+                (reg.MIN_POSITION, row.range_min),
+                (reg.MAX_POSITION, row.range_max),
+                (reg.HOMING_OFFSET, row.homing_offset),
+                (reg.MAX_TORQUE, FULL_TORQUE),
+                (reg.TORQUE_LIMIT, FULL_TORQUE),
+                (reg.P, 32),
+                (reg.D, 32),
+                (reg.PROTECTION_CURRENT, 500),
+                (reg.PRESENT_VOLTAGE, 120),
+            ):
                 _put(memory, register, value)
         self.silent: set[int] = set()  # servos that do not answer
         self.damaged = False  # replies have a wrong checksum
@@ -115,14 +124,16 @@ class VirtualSO101:
 
     def receive(self, data: bytes) -> bytes:
         """Handle bytes from the bus and return the replies."""
-        self._buffer, self._replies = self._buffer + data, b""
+        self._buffer = self._buffer + data
+        self._replies = b""
         while (start := self._buffer.find(b"\xff\xff")) >= 0:
             packet = self._buffer[start:]
             if len(packet) < 4 or len(packet) < 4 + packet[3]:
                 self._buffer = packet
                 return self._replies
             end = 4 + packet[3]
-            body, self._buffer = packet[2:end], packet[end:]
+            body = packet[2:end]
+            self._buffer = packet[end:]
             if reg.checksum(body[:-1]) == body[-1]:
                 self._execute(body[0], body[2], body[3:-1])
         self._buffer = self._buffer[-1:] if self._buffer.endswith(b"\xff") else b""
@@ -172,9 +183,8 @@ class VirtualSO101:
         """Write readings into the registers."""
         order = self._order
         qpos, qvel, tau, temperature = self.live.read()
-        steps = np.rint(qpos / (STEP_RAD * self.calibration.sign) + self.calibration.zero)[
-            order
-        ]  # may pass the limits
+        # may pass the limits
+        steps = np.rint(qpos / (STEP_RAD * self.calibration.sign) + self.calibration.zero)[order]
         share = (tau / self.robot.effort_limit)[order]
         values = {
             reg.PRESENT_POSITION: np.clip(steps, 0, STEPS_PER_TURN - 1),
@@ -189,13 +199,16 @@ class VirtualSO101:
 
     def _apply(self) -> None:
         """Set targets, gains and torque limits from the registers."""
-        kp, kd, effort = self.robot.kp.copy(), self.robot.kd.copy(), self.robot.effort_limit.copy()
+        kp = self.robot.kp.copy()
+        kd = self.robot.kd.copy()
+        effort = self.robot.effort_limit.copy()
         goals = self.calibration.steps(self.live.ctrl)
         for joint, memory in zip(self._order, self.memory, strict=True):
             kp[joint] = STIFFNESS_PER_P * _get(memory, reg.P)
             effort[joint] *= min(_get(memory, reg.TORQUE_LIMIT), FULL_TORQUE) / FULL_TORQUE
             if not _get(memory, reg.TORQUE_ENABLE):
-                kp[joint], kd[joint] = 0.0, FREE_DAMPING
+                kp[joint] = 0.0
+                kd[joint] = FREE_DAMPING
                 continue
             limits = _get(memory, reg.MIN_POSITION), _get(memory, reg.MAX_POSITION)
             goals[joint] = np.clip(_get(memory, reg.GOAL_POSITION), *limits)

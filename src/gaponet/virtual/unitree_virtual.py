@@ -1,8 +1,10 @@
-"""A VIRTUAL H1-2 behind the real DDS topics: hidden physics in real time, LowState out, arm_sdk and lowcmd in.
+"""A VIRTUAL H1-2 behind the real DDS topics: hidden physics in real time, LowState out, arm_sdk
+and lowcmd in.
 
-It holds its home posture until the first command, hands its arms over by the weight of rt/arm_sdk, uses the gains in
-the commands, and ignores messages with a wrong checksum. When commands stop it keeps the last one, which is the worst
-case. It can also simulate faults, to test the reaction of a controller.
+It holds its home posture until the first command, hands its arms over by the weight of rt/arm_sdk,
+uses the gains in the commands, and ignores messages with a wrong checksum. When commands stop it
+keeps the last one, which is the worst case. It can also simulate faults, to test the reaction of a
+controller.
 """
 
 from __future__ import annotations
@@ -21,9 +23,22 @@ from gaponet.virtual.physics import Physics
 from gaponet.virtual.virtual_driver import LiveUnit
 
 FaultKind = Literal[
-    "none", "stop", "freeze", "repeat", "nan", "jump", "hot", "late", "checksum", "clock",
-    "encoder", "motor", "remote", "fall", "machine",
-]  # fmt: skip
+    "none",
+    "stop",
+    "freeze",
+    "repeat",
+    "nan",
+    "jump",
+    "hot",
+    "late",
+    "checksum",
+    "clock",
+    "encoder",
+    "motor",
+    "remote",
+    "fall",
+    "machine",
+]
 
 LATE_S = 0.3  # delay of messages in the fault "late"
 CLOCK_STEP_S = 10.0  # by which the robot's clock is ahead in the fault "clock"
@@ -34,8 +49,8 @@ class VirtualH12:
     """The robot on the bus.
 
     Attributes:
-        heard: Received commands: time (s), topic, weight, and targets, gains, modes and joint states then, (n) in motor
-            order.
+        heard: Received commands: time (s), topic, weight, and targets, gains, modes and joint
+            states then, (n) in motor order.
     """
 
     def __init__(
@@ -60,14 +75,18 @@ class VirtualH12:
 
         robot = robot.nominal or robot
         bus = dds.Bus(domain, interface)
-        self.robot, self.rate, self.fault, self.fault_at = robot, rate, fault, fault_at
+        self.robot = robot
+        self.rate = rate
+        self.fault = fault
+        self.fault_at = fault_at
         self._order = robot.index(MOTOR_NAMES)  # motor → place in the robot's order
         self._writer = bus.writer("rt/lowstate", dds.LowState)
         self._readers = {
             name: bus.reader(f"rt/{name}", dds.LowCmd) for name in ("arm_sdk", "lowcmd")
         }
         self.live = LiveUnit(robot, physics, payload, seed=seed, period=1.0 / rate)
-        self.clock, self.heard = MonotonicClock(), list[dict[str, Any]]()
+        self.clock = MonotonicClock()
+        self.heard = list[dict[str, Any]]()
         self.first_command: float | None = None
         self.refused = self.missed = 0
         self._message = hg.LowState.new()
@@ -79,7 +98,8 @@ class VirtualH12:
     @no_garbage_collection()
     def run(self, seconds: float = np.inf) -> None:
         """Simulate in real time, until interrupted."""
-        start, k = self.clock.now(), 0
+        start = self.clock.now()
+        k = 0
         while (passed := k / self.rate) < seconds:
             now = self.clock.wait_until(start + passed)
             self._receive(now)
@@ -105,16 +125,28 @@ class VirtualH12:
             self.refused += 1
             return
         weight = 1.0 if topic == "lowcmd" else float(np.clip(q[WEIGHT_MOTOR], 0.0, 1.0))
-        robot, motors = self.robot, len(MOTOR_NAMES)
+        robot = self.robot
+        motors = len(MOTOR_NAMES)
         qpos, qvel, *_ = self.live.read()
-        self.heard.append({
-            "time": now, "topic": topic, "ctrl": q[:motors], "kp": kp[:motors], "kd": kd[:motors],
-            "mode": mode[:motors], "weight": weight, "qpos": qpos[self._order], "qvel": qvel[self._order],
-        })  # fmt: skip
+        self.heard.append(
+            {
+                "time": now,
+                "topic": topic,
+                "ctrl": q[:motors],
+                "kp": kp[:motors],
+                "kd": kd[:motors],
+                "mode": mode[:motors],
+                "weight": weight,
+                "qpos": qpos[self._order],
+                "qvel": qvel[self._order],
+            }
+        )
         share = np.zeros(motors)
         share[0 if topic == "lowcmd" else FIRST_ARM_MOTOR :] = weight
         enabled = (mode[:motors] == 1) | (topic == "arm_sdk")
-        gains, dampers, torque = robot.kp.copy(), robot.kd.copy(), np.zeros_like(robot.kp)
+        gains = robot.kp.copy()
+        dampers = robot.kd.copy()
+        torque = np.zeros_like(robot.kp)
         forward = tau[:motors] + kd[:motors] * dq[:motors]
         for out, mine, theirs in (
             (self.live.ctrl, robot.qpos_home, q[:motors]),
@@ -131,7 +163,8 @@ class VirtualH12:
         if fault == "stop":
             return
         readings = self._readings(fault)
-        message, data = hg.LowState, self._message
+        message = hg.LowState
+        data = self._message
         if fault != "repeat":
             ahead = CLOCK_STEP_S if fault == "clock" else 0.0
             message.view(data, "tick")[0] = round(1000 * (k / self.rate + ahead)) % 2**32
@@ -151,12 +184,12 @@ class VirtualH12:
 
     def _set_status(self, fault: str) -> None:
         """Set the status fields of the message, with a fault."""
-        message, data = hg.LowState, self._message
+        message = hg.LowState
+        data = self._message
         half = 0.5 if fault == "fall" else 0.0  # half of the angle by which it leans forward
         message.view(data, "imu_state.quaternion")[:] = (np.cos(half), 0.0, np.sin(half), 0.0)
-        message.view(data, "wireless_remote")[2:4] = (
-            (0x20, 0x02) if fault == "remote" else 0
-        )  # L2 + B
+        # L2 + B
+        message.view(data, "wireless_remote")[2:4] = (0x20, 0x02) if fault == "remote" else 0
         message.view(data, "mode_machine")[0] = 5 if fault == "machine" else self.machine
         errors = np.zeros(hg.MOTORS)
         errors[MOTOR_NAMES.index("left_elbow_joint")] = 4 * (fault == "motor")

@@ -1,4 +1,6 @@
-"""VirtualDriver: a virtual robot in this process, in real time or as fast as the control loop runs."""
+"""VirtualDriver: a virtual robot in this process, in real time or as fast as the control loop
+runs.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +23,9 @@ MAX_LAG_S = 0.5  # simulated time behind the clock, once the robot was commanded
 
 
 class LiveUnit:
-    """One virtual unit, stepped in equal periods without a clock; base of every virtual bus and driver."""
+    """One virtual unit, stepped in equal periods without a clock; base of every virtual bus and
+    driver.
+    """
 
     def __init__(
         self,
@@ -36,7 +40,8 @@ class LiveUnit:
             payload: kg per hand, and side.
             period: Time between two states, s.
         """
-        self.robot, self.period = robot, period
+        self.robot = robot
+        self.period = period
         locked = idle_joints(robot, robot.operated)
         self.unit = VirtualRobot(robot, [physics], [payload], dt=period, locked=locked)
         self.ctrl = robot.qpos_home.copy()
@@ -74,8 +79,8 @@ class LiveUnit:
 class VirtualDriver:
     """A `Driver` of a virtual robot in this process; its time is the controller's clock.
 
-    Until the first command the robot stands still, so time that passes without a reading (planning, the question for
-    consent, compiling) is not simulated. From the first command on all time is.
+    Until the first command the robot stands still, so time that passes without a reading (planning,
+    the question for consent, compiling) is not simulated. From the first command on all time is.
     """
 
     virtual = True
@@ -103,7 +108,8 @@ class VirtualDriver:
             period: Time between two states, s.
         """
         robot = robot.nominal or robot  # the hidden physics replaces what was identified
-        self.kp, self.kd = robot.kp, robot.kd
+        self.kp = robot.kp
+        self.kd = robot.kd
         self.facts: dict[str, Any] = {}
         self.address = f"virtual {robot.name} {name} in process {os.getpid()}"
         self.joint_names = robot.joint_names
@@ -128,7 +134,8 @@ class VirtualDriver:
         """Simulate until now and return the state.
 
         Raises:
-            DriverError: The simulation of a commanded robot is more than MAX_LAG_S behind the clock.
+            DriverError: The simulation of a commanded robot is more than MAX_LAG_S behind the
+                clock.
         """
         due = self._periods_due()
         if due <= 0:
@@ -138,7 +145,8 @@ class VirtualDriver:
             due = 1
         if due * self.period > MAX_LAG_S:
             raise DriverError(
-                f"{self.address}: this machine cannot simulate it in real time; run without real time (--fast)"
+                f"{self.address}: this machine cannot simulate it in real time; run without real "
+                "time (--fast)"
             )
         for _ in range(due):
             self.live.step()

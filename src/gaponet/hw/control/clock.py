@@ -9,7 +9,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import ClassVar, Protocol
 
-SPIN_S = 0.0003  # last part of a wait, spent in a busy loop: on a quiet Linux a sleep ends up to this much late
+# last part of a wait, spent in a busy loop: on a quiet Linux a sleep ends up to this much late
+SPIN_S = 0.0003
 
 START_RANGE_S = (1e3, 1e6)  # of a simulated clock: computers are on for an hour or some days
 
@@ -24,7 +25,9 @@ class Clock(Protocol):
         """Return the time at or after an absolute deadline; at once if it has passed."""
 
     def suspended(self) -> float:
-        """Return the s for which the computer was suspended since some fixed moment; `now` stood still meanwhile."""
+        """Return the s for which the computer was suspended since some fixed moment; `now` stood
+        still meanwhile.
+        """
 
 
 class MonotonicClock:
@@ -35,7 +38,10 @@ class MonotonicClock:
         return time.monotonic()
 
     def wait_until(self, deadline: float) -> float:
-        """Sleep until shortly before the deadline, then spin. Signal handlers run meanwhile and do not shorten it."""
+        """Sleep until shortly before the deadline, then spin.
+
+        Signal handlers run meanwhile and do not shorten it.
+        """
         left = deadline - time.monotonic() - SPIN_S
         if left > 0:
             time.sleep(left)
@@ -54,10 +60,12 @@ class MonotonicClock:
 class SimulatedClock:
     """Time that passes only in `wait_until`: a loop with a virtual robot runs as fast as it can.
 
-    As on a real computer the time has no known start, so that code which mistakes a time for a duration fails.
+    As on a real computer the time has no known start, so that code which mistakes a time for a
+    duration fails.
 
     Attributes:
-        seed: Of the start; drawn once in a process. Set it before clocks are made to repeat their starts.
+        seed: Of the start; drawn once in a process. Set it before clocks are made to repeat their
+            starts.
         start: Time at which the clock began, s.
         suspended_s: What `suspended` returns.
     """
@@ -90,7 +98,8 @@ class SimulatedClock:
 def no_garbage_collection() -> Iterator[None]:
     """Disable the garbage collector inside the block.
 
-    One pass stands still for 13 ms or more, longer as a recording grows. Reference counts free what a period leaves.
+    One pass stands still for 13 ms or more, longer as a recording grows. Reference counts free what
+    a period leaves.
     """
     enabled = gc.isenabled()
     gc.collect()

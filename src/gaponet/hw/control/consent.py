@@ -1,4 +1,7 @@
-"""Consent of the person at the terminal, without which no real robot moves. All commands ask through this module."""
+"""Consent of the person at the terminal, without which no real robot moves.
+
+All commands ask through this module.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +23,8 @@ def require_terminal(option: str = "--yes") -> int:
     """
     if sys.stdin is None or not sys.stdin.isatty():
         raise UsageError(
-            f"no terminal to ask on, so nothing was commanded; give {option} if the space around the robot is free"
+            f"no terminal to ask on, so nothing was commanded; give {option} if the space around "
+            "the robot is free"
         )
     return sys.stdin.fileno()
 
@@ -47,16 +51,14 @@ def require_consent(
     descriptor = require_terminal(option)
     import termios  # not on Windows
 
-    termios.tcflush(
-        descriptor, termios.TCIFLUSH
-    )  # an answer typed before the question was shown answers nothing
+    # an answer typed before the question was shown answers nothing
+    termios.tcflush(descriptor, termios.TCIFLUSH)
     sys.stderr.write(
         f"{escape(statement)} {question} Type '{word}' to start; anything else leaves: "
     )
     sys.stderr.flush()
-    line = os.read(descriptor, 1024).decode(
-        errors="replace"
-    )  # not sys.stdin, which may hold earlier bytes
+    # not sys.stdin, which may hold earlier bytes
+    line = os.read(descriptor, 1024).decode(errors="replace")
     if not line.endswith("\n"):  # end of file, also behind a word
         sys.stderr.write("\n")
     elif line.strip().lower() == word:

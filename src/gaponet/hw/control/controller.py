@@ -1,7 +1,7 @@
 """Controller: plays targets on a robot at a fixed rate, within limits, and stops it after a fault.
 
-phases.TRANSITIONS is its state machine. A fault is latched, and a controller that has stopped cannot be started again.
-docs/deploy-safety.md lists the guarantees.
+phases.TRANSITIONS is its state machine. A fault is latched, and a controller that has stopped
+cannot be started again. docs/deploy-safety.md lists the guarantees.
 """
 
 from __future__ import annotations
@@ -71,34 +71,49 @@ class Controller:
             safety: Limits and checks of states; default SafetyConfig().
             compensator: Turns targets into commands; without one targets are sent as they are.
             clock: Default the machine's monotonic clock.
-            watchdog: Start the process that damps the robot if this one dies, if the driver supports one.
-            planner: Checks the path to the first target, and live targets while the robot moves; default one without
-                payload, for a robot that has shapes (collision.toml).
+            watchdog: Start the process that damps the robot if this one dies, if the driver
+                supports one.
+            planner: Checks the path to the first target, and live targets while the robot moves;
+                default one without payload, for a robot that has shapes (collision.toml).
             unchecked: Use no default planner.
-            payload_mass: kg per hand, for the compensator and the recording; None if it is not known.
+            payload_mass: kg per hand, for the compensator and the recording; None if it is not
+                known.
             on_event: Called with every change of phase.
-            on_connect: Called with the driver once the robot has answered and nothing was commanded; it refuses the run
-                by an exception.
-            folder: Folder in which the recording is written period by period; default a temporary file.
+            on_connect: Called with the driver once the robot has answered and nothing was
+                commanded; it refuses the run by an exception.
+            folder: Folder in which the recording is written period by period; default a temporary
+                file.
             metadata: Saved with the recording (unit id, model …).
         """
-        self.driver, self.clock, self.config = (
-            driver,
-            clock or MonotonicClock(),
-            config or ControlConfig(),
-        )
-        self.dt, safety = 1.0 / self.config.rate, safety or SafetyConfig()
+        self.driver = driver
+        self.clock = clock or MonotonicClock()
+        self.config = config or ControlConfig()
+        self.dt = 1.0 / self.config.rate
+        safety = safety or SafetyConfig()
         if planner is None and not unchecked and (robot.folder / "collision.toml").is_file():
             planner = Planner(robot, driver.commanded, self.config, safety)
         self.context = Context(
-            driver, robot, self.config, safety, compensator, self.clock, planner, payload_mass,
-            robot.index(driver.commanded), self.dt,
-        )  # fmt: skip
-        self.phase, self.stop = Phase.CONNECT, StopRequest()
+            driver,
+            robot,
+            self.config,
+            safety,
+            compensator,
+            self.clock,
+            planner,
+            payload_mass,
+            robot.index(driver.commanded),
+            self.dt,
+        )
+        self.phase = Phase.CONNECT
+        self.stop = StopRequest()
         self.recording = Recording(
-            robot.name, driver.virtual, driver.joint_names, driver.commanded, self.dt,
+            robot.name,
+            driver.virtual,
+            driver.joint_names,
+            driver.commanded,
+            self.dt,
             meta=(metadata or {}) | {"payload_mass": payload_mass},
-        )  # fmt: skip
+        )
         self.monitor = StateMonitor(
             driver.joint_names, self.context.joints, self.dt, safety, driver.noisy
         )
@@ -106,17 +121,14 @@ class Controller:
         self.output = Output(self.context, self.monitor)
         self.readiness = Readiness(self.context, self.output)
         self._targets: TargetGenerator | None = None
-        self._folder, self._use_watchdog, self._on_event, self._on_connect = (
-            folder,
-            watchdog,
-            on_event,
-            on_connect,
-        )
-        self._k, self._now, self._phase_start = (
-            0,
-            0.0,
-            0,
-        )  # this period, its start in s, first period of the phase
+        self._folder = folder
+        self._use_watchdog = watchdog
+        self._on_event = on_event
+        self._on_connect = on_connect
+        # this period, its start in s, first period of the phase
+        self._k = 0
+        self._now = 0.0
+        self._phase_start = 0
         self._state: State | None = None  # last one
         self._error: BaseException | None = None  # of other code; raised when the robot is damped
         self._reported_full_disk = False
@@ -145,15 +157,16 @@ class Controller:
         Raises:
             DriverError: The robot could not be reached; nothing was commanded.
             UsageError: Another process commands it, or this controller has run before.
-            Exception: Any error of the policy or the compensator, raised after the robot has damped.
+            Exception: Any error of the policy or the compensator, raised after the robot has
+                damped.
         """
         if self.phase is not Phase.CONNECT:
             raise UsageError("a controller runs once; make a new one")
-        driver, output = self.driver, self.output
+        driver = self.driver
+        output = self.output
         with ExitStack() as stack:
-            stack.enter_context(
-                no_garbage_collection()
-            )  # exited last: during one no heartbeat is sent
+            # exited last: during one no heartbeat is sent
+            stack.enter_context(no_garbage_collection())
             lock = stack.enter_context(sole_publisher(driver.address))
             stack.callback(lambda: driver.close(hold=output.damping_since is None))
             driver.connect()
@@ -161,9 +174,8 @@ class Controller:
             output.limits = output.servo_limits()
             self._on_connect(driver)
             stack.enter_context(stop_on_signals(self.stop))
-            pressed = (
-                stack.enter_context(StopKeys(self.stop)) if keys else None
-            )  # counts from the consent on
+            # counts from the consent on
+            pressed = stack.enter_context(StopKeys(self.stop)) if keys else None
             gains = {
                 name: getattr(driver, name)[self.context.joints].tolist() for name in ("kp", "kd")
             }
@@ -190,10 +202,9 @@ class Controller:
         return self.recording
 
     def _loop(self, policy: Policy, keys: StopKeys | None) -> None:
-        start, due = (
-            self.clock.now(),
-            0,
-        )  # due: the period after the last one; _k: the next one that is possible
+        # due: the period after the last one; _k: the next one that is possible
+        start = self.clock.now()
+        due = 0
         self._now = self.readiness.since = start
         self._fire(Trigger.CONSENT, "waiting for fresh states")
         for remark in self.driver.facts.get("remarks", ()):
@@ -204,9 +215,8 @@ class Controller:
             self.output.due = start + due * self.dt
             self.recording.late.append(self._now - self.output.due)
             self._period(policy, keys)
-            lost = (
-                int((self.clock.now() - start) / self.dt) - self._k
-            )  # whole periods by which this one ran over
+            # whole periods by which this one ran over
+            lost = int((self.clock.now() - start) / self.dt) - self._k
             self.recording.missed += max(lost - 1, 0)
             self._k, due = self._k + max(1, lost), self._k + 1
 
@@ -278,7 +288,10 @@ class Controller:
             self._fire(Trigger.READY, f"to the first target in {self._targets.path.duration:.1f} s")
 
     def _send(self, state: State, policy: Policy) -> tuple[Array, Array] | None:
-        """Send this period's command. Return target and command of all joints, (n) rad; None if none was sent."""
+        """Send this period's command.
+
+        Return target and command of all joints, (n) rad; None if none was sent.
+        """
         while self._targets and self.phase in COMMANDING:
             target = self._targets.step(self.phase, self._k - self._phase_start, state, policy)
             while self._targets.remarks:
@@ -331,14 +344,15 @@ class Controller:
 
     def _fail(self, fault: Fault) -> None:
         """Stop the robot after a fault, as TRANSITIONS has it."""
-        output, trigger, text = self.output, Trigger.FAULT, fault.text
+        output = self.output
+        trigger = Trigger.FAULT
+        text = fault.text
         if output.weight is None:
-            trigger, text = Trigger.FAULT_BEFORE_COMMAND, f"{text}; nothing was commanded"
+            trigger = Trigger.FAULT_BEFORE_COMMAND
+            text = f"{text}; nothing was commanded"
         elif output.watchdog and output.watchdog.fired():
-            trigger, text = (
-                Trigger.FAULT_AFTER_WATCHDOG,
-                f"{text}; the watchdog has damped the robot",
-            )
+            trigger = Trigger.FAULT_AFTER_WATCHDOG
+            text = f"{text}; the watchdog has damped the robot"
         self._fire(trigger, text, fault.kind)
 
     def _fire(self, trigger: Trigger, text: str, kind: str = "") -> None:
@@ -348,7 +362,8 @@ class Controller:
             return
         if action is Action.RAISE:
             raise AssertionError(f"{trigger.name} in phase {self.phase}: {text}")
-        self.phase, self._phase_start = phase, self._k
+        self.phase = phase
+        self._phase_start = self._k
         if action is Action.DAMP:
             self.output.begin_damping(self._now, lowers(kind))
         elif action is Action.GO_BACK and self._targets and self._state:

@@ -14,7 +14,9 @@ EndAction = Literal["hand_over", "hold", "damp"]
 
 
 class DriverError(GAPONetError):
-    """A robot cannot be reached, does not answer, or gives invalid answers; the message says what to check."""
+    """A robot cannot be reached, does not answer, or gives invalid answers; the message says what
+    to check.
+    """
 
 
 @dataclass(frozen=True)
@@ -31,10 +33,12 @@ class State:
 
     Attributes:
         time: When it was measured, on this machine's monotonic clock, s.
-        qpos, qvel, tau, temperature: rad, rad/s, N·m, °C; temperature NaN where a robot does not measure it.
+        qpos, qvel, tau, temperature: rad, rad/s, N·m, °C; temperature NaN where a robot does not
+            measure it.
         refused: Number of messages with a wrong checksum so far.
         tilt: Angle of the trunk against the vertical, rad; 0 where a robot does not measure it.
-        fault: Reported by the robot itself, or a stop by its operator; the driver keeps it for good.
+        fault: Reported by the robot itself, or a stop by its operator; the driver keeps it for
+            good.
     """
 
     time: float
@@ -57,19 +61,24 @@ class Driver(Protocol):
     """Connection to one robot: connect, read states, write targets, damp.
 
     Attributes:
-        address: Name of the connection ("unitree dds domain 0", "/dev/ttyUSB0"); one controller at a time per address.
+        address: Name of the connection ("unitree dds domain 0", "/dev/ttyUSB0"); one controller at
+            a time per address.
         virtual: True without a real robot; final once connected.
         joint_names: All joints of the robot, (n), in the order of every array.
         commanded: Joints that `write` commands; other controllers command the rest.
-        noisy: Readings of a working robot are never twice the same, so equal ones mean that it is frozen.
-        reads_back: `read` and `verify` check that the robot holds its commands and settings (state.fault). For other
-            robots the controller checks that the joints follow.
-        kp, kd: Gains of the real servos under `write`, (n), N·m/rad and N·m·s/rad; final once connected.
-        qpos_range: Joint ranges that the robot itself reports, (n, 2) rad, or None; final once connected.
-        facts: Stored with a recording (registers, kind of machine); `remarks`: sentences for the user; `source`: the
-            one robot that the states are from, in words. Final once connected.
-        at_end: After a run without fault: hand_over (hold while the weight goes from 1 to 0; the robot's own controller
-            takes over), hold (servos keep the last target after `close`), damp (nothing holds it afterwards).
+        noisy: Readings of a working robot are never twice the same, so equal ones mean that it is
+            frozen.
+        reads_back: `read` and `verify` check that the robot holds its commands and settings
+            (state.fault). For other robots the controller checks that the joints follow.
+        kp, kd: Gains of the real servos under `write`, (n), N·m/rad and N·m·s/rad; final once
+            connected.
+        qpos_range: Joint ranges that the robot itself reports, (n, 2) rad, or None; final once
+            connected.
+        facts: Stored with a recording (registers, kind of machine); `remarks`: sentences for the
+            user; `source`: the one robot that the states are from, in words. Final once connected.
+        at_end: After a run without fault: hand_over (hold while the weight goes from 1 to 0; the
+            robot's own controller takes over), hold (servos keep the last target after `close`),
+            damp (nothing holds it afterwards).
         at_stop: Effect of `damp`, as a verb: damps, lowers.
     """
 
@@ -111,12 +120,14 @@ class Driver(Protocol):
         """Compare all that can be read back with what was sent; may take several periods."""
 
     def damp(self, weight: float = 1.0, share: float = 0.0) -> None:
-        """Brake all joints without a position command; joints that cannot brake sink as their torque is reduced.
+        """Brake all joints without a position command; joints that cannot brake sink as their
+        torque is reduced.
 
         Args:
             weight: Our share of control; decreases to 0.
-            share: Share of their torque that joints keep which cannot brake; decreases from 1 to 0, or is 0 at once.
-                The watchdog begins with 1 also where the controller has reduced the torque already: never raise it.
+            share: Share of their torque that joints keep which cannot brake; decreases from 1 to 0,
+                or is 0 at once. The watchdog begins with 1 also where the controller has reduced
+                the torque already: never raise it.
         """
 
     def confirm(self) -> str:
@@ -130,14 +141,15 @@ class Driver(Protocol):
         """Leave the bus; never raises.
 
         Args:
-            hold: Send nothing: nothing was commanded, or the last command shall stay. Otherwise joints are left damped
-                or free.
+            hold: Send nothing: nothing was commanded, or the last command shall stay. Otherwise
+                joints are left damped or free.
         """
 
     def watchdog(self) -> dict[str, object] | None:
-        """Return the arguments of open_driver with which another process connects to this robot to damp it.
+        """Return the arguments of open_driver with which another process connects to this robot to
+        damp it.
 
-        `kind` is the driver's name, `robot` the folder of its robot; the others are parameters of the driver. The
-        process connects before the first command and must send nothing until it damps (control.watchdog). None: no
-        other process can damp the robot.
+        `kind` is the driver's name, `robot` the folder of its robot; the others are parameters of
+        the driver. The process connects before the first command and must send nothing until it
+        damps (control.watchdog). None: no other process can damp the robot.
         """

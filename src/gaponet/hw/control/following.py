@@ -10,9 +10,11 @@ from gaponet.hw.control.output import Context, Output
 from gaponet.sim.dynamics import static_torque
 from gaponet.sim.model import build_model
 
-REFERENCE_LAG_S = 0.15  # time constant of the reference servo with which joints are compared; slower than any real one
+# time constant of the reference servo with which joints are compared; slower than any real one
+REFERENCE_LAG_S = 0.15
 STRIDE_RAD = 0.05  # way of the reference after which a joint must have moved along
-MAX_UNFOLLOWED_RAD = 0.25  # span of the reference without that; friction was seen to hold a joint in a band of 0.14 rad
+# span of the reference without that; friction was seen to hold a joint in a band of 0.14 rad
+MAX_UNFOLLOWED_RAD = 0.25
 MIN_PUSH_SHARE = 0.5  # of its effort limit with which a joint counts as pushing …
 MIN_LOAD_SHARE = 0.5  # … if gravity alone requires at least this share of MIN_PUSH_SHARE
 
@@ -26,13 +28,14 @@ class FollowingMonitor:
     """
 
     def __init__(self, context: Context) -> None:
-        robot, self.context = context.robot.before_identification, context
+        robot = context.robot.before_identification
+        self.context = context
         self.share = 0.0 if context.driver.reads_back else context.safety.following
         self.shown = np.zeros(len(context.joints), bool)
         self._model = build_model(robot, context.payload_mass or 0.0) if self.share else None
         self._reference: Array | None = None
-        # Ends of the reference's current stride and the joint's position at them; span of the reference without a
-        # followed stride.
+        # Ends of the reference's current stride and the joint's position at them; span of the
+        # reference without a followed stride.
         self._low, self._high, self._qpos_low, self._qpos_high, self._span_low, self._span_high = (
             np.zeros((6, len(self.shown)))
         )
@@ -41,34 +44,35 @@ class FollowingMonitor:
     def check(self, state: State, output: Output) -> Fault | None:
         """Take in one period; return a fault if a joint has not followed for long.
 
-        A joint that pushes as hard as it can against a load that the payload explains obeys, though it does not move;
-        a joint that is held does not.
+        A joint that pushes as hard as it can against a load that the payload explains obeys, though
+        it does not move; a joint that is held does not.
         """
         if self._model is None or state.time <= self._state_time:
             return None
-        self._state_time, joints = state.time, self.context.joints
+        self._state_time = state.time
+        joints = self.context.joints
         limit = output.limits.effort / self.context.safety.torque_share
-        command, qpos = output.expected(), state.qpos[joints]
+        command = output.expected()
+        qpos = state.qpos[joints]
         if self._reference is None:
             self._reference = command.copy()
             self._low, self._high, self._span_low, self._span_high = (
                 command.copy() for _ in range(4)
             )
-            self._qpos_low, self._qpos_high = qpos.copy(), qpos.copy()
+            self._qpos_low = qpos.copy()
+            self._qpos_high = qpos.copy()
         reference = self._reference + (command - self._reference) * min(
             1.0, self.context.dt / REFERENCE_LAG_S
         )
         self._reference = reference
-        lower, higher = reference < self._low, reference > self._high
-        self._low, self._qpos_low = (
-            np.where(lower, reference, self._low),
-            np.where(lower, qpos, self._qpos_low),
-        )
-        self._high, self._qpos_high = (
-            np.where(higher, reference, self._high),
-            np.where(higher, qpos, self._qpos_high),
-        )
-        up, down = reference - self._low >= STRIDE_RAD, self._high - reference >= STRIDE_RAD
+        lower = reference < self._low
+        higher = reference > self._high
+        self._low = np.where(lower, reference, self._low)
+        self._qpos_low = np.where(lower, qpos, self._qpos_low)
+        self._high = np.where(higher, reference, self._high)
+        self._qpos_high = np.where(higher, qpos, self._qpos_high)
+        up = reference - self._low >= STRIDE_RAD
+        down = self._high - reference >= STRIDE_RAD
         distance = np.where(up, qpos - self._qpos_low, self._qpos_high - qpos)
         done = up | down
         side = np.sign(command - qpos)
@@ -89,10 +93,8 @@ class FollowingMonitor:
 
     def fault(self, joint: int) -> Fault:
         """Return the fault of a joint that does not follow."""
-        name, causes = (
-            self.context.driver.commanded[joint],
-            "in a mode that ignores commands, or to another joint's",
-        )
+        name = self.context.driver.commanded[joint]
+        causes = "in a mode that ignores commands, or to another joint's"
         return Fault(
             "obedience", f"{name} does not follow: blocked, limp or not listening ({causes})"
         )

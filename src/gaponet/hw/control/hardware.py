@@ -1,7 +1,9 @@
-"""Limits of real robots: they come from the package's own robot, or from a folder that the user names.
+"""Limits of real robots: they come from the package's own robot, or from a folder that the user
+names.
 
-A run or an identified folder may come from a stranger. On hardware it supplies identified values only. Its nominal
-gains, joint ranges, effort limits, inertias and collision shapes must equal those of the reference robot.
+A run or an identified folder may come from a stranger. On hardware it supplies identified values
+only. Its nominal gains, joint ranges, effort limits, inertias and collision shapes must equal those
+of the reference robot.
 """
 
 from __future__ import annotations
@@ -24,10 +26,9 @@ ROBOT_OF_DRIVER = {"unitree": "h1_2", "so101": "so101"}
 # of an identified command offset; a larger one is a wrong zero, which calibration removes
 MAX_OFFSET_RAD = 0.1
 KP_RATIO_BOUNDS = (0.25, 4.0)  # of identified kp to nominal kp
-MAX_WEIGHT_SHARE, POSTURES = (
-    0.5,
-    64,
-)  # of the effort limit, for identified masses; postures in which they are compared
+# of the effort limit, for identified masses; postures in which they are compared
+MAX_WEIGHT_SHARE = 0.5
+POSTURES = 64
 RELATIVE_TOLERANCE = 1e-6  # between values of two files
 RANGE_TOLERANCE_RAD = 1e-6  # between joint ranges of two files
 MAX_KP = 300.0  # N·m/rad of any joint; the H1-2's legs have 200
@@ -37,15 +38,17 @@ MAX_BEYOND_RANGE_RAD = 0.051
 
 
 def reference_robot(driver: str, limits_from: str | None) -> RobotSpec:
-    """Return the robot whose limits hold for a driver: the package's own, or the folder that the user names.
+    """Return the robot whose limits hold for a driver: the package's own, or the folder that the
+    user names.
 
     Raises:
         UsageError: The driver is an extension's, and no folder is named.
     """
     if limits_from is None and driver not in ROBOT_OF_DRIVER:
         raise UsageError(
-            f"driver '{driver}' is an extension, whose robot this package does not have; give --limits-from FOLDER, a "
-            "robot folder whose gains, joint ranges, effort limits and collision shapes you have read"
+            f"driver '{driver}' is an extension, whose robot this package does not have; give "
+            "--limits-from FOLDER, a robot folder whose gains, joint ranges, effort limits and "
+            "collision shapes you have read"
         )
     if limits_from is None:
         return load_robot(PACKAGE_FOLDER / ROBOT_OF_DRIVER[driver]).before_identification
@@ -60,7 +63,8 @@ def hardware_robot(robot: RobotSpec, reference: RobotSpec) -> RobotSpec:
         reference: Supplies gains, ranges, effort limits and collision shapes.
 
     Raises:
-        RobotError: A nominal value of `robot` differs from the reference, or an identified value is implausible.
+        RobotError: A nominal value of `robot` differs from the reference, or an identified value is
+            implausible.
     """
     _require_equal(robot.before_identification, reference)
     require_plausible(robot)
@@ -72,7 +76,9 @@ def hardware_robot(robot: RobotSpec, reference: RobotSpec) -> RobotSpec:
 
 
 def robot_hash(robot: RobotSpec) -> str:
-    """Return 12 hex digits of all values that determine motion and limits: simulator, gains, ranges, shapes."""
+    """Return 12 hex digits of all values that determine motion and limits: simulator, gains,
+    ranges, shapes.
+    """
     text = f"{model_hash(robot.before_identification)} {read_shapes(robot.folder)}"
     return hashlib.sha256(text.encode()).hexdigest()[:12]
 
@@ -87,15 +93,16 @@ def _require_equal(robot: RobotSpec, reference: RobotSpec) -> None:
         ("effort_limit", "N·m"),
         ("qpos_range", "rad"),
     ):
-        theirs, ours = getattr(robot, name), getattr(reference, name)
+        theirs = getattr(robot, name)
+        ours = getattr(reference, name)
         differ = ~np.isclose(theirs, ours, rtol=RELATIVE_TOLERANCE, atol=1e-9).reshape(
             len(ours), -1
         ).all(axis=1)
         if differ.any():
             i = int(differ.argmax())
             raise RobotError(
-                f"{robot.folder}: {name} of {reference.joint_names[i]} is {_text(theirs[i])} {unit}, the known robot "
-                f"has {_text(ours[i])} ({reference.folder}). {use}"
+                f"{robot.folder}: {name} of {reference.joint_names[i]} is {_text(theirs[i])} "
+                f"{unit}, the known robot has {_text(ours[i])} ({reference.folder}). {use}"
             )
     if robot.folder.resolve() == reference.folder.resolve():
         return  # the same files; only numbers in memory may differ
@@ -105,7 +112,8 @@ def _require_equal(robot: RobotSpec, reference: RobotSpec) -> None:
         )
     if model_hash(robot) != model_hash(reference):
         raise RobotError(
-            f"{robot.folder}: inertias or geometry of robot.xml differ from {reference.folder}. {use}"
+            f"{robot.folder}: inertias or geometry of robot.xml differ from {reference.folder}. "
+            f"{use}"
         )
 
 
@@ -132,22 +140,25 @@ def require_plausible(robot: RobotSpec) -> None:
             scale = robot.kp if field.axis == "over kp" else np.ones(len(robot.kp))
             bounds[name] = np.outer(field.bounds[:2], scale)
     for name, (low, high) in bounds.items():
-        values, field = getattr(robot, name), SERVO_FIELDS[name]
-        beyond = ~(
-            (values >= low) & (values <= high) | np.isnan(values)
-        )  # NaN: the MJCF's; other fields have none
+        values = getattr(robot, name)
+        field = SERVO_FIELDS[name]
+        # NaN: the MJCF's; other fields have none
+        beyond = ~((values >= low) & (values <= high) | np.isnan(values))
         if beyond.any():
             i = int(beyond.argmax())
             raise RobotError(
-                f"{robot.folder}: the identified {name} of {robot.joint_names[i]} is {values[i]:g} {field.unit}; "
-                f"hardware takes {low[i]:g} to {high[i]:g}. To do: {field.advice}; then identify again"
+                f"{robot.folder}: the identified {name} of {robot.joint_names[i]} is "
+                f"{values[i]:g} {field.unit}; hardware takes {low[i]:g} to {high[i]:g}. To do: "
+                f"{field.advice}; then identify again"
             )
     if robot.links or robot.payload_mounts != nominal.payload_mounts:
         _require_light(robot, nominal)
 
 
 def _require_light(robot: RobotSpec, nominal: RobotSpec) -> None:
-    """Refuse identified masses whose weight changes a joint's torque by more than a share of its effort limit."""
+    """Refuse identified masses whose weight changes a joint's torque by more than a share of its
+    effort limit.
+    """
     low, high = np.clip(nominal.qpos_range.T, -np.pi, np.pi)
     postures = np.random.default_rng(0).uniform(low, high, (POSTURES, len(robot.kp)))
     with_mass, without = (
@@ -157,16 +168,19 @@ def _require_light(robot: RobotSpec, nominal: RobotSpec) -> None:
     if not share.max() <= MAX_WEIGHT_SHARE:
         joint = robot.joint_names[int(share.argmax())]
         raise RobotError(
-            f"{robot.folder}: identified masses change the torque of {joint} by {share.max():.2f} of its effort limit; "
-            f"hardware takes {MAX_WEIGHT_SHARE:g}. Check kp's unit and the payload, or identify without --masses"
+            f"{robot.folder}: identified masses change the torque of {joint} by {share.max():.2f} "
+            f"of its effort limit; hardware takes {MAX_WEIGHT_SHARE:g}. Check kp's unit and the "
+            "payload, or identify without --masses"
         )
 
 
 def require_known_limits(robot: RobotSpec, packaged: str) -> None:
-    """Refuse the robot of a driver whose gains, ranges or effort limits are beyond those of the known robot.
+    """Refuse the robot of a driver whose gains, ranges or effort limits are beyond those of the
+    known robot.
 
-    The drivers of this package call it, so it holds for whoever makes one. The known robot is the package's. A robot of
-    `reference_robot` whose folder the user named may have other gains and ranges, but nothing beyond its motors.
+    The drivers of this package call it, so it holds for whoever makes one. The known robot is the
+    package's. A robot of `reference_robot` whose folder the user named may have other gains and
+    ranges, but nothing beyond its motors.
 
     Args:
         robot: The robot of a driver.
@@ -189,13 +203,16 @@ def require_known_limits(robot: RobotSpec, packaged: str) -> None:
     if wider.any():
         joint = int(wider.argmax())
         raise RobotError(
-            f"{robot.folder}: the range of {nominal.joint_names[joint]} is {_text(nominal.qpos_range[joint])} rad, the "
-            f"known robot has {low[joint]:g} to {high[joint]:g} ({known.folder}). {_advice(known)}"
+            f"{robot.folder}: the range of {nominal.joint_names[joint]} is "
+            f"{_text(nominal.qpos_range[joint])} rad, the known robot has {low[joint]:g} to "
+            f"{high[joint]:g} ({known.folder}). {_advice(known)}"
         )
 
 
 def accepted_folder(robot: RobotSpec) -> str | None:
-    """Return the folder whose limits the user accepted for this robot, as another process finds it; or None."""
+    """Return the folder whose limits the user accepted for this robot, as another process finds
+    it; or None.
+    """
     nominal = robot.before_identification
     return str(nominal.folder.resolve()) if nominal.limits_accepted else None
 
@@ -209,35 +226,38 @@ def _require_within(
     if beyond.any():
         joint = int(beyond.argmax())
         raise RobotError(
-            f"{robot.folder}: {name} of {robot.joint_names[joint]} is {values[joint]:g} {unit}, the known robot has "
-            f"{bounds[joint]:g} ({known.folder}). {_advice(known)}"
+            f"{robot.folder}: {name} of {robot.joint_names[joint]} is {values[joint]:g} {unit}, "
+            f"the known robot has {bounds[joint]:g} ({known.folder}). {_advice(known)}"
         )
 
 
 def _advice(reference: RobotSpec) -> str:
     return (
-        f"Use a folder made from {reference.folder}, or --limits-from FOLDER (Python: limits_from) with a folder whose "
-        "values you have read"
+        f"Use a folder made from {reference.folder}, or --limits-from FOLDER (Python: "
+        "limits_from) with a folder whose values you have read"
     )
 
 
 def _require_motor_limits(robot: RobotSpec, packaged: str) -> None:
     """Refuse gains and effort limits beyond those of a packaged robot's motors."""
-    nominal, motors = robot.before_identification, load_robot(PACKAGE_FOLDER / packaged)
+    nominal = robot.before_identification
+    motors = load_robot(PACKAGE_FOLDER / packaged)
     effort = motors.effort_limit[motors.index(robot.joint_names)] * (1 + RELATIVE_TOLERANCE)
     for name, most in (("kp", MAX_KP), ("kd", MAX_KD), ("effort_limit", effort)):
-        values, bounds = getattr(nominal, name), np.broadcast_to(most, len(effort))
+        values = getattr(nominal, name)
+        bounds = np.broadcast_to(most, len(effort))
         beyond = ~(values <= bounds)  # NaN too
         if beyond.any():
             i = int(beyond.argmax())
             raise RobotError(
-                f"{robot.folder}: {name} of {robot.joint_names[i]} is {values[i]:g}; the driver of {packaged} takes at "
-                f"most {bounds[i]:g}"
+                f"{robot.folder}: {name} of {robot.joint_names[i]} is {values[i]:g}; the driver "
+                f"of {packaged} takes at most {bounds[i]:g}"
             )
 
 
 def range_violation(robot: RobotSpec, ctrl: Array, joints: Array) -> str:
-    """Return why a position command (n) rad must not be written for `joints` (indices), or "" if it may.
+    """Return why a position command (n) rad must not be written for `joints` (indices), or "" if
+    it may.
 
     The range is the nominal one, widened by MAX_BEYOND_RANGE_RAD.
     """
@@ -246,4 +266,7 @@ def range_violation(robot: RobotSpec, ctrl: Array, joints: Array) -> str:
     if not wrong.any():
         return ""
     i = int(joints[wrong.argmax()])
-    return f"command {ctrl[i]:g} rad to {robot.joint_names[i]} is outside its range, {low[i]:.2f} to {high[i]:.2f} rad"
+    return (
+        f"command {ctrl[i]:g} rad to {robot.joint_names[i]} is outside its range, {low[i]:.2f} to "
+        f"{high[i]:.2f} rad"
+    )

@@ -1,4 +1,6 @@
-"""Output: commands to a robot within its limits, and damping; and what all parts of a controller share."""
+"""Output: commands to a robot within its limits, and damping; and what all parts of a controller
+share.
+"""
 
 from __future__ import annotations
 
@@ -44,10 +46,13 @@ class Context:
 
 
 class Output:
-    """Corrects, limits and sends commands to one robot, and damps it. Arrays are of the commanded joints.
+    """Corrects, limits and sends commands to one robot, and damps it.
+
+    Arrays are of the commanded joints.
 
     Attributes:
-        limits: Limits of commands; final once the driver is connected and `admit` has accepted the start.
+        limits: Limits of commands; final once the driver is connected and `admit` has accepted the
+            start.
         watchdog: Gets a heartbeat before each command; None: there is none.
         due: When the present period should have begun, s.
         suspended_before: s for which the computer was suspended before the run.
@@ -58,7 +63,8 @@ class Output:
     """
 
     def __init__(self, context: Context, monitor: StateMonitor) -> None:
-        self.context, self.monitor = context, monitor
+        self.context = context
+        self.monitor = monitor
         self.watchdog: Watchdog | None = None
         self.limits = self.servo_limits()
         self.due = self.suspended_before = 0.0
@@ -77,7 +83,9 @@ class Output:
         )
 
     def suspended(self) -> Fault | None:
-        """Return a fault if the computer was suspended: time stood still for this process, not for the robot."""
+        """Return a fault if the computer was suspended: time stood still for this process, not for
+        the robot.
+        """
         duration = self.context.clock.suspended() - self.suspended_before
         if duration <= MAX_SUSPENDED_S:
             return None
@@ -87,23 +95,25 @@ class Output:
         )
 
     def admit(self, qpos: Array) -> Fault | None:
-        """Widen the limits to the measured position, (n) rad, so that it can be the first command; or refuse it."""
-        driver, joints = self.context.driver, self.context.joints
-        at, ranges = qpos[joints], self.context.robot.qpos_range[joints]
+        """Widen the limits to the measured position, (n) rad, so that it can be the first command;
+        or refuse it.
+        """
+        driver = self.context.driver
+        joints = self.context.joints
+        at = qpos[joints]
+        ranges = self.context.robot.qpos_range[joints]
         # Servos that know their own range cut goals beyond it.
         tolerance = MAX_BEYOND_RANGE_RAD if driver.qpos_range is None else MAX_START_DRIFT_RAD
         ends = ranges if driver.qpos_range is None else driver.qpos_range[joints]
-        low, high = (
-            np.minimum(ranges, ends)[:, 0] - tolerance,
-            np.maximum(ranges, ends)[:, 1] + tolerance,
-        )
+        low = np.minimum(ranges, ends)[:, 0] - tolerance
+        high = np.maximum(ranges, ends)[:, 1] + tolerance
         beyond = np.maximum(low - at, at - high)
         if beyond.max() > 0:
             i = int(beyond.argmax())
             return Fault(
                 "plan",
-                f"{driver.commanded[i]} was found at {at[i]:.2f} rad, beyond its range of {low[i]:.2f} to "
-                f"{high[i]:.2f}; bring it there by hand, or calibrate",
+                f"{driver.commanded[i]} was found at {at[i]:.2f} rad, beyond its range of "
+                f"{low[i]:.2f} to {high[i]:.2f}; bring it there by hand, or calibrate",
             )
         self.limits = replace(
             self.limits, low=np.minimum(self.limits.low, at), high=np.maximum(self.limits.high, at)
@@ -117,15 +127,20 @@ class Output:
     def expected(self) -> Array:
         """Return where the joints are requested to be, rad, as far as the robot is handed over.
 
-        This is not the last command: that never goes further from a joint than its torque limit allows, and so stays
-        with a joint that does not move.
+        This is not the last command: that never goes further from a joint than its torque limit
+        allows, and so stays with a joint that does not move.
         """
         handed = (self.weight or 0.0) if self.context.driver.at_end == "hand_over" else 1.0
         return self._start + handed * (self._requested - self._start)
 
     def send(self, target: Array, weight: float, state: State) -> tuple[Array, Array] | Fault:
-        """Send a target, corrected and limited. Return target and command of all joints, or why nothing was sent."""
-        context, limits, joints = self.context, self.limits, self.context.joints
+        """Send a target, corrected and limited.
+
+        Return target and command of all joints, or why nothing was sent.
+        """
+        context = self.context
+        limits = self.limits
+        joints = self.context.joints
         full = corrected = state.qpos_with(joints, target)
         if context.compensator:
             corrected = context.compensator.step(full, state.qpos, state.qvel)
@@ -139,13 +154,19 @@ class Output:
         return command if isinstance(command, Fault) else (full, command)
 
     def _write(self, ctrl: Array, weight: float, state: State) -> Array | Fault:
-        """Limit a command and write it, or return why none may be sent. A period that stood still sends nothing."""
-        context, joints, before, last_look = self.context, self.context.joints, self.ctrl, -np.inf
-        q, v = state.qpos[joints], state.qvel[joints]
+        """Limit a command and write it, or return why none may be sent.
+
+        A period that stood still sends nothing.
+        """
+        context = self.context
+        joints = self.context.joints
+        before = self.ctrl
+        last_look = -np.inf
+        q = state.qpos[joints]
+        v = state.qvel[joints]
         assert before is not None
-        if self.watchdog and not self.watchdog.beat(
-            weight
-        ):  # before the command, so that it guards the first one too
+        # before the command, so that it guards the first one too
+        if self.watchdog and not self.watchdog.beat(weight):
             return Fault("stop", "the watchdog ended")
         while (now := context.clock.now()) - last_look > MAX_SEND_DELAY_S:
             last_look = now
@@ -161,10 +182,13 @@ class Output:
                 age = f"{(now - state.time) * 1e3:.0f} ms"
                 return Fault(
                     "stale",
-                    f"the newest state is {age} old; no command is safe wherever {joint} can be by now",
+                    f"the newest state is {age} old; no command is safe wherever {joint} can be "
+                    "by now",
                 )
             return Fault("torque", f"{joint}: no command is within range, rate and torque")
-        self.ctrl, self.weight, full = out.ctrl, weight, state.qpos_with(joints, out.ctrl)
+        self.ctrl = out.ctrl
+        self.weight = weight
+        full = state.qpos_with(joints, out.ctrl)
         try:
             context.driver.write(full, weight)
         except (DriverError, OSError) as error:
@@ -172,22 +196,30 @@ class Output:
         return full
 
     def begin_damping(self, now: float, lower: bool) -> None:
-        """Let `damp` begin now; lower: a robot that cannot brake is lowered, else its torque goes off at once."""
-        self.damping_since, self._lower, self.ctrl = now, lower, None
+        """Let `damp` begin now; lower: a robot that cannot brake is lowered, else its torque goes
+        off at once.
+        """
+        self.damping_since = now
+        self._lower = lower
+        self.ctrl = None
 
     def damping_left(self, now: float) -> float:
         """Return the share of the damping time that is left."""
         return max(1.0 - (now - (self.damping_since or 0.0)) / self.context.config.damp, 0.0)
 
     def damp(self, left: float) -> None:
-        """Damp for a period, with this share of the last weight; may raise whatever a driver raises."""
+        """Damp for a period, with this share of the last weight; may raise whatever a driver
+        raises.
+        """
         weight = left * (self.weight or 0.0)
         if self.watchdog and not self.watchdog.fired():
             self.watchdog.beat(weight)
         self.context.driver.damp(weight, left * self._lower)
 
     def confirm(self) -> tuple[str, str]:
-        """Return what the robot itself reports after damping, and the kind of fault if it does not confirm it."""
+        """Return what the robot itself reports after damping, and the kind of fault if it does not
+        confirm it.
+        """
         try:
             return self.context.driver.confirm(), ""
         except (DriverError, OSError) as error:

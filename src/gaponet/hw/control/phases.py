@@ -52,7 +52,10 @@ class Action(Enum):
     PLAY = "send the positions of the motion, corrected where a model is given"
     GO_BACK = "send positions, back to where the robot was at the start"
     RELEASE = "send the last position; weight 1 → 0"
-    DAMP = "send no position: stiffness 0, damping gains (H1-2); torque limits to 0, then torque off (SO-101)"
+    DAMP = (
+        "send no position: stiffness 0, damping gains (H1-2); torque limits to 0, then torque off "
+        "(SO-101)"
+    )
     HOLD = "send nothing; servos hold the last position"
     SEND_NOTHING = "send nothing"
     CONFIRM = "send nothing; report what the robot itself says"
@@ -115,7 +118,8 @@ class ControlConfig:
     blend_out: bool = True
     """Go back to where the robot was at the start; a fault never waits for this."""
     damp: float = 2.0
-    """Damping after a fault, or handing the arms back after a run, before the robot is let go, s."""
+    """Damping after a fault, or handing the arms back after a run, before the robot is let go,
+    s."""
 
     def __post_init__(self) -> None:
         if not 1 <= self.rate <= 1000:

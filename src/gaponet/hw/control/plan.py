@@ -1,10 +1,12 @@
-"""Plan of a run: a trajectory from where the robot is, through the motion, and back, checked before the first command.
+"""Plan of a run: a trajectory from where the robot is, through the motion, and back, checked
+before the first command.
 
-`Planner.plan` takes a motion, `Planner.begin` the first of live targets, which `CollisionGuard` keeps clear of
-obstacles while the robot moves. With a compensator, `Planner.judge_commands` runs it over the whole motion, because its
-commands differ from the targets. Checked are free space between the robot's own limbs and above floor or table
-(robot.collision), range, speed, acceleration and torque (motion.feasible). A robot that starts nearer to something than
-the clearance may go away from it, but no nearer.
+`Planner.plan` takes a motion, `Planner.begin` the first of live targets, which `CollisionGuard`
+keeps clear of obstacles while the robot moves. With a compensator, `Planner.judge_commands` runs it
+over the whole motion, because its commands differ from the targets. Checked are free space between
+the robot's own limbs and above floor or table (robot.collision), range, speed, acceleration and
+torque (motion.feasible). A robot that starts nearer to something than the clearance may go away
+from it, but no nearer.
 """
 
 from __future__ import annotations
@@ -50,10 +52,14 @@ class TargetCompensator(Protocol):
     """Changes targets so that the robot reaches them (deploy.compensator). All joints, (n)."""
 
     def reset(self, target: Array, payload_mass: float | None = None) -> None:
-        """Begin at rest at `target` (n) rad, with a payload in kg or an unknown one; may take long."""
+        """Begin at rest at `target` (n) rad, with a payload in kg or an unknown one; may take
+        long.
+        """
 
     def step(self, target: Array, qpos: Array | None, qvel: Array | None = None) -> Array:
-        """Return the command with which the robot reaches `target`, (n) rad; qpos None: no state was measured."""
+        """Return the command with which the robot reaches `target`, (n) rad; qpos None: no state
+        was measured.
+        """
 
 
 @dataclass(frozen=True)
@@ -63,15 +69,17 @@ class Plan:
     Attributes:
         start: Measured posture at which it begins and ends, (n,) rad.
         approach: Path to the first target.
-        motion: Adapted to the limits; joints that it does not name, or that are not commanded, stay at the start. None
-            with live targets.
-        retreat: Path from the motion's last row to the start; None without a motion, or where the robot stays.
+        motion: Adapted to the limits; joints that it does not name, or that are not commanded, stay
+            at the start. None with live targets.
+        retreat: Path from the motion's last row to the start; None without a motion, or where the
+            robot stays.
         clearance: Least free space on all of it, m; inf for a robot without shapes.
         nearest: The two shells at that clearance.
         torque: Largest share of the usable torque.
         joint: The joint that needs it.
         changed: How the motion was changed to fit, in words; empty if it was not.
-        correction: Largest |command − target| of a compensator, rad, at corrected_joint; 0 without one.
+        correction: Largest |command − target| of a compensator, rad, at corrected_joint; 0 without
+            one.
         command_clearance: Least free space of the commands, m.
     """
 
@@ -122,8 +130,10 @@ class Planner:
             safety: Speed and acceleration of commands.
             limits: Range, torque and shapes; default without payload.
         """
-        self.robot, self.commanded = robot, commanded
-        self.config, self.safety = config or ControlConfig(), safety or SafetyConfig()
+        self.robot = robot
+        self.commanded = commanded
+        self.config = config or ControlConfig()
+        self.safety = safety or SafetyConfig()
         self.limits = limits or Feasibility(robot, 0.0)
         self.collision = self.limits.collision
 
@@ -131,7 +141,8 @@ class Planner:
         """Return the whole trajectory of a motion from a measured posture (n,) rad and back.
 
         Raises:
-            UsageError: No trajectory keeps within all limits; the message names the limit and what is in the way.
+            UsageError: No trajectory keeps within all limits; the message names the limit and what
+                is in the way.
         """
         robot = self.robot
         named = tuple(name for name in motion.named(robot) if name in self.commanded)
@@ -139,7 +150,8 @@ class Planner:
             start, robot
         )
         required = self._required_clearance(start)
-        first, here = self.collision.along(wanted.ctrl[:1]), self.collision.along(start[None])
+        first = self.collision.along(wanted.ctrl[:1])
+        here = self.collision.along(start[None])
         need = np.where(np.abs(first - here) < NO_MOVEMENT, required, self.collision.clearance)
         if (first < np.minimum(need, 0.0)).any():
             raise UsageError(
@@ -158,7 +170,8 @@ class Planner:
         return self._check(plan, required)
 
     def begin(self, first: Array, start: Array) -> Search[Plan]:
-        """Search the path from a measured posture to the first live target, both (n,) rad, step by step.
+        """Search the path from a measured posture to the first live target, both (n,) rad, step by
+        step.
 
         Raises:
             UsageError: As `plan`.
@@ -171,9 +184,8 @@ class Planner:
         free = self.collision.along(goal[None])
         if (free < np.minimum(required, 0.0)).any():
             raise UsageError(f"the first target brings {self._describe(free)}")
-        shares = np.linspace(1.0, 0.0, GOAL_SHARES)[
-            :, None
-        ]  # a goal within the clearance is not gone to entirely
+        # a goal within the clearance is not gone to entirely
+        shares = np.linspace(1.0, 0.0, GOAL_SHARES)[:, None]
         clear = (self.collision.distances(start + shares * (goal - start)) >= required).all(axis=1)
         goal = start + float(shares[int(clear.argmax()), 0]) * (goal - start)
         approach = yield from self._find_path(start, goal, moved, required, "to the first target")
@@ -182,25 +194,31 @@ class Planner:
     def judge_commands(
         self, plan: Plan, compensator: TargetCompensator, masses: tuple[float, ...]
     ) -> Plan:
-        """Return the plan with its largest correction and the clearance of the commands, for all `masses` (kg).
+        """Return the plan with its largest correction and the clearance of the commands, for all
+        `masses` (kg).
 
-        The compensator is causal and is run without measured states. Its feedback is not included: that adds at most
-        CompensatorConfig.feedback_limit.
+        The compensator is causal and is run without measured states. Its feedback is not included:
+        that adds at most CompensatorConfig.feedback_limit.
 
         Raises:
             UsageError: A command is not a number or brings shells too near to each other.
         """
-        config, at = self.safety, self.robot.index(self.commanded)
-        limits, dt = Limits.from_robot(self.robot, self.commanded, config), 1.0 / self.config.rate
+        config = self.safety
+        at = self.robot.index(self.commanded)
+        limits = Limits.from_robot(self.robot, self.commanded, config)
+        dt = 1.0 / self.config.rate
         targets = plan.sample(dt)
         floor = (
             self._required_clearance(plan.start)
             - COMMAND_CLEARANCE_SHARE * self.collision.clearance
         )
-        correction, joint, least = 0.0, "", np.inf
+        correction = 0.0
+        joint = ""
+        least = np.inf
         for mass in masses:
             compensator.reset(plan.start, mass)
-            delta, commands = np.zeros(len(at)), targets.copy()
+            delta = np.zeros(len(at))
+            commands = targets.copy()
             for k, target in enumerate(targets):
                 wanted = compensator.step(target, None)[at]
                 if not np.isfinite(wanted).all():
@@ -213,13 +231,15 @@ class Planner:
             free = self.collision.along(commands)
             if (free < floor).any():
                 raise UsageError(
-                    f"compensation with {mass:g} kg brings {self._describe(np.where(free < floor, free, np.inf))}. The "
-                    "targets keep clear. State the payload (--payload-mass), check the identified values, or "
+                    f"compensation with {mass:g} kg brings "
+                    f"{self._describe(np.where(free < floor, free, np.inf))}. The targets keep "
+                    "clear. State the payload (--payload-mass), check the identified values, or "
                     "leave out --compensate and --model"
                 )
             far = np.abs(commands - targets).max(axis=0)
             if far.max() > correction:
-                correction, joint = float(far.max()), self.robot.joint_names[int(far.argmax())]
+                correction = float(far.max())
+                joint = self.robot.joint_names[int(far.argmax())]
             least = min(least, float(free.min(initial=np.inf)))
         return replace(plan, correction=correction, corrected_joint=joint, command_clearance=least)
 
@@ -234,12 +254,15 @@ class Planner:
         )
 
     def _required_clearance(self, start: Array) -> Array:
-        """Return the free space (pairs + shells,) m that a robot must keep which starts in a posture."""
+        """Return the free space (pairs + shells,) m that a robot must keep which starts in a
+        posture.
+        """
         free = self.collision.along(start[None])
         if free.min(initial=np.inf) < -MAX_START_OVERLAP_M:
             raise UsageError(
-                f"the robot was found with {self.collision.nearest(free)} {-100 * free.min():.0f} cm in each other: "
-                "its zero, or the height of what it stands on, is not what collision.toml says (--plane HEIGHT)"
+                f"the robot was found with {self.collision.nearest(free)} {-100 * free.min():.0f} "
+                "cm in each other: its zero, or the height of what it stands on, is not what "
+                "collision.toml says (--plane HEIGHT)"
             )
         return np.minimum(free - MAX_APPROACH_M, self.collision.clearance)
 
@@ -255,7 +278,8 @@ class Planner:
         )
 
     def back(self, end: Array, start: Array) -> Search[Trajectory]:
-        """Search the path from where live targets ended back to the start, both (n,) rad, step by step.
+        """Search the path from where live targets ended back to the start, both (n,) rad, step by
+        step.
 
         Raises:
             UsageError: No path keeps clear.
@@ -271,8 +295,10 @@ class Planner:
         self, start: Array, goal: Array, columns: Array, required: Array, label: str
     ) -> Search[Trajectory]:
         """Search a path from a posture (n,) rad to another by moving these joints."""
-        low, high = start.copy(), start.copy()
-        low[columns], high[columns] = self.limits.low[columns], self.limits.high[columns]
+        low = start.copy()
+        high = start.copy()
+        low[columns] = self.limits.low[columns]
+        high[columns] = self.limits.high[columns]
         home = np.clip(self.robot.qpos_home, low, high)
         heavy = [
             np.abs(static_torque(m, np.stack([start, goal]))).max(axis=0)
@@ -291,14 +317,17 @@ class Planner:
         if points is None:
             straight = self.collision.along(np.linspace(start, goal, 200))
             raise UsageError(
-                f"no clear way was found {label}: the straight one brings {self._describe(straight)}"
+                f"no clear way was found {label}: the straight one brings "
+                f"{self._describe(straight)}"
             )
         return Trajectory.minimum_jerk(
             points, self.config.blend_speed, self.safety.acceleration, self.config.blend
         )
 
     def _check(self, plan: Plan, required: Array) -> Plan:
-        """Check the whole plan again, however it was made; return it with its clearance and torque."""
+        """Check the whole plan again, however it was made; return it with its clearance and
+        torque.
+        """
         rows = plan.rows
         free = self.collision.along(rows)
         if (free < required).any():
@@ -309,8 +338,8 @@ class Planner:
         here = self.limits.demand(np.stack([plan.start] * 2), GRID)
         if demand.torque > MAX_TORQUE_EXCESS * max(1.0, here.torque):
             raise UsageError(
-                f"the plan asks {demand.worst_joint} for {demand.torque:.2f} of the torque that may be used; go slower "
-                "(--blend-speed), or from a posture that is easier to hold"
+                f"the plan asks {demand.worst_joint} for {demand.torque:.2f} of the torque that "
+                "may be used; go slower (--blend-speed), or from a posture that is easier to hold"
             )
         nearest = self.collision.nearest(free) if len(free) else ""
         clearance = float(free.min(initial=np.inf))
@@ -341,30 +370,39 @@ def advance(search: Search[_T], clock: Clock, seconds: float) -> _T | None:
 class CollisionGuard:
     """Keeps live targets clear of limbs and plane: a step that leads into one is cut.
 
-    The free space beyond the clearance may be used up only so fast that the robot can stop. Where the measured robot is
-    nearer than its command, for instance because it sags, the clearance grows by the difference. A step towards an
-    obstacle goes along it if the control period leaves the time to find out how.
+    The free space beyond the clearance may be used up only so fast that the robot can stop. Where
+    the measured robot is nearer than its command, for instance because it sags, the clearance grows
+    by the difference. A step towards an obstacle goes along it if the control period leaves the
+    time to find out how.
 
     Attributes:
         qpos: The last target, (n,) rad.
-        obstacle: The two shells that are in the way, in words, while a target is cut; empty otherwise.
+        obstacle: The two shells that are in the way, in words, while a target is cut; empty
+            otherwise.
     """
 
     def __init__(self, planner: Planner, qpos: Array) -> None:
         """Begin at a posture (n,) rad, with the shapes and speeds of a planner."""
-        self.collision, self.config, self.safety = planner.collision, planner.config, planner.safety
-        self.qpos, self.obstacle = np.array(qpos, float), ""
-        # Free space now and at the start, to be kept, and its reduction by sagging, (pairs + shells,) m.
+        self.collision = planner.collision
+        self.config = planner.config
+        self.safety = planner.safety
+        self.qpos = np.array(qpos, float)
+        self.obstacle = ""
+        # Free space now and at the start, to be kept, and its reduction by sagging, (pairs +
+        # shells,) m.
         self._free = self._start_free = self.collision.along(self.qpos[None])
-        self._keep, self._sag = (
-            np.full_like(self._free, self.collision.clearance),
-            np.zeros_like(self._free),
-        )
-        self._cut, self._approach_time, self._max_sag = False, APPROACH_TIME_S, MAX_SAG_M
+        self._keep = np.full_like(self._free, self.collision.clearance)
+        self._sag = np.zeros_like(self._free)
+        self._cut = False
+        self._approach_time = APPROACH_TIME_S
+        self._max_sag = MAX_SAG_M
 
     def allow_start_clearance(self) -> None:
-        """Let the robot go back slowly: it may come as near to everything as it was at the start."""
-        self._approach_time, self._max_sag = BACK_APPROACH_TIME_S, 0.0
+        """Let the robot go back slowly: it may come as near to everything as it was at the
+        start.
+        """
+        self._approach_time = BACK_APPROACH_TIME_S
+        self._max_sag = 0.0
         self._keep = np.minimum(self._keep, self._start_free - MAX_APPROACH_M)
 
     def step(self, target: Array, qpos: Array, dt: float) -> Array:
@@ -379,10 +417,8 @@ class CollisionGuard:
         speed = self.config.blend_speed if self._cut else self.safety.speed
         move = np.clip(target - self.qpos, -speed * dt, speed * dt)
         if self._try(move, STEP_SHARES[:1], dt):
-            self.obstacle, self._cut = (
-                "",
-                self._cut and bool(np.abs(target - self.qpos).max() > speed * dt),
-            )
+            self.obstacle = ""
+            self._cut = self._cut and bool(np.abs(target - self.qpos).max() > speed * dt)
             return self.qpos
         self._cut = True
         free = self.collision.along((self.qpos + move)[None])
@@ -398,22 +434,25 @@ class CollisionGuard:
         return np.where(self._free > keep, shrunk, self._free - 1e-9)
 
     def _try(self, move: Array, shares: tuple[float, ...], dt: float) -> bool:
-        """Make the largest of these shares of a move that leaves enough free space; return False if none does."""
+        """Make the largest of these shares of a move that leaves enough free space; return False
+        if none does.
+        """
         for share in shares:
             posture = self.qpos + share * move
             free = self.collision.along(posture[None])
             if (free >= self._floor(dt)).all():
-                self.qpos, self._free = posture, free
+                self.qpos = posture
+                self._free = free
                 return True
         return False
 
     def _along_obstacle(self, move: Array, dt: float) -> Array:
         """Return the step (n,) rad without its parts towards the obstacles, each in turn."""
-        floor, moved = self._floor(dt), np.flatnonzero(move)
+        floor = self._floor(dt)
+        moved = np.flatnonzero(move)
         rows = self.qpos + GRADIENT_STEP_RAD * np.eye(len(move))[moved]
-        slope = (
-            self.collision.distances(rows) - self._free
-        ) / GRADIENT_STEP_RAD  # (moved, pairs + shells)
+        # (moved, pairs + shells)
+        slope = (self.collision.distances(rows) - self._free) / GRADIENT_STEP_RAD
         step = move[moved]
         for _ in range(3):
             short = floor - self._free - step @ slope
@@ -433,7 +472,8 @@ def _describe_changes(wanted: Motion, fitted: Motion) -> str:
     slower = fitted.duration / wanted.duration
     if slower > 1.01:
         sentences.append(f"played {slower:.2f} times slower")
-    span, was = np.ptp(fitted.ctrl, axis=0), np.ptp(wanted.ctrl, axis=0)
+    span = np.ptp(fitted.ctrl, axis=0)
+    was = np.ptp(wanted.ctrl, axis=0)
     share = float((span[was > NO_MOVEMENT] / was[was > NO_MOVEMENT]).min(initial=1.0))
     if share < 0.99:
         sentences.append(f"brought down to {share:.2f} of its size")

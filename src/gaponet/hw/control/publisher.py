@@ -1,4 +1,6 @@
-"""Lock that admits one controller per robot on this machine; the system releases it when its holder ends."""
+"""Lock that admits one controller per robot on this machine; the system releases it when its
+holder ends.
+"""
 
 from __future__ import annotations
 
@@ -42,7 +44,9 @@ def sole_publisher(address: str) -> Iterator[int]:
 
 
 def _device(address: str) -> str:
-    """Return the number of the device at an address, as a word; the address itself if it is no device."""
+    """Return the number of the device at an address, as a word; the address itself if it is no
+    device.
+    """
     try:
         status = os.stat(address)
     except (OSError, ValueError):
@@ -55,11 +59,13 @@ def _device(address: str) -> str:
 def _open_lock(path: Path) -> int:
     """Return the descriptor of a lock file, which is made if it is missing.
 
-    It is opened for reading only: that suffices for a lock, and other users may only read this user's file.
+    It is opened for reading only: that suffices for a lock, and other users may only read this
+    user's file.
     """
     for _ in range(3):
         try:
-            # Any user of the computer may have put something there. Opening a pipe for reading would wait for a writer.
+            # Any user of the computer may have put something there. Opening a pipe for reading
+            # would wait for a writer.
             descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
         except FileNotFoundError:
             pass

@@ -1,4 +1,6 @@
-"""Recording of a run: readings, commands and events of every period, as a Log of the motion and as files."""
+"""Recording of a run: readings, commands and events of every period, as a Log of the motion and as
+files.
+"""
 
 from __future__ import annotations
 
@@ -46,7 +48,8 @@ class Recording:
         missed: Number of periods in which the loop did not start at all.
         late: How late each period started, s.
         meta: Further values of the caller (unit id, payload, gains, model).
-        disobedience: How the robot disobeyed, in words; such a recording is no data. Empty if it obeyed.
+        disobedience: How the robot disobeyed, in words; such a recording is no data. Empty if it
+            obeyed.
         rows: Readings and commands of every period.
     """
 
@@ -80,12 +83,15 @@ class Recording:
         return next((e for e in self.events if e.kind in FAULT_KINDS), None)
 
     def log(self, source: str = "controller") -> Log:
-        """Return the periods of the phase `run` as a Log of the commanded joints; its time begins with them, s.
+        """Return the periods of the phase `run` as a Log of the commanded joints; its time begins
+        with them, s.
 
-        A row has the state read at the start of a period and the command sent in it, as to_sequence requires.
+        A row has the state read at the start of a period and the command sent in it, as to_sequence
+        requires.
 
         Raises:
-            LogError: The robot did not obey; the phase has fewer than two periods; or the disk was full.
+            LogError: The robot did not obey; the phase has fewer than two periods; or the disk was
+                full.
         """
         if self.disobedience:
             raise LogError(
@@ -106,7 +112,8 @@ class Recording:
                 f"{source}: {len(rows)} periods of phase 'run', nothing to learn from{why}"
             )
         at = [self.joint_names.index(name) for name in self.commanded]
-        time, values = np.array(rows["time"]), {"ctrl": rows["ctrl"][:, at]}
+        time = np.array(rows["time"])
+        values = {"ctrl": rows["ctrl"][:, at]}
         for name in READINGS:
             column = rows[name][:, at]
             if np.isfinite(column).all():  # not every bus measures all of them
@@ -129,19 +136,34 @@ class Recording:
         late = np.array(self.late or [0.0])
         ages = table["time"] - table["state_time"] if len(table) else np.zeros(1)
         incomplete = {"not_whole": self.rows.error.strerror} if self.rows.error else {}
-        return incomplete | self.meta | {
-            "robot": self.robot, "virtual": self.virtual, "obeyed": not self.disobedience, "rate_hz": 1 / self.dt,
-            "periods": len(table), "missed": self.missed,
-            "late_ms": {q: round(float(np.quantile(late, p)) * 1e3, 3) for q, p in QUANTILES.items()},
-            "state_age_ms": {q: round(float(np.quantile(ages, p)) * 1e3, 3) for q, p in QUANTILES.items()},
-            "refused_messages": int(table["refused"][-1]) if len(table) else 0,
-            "events": [[round(e.time - start, 4), e.phase, e.kind, e.text] for e in self.events],
-        }  # fmt: skip
+        return (
+            incomplete
+            | self.meta
+            | {
+                "robot": self.robot,
+                "virtual": self.virtual,
+                "obeyed": not self.disobedience,
+                "rate_hz": 1 / self.dt,
+                "periods": len(table),
+                "missed": self.missed,
+                "late_ms": {
+                    q: round(float(np.quantile(late, p)) * 1e3, 3) for q, p in QUANTILES.items()
+                },
+                "state_age_ms": {
+                    q: round(float(np.quantile(ages, p)) * 1e3, 3) for q, p in QUANTILES.items()
+                },
+                "refused_messages": int(table["refused"][-1]) if len(table) else 0,
+                "events": [
+                    [round(e.time - start, 4), e.phase, e.kind, e.text] for e in self.events
+                ],
+            }
+        )
 
     def save(self, folder: Path, name: str) -> Path:
         """Write NAME.parquet for gaponet import, all periods as NAME.cycles.npy, and NAME.json.
 
-        NAME.parquet is written if the phase `run` was reached. If NAME exists, NAME-2 is used, and so on.
+        NAME.parquet is written if the phase `run` was reached. If NAME exists, NAME-2 is used, and
+        so on.
 
         Returns:
             The path of NAME.parquet.
@@ -184,6 +206,9 @@ class Recording:
                     json.dumps(self.summary(), indent=1, ensure_ascii=False) + "\n",
                 )
             except OSError as error:
-                explanation = f"{error.strerror or error}; all periods that were written are in {name}{ROWS_SUFFIX}"
+                explanation = (
+                    f"{error.strerror or error}; all periods that were written are in "
+                    f"{name}{ROWS_SUFFIX}"
+                )
                 raise OSError(error.errno, explanation, error.filename) from error
             return path

@@ -1,7 +1,8 @@
 """Rows of a recording: each period is appended to a file, so that memory holds about a second only.
 
-The file is a NumPy .npy with one row per period and a named column per number (qpos.elbow_flex). numpy.load can read it
-at any time, also after a kill or on a full disk: its header counts the complete rows.
+The file is a NumPy .npy with one row per period and a named column per number (qpos.elbow_flex).
+numpy.load can read it at any time, also after a kill or on a full disk: its header counts the
+complete rows.
 """
 
 from __future__ import annotations
@@ -28,7 +29,9 @@ READINGS = ("qpos", "qvel", "tau", "temperature")
 
 
 class Row(NamedTuple):
-    """One period: its start, s, phase, target and command (n) rad (None: no position command), and state."""
+    """One period: its start, s, phase, target and command (n) rad (None: no position command), and
+    state.
+    """
 
     time: float
     phase: str
@@ -59,11 +62,9 @@ class Rows:
         self._columns = scalars + [
             (f"{name}.{joint}", "<f8") for name in vectors for joint in joint_names
         ]
-        self._chunk, self._count, self._absent = (
-            np.empty(CHUNK_ROWS, self._dtype),
-            0,
-            np.full(n, np.nan),
-        )
+        self._chunk = np.empty(CHUNK_ROWS, self._dtype)
+        self._count = 0
+        self._absent = np.full(n, np.nan)
         self._file: IO[bytes] | None = None
         self.path: Path | None = None
         self.error: OSError | None = None
@@ -72,7 +73,8 @@ class Rows:
         self._writer: threading.Thread | None = None
 
     def write_to(self, folder: Path) -> None:
-        """Make the file in a folder; without this call it is a temporary one, which ends with the process.
+        """Make the file in a folder; without this call it is a temporary one, which ends with the
+        process.
 
         Raises:
             OSError: No file can be made there.
@@ -86,15 +88,24 @@ class Rows:
         target, ctrl = (self._absent if x is None else x for x in (row.target, row.ctrl))
         state = row.state
         self._chunk[self._count % CHUNK_ROWS] = (
-            row.time, state.time, state.tilt, state.refused, row.phase, target, ctrl,
+            row.time,
+            state.time,
+            state.tilt,
+            state.refused,
+            row.phase,
+            target,
+            ctrl,
             *(getattr(state, name) for name in READINGS),
-        )  # fmt: skip
+        )
         self._count += 1
         if self._count % CHUNK_ROWS == 0:
             self._enqueue(CHUNK_ROWS)
 
     def table(self) -> Array:
-        """Return all rows as a structured array (rows,); columns of joints are (rows, n). It is read from the file."""
+        """Return all rows as a structured array (rows,); columns of joints are (rows, n).
+
+        It is read from the file.
+        """
         if self._file is None:
             return self._chunk[: self._count]
         self._flush()
@@ -152,7 +163,8 @@ class Rows:
             for name in ("target", "ctrl")
         )
         qpos, qvel, tau, temperature = (np.array(record[name]) for name in READINGS)
-        refused, tilt = int(record["refused"]), float(record["tilt"])
+        refused = int(record["refused"])
+        tilt = float(record["tilt"])
         state = State(float(record["state_time"]), qpos, qvel, tau, temperature, refused, tilt)
         return Row(float(record["time"]), str(record["phase"]), target, ctrl, state)
 
@@ -169,18 +181,19 @@ class Rows:
 
     def _write(self) -> None:
         assert self._file
-        descriptor, size = self._file.fileno(), self._dtype.itemsize
+        descriptor = self._file.fileno()
+        size = self._dtype.itemsize
         while (data := self._pending.get()) is not None:
-            at, done = self._header_size + self._written * size, 0
+            at = self._header_size + self._written * size
+            done = 0
             try:
                 while done < len(data) and not self.error:
                     done += os.pwrite(descriptor, data[done:], at + done)
             except OSError as error:
                 self.error = error
             self._written += done // size
-            with suppress(
-                OSError
-            ):  # overwrites, which works on a full disk unless its file system copies
+            # overwrites, which works on a full disk unless its file system copies
+            with suppress(OSError):
                 os.pwrite(descriptor, self._header(self._written), 0)
             self._pending.task_done()
         self._pending.task_done()

@@ -4,14 +4,15 @@ A position command is sent only if it is within
 
 1. the joint range less a margin,
 2. the command rate: |u − u_previous| ≤ speed · dt,
-3. the torque that it requests: |kp (u − q) − kd q̇| ≤ share · effort limit, wherever the joint can be since it was
-   measured, accelerating at most as `acceleration` allows,
+3. the torque that it requests: |kp (u − q) − kd q̇| ≤ share · effort limit, wherever the joint can
+   be since it was measured, accelerating at most as `acceleration` allows,
 
-all three, for every joint. Each is an interval; the command is moved into their intersection. Range and rate always
-intersect, because the previous command was within the range. The torque interval follows the measured joint and may
-leave the other two: the joint was pushed away, or moves so fast that braking alone exceeds the limit. Then no position
-command is safe, and `feasible` is False: the controller damps the robot instead. So no limit ever yields to another.
-Size and rate of a model's correction are bounded before that; the three limits come last and may cut it further.
+all three, for every joint. Each is an interval; the command is moved into their intersection. Range
+and rate always intersect, because the previous command was within the range. The torque interval
+follows the measured joint and may leave the other two: the joint was pushed away, or moves so fast
+that braking alone exceeds the limit. Then no position command is safe, and `feasible` is False: the
+controller damps the robot instead. So no limit ever yields to another. Size and rate of a model's
+correction are bounded before that; the three limits come last and may cut it further.
 """
 
 from __future__ import annotations
@@ -66,11 +67,13 @@ class SafetyConfig:
     stale: float = 2.0
     """Control periods after which a state is too old."""
     frozen: int = 2
-    """Control periods with new messages but equal readings until a state counts as frozen; 0: never."""
+    """Control periods with new messages but equal readings until a state counts as frozen; 0:
+    never."""
     frozen_travel: float = 0.3
     """Way of a command while nothing moves, rad; on coarse encoders, whose readings may repeat."""
     frozen_joint: float = 0.1
-    """Way of one joint's command or velocity while its position stands still, rad; on fine encoders."""
+    """Way of one joint's command or velocity while its position stands still, rad; on fine
+    encoders."""
     joint_speed: float = 12.0
     """A joint that moves faster between two states has jumped, rad/s."""
     jump: float = 0.05
@@ -84,8 +87,8 @@ class SafetyConfig:
     tracking_time: float = 0.25
     """… for longer than this, s."""
     following: float = 0.25
-    """Share of its command's way that a joint must go, on robots whose commands cannot be read back; 0: not checked,
-    for joints that press on something."""
+    """Share of its command's way that a joint must go, on robots whose commands cannot be read
+    back; 0: not checked, for joints that press on something."""
     overrun: float = 2.0
     """Control periods by which a period may start late."""
     refused: int = 20
@@ -135,8 +138,10 @@ class Limits:
 
         Args:
             robot: Ranges and effort limits.
-            gains: kp and kd of the real servos, all joints (n) each; default the robot's, before identification.
-            qpos_range: Ranges that the real robot reports, all joints (n, 2) rad; they narrow those of the MJCF.
+            gains: kp and kd of the real servos, all joints (n) each; default the robot's, before
+                identification.
+            qpos_range: Ranges that the real robot reports, all joints (n, 2) rad; they narrow those
+                of the MJCF.
 
         Raises:
             UsageError: The margin is wider than the range of a joint.
@@ -147,27 +152,34 @@ class Limits:
         ranges = np.stack(
             [robot.qpos_range, robot.qpos_range if qpos_range is None else qpos_range]
         )[:, at]
-        low, high = (
-            ranges[..., 0].max(axis=0) + config.margin,
-            ranges[..., 1].min(axis=0) - config.margin,
-        )
+        low = ranges[..., 0].max(axis=0) + config.margin
+        high = ranges[..., 1].min(axis=0) - config.margin
         if (low > high).any():
             joint = joints[int(np.argmax(low > high))]
             raise UsageError(
-                f"safety: margin {config.margin} leaves nothing of the range of {joint}; make it smaller"
+                f"safety: margin {config.margin} leaves nothing of the range of {joint}; make it "
+                "smaller"
             )
         full = lambda value: np.full(len(joints), value)  # noqa: E731
         return cls(
-            low, high, full(config.speed), config.torque_share * nominal.effort_limit[at], kp[at], kd[at],
-            full(config.delta), full(config.delta_rate), full(config.acceleration),
-        )  # fmt: skip
+            low,
+            high,
+            full(config.speed),
+            config.torque_share * nominal.effort_limit[at],
+            kp[at],
+            kd[at],
+            full(config.delta),
+            full(config.delta_rate),
+            full(config.acceleration),
+        )
 
 
 class LimitedCommand(NamedTuple):
     """Result of limit_command, (..., n) each.
 
     Attributes:
-        ctrl: The command to send where feasible, rad; else the previous one within range, which must not be sent.
+        ctrl: The command to send where feasible, rad; else the previous one within range, which
+            must not be sent.
         feasible: A command within all three limits exists.
     """
 
@@ -176,7 +188,9 @@ class LimitedCommand(NamedTuple):
 
 
 def limit_delta(delta: Array, previous: Array, dt: float, limits: Limits) -> Array:
-    """Return a correction (..., n) rad bounded in size and rate; NaN becomes the previous correction."""
+    """Return a correction (..., n) rad bounded in size and rate; NaN becomes the previous
+    correction.
+    """
     step = limits.delta_rate * dt
     wanted = np.clip(
         np.where(np.isfinite(delta), delta, previous), previous - step, previous + step
@@ -204,20 +218,18 @@ def limit_command(
     """
     before = np.clip(previous, limits.low, limits.high)
     step = limits.speed * dt * (1 - RELATIVE_ROUNDING)
-    low, high = np.maximum(limits.low, before - step), np.minimum(limits.high, before + step)
+    low = np.maximum(limits.low, before - step)
+    high = np.minimum(limits.high, before + step)
     with np.errstate(divide="ignore", invalid="ignore"):
-        brake, half = (
-            limits.kd * qvel / limits.kp,
-            limits.effort * (1 - RELATIVE_ROUNDING) / limits.kp,
-        )
-        # As measured, and where the joint can be by now: it went on and may have accelerated either way.
+        brake = limits.kd * qvel / limits.kp
+        half = limits.effort * (1 - RELATIVE_ROUNDING) / limits.kp
+        # As measured, and where the joint can be by now: it went on and may have accelerated either
+        # way.
         spread = limits.acceleration * age * (age / 2 + limits.kd / limits.kp)
         for centre, width in ((qpos + brake, half), (qpos + qvel * age + brake, half - spread)):
             rounding = RELATIVE_ROUNDING * np.abs(centre)
-            low, high = (
-                np.maximum(low, centre - width + rounding),
-                np.minimum(high, centre + width - rounding),
-            )
+            low = np.maximum(low, centre - width + rounding)
+            high = np.minimum(high, centre + width - rounding)
         finite = np.isfinite(target) & np.isfinite(previous) & np.isfinite(qpos) & np.isfinite(qvel)
         feasible = finite & (low <= high)
         ctrl = np.where(feasible, np.minimum(np.maximum(target, low), high), before)
@@ -225,9 +237,11 @@ def limit_command(
 
 
 def damping_gains(kd: Array, qvel: Array, effort: Array) -> Array:
-    """Return gains (n), at most kd, whose torque kd |q̇| stays within the effort limits; kd where q̇ is unknown.
+    """Return gains (n), at most kd, whose torque kd |q̇| stays within the effort limits; kd where
+    q̇ is unknown.
 
-    A speed above MAX_BELIEVED_SPEED_RAD_S is a wrong reading, and counts as that speed: a joint always brakes.
+    A speed above MAX_BELIEVED_SPEED_RAD_S is a wrong reading, and counts as that speed: a joint
+    always brakes.
     """
     speed = np.abs(np.nan_to_num(qvel, nan=0.0, posinf=0.0, neginf=0.0))
     believed = np.clip(speed, MIN_SPEED_RAD_S, MAX_BELIEVED_SPEED_RAD_S)
@@ -235,14 +249,17 @@ def damping_gains(kd: Array, qvel: Array, effort: Array) -> Array:
 
 
 # Faults: what each one puts in doubt, what may still be used afterwards, and how the robot ends.
-#
-# After a fault no joint is sent to a position, neither to a target nor to a measured one: a wrong reading would move
-# the joint. The robot damps. Damping needs no position. A measured speed may only lower a damping gain, and only as
-# far as damping_gains allows. docs/deploy-safety.md has the same table.
+# After a fault no joint is sent to a position, neither to a target nor to a measured one: a wrong
+# reading would move the joint. The robot damps. Damping needs no position. A measured speed may
+# only lower a damping gain, and only as far as damping_gains allows. docs/deploy-safety.md has the
+# same table.
 
 
 class Ending(StrEnum):
-    """What stops the robot after a fault. An SO-101 has no brake: it is lowered, or let go at once."""
+    """What stops the robot after a fault.
+
+    An SO-101 has no brake: it is lowered, or let go at once.
+    """
 
     DAMP_OR_LOWER = "damp; lower an SO-101"
     DAMP_OR_LET_GO = "damp; let an SO-101 go at once"
@@ -260,7 +277,8 @@ class FaultRule:
     ending: Ending
     """What is done."""
     is_data: bool = True
-    """The recording until the fault can be trusted; False where a joint did not go where it was sent."""
+    """The recording until the fault can be trusted; False where a joint did not go where it was
+    sent."""
 
 
 LAST_COMMAND = "the last command, without stiffness; damping; torque limits"
@@ -350,24 +368,24 @@ class StateMonitor:
         Args:
             commanded: Indices of the commanded joints.
             dt: Control period, s.
-            noisy: Equal readings count as frozen at once; else only after the command has moved by frozen_travel.
+            noisy: Equal readings count as frozen at once; else only after the command has moved by
+                frozen_travel.
         """
-        self.names, self.commanded, self.dt, self.config, self.noisy = (
-            joint_names,
-            commanded,
-            dt,
-            config,
-            noisy,
-        )
+        self.names = joint_names
+        self.commanded = commanded
+        self.dt = dt
+        self.config = config
+        self.noisy = noisy
         self._last: State | None = None
         self._last_ctrl: Array | None = None
-        self._equal_states, self._travel = (
-            0,
-            np.zeros(len(commanded)),
-        )  # of all readings; rad of commands meanwhile
-        # Of joints whose position stands still: the command then, the integral of the velocity since, states since.
+        # of all readings; rad of commands meanwhile
+        self._equal_states = 0
+        self._travel = np.zeros(len(commanded))
+        # Of joints whose position stands still: the command then, the integral of the velocity
+        # since, states since.
         self._anchor: Array | None = None
-        self._integral, self._still_states = np.zeros(len(commanded)), np.zeros(len(commanded), int)
+        self._integral = np.zeros(len(commanded))
+        self._still_states = np.zeros(len(commanded), int)
         self._tracking_s = 0.0  # for which a joint has been far from its command
         self._refused: list[tuple[float, int]] = []  # time, s, and messages refused until then
 
@@ -384,10 +402,12 @@ class StateMonitor:
         Args:
             now: s.
             state: The newest one.
-            ctrl: The command in force since the last period, (len(commanded),) rad; None where there is none.
+            ctrl: The command in force since the last period, (len(commanded),) rad; None where
+                there is none.
             late: How late this period starts, s.
-            requested: Where the joints are asked to be, as `ctrl`, but without the torque limit. That limit keeps the
-                command near the measured position, wherever a wrong reading goes; default the command.
+            requested: Where the joints are asked to be, as `ctrl`, but without the torque limit.
+                That limit keeps the command near the measured position, wherever a wrong reading
+                goes; default the command.
         """
         fault = (
             self.overrun(late)
@@ -402,11 +422,14 @@ class StateMonitor:
             or self._tracking(state, ctrl, requested)
             or self._checksum(now, state)
         )
-        self._last, self._last_ctrl = state, ctrl
+        self._last = state
+        self._last_ctrl = ctrl
         return fault
 
     def overrun(self, late: float) -> Fault | None:
-        """Return a fault if a period that was due `late` s ago may not send its command any more."""
+        """Return a fault if a period that was due `late` s ago may not send its command any
+        more.
+        """
         if late > self.config.overrun * self.dt:
             return Fault(
                 "overrun",
@@ -464,7 +487,8 @@ class StateMonitor:
             not np.array_equal(getattr(state, name), getattr(last, name))
             for name in ("qpos", "qvel", "tau")
         ):
-            self._equal_states, self._travel[:] = 0, 0.0
+            self._equal_states = 0
+            self._travel[:] = 0.0
             return None
         self._equal_states += 1
         if ctrl is not None and self._last_ctrl is not None:
@@ -475,8 +499,11 @@ class StateMonitor:
         return Fault("frozen", f"{self._equal_states + 1} states in a row read exactly the same")
 
     def _frozen_joint(self, state: State, ctrl: Array | None) -> Fault | None:
-        """Return a fault if one encoder stands still while its command or the integral of its velocity goes on."""
-        qpos, last = state.qpos[self.commanded], self._last
+        """Return a fault if one encoder stands still while its command or the integral of its
+        velocity goes on.
+        """
+        qpos = state.qpos[self.commanded]
+        last = self._last
         if last is not None and state.time <= last.time:
             return None  # the same state again
         if last is None or ctrl is None or not self.noisy:
@@ -485,7 +512,8 @@ class StateMonitor:
         moved = qpos != last.qpos[self.commanded]
         anchor = ctrl if self._anchor is None else np.where(moved, ctrl, self._anchor)
         integral = self._integral + state.qvel[self.commanded] * (state.time - last.time)
-        self._anchor, self._integral = anchor, np.where(moved, 0.0, integral)
+        self._anchor = anchor
+        self._integral = np.where(moved, 0.0, integral)
         self._still_states = np.where(moved, 0, self._still_states + 1)
         distance = np.maximum(np.abs(ctrl - anchor), np.abs(self._integral))
         beyond = np.where(self._still_states < MIN_STILL_STATES, 0.0, distance)
@@ -500,7 +528,8 @@ class StateMonitor:
         )
 
     def _tracking(self, state: State, ctrl: Array | None, requested: Array | None) -> Fault | None:
-        """Return a fault if a joint is far from its command, or from where it is asked to be without coming nearer.
+        """Return a fault if a joint is far from its command, or from where it is asked to be
+        without coming nearer.
 
         A fast joint may lag far behind the latter while it comes nearer at its full torque.
         """
@@ -530,8 +559,8 @@ class StateMonitor:
     def _mean_speed(self, state: State) -> Array:
         """Return the speed of the commanded joints since the last state, rad/s.
 
-        At a low control rate a joint reaches each command and stands again when it is read: its velocity then says
-        nothing of how it moves.
+        At a low control rate a joint reaches each command and stands again when it is read: its
+        velocity then says nothing of how it moves.
         """
         qvel = state.qvel[self.commanded]
         if self._last is None or state.time <= self._last.time:

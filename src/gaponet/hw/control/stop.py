@@ -19,7 +19,10 @@ STOP_SIGNALS = tuple(
 
 
 class StopRequest:
-    """Latched request to stop; nothing clears it. Safe to call from any thread and from signal handlers."""
+    """Latched request to stop; nothing clears it.
+
+    Safe to call from any thread and from signal handlers.
+    """
 
     def __init__(self) -> None:
         self.reason: str | None = None
@@ -32,7 +35,9 @@ class StopRequest:
 
 @contextmanager
 def stop_on_signals(stop: StopRequest) -> Iterator[None]:
-    """Let STOP_SIGNALS request a stop instead of ending or suspending the process; works in the main thread only."""
+    """Let STOP_SIGNALS request a stop instead of ending or suspending the process; works in the
+    main thread only.
+    """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -49,7 +54,8 @@ def stop_on_signals(stop: StopRequest) -> Iterator[None]:
 
 
 class StopKeys:
-    """Any key on the terminal requests a stop, also Ctrl-C, Ctrl-Z and Ctrl-S; so does the end of the terminal.
+    """Any key on the terminal requests a stop, also Ctrl-C, Ctrl-Z and Ctrl-S; so does the end of
+    the terminal.
 
     It is polled once per period. Without a terminal it does nothing.
     """
@@ -67,11 +73,12 @@ class StopKeys:
             self._settings_before = termios.tcgetattr(self._terminal)
             mode = termios.tcgetattr(self._terminal)
             mode[0] &= ~(termios.IXON | termios.IGNCR)  # input flags
-            mode[3] &= ~(
-                termios.ICANON | termios.ECHO | termios.ISIG | termios.IEXTEN
-            )  # local flags
-            mode[6][termios.VMIN], mode[6][termios.VTIME] = 1, 0
-            # TCSANOW: keys typed before this count, and output that Ctrl-S holds back is not waited for.
+            # local flags
+            mode[3] &= ~(termios.ICANON | termios.ECHO | termios.ISIG | termios.IEXTEN)
+            mode[6][termios.VMIN] = 1
+            mode[6][termios.VTIME] = 0
+            # TCSANOW: keys typed before this count, and output that Ctrl-S holds back is not waited
+            # for.
             termios.tcsetattr(self._terminal, termios.TCSANOW, mode)
         return self
 

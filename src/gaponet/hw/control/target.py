@@ -1,4 +1,6 @@
-"""Targets of one run: readiness for the first command, then for each period the target or the end of the phase."""
+"""Targets of one run: readiness for the first command, then for each period the target or the end
+of the phase.
+"""
 
 from __future__ import annotations
 
@@ -32,15 +34,17 @@ FAR_RAD = 0.4  # … this far to the first target: at that weight more than fric
 FULL_WEIGHT = 1.0 - 1e-9
 # of the run, after which the estimated payload is compared with the stated one
 PAYLOAD_CHECK_S = 2.0
+# by Driver.at_end
 END_TEXTS = {
     "hand_over": "held while it is handed over",
     "hold": "hold",
     "damp": "damp",
-}  # by Driver.at_end
+}
 
 
 class Readiness:
-    """Waits for good states in a row, a prepared compensator, a first target, and a clear path to it.
+    """Waits for good states in a row, a prepared compensator, a first target, and a clear path to
+    it.
 
     Attributes:
         since: Start of the wait for the robot, s.
@@ -48,27 +52,33 @@ class Readiness:
     """
 
     def __init__(self, context: Context, output: Output) -> None:
-        self.context, self.output = context, output
+        self.context = context
+        self.output = output
         self.since = 0.0
         self.plan: Plan | None = None
         self._search: Search[Plan] | None = None
         self._prepared = context.compensator is None
-        self._good_states, self._fault = 0, NO_STATE
+        self._good_states = 0
+        self._fault = NO_STATE
 
     def count(self, fault: Fault | None) -> None:
         """Count a state; a fault begins anew."""
         self._good_states, self._fault = (0, fault) if fault else (self._good_states + 1, NO_STATE)
 
     def first_target(self, now: float, state: State, policy: Policy) -> Array | Fault | None:
-        """Return the first target, (n) rad, if the robot may go there now; None: wait; a fault: it may not."""
-        compensator, planner = self.context.compensator, self.context.planner
+        """Return the first target, (n) rad, if the robot may go there now; None: wait; a fault: it
+        may not.
+        """
+        compensator = self.context.compensator
+        planner = self.context.planner
         if self._good_states < MIN_GOOD_STATES:
             never = Fault(self._fault.kind, f"never ready: {self._fault.text}")
             return never if now - self.since > MAX_WAIT_S else None
         # takes longer than a period; then wait for fresh states again
         if compensator and not self._prepared:
             compensator.reset(state.qpos, self.context.payload_mass)
-            self._prepared, self._good_states = True, 0
+            self._prepared = True
+            self._good_states = 0
             return None
         first = policy(0, state)
         if isinstance(first, NotYet):
@@ -86,7 +96,9 @@ class Readiness:
         return first
 
     def _update_plan(self, first: Array, state: State, now: float) -> Fault | None:
-        """Let a plan begin where the robot is, if there is a planner; this may take several periods."""
+        """Let a plan begin where the robot is, if there is a planner; this may take several
+        periods.
+        """
         if self.plan is not None:
             moved = np.abs(state.qpos - self.plan.start)[self.context.joints]
             joint = self.context.driver.commanded[int(moved.argmax())]
@@ -137,8 +149,12 @@ class TargetGenerator:
         state: State,
         first: Array,
     ) -> None:
-        """Begin where the robot is and go to the first target, (n) rad: by the paths of a plan, or straight."""
-        self.context, self.following, self.plan = context, following, plan
+        """Begin where the robot is and go to the first target, (n) rad: by the paths of a plan, or
+        straight.
+        """
+        self.context = context
+        self.following = following
+        self.plan = plan
         self.start = self._last = self._origin = state.qpos[context.joints]
         self.path = (
             plan.approach if plan else self._straight(self.start, first[context.joints], state)
@@ -174,7 +190,8 @@ class TargetGenerator:
 
     def go_back(self, state: State) -> None:
         """Begin the way back to the start."""
-        planner, joints = self.context.planner, self.context.joints
+        planner = self.context.planner
+        joints = self.context.joints
         self._origin = self._last
         self.path = (self.plan and self.plan.retreat) or self._straight(
             self._last, self.start, state
@@ -185,7 +202,9 @@ class TargetGenerator:
             self._search = planner.back(*ends) if self.context.dt >= MIN_SEARCH_PERIOD_S else None
 
     def _blend_in(self, state: State, policy: Policy) -> Array | PhaseChange | Fault:
-        config, dt, following = self.context.config, self.context.dt, self.following
+        config = self.context.config
+        dt = self.context.dt
+        following = self.following
         arrived = self._progress >= self.path.duration + config.settle
         if arrived and self._handed > FULL_WEIGHT:
             return PhaseChange(Trigger.ARRIVED, "motion")
@@ -222,9 +241,8 @@ class TargetGenerator:
             return target
         if not self._checked_payload and n * self.context.dt >= PAYLOAD_CHECK_S:
             self._checked_payload = True
-            if doubt := getattr(
-                self.context.compensator, "doubt", ""
-            ):  # not every compensator estimates the payload
+            # not every compensator estimates the payload
+            if doubt := getattr(self.context.compensator, "doubt", ""):
                 self.remarks.append(f"compensation: {doubt}")
         if target is not None:
             self._last = np.array(target[self.context.joints], float)
@@ -241,7 +259,9 @@ class TargetGenerator:
                 return self._end(f"where it is: {error}")
             if path is None:
                 return self._last
-            self._search, self._back_since, self.path = None, n, path
+            self._search = None
+            self._back_since = n
+            self.path = path
         passed = (n - self._back_since) * self.context.dt
         if passed <= self.path.duration + self.context.config.settle:
             return self._on_path(passed, self._origin, self.start)
@@ -276,12 +296,17 @@ class TargetGenerator:
         return self._last
 
     def _straight(self, start: Array, goal: Array, state: State) -> Trajectory:
-        config, joints = self.context.config, self.context.joints
+        config = self.context.config
+        joints = self.context.joints
         points = np.stack([state.qpos_with(joints, start), state.qpos_with(joints, goal)])
         return Trajectory.minimum_jerk(points, config.blend_speed, np.inf, config.blend)
 
     def _on_path(self, passed: float, start: Array, goal: Array) -> Array:
-        """Return the place on the path after some s, with its ends moved to the true start and goal."""
-        joints, share = self.context.joints, float(blend(np.array(passed / self.path.duration)))
-        first, last = self.path.points[0][joints], self.path.points[-1][joints]
+        """Return the place on the path after some s, with its ends moved to the true start and
+        goal.
+        """
+        joints = self.context.joints
+        share = float(blend(np.array(passed / self.path.duration)))
+        first = self.path.points[0][joints]
+        last = self.path.points[-1][joints]
         return self.path.at(passed)[joints] + (1 - share) * (start - first) + share * (goal - last)

@@ -1,11 +1,12 @@
 """Watchdog: a second process that damps the robot if the controller dies or hangs.
 
-In each period, from just before its first command on, the controller sends the watchdog a byte through a pipe: the
-weight of that command. The watchdog answers each byte, so that the controller notices a watchdog that hangs. The pipe
-closes when the controller's process ends, however it ends; if it hangs, no byte comes. Then the watchdog damps the
-robot, as after a fault that is not the robot's own, until the robot confirms it, for at most MAX_RETRY_S. Without any
-byte nothing was commanded, and the watchdog sends nothing. It holds the controller's lock as long as it lives, so that
-no other controller starts while it damps.
+In each period, from just before its first command on, the controller sends the watchdog a byte
+through a pipe: the weight of that command. The watchdog answers each byte, so that the controller
+notices a watchdog that hangs. The pipe closes when the controller's process ends, however it ends;
+if it hangs, no byte comes. Then the watchdog damps the robot, as after a fault that is not the
+robot's own, until the robot confirms it, for at most MAX_RETRY_S. Without any byte nothing was
+commanded, and the watchdog sends nothing. It holds the controller's lock as long as it lives, so
+that no other controller starts while it damps.
 """
 
 from __future__ import annotations
@@ -24,14 +25,17 @@ from gaponet.base import child_process
 from gaponet.hw.control.driver import Driver, DriverError
 
 RELEASE = b"\xff"  # from the controller: it has stopped, and the watchdog ends
-READY, ANSWER, FIRED = b"\x01", b"\x02", b"\x03"  # from the watchdog
+# from the watchdog
+READY = b"\x01"
+ANSWER = b"\x02"
+FIRED = b"\x03"
 WEIGHT_STEPS = 200  # a heartbeat is the weight in steps of 1/200
 MAX_RETRY_S = 600.0  # for which it tries to damp a robot that does not confirm it
-DAMP_INTERVAL_S, RETRY_INTERVAL_S = (
-    0.01,
-    0.1,
-)  # between two messages, and after a message that failed
-READY_TIMEOUT_S, END_TIMEOUT_S = 20.0, 5.0
+# between two messages, and after a message that failed
+DAMP_INTERVAL_S = 0.01
+RETRY_INTERVAL_S = 0.1
+READY_TIMEOUT_S = 20.0
+END_TIMEOUT_S = 5.0
 
 
 class Watchdog:
@@ -42,20 +46,27 @@ class Watchdog:
         Args:
             spec: How to open the robot (Driver.watchdog).
             lock: Descriptor of the controller's lock.
-            timeout: s without a heartbeat after which it damps, and without an answer after which it counts as hanging.
+            timeout: s without a heartbeat after which it damps, and without an answer after which
+                it counts as hanging.
             damp: Duration of damping, s.
         """
         text = json.dumps(spec | {"timeout": timeout, "damp": damp})
         self._process = subprocess.Popen(
             child_process.module_command("gaponet.hw.control.watchdog", text),
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE, pass_fds=(lock,), start_new_session=True, bufsize=0,
-        )  # fmt: skip
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            pass_fds=(lock,),
+            start_new_session=True,
+            bufsize=0,
+        )
         assert self._process.stdin
         assert self._process.stdout
-        self._in, self._out = self._process.stdin, self._process.stdout
+        self._in = self._process.stdin
+        self._out = self._process.stdout
         for pipe in (self._in, self._out):
             os.set_blocking(pipe.fileno(), False)
-        self._fired, self._timeout = False, timeout
+        self._fired = False
+        self._timeout = timeout
         # monotonic s of the last answer, or of the first heartbeat before it
         self._answer_time: float | None = None
 
@@ -71,7 +82,9 @@ class Watchdog:
             raise DriverError("the watchdog could not reach the robot; see its message above")
 
     def problem(self) -> str:
-        """Return why this watchdog cannot damp the robot: it ended or does not answer; empty if it can."""
+        """Return why this watchdog cannot damp the robot: it ended or does not answer; empty if it
+        can.
+        """
         if self.fired() or self._process.poll() is not None:
             return "the watchdog ended"
         hangs = (
@@ -80,7 +93,9 @@ class Watchdog:
         return "the watchdog does not answer" if hangs else ""
 
     def fired(self) -> bool:
-        """Return True if the watchdog damps the robot or has damped it: nothing more may be sent."""
+        """Return True if the watchdog damps the robot or has damped it: nothing more may be
+        sent.
+        """
         answer = self._out.read(4096) or b""  # None: nothing new; does not wait
         if ANSWER in answer:
             self._answer_time = time.monotonic()
@@ -88,7 +103,9 @@ class Watchdog:
         return self._fired
 
     def beat(self, weight: float) -> bool:
-        """Send a heartbeat with the weight of the command that follows; return False if the watchdog has ended."""
+        """Send a heartbeat with the weight of the command that follows; return False if the
+        watchdog has ended.
+        """
         if self._answer_time is None:
             self._answer_time = time.monotonic()
         try:
@@ -103,7 +120,8 @@ class Watchdog:
         """Let the watchdog end without sending anything: the controller has stopped.
 
         Args:
-            unconfirmed: The robot did not confirm that it is damped: the watchdog damps it and goes on trying.
+            unconfirmed: The robot did not confirm that it is damped: the watchdog damps it and goes
+                on trying.
         """
         try:
             os.set_blocking(self._in.fileno(), True)
@@ -128,7 +146,8 @@ def main(spec: dict[str, Any]) -> None:
 
     for number in STOP_SIGNALS:
         signal.signal(number, signal.SIG_IGN)
-    timeout, damp = spec.pop("timeout"), spec.pop("damp")
+    timeout = spec.pop("timeout")
+    damp = spec.pop("damp")
     driver = open_driver(**spec)
     driver.connect()
     _send(READY)
@@ -155,11 +174,16 @@ def _send(word: bytes) -> None:
 
 
 def _damp(driver: Driver, seconds: float, weight: float) -> None:
-    """Damp for some seconds from the first success on, and until the robot confirms it; retry what fails."""
-    start, damping_since, last_error = time.monotonic(), None, ""
+    """Damp for some seconds from the first success on, and until the robot confirms it; retry what
+    fails.
+    """
+    start = time.monotonic()
+    damping_since = None
+    last_error = ""
     report = lambda text: print(f"watchdog: {driver.address} {text}", file=sys.stderr, flush=True)  # noqa: E731
     while True:
-        now, wait = time.monotonic(), DAMP_INTERVAL_S
+        now = time.monotonic()
+        wait = DAMP_INTERVAL_S
         left = 1.0 if damping_since is None else max(1.0 - (now - damping_since) / seconds, 0.0)
         try:
             driver.damp(weight * left, left)

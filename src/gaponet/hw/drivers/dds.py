@@ -1,12 +1,16 @@
-# mypy: disable-error-code="misc, type-arg, valid-type, method-assign, unused-ignore, attr-defined, assignment"
-"""Unitree's hg topics over cyclonedds: IDL types for the bus, bytes for this package. Imported when a bus is opened.
+# mypy: disable-error-code="misc, type-arg, valid-type, method-assign, unused-ignore"
+# mypy: disable-error-code="attr-defined, assignment"
+"""Unitree's hg topics over cyclonedds: IDL types for the bus, bytes for this package.
 
-Other participants see the classes below as the types of our topics. Messages are bytes: `serialize` and `deserialize`,
-which cyclonedds calls on every sample, pass them through instead of walking 500 fields.
+Imported when a bus is opened.
 
-uint8 of Unitree's IDL is byte here. On the wire both are the same. uint8 as cyclonedds 11 describes it ends every
-program on libddsc 0.10, Unitree's SDK among them, with a null pointer in its discovery (eclipse-cyclonedds/cyclonedds
-issue 1554; tests/hw/control/test_peers.py).
+Other participants see the classes below as the types of our topics. Messages are bytes: `serialize`
+and `deserialize`, which cyclonedds calls on every sample, pass them through instead of walking 500
+fields.
+
+uint8 of Unitree's IDL is byte here. On the wire both are the same. uint8 as cyclonedds 11 describes
+it ends every program on libddsc 0.10, Unitree's SDK among them, with a null pointer in its
+discovery (eclipse-cyclonedds/cyclonedds issue 1554; tests/hw/control/test_peers.py).
 """
 
 import atexit
@@ -55,7 +59,9 @@ def make_struct(typename: str, **fields: Any) -> Any:
 
 
 def _struct(name: str, fields: hg.Fields, **parts: type[IdlStruct]) -> type[IdlStruct]:
-    """Return the IDL type of a message of drivers.hg under its name in Unitree's IDL; parts: its structs, by field."""
+    """Return the IDL type of a message of drivers.hg under its name in Unitree's IDL; parts: its
+    structs, by field.
+    """
     members = {field: (parts.get(field) or SCALARS[kind], count) for field, kind, count in fields}
     hints = {
         field: kind if count == 1 else array[kind, count]
@@ -64,14 +70,17 @@ def _struct(name: str, fields: hg.Fields, **parts: type[IdlStruct]) -> type[IdlS
     return make_struct(f"unitree_hg.msg.dds_.{name}_", **hints)
 
 
-IMUState, MotorState = _struct("IMUState", hg.IMU), _struct("MotorState", hg.MOTOR_STATE)
+IMUState = _struct("IMUState", hg.IMU)
+MotorState = _struct("MotorState", hg.MOTOR_STATE)
 MotorCmd = _struct("MotorCmd", hg.MOTOR_CMD)
 LowState = _struct("LowState", hg.LOW_STATE, imu_state=IMUState, motor_state=MotorState)
 LowCmd = _struct("LowCmd", hg.LOW_CMD, motor_cmd=MotorCmd)
 
 
 def as_bytes(kind: type[IdlStruct]) -> type[IdlStruct]:
-    """Change a type so that its samples are bytes (`.data`, after the CDR header); on the bus it stays the same."""
+    """Change a type so that its samples are bytes (`.data`, after the CDR header); on the bus it
+    stays the same.
+    """
 
     def serialize(self: Any, *_: Any, **__: Any) -> bytes:
         return hg.HEADER + self.data
@@ -90,7 +99,8 @@ class Writer:
     """Publishes messages of one topic."""
 
     def __init__(self, writer: DataWriter, kind: type[IdlStruct]) -> None:
-        self._writer, self._kind = writer, kind
+        self._writer = writer
+        self._kind = kind
 
     def send(self, data: Array | bytes) -> None:
         """Publish one message.
@@ -110,10 +120,12 @@ class Reader:
     """Receives messages of one topic and buffers the newest ones."""
 
     def __init__(self, reader: DataReader, queue_length: int) -> None:
-        self._reader, self._queue_length = reader, queue_length
+        self._reader = reader
+        self._queue_length = queue_length
 
     def samples(self) -> list[Any]:
-        """Return the samples since the last call, oldest first: bytes (`.data`) and source (`.sample_info`).
+        """Return the samples since the last call, oldest first: bytes (`.data`) and source
+        (`.sample_info`).
 
         Raises:
             DriverError: DDS fails.
@@ -132,7 +144,9 @@ class Reader:
         return [np.frombuffer(sample.data, np.uint8) for sample in self.samples()]
 
     def receive_with_publisher(self) -> list[tuple[int, Array]]:
-        """Return the messages since the last call, oldest first: publisher's handle and array of bytes."""
+        """Return the messages since the last call, oldest first: publisher's handle and array of
+        bytes.
+        """
         messages = []
         for sample in self.samples():
             handle = sample.sample_info.publication_handle & HANDLE_MASK
@@ -140,7 +154,9 @@ class Reader:
         return messages
 
     def publishers(self) -> set[int]:
-        """Return the handles of the publishers of the topic that are connected now; takes some µs."""
+        """Return the handles of the publishers of the topic that are connected now; takes some
+        µs.
+        """
         try:
             handles = self._reader.get_matched_publications()
         except DDSException as error:
@@ -170,7 +186,8 @@ class Bus:
         """
         Args:
             domain: 0 on a Unitree robot.
-            interface: Network interface that reaches the robot: eth0, enp3s0…, lo for a robot on this machine.
+            interface: Network interface that reaches the robot: eth0, enp3s0…, lo for a robot on
+                this machine.
 
         Raises:
             DriverError: There is no such interface, or DDS does not start on it.
@@ -204,7 +221,9 @@ class Bus:
         return self._topics[name]
 
     def publishers(self) -> defaultdict[str, list[str]]:
-        """Return the other publishers, which takes DISCOVERY_S: topic → programs, as they call themselves."""
+        """Return the other publishers, which takes DISCOVERY_S: topic → programs, as they call
+        themselves.
+        """
         from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication
 
         publications = BuiltinDataReader(self._participant, BuiltinTopicDcpsPublication)
@@ -221,8 +240,9 @@ class Bus:
 def _configuration(interface: str) -> str:
     """Return cyclonedds' configuration for one network interface.
 
-    lo has no multicast on Linux by its own account. Programs on it, Unitree's SDK among them, are found by asking port
-    after port; programs that were configured to use multicast there nevertheless are found by that.
+    lo has no multicast on Linux by its own account. Programs on it, Unitree's SDK among them, are
+    found by asking port after port; programs that were configured to use multicast there
+    nevertheless are found by that.
     """
     loopback = interface == "lo"
     multicast = ' multicast="true"' if loopback else ""
@@ -230,12 +250,15 @@ def _configuration(interface: str) -> str:
         '<ParticipantIndex>auto</ParticipantIndex><Peers><Peer address="localhost"/></Peers>'
     )
     return (
-        f'<CycloneDDS><Domain Id="any"><General><Interfaces><NetworkInterface name="{interface}"{multicast}/>'
+        '<CycloneDDS><Domain Id="any"><General><Interfaces><NetworkInterface '
+        f'name="{interface}"{multicast}/>'
         f"</Interfaces><AllowMulticast>{'spdp' if loopback else 'true'}</AllowMulticast></General>"
         f"<Discovery>{discovery if loopback else ''}</Discovery>"
-        # Type descriptions of Fast DDS, which ROS 2 uses, do not come through; without this nothing would be matched.
+        # Type descriptions of Fast DDS, which ROS 2 uses, do not come through; without this nothing
+        # would be matched.
         "<Compatibility><IgnoreTypeInformation>1.15</IgnoreTypeInformation></Compatibility>"
-        f"<Internal><MaxSampleSize>{MAX_SAMPLE_KIB} KiB</MaxSampleSize></Internal></Domain></CycloneDDS>"
+        f"<Internal><MaxSampleSize>{MAX_SAMPLE_KIB} "
+        "KiB</MaxSampleSize></Internal></Domain></CycloneDDS>"
     )
 
 
@@ -269,7 +292,8 @@ _DOMAINS: dict[int, Domain] = {}  # a domain is configured once per process
 def _delete_domains() -> None:
     """Delete the domains before the interpreter ends, or leave them to the operating system.
 
-    In some runs cyclonedds 11.0.1 waits for ever while it deletes a domain (ddsi_stop); a command would never return.
+    In some runs cyclonedds 11.0.1 waits for ever while it deletes a domain (ddsi_stop); a command
+    would never return.
     """
 
     def delete() -> None:

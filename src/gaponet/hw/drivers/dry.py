@@ -16,18 +16,20 @@ from gaponet.hw.control.safety import Limits
 class DryRun:
     """A `Driver` around another one, of which only the readings are used.
 
-    Its states are the robot's, moved on by the way of the commands, as if the robot followed at once. Without this the
-    first motion would count as a joint that does not follow.
+    Its states are the robot's, moved on by the way of the commands, as if the robot followed at
+    once. Without this the first motion would count as a joint that does not follow.
     """
 
     def __init__(self, driver: Driver) -> None:
         """Take the driver of the robot, which must publish nothing when it connects."""
         self.driver = driver
-        self.address = (
-            driver.address
-        )  # the same lock: a serial bus has one master, also one that only reads
-        self.joint_names, self.commanded = driver.joint_names, driver.commanded
-        self.noisy, self.at_end, self.at_stop = driver.noisy, driver.at_end, driver.at_stop
+        # the same lock: a serial bus has one master, also one that only reads
+        self.address = driver.address
+        self.joint_names = driver.joint_names
+        self.commanded = driver.commanded
+        self.noisy = driver.noisy
+        self.at_end = driver.at_end
+        self.at_stop = driver.at_stop
         self.reads_back = True  # what was not sent cannot be checked
         self.virtual, self.kp, self.kd, self.qpos_range, self.facts = self._known_once_connected()
         self._at = np.array([driver.joint_names.index(name) for name in driver.commanded])
@@ -79,7 +81,9 @@ class DryRun:
 
 
 def summarize_commands(recording: Recording, limits: Limits) -> dict[str, dict[str, float]]:
-    """Return by joint the range of the commands (rad), the fastest one (rad/s) and the largest torque (N·m)."""
+    """Return by joint the range of the commands (rad), the fastest one (rad/s) and the largest
+    torque (N·m).
+    """
     table = recording.rows.table()
     rows = table[~np.isnan(table["ctrl"]).all(axis=1)]
     if not len(rows):

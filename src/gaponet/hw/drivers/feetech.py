@@ -1,8 +1,10 @@
-"""Feetech's servo bus (STS series, protocol 0): packets over any byte stream, and the registers of an STS3215.
+"""Feetech's servo bus (STS series, protocol 0): packets over any byte stream, and the registers of
+an STS3215.
 
-A packet is FF FF id length instruction parameters… checksum; a reply has a status byte in place of the instruction.
-Numbers are little-endian; velocity and load are sign and magnitude. From Feetech's public memory table (STS3215) and
-protocol manual. Tested against buses that answer by the same documents, well and badly; not against servos.
+A packet is FF FF id length instruction parameters… checksum; a reply has a status byte in place of
+the instruction. Numbers are little-endian; velocity and load are sign and magnitude. From Feetech's
+public memory table (STS3215) and protocol manual. Tested against buses that answer by the same
+documents, well and badly; not against servos.
 """
 
 from __future__ import annotations
@@ -16,8 +18,13 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from serial import Serial
 
-PING, READ, WRITE, SYNC_READ, SYNC_WRITE = 1, 2, 3, 0x82, 0x83
+PING = 1
+READ = 2
+WRITE = 3
+SYNC_READ = 0x82
+SYNC_WRITE = 0x83
 BROADCAST = 0xFE
+# status bits; bit 4: torque is on
 ERRORS = (
     "voltage",
     "angle sensor",
@@ -25,7 +32,7 @@ ERRORS = (
     "overcurrent",
     "",
     "overload",
-)  # status bits; bit 4: torque is on
+)
 FAULTY = sum(1 << bit for bit, word in enumerate(ERRORS) if word)
 RETRIES = 2  # of a read, as LeRobot's num_read_retries
 REQUEST_TAGS = 8  # lengths of replies, by which the requests that they answer are told apart
@@ -105,13 +112,14 @@ class ServoBus:
     Attributes:
         refused: Number of replies with a wrong checksum.
         errors: Servo → error bits of all its replies so far.
-        foreign: Number of intact packets that another program must have caused: requests that were not sent here, and
-            replies of a length that nobody here has asked for.
+        foreign: Number of intact packets that another program must have caused: requests that were
+            not sent here, and replies of a length that nobody here has asked for.
     """
 
     def __init__(self, stream: Serial, timeout: float = 0.01) -> None:
         """Send over a port; missing replies are given up after `timeout` s of silence."""
-        self.stream, self.timeout = stream, timeout
+        self.stream = stream
+        self.timeout = timeout
         self.refused = 0
         self.errors: dict[int, int] = {}
         self.foreign = 0
@@ -124,11 +132,13 @@ class ServoBus:
     ) -> dict[int, bytes]:
         """Return a block of each of several servos; servos without an intact reply are missing.
 
-        What is missing after a silence is requested again. A reply does not name its request. So successive requests
-        are for 0 to 7 bytes more than needed: the length of a reply shows which request it answers, and a late reply to
-        an earlier call is not taken for it.
+        What is missing after a silence is requested again. A reply does not name its request. So
+        successive requests are for 0 to 7 bytes more than needed: the length of a reply shows which
+        request it answers, and a late reply to an earlier call is not taken for it.
         """
-        missing, replies, sizes = list(servos), dict[int, bytes](), set[int]()
+        missing = list(servos)
+        replies = dict[int, bytes]()
+        sizes = set[int]()
         for _ in range(1 + retries):
             self._tag = (self._tag + 1) % REQUEST_TAGS
             size = block.size + self._tag
@@ -183,12 +193,15 @@ class ServoBus:
     def _replies(
         self, servos: list[int], expected: int, sizes: set[int], request: bytes
     ) -> dict[int, bytes]:
-        """Return intact replies of these servos, in any order, until all have come or nothing more comes.
+        """Return intact replies of these servos, in any order, until all have come or nothing more
+        comes.
 
         An adapter with one wire for both directions echoes the request, which is then skipped.
         """
         replies: dict[int, bytes] = {}
-        data, patience = b"", MAX_BYTES_RATIO * (expected + 6) * len(servos)  # bytes
+        # bytes
+        data = b""
+        patience = MAX_BYTES_RATIO * (expected + 6) * len(servos)
         silent = time.monotonic() + self.timeout
         while len(replies) < len(servos) and patience > 0:
             more = self.stream.read(
@@ -198,7 +211,8 @@ class ServoBus:
                 silent = time.monotonic() + self.timeout
             elif time.monotonic() >= silent:
                 break
-            data, patience = data + more, patience - len(more)
+            data = data + more
+            patience = patience - len(more)
             while (start := data.find(b"\xff\xff")) >= 0 and len(data) >= start + 6:
                 body = data[start + 2 : start + 4 + data[start + 3]]
                 if not 2 <= data[start + 3] <= MAX_REPLY_BYTES:

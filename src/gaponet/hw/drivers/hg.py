@@ -1,11 +1,13 @@
-"""Unitree's hg messages (H1-2, G1) as arrays of bytes: layout on the wire and under the checksum, and the checksum.
+"""Unitree's hg messages (H1-2, G1) as arrays of bytes: layout on the wire and under the checksum,
+and the checksum.
 
-LowState and LowCmd have a fixed size, so that all motors' values of a field are read or written at once: 5 µs per
-message instead of 2 ms field by field, of the 2 ms between two states at 500 Hz.
+LowState and LowCmd have a fixed size, so that all motors' values of a field are read or written at
+once: 5 µs per message instead of 2 ms field by field, of the 2 ms between two states at 500 Hz.
 
-Fields and types are those of Unitree's public IDL (unitree_sdk2, unitree_hg). On the wire they are little-endian CDR
-without padding at the end of a struct. The checksum is CRC-32/MPEG-2 over the 32-bit words of the C struct, which has
-padding. Tested against the serialiser of cyclonedds and a CRC written bit by bit; not against a robot.
+Fields and types are those of Unitree's public IDL (unitree_sdk2, unitree_hg). On the wire they are
+little-endian CDR without padding at the end of a struct. The checksum is CRC-32/MPEG-2 over the
+32-bit words of the C struct, which has padding. Tested against the serialiser of cyclonedds and a
+CRC written bit by bit; not against a robot.
 """
 
 from __future__ import annotations
@@ -52,7 +54,8 @@ def flatten(
     Args:
         fields: Fields of a struct.
         start: Offset at which it begins.
-        padded: Pad as C does (structs begin and end at multiples of 4), else as CDR does (only scalars are aligned).
+        padded: Pad as C does (structs begin and end at multiples of 4), else as CDR does (only
+            scalars are aligned).
     """
     out: list[tuple[str, str, int, int]] = []
     at = start
@@ -73,14 +76,17 @@ def flatten(
 
 
 class Message:
-    """Layout of a fixed-size message: fields of all motors at once, other fields, and the checksum."""
+    """Layout of a fixed-size message: fields of all motors at once, other fields, and the
+    checksum.
+    """
 
     def __init__(self, fields: Fields, motors: str) -> None:
         wire, self.wire_size = flatten(fields, 0, padded=False)
         packed, self.packed_size = flatten(fields, 0, padded=True)
         self._at = {path: (kind, count, offset) for path, kind, count, offset in wire}
         names = [path.split(".")[-1] for path, *_ in wire if path.startswith(f"{motors}[1].")]
-        # From the second motor on, slots repeat every `stride` bytes; the first may begin closer to what precedes it.
+        # From the second motor on, slots repeat every `stride` bytes; the first may begin closer to
+        # what precedes it.
         self.columns = {
             n: np.array([self._at[f"{motors}[{i}].{n}"][2] for i in range(MOTORS)]) for n in names
         }
@@ -89,7 +95,9 @@ class Message:
     def _bytes(
         self, wire: list[tuple[str, str, int, int]], packed: list[tuple[str, str, int, int]]
     ) -> Array:
-        """Return the wire offset of every byte of the padded struct; padding points behind the message, at a 0."""
+        """Return the wire offset of every byte of the padded struct; padding points behind the
+        message, at a 0.
+        """
         source = np.full(self.packed_size, self.wire_size)
         for (_, kind, count, at), (_, _, _, to) in zip(wire, packed, strict=True):
             size = np.dtype(kind).itemsize * count
@@ -125,11 +133,12 @@ class Message:
         return next(path for path in self._at if path.endswith(f"[0].{name}"))
 
     def checksum(self, data: Array) -> int:
-        """Return CRC-32/MPEG-2 of the C struct's words: polynomial 0x04c11db7, start 0xffffffff, highest bit first."""
+        """Return CRC-32/MPEG-2 of the C struct's words: polynomial 0x04c11db7, start 0xffffffff,
+        highest bit first.
+        """
         ordered = np.append(data, np.uint8(0))[self._gather]
-        mirrored = (
-            zlib.crc32(MIRRORED_BYTES[ordered].tobytes()) ^ 0xFFFFFFFF
-        )  # zlib's is the same with all bits mirrored
+        # zlib's is the same with all bits mirrored
+        mirrored = zlib.crc32(MIRRORED_BYTES[ordered].tobytes()) ^ 0xFFFFFFFF
         return int(f"{mirrored:032b}"[::-1], 2)
 
     def seal(self, data: Array) -> None:

@@ -18,12 +18,14 @@ def measure_link(driver: Driver, seconds: float) -> dict[str, Any]:
     """Listen to a connected robot; nothing is sent.
 
     Returns:
-        states; rate_hz; age_ms of a state when it arrives and interval_ms between two (p50, p99, max); lost: states
-        that were due by the robot's own clock and never came; refused: states with a wrong checksum.
+        states; rate_hz; age_ms of a state when it arrives and interval_ms between two (p50, p99,
+        max); lost: states that were due by the robot's own clock and never came; refused: states
+        with a wrong checksum.
     """
     received = getattr(driver, "received", None)  # a bus may bring several states between two reads
     first = driver.read()
-    measured, arrived = [first.time], [time.monotonic()]
+    measured = [first.time]
+    arrived = [time.monotonic()]
     while arrived[-1] - arrived[0] < seconds and time.monotonic() - arrived[-1] < max(seconds, 1.0):
         state = driver.read()
         if state.time > measured[-1]:
@@ -34,7 +36,8 @@ def measure_link(driver: Driver, seconds: float) -> dict[str, Any]:
     span = max(measured[-1] - measured[0], 1e-9)
     steps = np.diff(measured) if len(measured) > 1 else np.array([np.inf])
     due = 1 + round(span / float(np.median(steps)))
-    ages, intervals = np.subtract(arrived, measured)[1:], np.diff(arrived)
+    ages = np.subtract(arrived, measured)[1:]
+    intervals = np.diff(arrived)
     return {
         "states": count,
         "rate_hz": (count - 1) / max(arrived[-1] - arrived[0], 1e-9),

@@ -1,4 +1,6 @@
-"""Drivers by name: those of this package and of extensions (entry points `gaponet.drivers`), imported when opened."""
+"""Drivers by name: those of this package and of extensions (entry points `gaponet.drivers`),
+imported when opened.
+"""
 
 from __future__ import annotations
 
@@ -42,10 +44,11 @@ def open_driver(
     """Return a driver that is not yet connected.
 
     Args:
-        kind: One of driver_names(). Virtual robots live in the caller's process (virtual.virtual_driver).
+        kind: One of driver_names(). Virtual robots live in the caller's process
+            (virtual.virtual_driver).
         robot: The robot, its name or its folder.
-        limits_from: Robot folder whose gains and ranges hold instead of the package's; read it first. The robot must
-            equal it, but for identified values.
+        limits_from: Robot folder whose gains and ranges hold instead of the package's; read it
+            first. The robot must equal it, but for identified values.
         options: Parameters of the driver's class or function.
 
     Raises:
@@ -62,6 +65,7 @@ def open_driver(
     ]
     if missing := [name for name in members if not hasattr(driver, name)]:
         raise UsageError(
-            f"driver '{kind}' lacks {', '.join(missing)} (gaponet.hw.control.driver.Driver says what they do)"
+            f"driver '{kind}' lacks {', '.join(missing)} (gaponet.hw.control.driver.Driver says "
+            "what they do)"
         )
     return driver

@@ -11,8 +11,9 @@ PROCESSES = Path("/proc")
 def other_programs(port: str) -> list[str]:
     """Return the programs that have a port open, in words, beside this process and its children.
 
-    Linux shows the files of the same user's processes alone; root sees all. Elsewhere the list is empty. The program at
-    the other end of a pseudo-terminal (a virtual arm) is the arm, and is left out.
+    Linux shows the files of the same user's processes alone; root sees all. Elsewhere the list is
+    empty. The program at the other end of a pseudo-terminal (a virtual arm) is the arm, and is left
+    out.
     """
     device = os.path.realpath(port)
     programs = []
@@ -33,7 +34,9 @@ def _has_open(folder: Path, device: str) -> bool:
 
 
 def _is_child_or_arm(folder: Path, device: str) -> bool:
-    """Return True for a child of this process, as its watchdog, and for the other end of a pseudo-terminal."""
+    """Return True for a child of this process, as its watchdog, and for the other end of a
+    pseudo-terminal.
+    """
     status = (folder / "status").read_text()
     if f"PPid:\t{os.getpid()}\n" in status:
         return True

@@ -1,13 +1,14 @@
 """SO101Driver: an SO-101 arm, six Feetech STS3215 servos on a serial bus.
 
-Units: 4096 encoder steps a turn; velocity in steps/s; current in 6.5 mA. tau is current times a constant, with the sign
-of the load. The constant makes the stall current the effort limit; it was not calibrated. so101_calibration.py defines
-0 rad of each joint.
+Units: 4096 encoder steps a turn; velocity in steps/s; current in 6.5 mA. tau is current times a
+constant, with the sign of the load. The constant makes the stall current the effort limit; it was
+not calibrated. so101_calibration.py defines 0 rad of each joint.
 
-The servos cannot damp: `damp` lowers the arm by their torque limits, then switches their torque off. They keep their
-last target when commands cease, so a run without fault ends held. Torque, goal and limits are read back with every
-state, gains and zeros of one servo at a time. Not checked on a real arm: everything was tested against buses that
-answer as Feetech's documents say, correctly and with errors.
+The servos cannot damp: `damp` lowers the arm by their torque limits, then switches their torque
+off. They keep their last target when commands cease, so a run without fault ends held. Torque, goal
+and limits are read back with every state, gains and zeros of one servo at a time. Not checked on a
+real arm: everything was tested against buses that answer as Feetech's documents say, correctly and
+with errors.
 """
 
 from __future__ import annotations
@@ -45,11 +46,13 @@ except ImportError:  # Windows, where only one program can open a port
     PORT_ERRORS: tuple[type[Exception], ...] = (OSError,)
     EXCLUSIVE = SHARED = 0
 else:
+    # pyserial's own errors are OSErrors; a removed port also raises the other
     PORT_ERRORS = (
         OSError,
         termios.error,
-    )  # pyserial's own errors are OSErrors; a removed port also raises the other
-    EXCLUSIVE, SHARED = termios.TIOCEXCL, termios.TIOCNXCL
+    )
+    EXCLUSIVE = termios.TIOCEXCL
+    SHARED = termios.TIOCNXCL
 
 if TYPE_CHECKING:
     from serial import Serial
@@ -57,7 +60,8 @@ if TYPE_CHECKING:
 STALL_CURRENT_STEPS = 2.7 / 0.0065  # 2.7 A at 12 V (Feetech's data sheet of the STS3215)
 BAUD = 1_000_000
 STIFFNESS_PER_P = 17.8 / 32  # N·m/rad; robot.toml of the so101 has the source
-PORT_TIMEOUT_S, WRITE_TIMEOUT_S = 0.002, 1.0
+PORT_TIMEOUT_S = 0.002
+WRITE_TIMEOUT_S = 1.0
 CONNECT_SILENCE_S = 0.1  # after which missing replies are given up while connecting
 CONNECT_TIMEOUT_S = 1.0  # for a first whole state
 FULL_TORQUE = 1000  # of TORQUE_LIMIT, 0.1 %
@@ -69,9 +73,13 @@ FOREIGN_WINDOW_S = 1.0  # in which signs of another program are counted
 MAX_FOREIGN_SIGNS = 2  # one may be noise on the cable
 RELATIVE_KP_TOLERANCE = 0.01
 GAINS = {
-    "p": reg.P, "i": reg.I, "d": reg.D, "max_torque": reg.MAX_TORQUE, "protection_current": reg.PROTECTION_CURRENT,
+    "p": reg.P,
+    "i": reg.I,
+    "d": reg.D,
+    "max_torque": reg.MAX_TORQUE,
+    "protection_current": reg.PROTECTION_CURRENT,
     "mode": reg.MODE,
-}  # fmt: skip
+}
 CALIBRATION = {
     "homing_offset": reg.HOMING_OFFSET,
     "range_min": reg.MIN_POSITION,
@@ -83,9 +91,12 @@ LIMITS = {
     "torque_limit": reg.TORQUE_LIMIT,
 }
 READINGS = {
-    "qpos": reg.PRESENT_POSITION, "qvel": reg.PRESENT_VELOCITY, "load": reg.PRESENT_LOAD,
-    "current": reg.PRESENT_CURRENT, "temperature": reg.PRESENT_TEMPERATURE,
-}  # fmt: skip
+    "qpos": reg.PRESENT_POSITION,
+    "qvel": reg.PRESENT_VELOCITY,
+    "load": reg.PRESENT_LOAD,
+    "current": reg.PRESENT_CURRENT,
+    "temperature": reg.PRESENT_TEMPERATURE,
+}
 
 
 class SO101Driver:
@@ -110,28 +121,35 @@ class SO101Driver:
         Args:
             robot: The SO-101.
             port: Serial port.
-            calibration: JSON file that lerobot-calibrate wrote; default the calibration in the servos.
+            calibration: JSON file that lerobot-calibrate wrote; default the calibration in the
+                servos.
             timeout: Longest silence of the bus while replies are awaited, s.
-            silent: `connect` opens the port and sends nothing: for the watchdog, because one program may speak.
+            silent: `connect` opens the port and sends nothing: for the watchdog, because one
+                program may speak.
             torque_limit: Limit of each servo for a driver that is silent, 0.1 %; default full.
 
         Raises:
             UsageError: The robot is no SO-101, or the file is no calibration.
-            RobotError: Gains or ranges exceed those of the known robot, or effort limits those of the motors.
+            RobotError: Gains or ranges exceed those of the known robot, or effort limits those of
+                the motors.
         """
         if set(robot.joint_names) != set(JOINTS):
             raise UsageError(
                 f"the so101 driver is for the joints {', '.join(JOINTS)}; {robot.name} has others"
             )
         require_known_limits(robot, "so101")
-        self.robot, self.port, self.calibration = robot, port, calibration
-        self.timeout, self.silent = timeout, silent
+        self.robot = robot
+        self.port = port
+        self.calibration = calibration
+        self.timeout = timeout
+        self.silent = silent
         self.address = port
         self.joint_names = self.commanded = robot.joint_names
         self.file_calibration = read_calibration(calibration, robot) if calibration else None
         self.arm = self.file_calibration or uncalibrated(robot)
         self._nominal = robot.before_identification
-        self.kp, self.kd = self._nominal.kp, self._nominal.kd
+        self.kp = self._nominal.kp
+        self.kd = self._nominal.kd
         self.qpos_range: Array | None = None
         self.facts: dict[str, Any] = {}
         self._serial: Serial | None = None
@@ -144,10 +162,9 @@ class SO101Driver:
         self._torque_on: set[int] = set()  # servos that have reported it
         self._mismatches: Counter[tuple[str, int]] = Counter()
         self._settings: dict[int, dict[str, int]] = {}  # at the start, by servo
-        self._settings_index, self._settings_time = (
-            0,
-            0.0,
-        )  # servo whose settings were read last, and when, s
+        # servo whose settings were read last, and when, s
+        self._settings_index = 0
+        self._settings_time = 0.0
         self._disobedience: Fault | None = None
         self._goals_before: set[int] = set()  # that the servos held when they were found
         self._goals_sent: deque[set[int]] = deque(maxlen=REMEMBERED_GOALS)
@@ -165,7 +182,8 @@ class SO101Driver:
             with self._port_errors():
                 bus.timeout = max(self.timeout, CONNECT_SILENCE_S)
                 self._identify(bus)
-            self._state, bus.timeout = None, self.timeout
+            self._state = None
+            bus.timeout = self.timeout
             deadline = time.monotonic() + CONNECT_TIMEOUT_S
             while self._state is None:
                 self._poll(bus)
@@ -205,10 +223,11 @@ class SO101Driver:
         return self._bus
 
     def _set_sharing(self, mode: int) -> None:
-        """Let other programs open the port (SHARED), or not (EXCLUSIVE); who has it open, as our watchdog, keeps it."""
-        with contextlib.suppress(
-            *PORT_ERRORS, AttributeError, ValueError
-        ):  # a port without a descriptor, or removed
+        """Let other programs open the port (SHARED), or not (EXCLUSIVE); who has it open, as our
+        watchdog, keeps it.
+        """
+        # a port without a descriptor, or removed
+        with contextlib.suppress(*PORT_ERRORS, AttributeError, ValueError):
             if mode:
                 fcntl.ioctl(self._serial.fileno(), mode)  # type: ignore[union-attr]
 
@@ -223,11 +242,14 @@ class SO101Driver:
         others = other_programs(self.port)
         if others:
             raise DriverError(
-                f"{self.port}: {', '.join(others)} has the port open and can command the arm; end it first"
+                f"{self.port}: {', '.join(others)} has the port open and can command the arm; end "
+                "it first"
             )
 
     def _identify(self, bus: reg.ServoBus) -> None:
-        """Read and check model and mode of each servo; then read its gains, limits and calibration."""
+        """Read and check model and mode of each servo; then read its gains, limits and
+        calibration.
+        """
         servos = self.arm.servos
         numbers = dict(zip(self.joint_names, servos, strict=True))
         settings, running = (bus.sync_read(servos, block) for block in (reg.SETTINGS, reg.RUNNING))
@@ -242,8 +264,8 @@ class SO101Driver:
             )
             if model != reg.STS3215 or mode != 0:
                 raise DriverError(
-                    f"{self.port}: servo {servo} ({joint}) is model {model} in mode {mode}; the driver needs an "
-                    f"STS3215 ({reg.STS3215}) in position mode (0)"
+                    f"{self.port}: servo {servo} ({joint}) is model {model} in mode {mode}; the "
+                    f"driver needs an STS3215 ({reg.STS3215}) in position mode (0)"
                 )
         self._settings = {servo: _settings(settings[servo]) for servo in servos}
         stored = {
@@ -259,10 +281,8 @@ class SO101Driver:
         servo_facts = {name: [self._settings[servo][name] for servo in servos] for name in GAINS}
         for name, register in (LIMITS | {"voltage": reg.PRESENT_VOLTAGE}).items():
             servo_facts[name] = [register.value_in(reg.RUNNING, running[servo]) for servo in servos]
-        self.kp, self._torque_limit = (
-            STIFFNESS_PER_P * np.array(servo_facts["p"], float),
-            servo_facts["torque_limit"],
-        )
+        self.kp = STIFFNESS_PER_P * np.array(servo_facts["p"], float)
+        self._torque_limit = servo_facts["torque_limit"]
         self._goals_before = {
             reg.GOAL_POSITION.value_in(reg.RUNNING, running[servo]) for servo in servos
         }
@@ -275,9 +295,13 @@ class SO101Driver:
 
     def _remarks(self, facts: dict[str, list[int]]) -> list[str]:
         """Return how the servos' settings differ from the robot's, in sentences."""
-        notes, nominal = [], self._nominal.kp
-        odd = [(j, p, kp, k) for j, p, kp, k in zip(self.joint_names, facts["p"], self.kp, nominal, strict=True)
-               if abs(kp - k) > RELATIVE_KP_TOLERANCE * k]  # fmt: skip
+        notes = []
+        nominal = self._nominal.kp
+        odd = [
+            (j, p, kp, k)
+            for j, p, kp, k in zip(self.joint_names, facts["p"], self.kp, nominal, strict=True)
+            if abs(kp - k) > RELATIVE_KP_TOLERANCE * k
+        ]
         if odd:
             joints = "all joints" if len(odd) == len(nominal) else ", ".join(j for j, *_ in odd)
             _, p, kp, k = odd[0]
@@ -310,7 +334,8 @@ class SO101Driver:
 
     def _poll(self, bus: reg.ServoBus) -> None:
         now = time.monotonic()
-        servos, old = self.arm.servos, self._state
+        servos = self.arm.servos
+        old = self._state
         blocks = bus.sync_read(servos, reg.RUNNING)
         if len(blocks) < len(servos):
             if old is not None:
@@ -329,17 +354,22 @@ class SO101Driver:
         sign = self.arm.sign
         share = np.abs(raw["current"]) / STALL_CURRENT_STEPS * np.sign(raw["load"])
         self._state = State(
-            now, self.arm.qpos(raw["qpos"]), raw["qvel"] * STEP_RAD * sign, share * self._nominal.effort_limit * sign,
-            raw["temperature"], bus.refused, fault=self._fault(bus),
-        )  # fmt: skip
+            now,
+            self.arm.qpos(raw["qpos"]),
+            raw["qvel"] * STEP_RAD * sign,
+            share * self._nominal.effort_limit * sign,
+            raw["temperature"],
+            bus.refused,
+            fault=self._fault(bus),
+        )
 
     def _check_source(
         self, bus: reg.ServoBus, blocks: dict[int, bytes], now: float
     ) -> Fault | None:
         """Return a fault if another program commands the servos, or speaks on the bus.
 
-        Its goals are seen if they are in force when the servos are read: they were never sent here. Its requests, and
-        the replies to them, are seen if they reach this port.
+        Its goals are seen if they are in force when the servos are read: they were never sent here.
+        Its requests, and the replies to them, are seen if they reach this port.
         """
         signs = bus.foreign - self._foreign_packets
         self._foreign_packets = bus.foreign
@@ -361,7 +391,9 @@ class SO101Driver:
         return goal in self._goals_before or any(goal in goals for goals in self._goals_sent)
 
     def _check_running(self, blocks: dict[int, bytes]) -> Fault | None:
-        """Return a fault if a servo's torque is off, or its goal or limits are not those that were sent or found."""
+        """Return a fault if a servo's torque is off, or its goal or limits are not those that were
+        sent or found.
+        """
         wrong: list[tuple[int, str]] = []
         for i, (servo, block) in enumerate(blocks.items()):
             if self._goal is not None:
@@ -381,7 +413,8 @@ class SO101Driver:
                 elif self._mismatch("goal", servo):
                     wrong.append((servo, f"it holds the goal {goal}, not {sent} as it was told"))
             for name, register in LIMITS.items():
-                before, now = self.facts["servos"][name][i], register.value_in(reg.RUNNING, block)
+                before = self.facts["servos"][name][i]
+                now = register.value_in(reg.RUNNING, block)
                 if now != before and not (name == "torque_limit" and self._goal is None):
                     wrong.append(
                         (servo, f"its {name.replace('_', ' ')} went from {before} to {now}")
@@ -389,7 +422,9 @@ class SO101Driver:
         return self._disobedience_fault(wrong)
 
     def _mismatch(self, what: str, servo: int) -> bool:
-        """Count a reading that differs from what was sent; return True after more than lost packets can explain."""
+        """Count a reading that differs from what was sent; return True after more than lost
+        packets can explain.
+        """
         self._mismatches[what, servo] += 1
         return self._mismatches[what, servo] >= MAX_MISMATCHES
 
@@ -398,19 +433,29 @@ class SO101Driver:
         servos = self.arm.servos
         if now - self._settings_time < SETTINGS_INTERVAL_S / len(servos):
             return None
-        self._settings_index, self._settings_time = (self._settings_index + 1) % len(servos), now
+        self._settings_index = (self._settings_index + 1) % len(servos)
+        self._settings_time = now
         return self._check_settings(bus, [servos[self._settings_index]], retries=0)
 
     def _check_settings(
         self, bus: reg.ServoBus, servos: list[int], retries: int = reg.RETRIES
     ) -> Fault | None:
-        """Return a fault if gains, ranges or zeros have changed; a servo that does not answer has changed none."""
+        """Return a fault if gains, ranges or zeros have changed; a servo that does not answer has
+        changed none.
+        """
         settings = bus.sync_read(servos, reg.SETTINGS, retries)
-        return self._disobedience_fault([
-            (servo, f"its {name.replace('_', ' ')} went from {self._settings[servo][name]} to {value}")
-            for servo, data in settings.items() for name, value in _settings(data).items()
-            if value != self._settings[servo][name]
-        ])  # fmt: skip
+        return self._disobedience_fault(
+            [
+                (
+                    servo,
+                    f"its {name.replace('_', ' ')} went from {self._settings[servo][name]} to "
+                    f"{value}",
+                )
+                for servo, data in settings.items()
+                for name, value in _settings(data).items()
+                if value != self._settings[servo][name]
+            ]
+        )
 
     def _disobedience_fault(self, wrong: list[tuple[int, str]]) -> Fault | None:
         """Return the fault of servos and what is wrong with each, by joint; None if nothing is."""
@@ -430,9 +475,11 @@ class SO101Driver:
         """Return the errors that the servos have reported in any reply, else their disobedience."""
         numbers = dict(zip(self.arm.servos, self.joint_names, strict=True))
         reports = [
-            f"servo {servo} ({joint}): " + ", ".join(w for bit, w in enumerate(reg.ERRORS) if w and errors >> bit & 1)
-            for servo, joint in numbers.items() if (errors := bus.errors.get(servo, 0) & reg.FAULTY)
-        ]  # fmt: skip
+            f"servo {servo} ({joint}): "
+            + ", ".join(w for bit, w in enumerate(reg.ERRORS) if w and errors >> bit & 1)
+            for servo, joint in numbers.items()
+            if (errors := bus.errors.get(servo, 0) & reg.FAULTY)
+        ]
         return (
             Fault("robot", "; ".join(reports) + "; look at load, supply and cables")
             if reports
@@ -458,12 +505,14 @@ class SO101Driver:
         self._goals_sent.append(set(goal.values()))
 
     def damp(self, weight: float = 1.0, share: float = 0.0) -> None:
-        """Lower the arm: torque limits decrease with `share`; at 0 the torque of all servos on the bus is switched off.
+        """Lower the arm: torque limits decrease with `share`; at 0 the torque of all servos on the
+        bus is switched off.
 
-        Everything is sent in every period, so that a lost packet does not matter. Nothing is read, except by the
-        watchdog before it lowers: the controller may have died while it lowered.
+        Everything is sent in every period, so that a lost packet does not matter. Nothing is read,
+        except by the watchdog before it lowers: the controller may have died while it lowered.
         """
-        self._goal, self._torque_on = None, set()
+        self._goal = None
+        self._torque_on = set()
         bus = self._open()
         with self._port_errors():
             if share > 0:
@@ -478,8 +527,8 @@ class SO101Driver:
     def _limits_in_force(self, bus: reg.ServoBus) -> list[int]:
         """Return the torque limits from which the arm is lowered, 0.1 %.
 
-        They are never raised: an arm that has sunk would spring back to its last goal. A silent driver asks the servos
-        for theirs; one that does not answer counts as not lowered yet.
+        They are never raised: an arm that has sunk would spring back to its last goal. A silent
+        driver asks the servos for theirs; one that does not answer counts as not lowered yet.
         """
         if not self.silent:
             return self._torque_limit
@@ -492,13 +541,15 @@ class SO101Driver:
 
     def confirm(self) -> str:
         """Check that the torque of all servos is off; only then set their torque limits back."""
-        servos, bus = self.arm.servos, self._open()
+        servos = self.arm.servos
+        bus = self._open()
         with self._port_errors():
             blocks = bus.sync_read(servos, reg.TORQUE_ENABLE)
             stiff = [
-                f"{servo} ({joint})" for servo, joint in zip(servos, self.joint_names, strict=True)
+                f"{servo} ({joint})"
+                for servo, joint in zip(servos, self.joint_names, strict=True)
                 if servo not in blocks or any(blocks[servo])
-            ]  # fmt: skip
+            ]
             if stiff:
                 raise DriverError(
                     f"{self.port}: no word that the torque is off in servo {', '.join(stiff)}"
@@ -513,7 +564,9 @@ class SO101Driver:
 
     @contextlib.contextmanager
     def _port_errors(self) -> Iterator[None]:
-        """Turn errors of the port into DriverErrors and close it; the next `damp` opens it again."""
+        """Turn errors of the port into DriverErrors and close it; the next `damp` opens it
+        again.
+        """
         try:
             yield
         except PORT_ERRORS as error:
@@ -536,15 +589,21 @@ class SO101Driver:
         self._serial = None
 
     def watchdog(self) -> dict[str, object] | None:
-        """Return the options of a driver that is silent until it damps; let it open the port until the next `read`."""
+        """Return the options of a driver that is silent until it damps; let it open the port until
+        the next `read`.
+        """
         calibration = str(self.calibration) if self.calibration else None
         self._set_sharing(SHARED)
         self._awaits_watchdog = True
         return {
-            "kind": "so101", "robot": str(self.robot.folder.resolve()), "port": self.port,
-            "calibration": calibration, "silent": True, "torque_limit": self._torque_limit,
+            "kind": "so101",
+            "robot": str(self.robot.folder.resolve()),
+            "port": self.port,
+            "calibration": calibration,
+            "silent": True,
+            "torque_limit": self._torque_limit,
             "limits_from": accepted_folder(self.robot),
-        }  # fmt: skip
+        }
 
 
 def _settings(block: bytes) -> dict[str, int]:

@@ -17,6 +17,7 @@ from gaponet.robot.spec import RobotSpec
 
 STEPS_PER_TURN = 4096  # of an encoder
 STEP_RAD = 2 * np.pi / STEPS_PER_TURN
+# servo 1 to 6
 JOINTS = (
     "shoulder_pan",
     "shoulder_lift",
@@ -24,8 +25,10 @@ JOINTS = (
     "wrist_flex",
     "wrist_roll",
     "gripper",
-)  # servo 1 to 6
-CONTINUOUS_JOINT, GRIPPER = "wrist_roll", "gripper"  # without stops; with its zero at a stop
+)
+# without stops; with its zero at a stop
+CONTINUOUS_JOINT = "wrist_roll"
+GRIPPER = "gripper"
 USUAL_FILE = "~/.cache/huggingface/lerobot/calibration/robots/so_follower/ID.json"
 
 Position = Annotated[int, at.Interval(ge=0, le=STEPS_PER_TURN - 1)]
@@ -33,7 +36,9 @@ Position = Annotated[int, at.Interval(ge=0, le=STEPS_PER_TURN - 1)]
 
 @dataclass(frozen=True)
 class ServoRow:
-    """Calibration of one joint: row of the file; all but id and drive_mode are also registers of the servo."""
+    """Calibration of one joint: row of the file; all but id and drive_mode are also registers of
+    the servo.
+    """
 
     id: Annotated[int, at.Interval(ge=1, le=253)]
     drive_mode: Annotated[int, at.Interval(ge=0, le=1)]
@@ -45,8 +50,8 @@ class ServoRow:
 class ArmCalibration:
     """Converts encoder steps to rad and back, for every joint in the robot's order.
 
-    0 rad is the middle of a joint's calibrated range, as in LeRobot. For the gripper it is the zero of the MJCF, whose
-    lower limit is the end of the calibrated range at which the jaw is closed.
+    0 rad is the middle of a joint's calibrated range, as in LeRobot. For the gripper it is the zero
+    of the MJCF, whose lower limit is the end of the calibrated range at which the jaw is closed.
 
     Attributes:
         rows: Calibration of each joint, by its name.
@@ -59,7 +64,8 @@ class ArmCalibration:
     def __init__(self, rows: dict[str, ServoRow], robot: RobotSpec) -> None:
         """Take the order of the joints and the gripper's lower limit from the robot."""
         ordered = [rows[joint] for joint in robot.joint_names]
-        self.rows, self.servos = rows, [row.id for row in ordered]
+        self.rows = rows
+        self.servos = [row.id for row in ordered]
         self.low, self.high = (
             np.array([getattr(row, end) for row in ordered]) for end in ("range_min", "range_max")
         )
@@ -107,15 +113,20 @@ def read_calibration(path: str | Path, robot: RobotSpec) -> ArmCalibration:
 
 def uncalibrated(robot: RobotSpec) -> ArmCalibration:
     """Return a calibration with the whole range of each encoder, for servos with the ids 1 to 6."""
-    rows = {joint: ServoRow(id=i + 1, drive_mode=0, homing_offset=0, range_min=0, range_max=STEPS_PER_TURN - 1)
-             for i, joint in enumerate(JOINTS)}  # fmt: skip
+    rows = {
+        joint: ServoRow(
+            id=i + 1, drive_mode=0, homing_offset=0, range_min=0, range_max=STEPS_PER_TURN - 1
+        )
+        for i, joint in enumerate(JOINTS)
+    }
     return ArmCalibration(rows, robot)
 
 
 def resolve_calibration(
     file: ArmCalibration | None, stored: dict[str, ServoRow], robot: RobotSpec, port: str
 ) -> ArmCalibration:
-    """Return the calibration of the file if the servos store the same, by joint, or the servos' own without a file.
+    """Return the calibration of the file if the servos store the same, by joint, or the servos'
+    own without a file.
 
     Raises:
         DriverError: The two differ, or neither has the ends of the joints.
@@ -127,17 +138,19 @@ def resolve_calibration(
         blank = [j for j in JOINTS if j in whole and j != CONTINUOUS_JOINT]
         if blank:
             raise DriverError(
-                f"{port}: the servos hold no calibration (no limits in {', '.join(blank)}); run lerobot-calibrate, "
-                f"which writes it into them, and say --calibration FILE ({USUAL_FILE})"
+                f"{port}: the servos hold no calibration (no limits in {', '.join(blank)}); run "
+                "lerobot-calibrate, which writes it into them, and say --calibration FILE "
+                f"({USUAL_FILE})"
             )
         return ArmCalibration(stored, robot)
     for joint in JOINTS:
         for field in ("homing_offset", "range_min", "range_max"):
-            in_file, in_servo = getattr(file.rows[joint], field), getattr(stored[joint], field)
+            in_file = getattr(file.rows[joint], field)
+            in_servo = getattr(stored[joint], field)
             if in_file != in_servo:
                 raise DriverError(
-                    f"{port}: {field} of {joint} is {in_file} in the calibration file and {in_servo} in servo "
-                    f"{file.rows[joint].id}: the file of another arm, or an older one. Calibrate again, or let "
-                    "LeRobot write the file into the servos"
+                    f"{port}: {field} of {joint} is {in_file} in the calibration file and "
+                    f"{in_servo} in servo {file.rows[joint].id}: the file of another arm, or an "
+                    "older one. Calibrate again, or let LeRobot write the file into the servos"
                 )
     return file

@@ -1,4 +1,6 @@
-"""One robot, one source of states: the publisher of a topic is pinned, and a second one is noticed."""
+"""One robot, one source of states: the publisher of a topic is pinned, and a second one is
+noticed.
+"""
 
 from __future__ import annotations
 
@@ -13,13 +15,14 @@ if TYPE_CHECKING:
 class SoleSource:
     """Messages of one publisher of a topic.
 
-    The publisher of the first message is pinned. Messages of others are dropped. A publisher that restarts is another
-    one.
+    The publisher of the first message is pinned. Messages of others are dropped. A publisher that
+    restarts is another one.
 
     Attributes:
         topic: Name on the bus.
         identity: The pinned publisher in words; empty before the first message.
-        second: Another publisher in words, once one was seen; it stays, although that publisher may leave.
+        second: Another publisher in words, once one was seen; it stays, although that publisher may
+            leave.
     """
 
     def __init__(self, reader: Reader, topic: str) -> None:
@@ -30,7 +33,8 @@ class SoleSource:
         self._pinned: int | None = None  # handle
 
     def receive(self) -> list[Array]:
-        """Return the messages of the pinned publisher since the last call, oldest first, as arrays of bytes.
+        """Return the messages of the pinned publisher since the last call, oldest first, as arrays
+        of bytes.
 
         Raises:
             DriverError: DDS fails.

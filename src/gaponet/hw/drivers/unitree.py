@@ -1,17 +1,19 @@
 """UnitreeDriver: the H1-2 over DDS. States from rt/lowstate, commands to rt/arm_sdk or rt/lowcmd.
 
-Motor numbers, topics, the weight of rt/arm_sdk in q of motor 27, mode 1 = enabled, mode_machine echoed from the state,
-and mode_pr 0 for pitch/roll ankles are from Unitree's public SDK examples (h1_2_arm_sdk_dds_example.cpp,
-h1_2_low_level_example.py). Tested against a virtual robot and against programs on Unitree's IDL and DDS version only.
-Not checked, for want of a robot:
+Motor numbers, topics, the weight of rt/arm_sdk in q of motor 27, mode 1 = enabled, mode_machine
+echoed from the state, and mode_pr 0 for pitch/roll ankles are from Unitree's public SDK examples
+(h1_2_arm_sdk_dds_example.cpp, h1_2_low_level_example.py). Tested against a virtual robot and
+against programs on Unitree's IDL and DDS version only. Not checked, for want of a robot:
 
-- that `tick` counts milliseconds (measured when connecting; arrival times are used where it does not)
+- that `tick` counts milliseconds (measured when connecting; arrival times are used where it does
+not)
 - how the robot behaves when commands cease
 - the sign and scale of tau_est
 - that slots without a motor stay zero, and that motorstate is 0 without an error
 
-The arm_sdk example numbers the wrists yaw, pitch, roll, the low-level one roll, pitch, yaw (17 to 19 and 24 to 26).
-This driver follows the latter, as the MJCF does; check it with one small wrist motion first.
+The arm_sdk example numbers the wrists yaw, pitch, roll, the low-level one roll, pitch, yaw (17 to
+19 and 24 to 26). This driver follows the latter, as the MJCF does; check it with one small wrist
+motion first.
 """
 
 from __future__ import annotations
@@ -54,6 +56,7 @@ MOTOR_NAMES = (
     *(f"{side}_{joint}_joint" for side in ("left", "right") for joint in ARM),
 )
 FIRST_MOTOR = {"arms": 13, "upper_body": 12, "all": 0}  # of the commanded ones
+# not all 0 in a slot with a motor
 MOTOR_FIELDS = (
     "mode",
     "q",
@@ -62,7 +65,7 @@ MOTOR_FIELDS = (
     "temperature",
     "vol",
     "motorstate",
-)  # not all 0 in a slot with a motor
+)
 STATES_TOPIC = "rt/lowstate"
 WEIGHT_MOTOR = 27
 # of damping: 8 N·m·s/rad at the shoulder, where a straight arm then sinks at about 1 rad/s
@@ -70,6 +73,7 @@ KD_FACTOR = 4.0
 VIRTUAL_MARK = 0x54524956  # "VIRT" in LowState.reserve[0], written by our virtual robot
 TICK_PERIODS_S = (0.001, 0.002)  # that the robot's tick may have
 MAX_CLOCK_DRIFT = 2e-4  # of the robot's clock, relative to ours
+# mode_machine of a G1 (unitree_ros); 6 may be either, slots decide
 G1_MACHINES = (
     1,
     2,
@@ -77,8 +81,10 @@ G1_MACHINES = (
     4,
     5,
     *range(10, 17),
-)  # mode_machine of a G1 (unitree_ros); 6 may be either, slots decide
-SELECT, L2_B = 1 << 3, 1 << 5 | 1 << 9  # stop keys in bytes 2 and 3 of wireless_remote
+)
+# stop keys in bytes 2 and 3 of wireless_remote
+SELECT = 1 << 3
+L2_B = 1 << 5 | 1 << 9
 MAX_QUATERNION_ERROR = 0.1  # of its length
 CONNECT_TIMEOUT_S = 3.0
 LISTEN_S = 0.4  # in which the rate of the robot's tick is measured
@@ -86,7 +92,10 @@ MAX_SILENCE_S = 0.5  # without a state after which nobody knows the robot's stat
 
 
 class UnitreeDriver:
-    """A `Driver` for the 27 motors of an H1-2. Legs are commanded only with joints="all" on rt/lowcmd."""
+    """A `Driver` for the 27 motors of an H1-2.
+
+    Legs are commanded only with joints="all" on rt/lowcmd.
+    """
 
     noisy = True
     reads_back = False
@@ -105,17 +114,19 @@ class UnitreeDriver:
         """
         Args:
             robot: The H1-2; its kp and kd before identification are sent with every command.
-            topic: arm_sdk leaves legs and balance to the robot; lowcmd switches off all motors that are not commanded
-                and is for a robot that hangs.
+            topic: arm_sdk leaves legs and balance to the robot; lowcmd switches off all motors that
+                are not commanded and is for a robot that hangs.
             joints: arms, upper_body (with torso), or all.
             domain: DDS domain; 0 on a robot.
             interface: Network interface to the robot; lo for a virtual one on this machine.
-            sole: Refuse to connect if another participant publishes the topic, or if two robots publish their states.
+            sole: Refuse to connect if another participant publishes the topic, or if two robots
+                publish their states.
             silent: Only listen: publish nothing, and accept other publishers of the topic.
 
         Raises:
             UsageError: The robot is no H1-2, or the topic does not take the legs.
-            RobotError: Gains or ranges exceed those of the known robot, or effort limits those of the motors.
+            RobotError: Gains or ranges exceed those of the known robot, or effort limits those of
+                the motors.
         """
         if set(robot.joint_names) != set(MOTOR_NAMES):
             raise UsageError(
@@ -127,12 +138,19 @@ class UnitreeDriver:
             )
         require_known_limits(robot, "h1_2")
         nominal = robot.before_identification
-        self.robot, self.topic, self.joints = robot, topic, joints
-        self.kp, self.kd, self._effort_limit = nominal.kp, nominal.kd, nominal.effort_limit
+        self.robot = robot
+        self.topic = topic
+        self.joints = joints
+        self.kp = nominal.kp
+        self.kd = nominal.kd
+        self._effort_limit = nominal.effort_limit
         self.qpos_range: Array | None = None
         self.facts: dict[str, Any] = {}
         self.at_end: EndAction = "hand_over" if topic == "arm_sdk" else "damp"
-        self.domain, self.interface, self.sole, self.silent = domain, interface, sole, silent
+        self.domain = domain
+        self.interface = interface
+        self.sole = sole
+        self.silent = silent
         self.address = f"unitree dds domain {domain}"
         self.virtual = False
         self.joint_names = robot.joint_names
@@ -142,7 +160,8 @@ class UnitreeDriver:
         )
         self._motor = np.array([MOTOR_NAMES.index(name) for name in robot.joint_names])
         self._at = robot.index(self.commanded)
-        # As in Unitree's own arm_sdk example: with weight 1 the waist is ours, whether a motion moves it or not.
+        # As in Unitree's own arm_sdk example: with weight 1 the waist is ours, whether a motion
+        # moves it or not.
         held = [
             n
             for n in robot.joint_names
@@ -162,7 +181,9 @@ class UnitreeDriver:
         self._writer: Writer | None = None
 
     def connect(self) -> None:
-        """Find the robot, learn its tick and machine mode, and refuse if another participant commands it."""
+        """Find the robot, learn its tick and machine mode, and refuse if another participant
+        commands it.
+        """
         from gaponet.hw.drivers import dds
 
         self._bus = dds.Bus(self.domain, self.interface)
@@ -174,8 +195,8 @@ class UnitreeDriver:
         others = [] if self.silent else publishers.get(topic, [])
         if others:
             raise DriverError(
-                f"others publish {topic} on {self.interface}: {'; '.join(others)}; stop them first (on the "
-                "robot: leave debug programs, and for lowcmd release the motion mode)"
+                f"others publish {topic} on {self.interface}: {'; '.join(others)}; stop them "
+                "first (on the robot: leave debug programs, and for lowcmd release the motion mode)"
             )
         robots = publishers.get(STATES_TOPIC, [])
         if len(robots) > 1:
@@ -196,11 +217,13 @@ class UnitreeDriver:
         }
 
     def _refuse_second(self, robots: list[str]) -> NoReturn:
-        """Refuse a bus on which more than one robot publishes its states: all of them would take each command."""
+        """Refuse a bus on which more than one robot publishes its states: all of them would take
+        each command.
+        """
         raise DriverError(
-            f"{len(robots)} robots publish {STATES_TOPIC} on domain {self.domain}, {self.interface}: "
-            f"{'; '.join(robots)}. Each of them would move. Leave one on this domain or network; a program that was "
-            "killed is remembered for about 10 s"
+            f"{len(robots)} robots publish {STATES_TOPIC} on domain {self.domain}, "
+            f"{self.interface}: {'; '.join(robots)}. Each of them would move. Leave one on this "
+            "domain or network; a program that was killed is remembered for about 10 s"
         )
 
     def _listen(self, states: SoleSource) -> tuple[list[float], list[Array]]:
@@ -221,9 +244,9 @@ class UnitreeDriver:
                     else ""
                 )
                 raise DriverError(
-                    f"nobody speaks on rt/lowstate, domain {self.domain}, interface {self.interface}, within "
-                    f"{CONNECT_TIMEOUT_S:g} s{wrong}. Is the robot on, the cable in, the interface right? A virtual "
-                    "one: gaponet virtual serve"
+                    f"nobody speaks on rt/lowstate, domain {self.domain}, interface "
+                    f"{self.interface}, within {CONNECT_TIMEOUT_S:g} s{wrong}. Is the robot on, "
+                    "the cable in, the interface right? A virtual one: gaponet virtual serve"
                 )
             time.sleep(0.001)
         return arrivals, messages
@@ -235,19 +258,22 @@ class UnitreeDriver:
         return intact
 
     def _require_h1_2(self, messages: list[Array]) -> None:
-        """Refuse a robot that is not an H1-2, by its mode_machine and by which of the 35 motor slots are not all 0."""
+        """Refuse a robot that is not an H1-2, by its mode_machine and by which of the 35 motor
+        slots are not all 0.
+        """
         self._machine = int(hg.LowState.view(messages[-1], "mode_machine")[0])
         fields = [hg.LowState.motors(data, name) for data in messages for name in MOTOR_FIELDS]
         values = np.concatenate([field.reshape(hg.MOTORS, -1) for field in fields], axis=1)
         used = np.abs(values).max(axis=1) != 0
-        strange, missing = (
-            np.flatnonzero(used[len(MOTOR_NAMES) :]),
-            np.flatnonzero(~used[: len(MOTOR_NAMES)]),
-        )
+        strange = np.flatnonzero(used[len(MOTOR_NAMES) :])
+        missing = np.flatnonzero(~used[: len(MOTOR_NAMES)])
         if self._machine in G1_MACHINES:
             reason = f"its mode_machine is {self._machine}, a G1's"
         elif len(strange):
-            reason = f"there are motors in slots {', '.join(str(len(MOTOR_NAMES) + i) for i in strange)}, a G1's"
+            reason = (
+                "there are motors in slots "
+                f"{', '.join(str(len(MOTOR_NAMES) + i) for i in strange)}, a G1's"
+            )
         elif len(missing):
             reason = f"no motor in slot {missing[0]}, {MOTOR_NAMES[missing[0]]}"
         else:
@@ -257,7 +283,9 @@ class UnitreeDriver:
         )
 
     def read(self) -> State:
-        """Return the newest state with a right checksum; its time is the robot's, mapped to ours (TickClock)."""
+        """Return the newest state with a right checksum; its time is the robot's, mapped to ours
+        (TickClock).
+        """
         assert self._state is not None
         assert self._states is not None
         assert self._clock is not None
@@ -267,7 +295,8 @@ class UnitreeDriver:
         if self._states.second and self._fault is None:
             self._fault = Fault(
                 "source",
-                f"a second robot publishes {STATES_TOPIC} and takes the same commands: {self._states.second}",
+                f"a second robot publishes {STATES_TOPIC} and takes the same commands: "
+                f"{self._states.second}",
             )
             self._state = replace(self._state, fault=self._fault)
         for data in messages:
@@ -282,7 +311,9 @@ class UnitreeDriver:
         return self._state
 
     def _reported_fault(self, data: Array) -> Fault | None:
-        """Return what the robot itself reports: its operator's stop keys, motor errors, another mode_machine."""
+        """Return what the robot itself reports: its operator's stop keys, motor errors, another
+        mode_machine.
+        """
         keys = int(hg.LowState.view(data, "wireless_remote")[2:4].view("<u2")[0])
         if keys & SELECT or keys & L2_B == L2_B:
             return Fault(
@@ -299,17 +330,18 @@ class UnitreeDriver:
         return None
 
     def _decode(self, data: Array, clock: TickClock, now: float) -> State:
-        message, at = hg.LowState, self._motor
+        message = hg.LowState
+        at = self._motor
         measured = clock.time(int(message.view(data, "tick")[0]), now)
         self.virtual = int(message.view(data, "reserve")[0]) == VIRTUAL_MARK
         q, dq, tau = (
             message.motors(data, name)[at].astype(float) for name in ("q", "dq", "tau_est")
         )
-        temperature = (
-            message.motors(data, "temperature")[at].max(axis=1).astype(float)
-        )  # case and winding
+        # case and winding
+        temperature = message.motors(data, "temperature")[at].max(axis=1).astype(float)
         _, x, y, _ = quaternion = message.view(data, "imu_state.quaternion").astype(float)
-        # The vertical's component along the trunk; an invalid quaternion gives NaN, which counts as tilt.
+        # The vertical's component along the trunk; an invalid quaternion gives NaN, which counts as
+        # tilt.
         valid = abs(np.linalg.norm(quaternion) - 1.0) < MAX_QUATERNION_ERROR
         upright = 1.0 - 2.0 * (x * x + y * y) if valid else np.nan
         tilt = float(np.arccos(np.clip(upright, -1.0, 1.0)))
@@ -332,12 +364,14 @@ class UnitreeDriver:
         """Do nothing: nothing can be read back. The controller checks that the joints follow."""
 
     def damp(self, weight: float = 1.0, share: float = 0.0) -> None:
-        """Send stiffness 0 and damping gains, at most those that the effort limits allow at the present speed.
+        """Send stiffness 0 and damping gains, at most those that the effort limits allow at the
+        present speed.
 
-        The position in the message has no stiffness, but a robot may blend it with its own by the weight. So it is the
-        last command, not a reading, which may be what is wrong. The watchdog has sent no command: its position is the
-        one that it reads when it begins to damp. A torso that is only held stays held until the weight is 0: a trunk
-        must not swing while the arms brake.
+        The position in the message has no stiffness, but a robot may blend it with its own by the
+        weight. So it is the last command, not a reading, which may be what is wrong. The watchdog
+        has sent no command: its position is the one that it reads when it begins to damp. A torso
+        that is only held stays held until the weight is 0: a trunk must not swing while the arms
+        brake.
         """
         state = self._newest_state()
         qpos = np.zeros(len(self._motor)) if state is None else np.nan_to_num(state.qpos)
@@ -350,8 +384,8 @@ class UnitreeDriver:
     def _newest_state(self) -> State | None:
         """Return the newest state, or the last one if the bus gives none; None before `connect`.
 
-        The watchdog reads nothing until it damps. The state from its connection may be minutes old: a torso that is
-        held there, with stiffness, would jump back to it.
+        The watchdog reads nothing until it damps. The state from its connection may be minutes old:
+        a torso that is held there, with stiffness, would jump back to it.
         """
         if self._states is not None and self._clock is not None:
             with contextlib.suppress(DriverError):
@@ -363,7 +397,9 @@ class UnitreeDriver:
             return
         if self._held_qpos is None:
             self._held_qpos = (ctrl if self._state is None else self._state.qpos)[self._held]
-        motors, held, data = self._motor[self._at], self._held, self._command
+        motors = self._motor[self._at]
+        held = self._held
+        data = self._command
         for name, values, held_values in (
             ("mode", np.ones(len(ctrl)), np.ones(len(held))),
             ("q", ctrl, np.nan_to_num(self._held_qpos)),
@@ -387,7 +423,9 @@ class UnitreeDriver:
         return "damped and let go"
 
     def close(self, hold: bool = False) -> None:
-        """Leave the bus; after damping the last message has weight 0: the arms are the robot's own again (arm_sdk)."""
+        """Leave the bus; after damping the last message has weight 0: the arms are the robot's own
+        again (arm_sdk).
+        """
         if self._bus is None:
             return
         with contextlib.suppress(DriverError):
@@ -396,7 +434,9 @@ class UnitreeDriver:
         self._bus = self._states = self._writer = None
 
     def publishers(self) -> dict[str, list[str]]:
-        """Return the other publishers on the bus: topic → programs; the robot's topics are always included."""
+        """Return the other publishers on the bus: topic → programs; the robot's topics are always
+        included.
+        """
         assert self._bus is not None
         publishers = self._bus.publishers()
         return {
@@ -405,19 +445,27 @@ class UnitreeDriver:
         }
 
     def watchdog(self) -> dict[str, object] | None:
-        """Return the options of a second participant: connected from the start, and silent until it damps."""
+        """Return the options of a second participant: connected from the start, and silent until
+        it damps.
+        """
         return {
-            "kind": "unitree", "robot": str(self.robot.folder.resolve()), "topic": self.topic,
-            "joints": self.joints, "domain": self.domain, "interface": self.interface, "sole": False,
+            "kind": "unitree",
+            "robot": str(self.robot.folder.resolve()),
+            "topic": self.topic,
+            "joints": self.joints,
+            "domain": self.domain,
+            "interface": self.interface,
+            "sole": False,
             "limits_from": accepted_folder(self.robot),
-        }  # fmt: skip
+        }
 
 
 class TickClock:
-    """Maps the robot's tick to this machine's monotonic clock, so that delayed messages are seen to be old.
+    """Maps the robot's tick to this machine's monotonic clock, so that delayed messages are seen
+    to be old.
 
-    The offset is the smallest (arrival − tick) seen: that of the fastest message so far. It may grow slowly, in case
-    the robot's clock is slower than ours.
+    The offset is the smallest (arrival − tick) seen: that of the fastest message so far. It may
+    grow slowly, in case the robot's clock is slower than ours.
     """
 
     def __init__(self, arrivals: list[float], ticks: list[int]) -> None:
@@ -425,8 +473,11 @@ class TickClock:
         period = (arrivals[-1] - arrivals[0]) / max((ticks[-1] - ticks[0]) % 2**32, 1)
         # s; None: the tick is no clock, and arrival times are used
         self.period = next((p for p in TICK_PERIODS_S if 0.7 < period / p < 1.4), None)
-        self._last_tick, self._wraps = ticks[0], 0
-        self._offset, self._last_arrival, self._time = np.inf, arrivals[0], arrivals[0]
+        self._last_tick = ticks[0]
+        self._wraps = 0
+        self._offset = np.inf
+        self._last_arrival = arrivals[0]
+        self._time = arrivals[0]
         for arrival, tick in zip(arrivals, ticks, strict=True):
             self.time(tick, arrival)
 
@@ -443,7 +494,8 @@ class TickClock:
             self._offset = np.inf
         self._last_tick = tick
         if self.period is None:
-            self._offset, self._time = 0.0, arrival
+            self._offset = 0.0
+            self._time = arrival
             return arrival
         robot_time = (tick + self._wraps * 2**32) * self.period
         drift = MAX_CLOCK_DRIFT * max(arrival - self._last_arrival, 0.0)

@@ -1,4 +1,6 @@
-"""Client of `gaponet run --targets zmq`: the robot as a policy or a teleoperator in another process sees it."""
+"""Client of `gaponet run --targets zmq`: the robot as a policy or a teleoperator in another
+process sees it.
+"""
 
 from __future__ import annotations
 
@@ -36,7 +38,8 @@ class RemoteRobot:
             address: Where `gaponet run` listens.
             patience: Longest wait for a state, s.
         """
-        self.address, self.patience = address, patience
+        self.address = address
+        self.patience = patience
         self.joint_names: tuple[str, ...] = ()
         self.commanded: tuple[str, ...] = ()
         self.ended = ""
@@ -63,10 +66,12 @@ class RemoteRobot:
             yield state
 
     def send(self, target: Mapping[str, float] | Array) -> None:
-        """Send a target: joint → rad, or an array (n) of all joints, rad, of which the commanded ones count.
+        """Send a target: joint → rad, or an array (n) of all joints, rad, of which the commanded
+        ones count.
 
         Raises:
-            DriverError: An array was given before the first state, when the order of the joints is not known.
+            DriverError: An array was given before the first state, when the order of the joints is
+                not known.
         """
         if not isinstance(target, Mapping):
             if not self.joint_names:
@@ -78,7 +83,10 @@ class RemoteRobot:
         self._send({"target": {name: float(value) for name, value in target.items()}})
 
     def close(self, end: bool = True) -> None:
-        """Leave. With `end` the robot goes back to where it started; without, it is held, then damps."""
+        """Leave.
+
+        With `end` the robot goes back to where it started; without, it is held, then damps.
+        """
         if end and not self.ended:
             self._send({"end": True})
         self._context.destroy()
@@ -92,7 +100,8 @@ class RemoteRobot:
     def _newest(self) -> State | None:
         if not self._socket.poll(round(1e3 * self.patience)):
             raise DriverError(
-                f"no state from {self.address} in {self.patience:g} s; is gaponet run --targets zmq there?"
+                f"no state from {self.address} in {self.patience:g} s; is gaponet run --targets "
+                "zmq there?"
             )
         with contextlib.suppress(zmq.Again):
             while True:
@@ -100,9 +109,7 @@ class RemoteRobot:
                 self.ended = message.get("end", "")
                 if self.ended:
                     return None
-        self.joint_names, self.commanded = (
-            tuple(message["joint_names"]),
-            tuple(message["commanded"]),
-        )
+        self.joint_names = tuple(message["joint_names"])
+        self.commanded = tuple(message["commanded"])
         qpos, qvel, tau = (np.array(message[name], float) for name in ("qpos", "qvel", "tau"))
         return State(message["time"], qpos, qvel, tau, np.full_like(qpos, np.nan))

@@ -1,9 +1,11 @@
-"""Live targets: positions that arrive while the robot moves, from teleoperation or from a policy in another process.
+"""Live targets: positions that arrive while the robot moves, from teleoperation or from a policy
+in another process.
 
-A `Transport` delivers messages. `LiveTargets` checks them and is the controller's policy. A rejected target changes
-nothing: the last accepted one is held. If no target is accepted for `LiveConfig.hold`, the robot damps. An accepted
-target is approached within an acceleration limit, and then passes compensator, limits and watchdog like a motion's row.
-docs/reference/controller.md lists the end of each fault.
+A `Transport` delivers messages. `LiveTargets` checks them and is the controller's policy. A
+rejected target changes nothing: the last accepted one is held. If no target is accepted for
+`LiveConfig.hold`, the robot damps. An accepted target is approached within an acceleration limit,
+and then passes compensator, limits and watchdog like a motion's row. docs/reference/controller.md
+lists the end of each fault.
 """
 
 from __future__ import annotations
@@ -54,7 +56,8 @@ class LiveConfig:
         for name, (most, unit) in MAX_OPTIONS.items():
             if not 0 < getattr(self, name) <= most:
                 raise UsageError(
-                    f"live: {name} is {getattr(self, name)} {unit}; give a positive number up to {most:g}"
+                    f"live: {name} is {getattr(self, name)} {unit}; give a positive number up to "
+                    f"{most:g}"
                 )
 
 
@@ -64,7 +67,8 @@ class MessageFields:
 
     Attributes:
         time: On the sender's own clock, s; increases from message to message.
-        target: Joint → rad; the same joints in every message. Empty: the sender only wants to receive states.
+        target: Joint → rad; the same joints in every message. Empty: the sender only wants to
+            receive states.
         end: The motion is over: the robot goes back to where it started.
     """
 
@@ -84,7 +88,9 @@ class Message(NamedTuple):
 
 
 def sender_name(sender: Hashable) -> str:
-    """Return a sender in words: a DDS handle or the bytes of a ZeroMQ connection as hexadecimal digits."""
+    """Return a sender in words: a DDS handle or the bytes of a ZeroMQ connection as hexadecimal
+    digits.
+    """
     if isinstance(sender, bytes):
         return sender.hex()
     if isinstance(sender, int):
@@ -112,10 +118,14 @@ class Transport(Protocol):
         """Return the messages since the last call, oldest first, at most some dozens."""
 
     def senders(self) -> set[Hashable]:
-        """Return the senders that are connected now; empty where a transport knows them by their messages alone."""
+        """Return the senders that are connected now; empty where a transport knows them by their
+        messages alone.
+        """
 
     def publish(self, to: Hashable, state: dict[str, Any]) -> None:
-        """Send joint_names, commanded, and qpos, qvel, tau in SI units to the sender, or to all listeners."""
+        """Send joint_names, commanded, and qpos, qvel, tau in SI units to the sender, or to all
+        listeners.
+        """
 
     def close(self, reason: str) -> None:
         """Send the reason why the run ended, and close."""
@@ -130,7 +140,8 @@ def next_step(step: Array, distance: Array, max_step: float, max_change: float) 
         max_step: Largest step, rad.
         max_change: Largest change of the step from one control period to the next, rad.
     """
-    # A step of u changes, u from m to m + 1, and the m smaller ones that end it go (m + 1) u - m (m + 1) / 2 changes.
+    # A step of u changes, u from m to m + 1, and the m smaller ones that end it go (m + 1) u - m (m
+    # + 1) / 2 changes.
     far = np.abs(distance)
     m = np.floor((np.sqrt(1 + 8 * far / max_change) - 1) / 2)
     largest = np.where(
@@ -144,14 +155,15 @@ def next_step(step: Array, distance: Array, max_step: float, max_change: float) 
 class LiveTargets:
     """Policy of a controller whose targets arrive over a transport.
 
-    The sender of the first well-formed message is the only sender of the run. If another one speaks before a first
-    target is accepted, nobody knows which of the two was meant, and the run is refused. Later its messages are
-    rejected, with a remark, and the robot follows the first one. They cannot move the robot, and a stop would let every
-    program that reaches the address drop an arm in the middle of a motion.
+    The sender of the first well-formed message is the only sender of the run. If another one speaks
+    before a first target is accepted, nobody knows which of the two was meant, and the run is
+    refused. Later its messages are rejected, with a remark, and the robot follows the first one.
+    They cannot move the robot, and a stop would let every program that reaches the address drop an
+    arm in the middle of a motion.
 
     Attributes:
-        counts: accepted (`taken`) and rejected (`refused`, by kind) messages; periods in which a target was `held`;
-            the `sender`.
+        counts: accepted (`taken`) and rejected (`refused`, by kind) messages; periods in which a
+            target was `held`; the `sender`.
         remarks: Sentences for the recording; the controller takes them out.
     """
 
@@ -175,20 +187,23 @@ class LiveTargets:
         # Decoding the first message of a process takes 20 ms or more, which no control period has.
         decode("", b'{"time": 0.0, "target": {"joint": 0.0}, "end": false}')
         decode("", b"no message")
-        self.transport, self.robot, self.commanded, self.clock = transport, robot, commanded, clock
-        self.dt, self.speed, self.config = dt, speed, config
+        self.transport = transport
+        self.robot = robot
+        self.commanded = commanded
+        self.clock = clock
+        self.dt = dt
+        self.speed = speed
+        self.config = config
         self.counts: dict[str, Any] = {"taken": 0, "held": 0, "refused": Counter(), "sender": ""}
         self.remarks: list[str] = []
         self._sender: Hashable | None = None
         self._joints: tuple[str, ...] = ()
         self._target: Array | None = None  # the last accepted one, all joints, rad
-        self._position, self._step = (
-            np.zeros(0),
-            np.zeros(0),
-        )  # on the way to the target, rad; the last step, rad
-        self._offset = self._offset_time = (
-            np.inf
-        )  # least arrival − time, s; our time of the last update
+        # on the way to the target, rad; the last step, rad
+        self._position = np.zeros(0)
+        self._step = np.zeros(0)
+        # least arrival − time, s; our time of the last update
+        self._offset = self._offset_time = np.inf
         self._sender_time = -np.inf  # of the last accepted target, sender's clock
         self._start: float | None = None
         self._accepted_time = 0.0  # our time of the last accepted target
@@ -196,9 +211,11 @@ class LiveTargets:
         self._rejection = ""
 
     def __call__(self, k: int, state: State) -> Array | Fault | None:
-        """Return the position on the way to the target, (n) rad; it begins at the first target, at rest.
+        """Return the position on the way to the target, (n) rad; it begins at the first target, at
+        rest.
 
-        None: the sender has ended the motion and its last target is reached. Fault: no target was accepted for long.
+        None: the sender has ended the motion and its last target is reached. Fault: no target was
+        accepted for long.
         """
         now = self.clock.now()
         self._start = now if self._start is None else self._start
@@ -211,11 +228,11 @@ class LiveTargets:
             if unproven and self._has_second_sender():
                 return Fault(
                     "source",
-                    f"more than one program sends targets to {self.transport.address}; end all but one",
+                    f"more than one program sends targets to {self.transport.address}; end all "
+                    "but one",
                 )
-        ending = self._ended and (
-            k > 0 or self._target is None
-        )  # row 0 is also the goal of the blend
+        # row 0 is also the goal of the blend
+        ending = self._ended and (k > 0 or self._target is None)
         if self._target is None:
             if ending:
                 return None
@@ -249,7 +266,8 @@ class LiveTargets:
     def _advance(self, target: Array) -> None:
         """Move on towards a target (n) rad by one control period."""
         if not self._position.size:
-            self._position, self._step = target, np.zeros_like(target)
+            self._position = target
+            self._step = np.zeros_like(target)
         distance = target - self._position
         self._step = next_step(
             self._step, distance, self.speed * self.dt, self.config.acceleration * self.dt**2
@@ -257,8 +275,12 @@ class LiveTargets:
         self._position = np.where(self._step == distance, target, self._position + self._step)
 
     def _receive(self, now: float, state: State) -> None:
-        """Accept the newest valid target; each is compared with the one in force before this call."""
-        before, since, accepted = self._target, now - self._accepted_time, None
+        """Accept the newest valid target; each is compared with the one in force before this
+        call.
+        """
+        before = self._target
+        since = now - self._accepted_time
+        accepted = None
         for message in self.transport.receive():
             kind, why = self._reject(message, now)
             target, kind, why = (
@@ -276,7 +298,9 @@ class LiveTargets:
                 self._sender_time = message.time if message.time is not None else self._sender_time
                 self.counts["taken"] += 1
         if accepted is not None:
-            self._target, self._accepted_time, self._rejection = accepted, now, ""
+            self._target = accepted
+            self._accepted_time = now
+            self._rejection = ""
 
     def _reject(self, message: Message, now: float) -> tuple[str, str]:
         """Return kind and reason if sender or time of a message are wrong, else empty strings."""
@@ -297,7 +321,8 @@ class LiveTargets:
         if message.time <= self._sender_time:
             return "order", f"its time {message.time:.6g} s is not after {self._sender_time:.6g} s"
         drifted = self._offset + MAX_CLOCK_DRIFT * max(now - self._offset_time, 0.0)
-        self._offset, self._offset_time = min(now - message.time, drifted), now
+        self._offset = min(now - message.time, drifted)
+        self._offset_time = now
         late = now - message.time - self._offset
         if late > self.config.late:
             return "late", f"it took {late * 1e3:.0f} ms longer than the fastest"
@@ -306,7 +331,9 @@ class LiveTargets:
     def _full_target(
         self, message: Message, before: Array | None, since: float, state: State
     ) -> tuple[Array | None, str, str]:
-        """Return the target of all joints (n) rad, None for a greeting; or kind and reason of its rejection."""
+        """Return the target of all joints (n) rad, None for a greeting; or kind and reason of its
+        rejection.
+        """
         if not message.target:
             return None, "", ""
         names = self._joints or tuple(message.target)
@@ -320,10 +347,8 @@ class LiveTargets:
                 f"joint '{odd[0]}' is new, left out, or not one that is commanded",
             )
         at = self.robot.index(names)
-        wanted, (low, high) = (
-            np.array([message.target[name] for name in names], float),
-            self.robot.qpos_range[at].T,
-        )
+        wanted = np.array([message.target[name] for name in names], float)
+        low, high = self.robot.qpos_range[at].T
         beyond = np.maximum(low - wanted, wanted - high)
         if not beyond.max() <= MAX_BEYOND_RANGE_RAD:  # NaN too
             worst = int(np.argmax(beyond))
@@ -336,7 +361,8 @@ class LiveTargets:
             return (
                 None,
                 "speed",
-                f"{names[worst]} goes {step[worst]:.2f} rad at once, {allowed:.2f} would be possible",
+                f"{names[worst]} goes {step[worst]:.2f} rad at once, {allowed:.2f} would be "
+                "possible",
             )
         target[at] = np.clip(wanted, low, high)
         self._joints = names

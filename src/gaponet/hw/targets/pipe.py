@@ -1,4 +1,6 @@
-"""Targets on standard input: one line of JSON per message (live.MessageFields), from a program at the other end."""
+"""Targets on standard input: one line of JSON per message (live.MessageFields), from a program at
+the other end.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,8 @@ class PipeTransport:
         """
         if descriptor is None and (sys.stdin is None or sys.stdin.isatty()):
             raise UsageError(
-                "targets on stdin come through a pipe: PROGRAM | gaponet run --targets stdin --yes …"
+                "targets on stdin come through a pipe: PROGRAM | gaponet run --targets stdin "
+                "--yes …"
             )
         self.address = "stdin"
         self._descriptor = sys.stdin.fileno() if descriptor is None else descriptor
@@ -42,10 +45,12 @@ class PipeTransport:
             return [Message("stdin", error="the other end closed the pipe")]
         *lines, self._partial_line = (self._partial_line + data).split(b"\n")
         if self._skipping and lines:  # the end of a line that was too long
-            lines, self._skipping = lines[1:], False
+            lines = lines[1:]
+            self._skipping = False
         messages = [decode("stdin", line) for line in lines]
         if len(self._partial_line) > MAX_MESSAGE_BYTES:
-            self._partial_line, self._skipping = b"", True
+            self._partial_line = b""
+            self._skipping = True
             messages.append(decode("stdin", bytes(MAX_MESSAGE_BYTES + 1)))
         return messages
 

@@ -1,10 +1,11 @@
 # mypy: disable-error-code="misc, type-arg, valid-type"
 """Targets from a ROS 2 topic and states to another, over DDS, without ROS.
 
-Messages are those of ros2_control: its joint trajectory controller receives trajectory_msgs/JointTrajectory, its joint
-state broadcaster sends sensor_msgs/JointState. Each message has one point, as MoveIt Servo and teleoperation send it,
-and takes effect at once. A message without points ends the run. Types and topics have the names that ROS 2 uses on DDS
-(rt/…, …::msg::dds_::…_).
+Messages are those of ros2_control: its joint trajectory controller receives
+trajectory_msgs/JointTrajectory, its joint state broadcaster sends sensor_msgs/JointState. Each
+message has one point, as MoveIt Servo and teleoperation send it, and takes effect at once. A
+message without points ends the run. Types and topics have the names that ROS 2 uses on DDS (rt/…,
+…::msg::dds_::…_).
 """
 
 import struct
@@ -73,14 +74,16 @@ class ROS2Transport:
     def __init__(
         self, domain: int = 0, interface: str = "lo", topic: str = TOPIC, states: str = STATES_TOPIC
     ) -> None:
-        """Join the domain ROS_DOMAIN_ID. Topics, of JointTrajectory and of JointState, have the prefix rt/."""
+        """Join the domain ROS_DOMAIN_ID.
+
+        Topics, of JointTrajectory and of JointState, have the prefix rt/.
+        """
         self.address = f"{topic}, domain {domain}, interface {interface}"
         self._bus = dds.Bus(domain, interface)
         self._reader = self._bus.reader(topic, JointTrajectory, QUEUE_LENGTH)
         self._writer = self._bus.writer(states, JointState)
-        point = JointTrajectoryPoint(
-            [0.0], [], [], [], Duration(0, 0)
-        )  # decoding the first one takes long
+        # decoding the first one takes long
+        point = JointTrajectoryPoint([0.0], [], [], [], Duration(0, 0))
         to_message("", encode(JointTrajectory(Header(Time(0, 0), ""), ["joint"], [point])))
 
     def receive(self) -> list[Message]:
@@ -113,7 +116,9 @@ def to_message(sender: Hashable, data: bytes) -> Message:
         trajectory = decode(JointTrajectory, data)
     except ValueError as error:
         return Message(sender, error=str(error))
-    stamp, names, points = trajectory.header.stamp, trajectory.joint_names, trajectory.points
+    stamp = trajectory.header.stamp
+    names = trajectory.joint_names
+    points = trajectory.points
     time_s = stamp.sec + 1e-9 * stamp.nanosec or None  # 0: no clock
     if not points:
         return Message(sender, time_s, end=True)

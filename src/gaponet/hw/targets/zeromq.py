@@ -25,8 +25,8 @@ class ZeroMQTransport:
     def __init__(self, address: str = ADDRESS) -> None:
         """
         Args:
-            address: tcp://HOST:PORT of this machine, or ipc://PATH. Only this machine reaches 127.0.0.1. Nothing is
-                encrypted or authenticated.
+            address: tcp://HOST:PORT of this machine, or ipc://PATH. Only this machine reaches
+                127.0.0.1. Nothing is encrypted or authenticated.
 
         Raises:
             UsageError: The address cannot be bound.

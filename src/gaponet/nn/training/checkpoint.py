@@ -18,7 +18,8 @@ from gaponet.nn.training.sensor_fit import SensorReport
 
 StateDict = dict[str, Any]
 
-CHECKPOINT, PROGRESS = "checkpoint.pt", "progress.jsonl"
+CHECKPOINT = "checkpoint.pt"
+PROGRESS = "progress.jsonl"
 SHARED = ("net", "optimiser", "critic", "critic_optimiser")  # equal on all ranks
 
 
@@ -34,9 +35,11 @@ class Checkpoint:
         steps: Control steps of all ranks.
         seconds: Training time up to this checkpoint.
         pretraining_rounds, ppo_updates: How many are done.
-        ppo_from_untrained: PPO started from untrained weights because pre-training increased the error.
+        ppo_from_untrained: PPO started from untrained weights because pre-training increased the
+            error.
         sensor_r2: R² of the sensor predictor.
-        ppo, env, pretraining: States of PPO, of its environments, and of pre-training; None outside these stages.
+        ppo, env, pretraining: States of PPO, of its environments, and of pre-training; None outside
+            these stages.
         progress: Lines of progress.jsonl.
         dataset_hash: Hash of the recordings.
     """
@@ -64,7 +67,10 @@ class Checkpoint:
         return float(self.progress[0]["val_mpjae"])
 
     def write(self, out: Path, net: DeltaNet) -> None:
-        """Write checkpoint.pt and progress.jsonl. The first rank writes, after all ranks compared their networks."""
+        """Write checkpoint.pt and progress.jsonl.
+
+        The first rank writes, after all ranks compared their networks.
+        """
         ranks.require_equal(net.state_dict(), self.ppo["critic"] if self.ppo else {})
         state = vars(self) | {"net": net.state_dict(), "rng": torch.get_rng_state()}
         others = ranks.gathered(
@@ -118,7 +124,9 @@ class Checkpoint:
 
 
 def _rank_state(state: Any) -> Any:
-    """Select what differs between ranks, on the CPU: everything except networks and their optimisers."""
+    """Select what differs between ranks, on the CPU: everything except networks and their
+    optimisers.
+    """
     if isinstance(state, dict):
         return {name: _rank_state(x) for name, x in state.items() if name not in SHARED}
     if isinstance(state, list):

@@ -39,7 +39,8 @@ class PretrainingConfig:
     """Supervised pre-training: regression of labels on the states of rollouts."""
 
     rounds: Annotated[int, Interval(ge=0, le=100000)] = 3
-    """Rounds of rollouts. The first applies the labels, later ones the network. 0: PPO starts untrained."""
+    """Rounds of rollouts. The first applies the labels, later ones the network. 0: PPO starts
+    untrained."""
     num_envs: Annotated[int, Interval(ge=0, le=1000000)] = 0
     """Simulations per round; 0 means 256, or 4,096 with --device cuda."""
     steps: Annotated[int, Interval(ge=1, le=10000000)] = 400
@@ -73,14 +74,16 @@ class PPOConfig:
     mini_batches: Annotated[int, Interval(ge=1, le=10000)] = 4
     """Mini-batches per pass; 2048 samples each fit into the cache."""
     learning_rate: Annotated[float, Interval(gt=0, le=1)] = 1e-5
-    """Initial step size of the actor; it adapts to desired_kl. Adam's first steps have this size whatever the gradient
-    is, and 1e-4 destroys a pre-trained network."""
+    """Initial step size of the actor; it adapts to desired_kl. Adam's first steps have this size
+    whatever the gradient is, and 1e-4 destroys a pre-trained network."""
     critic_learning_rate: Annotated[float, Interval(gt=0, le=1)] = 1e-3
     """Step size of the critic. With the actor's, it would learn too slowly."""
     desired_kl: Annotated[float, Interval(ge=0, le=1e6)] = 0.005
-    """KL divergence per joint and update. The actor's step size changes by a factor of 1.5 to stay near it."""
+    """KL divergence per joint and update. The actor's step size changes by a factor of 1.5 to stay
+    near it."""
     gamma: Annotated[float, Interval(gt=0, lt=1)] = 0.95
-    """Discount per control period. A correction acts within the servo lag; a longer horizon only adds variance."""
+    """Discount per control period. A correction acts within the servo lag; a longer horizon only
+    adds variance."""
     lam: Annotated[float, Interval(gt=0, le=1)] = 0.95
     """GAE λ."""
     clip: Annotated[float, Interval(gt=0, le=1)] = 0.2
@@ -88,10 +91,11 @@ class PPOConfig:
     critic_warmup: Annotated[int, Interval(ge=0, le=10000000)] = 8
     """Number of updates of the critic alone, before the actor is trained."""
     explained: Annotated[float, Interval(le=1)] = 0.5
-    """Share of the variance of the returns that the critic must explain before the actor is trained."""
+    """Share of the variance of the returns that the critic must explain before the actor is
+    trained."""
     std: Annotated[float, Interval(gt=0, le=1e6)] = 0.0025
-    """Exploration σ, rad. Noise above friction/kp (0.003 rad on the SO-101) breaks the stiction of joints, and the best
-    policy with noise is then not the best policy without."""
+    """Exploration σ, rad. Noise above friction/kp (0.003 rad on the SO-101) breaks the stiction of
+    joints, and the best policy with noise is then not the best policy without."""
     std_half_life: Annotated[float, Interval(ge=0, le=1e9)] = 0.0
     """Number of updates in which the exploration σ halves, down to std_end; 0 keeps it constant."""
     std_end: Annotated[float, Interval(gt=0, le=1e6)] = 0.0025
@@ -99,18 +103,26 @@ class PPOConfig:
     noise_time: Annotated[float, Interval(ge=0, le=1e6)] = 0.2
     """Correlation time of the exploration, s; 0 means white noise."""
     noise_share: Annotated[float, Interval(gt=0, le=1)] = 0.5
-    """Share of the joints that explore at a time. The other joints show the error without exploration."""
+    """Share of the joints that explore at a time. The other joints show the error without
+    exploration."""
     critic_hidden: Layers = (256, 128)
     """Hidden layers of the critic."""
     refit_sensors: Annotated[int, Interval(ge=0, le=10000000)] = 0
-    """Number of updates between new fits of the sensor predictor to visited states; 0 means none."""
+    """Number of updates between new fits of the sensor predictor to visited states; 0 means
+    none."""
 
 
 # The paper's training: PPO from an untrained network, with a larger step size and more exploration.
 PAPER_PPO = PPOConfig(
-    learning_rate=3e-4, desired_kl=0.01, critic_warmup=4, explained=0.2, std=0.02, std_half_life=20.0, noise_share=1.0,
+    learning_rate=3e-4,
+    desired_kl=0.01,
+    critic_warmup=4,
+    explained=0.2,
+    std=0.02,
+    std_half_life=20.0,
+    noise_share=1.0,
     refit_sensors=50,
-)  # fmt: skip
+)
 
 # For many simulators: wider networks, less noise and more steps than for one.
 MANY_SIMULATORS_MODEL = ModelConfig(branch_hidden=(160, 128), trunk_hidden=(64, 64), num_basis=32)
@@ -153,9 +165,9 @@ class TrainConfig:
     train_share: Annotated[float, Interval(gt=0, le=1)] = 1.0
     """Share of the training motions that is used. Validation and test motions stay the same."""
     simulators: Annotated[int, Interval(ge=0, le=100_000)] = 0
-    """Number of simulators in which the network is trained; they are drawn from simulator_ranges by the seed. The
-    network is told the simulator's answers to fixed probes (sim/context.py), and then corrects simulators that it has
-    never seen. 0: the robot's own simulator alone."""
+    """Number of simulators in which the network is trained; they are drawn from simulator_ranges by
+    the seed. The network is told the simulator's answers to fixed probes (sim/context.py), and then
+    corrects simulators that it has never seen. 0: the robot's own simulator alone."""
     simulators_per_piece: Annotated[int, Interval(ge=1, le=1000)] = 2
     """Number of these simulators in which each piece of a recording is replayed."""
     simulator_ranges: SimulatorRanges = field(default_factory=SimulatorRanges)
@@ -166,10 +178,12 @@ class TrainConfig:
     validate_every: Annotated[int, Interval(ge=1, le=10000000)] = 10
     """PPO updates between validations."""
     threads: Annotated[int, Interval(ge=0, le=4096)] = 0
-    """Threads of the simulator and of torch, which take turns; 0 means all cores, and OMP_NUM_THREADS for torch."""
+    """Threads of the simulator and of torch, which take turns; 0 means all cores, and
+    OMP_NUM_THREADS for torch."""
     device: Literal["cpu", "cuda", "warp-cpu"] = "cpu"
-    """cuda: simulations and networks on a GPU (pip install 'gaponet[warp]'), by default 4,096 simulations. warp-cpu:
-    the same on the CPU, slowly, for tests. Validation, identification and robots use C MuJoCo."""
+    """cuda: simulations and networks on a GPU (pip install 'gaponet[warp]'), by default 4,096
+    simulations. warp-cpu: the same on the CPU, slowly, for tests. Validation, identification and
+    robots use C MuJoCo."""
 
     def network_device(self) -> str:
         """Return torch's device for the networks.
@@ -207,7 +221,8 @@ class TrainConfig:
     def many_simulators_recipe(self) -> TrainConfig:
         """Return this configuration with what training in many simulators needs.
 
-        Options that differ from the defaults stay. The network is told its simulator's answers, if its kind can be.
+        Options that differ from the defaults stay. The network is told its simulator's answers, if
+        its kind can be.
         """
         model = _keep_changed(self.model, MANY_SIMULATORS_MODEL)
         if not self.without_context and self.model.kind in CONTEXT_KINDS:
@@ -216,14 +231,16 @@ class TrainConfig:
         return replace(self, model=model, pretraining=pretraining)
 
     def sized(self) -> TrainConfig:
-        """Return this configuration with the number of simulations where num_envs is 0, and its recipe.
+        """Return this configuration with the number of simulations where num_envs is 0, and its
+        recipe.
 
         Raises:
             UsageError: Many simulators on a GPU.
         """
         if self.simulators and self.device != "cpu":
             raise UsageError(
-                f"--simulators with --device {self.device}: many simulators step in C MuJoCo; use --device cpu"
+                f"--simulators with --device {self.device}: many simulators step in C MuJoCo; use "
+                "--device cpu"
             )
         config = self.many_simulators_recipe() if self.simulators else self
         num = max(4096 if self.device == "cuda" else 256, 2 * self.simulators)
@@ -237,25 +254,30 @@ class TrainConfig:
 
 
 def command(
-    dataset: Path | str, out: Path, budget: Budget, config: TrainConfig, robot: RobotSpec,
-    holdout_units: tuple[str, ...], processes: int,
-) -> str:  # fmt: skip
+    dataset: Path | str,
+    out: Path,
+    budget: Budget,
+    config: TrainConfig,
+    robot: RobotSpec,
+    holdout_units: tuple[str, ...],
+    processes: int,
+) -> str:
     """Return the shell command that repeats a run."""
     limit = str(budget.steps) if budget.seconds is None else f"{budget.seconds:g}s"
     several = ["torchrun", "--nproc-per-node", str(processes), "-m"] if processes > 1 else []
     words = [*several, "gaponet", "train", str(dataset), "--out", str(out), "--budget", limit]
     words += ["--robot", str(robot.folder)] if robot.nominal is not None else []
     words += ["--holdout-units", *holdout_units] if holdout_units else []
-    words += (
-        ["--model", "gaponet"] if config.model.kind == "gaponet" else []
-    )  # the command's default is auto
+    # the command's default is auto
+    words += ["--model", "gaponet"] if config.model.kind == "gaponet" else []
     return shlex.join(words + config.options())
 
 
 def _options(config: dict[str, Any], defaults: dict[str, Any], prefix: str) -> list[str]:
     words: list[str] = []
     for key, default in defaults.items():
-        value, name = config[key], key.replace("_", "-")
+        value = config[key]
+        name = key.replace("_", "-")
         if isinstance(default, dict):
             words += _options(value, default, f"{prefix}{name}.")
         elif isinstance(value, bool):
@@ -292,7 +314,8 @@ class Budget:
         unit = match.group(2).lower()
         if not unit and number < MIN_STEPS:
             raise UsageError(
-                f"--budget {text}: {number:g} control steps teach nothing; is it {text}s or {text}m?"
+                f"--budget {text}: {number:g} control steps teach nothing; is it {text}s or "
+                f"{text}m?"
             )
         return cls(seconds=number * SECONDS[unit]) if unit else cls(steps=int(number))
 
@@ -309,7 +332,10 @@ class Budget:
 
 @dataclass(frozen=True)
 class Status:
-    """State of a run, for a progress bar. Errors are mean position errors in rad; NaN where unknown."""
+    """State of a run, for a progress bar.
+
+    Errors are mean position errors in rad; NaN where unknown.
+    """
 
     stage: str
     fraction: float

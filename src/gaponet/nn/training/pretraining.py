@@ -1,11 +1,13 @@
 """Supervised pre-training: regression of labels on visited states (DAgger, Ross et al. 2011).
 
-In the first round, rollouts apply the label corrections. In later rounds they apply the present network. Each visited
-state gets the label of its recorded row (`trajectory_labels`). The servos are stable, so that label also holds for a
-state that has drifted. Each round adds the visited states to a pool and fits the network to the whole pool.
+In the first round, rollouts apply the label corrections. In later rounds they apply the present
+network. Each visited state gets the label of its recorded row (`trajectory_labels`). The servos are
+stable, so that label also holds for a state that has drifted. Each round adds the visited states to
+a pool and fits the network to the whole pool.
 
-Inputs are noisy during the fit. Past corrections are visible in the states that followed. Without noise, a network
-reads the label from them, and its own rollouts are worse than without correction (docs/results/unnamed.md).
+Inputs are noisy during the fit. Past corrections are visible in the states that followed. Without
+noise, a network reads the label from them, and its own rollouts are worse than without correction
+(docs/results/unnamed.md).
 """
 
 from __future__ import annotations
@@ -34,7 +36,8 @@ from gaponet.robot.spec import RobotSpec
 from gaponet.sim.replay import replay
 from gaponet.sysid.table_contact import tip_heights
 
-ITERATIONS, LEARNING_GAIN = 3, 0.8
+ITERATIONS = 3
+LEARNING_GAIN = 0.8
 LEAD_S = 0.12  # after this time a correction shows in the position
 SMOOTHING_S = 0.06  # σ of the filter
 TABLE_CLEARANCE_M = 0.01  # below it, a tip is taken to touch the table
@@ -47,15 +50,17 @@ def trajectory_labels(
     nthread: int = 0,
     tick: Callable[[], object] = bool,
 ) -> Array:
-    """Return Δa* of the operated joints within ±limit rad, (rows of all recordings, n), by iterative learning control.
+    """Return Δa* of the operated joints within ±limit rad, (rows of all recordings, n), by
+    iterative learning control.
 
-    Each iteration simulates a whole recording under a + Δa. The error a little later, because a servo responds late, is
-    smoothed and added to Δa (Arimoto, Kawamura & Miyazaki 1984; Bristow, Tharayil & Alleyne 2006). The labels of a
-    recording are therefore consistent with each other. An inverse model of single rows is only valid at the recorded
-    states, and a network that is fitted to it has a larger error (docs/results/unnamed.md).
+    Each iteration simulates a whole recording under a + Δa. The error a little later, because a
+    servo responds late, is smoothed and added to Δa (Arimoto, Kawamura & Miyazaki 1984; Bristow,
+    Tharayil & Alleyne 2006). The labels of a recording are therefore consistent with each other. An
+    inverse model of single rows is only valid at the recorded states, and a network that is fitted
+    to it has a larger error (docs/results/unnamed.md).
 
-    Each recording has the labels of its best iteration. Rows are NaN where a joint was not recorded, and where a tip
-    touches the robot's table: no correction explains a contact force.
+    Each recording has the labels of its best iteration. Rows are NaN where a joint was not
+    recorded, and where a tip touches the robot's table: no correction explains a contact force.
 
     Args:
         tick: Called in each iteration.
@@ -106,11 +111,15 @@ def _commanded(sequence: Sequence, delta: Array, op: Array) -> Sequence:
 
 
 HUBER_DELTA = 0.5  # in units of the RMS of the labels
-MAX_POOL_STATES = 2_000_000  # if more are visited, the pool takes a part of the environments of each period, in turn
+# if more are visited, the pool takes a part of the environments of each period, in turn
+MAX_POOL_STATES = 2_000_000
 
 
 class Pretraining:
-    """Pool of visited states, and the optimiser. `round` extends the pool and fits the network to it."""
+    """Pool of visited states, and the optimiser.
+
+    `round` extends the pool and fits the network to it.
+    """
 
     def __init__(
         self,
@@ -122,7 +131,11 @@ class Pretraining:
         nthread: int = 0,
     ) -> None:
         """labels: Δa* of each row of the environment's recordings, (rows, n) rad."""
-        self.net, self.env, self.config, self.seed, self.nthread = net, env, config, seed, nthread
+        self.net = net
+        self.env = env
+        self.config = config
+        self.seed = seed
+        self.nthread = nthread
         labels = _mean_over_hold(labels, env.config.delta_hold)
         self.labels: Any = env.sim.array(labels)
         self.label_rms = float(np.sqrt(np.nanmean(np.square(labels)))) or 1.0
@@ -135,9 +148,8 @@ class Pretraining:
         self.optimiser = torch.optim.AdamW(
             self.parameters, lr=config.learning_rate, weight_decay=config.weight_decay
         )
-        self.rollout_states: list[
-            dict[str, Any]
-        ] = []  # network and random numbers before the rollouts of each round
+        # network and random numbers before the rollouts of each round
+        self.rollout_states: list[dict[str, Any]] = []
 
     @property
     def rounds_done(self) -> int:
@@ -145,7 +157,10 @@ class Pretraining:
         return len(self.rollout_states)
 
     def fit_inputs(self) -> SensorReport | None:
-        """Fit input statistics and the sensor predictor on a rollout with label corrections. Call before round 1."""
+        """Fit input statistics and the sensor predictor on a rollout with label corrections.
+
+        Call before round 1.
+        """
         x, _ = self.rollout(follow_labels=True)
         self.net.bounded.scale.fill_(self.label_rms)
         return fit_inputs(self.net, self.env, x, self.config.sensor_states, self.seed, self.nthread)
@@ -157,9 +172,12 @@ class Pretraining:
             follow_labels: Apply the labels instead of the network's corrections.
 
         Returns:
-            Visited inputs, (states, dim), and their labels, (states, n) rad; NaN where there is none.
+            Visited inputs, (states, dim), and their labels, (states, n) rad; NaN where there is
+            none.
         """
-        env, net, hold = self.env, self.net, self.env.config.delta_hold
+        env = self.env
+        net = self.net
+        hold = self.env.config.delta_hold
         steps = max(self.config.steps // hold, 1)
         env.reset()
         net.eval()
@@ -169,7 +187,7 @@ class Pretraining:
         for t in range(steps):
             subset = slice(t % every, None, every)
             x = env.get_observations()["actor"]
-            labels = self.labels[env.row_on_device] + env.nan_where_unobserved
+            labels = self.labels[env.playback.row_on_device] + env.nan_where_unobserved
             xs.append(x[subset].contiguous())
             ys.append(torch.as_tensor(labels[subset], device=x.device))
             if follow_labels:
@@ -189,8 +207,8 @@ class Pretraining:
             tick: Called after each gradient step.
 
         Returns:
-            RMSE of the labels, rad, in the last quarter of the gradient steps and in the quarter before. The fit has
-            converged if both are equal.
+            RMSE of the labels, rad, in the last quarter of the gradient steps and in the quarter
+            before. The fit has converged if both are equal.
         """
         before = {
             "net": {k: x.clone() for k, x in self.net.state_dict().items()},
@@ -200,16 +218,15 @@ class Pretraining:
         self.rollout_states.append(before)
         squares = self._fit_trees(self.net) if isinstance(self.net, TreesNet) else self._fit(tick)
         quarter = max(len(squares) // 4, 1)
-        last, earlier = squares[-quarter:], squares[-2 * quarter : -quarter]
+        last = squares[-quarter:]
+        earlier = squares[-2 * quarter : -quarter]
         return {"label_rmse": _rms(last), "label_rmse_before": _rms(earlier)}
 
     def _extend_pool(self, follow_labels: bool) -> None:
         x, labels = self.rollout(follow_labels)
         # One tensor each: the pool is in memory once.
-        self.pool_x, self.pool_labels = (
-            [torch.cat([*self.pool_x, x])],
-            [torch.cat([*self.pool_labels, labels])],
-        )
+        self.pool_x = [torch.cat([*self.pool_x, x])]
+        self.pool_labels = [torch.cat([*self.pool_labels, labels])]
 
     def _fit_trees(self, net: TreesNet) -> Array:
         """Fit trees to the first rank's pool; return the mean squared label error, (1,) rad²."""
@@ -218,11 +235,15 @@ class Pretraining:
         return squares
 
     def _fit(self, tick: Callable[[], object]) -> Array:
-        """Fit the network to the pool; return the mean squared label error of each gradient step, rad²."""
-        config, net, (x,), (labels,) = self.config, self.net, self.pool_x, self.pool_labels
-        squares = torch.zeros(
-            config.gradient_steps, dtype=torch.double, device=x.device
-        )  # read after the last step
+        """Fit the network to the pool; return the mean squared label error of each gradient step,
+        rad².
+        """
+        config = self.config
+        net = self.net
+        (x,) = self.pool_x
+        (labels,) = self.pool_labels
+        # read after the last step
+        squares = torch.zeros(config.gradient_steps, dtype=torch.double, device=x.device)
         net.train()
         net.features.noise_std = config.noise
         for step in range(config.gradient_steps):
@@ -246,7 +267,8 @@ class Pretraining:
     def state_dict(self) -> dict[str, Any]:
         """Return the state between rounds, for a checkpoint.
 
-        The pool has hundreds of megabytes. It is not stored: the networks of all rounds are, and roll out again.
+        The pool has hundreds of megabytes. It is not stored: the networks of all rounds are, and
+        roll out again.
         """
         return {
             "rounds": list(self.rollout_states),
@@ -270,7 +292,8 @@ class Pretraining:
 
 
 def _mean_over_hold(labels: Array, hold: int) -> Array:
-    """Average labels over the control periods that a correction is held: (N, n) → (N − hold + 1, n).
+    """Average labels over the control periods that a correction is held: (N, n) → (N − hold + 1,
+    n).
 
     Averages across the end of a recording are not used.
     """

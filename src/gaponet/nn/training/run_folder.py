@@ -1,10 +1,11 @@
 """Recordings and files of one training run.
 
-RUN/config.json        all that is needed to repeat it      RUN/progress.jsonl   training curve, one line per validation
-RUN/split.json         content hashes of each split         RUN/checkpoint.pt    newest state, for --resume
-RUN/delay_offset.json  the delay and offset baseline        RUN/model/           the artifact: model.onnx, card.json
-RUN/candidates.json    validation errors of --model auto    RUN/candidates/      the run of each of its networks
-RUN/robot/             the simulator that is corrected      RUN/tensorboard/     the same curve, with --log tensorboard
+RUN/config.json        all that is needed to repeat it      RUN/progress.jsonl   training curve, one
+line per validation RUN/split.json         content hashes of each split         RUN/checkpoint.pt
+newest state, for --resume RUN/delay_offset.json  the delay and offset baseline        RUN/model/
+the artifact: model.onnx, card.json RUN/candidates.json    validation errors of --model auto
+RUN/candidates/      the run of each of its networks RUN/robot/             the simulator that is
+corrected      RUN/tensorboard/     the same curve, with --log tensorboard
 """
 
 from __future__ import annotations
@@ -52,10 +53,13 @@ class TrainingData:
         """Split a dataset and read what training needs.
 
         Raises:
-            DatasetError, UsageError: Another robot, recordings with several gains, or splits that share a recording.
+            DatasetError, UsageError: Another robot, recordings with several gains, or splits that
+                share a recording.
         """
         dataset.require_robot(robot)
-        self.dataset, self.robot, self.holdout_units = dataset, robot, holdout_units
+        self.dataset = dataset
+        self.robot = robot
+        self.holdout_units = holdout_units
         self.splits = training_splits(dataset, config, holdout_units)
         if not config.mixed_gains:
             metas = (e.meta for entries in self.splits.values() for e in entries)
@@ -69,8 +73,9 @@ class TrainingData:
             other := next((c for c in self.conditions if c.kp or c.kd), None)
         ):
             raise UsageError(
-                f"the recordings were made with kp {other.kp} and kd {other.kd}, robot.toml says others: write there "
-                "what the robot runs with, or add --mixed-gains to train in simulators of the recordings' own gains"
+                f"the recordings were made with kp {other.kp} and kd {other.kd}, robot.toml says "
+                "others: write there what the robot runs with, or add --mixed-gains to train in "
+                "simulators of the recordings' own gains"
             )
 
     @property
@@ -79,7 +84,8 @@ class TrainingData:
         return {Condition.of(s, self.robot) for s in self.train}
 
     def labelled_subset(self, max_rows: int) -> list[Sequence]:
-        """Return training recordings with about max_rows rows, stratified by payload, unit and rate.
+        """Return training recordings with about max_rows rows, stratified by payload, unit and
+        rate.
 
         A row counts once for each of its simulators.
         """
@@ -104,7 +110,8 @@ def training_splits(
 
 
 def require_suitable(run: Path, robot: RobotSpec, resume: bool) -> None:
-    """Refuse a folder that holds a run and is not to be resumed, or that holds no run of this simulator and is.
+    """Refuse a folder that holds a run and is not to be resumed, or that holds no run of this
+    simulator and is.
 
     Raises:
         UsageError: The folder does not fit.
@@ -134,7 +141,8 @@ def write_setup(
     despite_errors: bool = False,
 ) -> None:
     """Write config.json, split.json and the robot."""
-    dataset, robot = data.dataset, data.robot
+    dataset = data.dataset
+    robot = data.robot
     words = command(
         dataset.address or dataset.path,
         run,
@@ -146,10 +154,18 @@ def write_setup(
     )
     if despite_errors:
         words += " --despite-errors"
-    write_json(run / "config.json", asdict(config) | {
-        "budget": asdict(budget), "holdout_units": data.holdout_units, "robot": robot.name, "command": words,
-        "dataset": dataset.address or os.path.relpath(dataset.path, run), "dataset_hash": dataset_hash(dataset.entries),
-    })  # fmt: skip
+    write_json(
+        run / "config.json",
+        asdict(config)
+        | {
+            "budget": asdict(budget),
+            "holdout_units": data.holdout_units,
+            "robot": robot.name,
+            "command": words,
+            "dataset": dataset.address or os.path.relpath(dataset.path, run),
+            "dataset_hash": dataset_hash(dataset.entries),
+        },
+    )
     if robot.folder.resolve() != (run / STORED_ROBOT).resolve() and not (
         resume and has_stored_robot(run)
     ):
@@ -161,9 +177,8 @@ def write_setup(
 
 
 LOG_KINDS = ("tensorboard", "wandb")
-Writer = tuple[
-    Callable[[dict[str, float], int], None], Callable[[], None]
-]  # write(numbers, steps), close()
+# write(numbers, steps), close()
+Writer = tuple[Callable[[dict[str, float], int], None], Callable[[], None]]
 
 
 class Loggers:

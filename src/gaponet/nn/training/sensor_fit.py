@@ -22,12 +22,15 @@ FIT_STEPS = 600  # gradient steps
 BATCH_SIZE = 256
 LEARNING_RATE = 1e-3
 MIN_STATES = 8
-POSITION_NOISE_RAD, VELOCITY_NOISE_RAD_S = 0.05, 0.3  # σ of the states near recorded ones
-SensorReport = dict[
-    str, Any
-]  # R² on held-out states {"mean", "by_joint": {name: …}, "by_probe": […]}
+# σ of the states near recorded ones
+POSITION_NOISE_RAD = 0.05
+VELOCITY_NOISE_RAD_S = 0.3
+# R² on held-out states {"mean", "by_joint": {name: …}, "by_probe": […]}
+SensorReport = dict[str, Any]
 
-NEAR, RANDOM = 1, 2  # origin of a state; 0 for one that was visited
+# origin of a state; 0 for one that was visited
+NEAR = 1
+RANDOM = 2
 
 
 def fit_inputs(
@@ -52,7 +55,10 @@ def fit_inputs(
 def fit_sensors(
     net: DeltaNet, env: DeltaEnv, states: int, seed: int, nthread: int = 0, refit: bool = False
 ) -> SensorReport | None:
-    """Fit the sensor predictor; on `refit`, continue its fit at the environment's present states. Result as above."""
+    """Fit the sensor predictor; on `refit`, continue its fit at the environment's present states.
+
+    Result as above.
+    """
     if net.predictor is None:
         return None
     device = next(net.parameters()).device
@@ -71,19 +77,21 @@ def fit_sensors(
 def _probe(
     net: DeltaNet, env: DeltaEnv, states: int, seed: int, nthread: int, refit: bool
 ) -> tuple[Tensor, Tensor]:
-    """Probe the simulator at recorded start states, or on `refit` at the environment's present states.
+    """Probe the simulator at recorded start states, or on `refit` at the environment's present
+    states.
 
-    A third of the states stays there. A third is moved by noise, away from its recorded state. A third is moved to a
-    random posture within the joint limits, with history, action and recorded state. So the predictor also learns
-    gravity and inertia where no motion was recorded.
+    A third of the states stays there. A third is moved by noise, away from its recorded state. A
+    third is moved to a random posture within the joint limits, with history, action and recorded
+    state. So the predictor also learns gravity and inertia where no motion was recorded.
 
     Returns:
-        Inputs of the predictor, (k, …), and the simulator's answers, (k, 2nm), or (k, 2n) for learned probes: each is
-        one row of the inputs.
+        Inputs of the predictor, (k, …), and the simulator's answers, (k, 2nm), or (k, 2n) for
+        learned probes: each is one row of the inputs.
     """
     if states < MIN_STATES:
         raise UsageError(
-            f"--pretraining.sensor-states {states}: too few to fit a predictor on; give {MIN_STATES} or more"
+            f"--pretraining.sensor-states {states}: too few to fit a predictor on; give "
+            f"{MIN_STATES} or more"
         )
     rng = np.random.default_rng(seed)
     visited: list[tuple[Array, Array, Array]] = []
@@ -101,11 +109,17 @@ def _probe(
         origin[env.num_envs :] = NEAR + origin[env.num_envs :] % 2
     conditions = [env.rows.conditions[g] for g in env.rows.group[env_of_state[chosen]]]
     oracle = ProbeOracle(env.robot, net.config, conditions, nthread, env.rows.locked)
-    x, q, v, origin = x[chosen], q[chosen], v[chosen], origin[chosen]
+    x = x[chosen]
+    q = q[chosen]
+    v = v[chosen]
+    origin = origin[chosen]
 
     rng = np.random.default_rng(seed)
-    n, layout, op = net.n, net.features.layout, oracle.operated
-    near, far = np.flatnonzero(origin == NEAR), np.flatnonzero(origin == RANDOM)
+    n = net.n
+    layout = net.features.layout
+    op = oracle.operated
+    near = np.flatnonzero(origin == NEAR)
+    far = np.flatnonzero(origin == RANDOM)
     position_noise = rng.normal(0, POSITION_NOISE_RAD, (len(near), n))
     velocity_noise = rng.normal(0, VELOCITY_NOISE_RAD_S, (len(near), n))
     q[np.ix_(near, op)] += position_noise
@@ -123,7 +137,8 @@ def _probe(
     x[far] += layout.shifted(shift)
     with torch.inference_mode():
         inputs = net.sensor_inputs(torch.from_numpy(x.astype(np.float32)))
-    offsets, m = None, net.config.num_probes
+    offsets = None
+    m = net.config.num_probes
     if net.config.sensor_source == "learned":
         # Each probe moves a random subset of the joints.
         probes = rng.uniform(-1, 1, (len(q), m, n)) * (
@@ -141,14 +156,16 @@ def _fit_predictor(
 ) -> SensorReport:
     """Maximise the Gaussian likelihood on three quarters of the samples; return R² on the rest.
 
-    `refit` keeps the scale of the sensor values, because the branch net has learned it. PPO does not train the
-    predictor: it would change the predicted answers in favour of the policy.
+    `refit` keeps the scale of the sensor values, because the branch net has learned it. PPO does
+    not train the predictor: it would change the predicted answers in favour of the policy.
     """
-    predictor, held_out = net.predictor, len(inputs) // 4
+    predictor = net.predictor
+    held_out = len(inputs) // 4
     generator = torch.Generator().manual_seed(seed)
     if not refit:
         predictor.outputs.fit(answers[held_out:], min_std=1e-6)
-    target, train = predictor.outputs(answers[held_out:]), inputs[held_out:]
+    target = predictor.outputs(answers[held_out:])
+    train = inputs[held_out:]
     predictor.requires_grad_(True)
     optimiser = torch.optim.Adam(predictor.parameters(), lr=LEARNING_RATE)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, FIT_STEPS)
@@ -164,9 +181,8 @@ def _fit_predictor(
         truth = predictor.outputs(answers[:held_out])
         residual = ((predictor(inputs[:held_out])[0] - truth) ** 2).mean(0)
         variance = ((truth - truth.mean(0)) ** 2).mean(0).clamp_min(1e-9)
-        r2 = (1 - residual / variance).reshape(
-            -1, 2, len(joints)
-        )  # (m, positions and velocities, n)
+        # (m, positions and velocities, n)
+        r2 = (1 - residual / variance).reshape(-1, 2, len(joints))
         by_joint = dict(zip(joints, r2.mean((0, 1)).tolist(), strict=True))
         return {
             "mean": float(r2.mean()),

@@ -1,8 +1,9 @@
 """The simulators of a training: which piece of a recording is replayed in which of them.
 
-Recordings are cut into pieces, and each piece starts at its recorded state. Whole recordings are worse for two reasons.
-With few of them a simulator has one or two, so that the network can tell the motion by the simulator. And a simulation
-that starts at the recorded state shows what brings it back there. docs/simulators.md has the measurement.
+Recordings are cut into pieces, and each piece starts at its recorded state. Whole recordings are
+worse for two reasons. With few of them a simulator has one or two, so that the network can tell the
+motion by the simulator. And a simulation that starts at the recorded state shows what brings it
+back there. docs/simulators.md has the measurement.
 """
 
 from __future__ import annotations
@@ -30,8 +31,9 @@ def in_many_simulators(
 ) -> list[Sequence]:
     """Return the pieces of each training recording, once for each of its simulators.
 
-    One of the simulators is the robot's own. Recordings with different payloads or rates share no simulator: there are
-    then as few groups of equal simulations as possible, and each simulator has one payload.
+    One of the simulators is the robot's own. Recordings with different payloads or rates share no
+    simulator: there are then as few groups of equal simulations as possible, and each simulator has
+    one payload.
 
     Without --simulators, the result is the recordings as they are.
     """
@@ -65,7 +67,8 @@ def pieces(sequence: Sequence) -> list[Sequence]:
 def in_validation_simulators(
     sequences: ListOf[Sequence], robot: RobotSpec, config: TrainConfig
 ) -> list[Sequence]:
-    """Return about VALIDATION_SIMULATORS validation recordings in as many simulators; a recording can be in several.
+    """Return about VALIDATION_SIMULATORS validation recordings in as many simulators; a recording
+    can be in several.
 
     No training recording has these simulators, but for the first one, the robot's own.
     """
