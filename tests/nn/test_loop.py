@@ -8,8 +8,7 @@ from arm import recordings, write_arm
 from gaponet.nn.config import ModelConfig
 from gaponet.nn.loop import DeltaCorrector, DeltaLoop
 from gaponet.nn.observation import Layout
-from gaponet.nn.training.config import RewardConfig
-from gaponet.nn.training.env import DeltaEnv
+from gaponet.nn.training.env import DeltaEnv, EnvOptions
 from gaponet.sim.replay import replay
 
 LIMITS = np.array([[-10.0, 10.0]] * 2)
@@ -69,11 +68,11 @@ def test_training_and_rollout_give_the_network_the_same_inputs(tmp_path, how):
         return np.full((1, 2), 0.01, np.float32)
 
     replay(sequence, robot, DeltaCorrector(infer, config, robot), nthread=1)
-    env = DeltaEnv(sequence, robot, config, 1, 1000, RewardConfig(), nthread=1)
+    env = DeltaEnv(sequence, robot, config, EnvOptions(1, nthread=1))
     env.rng = FirstRow()
     env.reset()
     trained = []
-    while env.row[0] < env.last[0]:
+    while env.playback.row[0] < env.playback.last[0]:
         trained.append(env.get_observations()["actor"].numpy())
         env.advance(np.full((1, 2), 0.01, np.float32))
     assert len(trained) == 13

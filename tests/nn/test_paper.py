@@ -24,10 +24,9 @@ from gaponet.nn.training.config import (
     Budget,
     PPOConfig,
     PretrainingConfig,
-    RewardConfig,
     TrainConfig,
 )
-from gaponet.nn.training.env import DeltaEnv
+from gaponet.nn.training.env import DeltaEnv, EnvOptions
 from gaponet.nn.training.ppo import PPO
 from gaponet.nn.training.sensor_fit import _probe, fit_inputs
 from gaponet.nn.training.trainer import Trainer
@@ -194,9 +193,7 @@ def test_learned_sensors_are_the_predictor_s_answers_to_each_probe():
 def test_the_predictor_answers_random_probes_and_ppo_trains_the_learned_ones(tmp_path, monkeypatch):
     monkeypatch.setattr("gaponet.nn.training.sensor_fit.FIT_STEPS", 200)
     config, robot = replace(PAPER, sensor_source="learned"), write_arm(tmp_path)
-    env = DeltaEnv(
-        recordings(robot, 2, rows=60, kp=0.5), robot, config, 64, 1000, RewardConfig(), nthread=1
-    )
+    env = DeltaEnv(recordings(robot, 2, rows=60, kp=0.5), robot, config, EnvOptions(64, nthread=1))
     net = network(config)
     start, learner = net.probes.clone(), PPO(env, net, TRAINING.ppo)
     assert fit_inputs(net, env, env.get_observations()["actor"], 256, 0, 1)["mean"] > 0.6
@@ -290,7 +287,7 @@ def test_on_a_robot_the_measured_state_reaches_the_predictor_of_equation_1(tmp_p
 def test_the_fit_moves_a_simulated_state_away_from_its_recorded_state(tmp_path):
     robot = write_arm(tmp_path)
     motions = recordings(robot, 2, rows=60, kp=0.5)
-    env = DeltaEnv(motions, robot, EQUATION_1, 64, 1000, RewardConfig(), nthread=1)
+    env = DeltaEnv(motions, robot, EQUATION_1, EnvOptions(64, nthread=1))
     net = build_network(EQUATION_1, 2)
     inputs, _ = _probe(net, env, 64, 0, 1, False)
     *_, visible = inputs.T
@@ -307,7 +304,7 @@ def test_the_predictor_of_equation_1_is_fitted_and_ppo_does_not_train_it(tmp_pat
     monkeypatch.setattr("gaponet.nn.training.sensor_fit.FIT_STEPS", 300)
     robot = write_arm(tmp_path)
     motions = recordings(robot, 2, rows=60, kp=0.5)
-    env = DeltaEnv(motions, robot, EQUATION_1, 64, 1000, RewardConfig(), nthread=1)
+    env = DeltaEnv(motions, robot, EQUATION_1, EnvOptions(64, nthread=1))
     net = network(EQUATION_1)
     branch, learner = net.branch[0].weight.clone(), PPO(env, net, TRAINING.ppo)
     assert fit_inputs(net, env, env.get_observations()["actor"], 256, 0, 1)["mean"] > 0.6
@@ -382,9 +379,7 @@ def test_a_hidden_recorded_state_has_no_effect_and_a_visible_one_has():
 @pytest.mark.parametrize("config", [replace(PAPER, real_state=True), EQUATION_1])
 def test_half_of_the_episodes_show_the_recorded_state(tmp_path, config):
     robot = write_arm(tmp_path)
-    env = DeltaEnv(
-        recordings(robot, 2, rows=30), robot, config, 200, 1000, RewardConfig(), nthread=1
-    )
+    env = DeltaEnv(recordings(robot, 2, rows=30), robot, config, EnvOptions(200, nthread=1))
     env.sim.qpos[:] -= 0.1
     real = env.get_observations()["actor"][:, env.loop.layout.real]
     shown = real[:, 4] == 1

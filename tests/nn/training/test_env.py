@@ -11,7 +11,7 @@ from gaponet.base.errors import UsageError
 from gaponet.nn.config import ModelConfig
 from gaponet.nn.networks import build_network
 from gaponet.nn.training.config import PretrainingConfig, RewardConfig
-from gaponet.nn.training.env import CRITIC_PREVIEW, DeltaEnv
+from gaponet.nn.training.env import CRITIC_PREVIEW, DeltaEnv, EnvOptions
 from gaponet.nn.training.pretraining import Pretraining
 from gaponet.sim.batch import Condition
 from gaponet.sim.replay import replay
@@ -23,25 +23,16 @@ def robot(tmp_path):
 
 
 def make(robot, sequences, num_envs=8, steps=1000, **reward):
-    return DeltaEnv(
-        sequences,
-        robot,
-        ModelConfig(history=2),
-        num_envs,
-        steps,
-        RewardConfig(**reward),
-        seed=0,
-        nthread=1,
-    )
+    options = EnvOptions(num_envs, steps, RewardConfig(**reward), seed=0, nthread=1)
+    return DeltaEnv(sequences, robot, ModelConfig(history=2), options)
 
 
 def test_without_correction_the_environment_is_the_replay(robot):
     sequences = recordings(robot, 2, rows=60, kp=0.6)
     env = make(robot, sequences)
-    for i in range(env.num_envs):  # put everyone at a motion's first row
-        env.row[i] = env.row_on_device[i] = env.first[i]
-    env.sim.reset(slice(None), env.qpos[env.row], env.qvel[env.row])
-    first = env.first.copy()
+    first = env.playback.first.copy()
+    env.playback.start(slice(None), first, first, env.playback.last.copy())
+    env.sim.reset(slice(None), env.qpos[first], env.qvel[first])
     for _ in range(59):
         env.advance(np.zeros((env.num_envs, 2)))
     replays = replay(sequences, robot)
@@ -52,7 +43,7 @@ def test_without_correction_the_environment_is_the_replay(robot):
 
 def test_the_reward_of_a_joint_compares_it_one_row_on(robot):
     env = make(robot, recordings(robot, 2, rows=60, kp=0.6), position=0.02, cap=0.1)
-    row = env.row.copy()
+    row = env.playback.row.copy()
     reward, done = env.step(np.zeros((env.num_envs, 2), np.float32))
     error = np.abs(env.sim.qpos - env.qpos[np.minimum(row + 1, len(env.qpos) - 1)])[~done]
     assert (error > 0.002).any()
@@ -81,7 +72,7 @@ def test_an_unrecorded_joint_stands_still_and_has_neither_reward_nor_label(robot
         0,
     )
     _, labels = pretraining.rollout(follow_labels=True)
-    unknown = env.first == env.rows.first[0]
+    unknown = env.playback.first == env.rows.first[0]
     assert 0 < unknown.sum() < len(unknown)
     assert np.isnan(labels.numpy().reshape(3, -1, 2)[0][unknown, 1]).all()
     np.testing.assert_allclose(env.sim.qpos[unknown, 1], 0.3, atol=1e-4)  # whatever it carries
@@ -98,8 +89,11 @@ def test_an_unrecorded_joint_stands_still_and_has_neither_reward_nor_label(robot
 def test_the_critic_looks_ahead_of_the_simulation(robot):
     env = make(robot, recordings(robot, 2, rows=60, kp=0.6))
     seen, n, many = env.get_observations()["critic"].numpy(), 2, len(CRITIC_PREVIEW)
-    q, rows = env.sim.qpos, np.minimum(env.row[:, None] + CRITIC_PREVIEW, env.last[:, None])
-    np.testing.assert_allclose(seen[:, :n], env.qpos[env.row] - q, atol=1e-6)
+    q, rows = (
+        env.sim.qpos,
+        np.minimum(env.playback.row[:, None] + CRITIC_PREVIEW, env.playback.last[:, None]),
+    )
+    np.testing.assert_allclose(seen[:, :n], env.qpos[env.playback.row] - q, atol=1e-6)
     ahead = seen[:, 2 * n : 2 * n + many * n].reshape(-1, many, n)
     np.testing.assert_allclose(ahead, env.qpos[rows] - q[:, None], atol=1e-6)
     commands = seen[:, 2 * n + many * n : 2 * n + 2 * many * n].reshape(-1, many, n)
@@ -112,7 +106,7 @@ def test_payload_of_the_log_is_the_payload_of_the_simulation(robot):
     masses = {env.rows.conditions[g][0] for g in env.rows.group}
     assert masses == {0.0, 0.2}
     for i in range(env.num_envs):
-        member = np.flatnonzero(env.rows.first == env.first[i])[0]
+        member = np.flatnonzero(env.rows.first == env.playback.first[i])[0]
         assert env.rows.conditions[env.rows.group[i]] == Condition.of(sequences[member], robot)
 
 
@@ -127,14 +121,14 @@ def test_motions_are_drawn_in_proportion_to_their_length_as_numpys_choice_does(r
         drawn += rng.choice(
             mine, size=(env.rows.group == g).sum(), p=length[mine] / length[mine].sum()
         ).tolist()
-    np.testing.assert_array_equal(env.first, env.rows.first[drawn])
+    np.testing.assert_array_equal(env.playback.first, env.rows.first[drawn])
 
 
 def test_the_end_of_a_motion_is_a_time_out_and_no_step_passes_it(robot):
     env = make(robot, recordings(robot, 2, rows=5))
     seen = 0
     for _ in range(6):
-        assert (env.row < env.last).all()
+        assert (env.playback.row < env.playback.last).all()
         seen += int(env.step(np.zeros((env.num_envs, 2), np.float32))[1].sum())
     assert seen >= env.num_envs
 
@@ -143,8 +137,8 @@ def test_the_actor_never_sees_the_recorded_state(robot):
     sequences = recordings(robot, 2, rows=60, kp=0.6)
     env = make(robot, sequences)
     before = env.get_observations()
-    env.track[:, :4] += 1.0  # recorded q, q̇
-    env.recorded[:, :4] += 1.0
+    env.playback.track[:, :4] += 1.0  # recorded q, q̇
+    env.playback.recorded[:, :4] += 1.0
     after = env.get_observations()
     assert torch.equal(before["actor"], after["actor"])
     assert not torch.equal(before["critic"], after["critic"])
@@ -152,4 +146,4 @@ def test_the_actor_never_sees_the_recorded_state(robot):
 
 def test_a_motion_of_one_row_is_refused(robot):
     with pytest.raises(UsageError, match="motion motion0 has 1 of the 2 rows that a step needs"):
-        DeltaEnv(recordings(robot, 2, rows=1), robot, ModelConfig(), 8, 1000, RewardConfig())
+        DeltaEnv(recordings(robot, 2, rows=1), robot, ModelConfig(), EnvOptions(8))

@@ -17,7 +17,7 @@ from gaponet.nn.training.config import (
     RewardConfig,
     TrainConfig,
 )
-from gaponet.nn.training.env import DeltaEnv
+from gaponet.nn.training.env import DeltaEnv, EnvOptions
 from gaponet.nn.training.trainer import Trainer
 
 pytest.importorskip("mujoco_warp", reason="needs pip install 'gaponet[warp]'")
@@ -28,9 +28,8 @@ STEPS, CASTS = 200, ("array", "bool", "float", "int", "index")
 def make(folder, device, servo=None, **model):
     robot = replace(write_arm(folder), **servo or {})
     sequences = recordings(robot, 4, rows=60, kp=0.6)
-    return DeltaEnv(
-        sequences, robot, ModelConfig(**model), 8, 90, RewardConfig(), 0, 1, device=device
-    )
+    options = EnvOptions(num_envs=8, episode_steps=90, nthread=1, device=device)
+    return DeltaEnv(sequences, robot, ModelConfig(**model), options)
 
 
 def test_observation_reward_and_done_are_those_of_c_mujoco(tmp_path):
@@ -89,14 +88,14 @@ def test_nothing_goes_to_the_host_in_a_step(tmp_path, servo):
     env = make(tmp_path, "warp-cpu", servo, history=2, stride=2)
     delta, resets = torch.zeros(8, 2), 0
     for _ in range(60):
-        before = env.elapsed.copy()
+        before = env.playback.elapsed.copy()
         with Crossings() as crossings:
             env.get_observations()
             _, done = env.step(delta)
         assert crossings.seen == []
-        np.testing.assert_array_equal(env.elapsed, np.where(done, 0, before + 1))
-        np.testing.assert_array_equal(env.row_on_device, env.row)
-        np.testing.assert_array_equal(env.last_on_device, env.last)
+        np.testing.assert_array_equal(env.playback.elapsed, np.where(done, 0, before + 1))
+        np.testing.assert_array_equal(env.playback.row_on_device, env.playback.row)
+        np.testing.assert_array_equal(env.playback.last_on_device, env.playback.last)
         resets += int(done.sum())
     assert resets
 

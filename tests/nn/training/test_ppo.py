@@ -7,8 +7,8 @@ from arm import recordings, write_arm
 
 from gaponet.nn.config import ModelConfig
 from gaponet.nn.networks import build_network
-from gaponet.nn.training.config import PPOConfig, RewardConfig
-from gaponet.nn.training.env import DeltaEnv
+from gaponet.nn.training.config import PPOConfig
+from gaponet.nn.training.env import DeltaEnv, EnvOptions
 from gaponet.nn.training.ppo import PPO, advantages
 from gaponet.nn.training.sensor_fit import fit_inputs
 
@@ -28,8 +28,9 @@ SETTINGS = PPOConfig(
 
 @pytest.fixture
 def env(tmp_path):
-    return DeltaEnv(recordings(write_arm(tmp_path), 4, kp=0.5), write_arm(tmp_path), MODEL, 16, 100, RewardConfig(),
-                    nthread=1)  # fmt: skip
+    robot = write_arm(tmp_path)
+    options = EnvOptions(num_envs=16, episode_steps=100, nthread=1)
+    return DeltaEnv(recordings(robot, 4, kp=0.5), robot, MODEL, options)
 
 
 def test_advantages_by_hand():

@@ -9,8 +9,8 @@ from arm import TOML, recordings, write_arm
 
 from gaponet.nn.config import ModelConfig
 from gaponet.nn.networks import build_network
-from gaponet.nn.training.config import PretrainingConfig, RewardConfig
-from gaponet.nn.training.env import DeltaEnv
+from gaponet.nn.training.config import PretrainingConfig
+from gaponet.nn.training.env import DeltaEnv, EnvOptions
 from gaponet.nn.training.pretraining import Pretraining, trajectory_labels
 from gaponet.robot.spec import Table
 from gaponet.sim.replay import replay
@@ -23,7 +23,7 @@ def fitted(tmp_path_factory):
     config = ModelConfig(
         history=2, num_probes=4, sensor_hidden=(32,), branch_hidden=(16,), trunk_hidden=(16,)
     )
-    env = DeltaEnv(recordings(robot, 4), robot, config, 32, 10**9, RewardConfig(), nthread=1)
+    env = DeltaEnv(recordings(robot, 4), robot, config, EnvOptions(32, nthread=1))
     net = build_network(config, 2)
     settings = PretrainingConfig(num_envs=32, steps=64, gradient_steps=2)
     warm = Pretraining(net, env, np.zeros((len(env.qpos), 2), np.float32), settings, seed=0)

@@ -7,8 +7,7 @@ from arm import recordings, write_arm
 
 from gaponet.nn.config import ModelConfig
 from gaponet.nn.networks import build_network
-from gaponet.nn.training.config import RewardConfig
-from gaponet.nn.training.env import DeltaEnv
+from gaponet.nn.training.env import DeltaEnv, EnvOptions
 from gaponet.nn.training.sensor_fit import fit_inputs
 
 
@@ -17,7 +16,7 @@ def test_the_predictor_explains_most_of_the_answers_on_held_out_states(tmp_path,
     torch.manual_seed(0)
     robot = write_arm(tmp_path)
     config = ModelConfig(history=2, sensors="predicted", num_probes=4, sensor_hidden=(64, 64))
-    env = DeltaEnv(recordings(robot, 6), robot, config, 64, 10**9, RewardConfig(), nthread=1)
+    env = DeltaEnv(recordings(robot, 6), robot, config, EnvOptions(64, nthread=1))
     net = build_network(config, 2)
     report = fit_inputs(net, env, env.get_observations()["actor"], 512, seed=0)
     assert report["mean"] > 0.5

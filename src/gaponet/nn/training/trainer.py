@@ -31,7 +31,7 @@ from gaponet.nn.onnx_export import export
 from gaponet.nn.training import ranks
 from gaponet.nn.training.checkpoint import Checkpoint, StateDict
 from gaponet.nn.training.config import Budget, Status, TrainConfig
-from gaponet.nn.training.env import DeltaEnv
+from gaponet.nn.training.env import UNLIMITED, DeltaEnv, EnvOptions
 from gaponet.nn.training.ppo import PPO, Update
 from gaponet.nn.training.pretraining import Pretraining, trajectory_labels
 from gaponet.nn.training.run_folder import Loggers, TrainingData, require_suitable, write_setup
@@ -40,8 +40,6 @@ from gaponet.nn.training.validation import Validator, choose_gain
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.batch import Condition
 from gaponet.sim.context import contexts
-
-UNLIMITED = 10**9  # control periods of an episode
 
 
 class Trainer:
@@ -315,9 +313,18 @@ class Trainer:
     ) -> DeltaEnv:
         config = self.rank_config
         return DeltaEnv(
-            sequences or self.data.train, self.robot, config.model, num_envs, episode_steps, config.reward,
-            _rank_seed(seed), config.threads, device or config.device,
-        )  # fmt: skip
+            sequences or self.data.train,
+            self.robot,
+            config.model,
+            EnvOptions(
+                num_envs=num_envs,
+                episode_steps=episode_steps,
+                reward=config.reward,
+                seed=_rank_seed(seed),
+                nthread=config.threads,
+                device=device or config.device,
+            ),
+        )
 
     def _validate_and_save(self, metrics: dict[str, float]) -> None:
         """Validate the network in training, and save it with these metrics of its stage."""

@@ -1,0 +1,118 @@
+"""Recordings as arrays of rows, and which environment may play which recording."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence as ListOf
+from typing import Any
+
+import numpy as np
+
+from gaponet.base.arrays import Array
+from gaponet.base.errors import UsageError
+from gaponet.data.sequence import Sequence
+from gaponet.robot.spec import RobotSpec
+from gaponet.sim.batch import Condition
+from gaponet.sim.replay import idle_limbs
+
+
+class RecordedRows:
+    """Recordings as arrays of rows, and their assignment to environments. All arrays are numpy's.
+
+    Environments are divided into groups in proportion to the recorded rows. A group has one
+    payload, rate, gains and set of recorded joints.
+
+    Attributes:
+        locked: Joints of limbs that no recording commands; they are clamped at home.
+        operated: Operated joints among those that are not locked, (n,).
+        ctrl, qpos, qvel: Joints that are not locked, (rows, n_free) rad, rad, rad/s.
+        track: [q | q̇ | a] of the operated joints, (rows, 3n) float32.
+        first, last: First and last row of each recording.
+        conditions, unobserved: Condition of each group, and the joints without recorded positions,
+            (groups, n_free).
+        group: Group of each environment, (num_envs,).
+    """
+
+    def __init__(
+        self, sequences: ListOf[Sequence], robot: RobotSpec, min_rows: int, num_envs: int
+    ) -> None:
+        """
+        Args:
+            min_rows: Least number of rows of a recording.
+
+        Raises:
+            UsageError: No recording, a recording that is too short, or fewer environments than
+                groups.
+        """
+        if not sequences:
+            raise UsageError("no sequences to train on; the split left the training set empty")
+        _require_rows(sequences, min_rows)
+        self.locked = idle_limbs(sequences, robot)
+        free = [joint for joint in robot.joint_names if joint not in self.locked]
+        self.operated = np.array([free.index(joint) for joint in robot.operated])
+
+        columns = robot.index(free)
+        self.ctrl = _joined([s.ctrl[:, columns] for s in sequences])
+        self.qpos = _joined([s.qpos[:, columns] for s in sequences])
+        self.qvel = _joined([s.qvel[:, columns] for s in sequences])
+        operated = [values[:, self.operated] for values in (self.qpos, self.qvel, self.ctrl)]
+        # take() copies an array that is neither contiguous nor float32.
+        self.track = np.ascontiguousarray(np.concatenate(operated, axis=1), np.float32)
+
+        length = np.array([len(s) for s in sequences])
+        self.last = np.cumsum(length) - 1
+        self.first = self.last - length + 1
+
+        keys = [(Condition.of(s, robot), s.meta.unrecorded) for s in sequences]
+        groups = list(dict.fromkeys(keys))
+        group_of_sequence = np.array([groups.index(key) for key in keys])
+        self.conditions = [condition for condition, _ in groups]
+        self.unobserved = np.array([[j in unrecorded for j in free] for _, unrecorded in groups])
+        self.group = _groups_of_environments(np.bincount(group_of_sequence, length), num_envs)
+
+        # Recordings by group, and the group number plus the cumulative share of rows in the group.
+        members = []
+        cumulative = []
+        for group in range(len(groups)):
+            in_group = np.flatnonzero(group_of_sequence == group)
+            share = np.cumsum(length[in_group] / length[in_group].sum())
+            members.append(in_group)
+            cumulative.append(group + share / share[-1])
+        self._members = np.concatenate(members)
+        self._cumulative = np.concatenate(cumulative)
+
+    def sample(self, group: Array, rng: Any) -> tuple[Array, Array]:
+        """Draw a recording for each of these groups, in proportion to its rows.
+
+        Returns:
+            First and last row of the recordings, (k,) each.
+        """
+        end_of_group = np.nextafter(group + 1.0, 0.0)
+        drawn = np.minimum(group + rng.random(len(group)), end_of_group)
+        sequence = self._members[np.searchsorted(self._cumulative, drawn, side="right")]
+        return self.first[sequence], self.last[sequence]
+
+
+def _require_rows(sequences: ListOf[Sequence], min_rows: int) -> None:
+    """Refuse a recording that is shorter than one step."""
+    shortest = min(sequences, key=len)
+    if len(shortest) < min_rows:
+        raise UsageError(
+            f"motion {shortest.meta.motion} has {len(shortest)} of the {min_rows} rows that a step "
+            "needs: drop the motion"
+        )
+
+
+def _joined(parts: list[Array]) -> Array:
+    """Return the rows of all recordings below each other, contiguous in memory."""
+    return np.ascontiguousarray(np.concatenate(parts))
+
+
+def _groups_of_environments(rows: Array, num_envs: int) -> Array:
+    """Divide environments among groups in proportion to their rows, (groups,) → (num_envs,)."""
+    if num_envs < len(rows):
+        raise UsageError(
+            f"{num_envs} environments for {len(rows)} conditions of payload, rate and gains; use "
+            "more"
+        )
+    quota = np.cumsum(rows) / rows.sum() * num_envs
+    return np.searchsorted(quota, np.arange(num_envs) + 0.5).astype(int)
