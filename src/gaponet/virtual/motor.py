@@ -1,7 +1,9 @@
-"""Effects of the motors of virtual robots, on (N, n) arrays for N simulations at once; parameters are in Physics.
+"""Effects of the motors of virtual robots, on (N, n) arrays for N simulations at once; parameters
+are in Physics.
 
-MuJoCo integrates the joints. The effects only change the gains and limits of its actuators and friction constraints,
-once per effect period. So friction sticks as in MuJoCo, and with neutral parameters the robot is the nominal simulator.
+MuJoCo integrates the joints. The effects only change the gains and limits of its actuators and
+friction constraints, once per effect period. So friction sticks as in MuJoCo, and with neutral
+parameters the robot is the nominal simulator.
 """
 
 from __future__ import annotations
@@ -29,16 +31,18 @@ def friction_limit(
 ) -> Array:
     """Return the largest torque of friction, (N, n), N·m.
 
-    Coulomb friction with a Lorentzian Stribeck peak (Hess & Soom 1990, J. Tribology 112) differs by direction. A part
-    grows with the transmitted torque: a gear of efficiency η loses (1 − η)|τ| if the motor drives the load, and
-    (1/η − 1)|τ| if the load drives the motor. So a joint sags less than it was pushed.
+    Coulomb friction with a Lorentzian Stribeck peak (Hess & Soom 1990, J. Tribology 112) differs by
+    direction. A part grows with the transmitted torque: a gear of efficiency η loses (1 − η)|τ| if
+    the motor drives the load, and (1/η − 1)|τ| if the load drives the motor. So a joint sags less
+    than it was pushed.
 
     Args:
         physics: Stacked parameters.
         nominal: Friction of the nominal model, N·m.
         qvel: rad/s.
         torque: Motor torque at the joint, N·m.
-        push: Torque that friction balanced in the last step, N·m; a stuck joint would move in its direction.
+        push: Torque that friction balanced in the last step, N·m; a stuck joint would move in its
+            direction.
         thinning: Factor of friction in a warm joint; the gear's part does not have it.
     """
     stuck = np.abs(qvel) < STUCK_SPEED
@@ -57,9 +61,10 @@ def friction_limit(
 class Bristles:
     """Pre-sliding friction: bristles bend like a spring, and slip near the friction limit g.
 
-    This is the LuGre model (Canudas de Wit, Olsson, Åström & Lischinsky 1995, IEEE Trans. Automatic Control 40) without
-    damping. At a constant g it is Dahl's model (1968): Ḟ = σ·v − σ·|v|·F/g. The friction of an unloaded joint builds up
-    over physics.presliding. If that is zero, MuJoCo's rigid friction is used.
+    This is the LuGre model (Canudas de Wit, Olsson, Åström & Lischinsky 1995, IEEE Trans. Automatic
+    Control 40) without damping. At a constant g it is Dahl's model (1968): Ḟ = σ·v − σ·|v|·F/g. The
+    friction of an unloaded joint builds up over physics.presliding. If that is zero, MuJoCo's rigid
+    friction is used.
     """
 
     def __init__(self, physics: Physics, nominal: Array) -> None:
@@ -83,8 +88,39 @@ class Bristles:
         return self.torque
 
 
+class Friction:
+    """Friction of all joints, (N, n).
+
+    Attributes:
+        nominal: Friction of the nominal model, (n,) N·m.
+        bristles: Pre-sliding friction, where a joint has it.
+        push: Torque that friction balanced in the last physics step, N·m.
+        thinning: Factor of friction in a warm joint.
+    """
+
+    def __init__(self, physics: Physics, nominal: Array) -> None:
+        self._physics = physics
+        self.nominal = nominal
+        self.bristles = Bristles(physics, nominal)
+        self.push = np.zeros_like(physics.friction)
+        self.thinning: Array = np.ones((1, 1))
+
+    def limit(self, drag: Array, qvel: Array, torque: Array) -> Array:
+        """Return the friction limit, N·m, with the drag of cables, at a speed and motor torque."""
+        nominal = self.nominal + drag
+        return friction_limit(self._physics, nominal, qvel, torque, self.push, self.thinning)
+
+    def note_constraint(self, torque: Array) -> None:
+        """Note the torque of MuJoCo's constraints in the last physics step, N·m."""
+        self.push = -torque
+        if self.bristles.any:
+            self.push = np.where(self.bristles.soft, self.bristles.torque, self.push)
+
+
 def speed_factor(physics: Physics, speed: Array) -> Array:
-    """Return the factor of the torque limit, 0 to 1, at a speed (N, n) rad/s in the direction of the torque."""
+    """Return the factor of the torque limit, 0 to 1, at a speed (N, n) rad/s in the direction of
+    the torque.
+    """
     return np.clip((1.0 - speed / physics.no_load_speed) / (1.0 - physics.corner), 0.0, 1.0)
 
 
@@ -96,9 +132,10 @@ def cogging_torque(physics: Physics, qpos: Array) -> Array:
 class Couplings:
     """Effects between joints: cables, the supply of a kinematic chain, and the base.
 
-    The joint before (for the first joint of a chain, the joint after) bends a cable bundle, which then adds friction.
-    If the motors of a chain together need more torque than a budget, all of them lose gain. The weight of the moving
-    links tilts the base with a first-order lag; a tilted base changes the direction of gravity.
+    The joint before (for the first joint of a chain, the joint after) bends a cable bundle, which
+    then adds friction. If the motors of a chain together need more torque than a budget, all of
+    them lose gain. The weight of the moving links tilts the base with a first-order lag; a tilted
+    base changes the direction of gravity.
     """
 
     def __init__(
@@ -109,19 +146,18 @@ class Couplings:
             batch: Simulations in which gravity changes its direction.
             effort: Torque limits, (n) N·m.
         """
-        self.p, self.effort = physics, effort
+        self.p = physics
+        self.effort = effort
         parent = model.dof_parentid
-        after = [next((i for i in range(model.nv) if parent[i] == j), j) for j in range(model.nv)]
-        self.neighbour = np.where(parent >= 0, parent, after)
+        self.neighbour = np.where(parent >= 0, parent, _first_children(parent))
         chain = np.cumsum(parent != np.arange(model.nv) - 1) - 1  # a chain starts at each branch
         self.same_chain = (chain[:, None] == chain).astype(float)
         self.flexes = bool((physics.flex > 0).any())
         if self.flexes:
-            self._gravity, self._com = batch.expand("opt.gravity"), batch.bind("subtree_com")
-            self._level_gravity, self._weight = (
-                self._gravity.copy(),
-                batch.expand("body_subtreemass"),
-            )
+            self._gravity = batch.expand("opt.gravity")
+            self._com = batch.bind("subtree_com")
+            self._level_gravity = self._gravity.copy()
+            self._weight = batch.expand("body_subtreemass")
             self._g = np.linalg.norm(self._level_gravity, axis=1, keepdims=True)
         self.tilt = np.zeros((len(physics.flex), 2))
 
@@ -135,7 +171,9 @@ class Couplings:
         return self.p.drag * 0.5 * (1.0 - np.cos(qpos[:, self.neighbour] - self.p.drag_angle))
 
     def gain_factor(self, torque: Array) -> Array:
-        """Return the factor of the gain that the supplies of the chains allow under motor torques, (N, n)."""
+        """Return the factor of the gain that the supplies of the chains allow under motor torques,
+        (N, n).
+        """
         load = (np.abs(torque) / self.effort) @ self.same_chain
         return 1.0 / (1.0 + self.p.limb_loss * np.maximum(load - self.p.limb_budget, 0.0))
 
@@ -148,14 +186,24 @@ class Couplings:
         self._gravity[:, :2] += self.tilt * self._g
 
 
+def _first_children(parent: Array) -> list[int]:
+    """Return the first child of each joint, or the joint itself if it has none.
+
+    parent: Parent of each joint, (n,); -1 without one.
+    """
+    children = list(range(len(parent)))
+    for joint in reversed(range(len(parent))):
+        if parent[joint] >= 0:
+            children[parent[joint]] = joint
+    return children
+
+
 class Firmware:
     """Firmware that rounds targets and smooths them; the filter is faster at a larger lag."""
 
     def __init__(self, physics: Physics) -> None:
-        self.p, self.any = (
-            physics,
-            bool((physics.smoothing > 0).any() or (physics.target_step > 0).any()),
-        )
+        self.p = physics
+        self.any = bool((physics.smoothing > 0).any() or (physics.target_step > 0).any())
         self.smoothed = np.zeros_like(physics.smoothing)
 
     def reset(self, target: Array) -> None:
@@ -184,9 +232,9 @@ def derating_factor(physics: Physics, winding: Array) -> Array:
 class Backlash:
     """Play between motor and link: if the torque changes its sign, the motor first crosses the gap.
 
-    In the gap the link gets no torque. The motor is a free rotor with the joint's armature as inertia; under a constant
-    torque it crosses in √(2·gap·J/τ). This is the dead zone of Nordin & Gutman (2002, Automatica 38) with a rigid,
-    plastic contact.
+    In the gap the link gets no torque. The motor is a free rotor with the joint's armature as
+    inertia; under a constant torque it crosses in √(2·gap·J/τ). This is the dead zone of Nordin &
+    Gutman (2002, Automatica 38) with a rigid, plastic contact.
     """
 
     def __init__(self, physics: Physics, armature: Array) -> None:
@@ -203,7 +251,9 @@ class Backlash:
         self.speed = np.zeros_like(self.half)
 
     def step(self, torque: Array, h: float) -> Array:
-        """Advance by h s under the motor torque (N, n); return 1 where it reaches the link, 0 in the gap."""
+        """Advance by h s under the motor torque (N, n); return 1 where it reaches the link, 0 in
+        the gap.
+        """
         pressed = (np.abs(self.gap) >= self.half) & (self.gap * torque >= 0)
         speed = np.where(pressed, 0.0, self.speed + torque / self.armature * h)
         gap = self.gap + speed * h
@@ -216,15 +266,16 @@ class Backlash:
 class Thermal:
     """Thermal model with two nodes: current heats the winding, and the winding heats the housing.
 
-    Torque and current are stated as motor torque at the rated torque constant. τ²/K_m² watts become heat, and more in
-    warm copper. The structure is that of motor makers' data (e.g. maxon catalogue: two resistances, two time
-    constants).
+    Torque and current are stated as motor torque at the rated torque constant. τ²/K_m² watts become
+    heat, and more in warm copper. The structure is that of motor makers' data (e.g. maxon
+    catalogue: two resistances, two time constants).
     """
 
     def __init__(self, physics: Physics) -> None:
         self.p = physics
         self.ambient = np.full_like(physics.kt_drift, KT_TEMPERATURE)
-        self.winding, self.housing = self.ambient.copy(), self.ambient.copy()
+        self.winding = self.ambient.copy()
+        self.housing = self.ambient.copy()
 
     def reset(self, temperature: Array) -> None:
         """Start with both nodes at a temperature, (N, n) °C, as after a pause."""
@@ -258,13 +309,17 @@ class Thermal:
 
 
 def supply_factor(physics: Physics, power: Array) -> Array:
-    """Return the battery voltage over the nominal one, (N, 1), for a power (N, 1) W: one resistance."""
+    """Return the battery voltage over the nominal one, (N, 1), for a power (N, 1) W: one
+    resistance.
+    """
     current = power / physics.supply_voltage
     return 1.0 - current * physics.supply_resistance / physics.supply_voltage
 
 
 class CommandLink:
-    """Delayed commands: each packet arrives after delay + jitter, or is lost; the newest arrived one is in force."""
+    """Delayed commands: each packet arrives after delay + jitter, or is lost; the newest arrived
+    one is in force.
+    """
 
     def __init__(self, physics: Physics, dt: float) -> None:
         """
@@ -272,21 +327,23 @@ class CommandLink:
             dt: Time between two packets, s.
         """
         self.p = physics
-        self.slots = (
-            int(np.ceil((physics.delay + physics.jitter).max() / dt)) + 2
-        )  # packets under way, one in force
+        # packets under way, one in force
+        self.slots = int(np.ceil((physics.delay + physics.jitter).max() / dt)) + 2
         count, n = physics.kp_scale.shape
-        self.packets, self.arrival = (
-            np.zeros((count, self.slots, n)),
-            np.full((count, self.slots), -np.inf),
-        )
-        self.sent, self.newest = np.full(self.slots, -1), np.full(count, -1)
-        self.current, self.count = np.zeros((count, n)), 0
+        self.packets = np.zeros((count, self.slots, n))
+        self.arrival = np.full((count, self.slots), -np.inf)
+        self.sent = np.full(self.slots, -1)
+        self.newest = np.full(count, -1)
+        self.current = np.zeros((count, n))
+        self.count = 0
 
     def reset(self, ctrl: Array) -> None:
         """Start as if all earlier packets had been ctrl, (N, n) rad."""
         self.packets[:] = ctrl[:, None]
-        self.arrival[:], self.sent[:], self.newest[:], self.count = -np.inf, -1, -1, 0
+        self.arrival[:] = -np.inf
+        self.sent[:] = -1
+        self.newest[:] = -1
+        self.count = 0
         self.current = ctrl.copy()
 
     def send(self, ctrl: Array, time: float, chance: Array) -> None:

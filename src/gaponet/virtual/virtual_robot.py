@@ -1,6 +1,7 @@
 """VirtualRobot: N virtual robots, each with hidden physics and a payload, stepped together.
 
-It is used like a robot: send targets for one control period, then read encoders, current sensors and thermometers.
+It is used like a robot: send targets for one control period, then read encoders, current sensors
+and thermometers.
 """
 
 from __future__ import annotations
@@ -13,21 +14,28 @@ import numpy as np
 from gaponet.base.arrays import Array
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.batch import Batch, expand_differences
-from gaponet.sim.model import build_model, qpos_range, stiffen_friction
+from gaponet.sim.model import qpos_range
 from gaponet.virtual import motor
+from gaponet.virtual.drives import Drives, Gains, Transmission
+from gaponet.virtual.noise import Noise
 from gaponet.virtual.physics import Physics, stack
+from gaponet.virtual.time_steps import TimeSteps
+from gaponet.virtual.unit_model import unit_models
 
-MAX_PHYSICS_STEP_S = 0.001
-# of the hidden effects; bristles and current loops are evaluated at every physics step
-MAX_EFFECT_PERIOD_S = 0.002
-NOISE_PERIODS = 50  # control periods of noise that are sampled at a time
-REST_STD = 0.1  # of the friction band: a joint that always arrives in the same way stops in nearly the same place
+# Of the friction band: a joint that always arrives in the same way stops in nearly the same place.
+REST_STD = 0.1
 SETTLING_STEPS = 40  # each reduces the error by gravity stiffness / kp, 0.4 at worst on H1-2
 
 
 @dataclass(frozen=True)
 class Reading:
-    """Readings of the sensors, (N, n) each: rad, rad/s, N·m (current × rated torque constant), °C (winding)."""
+    """Readings of the sensors, (N, n) each.
+
+    Attributes:
+        qpos, qvel: rad, rad/s.
+        tau: Current times the rated torque constant, N·m.
+        temperature: Of the winding, °C.
+    """
 
     qpos: Array
     qvel: Array
@@ -35,8 +43,51 @@ class Reading:
     temperature: Array
 
 
+class BatchArrays:
+    """Arrays of MuJoCo, (N, active) if not stated; a write counts from the next physics step on."""
+
+    def __init__(self, batch: Batch) -> None:
+        self.qpos = batch.bind("qpos")  # rad
+        self.qvel = batch.bind("qvel")  # rad/s
+        self.ctrl = batch.bind("ctrl")  # rad
+        self.warmstart = batch.bind("qacc_warmstart")
+        self.time = batch.bind("time")  # (N, 1) s
+        self.constraint_torque = batch.bind("qfrc_constraint")  # N·m
+        self.gain = batch.expand("actuator_gainprm")  # (N, active, 10)
+        self.bias = batch.expand("actuator_biasprm")  # (N, active, 10)
+        self.torque_range = batch.expand("actuator_forcerange")  # (N, active, 2) N·m
+        self.friction = batch.expand("dof_frictionloss")  # N·m
+        self.applied_torque = batch.bind("qfrc_applied")  # N·m
+        self.motor_torque = batch.bind("actuator_force")  # N·m
+        self.damping = batch.expand("dof_damping")  # N·m·s/rad
+
+    def set_gains(self, gains: Gains) -> None:
+        """Set the PD control that MuJoCo evaluates in each physics step."""
+        self.gain[:, :, 0] = gains.kp
+        self.bias[:, :, 0] = gains.added
+        self.bias[:, :, 1] = -gains.kp
+        self.bias[:, :, 2] = -gains.kd
+
+    def set_torque_range(self, low: Array, high: Array) -> None:
+        """Set the torque limits, (N, active) N·m."""
+        self.torque_range[:, :, 0] = low
+        self.torque_range[:, :, 1] = high
+
+    def stand_still(self) -> None:
+        """Set time and velocity to zero."""
+        self.time[:] = 0.0
+        self.qvel[:] = 0.0
+        self.warmstart[:] = 0.0
+
+
 class VirtualRobot:
-    """N robots of one type. A row's result does not depend on the other rows, bit for bit."""
+    """N robots of one type. A row's result does not depend on the other rows, bit for bit.
+
+    Attributes:
+        active: Joints that are not locked, (active,); they are what MuJoCo simulates.
+        physics: Hidden parameters of the active joints.
+        cold_damping: Damping of the joints at 25 °C, (N, active) N·m·s/rad.
+    """
 
     def __init__(
         self,
@@ -59,66 +110,41 @@ class VirtualRobot:
             nthread: Threads; 0 for all cores.
         """
         self.robot = robot
-        self.dt = robot.dt if dt is None else dt
-        self.decimation = (
-            int(np.ceil(self.dt / MAX_PHYSICS_STEP_S - 1e-9))
-            if timestep is None
-            else round(self.dt / timestep)
-        )
-        self.timestep = self.dt / self.decimation
-        self.active = np.array(
-            [i for i, name in enumerate(robot.joint_names) if name not in locked]
-        )
+        self.num_envs = len(units)
+        self.n = len(robot.joint_names)
+        free = [i for i, name in enumerate(robot.joint_names) if name not in locked]
+        self.active = np.array(free)
         self.physics = stack(units, self.active)
-        stiff = bool((self.physics.presliding > 0).any() or (self.physics.current_time > 0).any())
-        self.substeps = 1 if stiff else _substeps(self.decimation, self.timestep)
-        self.all_joints = stack(units, np.arange(len(robot.joint_names)))
-        models = _models(robot, units, payloads, self.dt, self.timestep, locked)
-        model, b, p = models[0], Batch(models[0], nsim=len(units), nthread=nthread), self.physics
-        self.batch = b
-        expand_differences(b, models)
-        self.num_envs, self.n = len(units), len(robot.joint_names)
-        self._qpos, self._qvel, self._ctrl = b.bind("qpos"), b.bind("qvel"), b.bind("ctrl")
-        self._warmstart, self._time = b.bind("qacc_warmstart"), b.bind("time")
-        self._constraint = b.bind("qfrc_constraint")
-        self._gain, self._bias = b.expand("actuator_gainprm"), b.expand("actuator_biasprm")
-        self._range, self._frictionloss = (
-            b.expand("actuator_forcerange"),
-            b.expand("dof_frictionloss"),
+        self._sensor_physics = stack(units, np.arange(self.n))
+        self.steps = TimeSteps.choose(self.physics, robot.dt if dt is None else dt, timestep)
+
+        models = unit_models(robot, units, payloads, self.steps, locked)
+        model = models[0]
+        self.batch = Batch(model, nsim=len(units), nthread=nthread)
+        expand_differences(self.batch, models)
+        self._arrays = BatchArrays(self.batch)
+        self.cold_damping = self._arrays.damping.copy()
+        self._limits = qpos_range(model)  # (active, 2) rad
+
+        physics = self.physics
+        effort = robot.effort_limit[self.active]
+        self._thermal = motor.Thermal(physics)
+        self._drives = Drives(
+            physics, self._thermal, robot.kp[self.active], robot.kd[self.active], effort
         )
-        self._applied, self._force = b.bind("qfrc_applied"), b.bind("actuator_force")
-        self._damping = b.expand("dof_damping")
-        self._cold_damping, self._thinning = self._damping.copy(), np.ones((1, 1))
-        self._nominal_friction = model.dof_frictionloss.copy()
-        self._kp = robot.kp[self.active] * p.kp_scale
-        self._kd = robot.kd[self.active] * p.kd_scale
-        self._added = np.zeros_like(self._kp)
-        self._effort = robot.effort_limit[self.active]
-        self._compliance = p.windup / self._effort  # rad per N·m
-        # Effects that most fleets lack cost a tenth of the time each step.
-        self._fast, self._lags = (
-            bool(np.isfinite(p.no_load_speed).any()),
-            bool((p.current_time > 0).any()),
-        )
-        self._twists = bool((p.windup > 0).any())
-        self._limits = qpos_range(model)
-        self.backlash = motor.Backlash(p, model.dof_armature)
-        self.bristles = motor.Bristles(p, self._nominal_friction)
-        self.thermal = motor.Thermal(p)
-        self.link, self.firmware = motor.CommandLink(p, self.dt), motor.Firmware(p)
-        self.couplings = motor.Couplings(p, model, b, self._effort)
-        self._supply = np.ones((self.num_envs, 1))
-        self._chain_gain = self._push = self._passed = self._twist = self._squares = (
-            self._max_torque
-        ) = self._kp * 0.0
-        self._idle_temperature = np.zeros((self.num_envs, self.n))
-        self._noise, self._chance, self._row, self._now = (
-            np.zeros(0),
-            np.zeros(0),
-            NOISE_PERIODS,
-            0.0,
-        )
-        self._rng: list[np.random.Generator] = []
+        self._transmission = Transmission(physics, effort)
+        self._friction = motor.Friction(physics, model.dof_frictionloss.copy())
+        self._backlash = motor.Backlash(physics, model.dof_armature)
+        self._couplings = motor.Couplings(physics, model, self.batch, effort)
+        self._link = motor.CommandLink(physics, self.steps.control)
+        self._firmware = motor.Firmware(physics)
+        self._speed_limits_torque = bool(np.isfinite(physics.no_load_speed).any())
+
+        self._noise = Noise(self.n)
+        self._now = 0.0  # s since the reset
+        self._squares = np.zeros_like(self._arrays.qpos)  # sum of squared torques of a period
+        self._max_torque = np.zeros_like(self._arrays.qpos)  # N·m
+        self._idle_temperature = np.zeros((self.num_envs, self.n))  # °C
 
     def reset(
         self, ctrl: Array, seeds: list[int], warmth: Array | float = 0.0, start: Array | None = None
@@ -131,67 +157,175 @@ class VirtualRobot:
             warmth: Motor temperature above ambient, (N,) K.
             start: True joint positions instead of the rest position, (N, n) rad.
         """
-        self._rng = [np.random.default_rng(seed) for seed in seeds]
-        self._row, self._now = NOISE_PERIODS, 0.0
-        target = (
-            np.clip(np.asarray(ctrl, float)[:, self.active], *self._limits.T)
-            - self.physics.zero_offset
-        )
+        self._noise.reset(seeds)
+        self._now = 0.0
+        target = self._servo_target(ctrl)
         warm = 25.0 + np.broadcast_to(np.asarray(warmth, float), (self.num_envs,))[:, None]
-        self.thermal.reset(np.repeat(warm, len(self.active), axis=1))
+        self._thermal.reset(np.repeat(warm, len(self.active), axis=1))
         self._idle_temperature = np.repeat(warm, self.n, axis=1)
-        self.link.reset(target)
-        self.firmware.reset(target)
-        self._supply[:], self._chain_gain = 1.0, np.ones_like(target)
-        self._time[:], self._qvel[:], self._warmstart[:] = 0.0, 0.0, 0.0
-        self._ctrl[:] = target
+        self._link.reset(target)
+        self._firmware.reset(target)
+        self._drives.supply[:] = 1.0
+        self._drives.chain_gain = np.ones_like(target)
+        arrays = self._arrays
+        arrays.stand_still()
+        arrays.ctrl[:] = target
         if start is None:
             self._settle(target)
         else:
-            self._qpos[:] = np.asarray(start)[:, self.active]
+            arrays.qpos[:] = np.asarray(start)[:, self.active]
         load = self._load()
-        self._chain_gain = self.couplings.gain_factor(load)
-        self._twist = self._compliance * load
-        self._ctrl[:] -= self._twist
-        self._push, self._passed = np.zeros_like(target), self._motor_torque() * self.thermal.kt()
-        self.bristles.reset(self._passed - load, self._friction_limit(self._passed))
-        self.backlash.reset(self._motor_torque())
+        self._drives.chain_gain = self._couplings.gain_factor(load)
+        self._transmission.load(load, np.zeros_like(load))
+        arrays.ctrl[:] -= self._transmission.twist
+        motor_torque = self._motor_torque()
+        passed = motor_torque * self._thermal.kt()
+        self._transmission.passed = passed
+        self._friction.push = np.zeros_like(target)
+        self._friction.bristles.reset(passed - load, self._friction_limit(passed))
+        self._backlash.reset(motor_torque)
         self._squares = np.zeros_like(target)
 
     def set_gains(
         self, kp: Array, kd: Array, effort: Array | None = None, torque: Array | float = 0.0
     ) -> None:
-        """Set the drives to other gains than the robot's, (n) or (N, n); each drive delivers its kp_scale and kd_scale.
+        """Set the drives to other gains than the robot's, (n) or (N, n).
 
-        Zero stiffness damps: only velocity feedback remains. Call it after reset, which uses the gains in force.
+        Each drive delivers its kp_scale and kd_scale. Zero stiffness damps: only velocity feedback
+        remains. Call it after reset, which uses the gains in force.
 
         Args:
             kp, kd: N·m/rad, N·m·s/rad.
             effort: Torque limits, (n) N·m; default: those in force.
             torque: Added torque, N·m.
         """
-        p, at = self.physics, self.active
-        self._kp = np.broadcast_to(np.asarray(kp, float)[..., at] * p.kp_scale, self._kp.shape)
-        self._kd = np.broadcast_to(np.asarray(kd, float)[..., at] * p.kd_scale, self._kd.shape)
-        if effort is not None:
-            self._effort = np.asarray(effort, float)[at]
-        self._added = np.broadcast_to(np.broadcast_to(torque, self.n)[..., at], self._kd.shape)
+        active = self.active
+        self._drives.set_gains(
+            np.asarray(kp, float)[..., active],
+            np.asarray(kd, float)[..., active],
+            None if effort is None else np.asarray(effort, float)[active],
+            np.broadcast_to(torque, self.n)[..., active],
+        )
+
+    def step(self, ctrl: Array, rows: Array | None = None) -> None:
+        """Send targets (N, n) rad and simulate one control period, only for `rows` (k,) if given."""
+        arrays = self._arrays
+        self._link.send(self._servo_target(ctrl), self._now, self._noise.chances())
+        self._squares[:] = 0.0
+        kt = self._thermal.kt()
+        gains = self._drives.gains.times(kt * self._drives.gain_factor())
+        self._max_torque = self._drives.max_torque()
+        arrays.set_torque_range(-self._max_torque, self._max_torque)
+        self._friction.thinning = self._thermal.thinning_factor()
+        arrays.damping[:] = self.cold_damping * self._friction.thinning
+        for k in range(self.steps.effects_per_control):
+            arrays.ctrl[:] = self._target_at(k * self.steps.effect) - self._transmission.twist
+            self._apply_effects(gains, kt)
+            self.batch.step(rows, nstep=self.steps.physics_per_effect)
+            self._friction.note_constraint(arrays.constraint_torque)
+            if self._transmission.lags or self._transmission.twists:
+                self._transmission.load(arrays.motor_torque.copy(), self._friction.push)
+        self._end_period()
+        self._now += self.steps.control
+        self._noise.next_period()
+
+    def read(self) -> Reading:
+        """Return the readings of the sensors.
+
+        A second reading within a period has the same noise.
+        """
+        physics = self._sensor_physics
+        arrays = self._arrays
+        noise = self._noise.sensors()
+        motor_angle = arrays.qpos + self._transmission.twist  # the encoder is on the motor's side
+        encoder = self._all_joints(motor_angle, self.robot.qpos_home) + physics.zero_offset
+        qpos = motor.quantised(encoder + physics.encoder_noise * noise[:, 0], physics.encoder_step)
+        qvel = self._all_joints(arrays.qvel, 0.0) + physics.velocity_noise * noise[:, 1]
+        current = self._all_joints(self._motor_torque(), 0.0) + physics.current_offset
+        tau = current + physics.current_noise * noise[:, 2]
+        temperature = self._idle_temperature.copy()
+        temperature[:, self.active] = self._thermal.winding
+        return Reading(qpos, qvel, tau, temperature)
+
+    def true_qpos(self) -> Array:
+        """Return the true joint positions, (N, n) rad.
+
+        For tests, and for the true position of the hand.
+        """
+        return self._all_joints(self._arrays.qpos, self.robot.qpos_home)
+
+    # ---- parts of a period
+
+    def _servo_target(self, ctrl: Array) -> Array:
+        """Return targets (N, n) rad as the encoders of the active joints see them."""
+        within = np.clip(np.asarray(ctrl, float)[:, self.active], *self._limits.T)
+        return within - self.physics.zero_offset
+
+    def _target_at(self, elapsed: float) -> Array:
+        """Return the target of the servos `elapsed` s after the start of the control period."""
+        period = self.steps.effect
+        target = self._link.read(self._now + elapsed)
+        if self._firmware.any:
+            target = self._firmware.step(target, period)
+        if self._couplings.flexes:
+            self._couplings.flex(period)
+        return target
+
+    def _apply_effects(self, gains: Gains, kt: Array) -> None:
+        """Set gains, torque limits and friction for the physics steps of an effect period.
+
+        kt: Torque constant over the rated one, (N, active).
+        """
+        arrays = self._arrays
+        period = self.steps.effect
+        torque = self._motor_torque()
+        self._squares += torque * torque
+        joint_torque = torque * kt
+        if self._transmission.lags:
+            gains = self._transmission.delayed(gains, period)
+        if self._backlash.any:
+            gains = gains.times(self._backlash.step(joint_torque, period))
+        arrays.set_gains(gains)
+        if self._speed_limits_torque:
+            forward = motor.speed_factor(self.physics, arrays.qvel)
+            backward = motor.speed_factor(self.physics, -arrays.qvel)
+            arrays.set_torque_range(-self._max_torque * backward, self._max_torque * forward)
+        limit = self._friction_limit(joint_torque)
+        arrays.applied_torque[:] = -self.physics.churning * arrays.qvel * np.abs(arrays.qvel)
+        arrays.applied_torque += motor.cogging_torque(self.physics, arrays.qpos)
+        bristles = self._friction.bristles
+        if bristles.any:
+            arrays.applied_torque -= bristles.step(limit, arrays.qvel, period)
+            limit = np.where(bristles.soft, 0.0, limit)
+        arrays.friction[:] = limit
+
+    def _end_period(self) -> None:
+        """Advance temperatures and supply by a control period."""
+        mean_square = self._squares / self.steps.effects_per_control
+        self._thermal.step(mean_square, self.steps.control)
+        torque = self._motor_torque()
+        work = np.maximum(torque * self._arrays.qvel, 0.0)  # W
+        power = (self._thermal.heat(mean_square) + work).sum(axis=1, keepdims=True)
+        self._drives.chain_gain = self._couplings.gain_factor(torque)
+        self._drives.supply = motor.supply_factor(self.physics, power)
 
     def _settle(self, target: Array) -> None:
-        """Move to the balance of PD and gravity, with a small offset: friction holds a joint where it stopped."""
-        full = (
-            self._kp * self.thermal.kt() * motor.derating_factor(self.physics, self.thermal.winding)
-        )
-        self._qpos[:] = target
+        """Move to the balance of PD and gravity, with a small offset.
+
+        Friction holds a joint where it stopped.
+        """
+        qpos = self._arrays.qpos
+        full = self._drives.gains.kp * self._thermal.kt() * self._drives.derating()
+        qpos[:] = target
         for _ in range(SETTLING_STEPS):
             load = self._load()
-            self.couplings.reset()
-            stiffness = full * self.couplings.gain_factor(load)
-            self._qpos[:] = target - load * (1.0 / stiffness + self._compliance)
-            np.clip(self._qpos, *self._limits.T, out=self._qpos)
-        rest = np.stack([rng.standard_normal(self.n) for rng in self._rng])[:, self.active]
-        band = (self._nominal_friction + self.physics.friction) / stiffness
-        self._qpos += REST_STD * band * np.clip(rest, -3, 3)
+            self._couplings.reset()
+            stiffness = full * self._couplings.gain_factor(load)
+            qpos[:] = target - load * (1.0 / stiffness + self._transmission.compliance)
+            np.clip(qpos, *self._limits.T, out=qpos)
+        rest = self._noise.of_rest()[:, self.active]
+        band = (self._friction.nominal + self.physics.friction) / stiffness
+        qpos += REST_STD * band * np.clip(rest, -3, 3)
 
     def _load(self) -> Array:
         """Return the load of gravity and cables on a joint at rest, (N, active), N·m."""
@@ -200,182 +334,17 @@ class VirtualRobot:
 
     def _friction_limit(self, torque: Array) -> Array:
         """Return the present friction limit under a motor torque at the joint, (N, active), N·m."""
-        dry = self._nominal_friction + self.couplings.drag(self._qpos)
-        return motor.friction_limit(
-            self.physics, dry, self._qvel, torque, self._push, self._thinning
-        )
+        drag = self._couplings.drag(self._arrays.qpos)
+        return self._friction.limit(drag, self._arrays.qvel, torque)
 
     def _motor_torque(self) -> Array:
         """Return the torque that the drive sets, at the rated torque constant, (N, active), N·m."""
-        torque = self._kp * (self._ctrl - self._qpos) - self._kd * self._qvel + self._added
-        return np.clip(torque * self._gain_factor(), -self._effort, self._effort)
+        arrays = self._arrays
+        return self._drives.torque(arrays.ctrl, arrays.qpos, arrays.qvel)
 
-    def _gain_factor(self) -> Array:
-        """Return the factor of the drives' gain by supply, temperature and load of the chain, (N, active)."""
-        supply = 1.0 + self.physics.supply_gain * (self._supply - 1.0)
-        return supply * motor.derating_factor(self.physics, self.thermal.winding) * self._chain_gain
-
-    def step(self, ctrl: Array, rows: Array | None = None) -> None:
-        """Send targets (N, n) rad and simulate one control period, only for `rows` (k,) if given."""
-        if self._row == NOISE_PERIODS:
-            self._sample_noise()
-        target = (
-            np.clip(np.asarray(ctrl, float)[:, self.active], *self._limits.T)
-            - self.physics.zero_offset
-        )
-        self.link.send(target, self._now, self._chance[:, self._row])
-        count = self.decimation // self.substeps
-        period = self.substeps * self.timestep
-        self._squares[:] = 0.0
-        kt = self.thermal.kt()
-        factor = kt * self._gain_factor()
-        self._max_torque = self._effort * kt * np.minimum(self._supply, 1.0)
-        self._range[:, :, 1], self._range[:, :, 0] = self._max_torque, -self._max_torque
-        self._thinning = self.thermal.thinning_factor()
-        self._damping[:] = self._cold_damping * self._thinning
-        kp, kd, added = self._kp * factor, self._kd * factor, self._added * factor
-        for k in range(count):
-            target = self.link.read(self._now + k * period)
-            if self.firmware.any:
-                target = self.firmware.step(target, period)
-            if self.couplings.flexes:
-                self.couplings.flex(period)
-            self._ctrl[:] = target - self._twist
-            self._apply_effects(kp, kd, added, kt, period)
-            self.batch.step(rows, nstep=self.substeps)
-            self._push = -self._constraint
-            if self.bristles.any:
-                self._push = np.where(self.bristles.soft, self.bristles.torque, self._push)
-            if self._lags or self._twists:
-                self._passed = self._force.copy()
-                self._twist = self._compliance * (self._passed - self._push)
-        self._end_period(count)
-        self._now += self.dt
-        self._row += 1
-
-    def _apply_effects(self, kp: Array, kd: Array, added: Array, kt: Array, period: float) -> None:
-        """Set gains, torque limits and friction for the next physics steps, `period` s."""
-        torque = self._motor_torque()
-        self._squares += torque * torque
-        joint_torque = torque * kt
-        if self._lags:
-            lag = np.exp(-period / np.maximum(self.physics.current_time, 1e-9))
-            kp, kd, added = (
-                kp * (1.0 - lag),
-                kd * (1.0 - lag),
-                added * (1.0 - lag) + lag * self._passed,
-            )
-        if self.backlash.any:
-            engaged = self.backlash.step(joint_torque, period)
-            kp, kd, added = kp * engaged, kd * engaged, added * engaged
-        self._gain[:, :, 0] = kp
-        self._bias[:, :, 0] = added
-        self._bias[:, :, 1] = -kp
-        self._bias[:, :, 2] = -kd
-        if self._fast:
-            self._range[:, :, 1] = self._max_torque * motor.speed_factor(self.physics, self._qvel)
-            self._range[:, :, 0] = -self._max_torque * motor.speed_factor(self.physics, -self._qvel)
-        limit = self._friction_limit(joint_torque)
-        self._applied[:] = -self.physics.churning * self._qvel * np.abs(self._qvel)
-        self._applied += motor.cogging_torque(self.physics, self._qpos)
-        if self.bristles.any:
-            self._applied -= self.bristles.step(limit, self._qvel, period)
-            limit = np.where(self.bristles.soft, 0.0, limit)
-        self._frictionloss[:] = limit
-
-    def _end_period(self, count: int) -> None:
-        """Advance temperatures and supply by a control period with `count` effect periods."""
-        squares = self._squares / count
-        self.thermal.step(squares, self.dt)
-        work = np.maximum(self._motor_torque() * self._qvel, 0.0)
-        self._chain_gain = self.couplings.gain_factor(self._motor_torque())
-        self._supply = motor.supply_factor(
-            self.physics, (self.thermal.heat(squares) + work).sum(axis=1, keepdims=True)
-        )
-
-    def _sample_noise(self) -> None:
-        """Sample noise (N, periods, 3, n) and chances of jitter and loss (N, periods, 2)."""
-        self._noise = np.stack(
-            [rng.standard_normal((NOISE_PERIODS, 3, self.n)) for rng in self._rng]
-        )
-        self._chance = np.stack([rng.random((NOISE_PERIODS, 2)) for rng in self._rng])
-        self._row = 0
-
-    def read(self) -> Reading:
-        """Return the readings of the sensors; a second reading within a period has the same noise."""
-        if self._row == NOISE_PERIODS:
-            self._sample_noise()
-        p, noise = self.all_joints, self._noise[:, self._row]
-        true = self._full(
-            self._qpos + self._twist, self.robot.qpos_home
-        )  # the encoder is on the motor's side
-        qpos = motor.quantised(true + p.zero_offset + p.encoder_noise * noise[:, 0], p.encoder_step)
-        qvel = self._full(self._qvel, 0.0) + p.velocity_noise * noise[:, 1]
-        tau = (
-            self._full(self._motor_torque(), 0.0) + p.current_offset + p.current_noise * noise[:, 2]
-        )
-        temperature = self._idle_temperature.copy()
-        temperature[:, self.active] = self.thermal.winding
-        return Reading(qpos, qvel, tau, temperature)
-
-    def true_qpos(self) -> Array:
-        """Return the true joint positions, (N, n) rad, for tests and for the true position of the hand."""
-        return self._full(self._qpos, self.robot.qpos_home)
-
-    def _full(self, values: Array, rest: Array | float) -> Array:
+    def _all_joints(self, values: Array, rest: Array | float) -> Array:
         """Return values (N, active) with those of locked joints added, (N, n)."""
         out = np.empty((self.num_envs, self.n))
         out[:] = rest
         out[:, self.active] = values
         return out
-
-
-def _substeps(decimation: int, timestep: float) -> int:
-    """Return the largest number of physics steps per effect period that divides a control period."""
-    limit = max(1, int(MAX_EFFECT_PERIOD_S / timestep + 1e-6))
-    return next(k for k in range(min(limit, decimation), 0, -1) if decimation % k == 0)
-
-
-def _models(
-    robot: RobotSpec,
-    units: list[Physics],
-    payloads: list[tuple[float, str]],
-    dt: float,
-    timestep: float,
-    locked: tuple[str, ...],
-) -> list[mujoco.MjModel]:
-    """Return one model per row, the same object for rows with the same unit and payload."""
-    models: dict[tuple[int, float, str], mujoco.MjModel] = {}
-    for unit, (mass, side) in zip(units, payloads, strict=True):
-        key = (id(unit), mass, side)
-        if key not in models:
-            model = build_model(robot, mass, side, dt, locked, physics_only=True)
-            model.opt.timestep = timestep
-            _edit(model, robot, unit, locked)
-            models[key] = model
-    return [models[id(u), m, s] for u, (m, s) in zip(units, payloads, strict=True)]
-
-
-def _edit(model: mujoco.MjModel, robot: RobotSpec, unit: Physics, locked: tuple[str, ...]) -> None:
-    """Set the effects in a model that MuJoCo simulates itself: damping, cable springs, link masses and centres."""
-    for i, name in enumerate(robot.joint_names):
-        if name in locked:
-            continue
-        joint = model.joint(name)
-        dof, body = int(joint.dofadr[0]), int(joint.bodyid[0])
-        model.dof_damping[dof] += unit.damping[i]
-        model.jnt_stiffness[joint.id] += unit.cable_stiffness[i]
-        model.qpos_spring[joint.qposadr[0]] += unit.cable_angle[i]
-        model.body_mass[body] *= unit.mass_scale[i]
-        model.body_inertia[body] *= unit.mass_scale[i]
-        model.body_ipos[body] += (unit.com_x[i], unit.com_y[i], unit.com_z[i])
-    for mount in robot.payload_mounts:
-        model.body(f"payload_{mount.side}").pos += (unit.grip_x[0], 0.0, unit.grip_z[0])
-    roll, pitch = float(unit.tilt_roll[0]), float(unit.tilt_pitch[0])
-    g = np.linalg.norm(model.opt.gravity)
-    if roll or pitch:  # gravity as seen from a tilted base
-        model.opt.gravity = g * np.array(
-            [np.sin(pitch), -np.sin(roll) * np.cos(pitch), -np.cos(roll) * np.cos(pitch)]
-        )
-    mujoco.mj_setConst(model, mujoco.MjData(model))
-    stiffen_friction(model)

@@ -98,8 +98,10 @@ class Disobedient(VirtualH12):
             hg.LowCmd.set_motors(data, "kp", kp)
         super()._apply(topic, data, now)
         if wrong and self.way == "blocked":  # something holds the forearm: it creeps
-            for damping in (self.live.unit._damping, self.live.unit._cold_damping):
-                damping[:, self.live.unit.batch.model.joint("left_elbow_joint").dofadr[0]] = 1000.0
+            unit = self.live.unit
+            elbow = unit.batch.model.joint("left_elbow_joint").dofadr[0]
+            unit.batch.expand("dof_damping")[:, elbow] = 1000.0
+            unit.cold_damping[:, elbow] = 1000.0
         if wrong and self.way == "weak":
             kp, kd, effort, torque = self.live._gains
             self.live.set_gains(
