@@ -2,7 +2,7 @@
 
 results.toml lists the steps: commands with their seeds. The output, commit, date and seconds of a step go to
 WORK/answers/STEP.json. A step with an answer is skipped, and an interrupted command resumes where it can. Then
-docs/results/real.md, docs/results/steps.md, README's table and its picture are written from the answers. What was not
+docs/results/real.md, benchmarks/steps.md, README's table and its picture are written from the answers. What was not
 measured again stays as it was.
 
     --list    show steps and answers       --write   only write the pages       --data FOLDER   public recordings
@@ -27,6 +27,9 @@ from gaponet.experiments.real.page import write_page
 
 ROOT = Path(__file__).parents[1]
 PAGES = ROOT / "docs" / "results"
+STEPS_LOG = (
+    ROOT / "benchmarks" / "steps.json"
+)  # what each step printed; steps.md beside it is for people
 LISTED = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
 STEPS: dict[str, list[str]] = LISTED["steps"]
 README_COLUMNS = (("nominal simulator",), ("delay + offset",), ("plain script", "mujoco.sysid"), ("identification",),
@@ -96,13 +99,13 @@ def write(answers: dict[str, dict[str, Any]], work: Path) -> None:
                 f"{name}: {' / '.join(dict.fromkeys(methods))}" for name, methods in sets.items()
             )
             file.write(f"| {when} | {text} |\n")
-    kept = json.loads((PAGES / "steps.json").read_text(encoding="utf-8"))
+    kept = json.loads(STEPS_LOG.read_text(encoding="utf-8"))
     for name, a in answers.items():
         text = re.sub(r"/tmp/\S+", "TEMPORARY", a["output"].replace(str(work), "WORK"))
         kept[name] = a | {"output": [] if name.startswith("real_") else text.splitlines()[-TAIL:]}
     kept = {name: kept[name] for name in STEPS if name in kept}
     text = json.dumps(kept, indent=1, ensure_ascii=False)
-    (PAGES / "steps.json").write_text(text + "\n", encoding="utf-8")
+    STEPS_LOG.write_text(text + "\n", encoding="utf-8")
     page = [STEPS_HEAD]
     page.append("| step | command | seeds | measured | minutes |\n| --- | --- | --- | --- | ---: |")
     for name, (command, seeds) in STEPS.items():
@@ -116,7 +119,7 @@ def write(answers: dict[str, dict[str, Any]], work: Path) -> None:
         for name, a in kept.items()
         if a["output"]
     ]
-    (PAGES / "steps.md").write_text("\n".join(page) + "\n", encoding="utf-8")
+    STEPS_LOG.with_suffix(".md").write_text("\n".join(page) + "\n", encoding="utf-8")
     if (picture := work / "so101_id" / "gap.png").is_file():  # of so101_causes
         shutil.copyfile(picture, PAGES / "so101_causes.png")
     readme = (ROOT / "README.md").read_text(encoding="utf-8")

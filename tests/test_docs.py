@@ -89,15 +89,21 @@ def test_the_architecture_page_names_every_folder_once_and_each_step_of_the_walk
         assert not again
 
 
-def test_the_api_page_describes_every_public_name_where_it_lives():
-    described = re.findall(
-        r"^::: (gaponet\w*\.[\w.]+)",
-        (ROOT / "docs/api.md").read_text(encoding="utf-8"),
-        re.MULTILINE,
-    )
+def test_the_api_pages_describe_every_public_name_where_it_lives():
+    described = [
+        path
+        for page in sorted((ROOT / "docs/api").glob("*.md"))
+        for path in re.findall(r"^::: (gaponet\w*\.[\w.]+)", page.read_text(encoding="utf-8"), re.M)
+    ]
     homes = {path.rpartition(".")[2]: path.rpartition(".")[0] for path in described}
     assert len(homes) == len(described)
     assert {name: getattr(gp, name).__module__ for name in set(dir(gp)) - {"__version__"}} == homes
+
+
+def test_the_overview_of_the_api_links_each_of_its_pages():
+    overview = (ROOT / "docs/api.md").read_text(encoding="utf-8")
+    for page in (ROOT / "docs/api").glob("*.md"):
+        assert f"(api/{page.name})" in overview, page.name
 
 
 def test_every_link_of_the_readme_is_absolute_and_leads_to_a_file_that_is_there():
@@ -118,8 +124,8 @@ def test_every_picture_of_a_page_is_there(page):
 
 def test_the_navigation_of_the_site_has_every_page():
     site = (ROOT / "zensical.toml").read_text(encoding="utf-8")
-    for page in PAGES:
-        assert f'"{page.name}"' in site, page.name
+    for page in ALL_PAGES:
+        assert f'"{page.relative_to(ROOT / "docs").as_posix()}"' in site, page
 
 
 def anchors(page: Path) -> set[str]:
