@@ -4,8 +4,9 @@
     python benchmarks/gpu.py --reached RUN OTHER
 
 Measured for each number of simulations, with the plain servo and with servo terms (Stribeck friction, friction by
-load). "bare" launches the CUDA graph of one control period, with the kernel of the servo terms. In "resets", one
-simulation in a hundred is reset in every period. --reached prints how long each of two trainings took to reach the best
+load). "plain" is mujoco_warp with the robot's own MJCF, without any code of gaponet: what an expert would write. "graph"
+launches gaponet's own CUDA graph of one control period, with the kernel of the servo terms, and nothing else. In
+"resets", one simulation in a hundred is reset in every period. --reached prints how long each of two trainings took to reach the best
 validation error of RUN. benchmarks/gpu.sh runs both.
 """
 
@@ -47,6 +48,35 @@ def rate(period: Callable[[], object], num_envs: int, seconds: float) -> float:
     return num_envs * periods / (time.perf_counter() - began)
 
 
+def plain_rate(robot: RobotSpec, num_envs: int, device: str, seconds: float) -> float:
+    """Return the control steps per second of mujoco_warp with the robot's own MJCF, without gaponet."""
+    import mujoco
+    import mujoco_warp
+    import warp
+
+    spec = mujoco.MjSpec.from_file(str(robot.mjcf))
+    for name, kp, kd in zip(robot.joint_names, robot.kp, robot.kd, strict=True):
+        servo = spec.add_actuator(target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+        servo.set_to_position(kp=kp, kv=kd)
+    model = spec.compile()
+    substeps = round(robot.dt / model.opt.timestep)
+    warp_device = warp.get_device("cuda" if device == "cuda" else "cpu")
+    with warp.ScopedDevice(warp_device):
+        worlds = mujoco_warp.put_model(model)
+        data = mujoco_warp.put_data(model, mujoco.MjData(model), num_envs)
+
+        def period() -> None:
+            for _ in range(substeps):
+                mujoco_warp.step(worlds, data)
+
+        period()  # compiles
+        if not warp_device.is_cuda:
+            return rate(period, num_envs, seconds)
+        with warp.ScopedCapture() as capture:
+            period()
+        return rate(lambda: warp.capture_launch(capture.graph), num_envs, seconds)
+
+
 def measure(robot: RobotSpec, num_envs: int, device: str, seconds: float) -> dict[str, float]:
     """Measure the speeds by name, control steps/s."""
     from gaponet.sim.warp import WarpSim
@@ -65,9 +95,12 @@ def measure(robot: RobotSpec, num_envs: int, device: str, seconds: float) -> dic
 
     begin(torch.arange(num_envs, device=home.device))
     (worlds,) = sim._worlds
-    turns: dict[str, Callable[[], object]] = {"bare": lambda: worlds.launch(worlds.period)}
+    turns: dict[str, Callable[[], object]] = {"graph": lambda: worlds.launch(worlds.period)}
     turns |= {"gaponet": lambda: sim.step(target), "resets": with_resets}
-    return {name: rate(turn, num_envs, seconds) for name, turn in turns.items()}
+    rates = {"plain": plain_rate(robot, num_envs, device, seconds)}
+    for name, turn in turns.items():
+        rates[name] = rate(turn, num_envs, seconds)
+    return rates
 
 
 def reached(runs: list[Path]) -> None:
