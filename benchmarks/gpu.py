@@ -4,10 +4,15 @@
     python benchmarks/gpu.py --reached RUN OTHER
 
 Measured for each number of simulations, with the plain servo and with servo terms (Stribeck friction, friction by
-load). "plain" is mujoco_warp with the robot's own MJCF, without any code of gaponet: what an expert would write. "graph"
-launches gaponet's own CUDA graph of one control period, with the kernel of the servo terms, and nothing else. In
-"resets", one simulation in a hundred is reset in every period. --reached prints how long each of two trainings took to reach the best
-validation error of RUN. benchmarks/gpu.sh runs both.
+load):
+
+    plain    mujoco_warp with the robot's own MJCF, without any code of gaponet: what an expert would write
+    graph    gaponet's own CUDA graph of one control period, with the kernel of the servo terms, and nothing else
+    gaponet  a step of gaponet's simulations
+    resets   the same; one simulation in a hundred is reset in every period
+
+--reached prints how long each of two trainings took to reach the best validation error of RUN. benchmarks/gpu.sh runs
+both.
 """
 
 from __future__ import annotations
