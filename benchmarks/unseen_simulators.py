@@ -46,13 +46,11 @@ from gaponet.nn.onnx_network import Network
 from gaponet.nn.training.config import (
     MANY_SIMULATORS_MODEL,
     MANY_SIMULATORS_PRETRAINING,
-    RewardConfig,
     TrainConfig,
 )
-from gaponet.nn.training.env import DeltaEnv
+from gaponet.nn.training.env import DeltaEnv, EnvOptions
 from gaponet.nn.training.sensor_fit import fit_sensors
 from gaponet.nn.training.simulators import pieces
-from gaponet.nn.training.trainer import UNLIMITED
 from gaponet.robot.simulator_change import SimulatorChange, SimulatorRanges
 from gaponet.robot.spec import RobotSpec
 from gaponet.share.reading import open_dataset
@@ -293,15 +291,8 @@ class PredictorRefit:
         config = self.model.config
         net = trained_network(self.model.path.parent, config, len(self.robot.operated))
         groups = len({Condition.of(s, self.robot) for s in sequences})
-        env = DeltaEnv(
-            sequences,
-            self.robot,
-            config,
-            num_envs=2 * groups if groups > 128 else 256,
-            episode_steps=UNLIMITED,
-            reward=RewardConfig(),
-            nthread=1,
-        )
+        num_envs = max(256, 2 * groups)
+        env = DeltaEnv(sequences, self.robot, config, EnvOptions(num_envs, nthread=1))
         # As after training, the scale of the sensor values stays: the branch net has learned it.
         fit_sensors(net, env, REFIT_STATES, seed=0, nthread=1, refit=True)
 
