@@ -1,4 +1,4 @@
-"""The first minutes of docs/deploy-safety.md and the run of README.md, as written, on virtual robots behind buses."""
+"""The steps of docs/first-minutes.md and the run of README.md, as written, on virtual robots behind buses."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ pytest.importorskip("serial", reason="pip install 'gaponet[so101]'")
 pytestmark = pytest.mark.faults
 
 ROOT = Path(__file__).parents[3]
-PAGE = (ROOT / "docs" / "deploy-safety.md").read_text(encoding="utf-8")
+PAGE = (ROOT / "docs" / "first-minutes.md").read_text(encoding="utf-8")
 BUSY = ["--rate", "4", "--safety.acceleration", "2"]  # machines that run tests are
 DOMAIN = str(20 + os.getpid() % 150)
 LONGEST = 90.0  # s for anything to be said

@@ -251,8 +251,8 @@ def damping_gains(kd: Array, qvel: Array, effort: Array) -> Array:
 # Faults: what each one puts in doubt, what may still be used afterwards, and how the robot ends.
 # After a fault no joint is sent to a position, neither to a target nor to a measured one: a wrong
 # reading would move the joint. The robot damps. Damping needs no position. A measured speed may
-# only lower a damping gain, and only as far as damping_gains allows. docs/deploy-safety.md has the
-# same table.
+# only lower a damping gain, and only as far as damping_gains allows. docs/reference/controller.md
+# has the same table.
 
 
 class Ending(StrEnum):
