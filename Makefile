@@ -8,7 +8,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 # Two pools of busy-waiting threads on two cores cost a factor of five.
 export OMP_WAIT_POLICY := PASSIVE
 
-.PHONY: setup demo test slow faults peers engines buckets browser adversary tournament results fuzz hostile kills lerobot check workflows windows resolve wheels ends site clean
+.PHONY: setup demo test slow faults peers engines browser adversary tournament results fuzz hostile kills lerobot check workflows windows resolve wheels ends site clean
 
 setup: $(VENV)/.done
 
@@ -48,11 +48,6 @@ peers: setup
 # half an hour.
 engines: setup
 	$(BIN)/python -m pytest -m peers -s tests/export
-
-# SeaweedFS (S3) and a stand-in of GCS (in an environment of their own in ~/.cache/gaponet) take pushes and pulls: minutes.
-buckets: setup
-	$(BIN)/pip install -q -e ".[dev,s3,gs]"
-	$(BIN)/python -m pytest -m peers -s tests/share
 
 # Chromium looks at gaponet view and at a report (Debian: apt-get install chromium libegl1): two minutes.
 browser: setup

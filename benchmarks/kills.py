@@ -193,7 +193,7 @@ def further_cases(given: Path) -> dict[str, Case]:
     """Return commands that are only killed and repeated.
 
     `given` holds, of an arm with two joints, a model file, a nominal and an identified robot, a fleet of one, data and
-    logs; an empty folder; and a bucket.
+    logs; and an empty folder.
     """
     data, logs, nominal, identified, fleet, trained_on = (
         str(given / name)
@@ -273,8 +273,6 @@ def further_cases(given: Path) -> dict[str, Case]:
             lambda out: ["robot", "show", identified, "--out", str(out / "known.png")],
             begin="empty",
         ),
-        "push": killed(lambda out: ["push", data, f"file://{out}/data"], file_count, "empty"),
-        "pull": killed(lambda out: ["pull", f"file://{given}/bucket/data", str(out)], entries),
         "check a fleet": killed(check_fleet, timed, done=(0, 1)),
         "start": killed(start, without("*.html", "*.json", "*.npz")),
     }
@@ -306,7 +304,6 @@ def prepare(given: Path) -> None:
         ["collect", "--robot", nominal, *few, "--fleet", "easy", "--out", arm_data],
         ["data", "export", arm_data, "--to", "lerobot", "--out", str(given / "arm_logs")],
         ["identify", arm_data, "--out", str(given / "identified"), *QUICK_FIT],
-        ["push", arm_data, f"file://{given}/bucket/data"],
     ):
         if wait(start(argv, given / "prepare.txt")):
             raise SystemExit(f"{argv[0]} failed; see {given / 'prepare.txt'}")

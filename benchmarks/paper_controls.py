@@ -33,7 +33,7 @@ from gaponet.experiments.paper.trainings import method_trainings
 from gaponet.nn.artifact import GapModel
 from gaponet.nn.paper import PaperNet
 from gaponet.nn.training.env import DeltaEnv
-from gaponet.share.reading import open_dataset
+from gaponet.sim.dataset_robot import open_dataset
 
 TRAINER_ENV = "gaponet.nn.training.trainer.DeltaEnv"
 

@@ -27,7 +27,7 @@ from gaponet.experiments.real.methods import FittedSim
 from gaponet.experiments.real.questions import Question
 from gaponet.robot.folder import save_robot
 from gaponet.robot.spec import RobotSpec
-from gaponet.share.reading import open_dataset
+from gaponet.sim.dataset_robot import open_dataset
 from gaponet.sim.model import build_spec, stiffen_friction
 from gaponet.sim.replay import idle_limbs, replay
 

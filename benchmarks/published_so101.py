@@ -19,7 +19,7 @@ from gaponet.data.split import split_entries
 from gaponet.experiments.real.methods import FittedSim
 from gaponet.experiments.real.questions import Question
 from gaponet.robot.spec import RobotSpec
-from gaponet.share.reading import open_dataset
+from gaponet.sim.dataset_robot import open_dataset
 from gaponet.sim.replay import replay
 
 FIELDS = "kp", "damping", "armature", "frictionloss"

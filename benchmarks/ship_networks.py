@@ -44,7 +44,7 @@ from gaponet.nn.onnx_export import MAX_DIFFERENCE_RAD, with_small_matrices
 from gaponet.nn.onnx_network import OnnxNetwork
 from gaponet.nn.packaged_networks import MAX_TOTAL_BYTES, PACKAGE_FOLDER
 from gaponet.robot.folder import PackagedRobot, load_stored_robot
-from gaponet.share.reading import open_dataset
+from gaponet.sim.dataset_robot import open_dataset
 from gaponet.sim.model import model_hash
 from gaponet.sim.replay import replay
 

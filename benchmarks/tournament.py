@@ -34,7 +34,7 @@ from gaponet.cli.main import main as gaponet
 from gaponet.data.sequence import Sequence
 from gaponet.data.split import split_entries
 from gaponet.robot.spec import RobotSpec, load_robot
-from gaponet.share.reading import open_dataset
+from gaponet.sim.dataset_robot import open_dataset
 from gaponet.sim.metrics import standard_error
 from gaponet.sim.replay import rollout_errors
 

@@ -53,9 +53,9 @@ from gaponet.nn.training.sensor_fit import fit_sensors
 from gaponet.nn.training.simulators import pieces
 from gaponet.robot.simulator_change import SimulatorChange, SimulatorRanges
 from gaponet.robot.spec import RobotSpec
-from gaponet.share.reading import open_dataset
 from gaponet.sim.batch import Condition
 from gaponet.sim.context import contexts
+from gaponet.sim.dataset_robot import open_dataset
 from gaponet.sim.replay import Corrector, rollout_errors
 
 TEST_SEED = 20_261_128

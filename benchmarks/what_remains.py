@@ -14,8 +14,8 @@ import numpy as np
 from scipy.ndimage import uniform_filter1d
 
 from gaponet.data.split import split_entries
+from gaponet.data.store import Dataset
 from gaponet.robot.spec import load_robot
-from gaponet.share.reading import load_dataset
 from gaponet.sim.dynamics import tips_of
 from gaponet.sim.replay import replay
 
@@ -24,7 +24,7 @@ REST_SPEED, REST_SPAN_S = 0.02, 0.2
 
 def main(dataset: str, folder: str) -> None:
     """Print the mean |error| of each kind of row, mrad, and what one removes from the mean over motions."""
-    data, robot = load_dataset(dataset), load_robot(folder)
+    data, robot = Dataset(dataset), load_robot(folder)
     heights, op = tips_of(robot), robot.operated_index
     kinds = ["at the table", "at rest, free", "moving, free"]
     sums, counts = np.zeros((2, len(kinds), len(op)))

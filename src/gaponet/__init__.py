@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from gaponet.nn.training.config import TrainConfig as TrainConfig
     from gaponet.robot.spec import RobotSpec as RobotSpec
     from gaponet.robot.spec import load_robot as load_robot
-    from gaponet.share.reading import open_dataset as open_dataset
+    from gaponet.sim.dataset_robot import open_dataset as open_dataset
     from gaponet.virtual.collect import CollectResult as CollectResult
 else:
     _MODULES = {  # public name → module
@@ -67,7 +67,7 @@ else:
         "DoctorResult": "gaponet.data.doctor",
         "ImportResult": "gaponet.data.importer",
         "Dataset": "gaponet.data.store",
-        "open_dataset": "gaponet.share.reading",
+        "open_dataset": "gaponet.sim.dataset_robot",
         "load_robot": "gaponet.robot.spec",
         "RobotSpec": "gaponet.robot.spec",
         "ModelConfig": "gaponet.nn.config",

@@ -15,7 +15,6 @@ from pathlib import Path
 
 import numpy as np
 from arm import XML, write_arm
-from logs import arm_sequence, late, wave
 
 from gaponet.base import sandbox
 from gaponet.base.errors import LogError
@@ -317,30 +316,7 @@ def sparse(name: str) -> Callable[[Path], None]:
     return logs(name)(make)
 
 
-def pushed(change: Callable[[Path], None]) -> Callable[[Path], None]:
-    """Push a dataset to a folder, then replace its robot; the index has the right hash."""
-
-    def make(folder: Path) -> None:
-        from gaponet.data.store import Dataset
-        from gaponet.share.push_pull import push
-        from gaponet.share.remote import FileRecord
-
-        ctrl = wave(60, 2)
-        robot = write_arm(folder / "good")
-        data = Dataset.create(folder / "set", robot)
-        data.append(arm_sequence(robot, ctrl, late(ctrl, 2), "wave", 0.0))
-        push(data.path, f"file://{folder}/bucket")
-        change(folder)
-        index = json.loads((folder / "bucket" / "gaponet.json").read_text())
-        part = FileRecord.of(folder / "arm" / "robot.xml")
-        shutil.copyfile(folder / "arm" / "robot.xml", folder / "bucket" / "sha256" / part.sha256)
-        index["files"]["gaponet/robot/robot.xml"] = vars(part)
-        (folder / "bucket" / "gaponet.json").write_text(json.dumps(index))
-
-    return make
-
-
-PULL, BENCH = ("pull", "file://{}/bucket", "{}/back"), ("export", "{}/run", "--to", "torch")
+BENCH = ("export", "{}/run", "--to", "torch")
 PICKLE = (*IMPORT, "--allow-pickle")
 CONE = asset('<mesh name="m" builtin="cone" params="100000000 1"/>')
 NKEY = before('<size nkey="300000000"/>')
@@ -355,7 +331,6 @@ CASES = {
     "mjcf iterations": Case(
         mjcf("<option ", '<option iterations="2000000000" tolerance="0" '), CHECK
     ),
-    "pull cone": Case(pushed(CONE), PULL),
     "onnx Loop": Case(lambda folder: network(loop, folder), BENCH),
     "onnx outer": Case(lambda folder: network(outer, folder), BENCH),
     "parquet rows": Case(parquet_rows, IMPORT),

@@ -17,7 +17,7 @@ from gaponet.evaluation.gap import gap_by_step
 from gaponet.report.view.side_by_side import side_by_side
 from gaponet.robot.folder import load_stored_robot
 from gaponet.robot.spec import load_robot
-from gaponet.share.reading import open_dataset
+from gaponet.sim.dataset_robot import open_dataset
 from gaponet.sim.model import model_hash
 
 STIFF = TOML.replace("kp = 20.0", "kp = 90.0")

@@ -1,7 +1,7 @@
-"""A dataset to push, and places for it: a stand-in of the Hub, and a disk as object storage."""
+"""A dataset to push, and a place for it: a stand-in of the Hub."""
 
+import hashlib
 import json
-import shutil
 from dataclasses import replace
 
 import pytest
@@ -9,7 +9,6 @@ from logs import arm_sequence, late, wave
 
 from gaponet.data.split import make_split, write_split
 from gaponet.data.store import Dataset
-from gaponet.share.remote import FileRecord
 
 
 def add(data, arm, names, **meta):
@@ -59,47 +58,30 @@ def hub(monkeypatch, tmp_path):
     server.server_close()
 
 
-@pytest.fixture(params=["hub", "bucket"])
-def place(request, tmp_path):
-    """An address on the Hub, and one on a disk as object storage."""
-    if request.param == "hub":
-        request.getfixturevalue("hub")
-        return "hf://me/arm"
-    return f"file://{tmp_path}/bucket/arm"
+@pytest.fixture
+def place(hub):
+    """An address on the stand-in of the Hub."""
+    return "hf://me/arm"
 
 
 @pytest.fixture
-def bucket(tmp_path):
-    """The folder of an address on a disk, file://{bucket}."""
-    return tmp_path / "bucket" / "arm"
-
-
-@pytest.fixture
-def disk(bucket):
-    """The address of a disk as object storage, for what is the same on the Hub."""
-    return f"file://{bucket}"
-
-
-@pytest.fixture
-def forge(bucket):
+def forge(hub):
     """Change what was pushed as somebody does who knows how an index is made: hashes and sizes are right.
 
     The function that is given gets the index, and put(name, content) and read(name) of its files.
     """
 
-    def forged(change):
-        index = json.loads((bucket / "gaponet.json").read_text())
+    def forged(change, repo="datasets/me/arm"):
+        files = dict(hub.files(repo))
+        index = json.loads(files["gaponet.json"])
 
         def put(name, content):
-            (bucket / ".new").write_bytes(content)
-            index["files"][name] = vars(FileRecord.of(bucket / ".new"))
-            shutil.move(bucket / ".new", bucket / "sha256" / index["files"][name]["sha256"])
+            files[name] = content
+            digest = hashlib.sha256(content).hexdigest()
+            index["files"][name] = {"size": len(content), "sha256": digest}
 
-        change(
-            index,
-            put,
-            lambda name: (bucket / "sha256" / index["files"][name]["sha256"]).read_bytes(),
-        )
-        (bucket / "gaponet.json").write_text(json.dumps(index))
+        change(index, put, lambda name: files[name])
+        files["gaponet.json"] = json.dumps(index).encode()
+        hub.commit(repo, files)
 
     return forged

@@ -14,7 +14,7 @@ robot = gp.load_robot("so101")
 assert_type(robot, gp.RobotSpec)
 assert_type(gp.__version__, str)
 data = gp.Dataset("data")
-assert_type(gp.open_dataset("s3://bucket/data"), tuple[gp.Dataset, gp.RobotSpec])
+assert_type(gp.open_dataset("data"), tuple[gp.Dataset, gp.RobotSpec])
 
 with gp.progress_bar("importing") as update:
     imported = gp.import_logs(

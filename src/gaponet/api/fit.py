@@ -79,7 +79,7 @@ def identify(
     the same gains, the robot folder has these.
 
     Args:
-        dataset: Recordings: a folder, or the address of one that was pushed to a bucket.
+        dataset: Recordings, a folder.
         out: Robot folder to write; `train(…, robot=out)` starts from it.
         windows: Number of 8 s rollouts that are fitted, taken evenly from the training motions.
         robot: Start of the fit, if not the robot that the dataset keeps.
@@ -233,7 +233,7 @@ def _origin(
     """Return what a robot folder was identified from: dataset, recordings and motions by split, validation errors, what
     the doctor found, and what the fit found."""
     return {
-        "dataset": data.address or os.path.relpath(data.path, folder),
+        "dataset": os.path.relpath(data.path, folder),
         "parts": {name: {e.id: e.hash for e in entries} for name, entries in split.items()},
         "motions": {name: sorted({e.meta.motion for e in entries}) for name, entries in split.items()},
         "val_mpjae": dict(val_mpjae), "findings": list(findings), "doctor": gate.to_dict(),
@@ -284,7 +284,7 @@ def train(
     (nn/training/ranks.py).
 
     Args:
-        dataset: Recordings: a folder, or the address of one that was pushed to a bucket.
+        dataset: Recordings, a folder.
         out: Run folder.
         budget: Time such as 90s, 10m or 2h, or control steps such as 2000000.
         config: Everything else; default `TrainConfig()`.

@@ -111,7 +111,7 @@ def doctor(
     """Check a dataset: order, sign, unit, range, rate, gaps, saturation, stuck channels, lag, sag, torque.
 
     Args:
-        dataset: Recordings; also the address of a dataset that was pushed to a bucket.
+        dataset: Recordings.
         robot: Another robot than the one that the dataset keeps.
         executor: Where many unchecked recordings are read: local, ray, ray:ADDRESS, or one of concurrent.futures.
 

@@ -35,8 +35,7 @@ def gap(
     """Measure the error of the nominal simulator in open-loop rollouts; for an identified robot also by cause.
 
     Args:
-        dataset: Recordings; those without a paired simulation are simulated first. Also the address of a dataset that
-            was pushed to a bucket.
+        dataset: Recordings; those without a paired simulation are simulated first.
         robot: Another robot than the one that the dataset keeps. An identified one is measured as `run` is.
         motions: Only these.
         run: Robot folder that `identify` wrote, a run of `train`, or a network of the package by name. The result then

@@ -1,4 +1,4 @@
-"""Datasets, robots and runs as arguments: a path, an address, or an object."""
+"""Datasets, robots and runs as arguments: a path or an object."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def as_dataset(
     dataset: Dataset | Place, robot: RobotSpec | Place | None, run: Path | None = None
 ) -> tuple[Dataset, RobotSpec]:
     """Return a dataset and its robot, or the robot that is given."""
-    from gaponet.share.reading import open_dataset
+    from gaponet.sim.dataset_robot import open_dataset
 
     return open_dataset(dataset, robot, run)
 

@@ -24,9 +24,7 @@ Known = Annotated[
 ]
 Logs = Annotated[
     tyro.conf.Positional[str],
-    tyro.conf.arg(
-        help="Dataset folder or address; for a robot folder logs as well.", metavar="LOGS"
-    ),
+    tyro.conf.arg(help="Dataset folder; for a robot folder logs as well.", metavar="LOGS"),
 ]
 
 

@@ -29,7 +29,7 @@ Robot = Annotated[
 Logs = Annotated[
     tyro.conf.Positional[str],
     tyro.conf.arg(
-        help="Dataset folder or address, or logs that gaponet import reads; with --fleet a folder of each robot's logs "
+        help="Dataset folder, or logs that gaponet import reads; with --fleet a folder of each robot's logs "
         "or dataset, or one dataset of all units.",
         metavar="LOGS",
     ),

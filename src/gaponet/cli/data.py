@@ -8,11 +8,11 @@ from typing import Any, Literal
 import tyro
 
 from gaponet.base.progress import progress_bar
-from gaponet.cli.options import Data, Json, Logs, Robot, Source, actions
+from gaponet.cli.options import Data, Json, Logs, Robot, actions
 from gaponet.cli.out import Out
 from gaponet.data.store import Dataset
 from gaponet.robot.finding import abbreviate
-from gaponet.share.reading import open_dataset
+from gaponet.sim.dataset_robot import open_dataset
 
 
 def _card(
@@ -87,7 +87,7 @@ def _split(
     out.result({"split": str(path), "by": by, "parts": rows})
 
 
-def _figures(dataset: Source, out: Path, robot: Robot = None, json: Json = False) -> None:
+def _figures(dataset: Data, out: Path, robot: Robot = None, json: Json = False) -> None:
     """Draw the dataset: joint ranges, composition, torque and temperature.
 
     Args:
@@ -107,7 +107,7 @@ def _figures(dataset: Source, out: Path, robot: Robot = None, json: Json = False
 
 
 def _export(
-    dataset: Source, out: Path, to: str = "lerobot", robot: Robot = None, json: Json = False
+    dataset: Data, out: Path, to: str = "lerobot", robot: Robot = None, json: Json = False
 ) -> None:
     """Write a dataset in another format; gaponet import reads it back as far as the format can hold it.
 

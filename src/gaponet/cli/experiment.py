@@ -11,7 +11,7 @@ import tyro
 
 from gaponet.base.errors import ModelError
 from gaponet.base.progress import progress_bar, progress_bars
-from gaponet.cli.options import Json, Source, actions
+from gaponet.cli.options import Data, Json, actions
 from gaponet.cli.out import Out, writes
 from gaponet.experiments.paper.options import PaperOptions
 
@@ -38,7 +38,7 @@ TITLES = {  # of tables on the terminal; the page numbers them too
 
 @writes("experiments")
 def paper(
-    dataset: Source,
+    dataset: Data,
     out: Path,
     options: Annotated[PaperOptions, tyro.conf.arg(name="")] = PaperOptions(),  # noqa: B008
     json: Json = False,

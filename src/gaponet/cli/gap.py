@@ -9,18 +9,18 @@ from typing import Any
 from gaponet import api
 from gaponet.base.executor import LOCAL
 from gaponet.base.progress import progress_bar
-from gaponet.cli.options import Json, Motions, Robot, Source, like
+from gaponet.cli.options import Data, Json, Motions, Robot, like
 from gaponet.cli.out import Out
 from gaponet.cli.show import show_methods, show_verdict
 from gaponet.evaluation.methods import title
 from gaponet.evaluation.tables import mrad
 from gaponet.nn.packaged_networks import network_folder
-from gaponet.share.reading import open_dataset
+from gaponet.sim.dataset_robot import open_dataset
 
 
 @like(api.gap)
 def gap(
-    dataset: Source, run: Path | None = None, motions: Motions = (), robot: Robot = None, executor: str = LOCAL,
+    dataset: Data, run: Path | None = None, motions: Motions = (), robot: Robot = None, executor: str = LOCAL,
     json: Json = False,
 ) -> None:  # fmt: skip
     """How far is the simulator from the robot, by joint and payload?
@@ -41,7 +41,7 @@ def gap(
         _show_steps(out, result.table)
         if (folder / "gap.png").is_file():
             out.say(f"figure: {folder / 'gap.png'}")
-    show_verdict(out, result.methods, dataset, folder if result.by_cause else None)
+    show_verdict(out, result.methods, str(dataset), folder if result.by_cause else None)
     out.result(result.to_dict())
 
 

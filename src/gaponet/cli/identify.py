@@ -11,14 +11,14 @@ from gaponet.base.errors import UsageError
 from gaponet.base.progress import progress_bar
 from gaponet.base.text import format_uncertainty
 from gaponet.cli import options
-from gaponet.cli.options import Flag, Json, Robot, Source
+from gaponet.cli.options import Data, Flag, Json, Robot
 from gaponet.cli.out import Out, writes
 from gaponet.evaluation.tables import mrad, mrad_with_error
 from gaponet.robot.finding import abbreviate
 from gaponet.robot.servo_fields import PASSIVE_FIELDS, SERVO_FIELDS, Term
 from gaponet.robot.spec import robot_argument
 from gaponet.robot.toml_file import MEASURED_FIELDS
-from gaponet.share.reading import open_dataset
+from gaponet.sim.dataset_robot import open_dataset
 from gaponet.sim.metrics import standard_error
 from gaponet.sysid.uncertainty import JointSummary
 
@@ -28,7 +28,7 @@ UNDETERMINED = "not determined by these logs"
 @writes("robot")
 @options.like(api.identify)
 def identify(
-    dataset: Source, out: Path, windows: int = 40, terms: tuple[Term, ...] | None = None, table: bool = True,
+    dataset: Data, out: Path, windows: int = 40, terms: tuple[Term, ...] | None = None, table: bool = True,
     threads: int = 0, budget: str | None = None, stops: Flag = False, masses: Flag = False, current: Flag = False,
     details: Flag = False, robot: Robot = None, like: str | None = None, units: tuple[str, ...] = (),
     holdout_units: tuple[str, ...] = (), despite_errors: Flag = False, json: Json = False,

@@ -14,7 +14,7 @@ from gaponet import api
 from gaponet.base.errors import UsageError
 from gaponet.base.files import lock_folder
 from gaponet.base.progress import progress_bar
-from gaponet.cli.options import Flag, Json, Source, like
+from gaponet.cli.options import Data, Flag, Json, like
 from gaponet.cli.out import Out
 from gaponet.robot.finding import abbreviate
 from gaponet.robot.spec import RobotSpec, load_robot
@@ -82,7 +82,7 @@ def import_logs(
 
 
 def doctor(
-    dataset: Source,
+    dataset: Data,
     robot: str | None = None,
     fix: Flag = False,
     figures: Path | None = None,
@@ -96,7 +96,7 @@ def doctor(
         figures: Folder for a picture of each finding.
     """
     from gaponet.robot.finding import Finding
-    from gaponet.share.reading import open_dataset
+    from gaponet.sim.dataset_robot import open_dataset
 
     out = Out(json)
     data, spec = open_dataset(dataset, robot)

@@ -17,13 +17,6 @@ Logs = Annotated[Folder, tyro.conf.arg(metavar="LOGS")]
 Model = Annotated[Folder, tyro.conf.arg(metavar="MODEL")]
 Flag = tyro.conf.FlagCreatePairsOff[bool]
 Data = Annotated[Folder, tyro.conf.arg(help="Dataset folder.", metavar="DATASET")]
-Source = Annotated[
-    tyro.conf.Positional[str],
-    tyro.conf.arg(
-        help="Dataset folder, or the address (s3://, gs://, file://, hf://) of one that was pushed.",
-        metavar="DATASET",
-    ),
-]
 Run = Annotated[Folder, tyro.conf.arg(help="Run folder of gaponet train.", metavar="RUN")]
 Known = Annotated[
     Folder,

@@ -17,7 +17,7 @@ from gaponet.cli.out import Out
 from gaponet.nn.packaged_networks import packaged_networks
 from gaponet.robot.spec import RobotSpec, load_robot, packaged_robots, robot_argument, servo_table
 from gaponet.robot.toml_file import MEASURED_FIELDS
-from gaponet.share.reading import open_dataset
+from gaponet.sim.dataset_robot import open_dataset
 
 if TYPE_CHECKING:
     from gaponet.robot.new import NewRobot

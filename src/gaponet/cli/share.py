@@ -6,7 +6,6 @@ from typing import Annotated
 
 import tyro
 
-from gaponet.base.text import remove_credentials
 from gaponet.cli.options import Flag, Folder, Json, like
 from gaponet.cli.out import Out
 from gaponet.share import push_pull
@@ -16,23 +15,17 @@ Address = Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="ADDRESS")]
 
 @like(push_pull.push)
 def push(
-    path: Folder, address: Address, private: Flag = False, replace: Flag = False, prune: Flag = False,
-    json: Json = False,
-) -> None:  # fmt: skip
-    """Put a dataset or a run onto the Hugging Face Hub or a bucket."""
+    path: Folder, address: Address, private: Flag = False, replace: Flag = False, json: Json = False
+) -> None:
+    """Put a dataset or a run onto the Hugging Face Hub."""
     screen = Out(json)
-    result, shown = (
-        push_pull.push(path, address, private, replace, prune),
-        remove_credentials(address),
+    result = push_pull.push(path, address, private, replace)
+    size = f"{result.files} files, {result.size / 1e6:,.1f} MB"
+    screen.say(f" of {size}, is now at {address}", result.kind)
+    screen.say(f"Back: gaponet pull {address} {path.name}")
+    screen.result(
+        {"kind": result.kind, "address": address, "files": result.files, "bytes": result.size}
     )
-    screen.say(
-        f" of {result.files} files, {result.size / 1e6:,.1f} MB, is now at {shown}", result.kind
-    )
-    if prune:
-        screen.say(f"{result.pruned} files of earlier pushes were deleted")
-    screen.say(f"Back: gaponet pull {shown} {path.name}")
-    screen.result({"kind": result.kind, "address": shown, "files": result.files, "bytes": result.size,
-                   "pruned": result.pruned})  # fmt: skip
 
 
 @like(push_pull.pull)

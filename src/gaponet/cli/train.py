@@ -12,7 +12,7 @@ import tyro
 
 from gaponet import api
 from gaponet.base.progress import no_progress, progress_bar
-from gaponet.cli.options import Flag, Json, Known, Motions, Robot, Source, like
+from gaponet.cli.options import Data, Flag, Json, Known, Motions, Robot, like
 from gaponet.cli.out import Out
 from gaponet.cli.show import show_methods, show_verdict
 from gaponet.evaluation.methods import title
@@ -25,7 +25,7 @@ from gaponet.robot.folder import STORED_ROBOT
 
 @like(api.train)
 def train(
-    dataset: Source,
+    dataset: Data,
     out: Path,
     model: ModelKind | Literal["auto"] = "auto",
     recipe: Literal["labels", "paper"] = "labels",
@@ -81,7 +81,7 @@ def train(
     )
     gain = NetworkGain("identified", val["added"], val.get("error", math.nan), val["start"])
     screen.say(f"with {kind} the error of validation motions falls by {gain.text}")
-    step = f"gaponet eval {out} {quote(dataset)}"
+    step = f"gaponet eval {out} {quote(str(dataset))}"
     if not gain.helps and val["start"] != val["nominal"]:
         step = f"gaponet export {quote(str(out / STORED_ROBOT))} --to mjcf"
         screen.say(
@@ -95,7 +95,7 @@ def train(
 
 @like(api.evaluate)
 def evaluate(
-    run: Known, dataset: Source, also: tuple[Path, ...] = (), motions: Motions = (), robot: Robot = None,
+    run: Known, dataset: Data, also: tuple[Path, ...] = (), motions: Motions = (), robot: Robot = None,
     units: tuple[str, ...] = (), json: Json = False,
 ) -> None:  # fmt: skip
     """Measure robots and runs on motions that they never saw."""
@@ -119,5 +119,5 @@ def evaluate(
     for note in table["notes"]:
         out.say(note)
     show_methods(out, table)
-    show_verdict(out, result.methods, dataset, run)
+    show_verdict(out, result.methods, str(dataset), run)
     out.result(table)

@@ -13,7 +13,7 @@ from gaponet.cli.out import Out
 from gaponet.evaluation.methods import title
 from gaponet.evaluation.tables import mrad
 from gaponet.nn.packaged_networks import network_folder
-from gaponet.share.reading import open_dataset
+from gaponet.sim.dataset_robot import open_dataset
 
 if TYPE_CHECKING:
     from gaponet.data.sequence import SequenceMeta

@@ -65,18 +65,17 @@ class Dataset:
 
     Attributes:
         path: The folder.
-        address: Where a dataset that was pushed to a bucket can be opened again (share.stream); "" for a folder.
         header: Content of dataset.json.
         entries: The listed sequences, oldest first.
     """
 
-    def __init__(self, path: str | Path, address: str = "") -> None:
+    def __init__(self, path: str | Path) -> None:
         """Open an existing folder.
 
         Raises:
             DatasetError: It is not a dataset, a newer version wrote it, or a listed file is missing.
         """
-        self.path, self.address = Path(path), address
+        self.path = Path(path)
         header = self.path / "dataset.json"
         if not header.is_file():
             raise DatasetError(

@@ -25,7 +25,7 @@ DATA_HINT = "data of the robot that the run was trained for"
 
 
 class _Origin(TypedDict):
-    """Data that a robot was identified from: dataset (address, or path from the folder), recordings and motions by
+    """Data that a robot was identified from: dataset (path from the folder), recordings and motions by
     split, the error on validation motions, rad, what was learned about backlash and links, and what the doctor found in
     the recordings (checks/gate.py)."""
 

@@ -129,7 +129,7 @@ def evaluate(
     for name, simulator, corrector in _methods(candidates, nominal, target):
         rollouts.add_method(name, simulator, corrector, with_note(progress, name))
     rollouts.add_adapted(with_note(progress, "adapted"))
-    command = _command(folders, dataset.address or os.path.normpath(dataset.path), motions)
+    command = _command(folders, os.path.normpath(dataset.path), motions)
     result = rollouts.result() | {
         "dataset": dataset.path.name,
         "unseen": unseen,

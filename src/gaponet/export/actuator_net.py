@@ -27,12 +27,12 @@ from gaponet.base.errors import UsageError
 from gaponet.base.files import atomic_write
 from gaponet.data.sequence import Sequence
 from gaponet.data.split import stratified_subset
+from gaponet.data.store import Dataset
 from gaponet.evaluation.candidate import split_of_run
 from gaponet.evaluation.run_files import read_config
 from gaponet.export.plain_servos import comparable, mean_error
 from gaponet.export.shipped.mujoco_servos import delay_weights
 from gaponet.robot.spec import RobotSpec
-from gaponet.share.reading import load_dataset
 from gaponet.sim.replay import Corrector, replay
 
 PAST_S = 0.1  # beyond the longest delay
@@ -114,7 +114,7 @@ def read_run_recordings(
         UsageError: There is none.
     """
     place = data or read_config(run)["dataset"]
-    dataset = load_dataset(place if data or "://" in place else run / place)
+    dataset = Dataset(place if data else run / place)
     entries = [e for e in dataset.entries if e.meta.payload_mass == payload_mass]
     hashes = [set(split_of_run(run)[split].values()) for split in ("train", "val")]
     chosen = [

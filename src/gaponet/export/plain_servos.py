@@ -23,10 +23,10 @@ from gaponet.base.progress import Progress, no_progress
 from gaponet.base.structure import read_json, validated
 from gaponet.data.sequence import Sequence, SequenceMeta
 from gaponet.data.split import split_entries
+from gaponet.data.store import Dataset
 from gaponet.evaluation.candidate import read_origin
 from gaponet.robot.servo_fields import SERVO_FIELDS, SERVO_TERMS
 from gaponet.robot.spec import RobotSpec
-from gaponet.share.reading import load_dataset
 from gaponet.sim.batch import Condition, speed_limited
 from gaponet.sim.model import model_hash
 from gaponet.sim.replay import replay
@@ -55,14 +55,11 @@ def read_recordings(
     """
     origin = read_origin(folder)
     if data is None and origin is not None:
-        data = origin["dataset"]
-        if "://" not in data:
-            data = (
-                str(folder / data) if (folder / data).is_dir() else None
-            )  # it may have moved away
+        fitted_to = folder / origin["dataset"]
+        data = str(fitted_to) if fitted_to.is_dir() else None  # it may have moved away
     if data is None:
         return None
-    dataset = load_dataset(data)
+    dataset = Dataset(data)
     dataset.require_robot(robot)
     first = dataset.read(dataset.entries[0])
     if np.array_equal(first.ctrl, first.qpos):

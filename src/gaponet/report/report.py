@@ -131,10 +131,6 @@ def _evaluate(run: Path, dataset: Path | None, robot: RobotSpec | None, progress
 
     origin = read_origin(run) if is_robot(run) else read_config(run)
     fitted_to = "" if origin is None else origin["dataset"]
-    if dataset is None and "://" in fitted_to:
-        raise DatasetError(
-            f"{run}: fitted to {fitted_to}; evaluate it first: gaponet eval {run} '{fitted_to}'"
-        )
     place = dataset or run / fitted_to
     try:
         data = Dataset(place)

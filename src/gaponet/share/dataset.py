@@ -10,29 +10,35 @@ from __future__ import annotations
 import hashlib
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from gaponet import __version__
 from gaponet.base.errors import DatasetError
 from gaponet.base.files import FOLDER_MARKER, write_text
 from gaponet.base.progress import progress_bar
 from gaponet.data.card import card_markdown, make_card
-from gaponet.data.formats.lerobot_set import Stated
+from gaponet.data.formats.lerobot import read_episodes
+from gaponet.data.formats.lerobot_set import Set, Stated, sets_under
 from gaponet.data.importer import measure_delays
+from gaponet.data.log import Log
 from gaponet.data.offsets import FILE as OFFSETS
 from gaponet.data.offsets import read_offsets
+from gaponet.data.sequence import Sequence, SequenceMeta, to_sequence
 from gaponet.data.split import read_split
 from gaponet.data.store import JOURNAL, Dataset
 from gaponet.data.writers.lerobot import write
 from gaponet.robot.folder import STORED_ROBOT, load_stored_robot, require_self_contained, save_robot
 from gaponet.robot.spec import RobotSpec, load_robot
 from gaponet.share.readme import dataset_readme
-from gaponet.share.remote import FileRecord, Index
+from gaponet.share.remote import INDEX, FileRecord, Index, RemoteError
 from gaponet.sim.model import model_hash
 
 SIDECAR = "gaponet"  # folder beside the LeRobot set
 SOURCE = f"{SIDECAR}/source.json"  # hashes of all files that the pushed files follow from
 COPIED_FILES = ("collect.json", OFFSETS)
+AGAIN = "push it again"
 
 
 def write_files(path: Path, folder: Path, address: str) -> tuple[str, ...]:
@@ -87,10 +93,40 @@ def _source_text(path: Path, address: str) -> str:
     )
 
 
-def add_missing(pushed: Dataset, robot: RobotSpec, out: Path, new: bool) -> None:
-    """Copy the sequences that a dataset lacks from a pushed one; one recording at a time is in memory.
+def is_recording_file(path: str) -> bool:
+    """Return True for a pushed file with samples; all others are small."""
+    return "data" in path.split("/")[:-1]
+
+
+def missing_files(files: Path, index: Index, present: Dataset | None) -> list[str]:
+    """Return the pushed files that hold recordings which a dataset lacks.
 
     Args:
+        files: Folder with the small files of the push.
+        present: The dataset; None where there is none yet.
+
+    Raises:
+        GAPONetError: The files do not list the sequences of the index.
+    """
+    sets = sets_under(files)
+    listed = [str(episode.get("content_hash")) for part in sets for episode in part.episodes]
+    if sorted(listed) != sorted(index.contents):
+        raise RemoteError(f"the sequences listed are not those of {INDEX}; {AGAIN}")
+    wanted = set()
+    for part in sets:
+        for episode in part.episodes:
+            if present is None or present.find(str(episode["content_hash"])) is None:
+                wanted.add(part.data_file(episode).relative_to(files).as_posix())
+    if unlisted := wanted - index.files.keys():
+        raise RemoteError(f"{min(unlisted)} is not in {INDEX}; {AGAIN}")
+    return sorted(wanted)
+
+
+def add_missing(files: Path, robot: RobotSpec, out: Path, new: bool) -> None:
+    """Copy the sequences that a dataset lacks from pushed files; each is compared with its content hash.
+
+    Args:
+        files: Folder with the small files of the push and with those of missing_files.
         out: Dataset; made if there is none.
         new: Also copy licence and source.
 
@@ -98,16 +134,44 @@ def add_missing(pushed: Dataset, robot: RobotSpec, out: Path, new: bool) -> None
         GAPONetError: It is another robot's, or a recording differs from the pushed one.
     """
     dataset = Dataset.create(out, robot)
-    if new:
-        known = (name for name in Stated.__annotations__ if name in pushed.header)
-        dataset.set_provenance(**{name: str(pushed.header[name]) for name in known})
-    missing = [entry for entry in pushed.entries if dataset.find(entry.hash) is None]
+    sets = sets_under(files)
+    total = sum(len(part.episodes) for part in sets)
+    done = 0
     with dataset.appending(), progress_bar("checking") as update:
-        for done, entry in enumerate(missing, 1):
-            sequence = pushed.read(entry)
-            dataset.append(sequence, entry.findings or measure_delays(sequence), entry.hash)
-            update(done, len(missing), entry.meta.motion)
-    copy_sidecars(pushed.path, dataset.path, dataset)
+        for part in sets:
+            if part.ours is None:
+                raise RemoteError(f"{part.path}: gaponet did not write this set")
+            if new:
+                dataset.set_provenance(**_provenance(part))
+            episodes = [e for e in part.episodes if dataset.find(e["content_hash"]) is None]
+            done += len(part.episodes) - len(episodes)
+            for episode, log in zip(episodes, read_episodes(part, episodes, robot), strict=True):
+                sequence = _pushed_sequence(episode, log, robot)
+                findings = episode["findings"] or measure_delays(sequence)
+                dataset.append(sequence, findings, str(episode["content_hash"]))
+                done += 1
+                update(done, total, sequence.meta.motion)
+    copy_sidecars(files / SIDECAR, dataset.path, dataset)
+
+
+def _provenance(part: Set) -> dict[str, str]:
+    """Return licence and source that a pushed set states."""
+    assert part.ours is not None
+    stated: dict[str, Any] = {**part.ours["dataset"]}
+    return {name: str(stated[name]) for name in Stated.__annotations__ if name in stated}
+
+
+def _pushed_sequence(episode: dict[str, Any], log: Log, robot: RobotSpec) -> Sequence:
+    """Return the sequence of an episode, as it was recorded.
+
+    Raises:
+        RemoteError: It is not the one that was pushed.
+    """
+    meta = SequenceMeta(**(episode["stated"] | {"robot": robot.name}))
+    sequence = replace(to_sequence(log, robot, meta), meta=meta)
+    if sequence.content_hash() != episode["content_hash"]:
+        raise RemoteError(f"'{meta.motion}' is not what was pushed, by its content hash; {AGAIN}")
+    return sequence
 
 
 def copy_sidecars(source: Path, out: Path, dataset: Dataset) -> None:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import glob
 import os
-from collections.abc import Collection
 from contextlib import suppress
 from pathlib import Path
 
@@ -20,6 +19,8 @@ from gaponet.share.remote import (
     RemoteError,
     lost_race,
     network_errors,
+    require_pushed_files,
+    require_space,
 )
 
 REPOSITORY_TYPES: dict[Kind, str] = {"dataset": "dataset", "run": "model"}
@@ -28,14 +29,27 @@ PARENT_CHANGED = 412  # HTTP status of a commit whose parent is not the newest c
 
 
 class Hub:
-    """A `Remote` on the Hub, or at HF_ENDPOINT; the token is HF_TOKEN or that of `hf auth login`."""
+    """A repository of the Hub, or at HF_ENDPOINT; the token is HF_TOKEN or that of `hf auth login`.
+
+    Its methods raise RemoteError for errors of network and place.
+    """
 
     def __init__(self, address: str) -> None:
         """
         Args:
             address: USER/NAME, with @REVISION behind it for another branch, tag or commit than main.
+
+        Raises:
+            RemoteError: It is the address of something else.
         """
         from huggingface_hub import HfApi
+
+        scheme, separator, _ = address.partition("://")
+        if separator and scheme != "hf":
+            raise RemoteError(
+                f"{address}: not on the Hub; a dataset is a folder, which the tools of other places "
+                "copy as it is, such as aws s3 sync"
+            )
 
         self.address = address
         self.repo, _, revision = (
@@ -46,6 +60,7 @@ class Hub:
         self._sizes: dict[str, int | None] = {}
 
     def index(self, kind: Kind | None = None) -> bytes | None:
+        """Return the content of gaponet.json, None if nothing was pushed; kind: look for this one only."""
         from huggingface_hub.errors import RepositoryNotFoundError
 
         for wanted in REPOSITORY_TYPES.values() if kind is None else (REPOSITORY_TYPES[kind],):
@@ -77,27 +92,39 @@ class Hub:
             )
         return None
 
-    def sizes(self, paths: list[str], index: Index) -> list[int | None]:
-        return [self._sizes.get(path) for path in paths]
+    def is_outdated(self, index: Index) -> bool:
+        """Return True if a file of the index is missing at the Hub or has another size there."""
+        return any(self._sizes.get(path) != file.size for path, file in index.files.items())
 
-    def outdated(self, index: Index) -> set[str]:
-        return {
-            path for path, record in index.files.items() if self._sizes.get(path) != record.size
-        }
+    def download(self, paths: list[str], index: Index, folder: Path) -> None:
+        """Download files of the index into a folder; those that an earlier download left there are kept.
 
-    def fetch(self, paths: list[str], index: Index, folder: Path) -> None:
-        names = [glob.escape(path) for path in paths]
+        Raises:
+            RemoteError: A file is missing or differs, or the disk is too small.
+        """
+        require_space(self.address, index.size(paths), folder)
+        if missing := set(paths) - self._sizes.keys():
+            raise RemoteError(f"{self.address}: {min(missing)} is missing; push it again")
         with network_errors(self.address):
             self.api.snapshot_download(
                 self.repo,
                 repo_type=self.type,
                 revision=self.commit,
                 local_dir=folder,
-                allow_patterns=names,
+                allow_patterns=[glob.escape(path) for path in paths],
             )
+        require_pushed_files(self.address, index, paths, folder)
 
-    def store(self, folder: Path, index: Index, paths: Collection[str], private: bool) -> None:
-        """Commit all files of the index; the Hub itself knows which of them are new (`paths` is not used)."""
+    def store(self, folder: Path, index: Index, private: bool) -> None:
+        """Commit all files of the index; the Hub itself knows which of them are new.
+
+        Args:
+            folder: Folder with the files.
+            private: Make a new repository readable by its owner only.
+
+        Raises:
+            RemoteError: Somebody else pushed since `index` was called.
+        """
         from huggingface_hub import CommitOperationAdd, CommitOperationDelete
         from huggingface_hub.errors import HfHubHTTPError, RevisionNotFoundError
 
@@ -129,7 +156,3 @@ class Hub:
                 with suppress(RevisionNotFoundError):
                     self.api.delete_tag(self.repo, tag=LEROBOT_TAG, repo_type=repo_type)
                 self.api.create_tag(self.repo, tag=LEROBOT_TAG, repo_type=repo_type, exist_ok=True)
-
-    def prune(self, index: Index) -> int:
-        """Return 0: files that a commit deletes stay in the history of the repository."""
-        return 0

@@ -20,6 +20,7 @@ from gaponet.base.files import FOLDER_MARKER, lock_folder, write_text
 from gaponet.data.store import Dataset
 from gaponet.share import dataset as datasets
 from gaponet.share import run as runs
+from gaponet.share.hub import Hub
 from gaponet.share.remote import (
     FORMAT,
     INDEX,
@@ -27,11 +28,9 @@ from gaponet.share.remote import (
     Index,
     Kind,
     RemoteError,
-    download,
     file_errors,
     read_index,
 )
-from gaponet.share.stream import RemoteDataset, open_remote
 
 
 @dataclass(frozen=True)
@@ -41,7 +40,6 @@ class TransferResult:
     kind: Kind  # dataset or run
     files: int  # number of files: all of a push, the downloaded ones of a pull
     size: int  # bytes of these files
-    pruned: int = 0  # number of deleted files of earlier pushes
 
 
 def push(
@@ -49,54 +47,50 @@ def push(
     address: str,
     private: bool = False,
     replace: bool = False,
-    prune: bool = False,
 ) -> TransferResult:
     """Put a dataset or a run where others can pull it, with a card; one that is there already is brought up to date.
 
     Args:
         path: Dataset or run.
-        address: USER/NAME on the Hugging Face Hub, or s3://, gs:// or file:// and a folder.
-        private: Readable by its owner alone, if a new repository of the Hub is made for it.
-        replace: Also replace what this is no newer state of; upload every file to a bucket.
-        prune: Delete files of earlier pushes from a bucket: those that neither this push nor the one before it uses
-            and that are older than a day.
+        address: USER/NAME on the Hugging Face Hub.
+        private: Readable by its owner alone, if a new repository is made for it.
+        replace: Also replace what this is no newer state of.
 
     Raises:
         RemoteError: The place cannot be reached or written, or holds something else.
         GAPONetError: The dataset or run is damaged.
     """
     path = Path(path).resolve()
-    kind, remote = _kind(path), open_remote(address)
-    content = remote.index(kind)
-    present = None if replace or content is None else read_index(remote, content)
+    kind = _kind(path)
+    hub = Hub(address)
+    content = hub.index(kind)
+    present = None if replace or content is None else read_index(hub.address, content)
     same = (
         present
         and kind == present.kind == "dataset"
-        and datasets.is_pushed(path, remote.address, present)
+        and datasets.is_pushed(path, hub.address, present)
     )
-    if present and same and not remote.outdated(present):
-        pruned = remote.prune(present) if prune else 0
-        return TransferResult(kind, len(present.files), present.size(present.files), pruned)
+    if present and same and not hub.is_outdated(present):
+        return TransferResult(kind, len(present.files), present.size(present.files))
     with _work_folder(path, "push") as folder:
         _clear(folder)  # files of a killed push
         files = folder / "files"
         files.mkdir()
         try:
-            contents = (datasets if kind == "dataset" else runs).write_files(
-                path, files, remote.address
-            )
-            _require_newer(present, kind, contents, remote.address)
+            source = datasets if kind == "dataset" else runs
+            contents = source.write_files(path, files, hub.address)
+            _require_newer(present, kind, contents, hub.address)
             records = {
                 file.relative_to(files).as_posix(): FileRecord.of(file)
-                for file in sorted(files.rglob("*")) if file.is_file()
-            }  # fmt: skip
+                for file in sorted(files.rglob("*"))
+                if file.is_file()
+            }
             index = Index(FORMAT, kind, path.name, contents, records)
             write_text(files / INDEX, index.text())
-            remote.store(files, index, records if replace else remote.outdated(index), private)
-            pruned = remote.prune(index) if prune else 0
+            hub.store(files, index, private)
         finally:
             _clear(folder)
-    return TransferResult(kind, len(records), index.size(records), pruned)
+    return TransferResult(kind, len(records), index.size(records))
 
 
 def pull(address: str, out: str | Path) -> TransferResult:
@@ -105,8 +99,7 @@ def pull(address: str, out: str | Path) -> TransferResult:
     A dataset that is there already gets the sequences that it lacks, and keeps all else as it is.
 
     Args:
-        address: USER/NAME on the Hugging Face Hub (@REVISION behind it for a tag or commit), or s3://, gs:// or
-            file:// and a folder.
+        address: USER/NAME on the Hugging Face Hub; @REVISION behind it for a tag or commit.
         out: New or empty folder, or a dataset of that robot.
 
     Raises:
@@ -117,12 +110,10 @@ def pull(address: str, out: str | Path) -> TransferResult:
     present = Dataset(out) if (out / "dataset.json").is_file() else None
     if present is None and out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise UsageError(f"{out}: exists and is not an empty folder; choose a new one")
-    remote = open_remote(address)
-    index = read_index(remote, remote.index())
+    hub = Hub(address)
+    index = read_index(hub.address, hub.index())
     if present is not None and index.kind != "dataset":
-        raise UsageError(
-            f"{out}: is a dataset, and {remote.address} holds a run; choose a new folder"
-        )
+        raise UsageError(f"{out}: is a dataset, and {address} holds a run; choose a new folder")
     if present is not None and all(present.find(digest) for digest in index.contents):
         return TransferResult(index.kind, 0, 0)
     with _work_folder(out.absolute(), "pull") as folder:
@@ -131,26 +122,44 @@ def pull(address: str, out: str | Path) -> TransferResult:
         work = folder / state
         work.mkdir(exist_ok=True)
         if index.kind == "dataset":
-            pushed = RemoteDataset(remote, index, work)
-            fetched = pushed.fetch(
-                [e for e in pushed.entries if present is None or present.find(e.hash) is None]
-            )
-            new = work / "dataset"
-            datasets.add_missing(
-                pushed, pushed.robot, new if present is None else out, new=present is None
-            )
+            fetched, new = _pull_dataset(hub, index, work, present)
         else:
-            fetched, new = sorted(index.files), work
-            with file_errors(remote.address, work):
-                runs.require_run_files(index)
-                download(remote, index, fetched, work)
-                runs.require_pushed_run(work, index)
+            fetched, new = _pull_run(hub, index, work)
         if present is None:
             if out.exists():
                 out.rmdir()
             new.rename(out)
         _clear(folder)
     return TransferResult(index.kind, len(fetched), index.size(fetched))
+
+
+def _pull_dataset(
+    hub: Hub, index: Index, work: Path, present: Dataset | None
+) -> tuple[list[str], Path]:
+    """Download what a dataset lacks, and add it to the dataset or to a new one; return the files and the dataset."""
+    files = work / "files"
+    files.mkdir(exist_ok=True)
+    small = sorted(path for path in index.files if not datasets.is_recording_file(path))
+    hub.download(small, index, files)
+    with file_errors(hub.address, files):
+        robot = datasets.downloaded_robot(files)
+        recordings = datasets.missing_files(files, index, present)
+    hub.download(recordings, index, files)
+    dataset = work / "dataset" if present is None else present.path
+    with file_errors(hub.address, files):
+        datasets.add_missing(files, robot, dataset, new=present is None)
+    return small + recordings, dataset
+
+
+def _pull_run(hub: Hub, index: Index, work: Path) -> tuple[list[str], Path]:
+    """Download and check a run; return its files and its folder."""
+    files = sorted(index.files)
+    with file_errors(hub.address, work):
+        runs.require_run_files(index)
+    hub.download(files, index, work)
+    with file_errors(hub.address, work):
+        runs.require_pushed_run(work, index)
+    return files, work
 
 
 def _kind(path: Path) -> Kind:

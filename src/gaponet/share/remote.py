@@ -1,4 +1,4 @@
-"""Remote places for datasets and runs, and the index file that lists the content of a place."""
+"""The index file that lists what was pushed to a repository, and the errors of reaching it."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path, PurePosixPath
-from typing import Annotated, Literal, Protocol
+from typing import Annotated, Literal
 
 from annotated_types import Interval, Len
 
@@ -30,10 +30,6 @@ LIBRARY_ERRORS = {
     "huggingface_hub.errors": (
         "HTTPError", "EntryNotFoundError", "CorruptedCacheException", "RevisionResolutionError", "XetDownloadError",
     ),
-    "botocore.exceptions": ("BotoCoreError", "ClientError"),
-    "gcsfs.retry": ("HttpError",),
-    "google.auth.exceptions": ("GoogleAuthError",),
-    "aiohttp": ("ClientError",),
 }  # fmt: skip
 
 
@@ -95,39 +91,6 @@ class Index:
         return sum(self.files[path].size for path in paths)
 
 
-class Remote(Protocol):
-    """A remote place for one dataset or run. Its methods raise RemoteError for errors of network and place."""
-
-    address: str
-
-    def index(self, kind: Kind | None = None) -> bytes | None:
-        """Return the content of gaponet.json, None if nothing was pushed. The Hub looks for `kind` only, if given."""
-
-    def sizes(self, paths: list[str], index: Index) -> list[int | None]:
-        """Return the bytes of files of the index as the place has them; None for a missing one."""
-
-    def outdated(self, index: Index) -> set[str]:
-        """Return the files of the index that are missing at the place, or damaged there as far as it can tell."""
-
-    def fetch(self, paths: list[str], index: Index, folder: Path) -> None:
-        """Download files of the index into a folder, except those that an earlier download left there."""
-
-    def store(self, folder: Path, index: Index, paths: Collection[str], private: bool) -> None:
-        """Upload files and then the index.
-
-        Args:
-            folder: Folder with all files of the index.
-            paths: Files that must be uploaded.
-            private: Make a new repository readable by its owner only.
-
-        Raises:
-            RemoteError: Somebody else pushed since `index` was called.
-        """
-
-    def prune(self, index: Index) -> int:
-        """Delete files that neither this index nor the one before it lists; return their number."""
-
-
 def lost_race(address: str) -> RemoteError:
     """Return the error of the slower one of two simultaneous pushes."""
     return RemoteError(
@@ -135,15 +98,15 @@ def lost_race(address: str) -> RemoteError:
     )
 
 
-def read_index(remote: Remote, content: bytes | None) -> Index:
+def read_index(address: str, content: bytes | None) -> Index:
     """Parse and check the content of gaponet.json.
 
     Raises:
         RemoteError: It is missing, damaged or of a newer format.
     """
     if content is None:
-        raise RemoteError(f"{remote.address}: nothing was pushed there")
-    where = f"{remote.address}: {INDEX}"
+        raise RemoteError(f"{address}: nothing was pushed there")
+    where = f"{address}: {INDEX}"
     index = parse_json(Index, content, where, RemoteError, "push it again, with --replace")
     if index.format > FORMAT:
         raise RemoteError(
@@ -152,27 +115,28 @@ def read_index(remote: Remote, content: bytes | None) -> Index:
     return index
 
 
-def download(remote: Remote, index: Index, paths: list[str], folder: Path) -> None:
-    """Download files of an index into a folder, and compare their sizes and hashes.
+def require_space(address: str, size: int, folder: Path) -> None:
+    """Refuse a download that the disk does not hold; size: bytes."""
+    free = shutil.disk_usage(folder).free
+    if size + MIN_FREE_BYTES > free:
+        raise RemoteError(
+            f"{address}: has {size / 1e9:.2f} GB; {free / 1e9:.2f} GB of the disk are free"
+        )
+
+
+def require_pushed_files(address: str, index: Index, paths: list[str], folder: Path) -> None:
+    """Compare downloaded files with the index by size and hash; one that differs is deleted.
 
     Raises:
-        RemoteError: A file is missing or differs, or the disk is too small.
+        RemoteError: A file differs.
     """
-    folder.mkdir(exist_ok=True)
-    wrong = "{}: {} is not the file that was pushed, by its size or hash; push it again, or else with --replace"
-    for path, size in zip(paths, remote.sizes(paths, index), strict=True):
-        if size != index.files[path].size:
-            raise RemoteError(wrong.format(remote.address, path))
-    needed, free = index.size(paths), shutil.disk_usage(folder).free
-    if needed + MIN_FREE_BYTES > free:
-        raise RemoteError(
-            f"{remote.address}: has {needed / 1e9:.2f} GB; {free / 1e9:.2f} GB of the disk are free"
-        )
-    remote.fetch(paths, index, folder)
     for path in paths:
         if FileRecord.of(folder / path) != index.files[path]:
             (folder / path).unlink()
-            raise RemoteError(wrong.format(remote.address, path))
+            raise RemoteError(
+                f"{address}: {path} is not the file that was pushed, by its size or hash; push it "
+                "again with --replace"
+            )
 
 
 def _network_error_types() -> tuple[type[Exception], ...]:

@@ -95,7 +95,7 @@ def pass_gate(
     findings = run_checks(checks, surveys, robot)
     errors = errors_of(findings)
     if not despite_errors:
-        refuse_errors(errors, place or str(dataset.address or dataset.path))
+        refuse_errors(errors, place or str(dataset.path))
     warnings = tuple(f for f in findings if f.level == "warning")
     return GateReport(errors, warnings)
 

@@ -22,7 +22,7 @@ import re
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -42,9 +42,6 @@ from gaponet.data.formats.lerobot_set import (
 )
 from gaponet.data.log import Channel, Log
 from gaponet.robot.spec import RobotSpec
-
-if TYPE_CHECKING:
-    import pyarrow as pa
 
 OPTIONS = ("position_unit", "joints", "ignore")
 POSITION_UNITS = ("rad", "deg", "fraction", "signed_percent")
@@ -98,11 +95,14 @@ def read(
             yield _motion(episode, tasks), partial(table.episode, episode)
 
 
-def read_episode(part: Set, episode: dict[str, Any], robot: RobotSpec, table: pa.Table) -> Log:
-    """The Log of one episode of what gaponet exported, from rows of its data file that were read elsewhere."""
-    return _Frames(
-        part, part.data_file(episode), robot, None, _unit(part, None), None, (), table
-    ).episode(episode)
+def read_episodes(part: Set, episodes: list[dict[str, Any]], robot: RobotSpec) -> Iterator[Log]:
+    """Yield the Logs of episodes of what gaponet exported; a data file is read once for its episodes in a row."""
+    frames = None
+    for episode in episodes:
+        file = part.data_file(episode)
+        if frames is None or frames.file != file:
+            frames = _Frames(part, file, robot, None, _unit(part, None), None, ())
+        yield frames.episode(episode)
 
 
 def _unit(part: Set, given: str | None) -> str:
@@ -133,7 +133,7 @@ class _Frames:
 
     def __init__(
         self, part: Set, file: Path, robot: RobotSpec, joint_map: dict[str, str] | None, unit: str,
-        joints: list[str] | None, ignore: tuple[str, ...], table: pa.Table | None = None,
+        joints: list[str] | None, ignore: tuple[str, ...],
     ) -> None:  # fmt: skip
         self.part, self.file, self.robot, self.given, self.ignore = (
             part,
@@ -164,7 +164,7 @@ class _Frames:
         }
         scaled = shares if unit in ("deg", "signed_percent") else ()
         self.units = ["percent" if j in scaled else unit for j in self.joints]
-        table = read_table(file, (*present.values(), *INDEX), table=table)
+        table = read_table(file, (*present.values(), *INDEX))
         self.columns = {
             c: _matrix(file, table, f, len(names[c]))[:, [names[c].index(j) for j in self.joints]]
             for c, f in present.items()

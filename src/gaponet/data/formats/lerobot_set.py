@@ -17,7 +17,7 @@ from gaponet.data.formats import parquet
 from gaponet.data.sequence import SequenceMeta
 
 if TYPE_CHECKING:
-    import pyarrow as pa
+    pass
 
 VERSION = "v3.0"  # that is written
 VERSIONS = ("v3", "v2")  # that are read
@@ -250,14 +250,9 @@ def read_table(
     need: tuple[str, ...],
     also: tuple[str, ...] = (),
     hint: str = AGAIN,
-    table: pa.Table | None = None,
 ) -> Any:
-    """The columns `need`, each once, and those of `also` that are there, in this order, of a Parquet file.
-
-    Args:
-        table: What was read of the file elsewhere, instead of all of it.
-    """
-    there = parquet.header(file)[0] if table is None else table.schema.names
+    """The columns `need`, each once, and those of `also` that are there, in this order, of a Parquet file."""
+    there = parquet.header(file)[0]
     for name in need:
         if there.count(name) != 1:
             text = "is missing" if name not in there else "stands twice"
@@ -265,4 +260,4 @@ def read_table(
                 f"{file}: column '{name}' {text}; it has {', '.join(there[:12])}; {hint}"
             )
     wanted = [*need, *(name for name in also if there.count(name) == 1)]
-    return parquet.read(file, wanted) if table is None else table.select(wanted)
+    return parquet.read(file, wanted)

@@ -109,7 +109,7 @@ def prepare(
     """Check all inputs, and record the unit that no network sees. Nothing is trained yet."""
     nominal = robot.before_identification
     dataset.require_robot(nominal)
-    study = Study(dataset.address or str(dataset.path.resolve()), nominal, out, options)
+    study = Study(str(dataset.path.resolve()), nominal, out, options)
     if options.quick:
         options = options.for_quick_run()
         study = replace(study, options=options)

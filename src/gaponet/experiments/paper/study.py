@@ -24,7 +24,6 @@ from gaponet.experiments.paper.measure import Recorded, VirtualUnit
 from gaponet.experiments.paper.options import PaperOptions
 from gaponet.experiments.paper.unseen_motions import make_unseen_motions
 from gaponet.robot.spec import RobotSpec
-from gaponet.share.reading import load_dataset
 from gaponet.sim.model import model_hash
 from gaponet.virtual.collect import fleet_name
 from gaponet.virtual.fleet import load_fleet
@@ -41,7 +40,7 @@ class Study:
     """Inputs of the experiment. Everything can be sent to another process.
 
     Attributes:
-        dataset: Folder or address.
+        dataset: Folder.
         robot: The nominal simulator that all networks correct.
         out: Folder of the results.
     """
@@ -54,7 +53,7 @@ class Study:
     @cached_property
     def data(self) -> Dataset:
         """The recordings."""
-        return load_dataset(self.dataset)
+        return Dataset(self.dataset)
 
     @cached_property
     def virtual(self) -> bool:

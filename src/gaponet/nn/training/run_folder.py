@@ -144,7 +144,7 @@ def write_setup(
     dataset = data.dataset
     robot = data.robot
     words = command(
-        dataset.address or dataset.path,
+        dataset.path,
         run,
         budget,
         config,
@@ -162,7 +162,7 @@ def write_setup(
             "holdout_units": data.holdout_units,
             "robot": robot.name,
             "command": words,
-            "dataset": dataset.address or os.path.relpath(dataset.path, run),
+            "dataset": os.path.relpath(dataset.path, run),
             "dataset_hash": dataset_hash(dataset.entries),
         },
     )
