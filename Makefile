@@ -81,11 +81,9 @@ hostile: setup
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -m slow tests/base
 
 # Every command that writes, killed and repeated; those that store data also on full and read-only disks and twice at once:
-# an hour; disks need root. Then ranks
-# of torchrun killed and frozen: five minutes.
+# an hour; disks need root.
 kills: setup
 	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/kills.py kills_work
-	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/ranks.py kills_work/ranks
 
 # LeRobot 0.6 with our plug-in (Python 3.12, torch; made in ~/.cache/gaponet, 5 GB) on a virtual servo bus: ten minutes.
 LEROBOT ?= $(HOME)/.cache/gaponet/lerobot-0.6.1

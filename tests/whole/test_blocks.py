@@ -317,7 +317,7 @@ def literals(file: Path) -> Iterator[str]:
             yield node.value
 
 
-FOREIGN = {"--nproc-per-node": "torchrun", "--repo-type": "hf", "--index-url": "pip", "--version": "gaponet itself",
+FOREIGN = {"--repo-type": "hf", "--index-url": "pip", "--version": "gaponet itself",
            "--tyro": "gaponet itself"}  # fmt: skip
 
 

@@ -280,8 +280,7 @@ def train(
 ) -> TrainResult:
     """Train a delta-action model; the run keeps the model with the least error in rollouts of validation motions.
 
-    Ctrl-C ends training and leaves a usable run. Under torchrun all its processes train one model
-    (nn/training/ranks.py).
+    Ctrl-C ends training and leaves a usable run.
 
     Args:
         dataset: Recordings, a folder.
@@ -307,7 +306,6 @@ def train(
     """
     from gaponet.base.files import lock_folder
     from gaponet.data.checks.gate import pass_gate, used_recordings
-    from gaponet.nn.training import ranks
     from gaponet.nn.training.config import Budget, TrainConfig
     from gaponet.nn.training.run_folder import training_splits
     from gaponet.nn.training.selection import candidate_errors, train_best
@@ -315,7 +313,7 @@ def train(
 
     config, whole, folder = config or TrainConfig(), Budget.parse(budget), Path(out)
     shared: dict[str, Any] = {}
-    with ranks.joined(config.device), ranks.on_first(lock_folder(folder, "run")):
+    with lock_folder(folder, "run"):
         data, spec = as_dataset(dataset, robot)
         require_commands(data)
         entries = used_recordings(data, training_splits(data, config, holdout_units))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from contextlib import nullcontext
 from pathlib import Path
 from shlex import quote
 from typing import Annotated, Literal
@@ -11,7 +10,7 @@ from typing import Annotated, Literal
 import tyro
 
 from gaponet import api
-from gaponet.base.progress import no_progress, progress_bar
+from gaponet.base.progress import progress_bar
 from gaponet.cli.options import Data, Flag, Json, Known, Motions, Robot, like
 from gaponet.cli.out import Out
 from gaponet.cli.show import show_methods, show_verdict
@@ -40,7 +39,7 @@ def train(
 ) -> None:
     """Train a network on top of an identified robot.
 
-    Ctrl-C ends training and leaves a usable run. Under torchrun all its processes train one model.
+    Ctrl-C ends training and leaves a usable run.
 
     Args:
         recipe: labels: supervised pre-training, then PPO. paper: PPO from an untrained network, with settings for that;
@@ -49,17 +48,14 @@ def train(
         config: Settings of the training.
     """
     from gaponet.nn.artifact import GapModel
-    from gaponet.nn.training.ranks import started
 
     screen = Out(json)
     config = config.paper_recipe() if recipe == "paper" else config
-    with nullcontext(no_progress) if started() else progress_bar(f"training {model}") as update:
+    with progress_bar(f"training {model}") as update:
         trained = api.train(
             dataset, out=out, budget=budget, config=config, model=model, robot=robot, holdout_units=holdout_units,
             resume=resume, log=log, despite_errors=despite_errors, progress=update,
         )  # fmt: skip
-    if started():  # the first rank prints for all
-        return
     card, kind = trained.card, title(trained.card["model"]["kind"])
     val = card["val_mpjae"]
     if trained.candidates:

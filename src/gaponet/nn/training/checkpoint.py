@@ -13,14 +13,12 @@ import torch
 from gaponet.base.errors import ModelError, UsageError
 from gaponet.base.files import atomic_write, write_text
 from gaponet.nn.layers import DeltaNet
-from gaponet.nn.training import ranks
 from gaponet.nn.training.sensor_fit import SensorReport
 
 StateDict = dict[str, Any]
 
 CHECKPOINT = "checkpoint.pt"
 PROGRESS = "progress.jsonl"
-SHARED = ("net", "optimiser", "critic", "critic_optimiser")  # equal on all ranks
 
 
 @dataclass
@@ -32,7 +30,7 @@ class Checkpoint:
         best_trained_state: The same among trained networks with gain 1: the start of PPO.
         best_error, best_trained_error: Their validation errors, rad.
         val_error: Validation error of the newest network, rad.
-        steps: Control steps of all ranks.
+        steps: Control steps.
         seconds: Training time up to this checkpoint.
         pretraining_rounds, ppo_updates: How many are done.
         ppo_from_untrained: PPO started from untrained weights because pre-training increased the
@@ -67,21 +65,13 @@ class Checkpoint:
         return float(self.progress[0]["val_mpjae"])
 
     def write(self, out: Path, net: DeltaNet) -> None:
-        """Write checkpoint.pt and progress.jsonl.
-
-        The first rank writes, after all ranks compared their networks.
-        """
-        ranks.require_equal(net.state_dict(), self.ppo["critic"] if self.ppo else {})
+        """Write checkpoint.pt and progress.jsonl."""
         state = vars(self) | {"net": net.state_dict(), "rng": torch.get_rng_state()}
-        others = ranks.gathered(
-            _rank_state({name: state[name] for name in ("rng", "env", "ppo", "pretraining")})
-        )[1:]
-        if not ranks.rank():
-            content = io.BytesIO()  # torch does not report the error of a full disk
-            torch.save(state | {"others": others}, content)
-            with atomic_write(out / CHECKPOINT) as temporary:
-                temporary.write_bytes(content.getbuffer())
-            self.write_progress(out)
+        content = io.BytesIO()  # torch does not report the error of a full disk
+        torch.save(state, content)
+        with atomic_write(out / CHECKPOINT) as temporary:
+            temporary.write_bytes(content.getbuffer())
+        self.write_progress(out)
 
     def write_progress(self, out: Path) -> None:
         """Write progress.jsonl."""
@@ -96,14 +86,12 @@ class Checkpoint:
 
         Raises:
             ModelError: The file is damaged or belongs to another network.
-            UsageError: The run has other recordings or another number of ranks.
+            UsageError: The run has other recordings, or several processes trained it.
         """
         try:
             state = torch.load(out / CHECKPOINT, weights_only=True, map_location="cpu")
             net.load_state_dict(state.pop("net"))
-            others = state.pop("others")
-            if 0 < ranks.rank() <= len(others):
-                state = _with_rank_state(state, others[ranks.rank() - 1])
+            other_processes = state.pop("others", [])  # of versions that trained with torchrun
             torch.set_rng_state(state.pop("rng"))
             checkpoint = cls(**state)
         except Exception as error:  # torch and its unpickler have no common base of errors
@@ -111,35 +99,13 @@ class Checkpoint:
             raise ModelError(
                 f"{out / CHECKPOINT}: does not fit this model or is damaged ({reason})"
             ) from None
-        if len(others) + 1 != ranks.world():
-            n = len(others) + 1
+        if other_processes:
             raise UsageError(
-                f"{out}: was trained by {n} processes; resume with torchrun --nproc-per-node {n}"
+                f"{out}: was trained by {len(other_processes) + 1} processes of torchrun, which an "
+                "earlier version did; train anew"
             )
         if checkpoint.dataset_hash != dataset_hash:
             raise UsageError(
                 f"{out}: was trained on other recordings than this dataset holds; train anew"
             )
         return checkpoint
-
-
-def _rank_state(state: Any) -> Any:
-    """Select what differs between ranks, on the CPU: everything except networks and their
-    optimisers.
-    """
-    if isinstance(state, dict):
-        return {name: _rank_state(x) for name, x in state.items() if name not in SHARED}
-    if isinstance(state, list):
-        return [_rank_state(x) for x in state]
-    return state.cpu() if isinstance(state, torch.Tensor) else state
-
-
-def _with_rank_state(state: Any, rank_state: Any) -> Any:
-    """Replace the first rank's `_rank_state` by another rank's."""
-    if isinstance(rank_state, dict):
-        return (state or {}) | {
-            name: _with_rank_state((state or {}).get(name), x) for name, x in rank_state.items()
-        }
-    if isinstance(rank_state, list):
-        return [_with_rank_state(x, y) for x, y in zip(state, rank_state, strict=True)]
-    return rank_state

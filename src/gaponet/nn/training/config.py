@@ -260,12 +260,10 @@ def command(
     config: TrainConfig,
     robot: RobotSpec,
     holdout_units: tuple[str, ...],
-    processes: int,
 ) -> str:
     """Return the shell command that repeats a run."""
     limit = str(budget.steps) if budget.seconds is None else f"{budget.seconds:g}s"
-    several = ["torchrun", "--nproc-per-node", str(processes), "-m"] if processes > 1 else []
-    words = [*several, "gaponet", "train", str(dataset), "--out", str(out), "--budget", limit]
+    words = ["gaponet", "train", str(dataset), "--out", str(out), "--budget", limit]
     words += ["--robot", str(robot.folder)] if robot.nominal is not None else []
     words += ["--holdout-units", *holdout_units] if holdout_units else []
     # the command's default is auto

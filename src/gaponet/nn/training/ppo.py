@@ -16,7 +16,6 @@ import torch
 from torch import Tensor, nn
 
 from gaponet.nn.layers import MAX_FEATURE, DeltaNet, Standardise, dense
-from gaponet.nn.training import ranks
 from gaponet.nn.training.config import PPOConfig
 from gaponet.nn.training.env import DeltaEnv
 
@@ -93,7 +92,6 @@ class PPO:
         self.critic = Critic(net.features.dim, width, config.critic_hidden, env.num_actions).to(
             device
         )
-        ranks.broadcast(self.critic)
         self.optimiser = torch.optim.Adam(
             [p for p in net.parameters() if p.requires_grad], lr=config.learning_rate
         )
@@ -128,7 +126,6 @@ class PPO:
         x, observations = observed["actor"], observed["critic"]
         if not self.updates and not self.critic.standardise.mean.any():
             self.critic.standardise.fit(observations)
-            ranks.pool_statistics(self.critic)
         prepared, features = self.net.prepare(x), self.net.features(x)
         return {
             "prepared": prepared, "features": features, "critic_observations": observations,
@@ -173,14 +170,12 @@ class PPO:
         unexplained = residual / steps["returns"].flatten(0, 1).var(0)
         size = steps["mean"].abs()
         at_limit = (size >= self.env.config.delta_max).float().mean()
-        explained, delta, limited, reward = ranks.mean(
-            1 - float(unexplained.mean()),
-            float(size.mean()),
-            float(at_limit),
-            self.env.mean_reward(),
-        )
+        explained = 1 - float(unexplained.mean())
         self.metrics = Update(
-            explained_variance=explained, mean_delta=delta, at_limit=limited, reward=reward
+            explained_variance=explained,
+            mean_delta=float(size.mean()),
+            at_limit=float(at_limit),
+            reward=float(self.env.mean_reward()),
         )
         self.actor_enabled |= (
             self.updates >= self.config.critic_warmup and explained >= self.config.explained
@@ -223,9 +218,8 @@ class PPO:
         self._descend(
             self.optimiser, -(weight * torch.minimum(ratio * advantage, clipped * advantage)).sum()
         )
-        kl = ranks.mean(
-            float((weight * (mean.detach() - old) ** 2).sum()) / (2 * self.innovation_std**2)
-        )[0]
+        squares = float((weight * (mean.detach() - old) ** 2).sum())
+        kl = float(squares / (2 * self.innovation_std**2))
         lowest, highest = LEARNING_RATE_BOUNDS
         for group in self.optimiser.param_groups:
             if kl > 2 * self.config.desired_kl:
@@ -239,7 +233,6 @@ class PPO:
         optimiser.zero_grad()
         loss.backward()
         parameters = [p for group in optimiser.param_groups for p in group["params"]]
-        ranks.average(*(p.grad for p in parameters if p.grad is not None))
         nn.utils.clip_grad_norm_(parameters, MAX_GRADIENT_NORM)
         optimiser.step()
 

@@ -27,7 +27,6 @@ from torch.nn.functional import huber_loss
 from gaponet.base.arrays import Array, array_module
 from gaponet.data.sequence import Sequence
 from gaponet.nn.layers import DeltaNet
-from gaponet.nn.training import ranks
 from gaponet.nn.training.config import PretrainingConfig
 from gaponet.nn.training.env import DeltaEnv
 from gaponet.nn.training.sensor_fit import SensorReport, fit_inputs
@@ -229,10 +228,8 @@ class Pretraining:
         self.pool_labels = [torch.cat([*self.pool_labels, labels])]
 
     def _fit_trees(self, net: TreesNet) -> Array:
-        """Fit trees to the first rank's pool; return the mean squared label error, (1,) rad²."""
-        squares = ranks.once(lambda: net.fit(self.pool_x[0], self.pool_labels[0], self.seed))
-        ranks.broadcast(net)
-        return squares
+        """Fit trees to the pool; return the mean squared label error, (1,) rad²."""
+        return net.fit(self.pool_x[0], self.pool_labels[0], self.seed)
 
     def _fit(self, tick: Callable[[], object]) -> Array:
         """Fit the network to the pool; return the mean squared label error of each gradient step,
@@ -256,7 +253,6 @@ class Pretraining:
             loss = huber_loss(error / self.label_rms, torch.zeros_like(error), delta=HUBER_DELTA)
             self.optimiser.zero_grad()
             loss.backward()
-            ranks.average(*(p.grad for p in self.parameters if p.grad is not None))
             self.optimiser.step()
             squares[step] = error.detach().square().mean()
             tick()
@@ -305,4 +301,4 @@ def _mean_over_hold(labels: Array, hold: int) -> Array:
 
 
 def _rms(squares: Array) -> float:
-    return float(np.sqrt(ranks.mean(squares.mean())[0])) if len(squares) else float("nan")
+    return float(np.sqrt(squares.mean())) if len(squares) else float("nan")

@@ -21,7 +21,6 @@ from gaponet.base.files import write_json
 from gaponet.data.sequence import Sequence, require_same_gains
 from gaponet.data.split import Splits, resolve_splits, stratified_subset
 from gaponet.data.store import Dataset, dataset_hash
-from gaponet.nn.training import ranks
 from gaponet.nn.training.checkpoint import CHECKPOINT
 from gaponet.nn.training.config import Budget, TrainConfig, command
 from gaponet.nn.training.simulators import in_many_simulators, in_validation_simulators
@@ -150,7 +149,6 @@ def write_setup(
         config,
         robot,
         data.holdout_units,
-        ranks.world(),
     )
     if despite_errors:
         words += " --despite-errors"

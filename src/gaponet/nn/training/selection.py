@@ -15,7 +15,6 @@ from gaponet.base.files import FOLDER_MARKER, whole_folder, write_json
 from gaponet.base.structure import read_json
 from gaponet.nn.artifact import GapModel
 from gaponet.nn.config import ModelKind
-from gaponet.nn.training import ranks
 from gaponet.nn.training.checkpoint import CHECKPOINT
 from gaponet.nn.trees import trees_available
 
@@ -40,7 +39,8 @@ def train_best(out: Path, resume: bool, train: Train) -> GapModel:
     Raises:
         UsageError: OUT holds a run and resume is false, or no run and resume is true.
     """
-    present, begun = ranks.once(lambda: (_kind(out), (out / FOLDER).is_dir()))
+    present = _kind(out)
+    begun = (out / FOLDER).is_dir()
     if resume and present and not begun:
         return train(present, out, 1.0, 0.0, True)
     if resume != begun or (not resume and present):
@@ -50,21 +50,21 @@ def train_best(out: Path, resume: bool, train: Train) -> GapModel:
             else "holds a run already; add --resume"
         )
         raise UsageError(f"{out}: {problem}, or choose another --out")
-    errors = ranks.once(lambda: candidate_errors(out))
+    errors = candidate_errors(out)
     kinds = [kind for kind in CANDIDATES if kind != "trees" or trees_available()]
     for i, kind in enumerate(kinds):
         if kind in errors:
             continue
         run = out / FOLDER / kind
-        again = ranks.once((run / CHECKPOINT).is_file)
+        again = (run / CHECKPOINT).is_file()
         model = train(kind, run, SHARE, i * SHARE, again)
         if model.card["interrupted"]:
             _copy(out, min(errors, key=errors.__getitem__, default=kind))
             return GapModel.load(out)
         errors[kind] = model.card["val_mpjae"]["model"]
-        ranks.once(lambda: write_json(out / ERRORS, errors))
+        write_json(out / ERRORS, errors)
     best = min(errors, key=errors.__getitem__)
-    if ranks.once(lambda: _kind(out)) != best:
+    if _kind(out) != best:
         _copy(out, best)
     spent = SHARE * (len(kinds) - 1)
     if best != "trees":
@@ -94,10 +94,7 @@ def _kind(run: Path) -> ModelKind | None:
 
 def _copy(out: Path, kind: ModelKind) -> None:
     """Put the run of a candidate in the place of OUT's own, all of it or nothing."""
-    ranks.once(lambda: _copy_run(out / FOLDER / kind, out))
-
-
-def _copy_run(source: Path, out: Path) -> None:
+    source = out / FOLDER / kind
     with whole_folder(out, "run", last=CHECKPOINT) as place:
         shutil.copytree(
             source, place, dirs_exist_ok=True, ignore=shutil.ignore_patterns(FOLDER_MARKER + "*")

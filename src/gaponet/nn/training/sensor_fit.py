@@ -15,7 +15,6 @@ from gaponet.base.arrays import Array, copy_array, to_numpy
 from gaponet.base.errors import UsageError
 from gaponet.nn.layers import DeltaNet
 from gaponet.nn.sensor import ProbeOracle
-from gaponet.nn.training import ranks
 from gaponet.nn.training.env import DeltaEnv
 
 FIT_STEPS = 600  # gradient steps
@@ -47,7 +46,6 @@ def fit_inputs(
         R² of the sensor predictor on held-out states; None for a network without one.
     """
     net.cpu().fit_inputs(x.cpu())
-    ranks.pool_statistics(net)
     net.to(x.device)
     return fit_sensors(net, env, states, seed, nthread)
 
@@ -63,13 +61,9 @@ def fit_sensors(
         return None
     device = next(net.parameters()).device
     net.cpu()  # C MuJoCo answers the probes
-    report = ranks.once(
-        lambda: _fit_predictor(
-            net, *_probe(net, env, states, seed, nthread, refit), env.robot.operated, seed, refit
-        )
-    )
+    probed = _probe(net, env, states, seed, nthread, refit)
+    report = _fit_predictor(net, *probed, env.robot.operated, seed, refit)
     net.predictor.requires_grad_(False)
-    ranks.broadcast(net.predictor)
     net.to(device)
     return report
 

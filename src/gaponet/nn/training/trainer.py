@@ -28,7 +28,6 @@ from gaponet.nn.delay_offset import DelayOffset
 from gaponet.nn.layers import DeltaNet
 from gaponet.nn.networks import build_network
 from gaponet.nn.onnx_export import export
-from gaponet.nn.training import ranks
 from gaponet.nn.training.checkpoint import Checkpoint, StateDict
 from gaponet.nn.training.config import Budget, Status, TrainConfig
 from gaponet.nn.training.env import UNLIMITED, DeltaEnv, EnvOptions
@@ -81,29 +80,23 @@ class Trainer:
         require_suitable(out, robot, resume)
         self.robot, self.out, self.config, self.budget, self.show = robot, out, config, budget, show
         self.gate = gate or GateReport()
-        self.data, self.rank_config = (
-            TrainingData(dataset, robot, config, holdout_units),
-            ranks.share(config),
-        )
+        self.data = TrainingData(dataset, robot, config, holdout_units)
         torch.manual_seed(config.seed)
-        torch.set_num_threads(self.rank_config.learner_threads)
+        torch.set_num_threads(self.config.learner_threads)
         self.net = net = build_network(config.model, len(robot.operated))
-        if ranks.rank():  # equal networks, different noise
-            torch.manual_seed(_rank_seed(config.seed))
         weights = copy.deepcopy(net.state_dict())
         self.state = Checkpoint(weights, weights, dataset_hash=dataset_hash(dataset.entries))
-        with ranks.on_first(lock_folder(out, "run")):
+        with lock_folder(out, "run"):
             if resume:
                 self.state = Checkpoint.read(out, net, self.state.dataset_hash)
-            if not ranks.rank():
-                despite_errors = bool(self.gate.errors)
-                write_setup(out, self.data, config, budget, resume, despite_errors)
-                self.state.write_progress(out)
+            despite_errors = bool(self.gate.errors)
+            write_setup(out, self.data, config, budget, resume, despite_errors)
+            self.state.write_progress(out)
         net.to(config.network_device())
-        self.loggers = Loggers(() if ranks.rank() else log, out, asdict(config))
+        self.loggers = Loggers(log, out, asdict(config))
         self.baseline: DelayOffset | None = None
         self.shared = {} if shared is None else shared
-        self.validator = Validator(self.data.val, robot, config.model, self.rank_config.threads)
+        self.validator = Validator(self.data.val, robot, config.model, self.config.threads)
         self.rng_state = torch.get_rng_state()
         self.nominal_error = float("nan")
         self.update = Update()
@@ -117,8 +110,8 @@ class Trainer:
             FolderError: Another process writes into the run folder.
             ModelError: The budget ended before the first training step.
         """
-        with ranks.on_first(lock_folder(self.out, "run")):
-            self.baseline = ranks.once(self._write_baseline)
+        with lock_folder(self.out, "run"):
+            self.baseline = self._write_baseline()
             self.nominal_error = float(self.validator.errors(None, self.robot.nominal).mean())
             try:
                 self._run_stages()
@@ -154,7 +147,7 @@ class Trainer:
 
     def _write_baseline(self) -> DelayOffset:
         robot = self.robot.before_identification
-        fit = lambda: DelayOffset.fit(self.data.recorded, robot, self.rank_config.threads)  # noqa: E731
+        fit = lambda: DelayOffset.fit(self.data.recorded, robot, self.config.threads)  # noqa: E731
         baseline = self.baseline or self._once("baseline", fit)
         write_json(self.out / "delay_offset.json", baseline)
         return baseline
@@ -171,7 +164,7 @@ class Trainer:
 
     def _pretrain(self) -> None:
         """Supervised pre-training (nn/training/pretraining.py)."""
-        state, config, threads = self.state, self.rank_config.pretraining, self.rank_config.threads
+        state, config, threads = self.state, self.config.pretraining, self.config.threads
         self.stage = "labels"
         sequences = self.data.labelled_subset(config.rows)
         env = self._env(config.num_envs, UNLIMITED, self.config.seed, sequences=sequences)
@@ -179,9 +172,7 @@ class Trainer:
         labels = self._once(
             "labels", lambda: trajectory_labels(sequences, self.robot, largest, threads, self._tick)
         )
-        pretraining = Pretraining(
-            self.net, env, labels, config, _rank_seed(self.config.seed), threads
-        )
+        pretraining = Pretraining(self.net, env, labels, config, self.config.seed, threads)
         if state.pretraining_rounds == 0:
             self.stage = "sensors" if self.net.predictor is not None else "inputs"
             self._tick()
@@ -196,21 +187,21 @@ class Trainer:
                 pretraining.rounds_done,
                 pretraining.state_dict(),
             )
-            state.steps += ranks.world() * config.num_envs * config.steps
+            state.steps += config.num_envs * config.steps
             self._validate_and_save(fit)
 
     def _fit_inputs(self) -> None:
         """Fit input statistics and the sensor predictor for PPO without pre-training."""
         self.stage = "sensors"
         self._tick()
-        env = self._env(self.rank_config.pretraining.num_envs, UNLIMITED, self.config.seed)
+        env = self._env(self.config.pretraining.num_envs, UNLIMITED, self.config.seed)
         x = env.get_observations()["actor"]
-        states, threads = self.config.pretraining.sensor_states, self.rank_config.threads
+        states, threads = self.config.pretraining.sensor_states, self.config.threads
         self.state.sensor_r2 = fit_inputs(self.net, env, x, states, self.config.seed, threads)
         self.state.best_trained_state = copy.deepcopy(self.net.state_dict())
 
     def _ppo(self) -> None:
-        config, state = self.rank_config.ppo, self.state
+        config, state = self.config.ppo, self.state
         if self._spent() >= 1 or self.config.model.kind == "trees":
             return
         self.stage = "ppo"
@@ -227,16 +218,14 @@ class Trainer:
         while self._spent() < 1:
             self.update = ppo.update()
             state.ppo_updates += 1
-            state.steps += (
-                ranks.world() * config.num_envs * config.num_steps * self.config.model.delta_hold
-            )
+            state.steps += config.num_envs * config.num_steps * self.config.model.delta_hold
             if config.refit_sensors and state.ppo_updates % config.refit_sensors == 0:
                 states, seed = (
-                    self.rank_config.pretraining.sensor_states,
+                    self.config.pretraining.sensor_states,
                     self.config.seed + state.ppo_updates,
                 )
                 state.sensor_r2 = fit_sensors(
-                    self.net, env, states, seed, self.rank_config.threads, refit=True
+                    self.net, env, states, seed, self.config.threads, refit=True
                 )
             self._tick()
             if state.ppo_updates % self.config.validate_every == 0:
@@ -285,7 +274,7 @@ class Trainer:
         net = self._network(self.state.best_state).eval()
         reduction, error = self.validator.improvement(net)
         improvement = {"added": reduction} | ({} if np.isnan(error) else {"error": error})
-        ranks.once(lambda: self._export(net, improvement))
+        self._export(net, improvement)
         return GapModel.load(self.out)
 
     def _export(self, net: DeltaNet, improvement: dict[str, float]) -> None:
@@ -311,7 +300,7 @@ class Trainer:
         device: str | None = None,
         sequences: list[Sequence] | None = None,
     ) -> DeltaEnv:
-        config = self.rank_config
+        config = self.config
         return DeltaEnv(
             sequences or self.data.train,
             self.robot,
@@ -320,7 +309,7 @@ class Trainer:
                 num_envs=num_envs,
                 episode_steps=episode_steps,
                 reward=config.reward,
-                seed=_rank_seed(seed),
+                seed=seed,
                 nthread=config.threads,
                 device=device or config.device,
             ),
@@ -355,7 +344,7 @@ class Trainer:
         self._tick()
 
     def _spent(self) -> float:
-        return ranks.decided(self.budget.spent(self.seconds(), self.state.steps))
+        return self.budget.spent(self.seconds(), self.state.steps)
 
     def _tick(self) -> None:
         """Report the state of the run."""
@@ -412,7 +401,7 @@ class Trainer:
         if not self.config.model.context:
             return {}
         nominal = Condition.of(self.data.recorded[0], self.robot)
-        threads = self.rank_config.threads
+        threads = self.config.threads
         loaded = self.config.model.context_is_loaded
         conditions = sorted(self.data.conditions, key=repr)
         trained = contexts(self.robot, conditions, threads, loaded=loaded)
@@ -434,8 +423,3 @@ def _recorded_gains(metas: list[SequenceMeta], robot: RobotSpec) -> dict[str, li
         }
         recorded[name] = list(gains.pop()) if len(gains) == 1 else None
     return recorded
-
-
-def _rank_seed(seed: int) -> int:
-    """Return this rank's seed for what differs between ranks."""
-    return seed + ranks.SEED_STEP * ranks.rank()

@@ -19,7 +19,6 @@ from gaponet.nn.layers import DeltaNet
 from gaponet.nn.loop import DeltaCorrector
 from gaponet.nn.onnx_export import onnx_content
 from gaponet.nn.onnx_network import OnnxNetwork
-from gaponet.nn.training import ranks
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.metrics import mean_reduction
 from gaponet.sim.replay import rollout_errors
@@ -46,9 +45,7 @@ class Validator:
         """
         key = self._key(net, robot)
         if key not in self._cache:
-            self._cache[key] = ranks.each(
-                self.sequences, lambda own: self._rollout_errors(own, net, robot)
-            )
+            self._cache[key] = self._rollout_errors(net, robot)
         return self._cache[key]
 
     def improvement(self, net: DeltaNet) -> tuple[float, float]:
@@ -62,14 +59,12 @@ class Validator:
         )
         return hashlib.sha256(b"".join([repr(robot).encode(), *weights])).digest()
 
-    def _rollout_errors(
-        self, sequences: ListOf[Sequence], net: DeltaNet | None, robot: RobotSpec | None
-    ) -> Array:
+    def _rollout_errors(self, net: DeltaNet | None, robot: RobotSpec | None) -> Array:
         robot, corrector = robot or self.robot, None
         if net is not None:  # on onnxruntime, as it ships; torch needs twice the time
             network = OnnxNetwork(onnx_content(copy.deepcopy(net).cpu().eval()))
             corrector = DeltaCorrector(network, self.config, robot)
-        return rollout_errors(sequences, robot, self.nthread, corrector)
+        return rollout_errors(self.sequences, robot, self.nthread, corrector)
 
 
 def choose_gain(net: DeltaNet, error: Callable[[], float], full_error: float) -> float:
