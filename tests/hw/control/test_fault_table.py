@@ -39,6 +39,14 @@ def test_the_page_says_when_each_fault_is_detected():
     assert set(FAULTS) - {"stop"} <= detected
 
 
+def test_the_page_says_which_faults_let_an_so101_go_at_once():
+    for line in section(SAFETY, "## Faults that stop the robot"):
+        cells = [cell.strip() for cell in line.split("|")[1:-1]]
+        if line.startswith("| ") and cells[-1] in ("lowered", "let go"):
+            for kind in cells[0].split(", "):
+                assert lowers(kind) == (cells[-1] == "lowered"), kind
+
+
 def test_every_fault_in_the_code_has_a_rule():
     named = set()
     for file in SOURCES.rglob("*.py"):
