@@ -38,6 +38,7 @@ HEAVY = (
     "onnxruntime",
     "rsl_rl",
     "pydantic",
+    "numba",
 )
 MODULES = {
     ".".join(file.relative_to(PACKAGE.parent).with_suffix("").parts).removesuffix(".__init__"): file

@@ -68,9 +68,6 @@ def test_joint_and_robot_move_as_a_play_hinge(pendulum):
         (whole,) = replay([recorded], pendulum.with_servos({"swing": servo}))
         values = {f: np.full((1, 1), v) for f, v in servo.items()}
         alone = rollouts.errors(values)[0, 0, 0]
-        np.testing.assert_allclose(
-            rollouts._arrays(values)[0, 0, 0] * rollouts.counted[0], alone, atol=2e-4
-        )
         errors.append([np.abs(whole.qpos - real)[20:].mean(), np.abs(alone[20:]).mean()])
     assert min(errors[0]) > 4e-3  # rad: without the gap
     assert max(errors[1]) < 0.2 * min(errors[0])

@@ -10,6 +10,16 @@ from arm import TOML, write_arm
 from gaponet.robot.servo_fields import SERVO_TERMS
 from gaponet.sim.batch import BatchSim
 from gaponet.sim.model import build_model, build_spec
+from gaponet.sim.servo import (
+    SERVO_RECORD,
+    friction_limit,
+    joint_friction,
+    motor_limits,
+    present,
+    requested_torque,
+    servo_torque,
+    torque_range,
+)
 
 
 def servo_model(robot, **values):
@@ -113,27 +123,36 @@ def test_a_restored_state_continues_identically(arm):
     np.testing.assert_array_equal(*ends)
 
 
-def test_compiled_and_array_servo_models_agree(arm):
-    pytest.importorskip("numba")
-    terms = {
-        "stribeck": 0.1,
-        "stribeck_speed": 0.05,
-        "friction_motor": 0.2,
-        "friction_external": 0.1,
+def random_servos(count):
+    """Servos with and without each term, and states near and far from their targets."""
+    rng = np.random.default_rng(0)
+    servos = np.zeros(count, SERVO_RECORD)
+    for name in SERVO_RECORD.names:
+        servos[name] = rng.uniform(0.01, 1.0, count) * rng.integers(0, 2, count)
+    servos["effort_limit"] = 2.0
+    state = {
+        "kp": rng.uniform(1, 50, count),
+        "aim": rng.normal(0, 0.5, count),
+        "qpos": rng.normal(0, 0.5, count),
+        "qvel": rng.normal(0, 2, count),
+        "torque": rng.normal(0, 1, count),
+        "load": rng.normal(0, 1, count),
     }
-    robot = servo_model(
-        arm, **terms, min_torque=0.03, encoder_step=0.002, no_load_speed=1.0, effort_limit=1.5
-    )
-    sims = [BatchSim(robot, [(0.5, "both", 0.02)] * 3, 1) for _ in range(2)]
-    for sim in sims:
-        for x in sim.servo_model.values.values():
-            x *= [[0.0, 1.0], [1.0, 0.0], [1.0, 2.0]]
-        sim.reset(slice(None), np.full((3, 2), 0.1), np.zeros((3, 2)))
-    sims[1].servo_model._set_joints = None
-    for t in range(50):
-        for sim in sims:
-            sim.step(np.full((3, 2), 0.3 * np.sin(0.2 * t)))
-    np.testing.assert_allclose(sims[0].qpos, sims[1].qpos, atol=1e-9)
+    return servos, state
+
+
+def test_a_servo_of_the_simulator_is_one_of_the_arrays_that_exports_take():
+    servos, state = random_servos(200)
+    terms = present({name: servos[name] for name in SERVO_TERMS})
+    kp, aim, qpos, qvel, torque, load = state.values()
+    wanted = servo_torque(terms, kp, aim, qpos)
+    friction = friction_limit(terms, servos["frictionloss"], qvel, torque, load)
+    limits = np.transpose(torque_range(servos["effort_limit"], qvel / terms["no_load_speed"]))
+    for i, servo in enumerate(servos.view(np.recarray)):
+        assert requested_torque(servo, kp[i], aim[i], qpos[i]) == pytest.approx(wanted[i], abs=1e-9)
+        assert motor_limits(servo, qvel[i]) == pytest.approx(limits[i], abs=1e-9)
+        here = joint_friction(servo, qvel[i], torque[i], load[i])
+        assert here == pytest.approx(friction[i], abs=1e-9)
 
 
 def test_a_torque_falls_with_speed_and_brakes_whole(arm):

@@ -50,8 +50,6 @@ def test_every_simulation_has_the_friction_of_the_recorded_temperature(tmp_path,
     plain = {f: np.full((1, 2), v) for f, v in (SERVO | now).items()}
     for runs in (JointRollouts([warm], robot, nthread=1), RobotRollouts([warm], robot, 1)):
         np.testing.assert_allclose(runs.flat_errors(values), runs.flat_errors(plain), atol=1e-5)
-    joints = JointRollouts([warm], robot, nthread=1)
-    np.testing.assert_allclose(joints._arrays(values), joints._arrays(plain), atol=1e-5)
 
 
 def test_a_simulation_without_temperature_is_at_the_reference(tmp_path):

@@ -71,7 +71,7 @@ ServoTerms = dict[str, Any]  # name of a term → values that broadcast to the j
 '''
 SERVO_MODEL: tuple[Callable[..., Any], ...] = (
     array_module, servo.present, servo.exp, servo.torque_range, servo.passing_friction, servo.resting_friction,
-    servo.friction_limit, servo.servo_torque, servo.crossed, servo.Play,
+    servo.friction_limit, servo.servo_torque, servo.servo_bias, servo.crossed, servo.Play,
 )  # fmt: skip
 ENGINE_TERMS = {
     "isaaclab": ("no_load_speed",)

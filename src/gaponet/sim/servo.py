@@ -5,15 +5,18 @@ its speed to zero at the no-load speed (back-EMF). Friction is larger at rest (S
 the gear transmits (load-dependent as in BAM, Duclusaud et al. 2024). MuJoCo integrates: the model only changes the
 actuator's bias, its torque limits and the limit of friction, so friction sticks as MuJoCo's does.
 A gear with backlash parts the motor (armature, damping, friction) from the link while its gap is open.
-The model stands here twice: of arrays for numpy and torch, and of one joint for numba and Warp (`requested_torque`,
-`joint_friction`), which is faster. A MuJoCo model's actuator_user holds the parameters; without, nothing here runs.
+
+The model stands here twice. `servo_torque`, `torque_limits` and `friction_limit` take arrays of numpy or torch, for
+exports and inverses. `requested_torque`, `motor_limits` and `joint_friction` take one servo with fields by name, for
+numba and Warp, which are faster. Simulations (`set_servos`) and the fit of single joints (`simulate_joints`) share the
+latter. A MuJoCo model's actuator_user holds the parameters; without, nothing here runs.
 """
 
 from __future__ import annotations
 
 import functools
 from importlib import import_module
-from typing import Any
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -27,7 +30,6 @@ ServoTerms = dict[
 
 SLOWEST = 1e-3  # rad/s: of stribeck_speed
 FINEST = 1e-9  # rad: of encoder_step
-PLAY = SERVO_TERMS.index("backlash")
 OPENED = 1 - 1e-9  # of half the width: a gap that opens
 # encoder steps: a motor with a least torque rests while it reads a smaller error
 DEADBAND_STEPS = 0.5
@@ -85,46 +87,67 @@ def friction_limit(terms: ServoTerms, frictionloss: Any, qvel: Any, torque: Any,
 
 def servo_torque(terms: ServoTerms, kp: Any, aim: Any, qpos: Any) -> Any:
     """Return the torque that the servo requests, N·m, for an angle (rad) that it reads in its encoder's steps."""
-    xp, read, deadband = array_module(qpos), qpos, 0.0
+    xp = array_module(qpos)
+    read = qpos
+    deadband = 0.0
     if "encoder_step" in terms:
         step = terms["encoder_step"]
-        fine, deadband = step.clip(min=FINEST), DEADBAND_STEPS * step * kp
+        fine = step.clip(min=FINEST)
         read = xp.where(step > 0, xp.round(qpos / fine) * fine, qpos)
+        deadband = DEADBAND_STEPS * step * kp
     torque = kp * (aim - read)
     if "min_torque" not in terms:
         return torque
-    return xp.where(
-        abs(torque) > deadband,
-        xp.copysign(xp.maximum(abs(torque), terms["min_torque"]), torque),
-        0.0,
-    )
+    least = terms["min_torque"]
+    pushed = xp.copysign(xp.maximum(abs(torque), least), torque)
+    return xp.where((least > 0) & (abs(torque) <= deadband), 0.0, pushed)
 
 
-def requested_torque(kp: Any, aim: Any, qpos: Any, least: Any, step: Any, deadband: Any) -> Any:
-    """Return `servo_torque` of one joint, in N·m, for numba and Warp; deadband in encoder steps."""
+def servo_bias(terms: ServoTerms, kp: Any, bias: Any, ctrl: Any, qpos: Any) -> Any:
+    """Return the bias, N·m, with which an actuator of gain kp and its own bias requests `servo_torque`."""
+    if "encoder_step" not in terms and "min_torque" not in terms:
+        return bias
+    return servo_torque(terms, kp, ctrl + bias / kp, qpos) - kp * (ctrl - qpos)
+
+
+# A servo as numba and Warp read it: a record whose fields are those of SERVO_FIELDS that the model computes.
+SERVO_RECORD = np.dtype([(f, np.float64) for f in ("frictionloss", "effort_limit", *SERVO_TERMS)])
+# A joint by itself: its servo, and what MuJoCo computes elsewhere. kd is the servo's, damping the joint's.
+JOINT_FIELDS = ("kp", "kd", "damping", "armature", "offset", "delay")
+JOINT_RECORD = np.dtype([*SERVO_RECORD.descr, *((f, np.float64) for f in JOINT_FIELDS)])
+
+
+def requested_torque(servo: Any, kp: Any, aim: Any, qpos: Any) -> Any:
+    """Return `servo_torque` of a servo with the fields of SERVO_RECORD, in N·m, for numba and Warp."""
+    step = servo.encoder_step
+    least = servo.min_torque
     read = qpos
     if step > 0.0:
         read = np.rint(qpos / step) * step
     torque = kp * (aim - read)
-    if abs(torque) > deadband * step * kp:
-        return np.sign(torque) * max(abs(torque), least)
-    return 0.0 * torque
+    if least > 0.0:
+        if abs(torque) > DEADBAND_STEPS * step * kp:
+            return np.sign(torque) * max(abs(torque), least)
+        return 0.0 * torque
+    return torque
 
 
-def joint_friction(
-    dry: Any,
-    stribeck: Any,
-    speed: Any,
-    by_motor: Any,
-    by_load: Any,
-    qvel: Any,
-    torque: Any,
-    load: Any,
-) -> Any:
-    """Return `friction_limit` of one joint, in N·m, for numba and Warp."""
-    limit = dry + passing_friction(by_motor, by_load, torque, load)
-    if stribeck > 0.0:
-        limit += resting_friction(stribeck, speed, qvel)
+def motor_limits(servo: Any, qvel: Any) -> Any:
+    """Return the least and the largest torque of a servo at a joint speed, rad/s, in N·m, for numba and Warp."""
+    least = -servo.effort_limit
+    most = servo.effort_limit
+    if servo.no_load_speed > 0.0:
+        least, most = torque_range(servo.effort_limit, qvel / servo.no_load_speed)
+    return least, most
+
+
+def joint_friction(servo: Any, qvel: Any, torque: Any, load: Any) -> Any:
+    """Return `friction_limit` of a servo, in N·m, for numba and Warp."""
+    by_torque = passing_friction(servo.friction_motor, servo.friction_external, torque, load)
+    limit = servo.frictionloss + by_torque
+    if servo.stribeck > 0.0:
+        speed = max(servo.stribeck_speed, SLOWEST)
+        limit += resting_friction(servo.stribeck, speed, qvel)
     return limit
 
 
@@ -231,117 +254,182 @@ def cross_gap(
     return both, both, half if gap > 0.0 else -half
 
 
-def set_joints(
-    terms: Any, deadband: float, dry: Any, own_bias: Any, gain: Any, ctrl: Any, qpos: Any, qvel: Any, torque: Any,
-    load: Any, bias: Any, limit: Any, effort: Any, force_range: Any,
-) -> None:  # fmt: skip
-    """Fill `bias`, `limit`, (nsim, nu), and `force_range` as ServoModel.before does; numba compiles it.
+class ActuatorState(NamedTuple):
+    """What a simulation's actuators do before a physics step, (nsim, nu); live arrays."""
+
+    gain: Any  # MuJoCo's actuator_gainprm, (nsim, nu, 10)
+    bias: Any  # torque of the zero offset, N·m
+    ctrl: Any  # rad
+    qpos: Any  # rad
+    qvel: Any  # rad/s
+    torque: Any  # of the last physics step, N·m
+    load: Any  # torque of gravity and Coriolis forces, N·m
+
+
+def set_servos(servos: Any, state: Any, biasprm: Any, friction: Any, force_range: Any) -> None:
+    """Set servos for the next physics step; numba compiles it.
 
     Args:
-        terms: In the order of SERVO_TERMS, (nsim, nu, terms).
+        servos: SERVO_RECORD, (nsim, nu).
+        state: ActuatorState.
+        biasprm: MuJoCo's actuator_biasprm, (nsim, nu, 10), whose first number is set where a term changes the torque.
+        friction: MuJoCo's dof_frictionloss, (nsim, nu) N·m.
+        force_range: MuJoCo's actuator_forcerange, (nsim, nu, 2) N·m, set where a servo has a no-load speed.
     """
-    for i in range(len(qpos)):
-        for j in range(qpos.shape[1]):
-            rest, speed, by_motor, by_load, least, step, no_load = terms[i, j, :7]
-            limit[i, j] = joint_friction(
-                dry[i, j], rest, speed, by_motor, by_load, qvel[i, j], torque[i, j], load[i, j]
-            )
-            if least > 0.0 or step > 0.0:
-                kp, q = gain[i, j], qpos[i, j]
-                aim = ctrl[i, j] + own_bias[i, j] / kp
-                bias[i, j] = requested_torque(kp, aim, q, least, step, deadband) - kp * (
-                    ctrl[i, j] - q
-                )
-            if no_load > 0.0:
-                least, most = torque_range(effort[i, j], qvel[i, j] / no_load)
-                force_range[i, j, 0], force_range[i, j, 1] = least, most
+    simulations, actuators = state.qpos.shape
+    for i in range(simulations):
+        for j in range(actuators):
+            servo = servos[i, j]
+            qpos = state.qpos[i, j]
+            qvel = state.qvel[i, j]
+            friction[i, j] = joint_friction(servo, qvel, state.torque[i, j], state.load[i, j])
+            if servo.min_torque > 0.0 or servo.encoder_step > 0.0:
+                kp = state.gain[i, j, 0]
+                ctrl = state.ctrl[i, j]
+                aim = ctrl + state.bias[i, j] / kp
+                biasprm[i, j, 0] = requested_torque(servo, kp, aim, qpos) - kp * (ctrl - qpos)
+            if servo.no_load_speed > 0.0:
+                least, most = motor_limits(servo, qvel)
+                force_range[i, j, 0] = least
+                force_range[i, j, 1] = most
 
 
-def advance(
-    first: int, last: int, values: Any, has_terms: bool, tables: Any, ctrl: Any, qpos: Any, qvel: Any, touch: Any,
-    lengths: Any, stiffer: Any, kd: Any, stops: Any, warm: Any, periods: Any, count: int, thin: int,
-    out: Any,
-) -> None:  # fmt: skip
-    """Fill out[:, first:last] (k, n·windows, rows) with q_sim − q_real; arrays as JointRollouts keeps them.
+class Windows(NamedTuple):
+    """Windows of recordings beside which n joints move by themselves.
 
-    Candidates take each step side by side, so that none waits for its own last one. numba compiles this function. It
-    stands in this file because numba compiles a function again only when its own file changes.
+    Attributes:
+        loads: Inertia without armature, kg·m²; gravity's torque at an angle of zero, N·m; torque of the other joints'
+            accelerations, N·m; slope of gravity's torque, N·m/rad: (4, n, windows, rows).
+        ctrl, qpos, qvel: Commands and states, (n, windows, rows) rad and rad/s.
+        touch: Rows from which a rollout goes on from the recording, (windows, rows).
+        lengths: Rows of each window, (windows,).
+        stops: Ends of each joint's range, (n, 2) rad.
+        periods: Control period of each window, (windows,) s.
+        steps: Physics steps in a period.
+        thin: Rows from one error to the next.
     """
-    k, windows = len(values), qpos.shape[1]
-    for item in range(first, last):
-        j, p = item // windows, item % windows
-        h = periods[p] / count
-        v, rows = np.ascontiguousarray(values[:, j].T), lengths[p]
-        kp, mass, offset, limit = v[0] * stiffer[p, j], v[3], v[4], v[6]
-        damping, dry = warm[0, :, j, p], warm[1, :, j, p]
-        rest, speed, by_motor, by_load, least, step = (
-            v[7],
-            np.maximum(v[8], SLOWEST),
-            v[9],
-            v[10],
-            v[11],
-            v[12],
-        )
-        deadband, no_load = DEADBAND_STEPS * (least > 0), np.where(v[13] > 0, v[13], np.inf)
-        fades = np.isfinite(no_load).any()
-        brake, own = np.maximum(kd[p, j] + np.minimum(damping, 0.0), 0.0), np.maximum(damping, 0.0)
-        # A part of each command where it changes on the way.
-        late = np.arange(count).reshape(-1, 1) / count - v[5] / periods[p]
-        row = np.floor(late).astype(np.int64)
-        share = np.maximum((late - row - 1) * count + 1, 0.0)
-        q, w = np.full(k, float(qpos[j, p, 0])), np.full(k, float(qvel[j, p, 0]))
-        half, rotor = v[7 + PLAY] / 2, w.copy()
-        gap = np.where(tables[1, j, p, 0] + tables[3, j, p, 0] * q < 0, -half, half)
-        for t in range(rows - 1):
-            here = tables[:, j, p, t]  # inertia, weight, pull, slope
-            for part in range(count):
-                for c in range(k):
-                    heavy, at = here[0] + mass[c], t + row[part, c]
-                    aim = (1 - share[part, c]) * ctrl[j, p, min(max(at, 0), rows - 1)] + offset[c]
-                    aim += share[part, c] * ctrl[j, p, min(max(at + 1, 0), rows - 1)]
-                    load, low, high = here[3] * q[c] + here[1], -limit[c], limit[c]
-                    if fades:
-                        low, high = torque_range(limit[c], w[c] / no_load[c])
-                    wanted, most = kp[c] * (aim - q[c]), dry[c]
-                    if has_terms:
-                        wanted = requested_torque(kp[c], aim, q[c], least[c], step[c], deadband[c])
-                    wanted -= brake[c] * w[c]
-                    torque = min(max(wanted, low), high)
-                    if has_terms:
-                        most = joint_friction(
-                            dry[c], rest[c], speed[c], by_motor[c], by_load[c], w[c], torque, load
-                        )
-                    net = torque - load - here[2] - own[c] * w[c]
-                    net += min(max(-heavy / h * w[c] - net, -most), most)
-                    implicit = own[c] + brake[c] * (
-                        torque == wanted
-                    )  # as MuJoCo: not kd of a motor at its limit
-                    both = w[c] + h / (heavy + h * implicit) * net
+
+    loads: Any
+    ctrl: Any
+    qpos: Any
+    qvel: Any
+    touch: Any
+    lengths: Any
+    stops: Any
+    periods: Any
+    steps: int
+    thin: int
+
+
+def step_joint(
+    joint: Any, aim: Any, q: Any, w: Any, inertia: Any, load: Any, pull: Any, h: Any
+) -> Any:
+    """Return the speed, rad/s, of a joint without backlash after a step of h s, the servo's torque and the limit of
+    friction, N·m; as MuJoCo steps it.
+
+    Args:
+        joint: With the fields of JOINT_RECORD.
+        aim: Command and offset, rad.
+        q, w: Angle and speed before the step, rad and rad/s.
+        inertia: Without armature, kg·m².
+        load, pull: Torques of gravity and of the other joints' accelerations, N·m.
+    """
+    least, most = motor_limits(joint, w)
+    wanted = requested_torque(joint, joint.kp, aim, q) - joint.kd * w
+    torque = min(max(wanted, least), most)
+    friction = joint_friction(joint, w, torque, load)
+    heavy = inertia + joint.armature
+    net = torque - load - pull - joint.damping * w
+    net += min(max(-heavy / h * w - net, -friction), friction)
+    implicit = joint.damping
+    if torque == wanted:  # not kd of a motor at its limit
+        implicit += joint.kd
+    return w + h / (heavy + h * implicit) * net, torque, friction
+
+
+def command_rows(joints: Any, period: Any, steps: Any) -> Any:
+    """Return the row, from that of the period, whose command is in force in each physics step of a period, and the
+    share of the next row's, where it changes on the way: (steps, candidates) each."""
+    rows = np.empty((steps, len(joints)), np.int64)
+    shares = np.empty((steps, len(joints)))
+    for part in range(steps):
+        for c in range(len(joints)):
+            late = part / steps - joints[c].delay / period
+            rows[part, c] = np.floor(late)
+            shares[part, c] = max((late - rows[part, c] - 1) * steps + 1, 0.0)
+    return rows, shares
+
+
+def simulate_joints(first: int, last: int, joints: Any, windows: Any, out: Any) -> None:
+    """Fill out[:, first:last], (candidates, joints · windows, rows), with q_sim − q_real, rad; numba compiles it.
+
+    Candidates take each step side by side, so that none waits for its own last one. The function stands in this file
+    because numba compiles it again only when its own file changes.
+
+    Args:
+        first, last: Joints · windows that are simulated; the window varies fastest.
+        joints: JOINT_RECORD, (joints · windows, candidates), with the gains of the window's recording.
+        windows: Windows.
+    """
+    steps = windows.steps
+    count = joints.shape[1]
+    for i in range(first, last):
+        candidates = joints[i]
+        j = i // len(windows.lengths)
+        window = i % len(windows.lengths)
+        h = windows.periods[window] / steps
+        ctrl = windows.ctrl[j, window]
+        real = windows.qpos[j, window]
+        real_speed = windows.qvel[j, window]
+        loads = windows.loads[:, j, window]
+        low = windows.stops[j, 0]
+        high = windows.stops[j, 1]
+        end = windows.lengths[window] - 1
+        rows, shares = command_rows(candidates, windows.periods[window], steps)
+        q = np.full(count, real[0])
+        w = np.full(count, real_speed[0])
+        rotor = w.copy()
+        half = 0.5 * candidates["backlash"]
+        gap = np.where(loads[1, 0] + loads[3, 0] * q < 0, -half, half)
+        for t in range(end):
+            inertia = loads[0, t]
+            pull = loads[2, t]
+            for part in range(steps):
+                for c in range(count):
+                    one = candidates[c]
+                    at = t + rows[part, c]
+                    aim = (1 - shares[part, c]) * ctrl[min(max(at, 0), end)] + one.offset
+                    aim += shares[part, c] * ctrl[min(max(at + 1, 0), end)]
+                    load = loads[3, t] * q[c] + loads[1, t]
+                    speed, torque, friction = step_joint(
+                        one, aim, q[c], w[c], inertia, load, pull, h
+                    )
                     if half[c] > 0.0:
-                        both, rotor[c], gap[c] = cross_gap(
-                            half[c], gap[c], rotor[c], w[c], both, here[0], load + here[2], torque, own[c], most,
-                            mass[c], h,
+                        speed, rotor[c], gap[c] = cross_gap(
+                            half[c], gap[c], rotor[c], w[c], speed, inertia, load + pull, torque, one.damping, friction,
+                            one.armature, h,
                         )  # fmt: skip
-                    w[c] = both
+                    w[c] = speed
                     q[c] += h * w[c]
-                    if q[c] < stops[j, 0]:
-                        q[c], w[c] = stops[j, 0], max(w[c], 0.0)
-                    elif q[c] > stops[j, 1]:
-                        q[c], w[c] = stops[j, 1], min(w[c], 0.0)
-            if touch[p, t + 1]:  # goes on from the recording
-                q[:], w[:], rotor[:] = qpos[j, p, t + 1], qvel[j, p, t + 1], qvel[j, p, t + 1]
-            if (t + 1) % thin == 0:
-                out[:, item, (t + 1) // thin] = q - qpos[j, p, t + 1]
+                    if q[c] < low:
+                        q[c] = low
+                        w[c] = max(w[c], 0.0)
+                    elif q[c] > high:
+                        q[c] = high
+                        w[c] = min(w[c], 0.0)
+            if windows.touch[window, t + 1]:  # goes on from the recording
+                q[:] = real[t + 1]
+                w[:] = real_speed[t + 1]
+                rotor[:] = real_speed[t + 1]
+            if (t + 1) % windows.thin == 0:
+                out[:, i, (t + 1) // windows.thin] = q - real[t + 1]
 
 
 @functools.cache
 def compiled(function: Any) -> Any:
-    """Return a function of this file compiled by numba; None without numba, which is an extra."""
-    try:
-        numba, extending = import_module("numba"), import_module("numba.extending")
-    except ImportError:
-        return None
-    _extend(extending)
+    """Return a function of this file compiled by numba, which is imported at the first call."""
+    numba = import_module("numba")
+    _extend()
     try:
         return numba.njit(cache=True, nogil=True, error_model="numpy")(function)
     except RuntimeError:  # no folder for the cache is writable
@@ -349,16 +437,20 @@ def compiled(function: Any) -> Any:
 
 
 @functools.cache
-def _extend(extending: Any) -> None:
+def _extend() -> None:
     """Make functions of this file known to numba."""
+    extending = import_module("numba.extending")
     extending.overload(exp)(lambda x: lambda x: np.exp(x))
     functions = (
         torque_range,
         passing_friction,
         resting_friction,
         requested_torque,
+        motor_limits,
         joint_friction,
         cross_gap,
+        step_joint,
+        command_rows,
     )
     for function in functions:
         extending.register_jitable(function)
@@ -379,36 +471,51 @@ class ServoModel:
 
     def __init__(self, batch: Any, model: mujoco.MjModel) -> None:
         """Take the MuJoCo model's parameters for all simulations of a Batch, or of an object with its methods."""
-        self.batch, self.model = batch, model
-        user = (
-            model.actuator_user if model.nuser_actuator else np.zeros((model.nu, len(SERVO_TERMS)))
-        )
-        self._qpos, self._qvel, self._ctrl = (
-            batch.bind("qpos"),
-            batch.bind("qvel"),
-            batch.bind("ctrl"),
-        )
-        self._force, self._passing = batch.bind("actuator_force"), batch.bind("qfrc_bias")
-        self._gain, self._bias = batch.expand("actuator_gainprm"), batch.expand("actuator_biasprm")
+        self.batch = batch
+        self.model = model
+        user = np.zeros((model.nu, len(SERVO_TERMS)))
+        if model.nuser_actuator:
+            user = model.actuator_user
+        self._qpos = batch.bind("qpos")
+        self._qvel = batch.bind("qvel")
+        self._force = batch.bind("actuator_force")
+        self._passing = batch.bind("qfrc_bias")
+        self._gain = batch.expand("actuator_gainprm")
+        self._bias = batch.expand("actuator_biasprm")
         self._limit = batch.expand("dof_frictionloss")
         self.values: ServoTerms = {
             name: np.tile(user[:, i], (len(self._qpos), 1)) for i, name in enumerate(SERVO_TERMS)
         }
-        self.frictionloss, self.bias = self._limit.copy(), self._bias[:, :, 0].copy()
+        self._servos = np.zeros(self._limit.shape, SERVO_RECORD)
+        self.frictionloss = self._servos["frictionloss"]
+        self.frictionloss[:] = self._limit
+        self.bias = self._bias[:, :, 0].copy()
         own = batch.expanded("actuator_forcerange")
         limits = model.actuator_forcerange if own is None else own
-        self.effort = np.array(np.broadcast_to(limits[..., 1], self.bias.shape))
+        self.effort = self._servos["effort_limit"]
+        self.effort[:] = limits[..., 1]
         self._range = np.zeros((0, 0, 2))  # of torques, expanded where a term changes it
-        self.armature, self.damping = (
-            np.zeros(self._force.shape) + x for x in (model.dof_armature, model.dof_damping)
-        )
+        self.armature = np.zeros(self._force.shape) + model.dof_armature
+        self.damping = np.zeros(self._force.shape) + model.dof_damping
         self.play: Play | None = None
-        self.torque, self.load = (np.zeros(self._force.shape) for _ in range(2))
-        self._set_joints = compiled(set_joints)
+        self.torque = np.zeros(self._force.shape)
+        self.load = np.zeros(self._force.shape)
+        self._state = ActuatorState(
+            self._gain,
+            self.bias,
+            batch.bind("ctrl"),
+            self._qpos,
+            self._qvel,
+            self.torque,
+            self.load,
+        )
+        self._set_servos = compiled(set_servos)
         self._take_terms()
-        bias, limit = self._bias.copy(), self._limit.copy()
+        bias = self._bias.copy()
+        limit = self._limit.copy()
         self.before()  # compiles now, since the first step may belong to a control loop
-        self._bias[:], self._limit[:] = bias, limit
+        self._bias[:] = bias
+        self._limit[:] = limit
         if "backlash" in self.active:
             self._reset_play(np.arange(len(self._force)))
 
@@ -417,10 +524,18 @@ class ServoModel:
         self.active = present(self.values)
         if "no_load_speed" in self.active or self._range.size:
             self._range = self.batch.expand("actuator_forcerange")
-            self._range[..., 0], self._range[..., 1] = -self.effort, self.effort
-        none = np.zeros(self._force.shape)
-        self._packed = np.stack([self.active.get(name, none) for name in SERVO_TERMS], axis=-1)
-        self._deadband = DEADBAND_STEPS * ("min_torque" in self.active)
+            self._range[..., 0] = -self.effort
+            self._range[..., 1] = self.effort
+        for name, values in self.values.items():
+            self._servos[name] = values
+
+    @property
+    def records(self) -> Array:
+        """Present values of all servos, SERVO_RECORD (nsim, nu)."""
+        records = self._servos.copy()
+        for name, values in self.values.items():
+            records[name] = values
+        return records
 
     def reset(self, ids: Array, target: Array) -> None:
         """Begin again for simulations `ids`, which were put into a state, under position targets (k, nu) rad."""
@@ -462,25 +577,13 @@ class ServoModel:
 
         MuJoCo delays ctrl after this: the least torque of a late servo follows the target that is under way.
         """
-        gain, bias, qpos = self._gain[:, :, 0], self._bias[:, :, 0], self._qpos
-        state = (self._qvel, self.torque, self.load)
+        bias = self._bias[:, :, 0]
         if self.play is not None:
             bias[:] = self.bias
-        if self._set_joints is not None:
-            self._set_joints(
-                self._packed, self._deadband, self.frictionloss, self.bias, gain, self._ctrl, qpos, *state, bias,
-                self._limit, self.effort, self._range,
-            )  # fmt: skip
-        else:
-            if "encoder_step" in self.active or "min_torque" in self.active:
-                aim = self._ctrl + self.bias / gain
-                bias[:] = servo_torque(self.active, gain, aim, qpos) - gain * (self._ctrl - qpos)
-            if "no_load_speed" in self.active:
-                limits = torque_range(self.effort, self._qvel / self.active["no_load_speed"])
-                self._range[..., 0], self._range[..., 1] = limits
-            self._limit[:] = friction_limit(self.active, self.frictionloss, *state)
+        self._set_servos(self._servos, self._state, self._bias, self._limit, self._range)
         if self.play is not None:
-            *values, more = self.play.before(self._limit, gain, qpos, self._qvel, self._h)
+            gain = self._gain[:, :, 0]
+            *values, more = self.play.before(self._limit, gain, self._qpos, self._qvel, self._h)
             bias += more
             for field, value in zip((self._limit, *self._links), values, strict=True):
                 field[:] = value

@@ -19,7 +19,6 @@ from mujoco.batch import MODEL_FIELDS
 from torch import Tensor
 
 from gaponet.base.errors import UsageError
-from gaponet.robot.servo_fields import SERVO_TERMS
 from gaponet.sim import servo
 from gaponet.sim.batch import BatchSim, CommandHistory, ramp_start
 
@@ -34,23 +33,30 @@ SERVO = {"actuator_force": "servo_torque", "qfrc_bias": "servo_load"}
 TARGET = {"ctrl": "ctrl"}
 
 _Floats: Any = warp.array2d(dtype=float)
-_Numbers: Any = warp.array2d(
-    dtype=warp.types.vector(len(SERVO_TERMS), float)
-)  # in the order of SERVO_TERMS
 _Pairs: Any = warp.array2d(dtype=warp.vec2)
 _Parameters: Any = warp.array2d(dtype=warp.types.vector(10, float))  # of an actuator's gain or bias
 
 
+def _servo_struct() -> Any:
+    """Return SERVO_RECORD of sim/servo.py as a Warp struct of float32."""
+    fields = dict.fromkeys(servo.SERVO_RECORD.names or (), float)
+    return warp.struct(type("Servo", (), {"__annotations__": fields, "__module__": __name__}))
+
+
+_Servo = _servo_struct()
+_Servos: Any = warp.array2d(dtype=_Servo)
+
+
 def _warp_function(function: Any, **others: Any) -> Any:
     """Return a function of sim/servo.py for kernels, with Warp's functions in place of NumPy's."""
-    names = {"np": warp, "exp": warp.exp, "Any": Any} | others
+    names = vars(servo) | {"np": warp, "exp": warp.exp} | others
     copied = FunctionType(function.__code__, names, function.__name__)
     copied.__annotations__ = function.__annotations__
     return warp.func(copied)
 
 
-_range = _warp_function(servo.torque_range)
 _torque = _warp_function(servo.requested_torque)
+_limits = _warp_function(servo.motor_limits, torque_range=_warp_function(servo.torque_range))
 _friction = _warp_function(
     servo.joint_friction,
     passing_friction=_warp_function(servo.passing_friction),
@@ -60,24 +66,23 @@ _friction = _warp_function(
 
 @warp.kernel(enable_backward=False)
 def _set_servos(
-    terms: _Numbers, deadband: float, offset: _Floats, dry: _Floats, gain: _Parameters, ctrl: _Floats, qpos: _Floats,
-    qvel: _Floats, torque: _Floats, load: _Floats, bias: _Parameters, limit: _Floats, effort: _Floats, force: _Pairs,
+    servos: _Servos, offset: _Floats, gain: _Parameters, ctrl: _Floats, qpos: _Floats, qvel: _Floats, torque: _Floats,
+    load: _Floats, bias: _Parameters, friction: _Floats, force: _Pairs,
 ) -> None:  # fmt: skip
-    """Set bias, torque limits and friction of servo j of world i for the next physics step, as ServoModel.before does.
+    """Set bias, torque limits and friction of servo j of world i for the next physics step, as servo.set_servos does.
 
     Where a servo has a no-load speed, every world has its own torque limits `force`.
     """
     i, j = warp.tid()
-    own, kp, q = terms[i, j], gain[i, j][0], qpos[i, j]
-    speed, least, step = max(own[1], servo.SLOWEST), own[4], own[5]
-    limit[i, j] = _friction(
-        dry[i, j], own[0], speed, own[2], own[3], qvel[i, j], torque[i, j], load[i, j]
-    )
-    if least > 0.0 or step > 0.0:
+    one = servos[i, j]
+    friction[i, j] = _friction(one, qvel[i, j], torque[i, j], load[i, j])
+    if one.min_torque > 0.0 or one.encoder_step > 0.0:
+        kp = gain[i, j][0]
         aim = ctrl[i, j] + offset[i, j] / kp
-        bias[i, j][0] = _torque(kp, aim, q, least, step, deadband) - kp * (ctrl[i, j] - q)
-    if own[6] > 0.0:
-        low, high = _range(effort[i, j], qvel[i, j] / own[6])
+        wanted = _torque(one, kp, aim, qpos[i, j])
+        bias[i, j][0] = wanted - kp * (ctrl[i, j] - qpos[i, j])
+    if one.no_load_speed > 0.0:
+        low, high = _limits(one, qvel[i, j])
         force[i, j] = warp.vec2(low, high)
 
 
@@ -128,14 +133,21 @@ class _Worlds:
 
     def _inputs(self, servos: servo.ServoModel, rows: np.ndarray) -> list[Any]:
         """Return the arguments of _set_servos."""
-        model, data = self.model, self.data
-        deadband = servo.DEADBAND_STEPS * servos.values["min_torque"].any()
-        terms = np.stack([servos.values[name][rows] for name in SERVO_TERMS], axis=-1)
-        own = [warp.array(x[rows], dtype=float) for x in (servos.bias, servos.frictionloss)]
-        state = [data.ctrl, data.qpos, data.qvel, data.actuator_force, data.qfrc_bias]
-        return [warp.array(terms, dtype=_Numbers.dtype), deadband, *own, model.actuator_gainprm, *state,
-                model.actuator_biasprm, model.dof_frictionloss, warp.array(servos.effort[rows], dtype=float),
-                model.actuator_forcerange]  # fmt: skip
+        data = self.data
+        single = servos.records[rows].astype(_Servo.numpy_dtype())
+        return [
+            warp.array(single, dtype=_Servo),
+            warp.array(servos.bias[rows], dtype=float),
+            self.model.actuator_gainprm,
+            data.ctrl,
+            data.qpos,
+            data.qvel,
+            data.actuator_force,
+            data.qfrc_bias,
+            self.model.actuator_biasprm,
+            self.model.dof_frictionloss,
+            self.model.actuator_forcerange,
+        ]
 
     def bind(self, name: str) -> Tensor:
         """Return a live view of a field of all worlds, (nworld, …)."""

@@ -11,6 +11,7 @@ from __future__ import annotations
 import copy
 import os
 from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
 
 import mujoco
 import numpy as np
@@ -19,16 +20,12 @@ from scipy.optimize import nnls
 from gaponet.base.arrays import Array
 from gaponet.data.sequence import Sequence
 from gaponet.data.signals import differentiate, lowpass
-from gaponet.robot.servo_fields import SERVO_TERMS
 from gaponet.robot.spec import RobotSpec
-from gaponet.sim import servo
 from gaponet.sim.batch import speed_limited
 from gaponet.sim.dynamics import tips_of
 from gaponet.sim.model import build_model
-from gaponet.sim.servo import crossed, friction_limit, present, servo_torque, torque_range
+from gaponet.sim.servo import JOINT_RECORD, Windows, compiled, simulate_joints
 from gaponet.sim.temperature import recorded_temperatures, warm_values
-
-advance = servo.compiled(servo.advance)  # eight times as fast as numpy; None without numba
 
 # errors beyond count linearly (soft L1), so that one blocked joint does not decide
 ERROR_SCALE_RAD = 0.01
@@ -42,16 +39,6 @@ GRAVITY_STEP_RAD, GRAVITY_ROWS = (
     0.02,
     5,
 )  # of the derivative of gravity's torque; rows that share one
-KERNEL_FIELDS = (
-    "kp",
-    "damping",
-    "frictionloss",
-    "armature",
-    "offset",
-    "delay",
-    "effort_limit",
-    *SERVO_TERMS,
-)
 
 
 class JointRollouts:
@@ -226,106 +213,57 @@ class JointRollouts:
                 effort_limit, SERVO_TERMS and those of temperature, (k, n) each. A damping below zero is taken from the
                 servo's own kd.
         """
-        out = self._compiled(values) if advance is not None else self._arrays(values)
-        return np.asarray(out * (self.counted & self.recorded[..., None]))
+        k = len(values["kp"])
+        n = len(self.op)
+        out = np.zeros((k, n * len(self.parts), self.counted.shape[1]), np.float32)
+        joints = self._joints(values)
+        windows = self._windows()
+        simulate = compiled(simulate_joints)
+        ends = np.linspace(0, len(joints), self.nthread + 1).astype(int).tolist()
+        with ThreadPoolExecutor(self.nthread) as pool:
+            done = [
+                pool.submit(simulate, first, last, joints, windows, out)
+                for first, last in pairwise(ends)
+            ]
+            for one in done:
+                one.result()
+        errors = out.reshape(k, n, len(self.parts), -1)
+        return np.asarray(errors * (self.counted & self.recorded[..., None]))
 
     def flat_errors(self, values: dict[str, Array]) -> Array:
         """Return `errors` of all windows in one row, (k, n, windows · rows) rad."""
         errors = self.errors(values)
         return errors.reshape(*errors.shape[:2], -1)
 
-    def _compiled(self, values: dict[str, Array]) -> Array:
-        """Roll out by numba, shared by threads."""
-        k, (n, windows) = len(values["kp"]), self.qpos.shape[:2]
-        own = {"effort_limit": self.robot.effort_limit[self.op]}
-        packed = np.stack(
-            [np.broadcast_to(values.get(f, own.get(f, 0.0)), (k, n)) for f in KERNEL_FIELDS],
-            axis=-1,
-        )
-        terms = any(values[f].any() for f in SERVO_TERMS if f in values)
-        out = np.zeros((k, n * windows, self.counted.shape[1]), np.float32)
-        ends = np.linspace(0, n * windows, self.nthread + 1).astype(int)
-        warm = np.stack(warm_values(values, self.temperature))
-        rest = (packed, terms, self.tables, self.ctrl, self.qpos, self.qvel, self.touch, self.lengths, self.kp_ratio,
-                self.kd, self.stops, warm, self.periods, self.count, self.thin, out)  # fmt: skip
-        with ThreadPoolExecutor(self.nthread) as pool:
-            list(pool.map(lambda a, b: advance(a, b, *rest), ends[:-1].tolist(), ends[1:].tolist()))
-        return out.reshape(k, n, windows, -1)
+    def _joints(self, values: dict[str, Array]) -> Array:
+        """Return candidates beside each window, JOINT_RECORD (n · windows, k); values (k, n) as of `errors`."""
+        damping, frictionloss = warm_values(values, self.temperature)  # (k, n, windows)
+        k, n, windows = damping.shape
+        own = {"effort_limit": self.robot.effort_limit[self.op]} | values
+        each = {f: np.broadcast_to(x, (k, n))[..., None] for f, x in own.items()}
+        each["kp"] = each["kp"] * self.kp_ratio.T
+        each["kd"] = np.maximum(self.kd.T + np.minimum(damping, 0.0), 0.0)
+        each["damping"] = np.maximum(damping, 0.0)
+        each["frictionloss"] = frictionloss
+        joints = np.zeros((n, windows, k), JOINT_RECORD)
+        for field in each.keys() & set(JOINT_RECORD.names or ()):
+            joints[field] = np.moveaxis(np.broadcast_to(each[field], (k, n, windows)), 0, -1)
+        return joints.reshape(n * windows, k)
 
-    def _arrays(self, values: dict[str, Array]) -> Array:
-        """Roll out in numpy. Every array has the state's shape and precision, since broadcasting costs more."""
-        k = len(values["kp"])
-        shape = (k, *self.qpos.shape[:2])
-        v = {name: _filled(x[:, :, None], shape) for name, x in values.items()}
-        terms = present({name: v[name] for name in SERVO_TERMS if name in v})
-        kp, kd = v["kp"] * _filled(self.kp_ratio.T, shape), _filled(self.kd.T, shape)
-        damping, dry = (_filled(x, shape) for x in warm_values(values, self.temperature))
-        kd = np.maximum(kd + np.minimum(damping, 0), 0)
-        own, armature, offset = np.maximum(damping, 0), v["armature"], v["offset"]
-        limit = v.get("effort_limit", _filled(self.robot.effort_limit[self.op][:, None], shape))
-        h = _filled(self.periods / self.count, shape)
-        low, high = (_filled(x[:, None], shape) for x in self.stops.T)
-        q, w = _filled(self.qpos[..., 0], shape), _filled(self.qvel[..., 0], shape)
-        out = np.zeros((*shape, self.counted.shape[1]), np.float32)
-        half, rotor = terms.get("backlash", np.zeros(shape)) / 2, w.copy()
-        first = self.tables[..., 0]
-        gap = np.where(first[1] + first[3] * q < 0, -half, half)
-        for t in range(self.qpos.shape[2] - 1):
-            inertia, weight, pull, slope = self.tables[..., t]
-            heavy, slope = inertia + armature, _filled(slope, shape)
-            stop = heavy / -h
-            for aim in self._targets(t, values["delay"]) + offset:
-                wanted, least, most = servo_torque(terms, kp, aim, q) - kd * w, -limit, limit
-                if "no_load_speed" in terms:
-                    least, most = torque_range(limit, w / terms["no_load_speed"])
-                torque = np.minimum(np.maximum(wanted, least), most)
-                turn = h / (heavy + h * (own + kd * (torque == wanted)))
-                load = slope * q + weight
-                most = friction_limit(terms, dry, w, torque, load)
-                net = torque - load - pull - own * w
-                before, w = (
-                    w,
-                    w + turn * (net + np.minimum(np.maximum(stop * w - net, -most), most)),
-                )
-                if "backlash" in terms:
-                    force = inertia * (w - before) / h + load + pull
-                    pressed = (abs(gap) >= half) & (force * gap >= 0)
-                    link = np.where(pressed, w, before - h / inertia * (load + pull))
-                    gap, rotor = crossed(
-                        half, gap, rotor, pressed, link, torque, own, most, armature, h
-                    )
-                    both = (inertia * link + armature * rotor) / heavy
-                    met = abs(gap) >= half
-                    w, rotor = np.where(met, both, link), np.where(met, both, rotor)
-                q = q + h * w
-                w = np.where(q < low, np.maximum(w, 0), np.where(q > high, np.minimum(w, 0), w))
-                q = np.minimum(np.maximum(q, low), high)
-            touch = self.touch[:, t + 1]
-            if touch.any():  # goes on from the recording
-                q[..., touch], w[..., touch] = (
-                    self.qpos[:, touch, t + 1],
-                    self.qvel[:, touch, t + 1],
-                )
-                rotor[..., touch] = w[..., touch]
-            if (t + 1) % self.thin == 0:
-                out[..., (t + 1) // self.thin] = q - self.qpos[..., t + 1]
-        return out
-
-    def _targets(self, t: int, delay: Array) -> Array:
-        """Return the commands in force in the physics steps of a period, (count, k, n, windows); interpolated in the
-        step in which they change."""
-        at = (
-            np.arange(self.count)[:, None, None, None] / self.count
-            - delay[..., None] / self.periods
-        )  # rows from t
-        row = np.floor(at).astype(int)
-        share = np.maximum((at - row - 1) * self.count + 1, 0).astype(np.float32)
-        last, joint = self.lengths - 1, np.arange(len(self.op))[:, None]
-        window = np.arange(len(self.lengths))
-        first, then = (
-            self.ctrl[joint, window, np.clip(t + row + more, 0, last)] for more in (0, 1)
+    def _windows(self) -> Windows:
+        """Return the windows, of one type for numba whatever their number."""
+        return Windows(
+            loads=np.ascontiguousarray(self.tables, np.float32),
+            ctrl=np.ascontiguousarray(self.ctrl, np.float32),
+            qpos=np.ascontiguousarray(self.qpos, np.float32),
+            qvel=np.ascontiguousarray(self.qvel, np.float32),
+            touch=np.ascontiguousarray(self.touch),
+            lengths=self.lengths,
+            stops=self.stops,
+            periods=self.periods,
+            steps=self.count,
+            thin=self.thin,
         )
-        return np.asarray((1 - share) * first + share * then)
 
 
 def _loads_along(part: Sequence, model: mujoco.MjModel, op: Array, thin: int) -> Array:
@@ -368,10 +306,6 @@ def _loads_along(part: Sequence, model: mujoco.MjModel, op: Array, thin: int) ->
         if thin == 1
         else np.apply_along_axis(lambda y: np.interp(rows, at, y), 1, loads)
     )
-
-
-def _filled(x: Array, shape: tuple[int, ...]) -> Array:
-    return np.array(np.broadcast_to(x, shape), np.float32)
 
 
 def _extended(x: Array, rows: int) -> Array:

@@ -29,7 +29,7 @@ from gaponet.export.shipped.mujoco_servos import Check, read
 from gaponet.export.shipped.scene_facts import require_scene
 from gaponet.export.shipped.unit_events import columns_of, write_model
 from gaponet.export.shipped.unit_events import mjlab_units as mjlab_units
-from gaponet.sim.servo import SERVO_TERMS, friction_limit, present, servo_torque, torque_range
+from gaponet.sim.servo import SERVO_TERMS, friction_limit, present, servo_bias, torque_range
 
 PROGRAM, FACTS, ROBOT = "delta.pt2", "facts.json", "robot.xml"
 
@@ -441,8 +441,8 @@ class ServoModel:
             speed = self.terms["no_load_speed"]
             limits = torque_range(self.effort, torch.where(speed > 0, v / speed, 0.0))
             self.sim.model.actuator_forcerange[:, self.servo] = torch.stack(limits, dim=-1)
-        wanted = servo_torque(self.terms, self.kp, ctrl + self.bias / self.kp, q)
-        self.sim.model.actuator_biasprm[:, self.servo, 0] = wanted - self.kp * (ctrl - q)
+        bias = servo_bias(self.terms, self.kp, self.bias, ctrl, q)
+        self.sim.model.actuator_biasprm[:, self.servo, 0] = bias
 
 
 # ---- Isaac Lab

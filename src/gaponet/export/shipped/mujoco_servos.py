@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from gaponet.sim.servo import SERVO_TERMS, Play, friction_limit, present, servo_torque, torque_range
+from gaponet.sim.servo import SERVO_TERMS, Play, friction_limit, present, servo_bias, torque_range
 
 CHECK_WORLDS = 3
 Motion = dict[str, Any]  # one of check.npz: ctrl, qpos, qvel (T, n) in rad and rad/s, dt in s
@@ -78,16 +78,13 @@ class Servos:
         if not self.terms:
             return
         model, torque, load = self.model, data.actuator_force[self.servo], data.qfrc_bias[self.dof]
-        q, qvel, bias = data.qpos[self.qpos], data.qvel[self.dof], self.bias
+        q = data.qpos[self.qpos]
+        qvel = data.qvel[self.dof]
         limit = friction_limit(self.terms, self.frictionloss, qvel, torque, load)
         if "no_load_speed" in self.terms:
             limits = torque_range(self.effort, qvel / self.terms["no_load_speed"])
             model.actuator_forcerange[self.servo] = np.stack(limits, axis=-1)
-        if "encoder_step" in self.terms or "min_torque" in self.terms:
-            ctrl = data.ctrl[self.servo]
-            bias = servo_torque(self.terms, self.kp, ctrl + self.bias / self.kp, q) - self.kp * (
-                ctrl - q
-            )
+        bias = servo_bias(self.terms, self.kp, self.bias, data.ctrl[self.servo], q)
         if "backlash" in self.terms:
             h = model.opt.timestep
             if data.time != self._play_time:  # a new state
