@@ -11,12 +11,16 @@ from gaponet.data.sequence import Sequence, SequenceMeta, require_same_gains, to
 
 META = SequenceMeta("arm", "a", "wave", 0.0, source="wave.csv")
 ROWS = 50
+AHEAD = 0.005  # rad, of the command before the state
 
 
 def arm_log(time: np.ndarray, ctrl_time: np.ndarray | None = None, **meta: object) -> Log:
     ctrl_time = time if ctrl_time is None else ctrl_time
     both = lambda t: np.stack([t, 2 * t], axis=1)  # noqa: E731
-    channels = {"ctrl": Channel(ctrl_time, both(ctrl_time)), "qpos": Channel(time, both(time))}
+    channels = {
+        "ctrl": Channel(ctrl_time, AHEAD + both(ctrl_time)),
+        "qpos": Channel(time, both(time)),
+    }
     return Log("arm", ("shoulder", "elbow"), channels, "wave.csv", dict(meta))
 
 
@@ -38,7 +42,7 @@ def test_a_missing_sample_puts_the_log_on_a_grid(arm):
     assert sequence.meta.notes["longest_gap_ms"] == pytest.approx(40)
     assert len(sequence) == ROWS
     assert sequence.qpos[20, 0] == pytest.approx(0.4)  # on the line between its neighbours
-    assert sequence.ctrl[20, 0] == pytest.approx(0.38)  # the command of row 19 still stands
+    assert sequence.ctrl[20, 0] == pytest.approx(AHEAD + 0.38)  # the command of row 19 still stands
 
 
 def test_commands_and_states_on_different_clocks_meet_where_they_overlap(arm):

@@ -13,9 +13,11 @@ from gaponet.nn.packaged_networks import network_folder
 from gaponet.robot.spec import RobotSpec, load_robot
 
 if TYPE_CHECKING:
+    from gaponet.data.sequence import Sequence
     from gaponet.nn.artifact import GapModel
 
 Place = str | Path
+MOVING_RAD = 0.05  # range of a joint that moves
 
 
 def as_robot(robot: RobotSpec | Place) -> RobotSpec:
@@ -55,15 +57,35 @@ def entries_of_unit(data: Dataset, unit: str, motions: tuple[str, ...]) -> tuple
 
 
 def driven_by_torque(data: Dataset) -> bool:
-    """True if no positions were commanded: the commands of the first recording equal its measured positions."""
+    """True if torque was recorded and no position commanded: the commands of the first recording are its positions."""
     first = data.read(data.entries[0]) if data.entries else None
-    return first is not None and np.array_equal(first.ctrl, first.qpos) and bool(np.ptp(first.qpos))
+    return first is not None and first.tau is not None and set(_copies(first)) == {0}
+
+
+def copies_with_torque(data: Dataset) -> bool:
+    """True if torque was recorded, and the commands of the first recording are its positions, of any row."""
+    first = data.read(data.entries[0]) if data.entries else None
+    return first is not None and first.tau is not None and None not in _copies(first)
+
+
+def _copies(sequence: Sequence) -> list[int | None]:
+    """Return by how many rows each moving joint repeats its command; None: it does not. All are None if none moves."""
+    moving = np.flatnonzero(np.ptp(sequence.qpos, axis=0) > MOVING_RAD)
+    copies: list[int | None] = [
+        0
+        if np.array_equal(sequence.ctrl[:, j], sequence.qpos[:, j])
+        else sequence.copied.get(sequence.joint_names[j])
+        for j in moving
+    ]
+    return copies or [None]
 
 
 def require_commands(data: Dataset) -> None:
     """Refuse recordings without commanded positions."""
-    if driven_by_torque(data):
+    first = data.read(data.entries[0]) if data.entries else None
+    if first is not None and set(_copies(first)) == {0}:
         raise UsageError(
-            f"{data.path}: no position was commanded, so there is nothing to follow; this robot is driven by torque: "
-            f"gaponet identify {data.path} --out ROBOT fits its friction, inertia and delay, and says how far it is"
+            f"{data.path}: no position was commanded, so there is nothing to follow: command and state are the same "
+            f"numbers. If the robot is driven by torque, gaponet identify {data.path} --out ROBOT fits its friction, "
+            "inertia and delay, and says how far it is"
         )

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from gaponet import api
-from gaponet.api.opening import driven_by_torque
+from gaponet.api.opening import copies_with_torque, driven_by_torque
 from gaponet.api.results import IdentifyResult, TorqueResult
 from gaponet.base.errors import UsageError
 from gaponet.base.progress import progress_bar
@@ -49,7 +49,11 @@ def identify(
     """
     screen = Out(json)
     data, spec = open_dataset(dataset, robot)
-    if driven_by_torque(data):
+    by_torque = driven_by_torque(data)
+    if current and not by_torque:
+        by_torque = copies_with_torque(data)
+        _refuse_current_beside_commands(dataset, by_torque)
+    if by_torque:
         if like or units or holdout_units or terms or stops or masses:
             what = "--like, --units, --holdout-units, --terms, --stops and --masses"
             raise UsageError(f"{dataset} holds a robot that is driven by torque; leave out {what}")
@@ -74,6 +78,16 @@ def identify(
     screen.say(f"robot folder: {out}, after {made.seconds:.0f} s")
     screen.next(f"gaponet gap {dataset} --robot {robot_argument(out)}")
     screen.result(made.to_dict())
+
+
+def _refuse_current_beside_commands(dataset: Source, by_torque: bool) -> None:
+    if not by_torque:
+        raise UsageError(
+            f"--current is for a robot that is driven by torque or current, and {dataset} holds position commands "
+            "beside the positions, or no torque. Leave --current out. If no position was commanded, name the "
+            "position's column for ctrl too, and the torque's or current's for tau (docs/logs.md, 'Driven by torque "
+            "or current')"
+        )
 
 
 def _show(screen: Out, made: IdentifyResult, details: bool) -> None:

@@ -95,6 +95,7 @@ def doctor(
         fix: Print a proposal for logs.toml after the findings; nothing is applied.
         figures: Folder for a picture of each finding.
     """
+    from gaponet.api.opening import driven_by_torque
     from gaponet.robot.finding import Finding
     from gaponet.sim.dataset_robot import open_dataset
 
@@ -120,6 +121,8 @@ def doctor(
             if fix
             else f"gaponet doctor {dataset} --fix"
         )
+    elif driven_by_torque(data):
+        out.next(f"gaponet identify {dataset} --out ROBOT")
     else:
         out.next(f"gaponet gap {dataset}")
     out.result({"dataset": data.path.name, "robot": spec.name, "logs_toml": proposal,

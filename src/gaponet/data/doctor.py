@@ -16,6 +16,7 @@ from gaponet.data.checks.gravity import gravity
 from gaponet.data.checks.motor import fast_lags, lag_values, static_errors
 from gaponet.data.checks.static_checks import feedforward, static_checks
 from gaponet.data.checks.survey import Survey, survey_all
+from gaponet.data.checks.wiring import driven_by_torque
 from gaponet.data.offsets import Gravity
 from gaponet.data.store import Dataset
 from gaponet.robot.finding import LEVELS, Finding
@@ -103,7 +104,8 @@ def _examine_loads(
         text = f"zeros, offsets, gains and payloads are judged by gravity once this is mended: {', '.join(set(errors))}"
         return [Finding("ok", "gravity", text)]
     result = list[Finding]()
-    for check in (gravity, feedforward, static_checks):
+    by_commands = () if driven_by_torque(surveys) else (feedforward, static_checks)
+    for check in (gravity, *by_commands):
         result += check(surveys, robot, model)
         if any(f.level == "warning" for f in result):  # it would cause findings of the next
             break

@@ -301,6 +301,7 @@ def measure_delays(sequence: Sequence) -> Findings:
         estimate_delay(sequence.ctrl, sequence.qpos, sequence.dt),
         fast_speed(sequence.ctrl, sequence.dt),
     )
+    delay[[name in sequence.copied for name in sequence.joint_names]] = np.nan
     by_joint = lambda x: {  # noqa: E731
         j: round(float(v), 4) if np.isfinite(v) else None
         for j, v in zip(sequence.joint_names, x, strict=True)

@@ -13,6 +13,7 @@ from annotated_types import Interval
 from gaponet.base.arrays import Array
 from gaponet.base.errors import LogError, UsageError
 from gaponet.base.structure import Json
+from gaponet.data.describe.row_copies import copied_rows
 from gaponet.data.log import COMMANDS, FEEDFORWARD, Log
 from gaponet.data.signals import SAME_INSTANT, differentiate, resample_linear, resample_zoh
 from gaponet.robot.simulator_change import SimulatorChange
@@ -22,6 +23,7 @@ ARRAYS = ("ctrl", "qpos", "qvel", "qacc", "tau", "tau_eq", "temperature")
 OPTIONAL = ("qacc", "tau", "tau_eq", "temperature")
 MIN_PERIOD_S, MAX_PERIOD_S = 1e-4, 1.0  # periods, s
 MAX_GAP = 2.0  # between two samples of the state, s: what moved there is not known, and a clock that jumps is no clock
+MAX_UNEVEN_SHARE = 0.1  # of the median period, by which the periods of even rows differ from it
 MAX_GROWTH = 3  # times as many rows as were recorded: a few bursts must not set the period of all
 FEW = 16  # rows of which a loop's period is told first
 ASSUMED = "of robot.toml"  # note of gains that the log did not say
@@ -162,6 +164,12 @@ class Sequence:
             else tuple(self.temperature.mean(axis=0, dtype=float).round(1).tolist())
         )
 
+    @property
+    def copied(self) -> dict[str, int]:
+        """Joint → by how many rows of the log its state repeats its command (describe.row_copies)."""
+        copies: dict[str, int] = self.meta.notes.get("copied_rows", {})
+        return copies
+
     def rows(self, part: slice) -> Sequence:
         """The same recording, only these rows."""
         cut = {name: value[part] for name in ARRAYS if (value := getattr(self, name)) is not None}
@@ -240,10 +248,8 @@ def to_sequence(log: Log, robot: RobotSpec, meta: SequenceMeta) -> Sequence:
     _require_both_ends(log)
     period = np.diff(time)
     median = _median_period(log)
-    shared = all(
-        len(c.time) == len(time) and np.array_equal(c.time, time) for c in log.channels.values()
-    )
-    even = shared and bool((np.abs(period - median) <= 0.1 * median).all())
+    shared = _share_clock(log)
+    even = shared and bool((np.abs(period - median) <= MAX_UNEVEN_SHARE * median).all())
     mean = round(float(period.mean()), 7)
     exact = (mean,) if np.abs(period - mean).max() < 2e-6 else ()  # a clock that does not waver
     periods = (log.meta["dt"],) if "dt" in log.meta else (*exact, round(median, 5), mean)
@@ -255,6 +261,10 @@ def to_sequence(log: Log, robot: RobotSpec, meta: SequenceMeta) -> Sequence:
         free = shared and "dt" not in log.meta
         begin, dt = _loop(time, median, robot.dt) if free else (None, round(median, 5))
         arrays = _resample(log, dt, begin)
+    copies = _copies(log)
+    same = [copies.get(name) == 0 for name in log.joint_names]
+    if any(same) and not regular:  # the same numbers stay the same between the rows
+        arrays["ctrl"][:, same] = arrays["qpos"][:, same]
     arrays = {name: _to_robot(name, values, log, robot) for name, values in arrays.items()}
     converted = log.meta.get("converted_from", {})
     odd = [
@@ -265,25 +275,9 @@ def to_sequence(log: Log, robot: RobotSpec, meta: SequenceMeta) -> Sequence:
     if odd:  # a joint logged as a fraction of its range has its velocity in any unit at all
         qvel = differentiate(arrays["qpos"], dt)
         arrays.setdefault("qvel", qvel)[:, odd] = qvel[:, odd]
-    notes = meta.notes | log.meta.get("notes", {})
-    notes |= {
-        "rows": "as recorded"
-        if regular
-        else f"resampled to {1 / dt:.2f} Hz: commands held, states interpolated",
-        "rate_hz": round(1 / median, 3),
-        "jitter_ms": round(float(np.abs(period - median).max()) * 1e3, 3),
-        "uneven_ms": round(float(np.percentile(np.abs(period - median), 95)) * 1e3, 3),
-        "longest_gap_ms": round(float(period.max()) * 1e3, 3),
-        "qvel": "as recorded" if "qvel" in log.channels else "central differences of qpos",
-    }
-    if not regular:
-        span = f"{1e3 * period.min():.1f} to {1e3 * period.max():.1f} ms"
-        uneven = (
-            "no even period fits its rows"
-            if even
-            else f"its rows lie {span} apart, and shorter delays are not known"
-        )
-        notes["why_resampled"] = uneven if shared else "its channels have clocks of their own"
+    notes = meta.notes | log.meta.get("notes", {}) | _row_notes(log, median, dt, regular)
+    if copies:
+        notes["copied_rows"] = copies
     posture = {j: x for j, x in log.meta.get("posture", {}).items() if j not in log.joint_names}
     absent = [
         name for name in robot.joint_names if name not in log.joint_names and name not in posture
@@ -316,6 +310,45 @@ def to_sequence(log: Log, robot: RobotSpec, meta: SequenceMeta) -> Sequence:
     meta = SequenceMeta(**(asdict(meta) | gains | {"notes": notes}))
     channels: dict[str, Any] = dict(arrays)
     return Sequence(meta, robot.joint_names, dt, **channels)
+
+
+def _copies(log: Log) -> dict[str, int]:
+    """Joint → by how many rows its state repeats its command; without joints whose state does not."""
+    rows = copied_rows(log.channels["ctrl"], log.channels["qpos"])
+    by_joint = zip(log.joint_names, rows.tolist(), strict=True)
+    return {name: int(shift) for name, shift in by_joint if np.isfinite(shift)}
+
+
+def _row_notes(log: Log, median: float, dt: float, regular: bool) -> dict[str, Any]:
+    """Notes of the clock and of what became of the rows; median: period of the log, s; dt: of the sequence."""
+    time = log.channels["qpos"].time
+    period = np.diff(time)
+    off = np.abs(period - median)
+    notes: dict[str, Any] = {
+        "rows": "as recorded",
+        "rate_hz": round(1 / median, 3),
+        "jitter_ms": round(float(off.max()) * 1e3, 3),
+        "uneven_ms": round(float(np.percentile(off, 95)) * 1e3, 3),
+        "longest_gap_ms": round(float(period.max()) * 1e3, 3),
+        "qvel": "as recorded" if "qvel" in log.channels else "central differences of qpos",
+    }
+    if regular:
+        return notes
+    notes["rows"] = f"resampled to {1 / dt:.2f} Hz: commands held, states interpolated"
+    if not _share_clock(log):
+        notes["why_resampled"] = "its channels have clocks of their own"
+    elif (off <= MAX_UNEVEN_SHARE * median).all():
+        notes["why_resampled"] = "no even period fits its rows"
+    else:
+        span = f"{1e3 * period.min():.1f} to {1e3 * period.max():.1f} ms"
+        notes["why_resampled"] = f"its rows lie {span} apart, and shorter delays are not known"
+    return notes
+
+
+def _share_clock(log: Log) -> bool:
+    """Return True if all channels have the timestamps of the state."""
+    time = log.channels["qpos"].time
+    return all(np.array_equal(channel.time, time) for channel in log.channels.values())
 
 
 def _require_both_ends(log: Log) -> None:

@@ -54,6 +54,7 @@ class StaticPoses:
             if i:
                 moved = [np.abs(x[i] - x[i - 1]) > MIN_MOTION_RAD for x in (qpos, ctrl)]
                 distinct[i] = moved[0] | moved[1]
+        distinct[:, [name in sequence.copied for name in sequence.joint_names]] = False
         return cls(qpos, ctrl, approach, distinct)
 
     @classmethod

@@ -26,7 +26,10 @@ CONSEQUENCES = ("blocked", "stuck", "sag")  # checks that such a joint fails too
 def run_checks(checks: Iterable[Check], surveys: list[Survey], robot: RobotSpec) -> list[Finding]:
     """Return the findings of checks, without those that an exchanged, mirrored or mis-scaled joint explains."""
     findings = list[Finding]()
+    by_torque = wiring.driven_by_torque(surveys)
     for check in checks:
+        if by_torque and check.needs_commands:
+            continue
         findings += check.run(surveys, robot)
     wrong_joints = set[str]()
     for finding in findings:

@@ -17,6 +17,7 @@ class Check(NamedTuple):
     name: str
     ok_message: str
     may_be_error: bool = False  # only such a check may yield errors; the gate runs no others
+    needs_commands: bool = False  # means nothing of a robot that is driven by torque
 
     def run(self, surveys: list[Survey], robot: RobotSpec) -> list[Finding]:
         """Return the findings, at least one."""

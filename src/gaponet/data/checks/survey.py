@@ -17,6 +17,8 @@ import numpy as np
 from gaponet.base.arrays import Array
 from gaponet.base.executor import LOCAL, open_pool
 from gaponet.base.progress import Progress
+from gaponet.data.describe.row_copies import copied_rows
+from gaponet.data.log import Channel
 from gaponet.data.sequence import Sequence
 from gaponet.data.signals import (
     FAST_COMMAND_RAD_S,
@@ -46,7 +48,6 @@ GRAVITY_SAMPLES, SLOW_RAD_S = (
 )  # rows in which torque is compared with gravity, and the highest speed there
 HOLD_S, HELD_COMMAND_RAD = 0.4, 2e-3  # time and range of a command that stands still
 TORQUE_TOLERANCE = 0.05  # share of the torque limit by which a reading may exceed it
-EQUAL_RAD = 1e-5  # command and state that differ by less are one signal
 JUMP_RAD, JUMP_RAD_S2 = (
     0.1,
     1000.0,
@@ -58,12 +59,6 @@ SPECTRUM_HZ = np.arange(0.5, 60, 0.1)
 MOVING_RAD = 0.05
 JOB_ROWS, MIN_PARALLEL_ROWS = 40_000, 600_000  # of one job; from which starting processes pays
 OVERHEAD_ROWS = 1500  # rows that take as long as the fixed costs of a recording
-MAX_COPIED_ROWS = 3  # in both directions
-# changes of the command; fewer can be equal by chance where positions are counted in steps
-MIN_COPIED_CHANGES = 20
-COPIED_SHARE = (
-    0.99  # of these changes; a stiff servo with a coarse encoder can repeat most of a slow motion
-)
 LEVELS, LEVEL_TOLERANCE = (
     8,
     0.1,
@@ -102,8 +97,7 @@ class Survey:
     follows: Array  # (n, n)
     opposes: Array
     slope: Array  # motion of the state per motion of the command, (n); NaN where the motion does not show it
-    equals_command: Array  # joints whose state is the command itself, (n)
-    copied_rows: Array  # rows by which the state repeats the command, to the last digit, (n); NaN where it does not
+    copied_rows: Array  # rows by which the state repeats the command (describe.row_copies), (n); NaN where it does not
     jump_rows: Array  # rows with a position that no joint can reach and leave in a period, (n)
     zero_rows: int  # rows in which every joint is exactly 0, far from the rows around
     qvel_ratio: (
@@ -191,9 +185,7 @@ class Survey:
             follows=follows,
             opposes=opposes,
             slope=_slope(ctrl, qpos, dt, np.nan_to_num(delay) / dt, fast_speed(ctrl, dt)),
-            equals_command=(np.ptp(ctrl, axis=0) > MOVING_RAD)
-            & (np.abs(ctrl - qpos) < EQUAL_RAD).all(axis=0),
-            copied_rows=_copied_rows(ctrl, qpos),
+            copied_rows=_copied_rows(sequence),
             jump_rows=(apart > max(JUMP_RAD, JUMP_RAD_S2 / 2 * dt**2)).sum(axis=0),
             zero_rows=_zero_rows(sequence, notes, robot),
             qvel_ratio=_qvel_ratio(sequence),
@@ -338,23 +330,12 @@ def _standstill(ctrl: Array, qpos: Array, dt: float) -> float:
     return max((r.stop - r.start for r in runs if moving(r) >= commanded), default=0) * dt
 
 
-def _copied_rows(ctrl: Array, qpos: Array) -> Array:
-    """Return by how many rows the state repeats the command, to the last digit, (n); NaN where it does not.
-
-    Converters write such tables: the command of a row is the recorded position of the next one. No servo follows like
-    that. Only rows in which the command changes count, since a joint at rest is where it was told to be.
-    """
-    rows = np.full(ctrl.shape[1], np.nan)
-    for shift in range(-MAX_COPIED_ROWS, MAX_COPIED_ROWS + 1):
-        if shift == 0 or len(ctrl) <= MIN_COPIED_CHANGES + MAX_COPIED_ROWS:
-            continue
-        command = ctrl[max(-shift, 0) : len(ctrl) - max(shift, 0)]
-        state = qpos[max(shift, 0) : len(qpos) - max(-shift, 0)]
-        changes = command[1:] != command[:-1]
-        equal = (command[1:] == state[1:]) & changes
-        count = changes.sum(axis=0)
-        copied = (count >= MIN_COPIED_CHANGES) & (equal.sum(axis=0) >= COPIED_SHARE * count)
-        rows[copied & np.isnan(rows)] = shift
+def _copied_rows(sequence: Sequence) -> Array:
+    """Return by how many rows the state repeats the command, (n); NaN where it does not."""
+    time = sequence.dt * np.arange(len(sequence))
+    rows = copied_rows(Channel(time, sequence.ctrl), Channel(time, sequence.qpos))
+    for i, name in enumerate(sequence.joint_names):
+        rows[i] = sequence.copied.get(name, rows[i])
     return rows
 
 

@@ -148,19 +148,26 @@ def _sign(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
 
 def _copied(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     """Are command and state two signals, and does the command come first?"""
-    copies: dict[str, list[str]] = {}
-    shifted: dict[int, list[str]] = {}  # rows by which the state repeats the command → joints
+    if driven_by_torque(surveys):
+        text = (
+            "command and position are the same numbers, and torque is recorded: taken as driven by torque or current. "
+            "gaponet identify fits armature, friction and delay; gap and train need position commands. If positions "
+            "were commanded, log what the servo was sent"
+        )
+        yield Finding("warning", "copied", text)
+        return
     usual: list[int] = []  # joints that follow their commands in most recordings
+    copies: dict[int, dict[str, list[str]]] = {}  # rows → joint → motions
     for i, name in enumerate(robot.joint_names):
         moved = _moved(surveys, i)
-        copied = [s.motion for s in moved if s.equals_command[i]]
+        copied = [s for s in moved if np.isfinite(s.copied_rows[i])]
+        for s in copied:
+            joints = copies.setdefault(round(float(s.copied_rows[i])), {})
+            joints.setdefault(name, []).append(s.motion)
         leads = [s.lead[i] for s in moved if np.isfinite(s.lead[i])]
-        repeats = [s.copied_rows[i] for s in moved if np.isfinite(s.copied_rows[i])]
         if copied:
-            copies[name] = copied
-        elif 2 * len(repeats) > len(moved):
-            shifted.setdefault(round(float(np.median(repeats))), []).append(name)
-        elif len(leads) > 0.5 * len(moved):
+            continue
+        if len(leads) > 0.5 * len(moved):
             lead = float(np.median(leads))
             text = (
                 f"{name} moves {lead * 1e3:.0f} ms before its command in {len(leads)} of {len(moved)} motions: are "
@@ -176,25 +183,43 @@ def _copied(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
             "command and state are swapped there; leave these out, or import them with the columns exchanged"
         )
         yield Finding("error", "copied", text, (), {"recordings": [s.entry.id for s in early]})
-    for rows, joints in shifted.items():
-        count = f"{abs(rows)} row{'s' * (abs(rows) > 1)}"
+    with_torque = all(s.torque is not None for s in surveys)
+    for rows, motions in copies.items():
+        yield _copy(rows, motions, with_torque)
+
+
+def driven_by_torque(surveys: list[Survey]) -> bool:
+    """True if no position was commanded: each command is the joint's position, and torque is recorded."""
+    for s in surveys:
+        moves = s.qpos_range > MIN_COMMAND_RAD
+        if s.torque is None or not moves.any() or (s.copied_rows[moves] != 0).any():
+            return False
+    return True
+
+
+def _copy(rows: int, motions: dict[str, list[str]], with_torque: bool) -> Finding:
+    """Return the error that the state repeats the command by so many rows. motions: joint → motions."""
+    joints = abbreviate(list(motions))
+    where = abbreviate([motion for of_joint in motions.values() for motion in of_joint])
+    count = f"{abs(rows)} row{'s' * (abs(rows) > 1)}"
+    if rows == 0:
         text = (
-            f"the command of {abbreviate(joints)} is the recorded position {count} later, to the last digit: what was "
+            f"command and state of {joints} are the same numbers in {where}: one was logged as both; log the command "
+            "that the servo was sent"
+        )
+    elif rows > 0:
+        text = (
+            f"the command of {joints} is the recorded position {count} later, to the last digit, in {where}: what was "
             "sent to the servos is not in this log. Record the goal positions that the robot was sent"
         )
-        if rows < 0:
-            text = (
-                f"the position of {abbreviate(joints)} is the command {count} later, to the last digit: the state was "
-                "not measured. Record the positions of the encoders"
-            )
-        yield Finding("error", "copied", text, tuple(joints), {"rows": rows})
-    if copies:
-        motions = [motion for of_joint in copies.values() for motion in of_joint]
+    else:
         text = (
-            f"command and state of {abbreviate(list(copies))} are the same numbers in {abbreviate(motions)}: one was "
-            "logged as both; log the command that the servo was sent"
+            f"the position of {joints} is the command {count} later, to the last digit, in {where}: the state was not "
+            "measured. Record the positions of the encoders"
         )
-        yield Finding("error", "copied", text, tuple(copies))
+    if with_torque:
+        text += ". Of a robot that is driven by torque or current: gaponet identify --current"
+    return Finding("error", "copied", text, tuple(motions), {"rows": rows})
 
 
 def _moves_first(survey: Survey, joints: list[int]) -> bool:
@@ -310,10 +335,16 @@ def _labels(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
 
 CHECKS = (
     Check(
-        _command, "command", "commands are positions that the joints come near", may_be_error=True
+        _command,
+        "command",
+        "commands are positions that the joints come near",
+        may_be_error=True,
+        needs_commands=True,
     ),
-    Check(_order, "order", "", may_be_error=True),
-    Check(_sign, "sign", "no joint moves against its command", may_be_error=True),
+    Check(_order, "order", "", may_be_error=True, needs_commands=True),
+    Check(
+        _sign, "sign", "no joint moves against its command", may_be_error=True, needs_commands=True
+    ),
     Check(_copied, "copied", "no state comes before its command", may_be_error=True),
     Check(_unit, "unit", "", may_be_error=True),
     Check(_limits, "range", "commands and positions stay inside the joint ranges"),

@@ -1,0 +1,88 @@
+"""Is the command a copy of the state? Judged on the rows as they were logged: resampling hides copies.
+
+Converters write such tables: the command of a row is the recorded position of that row or of the next one. What was
+sent to the servos is then not in the log.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gaponet.base.arrays import Array
+from gaponet.data.log import Channel
+from gaponet.data.signals import encoder_step
+
+MAX_COPIED_ROWS = 3  # in both directions
+MIN_COPIED_CHANGES = 20  # of the command; fewer can be equal by chance
+FINE_STEPS = 10  # steps of the readings that a joint passes from row to row, from which chance repeats few of them
+# Share of the changes that a copy repeats. Rows may be missing. A stiff servo with a coarse encoder repeats most of a
+# slow motion.
+FINE_SHARE, COARSE_SHARE = 0.7, 0.99
+NO_DIGIT_RAD = 1.01e-6  # closer readings are the same one, in another precision
+
+
+def copied_rows(command: Channel, state: Channel) -> Array:
+    """Return by how many rows the state repeats the command, (n); 0: in the same row; NaN where it does not.
+
+    "Repeats" means to the last digit, or to the step of the coarser of both.
+
+    Args:
+        command: Commands (k, n); only those that differ from the one before are compared, since a joint at rest is
+            where it was told to be.
+        state: Positions (m, n) of the same joints, with any clock.
+    """
+    rows, nearest = _pairs(command.time, state.time)
+    inside = (nearest >= MAX_COPIED_ROWS) & (nearest < len(state.time) - MAX_COPIED_ROWS)
+    rows = rows[inside]
+    nearest = nearest[inside]
+    shifts = np.arange(-MAX_COPIED_ROWS, MAX_COPIED_ROWS + 1)
+    result = np.full(command.values.shape[1], np.nan)
+    if len(rows) <= MIN_COPIED_CHANGES:
+        return result
+    for joint in range(len(result)):
+        told = command.values[rows, joint].astype(float)
+        reading = state.values[:, joint].astype(float)
+        changes = np.flatnonzero(np.diff(told)) + 1
+        if len(changes) < MIN_COPIED_CHANGES:
+            continue
+        later = reading[nearest[changes][:, None] + shifts]  # (changes, shifts)
+        distance = np.abs(later - told[changes][:, None])
+        result[joint] = _shift(distance, shifts, told, reading)
+    return result
+
+
+def _pairs(command: Array, state: Array) -> tuple[Array, Array]:
+    """Return rows of the command, and the row of the state nearest in time to each; of the slower of both, each row."""
+    if len(command) == len(state) and np.array_equal(command, state):
+        rows = np.arange(len(command))
+        return rows, rows
+    if len(command) <= len(state):
+        return np.arange(len(command)), _nearest(state, command)
+    return _nearest(command, state), np.arange(len(state))
+
+
+def _nearest(time: Array, at: Array) -> Array:
+    """Return the row of `time` nearest to each instant of `at`."""
+    right = np.clip(np.searchsorted(time, at), 1, len(time) - 1)
+    before_is_nearer = at - time[right - 1] < time[right] - at
+    return right - before_is_nearer
+
+
+def _shift(distance: Array, shifts: Array, told: Array, reading: Array) -> float:
+    """Return the shift of one joint's copy; NaN if it is none. distance: (changes, shifts) rad."""
+    steps = [encoder_step([told]), encoder_step([reading])]
+    coarse = max(steps)
+    tolerance = NO_DIGIT_RAD
+    if min(steps) < 0.9 * coarse:  # one of them was rounded
+        tolerance = max(0.501 * coarse, NO_DIGIT_RAD)
+    equal = distance <= tolerance
+    passed = np.abs(np.diff(told))
+    usual_change = float(np.median(passed[passed > 0]))
+    if usual_change >= FINE_STEPS * coarse:
+        if equal.any(axis=1).mean() < FINE_SHARE:
+            return np.nan
+        return float(shifts[equal.sum(axis=0).argmax()])
+    share = equal.mean(axis=0)
+    if tolerance > NO_DIGIT_RAD or share.max() < COARSE_SHARE:
+        return np.nan
+    return float(shifts[share.argmax()])
