@@ -439,3 +439,27 @@ def test_a_feedforward_torque_in_the_file_of_the_commands_has_their_clock(tmp_pa
     ((_, log),) = read_logs(folder, arm)
     assert np.array_equal(log.channels["feedforward_torque"].values, TORQUES)
     assert np.array_equal(log.channels["feedforward_torque"].time, log.channels["ctrl"].time)
+
+
+@pytest.mark.parametrize(
+    ("factor", "name"), [(2.0, "real_time"), (0.6, "t_host"), (1.5e3, "elapsed_ms")]
+)
+def test_two_columns_that_run_like_clocks_at_other_rates_are_asked_about(
+    tmp_path, arm, factor, name
+):
+    columns = theirs()
+    folder = write(tmp_path / "logs", NAMES, columns=columns | {name: 100 + factor * columns["t"]})
+    with pytest.raises(LogError, match=f"t, 0.02 a row, and {name}"):
+        list(read_logs(folder, arm))
+    kind, known, found = look(folder)
+    assert "differ by a factor" in guess_logs(found, arm, kind, dict(known))
+    (folder / "logs.toml").write_text(UNITS + NAMES + f'ignore = ["{name}"]\n')
+    ((_, log),) = read_logs(folder, arm)
+    assert np.allclose(log.channels["qpos"].time, columns["t"])
+
+
+def test_a_second_clock_at_the_same_rate_and_a_counter_of_rows_are_no_question(tmp_path, arm):
+    columns = theirs()
+    columns |= {"stamp_ms": 7e9 + 1e3 * columns["t"], "frame": np.arange(60.0)}
+    ((_, log),) = read_logs(write(tmp_path / "logs", NAMES, columns=columns), arm)
+    assert log.channels["qpos"].time[-1] == pytest.approx(59 * 0.02)

@@ -14,6 +14,7 @@ from gaponet.robot.spec import RobotSpec
 
 MAX_JITTER = (0.1, 0.5)  # of a period, up to which jitter is ok and a note
 MIN_BLOCKED_S, MIN_STANDSTILL_S, MIN_REPEATED_S = 0.5, 1.0, 0.25
+MIN_COMMANDED_RAD = 0.1  # range of a command that moves a joint
 MAX_RESOLUTION_RAD = 3e-3  # step between positions; twice as much is a warning
 RESOLUTION_TOLERANCE = 0.02  # relative difference of an encoder's steps
 MIN_FLAT_ROWS, MIN_FLAT_SHARE = 20, 0.01  # of torque cut off at one value; of the torque limit
@@ -248,7 +249,7 @@ def _resolution(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
 def _stuck(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     """Does every channel change when it should?"""
     for i, name in enumerate(robot.joint_names):
-        moved = [s for s in surveys if s.ctrl_range[i] > 0.1]
+        moved = [s for s in surveys if s.ctrl_range[i] > MIN_COMMANDED_RAD]
         still = [
             s for s in moved if s.qpos_range[i] < 0.03 and s.qpos_range[i] < 0.05 * s.ctrl_range[i]
         ]
@@ -271,13 +272,20 @@ def _stuck(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
                 f"{_motions(repeated)}: it was not read; cut these logs there"
             )
             yield Finding("warning", "stuck", text, (name,))
-    frozen = [s for s in surveys if s.all_repeated_s > MIN_REPEATED_S]
+    frozen = [s for s in surveys if s.all_repeated_s > MIN_REPEATED_S and not _all_blocked(s)]
     if frozen:
         text = (
             f"the whole state repeats itself for up to {max(s.all_repeated_s for s in frozen):.2f} s while the command "
             f"moves in {_motions(frozen)}: samples were lost; cut the logs there"
         )
         yield Finding("warning", "stuck", text)
+
+
+def _all_blocked(survey: Survey) -> bool:
+    """True if every joint that is commanded ran into a stop, where an encoder with coarse steps repeats one number."""
+    commanded = survey.ctrl_range > MIN_COMMANDED_RAD
+    coarse = survey.resolution[commanded] > 0
+    return bool((coarse & (survey.blocked_s[commanded] > 0)).all())
 
 
 CHECKS = (

@@ -12,6 +12,7 @@ import numpy as np
 
 from gaponet.base.arrays import Array
 from gaponet.base.errors import JointMismatchError, LogError
+from gaponet.data.describe.clocks import MAX_RATE_DIFFERENCE, clock_periods, rate_ratio
 from gaponet.data.describe.plausibility import look_like_ticks
 from gaponet.data.describe.raw_recording import SECONDS, RawRecording
 from gaponet.data.log import FEEDFORWARD
@@ -186,7 +187,9 @@ def _clock(recording: RawRecording, specified: dict[str, Any]) -> list[str]:
     if "rate" in specified:
         return [f"rate = {specified['rate']:g}  # Hz"]
     named = [n for n, labels in recording.signals.items() if not labels]
-    clock = next((n for n in named if n == specified.get("time") or n.lower() in CLOCKS), None)
+    periods = clock_periods(recording)
+    known = [n for n in named if n == specified.get("time") or n.lower() in CLOCKS]
+    clock = next(iter([*known, *periods]), None)
     if clock is None:
         own = [n for n in list(recording.signals)[:1] if recording.load([n])[n].time is not None]
         return [] if own else ["rate = 50.0  # ? Hz: the log has no clock"]
@@ -196,6 +199,9 @@ def _clock(recording: RawRecording, specified: dict[str, Any]) -> list[str]:
     units = [u for u, s in SECONDS.items() if 5e-4 <= period * s <= 0.2]
     unit = units[0] if units else "s"
     lines = [] if clock == "time" else [f"time = {_text(clock)}"]
+    others = {name: other for name, other in periods.items() if name != clock}
+    if others and clock in periods:
+        lines = _which_clock(clock, periods[clock], others)
     uneven = (
         f"; uneven: {low * SECONDS[unit]:.3g} to {high * SECONDS[unit]:.3g} s"
         if high - low > 0.2 * period
@@ -204,6 +210,25 @@ def _clock(recording: RawRecording, specified: dict[str, Any]) -> list[str]:
     return [
         *lines,
         f'time_unit = "{unit}"  # the median period is {period * SECONDS[unit]:.6g} s{uneven}',
+    ]
+
+
+def _which_clock(clock: str, period: float, others: dict[str, float]) -> list[str]:
+    """Ask which of several columns is the clock. others: name → its distance of rows."""
+    apart = [
+        name
+        for name, other in others.items()
+        if abs(rate_ratio(period, other) - 1) > MAX_RATE_DIFFERENCE
+    ]
+    rates = "; ".join(f"{name} {other:.4g} a row" for name, other in others.items())
+    line = f"time = {_text(clock)}  # ? {period:.4g} a row; also like clocks: {rates}"
+    if not apart:
+        return [line]
+    factors = ", ".join(f"{rate_ratio(period, others[name]):.3g}" for name in apart)
+    return [
+        f"# {clock} and {', '.join(apart)} run like clocks and differ by a factor of {factors}: choose one",
+        f"# for time, and leave the other out: ignore = {json.dumps(apart)}",
+        line,
     ]
 
 

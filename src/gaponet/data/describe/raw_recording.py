@@ -15,6 +15,7 @@ import numpy as np
 from gaponet.base.arrays import Array
 from gaponet.base.errors import LogError, UsageError
 from gaponet.base.structure import validated
+from gaponet.data.describe.clocks import require_one_rate
 from gaponet.data.describe.joints import ignored, resolve_all
 from gaponet.data.describe.logs_file import HINT, LogsFile
 from gaponet.data.describe.plausibility import to_radians
@@ -136,6 +137,9 @@ class RawRecording:
             for joints in (*chosen.values(), *gains.values())
             for signal, _ in joints.values()
         }
+        for clock in {c for c in clocks.values() if c in self.signals}:
+            if "rate" not in specified:
+                require_one_rate(self, clock, list(own.values()), specified.get("ignore", ()))
         loaded = self.load(
             [*names, *{c for c in clocks.values() if c in self.signals and c not in names}]
         )
