@@ -80,12 +80,23 @@ def _copies(sequence: Sequence) -> list[int | None]:
     return copies or [None]
 
 
+def _what_torque_tells(data: Dataset, first: Sequence) -> str:
+    if first.tau is None:
+        return (
+            "Log what the servos were sent. This log also has no torque of every operated joint, as of a robot that "
+            "is driven by torque; if it was recorded, say its column as tau in logs.toml"
+        )
+    return (
+        f"If the robot is driven by torque, gaponet identify {data.path} --out ROBOT fits its friction, inertia and "
+        "delay, and says how far it is"
+    )
+
+
 def require_commands(data: Dataset) -> None:
     """Refuse recordings without commanded positions."""
     first = data.read(data.entries[0]) if data.entries else None
     if first is not None and set(_copies(first)) == {0}:
         raise UsageError(
             f"{data.path}: no position was commanded, so there is nothing to follow: command and state are the same "
-            f"numbers. If the robot is driven by torque, gaponet identify {data.path} --out ROBOT fits its friction, "
-            "inertia and delay, and says how far it is"
+            f"numbers. {_what_torque_tells(data, first)}"
         )

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
 from gaponet.base.errors import LogError
 from gaponet.data.describe.joints import ignored
-
-if TYPE_CHECKING:
-    from gaponet.data.describe.raw_recording import RawRecording
 
 CLOCK_WORDS = {
     "t", "ts", "time", "timestamp", "timestamps", "stamp", "clock", "elapsed", "uptime", "epoch", "wall", "tick",
@@ -27,14 +24,20 @@ MAX_RATE_DIFFERENCE = (
 )
 
 
-def clock_periods(recording: RawRecording) -> dict[str, float]:
-    """Return the columns that run like clocks → mean distance of their rows, in the column's own unit."""
+def clock_periods(
+    signals: Mapping[str, Sequence[str]], load: Callable[[list[str]], dict[str, Any]]
+) -> dict[str, float]:
+    """Return the columns that run like clocks → mean distance of their rows, in the column's own unit.
+
+    Args:
+        signals, load: Of a RawRecording.
+    """
     periods = {}
-    for name, labels in recording.signals.items():
+    for name, labels in signals.items():
         if labels or not named_like_a_clock(name):
             continue
         try:
-            values = recording.load([name])[name].values[:ROWS]
+            values = load([name])[name].values[:ROWS]
         except LogError:  # text
             continue
         if len(values) >= MIN_ROWS and np.isfinite(values).all() and _runs(values):
@@ -66,28 +69,29 @@ def rate_ratio(period: float, other: float) -> float:
 
 
 def require_one_rate(
-    recording: RawRecording, clock: str, others: Sequence[str], ignore: Sequence[str]
+    periods: dict[str, float], clock: str, used: Sequence[str], ignore: Sequence[str], where: str
 ) -> None:
     """Refuse a clock that another column contradicts.
 
     Args:
+        periods: Of clock_periods.
         clock: The column that is taken.
-        others: Clocks that logs.toml names for single channels.
+        used: Clocks that logs.toml names for single channels.
         ignore: Patterns of columns that logs.toml leaves out.
+        where: File, for the error.
 
     Raises:
         LogError: Another column runs like a clock, at another rate.
     """
-    periods = clock_periods(recording)
     if clock not in periods:
         return
     for other, period in periods.items():
-        if other == clock or other in others or ignored(other, ignore):
+        if other == clock or other in used or ignored(other, ignore):
             continue
         ratio = rate_ratio(periods[clock], period)
         if abs(ratio - 1) > MAX_RATE_DIFFERENCE:
             raise LogError(
-                f"{recording.where or recording.source}: two columns run like clocks and contradict each other: "
+                f"{where}: two columns run like clocks and contradict each other: "
                 f"{clock}, {periods[clock]:.4g} a row, and {other}, {period:.4g} a row, {ratio:.3g} times as much. A "
                 "lag measured with the wrong one is wrong by this factor. Say which is right in logs.toml: "
                 f'time = "{clock}" and ignore = ["{other}"], or time = "{other}" and ignore = ["{clock}"]'

@@ -187,7 +187,7 @@ def _clock(recording: RawRecording, specified: dict[str, Any]) -> list[str]:
     if "rate" in specified:
         return [f"rate = {specified['rate']:g}  # Hz"]
     named = [n for n, labels in recording.signals.items() if not labels]
-    periods = clock_periods(recording)
+    periods = clock_periods(recording.signals, recording.load)
     known = [n for n in named if n == specified.get("time") or n.lower() in CLOCKS]
     clock = next(iter([*known, *periods]), None)
     if clock is None:

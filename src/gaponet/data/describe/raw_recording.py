@@ -15,7 +15,7 @@ import numpy as np
 from gaponet.base.arrays import Array
 from gaponet.base.errors import LogError, UsageError
 from gaponet.base.structure import validated
-from gaponet.data.describe.clocks import require_one_rate
+from gaponet.data.describe.clocks import clock_periods, require_one_rate
 from gaponet.data.describe.joints import ignored, resolve_all
 from gaponet.data.describe.logs_file import HINT, LogsFile
 from gaponet.data.describe.plausibility import to_radians
@@ -137,9 +137,7 @@ class RawRecording:
             for joints in (*chosen.values(), *gains.values())
             for signal, _ in joints.values()
         }
-        for clock in {c for c in clocks.values() if c in self.signals}:
-            if "rate" not in specified:
-                require_one_rate(self, clock, list(own.values()), specified.get("ignore", ()))
+        self._require_one_clock(clocks, specified)
         loaded = self.load(
             [*names, *{c for c in clocks.values() if c in self.signals and c not in names}]
         )
@@ -176,6 +174,17 @@ class RawRecording:
                 "converted_from": {j: u for j, u in zip(joints, in_units, strict=True) if u != "rad"},
             },
         )  # fmt: skip
+
+    def _require_one_clock(self, clocks: dict[str, str | None], specified: LogsFile) -> None:
+        """Refuse clocks of channels that another column contradicts."""
+        chosen = {clock for clock in clocks.values() if clock in self.signals}
+        if "rate" in specified or not chosen:
+            return
+        periods = clock_periods(self.signals, self.load)
+        used = list(specified.get("clock", {}).values())
+        for clock in sorted(filter(None, chosen)):
+            where = self.where or self.source
+            require_one_rate(periods, clock, used, specified.get("ignore", ()), where)
 
 
 def restated(specified: Any, where: str) -> dict[str, Any]:
