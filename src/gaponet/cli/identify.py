@@ -80,7 +80,7 @@ def identify(
     screen.result(made.to_dict())
 
 
-def _refuse_current_beside_commands(dataset: Source, by_torque: bool) -> None:
+def _refuse_current_beside_commands(dataset: Path, by_torque: bool) -> None:
     if not by_torque:
         raise UsageError(
             f"--current is for a robot that is driven by torque or current, and {dataset} holds position commands "
