@@ -29,7 +29,7 @@ def test_a_value_that_is_not_finite_is_named_by_file_line_and_joint():
     values = VALUES.copy()
     values[1, 1] = np.nan
     with pytest.raises(
-        LogError, match=r"state\.csv:3: qpos of b is not finite; repair or cut the row"
+        LogError, match=r"state\.csv:3: qpos of b is empty or not finite"
     ):
         log(qpos=Channel(TIME, values))
 

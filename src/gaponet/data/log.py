@@ -119,14 +119,13 @@ class Log:
             )
         bad = np.flatnonzero(~np.isfinite(values).all(axis=1) | ~np.isfinite(time))
         if bad.size:
-            joint = (
-                int(np.flatnonzero(~np.isfinite(values[bad[0]]))[0])
-                if np.isfinite(time[bad[0]])
-                else 0
-            )
+            row = int(bad[0])
+            what = "time"
+            if np.isfinite(time[row]):
+                joint = int(np.flatnonzero(~np.isfinite(values[row]))[0])
+                what = f"{name} of {self.joint_names[joint]}"
             raise LogError(
-                f"{self.row(name, int(bad[0]))}: {name} of {self.joint_names[joint]} is not finite; "
-                "repair or cut the row"
+                f"{self.row(name, row)}: {what} is empty or not finite; repair or cut the row (--skip-bad does)"
             )
         back = np.flatnonzero(np.diff(time) <= 0)
         if back.size:

@@ -9,11 +9,13 @@ import numpy as np
 
 from gaponet.data.checks.check import Check
 from gaponet.data.checks.survey import Survey, Torque
+from gaponet.data.log import COMMANDS
 from gaponet.robot.finding import Finding, abbreviate, masked_names
 from gaponet.robot.spec import RobotSpec
 
 MAX_JITTER = (0.1, 0.5)  # of a period, up to which jitter is ok and a note
 MIN_BLOCKED_S, MIN_STANDSTILL_S, MIN_REPEATED_S = 0.5, 1.0, 0.25
+MAX_CUT_SHARE = 0.02  # of the rows that are left, from which cut rows are told
 MIN_COMMANDED_RAD = 0.1  # range of a command that moves a joint
 MAX_RESOLUTION_RAD = 3e-3  # step between positions; twice as much is a warning
 RESOLUTION_TOLERANCE = 0.02  # relative difference of an encoder's steps
@@ -135,6 +137,50 @@ def _repeated_rows(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]
         "twice, and they were left out at import"
     )
     yield Finding("note", "repeated", text, values={"rows": rows})
+
+
+def _as_logged(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
+    """What was held, left out, continued or cut at import?"""
+    for key, of_channel in (("slower", _slower), ("absent", _absent), ("turns", _turns)):
+        hit = [s for s in surveys if key in s.entry.meta.notes]
+        names = dict.fromkeys(name for s in hit for name in s.entry.meta.notes[key])
+        for name in names:
+            yield of_channel(name, [s for s in hit if name in s.entry.meta.notes[key]])
+    cut = [
+        s for s in surveys if s.entry.meta.notes.get("rows_cut", 0) > MAX_CUT_SHARE * s.entry.rows
+    ]
+    if cut:
+        rows = sum(s.entry.meta.notes["rows_cut"] for s in cut)
+        text = (
+            f"--skip-bad cut {rows} rows of {_motions(cut)}, and left {sum(s.entry.rows for s in cut)}: what moved "
+            "there is interpolated. Look at the lines that import listed, and repair their cause"
+        )
+        yield Finding("warning", "cut", text, values={"rows": rows})
+
+
+def _slower(channel: str, hit: list[Survey]) -> Finding:
+    notes = [s.entry.meta.notes["slower"][channel] for s in hit]
+    filled = "held" if channel in COMMANDS else "interpolated"
+    rows = sum(n["rows"] for n in notes)
+    text = (
+        f"{channel} stands in {rows} of {sum(n['of'] for n in notes)} rows of {_motions(hit)}: it is {filled} between "
+        "them"
+    )
+    return Finding("note", "slower", text)
+
+
+def _absent(channel: str, hit: list[Survey]) -> Finding:
+    joints = tuple(dict.fromkeys(j for s in hit for j in s.entry.meta.notes["absent"][channel]))
+    text = f"{channel} of {abbreviate(list(joints))} is empty in all rows of {_motions(hit)}: {channel} is left out"
+    return Finding("note", "absent", text, joints)
+
+
+def _turns(joint: str, hit: list[Survey]) -> Finding:
+    notes = [s.entry.meta.notes["turns"][joint] for s in hit]
+    text = f"{joint} turns on: {sum(n['wraps'] for n in notes)} jumps by a whole turn in {_motions(hit)} were continued"
+    if any(n["turns"] for n in notes):
+        text += ", and its state was moved by whole turns to its command"
+    return Finding("note", "turns", text, (joint,))
 
 
 def _blocked(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
@@ -293,6 +339,7 @@ CHECKS = (
     Check(_regularity, "jitter", ""),
     Check(_jumps, "jumps", "no joint jumps"),
     Check(_nonsense, "nonsense", "no value is implausible"),
+    Check(_as_logged, "as logged", "no channel was empty, and no row was cut"),
     Check(_repeated_rows, "repeated", "no row was written twice"),
     Check(_blocked, "blocked", "no joint ran into a stop", needs_commands=True),
     Check(_saturation, "saturation", ""),

@@ -193,9 +193,8 @@ def _clock(recording: RawRecording, specified: dict[str, Any]) -> list[str]:
     if clock is None:
         own = [n for n in list(recording.signals)[:1] if recording.load([n])[n].time is not None]
         return [] if own else ["rate = 50.0  # ? Hz: the log has no clock"]
-    low, period, high = np.percentile(
-        np.diff(recording.load([clock])[clock].values[:ROWS]), [5, 50, 95]
-    )
+    signal = recording.load([clock])[clock]
+    low, period, high = np.percentile(np.diff(signal.values[:ROWS]), [5, 50, 95])
     units = [u for u, s in SECONDS.items() if 5e-4 <= period * s <= 0.2]
     unit = units[0] if units else "s"
     lines = [] if clock == "time" else [f"time = {_text(clock)}"]

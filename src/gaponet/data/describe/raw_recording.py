@@ -19,6 +19,7 @@ from gaponet.data.describe.clocks import clock_periods, require_one_rate
 from gaponet.data.describe.joints import ignored, resolve_all
 from gaponet.data.describe.logs_file import HINT, LogsFile
 from gaponet.data.describe.plausibility import to_radians
+from gaponet.data.describe.slow_channels import sampled_channels
 from gaponet.data.log import CHANNELS, COMMANDS, DERIVED, FEEDFORWARD, REQUIRED, Channel, Log
 from gaponet.data.sequence import SequenceMeta
 from gaponet.robot.spec import LOG_UNITS, RobotSpec
@@ -35,10 +36,14 @@ NO_COMMANDS = (
 
 
 class Signal(NamedTuple):
-    """values (k,) or (k, n); time (k,) s where the signal has a clock of its own."""
+    """values (k,) or (k, n); time (k,) s where the signal has a clock of its own.
+
+    in_seconds: A clock that was written as dates, whose unit nobody has to state.
+    """
 
     values: Array
     time: Array | None = None
+    in_seconds: bool = False
 
 
 @dataclass(frozen=True)
@@ -126,7 +131,6 @@ class RawRecording:
             raise LogError(
                 f"{self.where or self.source}: no column holds {FEEDFORWARD}; there are: {self.shown()}"
             )
-        units = _units(robot, specified, list(chosen["ctrl"]), joint_map)
         own: dict[Any, str] = specified.get("clock", {})
         clocks = {channel: own.get(channel) or specified.get("time") for channel in chosen}
         gains = {
@@ -141,6 +145,9 @@ class RawRecording:
         loaded = self.load(
             [*names, *{c for c in clocks.values() if c in self.signals and c not in names}]
         )
+        if any(loaded[c].in_seconds for c in clocks.values() if c in loaded):
+            specified = LogsFile(time_unit="s") | specified
+        units = _units(robot, specified, list(chosen["ctrl"]), joint_map)
         times = {
             channel: _time(self, specified, loaded, clocks[channel], channel, chosen[channel])
             for channel in chosen
@@ -155,11 +162,14 @@ class RawRecording:
             channels[channel] = Channel(
                 times[channel], to_radians(channel, values, joints, in_units, robot)
             )
+        channels, empty = sampled_channels(channels, joints, self.where or self.source)
         start = min((float(c.time[0]) for c in channels.values() if len(c.time)), default=0.0)
         shifted = {
             id(c.time): c.time - start for c in channels.values()
         }  # epoch nanoseconds would lose their digits
         meta = dict(self.meta)
+        if empty:
+            meta["notes"] = meta.get("notes", {}) | empty
         for name, columns in gains.items():
             if columns:
                 meta[name] = [_constant(self, name, _column(loaded, *columns[j])) for j in joints]
@@ -442,6 +452,8 @@ def _time(
         raise LogError(
             f"{where}: clock '{clock}' has shape {time.shape}, {channel} {len(own.values)} rows"
         )
+    if loaded[clock].in_seconds:
+        return time
     return time * SECONDS[specified.get("time_unit", "s")]
 
 

@@ -40,6 +40,7 @@ from gaponet.data.describe.logs_file import LogsFile, Naming, read_logs_file
 from gaponet.data.describe.plausibility import require_plausible
 from gaponet.data.describe.raw_recording import COMMAND, RawRecording
 from gaponet.data.describe.repeats import without_repeated_rows
+from gaponet.data.describe.turns import continued_turns
 from gaponet.data.log import COMMANDS, Channel, Log, skipped_rows
 from gaponet.robot.spec import RobotSpec
 
@@ -167,6 +168,7 @@ def read_logs(
         try:
             log = _corrected(require_plausible(load(), robot, strict), robot, specified, names)
             log = without_repeated_rows(log)  # after the checks, which name lines of the file
+            log = continued_turns(log, robot)
         except LogError as error:
             if bad is None:
                 raise

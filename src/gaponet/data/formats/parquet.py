@@ -28,6 +28,37 @@ def header(file: Path) -> tuple[list[str], dict[str, str]]:
 
 
 @sandboxed(LogError, "pyarrow.parquet")
+def list_widths(file: Path) -> dict[str, int]:
+    """Columns whose cells are lists of numbers → how many numbers the first cell holds."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    with reading(file, "Parquet file"):
+        schema = pq.read_schema(file)
+        lists = [
+            field.name
+            for field in schema
+            if pa.types.is_list(field.type)
+            or pa.types.is_fixed_size_list(field.type)
+            or pa.types.is_large_list(field.type)
+        ]
+        numbers = [name for name in lists if _holds_numbers(schema.field(name).type)]
+        if not numbers:
+            return {}
+        first = next(pq.ParquetFile(file).iter_batches(1, columns=numbers, use_threads=False), None)
+        if first is None:
+            return {}
+        cells = {name: first.column(name)[0].as_py() for name in numbers}
+        return {name: len(cell) for name, cell in cells.items() if cell}
+
+
+def _holds_numbers(kind: pa.DataType) -> bool:
+    import pyarrow as pa
+
+    return bool(pa.types.is_integer(kind.value_type) or pa.types.is_floating(kind.value_type))
+
+
+@sandboxed(LogError, "pyarrow.parquet")
 def read(file: Path, wanted: list[str]) -> pa.Table:
     """These columns.
 

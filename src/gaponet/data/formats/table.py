@@ -13,21 +13,28 @@ import re
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from gaponet.base.arrays import Array
 from gaponet.base.errors import LogError
 from gaponet.base.structure import MAX_ARRAYS_BYTES, read_limited
 from gaponet.data.describe.logs_file import LogsFile
 from gaponet.data.describe.raw_recording import RawRecording, Signal, require_content
 from gaponet.data.formats import files_under, joint_rows, parquet
+from gaponet.data.formats.dates import is_date, to_seconds
 from gaponet.data.log import CHANNELS, skipped_rows
+
+if TYPE_CHECKING:
+    import pyarrow as pa
 
 SUFFIXES = (".csv", ".tsv", ".txt", ".dat", ".parquet")
 NOT_OURS = ("control.csv", "state_motor.csv", "event.csv", "joint_list.txt")  # of SAGE folders
 # metadata of a table that is no data, and why (hw/control/recording.py)
 NOT_OBEYED = "gaponet.not_obeyed"
 DECIMAL_SAMPLE_BYTES = 20_000  # of the first rows, by which decimal commas are told
+EMPTY = ("", "nan", "NaN", "NA", "N/A", "null", "None")  # cells without a number
 DEFAULT: LogsFile = {"time": "time"} | {c: c + ".{joint}" for c in CHANNELS}  # type: ignore[assignment]
 
 
@@ -59,8 +66,11 @@ def recordings(path: Path, specified: LogsFile) -> Iterator[RawRecording]:
         )
     for file in files:
         line = 1
+        signals: dict[str, tuple[str, ...]] = {}
         if file.suffix.lower() == ".parquet":
             names, load = _parquet_header(file), partial(_read_parquet, file)
+            lists = parquet.list_widths(file).items()
+            signals = {name: tuple(map(str, range(width))) for name, width in lists}
         else:
             names, first = _csv_header(file, specified.get("header"))
             load, line = partial(_read_csv, file, names, first), first + 1
@@ -70,7 +80,13 @@ def recordings(path: Path, specified: LogsFile) -> Iterator[RawRecording]:
             yield joint_rows.recording(file, names, joint, specified)
             continue
         yield RawRecording(
-            file.stem, str(file), dict.fromkeys(names, ()), load, f"{file}:1", (str(file),), line
+            file.stem,
+            str(file),
+            dict.fromkeys(names, ()) | signals,
+            load,
+            f"{file}:1",
+            (str(file),),
+            line,
         )
 
 
@@ -120,7 +136,8 @@ def _has_decimal_commas(body: bytes, delimiter: str) -> bool:
 def _numeric(cells: list[str]) -> bool:
     """Return True if all cells are numbers, with a decimal point or a decimal comma."""
     try:
-        return bool([float(cell.replace(",", ".")) for cell in cells if cell.strip()])
+        numbers = [cell for cell in cells if cell.strip() and not is_date(cell)]
+        return bool([float(cell.replace(",", ".")) for cell in numbers])
     except ValueError:
         return False
 
@@ -151,7 +168,7 @@ def _csv_header(file: Path, given: list[str] | None) -> tuple[list[str], int]:
 
 
 def _read_csv(file: Path, names: list[str], first: int, wanted: list[str]) -> dict[str, Signal]:
-    """{column: (k,)}; a short, empty or unreadable cell is refused with its line, or is NaN where rows are cut."""
+    """{column: (k,)}; an empty cell is NaN, a short row or an unreadable cell too where rows are cut, else refused."""
     import pyarrow as pa
     import pyarrow.csv as pc
 
@@ -167,6 +184,7 @@ def _read_csv(file: Path, names: list[str], first: int, wanted: list[str]) -> di
         without_margins = re.sub(rb"(?m)^[ \t]+|[ \t\r]+$", b"", body)
         body = re.sub(rb"[ \t]+", b",", without_margins)
         delimiter = ","
+    dates = _date_columns(body, names, wanted, delimiter)
     try:
         table = pc.read_csv(
             pa.py_buffer(body),
@@ -174,23 +192,36 @@ def _read_csv(file: Path, names: list[str], first: int, wanted: list[str]) -> di
             parse_options=pc.ParseOptions(ignore_empty_lines=False, delimiter=delimiter),
             convert_options=pc.ConvertOptions(
                 include_columns=wanted,
-                column_types=dict.fromkeys(wanted, pa.float64()),
-                null_values=[""],
+                column_types=dict.fromkeys(wanted, pa.float64())
+                | dict.fromkeys(dates, pa.string()),
+                null_values=list(EMPTY),
                 decimal_point="," if _has_decimal_commas(body, delimiter) else ".",
             ),
         )
-        whole = not any(table.column(name).null_count for name in wanted)
-        reason = ""
+        return {name: _signal(file, table.column(name), name in dates) for name in wanted}
     except pa.ArrowInvalid as error:
-        whole, reason = False, str(error)
-    if whole:
-        return {name: Signal(table.column(name).to_numpy()) for name in wanted}
+        reason = str(error)
     rows = _read_slowly(file, body.decode("utf-8", "replace"), names, wanted, delimiter, first)
     if not rows:
         raise LogError(f"{file}: not a readable CSV file ({reason}); export it again")
     return {
         name: Signal(column) for name, column in zip(wanted, np.array(rows, float).T, strict=True)
     }
+
+
+def _date_columns(body: bytes, names: list[str], wanted: list[str], delimiter: str) -> list[str]:
+    """Return the wanted columns whose first cell is a date and time."""
+    line = body.partition(b"\n")[0].decode("utf-8", "replace")
+    cells = next(csv.reader([line], delimiter=delimiter), [])
+    if len(cells) != len(names):
+        return []
+    return [name for name in wanted if is_date(cells[names.index(name)])]
+
+
+def _signal(file: Path, column: pa.ChunkedArray, dates: bool) -> Signal:
+    if dates:
+        return Signal(to_seconds(column.to_pylist(), str(file)), in_seconds=True)
+    return Signal(column.to_numpy())
 
 
 def _read_slowly(
@@ -222,7 +253,7 @@ def _number(row: list[str], place: int, names: list[str], name: str) -> float:
             f"{len(row)} cells, the header has {len(names)}; the file may be cut short"
         )
     try:
-        return float(row[place])
+        return np.nan if row[place].strip() in EMPTY else float(row[place])
     except ValueError:
         raise ValueError(f"column '{name}' is '{row[place][:60]}', not a number") from None
 
@@ -237,17 +268,37 @@ def _parquet_header(file: Path) -> list[str]:
 
 
 def _read_parquet(file: Path, wanted: list[str]) -> dict[str, Signal]:
-    """{column: (k,)}; an empty cell is refused with its row, counted from 1."""
+    """{column: (k,)}; an empty cell is NaN."""
+    import pyarrow as pa
+
     table = parquet.read(file, wanted)
+    widths = parquet.list_widths(file)
     data: dict[str, Signal] = {}
     for name in wanted:
         column = table.column(name)
+        if pa.types.is_timestamp(column.type):
+            at_ns = column.cast(pa.timestamp("ns")).cast(pa.int64()).to_numpy()
+            data[name] = Signal(1e-9 * (at_ns - at_ns[0]), in_seconds=True)
+            continue
+        if pa.types.is_string(column.type) and is_date(column[0].as_py() or ""):
+            data[name] = _signal(file, column, dates=True)
+            continue
+        if name in widths:
+            data[name] = Signal(_matrix(file, name, column, widths[name]))
+            continue
         if not joint_rows.is_number(column.type):
             raise LogError(
                 f"{file}: column '{name}' is {column.type}, not numbers; export it as float64"
             )
-        if column.null_count and skipped_rows() is None:
-            row = int(column.is_null().to_numpy().argmax()) + 1
-            raise LogError(f"{file}:{row}: column '{name}' is empty; repair or cut the row")
         data[name] = Signal(column.to_numpy().astype(float))
     return data
+
+
+def _matrix(file: Path, name: str, column: pa.ChunkedArray, width: int) -> Array:
+    """Return a column of lists as (k, width); refuses lists of other lengths."""
+    lists = column.combine_chunks()
+    if lists.null_count or any(len(cell) != width for cell in lists):
+        raise LogError(
+            f"{file}: the lists in column '{name}' are not all {width} numbers long; repair or cut the rows"
+        )
+    return np.asarray(lists.flatten().to_numpy(zero_copy_only=False), float).reshape(-1, width)

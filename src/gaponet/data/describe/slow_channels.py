@@ -1,0 +1,76 @@
+"""Channels that were sampled more slowly than their table has rows: empty cells between their samples."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from gaponet.base.arrays import Array
+from gaponet.base.errors import LogError
+from gaponet.data.log import COMMANDS, REQUIRED, Channel
+
+MIN_EMPTY_SHARE = 0.2  # of the rows; fewer empty cells are bad rows
+
+
+def sampled_channels(
+    channels: dict[str, Channel], joints: tuple[str, ...], where: str
+) -> tuple[dict[str, Channel], dict[str, Any]]:
+    """Return channels with the rows in which they were sampled, and notes of what was empty.
+
+    Empty cells are NaN. A command that stands in every fifth row is held until the next one. Torque, velocity or
+    temperature that is empty in all rows is left out.
+
+    Raises:
+        LogError: Command or position of a joint is empty in all rows.
+    """
+    sampled: dict[str, Channel] = {}
+    slower: dict[str, Any] = {}
+    absent: dict[str, Any] = {}
+    for name, channel in channels.items():
+        present = np.isfinite(channel.values)
+        empty = [
+            joint for joint, any_row in zip(joints, present.any(axis=0), strict=True) if not any_row
+        ]
+        if empty and name in REQUIRED:
+            names = ", ".join(f'"{joint}"' for joint in empty)
+            raise LogError(
+                f"{where}: {name} of {', '.join(empty)} is empty in all rows; leave out what was not recorded: "
+                f"ignore = [{names}] in logs.toml"
+            )
+        if empty:
+            absent[name] = empty
+            continue
+        sampled[name] = _sampled(name, channel, present)
+        if len(sampled[name].time) < len(channel.time):
+            slower[name] = {"rows": len(sampled[name].time), "of": len(channel.time)}
+    notes = {"slower": slower, "absent": absent}
+    return sampled, {key: value for key, value in notes.items() if value}
+
+
+def _sampled(name: str, channel: Channel, present: Array) -> Channel:
+    """Return the rows with samples. present: (k, n) bool."""
+    some = present.any(axis=1)
+    partial = some & ~present.all(axis=1)
+    if (~present).mean() < MIN_EMPTY_SHARE:
+        return channel
+    time = channel.time[some]
+    values = channel.values[some]
+    if partial.mean() < MIN_EMPTY_SHARE:
+        return Channel(time, values)
+    columns = [
+        _between_samples(name, time, values[:, j], present[some, j]) for j in range(values.shape[1])
+    ]
+    joined = np.stack(columns, axis=1)
+    known = np.isfinite(joined).all(axis=1)
+    return Channel(time[known], joined[known])
+
+
+def _between_samples(name: str, time: Array, values: Array, present: Array) -> Array:
+    """Return one joint's values in all rows: commands held, states interpolated; NaN before the first sample."""
+    samples = np.flatnonzero(present)
+    if name in COMMANDS:
+        last = np.searchsorted(samples, np.arange(len(values)), side="right") - 1
+        return np.where(last >= 0, values[samples[np.maximum(last, 0)]], np.nan)
+    nan = float("nan")
+    return np.interp(time, time[samples], values[samples], left=nan, right=nan)

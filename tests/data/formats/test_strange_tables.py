@@ -1,0 +1,144 @@
+"""Tables as people have them: slow commands, empty channels, dates, lists in cells, joints that turn on."""
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from arm import TOML, XML, write_arm
+from logs import arm_columns, table_text
+
+from gaponet.base.errors import LogError
+from gaponet.data.formats import read_logs
+
+SI = {"position_unit": "rad", "time_unit": "s"}
+ROWS = 200
+JOINTS = ("shoulder", "elbow")
+
+
+def cells(columns):
+    """CSV with empty cells for NaN."""
+    return table_text(columns).replace("nan", "")
+
+
+def only(path, robot, **options):
+    ((_, log),) = read_logs(path, robot, **options)
+    return log
+
+
+@pytest.mark.parametrize("every", [2, 5, 9])
+def test_a_command_that_is_slower_than_the_state_is_held(tmp_path, arm, every):
+    columns = arm_columns(ROWS)
+    told = np.arange(ROWS) % every == 0
+    for joint in JOINTS:
+        columns[f"ctrl.{joint}"] = np.where(told, columns[f"ctrl.{joint}"], np.nan)
+    (tmp_path / "m.csv").write_text(cells(columns))
+    log = only(tmp_path / "m.csv", arm, **SI)
+    assert np.allclose(log.channels["ctrl"].time, columns["time"][told])
+    assert len(log.channels["qpos"].time) == ROWS
+    assert log.meta["notes"]["slower"]["ctrl"] == {"rows": told.sum(), "of": ROWS}
+
+
+def test_commands_of_joints_that_come_in_turn_are_held_each(tmp_path, arm):
+    columns = arm_columns(ROWS)
+    sent = [columns[f"ctrl.{joint}"] for joint in JOINTS]
+    for j, joint in enumerate(JOINTS):
+        mine = np.arange(ROWS) % 2 == j
+        columns[f"ctrl.{joint}"] = np.where(mine, columns[f"ctrl.{joint}"], np.nan)
+    (tmp_path / "m.csv").write_text(cells(columns))
+    ctrl = only(tmp_path / "m.csv", arm, **SI).channels["ctrl"].values
+    rows = np.arange(1, ROWS)  # the elbow was told nothing in row 0
+    assert np.array_equal(ctrl[:, 0], sent[0][rows - rows % 2])
+    assert np.array_equal(ctrl[:, 1], sent[1][rows - 1 + rows % 2])
+
+
+def test_one_empty_cell_is_a_bad_row(tmp_path, arm):
+    columns = arm_columns(ROWS)
+    columns["ctrl.elbow"][50] = np.nan
+    (tmp_path / "m.csv").write_text(cells(columns))
+    with pytest.raises(LogError, match=r"m\.csv:52: ctrl of elbow"):
+        only(tmp_path / "m.csv", arm, **SI)
+
+
+def test_a_torque_that_is_never_there_is_left_out(tmp_path, arm):
+    columns = arm_columns(ROWS) | {f"tau.{joint}": np.full(ROWS, np.nan) for joint in JOINTS}
+    (tmp_path / "m.csv").write_text(table_text(columns))
+    log = only(tmp_path / "m.csv", arm, **SI)
+    assert "tau" not in log.channels
+    assert log.meta["notes"]["absent"] == {"tau": list(JOINTS)}
+
+
+@pytest.mark.parametrize(
+    "form",
+    ["%Y-%m-%dT%H:%M:%S.%fZ", "%Y-%m-%d %H:%M:%S.%f+02:00", "%Y-%m-%d %H:%M:%S.%f", "%H:%M:%S.%f"],
+)
+@pytest.mark.parametrize("kind", ["csv", "parquet"])
+def test_a_clock_of_dates_needs_no_unit(tmp_path, arm, form, kind):
+    columns = arm_columns(ROWS)
+    start = np.datetime64("2026-03-01T23:59:58")
+    at = start + (1e6 * columns.pop("time")).round().astype("timedelta64[us]")
+    text = [moment.item().strftime(form) for moment in at]
+    if kind == "parquet":
+        arrays = {"time": pa.array(text)} | {k: pa.array(v) for k, v in columns.items()}
+        pq.write_table(pa.table(arrays), tmp_path / "m.parquet")
+    else:
+        lines = table_text(columns).splitlines()
+        rows = [f"{a},{row}" for a, row in zip(["time", *text], lines, strict=True)]
+        (tmp_path / "m.csv").write_text("\n".join(rows) + "\n")
+    log = only(tmp_path / f"m.{kind}", arm, position_unit="rad")
+    assert np.allclose(log.channels["qpos"].time, 0.02 * np.arange(ROWS), atol=2e-6)
+
+
+def test_typed_dates_of_parquet_need_no_unit(tmp_path, arm):
+    columns = arm_columns(ROWS)
+    at = np.datetime64("2026-03-01") + (1e9 * columns.pop("time")).round().astype("timedelta64[ns]")
+    arrays = {"time": pa.array(at)} | {k: pa.array(v) for k, v in columns.items()}
+    pq.write_table(pa.table(arrays), tmp_path / "m.parquet")
+    log = only(tmp_path / "m.parquet", arm, position_unit="rad")
+    assert np.allclose(log.channels["qpos"].time, 0.02 * np.arange(ROWS), atol=2e-6)
+
+
+def test_lists_in_parquet_cells_are_arrays(tmp_path, arm):
+    columns = arm_columns(ROWS)
+    action, state = (
+        np.stack([columns[f"{name}.{joint}"] for joint in JOINTS], axis=1)
+        for name in ("ctrl", "qpos")
+    )
+    pq.write_table(
+        pa.table({
+            "timestamp": pa.array(columns["time"]),
+            "action": pa.array(action.tolist()),
+            "observation.state": pa.FixedSizeListArray.from_arrays(pa.array(state.ravel()), 2),
+        }),
+        tmp_path / "m.parquet",
+    )  # fmt: skip
+    (tmp_path / "logs.toml").write_text(
+        'time = "timestamp"\ntime_unit = "s"\nposition_unit = "rad"\nctrl = "action"\n'
+        'qpos = "observation.state"\njoints = ["shoulder", "elbow"]\n'
+    )
+    log = only(tmp_path, arm)
+    assert np.array_equal(log.channels["ctrl"].values, action)
+    assert np.array_equal(log.channels["qpos"].values, state)
+
+
+@pytest.mark.parametrize("turns", [0, 1, -3])
+@pytest.mark.parametrize("wrapped", [("qpos",), ("ctrl",), ("ctrl", "qpos")])
+def test_a_joint_that_turns_on_is_continued_beside_its_command(tmp_path, wrapped, turns):
+    robot = write_arm(
+        tmp_path / "arm",
+        TOML,
+        XML.replace(
+            'name="shoulder" axis="0 1 0" range="-1.5 1.5"', 'name="shoulder" axis="0 1 0"'
+        ),
+    )
+    columns = arm_columns(ROWS)
+    true = {
+        name: 2.9 + columns[f"{name}.shoulder"] + 2 * columns["time"] for name in ("ctrl", "qpos")
+    }
+    for name, values in true.items():
+        shown = (values + np.pi) % (2 * np.pi) - np.pi if name in wrapped else values
+        columns[f"{name}.shoulder"] = shown + 2 * np.pi * turns * (name == "qpos")
+    (tmp_path / "m.csv").write_text(table_text(columns))
+    log = only(tmp_path / "m.csv", robot, **SI)
+    off = log.channels["qpos"].values[:, 0] - log.channels["ctrl"].values[:, 0]
+    assert np.allclose(off, true["qpos"] - true["ctrl"], atol=1e-9)
+    assert "shoulder" in log.meta["notes"]["turns"]
