@@ -28,9 +28,7 @@ def test_a_log_without_commands_is_refused():
 def test_a_value_that_is_not_finite_is_named_by_file_line_and_joint():
     values = VALUES.copy()
     values[1, 1] = np.nan
-    with pytest.raises(
-        LogError, match=r"state\.csv:3: qpos of b is empty or not finite"
-    ):
+    with pytest.raises(LogError, match=r"state\.csv:3: qpos of b is empty or not finite"):
         log(qpos=Channel(TIME, values))
 
 
