@@ -9,6 +9,8 @@ import pytest
 from vendors import MJCF, URDF, write_mjcf, write_urdf
 
 from gaponet.base.errors import RobotError, UsageError
+from gaponet.data.log import Channel, Log
+from gaponet.data.sequence import SequenceMeta, to_sequence
 from gaponet.robot.mjcf import read_mjcf
 from gaponet.robot.new import NewRobot, RobotOptions, new_robot
 from gaponet.robot.spec import servo_type
@@ -73,7 +75,7 @@ def test_notes_name_coupled_joints_and_a_free_base(tmp_path):
     file = tmp_path / "fingers.xml"
     file.write_text(
         f'<mujoco><worldbody><body><freejoint/><geom size=".1"/>{body.format("thumb", body.format("tip", ""))}</body>'
-        '</worldbody><equality><joint joint1="tip" joint2="thumb"/></equality>'
+        '</worldbody><equality><joint joint1="tip" joint2="thumb" polycoef="0 1 0.3 0 0"/></equality>'
         '<actuator><position joint="thumb" kp="2"/></actuator></mujoco>'
     )
     notes = make(tmp_path, file).notes
@@ -319,3 +321,33 @@ def test_a_named_servo_type_fills_damping_friction_armature_and_torque_limit(tmp
         RobotError, match=r"--servo STS3216: servo .STS3216. is no .*; nearest: STS3215"
     ):
         make(tmp_path / "other", servo=("STS3216",))
+
+
+MIMIC = """<robot name="hand"><link name="base"><inertial><mass value="1"/>
+<inertia ixx="0.01" iyy="0.01" izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial></link>{joints}</robot>"""
+FINGER = """<link name="{name}_link"><inertial><origin xyz="0.05 0 0"/><mass value="0.05"/>
+<inertia ixx="1e-4" iyy="1e-4" izz="1e-4" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<joint name="{name}" type="revolute"><parent link="base"/><child link="{name}_link"/><axis xyz="0 0 1"/>
+<limit lower="-1.5" upper="1.5" effort="5" velocity="2"/>{mimic}</joint>"""
+
+
+@pytest.mark.parametrize(("ratio", "at_zero"), [(1.0, 0.0), (-0.5, 0.2)])
+def test_a_mimic_joint_follows_without_a_motor(tmp_path, ratio, at_zero):
+    mimic = f'<mimic joint="drive" multiplier="{ratio}" offset="{at_zero}"/>'
+    joints = FINGER.format(name="drive", mimic="") + FINGER.format(name="led", mimic=mimic)
+    (tmp_path / "hand.urdf").write_text(MIMIC.format(joints=joints))
+    robot = make(tmp_path, tmp_path / "hand.urdf").robot
+    assert robot.operated == ("drive",)
+    led, drive = robot.index(["led"])[0], robot.index(["drive"])[0]
+    assert robot.kp[led] == 0
+    model = build_model(robot)
+    data = mujoco.MjData(model)
+    data.ctrl[drive] = 0.6
+    mujoco.mj_step(model, data, 2000)
+    assert data.qpos[led] == pytest.approx(ratio * data.qpos[drive] + at_zero, abs=5e-3)
+    time = 0.02 * np.arange(50)
+    angle = np.sin(time)[:, None]
+    channels = {"ctrl": Channel(time, angle + 0.1), "qpos": Channel(time, angle)}
+    log = Log(robot.name, ("drive",), channels, "m.csv")
+    sequence = to_sequence(log, robot, SequenceMeta(robot.name, "u", "m", 0.0))
+    assert np.allclose(sequence.qpos[:, led], ratio * angle[:, 0] + at_zero, atol=1e-6)

@@ -17,7 +17,7 @@ from gaponet.data.describe.row_copies import copied_rows
 from gaponet.data.log import COMMANDS, FEEDFORWARD, Log
 from gaponet.data.signals import SAME_INSTANT, differentiate, resample_linear, resample_zoh
 from gaponet.robot.simulator_change import SimulatorChange
-from gaponet.robot.spec import GAIN_TOLERANCE, RobotSpec
+from gaponet.robot.spec import GAIN_TOLERANCE, Follower, RobotSpec
 
 ARRAYS = ("ctrl", "qpos", "qvel", "qacc", "tau", "tau_eq", "temperature")
 OPTIONAL = ("qacc", "tau", "tau_eq", "temperature")
@@ -279,9 +279,8 @@ def to_sequence(log: Log, robot: RobotSpec, meta: SequenceMeta) -> Sequence:
     if copies:
         notes["copied_rows"] = copies
     posture = {j: x for j, x in log.meta.get("posture", {}).items() if j not in log.joint_names}
-    absent = [
-        name for name in robot.joint_names if name not in log.joint_names and name not in posture
-    ]
+    known = {*log.joint_names, *posture, *_led(log, robot)}
+    absent = [name for name in robot.joint_names if name not in known]
     notes |= ({"posture": posture} if posture else {}) | (
         {"held_at_home": absent} if absent else {}
     )
@@ -456,12 +455,26 @@ def _feedforward_position(
     return torque / np.where(kp > 0, kp, 1.0)
 
 
-def _to_robot(name: str, values: Array, log: Log, robot: RobotSpec) -> Array:
+def _led(log: Log, robot: RobotSpec) -> dict[str, Follower]:
+    """Mimic joints that a log lacks, and whose leading joint it holds."""
+    return {
+        name: follower
+        for name, follower in robot.followers.items()
+        if name not in log.joint_names and follower.joint in log.joint_names
+    }
+
+
+def _to_robot(channel: str, values: Array, log: Log, robot: RobotSpec) -> Array:
     """Columns in robot order; joints the log lacks stand where its posture says or at home (positions), or at zero."""
     out = np.zeros((len(values), len(robot.joint_names)))
-    if name in ("ctrl", "qpos"):
+    if channel in ("ctrl", "qpos"):
         out += robot.qpos_home
         for joint, angle in log.meta.get("posture", {}).items():
             out[:, robot.index([joint])] = angle
     out[:, robot.index(log.joint_names)] = values
+    moving = channel in ("ctrl", "qpos", "qvel")
+    for name, follower in _led(log, robot).items() if moving else ():
+        leader = out[:, robot.index([follower.joint])]
+        at_zero = follower.at_zero if channel != "qvel" else 0.0
+        out[:, robot.index([name])] = follower.ratio * leader + at_zero
     return out

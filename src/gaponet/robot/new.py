@@ -19,7 +19,7 @@ from gaponet.robot.drives import ON_JOINT, Drive, drives
 from gaponet.robot.freeze import freeze
 from gaponet.robot.mjcf import compile_spec
 from gaponet.robot.self_contained import self_contained_text
-from gaponet.robot.spec import RobotSpec, load_robot
+from gaponet.robot.spec import Follower, RobotSpec, load_robot
 from gaponet.robot.vendor import read_vendor
 
 PICTURE = "picture.png"  # of a robot folder
@@ -87,8 +87,12 @@ def new_robot(
     logged = _logged_joints(model, options.joints, path)
     pose, source = _home(model, options.keyframe, path)
     given = {name: getattr(options, name) for name in ("kp", "kd", "effort_limit", "servo")}
-    joint_drives = drives(model, logged, pose, given, path.name)
+    followers = _followers(model, logged, options.joints)
+    motors = [name for name in logged if name not in followers]
+    logged = [name for name in _joint_names(model) if name in (*motors, *followers)]
+    joint_drives = drives(model, motors, pose, given, path.name)
     notes += _notes(spec, model, logged, pose, path)
+    notes += [f"{name} follows {led.joint}, without a motor" for name, led in followers.items()]
     for d in joint_drives:
         for name, value in d.passive.items():
             polynomial = np.ndim(
@@ -96,7 +100,7 @@ def new_robot(
             )  # of newer MuJoCo; a number of older
             setattr(spec.joint(d.name), name, [[value], [0.0], [0.0]] if polynomial else value)
     text = _robot_xml(spec, model, logged, pose, path, options.contacts)
-    robot_toml = _robot_toml(model, joint_drives, options, path, source)
+    robot_toml = _robot_toml(model, joint_drives, options, path, source, followers)
     for name in (*_joint_names(model), *(model.body(b).name for b in range(model.nbody))):
         if "/" in name:  # a joint name may become a file name
             text, robot_toml = (
@@ -155,6 +159,31 @@ def _logged_joints(model: mujoco.MjModel, patterns: tuple[str, ...], path: Path)
         for j in model.actuator_trnid[np.isin(model.actuator_trntype, ON_JOINT), 0]
     }
     return [name for name in hinges if name in actuated] or hinges
+
+
+def _followers(
+    model: mujoco.MjModel, logged: list[str], patterns: tuple[str, ...]
+) -> dict[str, Follower]:
+    """Return the hinges that an equality lets follow a logged hinge in proportion: URDF's mimic joints.
+
+    A joint that the user names counts as driven by a motor of its own.
+    """
+    followers = {}
+    for e in np.flatnonzero(model.eq_type == mujoco.mjtEq.mjEQ_JOINT):
+        name, leader = (
+            model.joint(j).name if j >= 0 else "" for j in (model.eq_obj1id[e], model.eq_obj2id[e])
+        )
+        constant, ratio, *curved = model.eq_data[e, :5].tolist()
+        hinges = all(
+            x and model.joint(x).type == mujoco.mjtJoint.mjJNT_HINGE for x in (name, leader)
+        )
+        if not hinges or any(curved) or leader not in logged or name in patterns:
+            continue
+        zero, leader_zero = (
+            float(model.qpos0[model.jnt_qposadr[model.joint(x).id]]) for x in (name, leader)
+        )
+        followers[name] = Follower(leader, ratio, zero + constant - ratio * leader_zero)
+    return {name: f for name, f in followers.items() if f.joint not in followers}
 
 
 def _joint_names(model: mujoco.MjModel) -> list[str]:
@@ -278,22 +307,28 @@ def _robot_toml(
     options: RobotOptions,
     path: Path,
     source: str,
+    followers: dict[str, Follower],
 ) -> str:
     if not (0 < options.rate <= 1000):
         raise UsageError(f"--rate {options.rate}: give the rate of the commands in Hz, up to 1000")
     names = [d.name for d in joint_drives]
+    by_name = {d.name: d for d in joint_drives}
     dt = 1 / options.rate
     steps = max(1, math.ceil(dt / model.opt.timestep - 1e-6))
     stem = path.resolve().parent.name if path.stem in ("robot", "model", "scene") else path.stem
-    name = options.name or "".join(c if c.isalnum() or c in "-_" else "_" for c in stem)
+    robot_name = options.name or "".join(c if c.isalnum() or c in "-_" else "_" for c in stem)
     lines = [
         f"# Made from {path.name} by gaponet robot new; every number may be changed here.",
-        f"name = {json.dumps(name)}",
+        f"name = {json.dumps(robot_name)}",
         f"dt = {dt!r}  # control period, s: --rate",
         f"timestep = {dt / steps!r}  # physics step, s; {path.name} has {model.opt.timestep:g}",
         f"contacts = {str(options.contacts).lower()}  # --contacts keeps geoms that touch, and lets them",
     ]
-    for d in joint_drives:
+    for name in (n for n in _joint_names(model) if n in by_name or n in followers):
+        if name in followers:
+            lines += _follower_lines(name, followers[name], path)
+            continue
+        d = by_name[name]
         lines += [
             "", "[[joint]]", f"name = {json.dumps(d.name)}",
             *([f"aliases = [{json.dumps(d.actuator)}]  # its actuator"] if d.actuator not in ("", *names) else []),
@@ -306,6 +341,15 @@ def _robot_toml(
         lines += ["", f"[[payload_mount]]  # {why}", f"side = {json.dumps(side)}",
                   f"body = {json.dumps(body)}", f"pos = {[round(float(x), 6) for x in pos]}"]  # fmt: skip
     return "\n".join("".join(c if c.isprintable() else "?" for c in line) for line in lines) + "\n"
+
+
+def _follower_lines(name: str, follower: Follower, path: Path) -> list[str]:
+    return [
+        "", "[[joint]]", f"name = {json.dumps(name)}",
+        f"follows = {json.dumps(follower.joint)}  # a mimic joint of {path.name}: no motor of its own",
+        f"ratio = {follower.ratio!r}  # its angle per rad of that joint", f"at_zero = {follower.at_zero!r}  # rad",
+        "kp = 0.0", "effort_limit = 1.0  # of no use without kp", "operated = false",
+    ]  # fmt: skip
 
 
 def _mounts(model: mujoco.MjModel, joints: list[str]) -> list[tuple[str, str, np.ndarray, str]]:

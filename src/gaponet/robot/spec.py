@@ -16,7 +16,7 @@ import shutil
 import tempfile
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -49,6 +49,14 @@ PACKAGE_FOLDER = Path(__file__).parent / "robots"
 LOG_UNITS = ("rad", "deg", "fraction", "ticks")
 MAX_SUGGESTIONS = 3  # similar joint names in an error
 GAIN_TOLERANCE = 1e-3  # relative; gains that differ by less are equal
+
+
+class Follower(NamedTuple):
+    """A mimic joint: its angle is ratio · (angle of the joint that it follows) + at_zero, rad."""
+
+    joint: str
+    ratio: float
+    at_zero: float
 
 
 @dataclass(frozen=True)
@@ -93,6 +101,7 @@ class RobotSpec:
         gain_scale: Factor on kp and kd of operated joints in [[joint]]; kp and kd include it.
         contacts: True if links collide as the MJCF states. It is off by default, because links welded to the world
             collide permanently with their neighbours, which looks like a gap.
+        followers: Mimic joints: they move with another joint, and have no motor.
         nominal: The robot before identification; None if no parameter was identified (sysid/identify.py).
         limits_accepted: True if the user stated that this folder's gains and ranges hold on hardware
             (hw/control/hardware.py); no file states it.
@@ -140,6 +149,7 @@ class RobotSpec:
     contacts: bool = False
     carries_payload: bool = True
     gain_scale: float = 1.0
+    followers: dict[str, Follower] = field(default_factory=dict)
     nominal: RobotSpec | None = None
     limits_accepted: bool = False
 
@@ -446,6 +456,7 @@ def _spec(table: RobotTable, mjcf: Path, folder: Path) -> RobotSpec:
         effort_limit=np.array([j.effort_limit for j in joints]),
         qpos_home=np.array([j.home for j in joints]),
         log_units=tuple(j.log_unit for j in joints),
+        followers={j.name: Follower(j.follows, j.ratio, j.at_zero) for j in joints if j.follows},
         aliases={alias: j.name for j in joints for alias in j.aliases},
         payload_mounts=table.payload_mount,
         dt=table.dt,

@@ -25,6 +25,11 @@ class _Joint:
     operated: bool = True
     log_unit: Literal["rad", "deg", "fraction"] = "rad"
     servo: str = ""  # name of a servo type
+    follows: str = (
+        ""  # joint that moves this one by a linkage or gear: a mimic joint, without a motor
+    )
+    ratio: Annotated[float, Interval(ge=-100, le=100)] = 1.0  # its angle per rad of that joint
+    at_zero: Angle = 0.0  # its angle where that joint is at 0, rad
     aliases: tuple[str, ...] = ()
 
 

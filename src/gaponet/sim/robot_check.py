@@ -76,7 +76,7 @@ def check_robot(
 def _joints(robot: RobotSpec) -> Iterator[Finding]:
     for i, name in enumerate(robot.joint_names):
         low, high = robot.qpos_range[i]
-        if robot.kp[i] <= 0:
+        if name not in robot.followers and robot.kp[i] <= 0:
             text = f"{name}: kp is {robot.kp[i]:g}; a position-controlled joint needs kp > 0 in robot.toml"
             yield Finding("warning", "gains", text, (name,))
         if not low <= robot.qpos_home[i] <= high:
@@ -152,7 +152,8 @@ def _couplings(robot: RobotSpec, model: mujoco.MjModel) -> Iterator[Finding]:
             "ratio squared); write armature in robot.xml, gaponet identify finds it"
         )
         yield Finding("note", "inertia", text, tuple(light))
-    free = names[(model.dof_damping + robot.kd < 1e-9) & (model.dof_frictionloss < 1e-9)]
+    led = np.isin(names, list(robot.followers))
+    free = names[(model.dof_damping + robot.kd < 1e-9) & (model.dof_frictionloss < 1e-9) & ~led]
     if len(free):
         text = (
             f"no damping, kd or friction at {abbreviate(free.tolist())}: it swings for ever; write kd in robot.toml, "
