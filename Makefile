@@ -60,7 +60,7 @@ adversary: setup
 	OMP_NUM_THREADS=1 $(BIN)/python tests/hw/control/adversary.py --states 1000000
 	OMP_NUM_THREADS=1 PYTHONPATH=tests $(BIN)/python tests/hw/control/plan_adversary.py --poses 1000 --seconds 60
 
-# Ten small robots that nobody tuned on, beside the plain script: minutes, resumable; exit code 1 where one loses.
+# Ten small robots that nobody tuned on, beside the least-squares script: minutes, resumable; exit code 1 where one loses.
 tournament: setup
 	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/tournament.py tournament_work --robots 10 --small
 

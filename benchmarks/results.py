@@ -2,8 +2,8 @@
 
 results.toml lists the steps: commands with their seeds. The output, commit, date and seconds of a step go to
 WORK/answers/STEP.json. A step with an answer is skipped, and an interrupted command resumes where it can. Then
-docs/results/real.md, benchmarks/steps.md, README's table and its picture are written from the answers. What was not
-measured again stays as it was.
+docs/results/real.md, benchmarks/steps.md, README's table and its picture are written from the answers, and
+page_numbers.py puts the numbers into the other pages. What was not measured again stays as it was.
 
     --list    show steps and answers       --write   only write the pages       --data FOLDER   public recordings
 """
@@ -23,6 +23,8 @@ from datetime import date
 from pathlib import Path
 from typing import Any
 
+import page_numbers
+
 from gaponet.experiments.real.page import write_page
 
 ROOT = Path(__file__).parents[1]
@@ -32,8 +34,13 @@ STEPS_LOG = (
 )  # what each step printed; steps.md beside it is for people
 LISTED = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
 STEPS: dict[str, list[str]] = LISTED["steps"]
-README_COLUMNS = (("nominal simulator",), ("delay + offset",), ("plain script", "mujoco.sysid"), ("identification",),
-                  ("identification + network",))  # fmt: skip
+README_COLUMNS = (
+    ("nominal simulator",),
+    ("delay + offset",),
+    ("least-squares script", "mujoco.sysid"),
+    ("identification",),
+    ("identification + network",),
+)
 TAIL = 60  # lines of an output on the page
 STEPS_HEAD = """# Steps of `make results`
 
@@ -126,6 +133,21 @@ def write(answers: dict[str, dict[str, Any]], work: Path) -> None:
     table = re.compile(r"(\| real robot \|.*\n\|[- :|]+\|\n)(\|.*\n)+")
     text = "".join(readme_rows(result["rows"]))
     (ROOT / "README.md").write_text(table.sub(lambda m: m[1] + text, readme), encoding="utf-8")
+    for paper in sorted(work.glob("paper_*/paper.json")):
+        store_paper(paper)
+    page_numbers.main()
+
+
+def store_paper(paper: Path) -> None:
+    """Keep facts and tables of the paper's experiment, as page_numbers.toml reads them."""
+    whole = json.loads(paper.read_text(encoding="utf-8"))
+    tables = {
+        name: {"columns": table["columns"], "texts": table["texts"]}
+        for name, table in whole["tables"].items()
+    }
+    kept = {"provenance": whole["provenance"], "facts": whole["facts"], "tables": tables}
+    text = json.dumps(kept, indent=1, ensure_ascii=False)
+    (PAGES / f"{paper.parent.name}.json").write_text(text + "\n", encoding="utf-8")
 
 
 def measured(answer: dict[str, Any]) -> str:

@@ -195,3 +195,30 @@ def test_every_page_that_llms_txt_names_is_there():
     for page in named:
         file = f"{page.rstrip('/')}.md" if page else "index.md"
         assert (ROOT / "docs" / file).is_file(), page
+
+
+@pytest.fixture
+def page_numbers(monkeypatch):
+    """benchmarks/page_numbers.py, which `make results` runs."""
+    monkeypatch.syspath_prepend(ROOT / "benchmarks")
+    return importlib.import_module("page_numbers")
+
+
+def test_the_numbers_of_the_pages_are_those_of_the_results_files(page_numbers):
+    for sentence in page_numbers.sentences():
+        for name in sentence["pages"]:
+            page = (ROOT / name).read_text(encoding="utf-8")
+            assert page_numbers.filled(page, sentence) == page, f"{name}: {sentence['text']}"
+
+
+def test_a_stale_number_of_a_page_is_replaced_also_across_a_line_break(page_numbers):
+    commit = page_numbers.value("commit; tournament")
+    sentence = {"text": "as {a} measured it", "a": "commit; tournament"}
+    assert page_numbers.filled("as 01234567 measured\nit, 3", sentence) == (
+        f"as {commit} measured\nit, 3"
+    )
+
+
+def test_a_sentence_that_no_page_has_any_more_is_an_error(page_numbers):
+    with pytest.raises(LookupError, match="no such sentence"):
+        page_numbers.filled("other words", {"text": "in {a} s", "a": "seconds; collect"})

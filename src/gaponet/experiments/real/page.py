@@ -34,10 +34,12 @@ COLUMNS = ("set", "question", "method", "mrad", "of nominal", "less than nominal
 STEM = "real"
 HEADING = """# Real robots
 
-`gaponet experiment real` ([benchmark](../benchmark.md)): recordings that no method was fitted to, in open-loop
-rollouts from the recorded start. Errors are in mrad. ± is the standard error over independent motions, of differences
-paired. "Floor" is the difference of two recordings of one command. "Identified elsewhere"
-means: on another session or unit."""
+This table is what `gaponet experiment real` writes ([compare your method](../benchmark.md)): errors in mrad on public
+recordings of real robots, of motions that no method was fitted to. Each simulation starts at the recorded state and then
+receives only commands.
+
+± is the standard error over independent motions; differences are paired, motion by motion. "Floor" is the difference
+between two recordings of one command. "Identified elsewhere" means on another session or unit."""
 
 
 def result_table(rows: list[dict[str, Any]]) -> ResultTable:

@@ -1,0 +1,129 @@
+"""Put the numbers of the results' files into the pages: python benchmarks/page_numbers.py
+
+page_numbers.toml lists sentences and rows of the pages, with a name in braces for each number, and where this number
+is. `make results` runs this at its end. tests/test_docs.py compares, so that no page keeps a number that was measured
+anew. The files are docs/results/real.json, docs/results/paper_*.json and benchmarks/steps.json.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+import tomllib
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).parents[1]
+RESULTS = ROOT / "docs" / "results"
+STEPS = ROOT / "benchmarks" / "steps.json"
+LIST = Path(__file__).with_suffix(".toml")
+COMMIT = r"[0-9a-f]{8}(?![\w.])"
+NUMBER = rf"{COMMIT}|[-+−]?\d+(?:[.,]\d+)*(?: ± \d+(?:\.\d+)?)?"
+PLACE = re.compile(r"\{(\w+)\}")
+
+
+def sentences() -> list[dict[str, Any]]:
+    """Return the entries of page_numbers.toml: pages, text, and the source of each name in braces."""
+    found: list[dict[str, Any]] = tomllib.loads(LIST.read_text(encoding="utf-8"))["sentence"]
+    return found
+
+
+def value(source: str) -> str:
+    """Return the number of a source as the pages write it.
+
+    Args:
+        source: one of the forms at the top of page_numbers.toml.
+
+    Raises:
+        LookupError: The file has no such number.
+    """
+    kind, *words = [word.strip() for word in source.split(";")]
+    read = {"real": _real, "paper": _paper, "step": _step, "commit": _commit, "seconds": _seconds}[
+        kind
+    ]
+    return read(*words).replace("-", "−")
+
+
+def _real(question: str, method: str, field: str, form: str) -> str:
+    rows = json.loads((RESULTS / "real.json").read_text(encoding="utf-8"))["rows"]
+    for row in rows:
+        if f"{row['set']}, {row['question']}" == question and row["method"] == method:
+            return f"{row[field]:{form}}"
+    raise LookupError(f"real.json: no row {question}, {method}")
+
+
+def _paper(name: str, table: str, begin: str, column: str) -> str:
+    found = json.loads((RESULTS / f"paper_{name}.json").read_text(encoding="utf-8"))["tables"][
+        table
+    ]
+    for row in found["texts"]:
+        if row[0].startswith(begin):
+            return str(row[found["columns"].index(column)])
+    raise LookupError(f"paper_{name}.json: {table} has no row {begin}")
+
+
+def _answer(step: str) -> dict[str, Any]:
+    answers: dict[str, dict[str, Any]] = json.loads(STEPS.read_text(encoding="utf-8"))
+    return answers[step]
+
+
+def _commit(step: str) -> str:
+    return str(_answer(step)["commit"])
+
+
+def _seconds(step: str) -> str:
+    return str(_answer(step)["seconds"])
+
+
+def _step(name: str, pattern: str) -> str:
+    printed = "\n".join(_answer(name)["output"])
+    found = re.search(pattern, printed)
+    if found is None:
+        raise LookupError(f"steps.json: {name} printed nothing like {pattern}")
+    return found[1]
+
+
+def filled(page: str, sentence: dict[str, Any]) -> str:
+    """Return the text of a page with the numbers of one sentence, below the heading `section` if it names one.
+
+    Raises:
+        LookupError: The page has no such sentence.
+    """
+    names = PLACE.findall(sentence["text"])
+    parts = PLACE.split(sentence["text"])
+    pattern = ""
+    for i, part in enumerate(parts):
+        is_name = i % 2 == 1
+        pattern += f"({NUMBER})" if is_name else r"\s+".join(map(re.escape, part.split(" ")))
+    numbers = [value(sentence[name]) for name in names]
+
+    def with_numbers(found: re.Match[str]) -> str:
+        text = found[0]
+        for i in range(len(numbers), 0, -1):  # from the end: earlier places stay where they are
+            begin, end = (place - found.start() for place in found.span(i))
+            text = text[:begin] + numbers[i - 1] + text[end:]
+        return text
+
+    begin = page.index(sentence.get("section", ""))
+    new, count = re.subn(pattern, with_numbers, page[begin:])
+    if count == 0:
+        raise LookupError(f"no such sentence: {sentence['text']}")
+    return page[:begin] + new
+
+
+def main() -> int:
+    """Write all pages."""
+    for sentence in sentences():
+        for name in sentence["pages"]:
+            page = ROOT / name
+            old = page.read_text(encoding="utf-8")
+            new = filled(old, sentence)
+            if new != old:
+                page.write_text(new, encoding="utf-8")
+                print(f"{name}: {sentence['text']}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
