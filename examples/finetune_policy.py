@@ -18,6 +18,8 @@ import contextlib
 import copy
 import io
 import time
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -191,9 +193,17 @@ class Unit:
     """Copies of a virtual unit, one per payload and motion, with the methods of AlignedSim and sensor readings only."""
 
     def __init__(
-        self, robot: RobotSpec, task: Task, name: str, payload_mass: Array, fleet: str = "easy"
+        self,
+        robot: RobotSpec,
+        task: Task,
+        name: str,
+        payload_mass: Array,
+        fleet: str = "easy",
+        extra_delay: float = 0.0,
     ) -> None:
+        """extra_delay: s by which commands arrive later than the unit's own do."""
         physics = load_fleet(fleet, robot).unit(name)
+        physics = replace(physics, delay=physics.delay + extra_delay)
         payloads = [(float(mass), "both") for mass in payload_mass]
         self.robots = VirtualRobot(
             robot, [physics] * len(payloads), payloads, robot.dt, locked=task.locked, nthread=0
@@ -205,12 +215,13 @@ class Unit:
         )
 
     def reset(self, qpos: Array) -> None:
-        self.robots.reset(self._full(qpos), list(range(len(qpos))), WARMTH)
+        self.robots.reset(self.all_joints(qpos), list(range(len(qpos))), WARMTH)
 
     def step(self, ctrl: Array) -> None:
-        self.robots.step(self._full(ctrl))
+        self.robots.step(self.all_joints(ctrl))
 
-    def _full(self, values: Array) -> Array:
+    def all_joints(self, values: Array) -> Array:
+        """Return values of the free joints with those of home for the others, (N, n) rad."""
         out = np.tile(self.home, (len(values), 1))
         out[:, self.free] = values
         return out
@@ -249,8 +260,22 @@ def train(name: str, runner: OnPolicyRunner, env: TrackingEnv, updates: int) -> 
     return runner
 
 
-def follow(task: Task, plant: AlignedSim | Unit, policy: OnPolicyRunner | None) -> Array:
-    """Return the mean |q − reference| of every simulation or unit, (N,) rad; each plays one motion to its end."""
+def measured(plant: Any) -> tuple[Array, Array]:
+    """Return the measured positions and velocities of a simulation or unit, (N, free) rad and rad/s."""
+    return plant.qpos, plant.qvel
+
+
+def follow(
+    task: Task,
+    plant: AlignedSim | Unit,
+    policy: OnPolicyRunner | None,
+    observe: Callable[[Any], tuple[Array, Array]] = measured,
+) -> Array:
+    """Return the mean |q − reference| of every simulation or unit, (N,) rad; each plays one motion to its end.
+
+    Args:
+        observe: Returns the positions and velocities of `plant` that the policy sees, (N, free) rad and rad/s.
+    """
     count = len(plant.payload_mass)
     motion = np.arange(count) % len(task.first)
     row, last, action = task.first[motion].copy(), task.last[motion], np.zeros((count, task.n))
@@ -259,7 +284,7 @@ def follow(task: Task, plant: AlignedSim | Unit, policy: OnPolicyRunner | None) 
     total, rows = np.zeros(count), np.zeros(count)
     for t in range(int((last - row).max())):
         if actor is not None:
-            q, v = plant.qpos[:, task.op], plant.qvel[:, task.op]
+            q, v = (values[:, task.op] for values in observe(plant))
             seen = torch.from_numpy(task.observe(q, v, row, last, plant.payload_mass, action))
             with torch.inference_mode():
                 action = (

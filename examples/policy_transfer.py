@@ -8,6 +8,10 @@ network to follow motions in three simulators: the nominal one, the identified o
 `gaponet export --to randomization` draws from its uncertainty and chooses. All policies are tested on the VIRTUAL
 robot with other motions. Finally, `gaponet replay` predicts the robot's motion under the targets of the nominal
 policy's own rollout.
+
+The nominal policies are also played with `gp.Compensator(identified, follow="nominal")`, under which the robot moves as
+the nominal simulator does, so that nothing is trained again. This is tried where it should be difficult, too: with the
+identified robot of another unit, with commands that are later by 40 ms, and with motors that are too weak.
 """
 
 from __future__ import annotations
@@ -15,6 +19,7 @@ from __future__ import annotations
 import contextlib
 import io
 import json
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -26,12 +31,19 @@ from tensordict import TensorDict
 
 from gaponet.cli.main import main as gaponet
 from gaponet.deploy.aligned_sim import AlignedSim
+from gaponet.deploy.compensator import Compensator
 from gaponet.export.drawn_robots import robots_of
 from gaponet.robot.spec import RobotSpec, load_robot
 
 Array = np.ndarray
 RECORDED_SEED, LEARN_SEED, TRY_SEED = 0, 101, 202  # different motions
 DRAWS = 16
+NOMINAL = "nominal policy"
+FOLLOWED = "nominal policy, follow"
+IDENTIFIED = "policy trained in the identified simulator"
+OTHER_UNIT = "virtual-2"
+EXTRA_DELAY_S = 0.04
+WEAK_TORQUE = 1.3  # N·m; at times the motions need more
 
 
 class Several:
@@ -68,6 +80,58 @@ class Several:
     def qvel(self) -> Array:
         """Velocities, (num_envs, n) rad/s."""
         return np.concatenate([sim.qvel for sim in self.sims])
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A VIRTUAL robot on which policies are tried."""
+
+    name: str
+    unit: str
+    extra_delay: float = 0.0
+    """s by which commands arrive later than they did when the robot was recorded."""
+    torque: float | None = None
+    """Torque limit of all motors, N·m; None: the robot's own."""
+
+
+class Followed:
+    """A unit that is commanded to move as the nominal simulator does, with the methods of Unit."""
+
+    def __init__(self, plant: Unit, known: RobotSpec) -> None:
+        self.plant, self.payload_mass = plant, plant.payload_mass
+        self.compensator = Compensator(known, num_envs=len(plant.payload_mass), follow="nominal")
+
+    def reset(self, qpos: Array) -> None:
+        """Put the units at rest."""
+        self.plant.reset(qpos)
+        self.compensator.reset(self.plant.all_joints(qpos), self.payload_mass)
+
+    def step(self, target: Array) -> None:
+        """Step all units by one control period."""
+        measured = self.plant.all_joints(self.plant.qpos)
+        commands = self.compensator.step(self.plant.all_joints(target), measured)
+        self.plant.step(commands[:, self.plant.free])
+
+    def observe(self) -> tuple[Array, Array]:
+        """Return what the policy sees, (N, free) rad and rad/s."""
+        state = self.compensator.observe(self.plant.all_joints(self.plant.qpos))
+        positions, velocities = (values[:, self.plant.free] for values in state)
+        return positions, velocities
+
+    @property
+    def qpos(self) -> Array:
+        """Measured positions, rad."""
+        return self.plant.qpos
+
+
+def make_plant(trial: Trial, spec: RobotSpec, task: Task, fleet: str) -> Unit:
+    """Return copies of a trial's unit, one per motion."""
+    empty = np.zeros(len(task.first))
+    plant = Unit(spec, task, trial.unit, empty, fleet, trial.extra_delay)
+    if trial.torque is not None:
+        limits = np.full(len(spec.joint_names), trial.torque)
+        plant.robots.set_gains(spec.kp, spec.kd, limits)
+    return plant
 
 
 def identified(work: Path, robot: str, fleet: str, unit: str, quick: bool) -> Path:
@@ -212,7 +276,14 @@ def main(
     robots = {
         "nominal": [spec], "identified": [found], "identified + units": drawn(known, work),
     }  # fmt: skip
+    trials = (
+        Trial("the robot that was identified", unit),
+        Trial(f"another unit, {OTHER_UNIT}", OTHER_UNIT),
+        Trial(f"commands {1e3 * EXTRA_DELAY_S:.0f} ms later", unit, EXTRA_DELAY_S),
+        Trial(f"motors of {WEAK_TORQUE:g} N·m", unit, torque=WEAK_TORQUE),
+    )
     errors: dict[str, list[Array]] = {}
+    tried_on: dict[str, dict[str, list[Array]]] = {}  # trial → way → errors of each seed
     for seed in seeds:
         for name, mine in robots.items():
             torch.manual_seed(seed)
@@ -223,13 +294,61 @@ def main(
             errors.setdefault(name, []).append(
                 1e3 * np.array([follow(unseen, p, policy) for p in plants])
             )
+            if len(mine) == 1:
+                for trial in trials:
+                    ways = try_policy(name, policy, trial, (spec, found), unseen, fleet)
+                    for way, error in ways.items():
+                        tried_on.setdefault(trial.name, {}).setdefault(way, []).append(error)
             if name == "nominal" and seed == seeds[0]:
                 (work / "rollout").mkdir(exist_ok=True)
                 targets = rollout(unseen, spec, policy, work / "rollout" / "policy.npz")
     alone = np.array([follow(unseen, p, None) for p in (Several([spec], len(tried), unseen.locked),
                                                         Unit(spec, unseen, unit, tried, fleet))])  # fmt: skip
     print(table({"reference as target": [1e3 * alone]} | errors))
+    print(trial_table(tried_on))
     print(forecast(work, known, unseen, Unit(spec, unseen, unit, tried, fleet), targets))
+
+
+def try_policy(
+    name: str,
+    policy: Any,
+    trial: Trial,
+    robots: tuple[RobotSpec, RobotSpec],
+    task: Task,
+    fleet: str,
+) -> dict[str, Array]:
+    """Return the error of each motion, mrad, by the way in which the policy was used.
+
+    Args:
+        name: Where the policy was trained: "nominal" or "identified".
+        robots: The nominal robot and the identified one.
+    """
+    spec, found = robots
+    plant = make_plant(trial, spec, task, fleet)
+    if name != "nominal":
+        return {IDENTIFIED: 1e3 * follow(task, plant, policy)}
+    followed = Followed(make_plant(trial, spec, task, fleet), found)
+    errors = {NOMINAL: 1e3 * follow(task, plant, policy)}
+    errors[FOLLOWED] = 1e3 * follow(task, followed, policy, Followed.observe)
+    limited = followed.compensator.limited_shares
+    if limited:
+        shares = ", ".join(f"{joint} {share:.0%}" for joint, share in limited.items())
+        print(f"{trial.name}: at a limit of torque or correction: {shares} of the time")
+    return errors
+
+
+def trial_table(errors: dict[str, dict[str, list[Array]]]) -> str:
+    """Return a Markdown table: trials × ways, mean ± over seeds and the worst motion, mrad."""
+    ways = (NOMINAL, FOLLOWED, IDENTIFIED)
+    lines = [f"| VIRTUAL robot | {' | '.join(ways)} |", "| --- | ---: | ---: | ---: |"]
+    for trial, by_way in errors.items():
+        cells = []
+        for way in ways:
+            each = np.array(by_way[way])  # (seeds, motions)
+            mean = each.mean(axis=1)
+            cells.append(f"{mean.mean():.1f} ± {mean.std():.1f} ({each.max():.1f})")
+        lines.append(f"| {trial} | {' | '.join(cells)} |")
+    return "\n".join(lines)
 
 
 def table(errors: dict[str, list[Array]]) -> str:

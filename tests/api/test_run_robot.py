@@ -18,6 +18,7 @@ from gaponet.api.run_report import SilentReporter, describe_plan
 from gaponet.api.run_robot import Compensation
 from gaponet.base.errors import RobotError, UsageError
 from gaponet.cli.main import main
+from gaponet.deploy.compensator import CompensatorConfig
 from gaponet.hw.control.clock import SimulatedClock
 from gaponet.hw.control.hardware import hardware_robot, reference_robot
 from gaponet.hw.control.phases import ControlConfig
@@ -90,6 +91,36 @@ def test_compensation_by_an_identified_folder_reduces_the_error(arm, tmp_path):
     assert errors[True] < 0.7 * errors[False]
 
 
+def simulate(robot, qpos, targets):
+    """Return the positions of a simulated robot that rests at qpos, under targets, (T, n) rad."""
+    sim = gp.AlignedSim(robot)
+    sim.reset(qpos, ctrl=targets[0])
+    positions = []
+    for target in targets:
+        sim.step(target)
+        positions.append(sim.qpos.copy())
+    return np.array(positions)
+
+
+def test_with_follow_the_commands_move_the_identified_robot_as_the_nominal_simulator(arm, tmp_path):
+    soft = arm.with_servos({joint: {"kp": 14.0, "delay": 0.01} for joint in arm.joint_names})
+    save_robot(soft, tmp_path / "soft")
+    open_loop = CompensatorConfig(feedback=0.0)
+    options = replace(FAST, follow="nominal", compensation=open_loop)
+
+    result = gp.run_robot(tmp_path / "soft", motion=SWAY, options=options, report=SilentReporter())
+
+    assert result.recording.meta["follow"] == "nominal"
+    rows = result.recording.phase_rows("run")
+    start = rows["qpos"][0]
+    nominal = simulate(arm, start, rows["target"])
+    followed = simulate(soft, start, rows["ctrl"])
+    uncorrected = simulate(soft, start, rows["target"])
+    moving = slice(15, None)  # the nominal simulator did not start at rest here
+    apart = np.abs(followed - nominal)[moving].mean()
+    assert apart < 0.2 * np.abs(uncorrected - nominal)[moving].mean()
+
+
 def test_the_plan_is_shown_on_standard_error_unless_a_reporter_is_given(arm, capsys):
     gp.run_robot(arm, motion=SWAY, options=FAST)
     shown = capsys.readouterr()
@@ -123,6 +154,7 @@ def test_the_plan_names_the_source_of_the_states_where_the_driver_knows_it(so101
         ({"targets": "zmq"}, "sway", "give either"),
         ({"dry_run": True, "out": Path("out")}, "sway", "dry run"),
         ({"connection": gp.Connection(fast=True), "targets": "zmq"}, None, "real time"),
+        ({"follow": "nominal", "model": Path("run")}, "sway", "leave out"),
     ],
 )
 def test_options_that_contradict_each_other_are_refused(arm, options, motion, word):

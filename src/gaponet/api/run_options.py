@@ -99,6 +99,9 @@ class RunOptions(ControlOptions):
     """Payload, kg in each hand. Compensation estimates it if it is not given."""
     model: Path | None = None
     """Run or artifact folder, or name of a network of the package, whose network corrects the commands in addition."""
+    follow: Literal["nominal"] | None = None
+    """Command the robot so that it moves as its nominal simulator does under the targets, for a policy that was trained
+    in an ordinary simulator. --robot must be identified. Instead of --compensate and --model."""
     compensation: CompensatorConfig = CompensatorConfig()  # noqa: RUF009
     """Settings of the compensation."""
     unit_id: str = ""

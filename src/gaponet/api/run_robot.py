@@ -15,6 +15,7 @@ from gaponet.api.results import RunResult
 from gaponet.api.run_consent import Consent, Permission
 from gaponet.api.run_options import LiveOptions, RunOptions
 from gaponet.api.run_report import RunReporter, StderrReporter, describe_plan
+from gaponet.base.arrays import Array
 from gaponet.base.errors import ModelError, UsageError
 from gaponet.deploy.compensator import Compensator, CompensatorConfig
 from gaponet.hw.control.clock import Clock, MonotonicClock, SimulatedClock
@@ -89,10 +90,14 @@ class RunRequest:
             raise UsageError(
                 "give either --motion, what to play, or --targets, where targets come from while it moves"
             )
-        corrects = self.compensate or options.model is not None
+        if options.follow is not None and (self.compensate or options.model is not None):
+            raise UsageError(
+                "--follow already corrects the commands; leave out --compensate and --model"
+            )
+        corrects = self.compensate or options.model is not None or options.follow is not None
         if options.compensation != CompensatorConfig() and not corrects:
             raise UsageError(
-                "settings of the compensation are given, and it is off; add --compensate or --model"
+                "settings of the compensation are given, and it is off; add --compensate, --model or --follow"
             )
         if options.live != LiveOptions() and options.targets is None:
             raise UsageError(
@@ -172,6 +177,7 @@ def execute(request: RunRequest, report: RunReporter, consent: Consent | None = 
     live = None
     if motion is None:
         live = listen(request, robot, driver, clock)
+        live.observe = compensation.observe
         report.note(f"targets are expected on {live.transport.address}")
 
     def plan_and_ask(connected: Driver) -> None:
@@ -393,6 +399,13 @@ class Compensation:
     compensator: Compensator | None = None
     adapted: str | None = None
 
+    def observe(self, qpos: Array) -> tuple[Array, Array] | None:
+        """Return what a policy is to see while the nominal simulator is followed, else None; (n) rad and rad/s."""
+        compensator = self.compensator
+        if compensator is None or compensator.follower is None or not compensator.started:
+            return None
+        return compensator.observe(qpos)
+
     def require_gains(self, driver: Driver) -> None:
         """Refuse servo gains other than those of the recordings."""
         if self.compensator is not None:
@@ -417,8 +430,15 @@ class Compensation:
         return plan
 
     def note_failures(self, recording: Recording, report: RunReporter) -> None:
-        """Store and report how often the network had no finite answer."""
-        if self.compensator is None or self.compensator.model is None:
+        """Store and report which joints were at their limits, and how often the network failed."""
+        if self.compensator is None:
+            return
+        limited = self.compensator.limited_shares
+        recording.meta["limited"] = limited
+        if limited:
+            shares = ", ".join(f"{joint} {share:.0%}" for joint, share in limited.items())
+            report.note(f"at a limit of torque or correction, in share of the time: {shares}")
+        if self.compensator.model is None:
             return
         refused = self.compensator.refused_answers
         recording.meta["refused_answers"] = refused
@@ -446,6 +466,8 @@ def make_compensation(
     options = request.options
     if options.model is not None:
         compensation = _with_model(request, robot, unit, report)
+    elif options.follow is not None:
+        compensation = _following(request, robot)
     elif request.compensate:
         compensation = _feedforward(request, robot, report)
     else:
@@ -474,6 +496,20 @@ def _feedforward(request: RunRequest, robot: RobotSpec, report: RunReporter) -> 
     )
     if robot.nominal is None:
         report.note(f"{robot.folder} is not identified: the feed-forward is the nominal robot's")
+    return Compensation(compensator)
+
+
+def _following(request: RunRequest, robot: RobotSpec) -> Compensation:
+    """Return the compensation under which the robot moves as its nominal simulator does."""
+    options = request.options
+    compensator = Compensator(
+        robot,
+        config=options.compensation,
+        dt=request.dt,
+        payload_side=options.payload_side,
+        extrapolate=options.extrapolate,
+        follow=options.follow,
+    )
     return Compensation(compensator)
 
 
@@ -529,6 +565,7 @@ def facts_of(
         "payload_side": options.payload_side,
         "model": str(options.model) if options.model else None,
         "compensated_by": str(compensator.robot.folder) if compensator else None,
+        "follow": options.follow,
         "adapted": compensation.adapted,
         "limits_from": str(robot.folder),
         "robot_hash": robot_hash(robot),

@@ -7,6 +7,7 @@ with target u + G(u), G being the model's correction. So u + G(u) = a′ is solv
     aim "target":     a′ = a + τ / kp. τ is the torque with which the shadow follows the targets: gravity and, with
                       dynamics, the torque for their velocity and acceleration (feedforward.py)
     aim "simulator":  a′ = a, so that the robot moves like the simulator, including sag and lag
+    follow "nominal": a′ moves the shadow as the nominal simulator moves under a (follow.py); without a model
 
 G is evaluated at the state and history of the shadow, not of the robot. If the compensation is right, both are the
 same. The command does not depend on measurements, so there is no loop that can become unstable, and measurement noise
@@ -31,6 +32,7 @@ from gaponet.base.arrays import Array
 from gaponet.base.errors import ModelError, RobotError, UsageError
 from gaponet.data.describe.plausibility import require_radians
 from gaponet.deploy.feedforward import Feedforward
+from gaponet.deploy.follow import Follower
 from gaponet.deploy.payload import PayloadEstimate
 from gaponet.nn.adaptation import Adaptation
 from gaponet.nn.artifact import GAIN_TOLERANCE, GapModel
@@ -39,6 +41,7 @@ from gaponet.sim.batch import BatchSim, Condition
 from gaponet.sim.model import idle_joints
 
 SETTLING_PERIODS = 100  # control periods in which the shadow comes to rest at a start
+MIN_LIMITED_SHARE = 0.05  # of the periods, from which on a joint at its limits is reported
 
 
 @dataclass(frozen=True)
@@ -62,6 +65,8 @@ class CompensatorConfig:
     """Time constant of the low-pass before the integrator, s."""
     feedback_limit: float = 0.1
     """Largest integral, rad."""
+    observation_time: float = 0.5
+    """Time constant with which `observe` takes over what the robot does differently, s."""
     limit: float = 0.5
     """Largest |u − a|, rad."""
     blend: float = 1.0
@@ -88,6 +93,9 @@ class Compensator:
         compensate.reset(target, payload_mass=3.0)
         u = compensate.step(target, qpos)      # once per control period; send u instead of target
 
+    With follow="nominal" the robot moves as the nominal simulator does under the targets, instead of reaching them:
+    for policies that were trained in an ordinary simulator.
+
     Arrays hold all joints of the robot, (num_envs, n), or (n,) without num_envs; only operated joints are changed.
     """
 
@@ -103,6 +111,7 @@ class Compensator:
         nthread: int = 1,
         extrapolate: bool = False,
         adaptation: Adaptation | None = None,
+        follow: Literal["nominal"] | None = None,
     ) -> None:
         """
         Args:
@@ -116,12 +125,21 @@ class Compensator:
             nthread: Threads of the shadow simulators.
             extrapolate: Accept payloads beyond the training data, up to the model's payload_max, and other servo gains.
             adaptation: Result of `adapt` for this unit; the shadow then has the unit's parameters.
+            follow: "nominal": let the robot move as its nominal simulator does under the targets. It needs an
+                identified robot and takes no model; the aim of the configuration does not count.
 
         Raises:
-            ModelError: The model does not fit the robot, the control period or the aim.
+            ModelError: The model does not fit the robot, the control period or the aim; or the robot is too different
+                from the nominal one to follow it, without `extrapolate`.
+            UsageError: `follow` with a model, or with a robot that is not identified.
         """
         self.dt = robot.dt if dt is None else dt
         max_mass = config.payload_max
+        if follow is not None and model is not None:
+            raise UsageError(
+                "compensator: follow takes no model. A model of the nominal simulator follows it "
+                'with CompensatorConfig(aim="simulator")'
+            )
         if model is not None:
             robot = _simulator_of(model, robot, self.dt, config)
             max_mass = model.config.payload_max if extrapolate else model.max_payload
@@ -150,11 +168,18 @@ class Compensator:
             self.shadow, self.operated, robot, len(self.masses), self.dt
         )
         self._carried = np.full(num, -1)  # index of the mass that each shadow carries
+        self.follower: Follower | None = None
+        if follow is not None:
+            empty = Condition(0.0, payload_side, self.dt)
+            self.follower = Follower(robot, empty, self.masses, num, locked, extrapolate)
         self.payload_mass, self.payload_stated, self.periods = np.zeros(num), False, 0
         self.offset, self.command = np.zeros(
             (2, num, len(self.op))
         )  # u − a′ of the iteration; last command, rad
         self._target: Array | None = None  # last finite target; None before `reset`
+        self._deviation = np.zeros((num, len(self.op)))  # of the robot from the shadow, slow, rad
+        # Control periods in which a motor or the command was at its limit, (num, n).
+        self.limited_periods = np.zeros((num, len(self.op)), int)
 
     # ---- use
 
@@ -210,8 +235,12 @@ class Compensator:
         rest = np.clip(a[:, self.free], *self.shadow.range.T)
         self.shadow.reset(self.ids, rest, 0.0, past=rest[:, None])  # type: ignore[arg-type]
         self.shadow.batch.forward(self.ids, stage=mujoco.mjtStage.mjSTAGE_VEL.value)
+        if self.follower is not None:
+            self.follower.reset(rest, SETTLING_PERIODS)
         for _ in range(SETTLING_PERIODS):
-            self._step_shadow(rest, self._shadow_target(rest[:, self.operated]))
+            self._step_shadow(rest, self._shadow_target(rest))
+        self.limited_periods[:] = 0
+        self._deviation[:] = 0.0
 
     def set_payload(self, payload_mass: Array | float) -> None:
         """Set the payload after a pick or place, kg, one number or (num_envs,); errors as of `reset`."""
@@ -237,6 +266,8 @@ class Compensator:
         if (nearest != self._carried).any():
             for field in self.shadow.fields.values():
                 field[: self.num_envs] = field[self.num_envs + nearest]
+            if self.follower is not None:
+                self.follower.carry(self.ids, nearest)
             self._carried = nearest
 
     def step(
@@ -273,18 +304,61 @@ class Compensator:
             v, torque = (None if x is None else self._as_rows(x)[:, self.op] for x in (qvel, tau))
             self._process_state(self._as_rows(qpos)[:, self.op], v, torque)
         self.feedforward.update(a)
-        shadow_target = self._shadow_target(a)
+        shadow_target = self._shadow_target(targets[:, self.free])
         u = self._invert(shadow_target) + self.feedback.integral
         share = min(1.0, self.periods * self.dt / self.config.blend) if self.config.blend else 1.0
         unlimited = a + share * (u - a)
         limit = self.config.limit
         self.command = np.clip(np.clip(unlimited, a - limit, a + limit), self.low, self.high)
         self.feedback.saturation = np.sign(unlimited - self.command)
+        self.limited_periods += self._at_limit()
         self.periods += 1
         self._step_shadow(targets[:, self.free], shadow_target)
         commands = targets.copy()
         commands[:, self.op] = self.command
         return commands[0] if self.single else commands
+
+    @property
+    def started(self) -> bool:
+        """True after the first `reset`."""
+        return self._target is not None
+
+    def observe(self, qpos: Array | None = None) -> tuple[Array, Array]:
+        """Return the positions, rad, and velocities, rad/s, that a policy of the nominal simulator is to see.
+
+        They are the nominal simulator's, which has no delay, plus the slow part of what distinguishes the robot from
+        its identified simulator. A policy that sees the measured state instead is a loop with the delay of the servos,
+        for which it was not trained. Only with follow="nominal"; once per control period, before `step`.
+
+        Args:
+            qpos: Measured position, rad; None if no new state has arrived. Joints that are not operated are returned
+                as measured, or at home.
+
+        Raises:
+            UsageError: Nothing is followed, or `reset` was not called before.
+        """
+        if self.follower is None or self._target is None:
+            raise UsageError('compensator: observe needs follow="nominal", and reset before')
+        shape = (self.num_envs, len(self.robot.joint_names))
+        positions = np.tile(self.robot.qpos_home, (self.num_envs, 1))
+        velocities = np.zeros(shape)
+        if qpos is not None:
+            positions = self._as_rows(qpos).copy()
+            self._update_deviation(positions[:, self.op])
+        positions[:, self.op] = self.follower.qpos[:, self.operated] + self._deviation
+        velocities[:, self.op] = self.follower.qvel[:, self.operated]
+        if self.single:
+            return positions[0], velocities[0]
+        return positions, velocities
+
+    def _update_deviation(self, measured: Array) -> None:
+        """Update the slow deviation of the robots from their shadows by positions, (num_envs, n) rad."""
+        deviation = measured - self.shadow.qpos[: self.num_envs, self.operated]
+        valid = np.isfinite(deviation).all(axis=1, keepdims=True)
+        limit = self.config.feedback_limit
+        share = min(1.0, self.dt / max(self.config.observation_time, self.dt))
+        change = share * (np.clip(deviation, -limit, limit) - self._deviation)
+        self._deviation += np.where(valid, change, 0.0)
 
     @property
     def doubt(self) -> str:
@@ -294,9 +368,23 @@ class Compensator:
             sentences.append(
                 f"{self.refused_answers} answers of the network were not finite; it corrected nothing there"
             )
+        if self.limited_shares:
+            shares = [f"{joint} {share:.0%}" for joint, share in self.limited_shares.items()]
+            sentences.append(f"at a limit of torque or correction: {', '.join(shares)} of the time")
         if self.payload_stated and self.single:
             sentences.append(self.payload_estimate.contradiction(float(self.payload_mass[0])))
         return "; ".join(sentence for sentence in sentences if sentence)
+
+    @property
+    def limited_shares(self) -> dict[str, float]:
+        """Joint → share of the periods since the start in which it could not do what was asked of it.
+
+        Its command was at a limit or, where the nominal simulator is followed, its motor. Joints with a share below
+        MIN_LIMITED_SHARE are left out; of several robots the mean counts.
+        """
+        shares = self.limited_periods.mean(axis=0) / max(self.periods, 1)
+        named = zip(self.robot.operated, shares.tolist(), strict=True)
+        return {joint: share for joint, share in named if share >= MIN_LIMITED_SHARE}
 
     @property
     def refused_answers(self) -> int:
@@ -305,8 +393,19 @@ class Compensator:
 
     # ---- internals
 
-    def _shadow_target(self, a: Array) -> Array:
-        """Return a′, the shadow's targets of the operated joints, (num_envs, n) rad."""
+    def _at_limit(self) -> Array:
+        """Return which commands, or motors that follow, are at their limits, (num_envs, n)."""
+        at_limit = self.feedback.saturation != 0
+        if self.follower is not None:
+            at_limit = at_limit | self.follower.saturated[:, self.operated]
+        return at_limit
+
+    def _shadow_target(self, targets: Array) -> Array:
+        """Return a′, the shadow's targets of the operated joints, (num_envs, n) rad; targets of the free ones."""
+        if self.follower is not None:
+            commands = self.follower.command(targets)[:, self.operated]
+            return np.clip(commands, self.low, self.high)
+        a = targets[:, self.operated]
         if self.config.aim == "simulator":
             return np.clip(a, self.low, self.high)
         tau = self.bias[: self.num_envs, self.operated]

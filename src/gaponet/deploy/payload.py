@@ -7,7 +7,7 @@ import numpy as np
 
 from gaponet.base.arrays import Array
 from gaponet.robot.spec import RobotSpec
-from gaponet.sim.batch import BatchSim
+from gaponet.sim.batch import Batch, BatchSim, differing_fields
 
 FORGETTING_TIME_S = 1.0  # time constant
 MAX_RATE_KG_S = 1.0  # of the estimate: a payload that appears at once must not make commands jump
@@ -17,6 +17,20 @@ MIN_LEVERAGE = 0.4  # (N·m/kg)² s; below it, the estimate does not change
 # 3 kg give 0.57 to 0.97, and no payload with positions wrong by 0.12 rad up to 0.56. Friction lowers the share of
 # smaller payloads.
 MIN_SIMILARITY = 0.55
+
+
+class PayloadFields:
+    """Values of the model fields that depend on the payload, for each mass that a simulation can carry."""
+
+    def __init__(self, batch: Batch, models: list[mujoco.MjModel]) -> None:
+        """models: The batch's model with each of the masses."""
+        self._values = differing_fields(models)  # (masses, …)
+        self._fields = {name: batch.expand(name) for name in self._values}  # (simulations, …)
+
+    def carry(self, simulations: Array, mass: Array) -> None:
+        """Let simulations, (k,) indices, carry masses, (k,) indices."""
+        for name, field in self._fields.items():
+            field[simulations] = self._values[name][mass]
 
 
 class PayloadEstimate:

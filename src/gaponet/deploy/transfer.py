@@ -33,6 +33,7 @@ KP_RATIO_BOUNDS = (0.15, 5.0)  # target to reference
 MAX_FRICTION_BAND_RAD = 0.06  # frictionloss / kp
 MAX_TIMESTEP_S = 0.0051
 MAX_EXTRA_DELAY_S = 0.005  # of the target's servos
+RANGE_TOLERANCE = 1e-6  # of the ends of these ranges
 STICTION_SPEED = 0.02  # rad/s at which three quarters of the friction act, for joints that are blocked by a contact
 
 
@@ -102,10 +103,10 @@ class Transfer:
         """
         self.sim.qpos[:], self.sim.qvel[:] = qpos, qvel
         corrected = self._corrected(qpos, qvel, target)
-        periods = [self._step_reference(corrected)]
+        periods = [self.step_reference(corrected)]
         if self.inverse.ahead:
             state = self.sim.state()
-            periods += [self._step_reference(corrected) for _ in range(self.inverse.ahead)]
+            periods += [self.step_reference(corrected) for _ in range(self.inverse.ahead)]
             self.sim.set_state(state)
         return self.inverse(periods)
 
@@ -122,7 +123,8 @@ class Transfer:
             corrected[:, self.op] += self._delta
         return corrected
 
-    def _step_reference(self, targets: Array) -> Period:
+    def step_reference(self, targets: Array) -> Period:
+        """Simulate a control period of the reference under targets, rad, without the model."""
         sim = self.sim
         qpos, qvel = sim.qpos.copy(), sim.qvel.copy()
         sim.step(targets)
@@ -183,26 +185,44 @@ def _require_measured(
     if extra_delay.max() > MAX_EXTRA_DELAY_S:
         joint = joints[extra_delay.argmax()]
         raise ModelError(
-            f"joint '{joint}': its servo is {1e3 * extra_delay.max():.0f} ms later than the reference's, and cannot "
-            "follow it: the reference moves before this servo receives a target. Make the reference as late (delay in "
-            "robot.toml; gaponet identify), or extrapolate (extrapolate=True, --extrapolate)"
+            f"joint '{joint}': its servo is {1e3 * extra_delay.max():.0f} ms later than the "
+            "reference's, and cannot follow it: the reference moves before this servo receives a "
+            "target. Make the reference as late (delay in robot.toml; gaponet identify), or "
+            "extrapolate (extrapolate=True, --extrapolate)"
         )
-    for quantity, values, (low, high) in (
+    require_measured_range(inverse, reference, joints)
+
+
+def require_measured_range(
+    inverse: AnalyticInverse, reference: AnalyticInverse, joints: tuple[str, ...]
+) -> None:
+    """Refuse gains, friction and physics steps with which transfer was not measured.
+
+    Raises:
+        ModelError: It names the joint and the quantity.
+    """
+    friction_band = inverse.frictionloss / inverse.kp
+    timestep = np.tile(inverse.h, len(joints))
+    measured = (
         ("kp, as a ratio to the reference's,", inverse.kp / reference.kp, KP_RATIO_BOUNDS),
-        (
-            "frictionloss / kp, rad,",
-            inverse.frictionloss / inverse.kp,
-            (0.0, MAX_FRICTION_BAND_RAD),
-        ),
-        ("the physics step, s,", np.tile(inverse.h, len(joints)), (0.0, MAX_TIMESTEP_S)),
-    ):
-        for joint, *extremes in zip(joints, values.min(axis=0), values.max(axis=0), strict=True):
-            for value in extremes:
-                if not low * (1 - 1e-6) <= value <= high * (1 + 1e-6):
-                    raise ModelError(
-                        f"joint '{joint}': {quantity} is {value:.3g}; transfer was measured from {low:g} to {high:g}. "
-                        "Train in this simulator, or extrapolate (extrapolate=True, --extrapolate)"
-                    )
+        ("frictionloss / kp, rad,", friction_band, (0.0, MAX_FRICTION_BAND_RAD)),
+        ("the physics step, s,", timestep, (0.0, MAX_TIMESTEP_S)),
+    )
+    for quantity, values, bounds in measured:
+        for joint, column in zip(joints, values.T, strict=True):
+            _require_between(f"joint '{joint}': {quantity}", column, bounds)
+
+
+def _require_between(what: str, values: Array, bounds: tuple[float, float]) -> None:
+    """Refuse values outside the bounds; `what` begins the message."""
+    low, high = bounds
+    outside = (values < low * (1 - RANGE_TOLERANCE)) | (values > high * (1 + RANGE_TOLERANCE))
+    if not outside.any():
+        return
+    raise ModelError(
+        f"{what} is {values[outside][0]:.3g}; transfer was measured from {low:g} to {high:g}. "
+        "Train in this simulator, or extrapolate (extrapolate=True, --extrapolate)"
+    )
 
 
 def control_periods_of(model: GapModel, dt: float) -> int:

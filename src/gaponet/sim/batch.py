@@ -393,16 +393,26 @@ def _compiled(
 def expand_differences(batch: Batch, models: list[mujoco.MjModel]) -> dict[str, Array]:
     """Expand every model field that differs between simulations, (nsim) models, and return those fields, live."""
     unique = list({id(m): m for m in models}.values())
-    fields: dict[str, Array] = {}
-    if len(unique) == 1:
-        return fields
     place = {id(m): i for i, m in enumerate(unique)}
     rows = [place[id(m)] for m in models]
+    fields: dict[str, Array] = {}
+    for name, values in differing_fields(unique).items():
+        fields[name] = batch.expand(name)
+        fields[name][:] = values[rows]
+    return fields
+
+
+def differing_fields(models: list[mujoco.MjModel]) -> dict[str, Array]:
+    """Return the values of every field in which models differ, (models, …) each."""
+    fields: dict[str, Array] = {}
+    if len(models) == 1:
+        return fields
     for name in sorted(MODEL_FIELDS):
-        values = [_field(m, name) for m in unique]
-        if values[0] is not None and any(not np.array_equal(v, values[0]) for v in values[1:]):
-            fields[name] = batch.expand(name)
-            fields[name][:] = np.stack(values)[rows]
+        values = [_field(model, name) for model in models]
+        if values[0] is None:
+            continue
+        if any(not np.array_equal(value, values[0]) for value in values[1:]):
+            fields[name] = np.stack(values)
     return fields
 
 

@@ -71,6 +71,7 @@ class AnalyticInverse:
 
     Attributes:
         ahead: Number of control periods after the coming one that a call needs, because servos have a delay.
+        saturated: Joints whose motors cannot give the torque of the last period of a call, (num, n).
     """
 
     def __init__(
@@ -122,6 +123,7 @@ class AnalyticInverse:
         self.qpos, self.qvel = batch.bind("qpos"), batch.bind("qvel")
         self.bias, self.passive = batch.bind("qfrc_bias"), batch.bind("qfrc_passive")
         self.inertia = Inertia(batch, model, self.dof)
+        self.saturated = np.zeros((self.num, len(joints)), bool)
 
     @classmethod
     def of(cls, sim: BatchSim) -> AnalyticInverse:
@@ -139,7 +141,7 @@ class AnalyticInverse:
 
         periods: The coming one and `ahead` more.
         """
-        held = np.stack([self._targets_in_force(period) for period in periods])
+        held = np.stack([self.targets_in_force(period) for period in periods])
         if not self.ahead:
             return held[0]
         late = np.broadcast_to(self.delay / self.dt, held[0].shape)
@@ -147,7 +149,8 @@ class AnalyticInverse:
         first, second = (np.take_along_axis(held, i[None], axis=0)[0] for i in (whole, whole + 1))
         return first + (late - whole) * (second - first)
 
-    def _targets_in_force(self, period: Period) -> Array:
+    def targets_in_force(self, period: Period) -> Array:
+        """Return the targets that must be in force in a period, (num, n) rad, not limited to any range."""
         displacement, gain = period.next_qpos - period.qpos, period.next_qvel - period.qvel
         ends = np.stack([self.h * period.qvel, self.h * period.next_qvel, displacement])
         qpos = period.qpos + np.einsum(
@@ -159,10 +162,12 @@ class AnalyticInverse:
         torque += self.damping * (mean(after) - mean(before[:-1]))
         back = self.kp * (qpos - self.offset) + self.kd * (before[:-1] if self.explicit else after)
         low, high = self.low, self.high
-        if (no_load := self.terms.get("no_load_speed")) is None:
-            return self._targets(np.clip(torque, low, high), back, low, high, mean)
-        low, high = torque_range(self.high, before[:-1] / no_load)
-        return self._targets(np.clip(torque, mean(low), mean(high)), back, low, high, mean)
+        mean_low, mean_high = low, high
+        if (no_load := self.terms.get("no_load_speed")) is not None:
+            low, high = torque_range(self.high, before[:-1] / no_load)
+            mean_low, mean_high = mean(low), mean(high)
+        self.saturated = (torque < mean_low) | (torque > mean_high)
+        return self._targets(np.clip(torque, mean_low, mean_high), back, low, high, mean)
 
     def _targets(
         self, torque: Array, back: Array, low: Array, high: Array, mean: Callable[[Array], Array]

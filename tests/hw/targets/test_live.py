@@ -414,3 +414,16 @@ def test_nothing_is_taken_apart_for_the_first_time_while_the_robot_moves(arm):
     made = _type_adapter.cache_info().misses
     assert decode("a", b'{"time": 1.0, "target": {"shoulder": 0.1}}').error == ""
     assert made == _type_adapter.cache_info().misses == 1
+
+
+def test_the_sender_is_told_what_a_policy_is_to_see_beside_what_is_measured(arm):
+    driver = NotedArm(arm)
+    transport = Scripted(driver.clock, lambda t: [good(t)] if t < 1.0 else [])
+    targets = LiveTargets(transport, arm, driver.commanded, driver.clock, DT, SafetyConfig().speed)
+    targets.observe = lambda qpos: (qpos + 0.1, np.full(2, 0.2))
+
+    control(driver).run(targets)
+
+    _, told = transport.states[-1]
+    np.testing.assert_allclose(told["nominal_qpos"], np.array(told["qpos"]) + 0.1)
+    assert told["nominal_qvel"] == [0.2, 0.2]

@@ -30,6 +30,7 @@ class RemoteRobot:
         joint_names: All joints of the robot, in the order of every array; set with the first state.
         commanded: Those that targets may name.
         ended: Why the run is over; empty before.
+        nominal_qpos, nominal_qvel: What a policy is to see with --follow nominal, rad and rad/s; None without it.
     """
 
     def __init__(self, address: str = ADDRESS, patience: float = 10.0) -> None:
@@ -43,6 +44,8 @@ class RemoteRobot:
         self.joint_names: tuple[str, ...] = ()
         self.commanded: tuple[str, ...] = ()
         self.ended = ""
+        self.nominal_qpos: Array | None = None
+        self.nominal_qvel: Array | None = None
         self._context = zmq.Context()
         self._socket = self._context.socket(zmq.DEALER)
         for option, value in ((zmq.LINGER, 200), (zmq.SNDHWM, 8), (zmq.RCVHWM, 8)):
@@ -111,5 +114,8 @@ class RemoteRobot:
                     return None
         self.joint_names = tuple(message["joint_names"])
         self.commanded = tuple(message["commanded"])
+        if "nominal_qpos" in message:
+            self.nominal_qpos = np.array(message["nominal_qpos"], float)
+            self.nominal_qvel = np.array(message["nominal_qvel"], float)
         qpos, qvel, tau = (np.array(message[name], float) for name in ("qpos", "qvel", "tau"))
         return State(message["time"], qpos, qvel, tau, np.full_like(qpos, np.nan))

@@ -11,7 +11,7 @@ lists the end of each fault.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Hashable
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
@@ -165,6 +165,8 @@ class LiveTargets:
         counts: accepted (`taken`) and rejected (`refused`, by kind) messages; periods in which a
             target was `held`; the `sender`.
         remarks: Sentences for the recording; the controller takes them out.
+        observe: Returns positions and velocities, (n) rad and rad/s, that a policy is to see instead of the measured
+            position, which it is given; None, or returning None: there are none.
     """
 
     def __init__(
@@ -196,6 +198,7 @@ class LiveTargets:
         self.config = config
         self.counts: dict[str, Any] = {"taken": 0, "held": 0, "refused": Counter(), "sender": ""}
         self.remarks: list[str] = []
+        self.observe: Callable[[Array], tuple[Array, Array] | None] | None = None
         self._sender: Hashable | None = None
         self._joints: tuple[str, ...] = ()
         self._target: Array | None = None  # the last accepted one, all joints, rad
@@ -219,9 +222,7 @@ class LiveTargets:
         """
         now = self.clock.now()
         self._start = now if self._start is None else self._start
-        names = {"joint_names": self.robot.joint_names, "commanded": self.commanded}
-        readings = {name: getattr(state, name).tolist() for name in ("qpos", "qvel", "tau")}
-        self.transport.publish(self._sender, {"time": state.time, **names, **readings})
+        self.transport.publish(self._sender, self._published(state))
         if not (self._ended and k > 0):
             unproven = self._target is None
             self._receive(now, state)
@@ -273,6 +274,21 @@ class LiveTargets:
             self._step, distance, self.speed * self.dt, self.config.acceleration * self.dt**2
         )
         self._position = np.where(self._step == distance, target, self._position + self._step)
+
+    def _published(self, state: State) -> dict[str, Any]:
+        """Return what the sender is told of a state."""
+        message: dict[str, Any] = {
+            "time": state.time,
+            "joint_names": self.robot.joint_names,
+            "commanded": self.commanded,
+        }
+        for name in ("qpos", "qvel", "tau"):
+            message[name] = getattr(state, name).tolist()
+        seen = None if self.observe is None else self.observe(state.qpos)
+        if seen is not None:
+            message["nominal_qpos"] = seen[0].tolist()
+            message["nominal_qvel"] = seen[1].tolist()
+        return message
 
     def _receive(self, now: float, state: State) -> None:
         """Accept the newest valid target; each is compared with the one in force before this
