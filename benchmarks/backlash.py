@@ -28,6 +28,7 @@ from gaponet.sim.batch import Batch
 from gaponet.sim.model import STIFF_MOBILITY, STIFF_SOLIMP, STIFF_SOLREF, build_model
 from gaponet.sim.replay import motion_errors, replay
 from gaponet.sysid.identify import identify
+from gaponet.sysid.options import IdentifyOptions
 
 DT, H = 0.01, 5e-4  # s: of the logs, of the true robot's physics
 MOTIONS, FITTED, VALIDATED, SECONDS = 14, 6, 10, 4.0
@@ -183,7 +184,12 @@ def result(robot: PlayRobot, terms: tuple[str, ...] | None = None) -> dict[str, 
     """Identify a robot from its logs; return widths, standard errors, the verdict and errors of new motions."""
     ctrl = np.stack([robot.commands(k) for k in range(MOTIONS)])
     logs, spec = robot.record(ctrl, [f"m{k:02}" for k in range(MOTIONS)]), robot.spec()
-    fit = identify(logs[:FITTED], spec, logs[FITTED:VALIDATED], terms=terms, table=False, folds=1)
+    fit = identify(
+        logs[:FITTED],
+        spec,
+        logs[FITTED:VALIDATED],
+        options=IdentifyOptions(terms=terms, table=False, folds=1),
+    )
     return {
         "seed": robot.seed, "true_rad": robot.backlash.tolist(), "findings": fit.findings,
         "rad": fit.robot.backlash[fit.robot.operated_index].tolist(),

@@ -31,6 +31,7 @@ from gaponet.robot.spec import Link, RobotSpec, load_robot
 from gaponet.sim.model import build_model, stiffen_friction
 from gaponet.sim.replay import motion_errors
 from gaponet.sysid.identify import identify
+from gaponet.sysid.options import IdentifyOptions
 from gaponet.virtual.physics import Physics, neutral
 from gaponet.virtual.virtual_robot import VirtualRobot
 
@@ -240,7 +241,9 @@ def play(seed: int, torque: bool) -> dict[str, Any]:
         judge("file", robot, 0.0)
         for name, masses in (("identify", False), ("identify --masses", True)):
             began = time.process_time()
-            made = identify(train, robot, validation, table=False, masses=masses)
+            made = identify(
+                train, robot, validation, options=IdentifyOptions(table=False, masses=masses)
+            )
             judge(name, made.robot, time.process_time() - began)
         began = time.process_time()
         judge(

@@ -23,6 +23,7 @@ from gaponet.data.sequence import Sequence, SequenceMeta
 from gaponet.robot.spec import RobotSpec, load_robot
 from gaponet.sim.replay import motion_errors
 from gaponet.sysid.identify import identify
+from gaponet.sysid.options import IdentifyOptions
 from gaponet.virtual.physics import Physics, neutral
 from gaponet.virtual.virtual_robot import VirtualRobot
 
@@ -116,7 +117,12 @@ def result(seed: int) -> dict[str, object]:
     """Identify a robot with and without the term; return estimates and errors of the test motions."""
     robot, unit, thinning = draw(seed)
     logs, began = record(robot, unit, seed), time.process_time()
-    fit = identify(logs[:FITTED], robot, logs[FITTED:VALIDATED], table=False, folds=1, nthread=1)
+    fit = identify(
+        logs[:FITTED],
+        robot,
+        logs[FITTED:VALIDATED],
+        options=IdentifyOptions(table=False, folds=1, nthread=1),
+    )
     seconds = time.process_time() - began
     term, without = next((c for c in fit.comparisons if c.name == "temperature"), None), fit
     if term and term.accepted:  # else the term changes nothing
@@ -124,10 +130,7 @@ def result(seed: int) -> dict[str, object]:
             logs[:FITTED],
             robot,
             logs[FITTED:VALIDATED],
-            terms=OTHER_TERMS,
-            table=False,
-            folds=1,
-            nthread=1,
+            options=IdentifyOptions(terms=OTHER_TERMS, table=False, folds=1, nthread=1),
         )
     return {
         "seed": seed, "true_per_kelvin": (-thinning).tolist(), "per_kelvin": fit.robot.friction_per_kelvin.tolist(),

@@ -25,6 +25,7 @@ from gaponet.robot.spec import RobotSpec, load_robot
 from gaponet.sim.replay import motion_errors
 from gaponet.sysid.identify import identify
 from gaponet.sysid.motion_limits import default_terms
+from gaponet.sysid.options import IdentifyOptions
 from gaponet.virtual.physics import neutral
 from gaponet.virtual.virtual_robot import VirtualRobot
 
@@ -226,14 +227,17 @@ def measure(seed: int, work: Path, timestep: float) -> dict[str, object]:
             "no_load": [0.0] * n,
             "std": [0.0] * n,
         }
-    options = {"windows": 8, "table": False, "nthread": 1}
+    options = IdentifyOptions(windows=8, table=False, nthread=1)
     limits = tuple(t for t in base if t == "limit")
     rich = plain = identify(
-        train, robot, validation, terms=(*limits, "speed", *base[len(limits) :]), **options
+        train,
+        robot,
+        validation,
+        replace(options, terms=(*limits, "speed", *base[len(limits) :])),
     )
     row["seconds"] = time.perf_counter() - began
     if rich.robot.no_load_speed.any():  # else nothing of the term is left in the robot
-        plain = identify(train, robot, validation, terms=base, **options)
+        plain = identify(train, robot, validation, replace(options, terms=base))
     errors = [1e3 * np.array(motion_errors(test, one.robot)) for one in (plain, rich)]
     row |= {
         "accepted": [c.name for c in rich.comparisons if c.accepted], "without": errors[0].tolist(),

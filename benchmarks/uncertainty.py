@@ -33,6 +33,7 @@ from gaponet.sim.replay import replay
 from gaponet.sysid.evidence.drift import drift
 from gaponet.sysid.evidence.evidence import estimate_uncertainty
 from gaponet.sysid.identify import identify
+from gaponet.sysid.options import IdentifyOptions
 from gaponet.sysid.uncertainty import ParameterUncertainty
 from gaponet.virtual.fleet import load_fleet, sample_unit
 from gaponet.virtual.physics import Physics
@@ -162,7 +163,9 @@ def _evaluated(
 ) -> dict[str, object]:
     """Identify one arm and check it on every day."""
     train, val, began = days[0], days[1][:3], time.monotonic()
-    fit = identify(train, robot, val, windows=WINDOWS, table=False, nthread=1)
+    fit = identify(
+        train, robot, val, options=IdentifyOptions(windows=WINDOWS, table=False, nthread=1)
+    )
     right = fit.robot
     mine = estimate_uncertainty(right, train, val, fit.covariance, nthread=1)
     op = robot.operated_index

@@ -22,11 +22,11 @@ RANKS = (
 # The same within sub-packages: these folders may be imported by those after them, never by what lies beside them.
 INNER = {
     "nn": ("training",),
-    "sysid": ("evidence",),
+    "sysid": ("steps", "evidence"),
     "report": ("figures", "view"),
     "experiments": ("paper", "real"),
 }
-BESIDE = {"report": {"report"}}  # modules above the folders beside them
+BESIDE = {"report": {"report"}, "sysid": {"identify"}}  # modules above the folders beside them
 HEAVY = (
     "mujoco",
     "torch",

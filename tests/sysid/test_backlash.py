@@ -8,10 +8,10 @@ from arm import write_arm
 
 from gaponet.data.sequence import Sequence, SequenceMeta
 from gaponet.sim.replay import replay
-from gaponet.sysid import backlash
 from gaponet.sysid.axes import Bounds
 from gaponet.sysid.joint_rollouts import JointRollouts
 from gaponet.sysid.problem import JointFit
+from gaponet.sysid.steps import backlash
 
 WIDTH = 0.008
 SERVO = {

@@ -14,6 +14,7 @@ from gaponet.sysid.acceptance import Judge, cross_validation
 from gaponet.sysid.axes import Bounds
 from gaponet.sysid.identify import identify
 from gaponet.sysid.motion_limits import with_stops
+from gaponet.sysid.options import IdentifyOptions
 from gaponet.sysid.problem import KinematicChains
 from gaponet.sysid.robot_rollouts import cut
 
@@ -25,7 +26,7 @@ def found(tmp_path_factory):
     robot = write_arm(
         tmp_path_factory.mktemp("arm"), TOML.replace("kp = 20.0", "kp = 20.0\nkd = 0.5")
     )
-    return robot, identify(sequences, robot, windows=4)
+    return robot, identify(sequences, robot, options=IdentifyOptions(windows=4))
 
 
 def test_gain_and_delay_are_found(found):
@@ -46,7 +47,7 @@ def test_damping_below_zero_is_fitted_if_no_recording_states_kd_and_the_nominal_
 
 def test_recordings_of_the_nominal_robot_change_nothing(tmp_path):
     robot = write_arm(tmp_path)
-    fit = identify(recordings(robot, 4, rows=150), robot, windows=4)
+    fit = identify(recordings(robot, 4, rows=150), robot, options=IdentifyOptions(windows=4))
     assert fit.robot is robot
     assert not fit.improved
 
@@ -55,7 +56,10 @@ def test_a_joint_that_never_moves_is_reported_as_undetermined(tmp_path):
     robot = write_arm(tmp_path)
     still = [replace(s, ctrl=np.zeros_like(s.ctrl)) for s in recordings(robot, 2, rows=100)]
     still = [replace(s, qpos=np.zeros_like(s.qpos), qvel=np.zeros_like(s.qvel)) for s in still]
-    assert any("not determined" in w for w in identify(still, robot, windows=2).warnings)
+    assert any(
+        "not determined" in w
+        for w in identify(still, robot, options=IdentifyOptions(windows=2)).warnings
+    )
 
 
 def test_terms_of_the_robot_are_part_of_the_start(tmp_path):
@@ -67,7 +71,9 @@ def test_terms_of_the_robot_are_part_of_the_start(tmp_path):
     warm = robot.with_servos({j: {"friction_per_kelvin": -0.01} for j in robot.operated})
     for start in (begun, warm):
         assert (
-            identify(logs, start, windows=2, terms=(), budget=1e-6).robot.joint_names
+            identify(
+                logs, start, options=IdentifyOptions(windows=2, terms=(), seconds=1e-6)
+            ).robot.joint_names
             == robot.joint_names
         )
 
@@ -75,7 +81,9 @@ def test_terms_of_the_robot_are_part_of_the_start(tmp_path):
 def test_no_term_is_tried_after_the_time_limit(tmp_path):
     robot = write_arm(tmp_path)
     fit = identify(
-        recordings(robot, 3, rows=100), robot, windows=2, terms=("stribeck", "load"), budget=1e-6
+        recordings(robot, 3, rows=100),
+        robot,
+        options=IdentifyOptions(windows=2, terms=("stribeck", "load"), seconds=1e-6),
     )
     assert fit.comparisons == ()
     assert any("the time was over before stribeck, load" in w for w in fit.warnings)
@@ -139,7 +147,12 @@ def test_cross_validation_ignores_one_short_motion_without_information(tmp_path)
         [record(robot, commands(10, 4), "still", kp=1.0)],
     )
     alone, folds = (
-        identify(logs, robot, still, windows=4, terms=(), table=False, folds=count).chosen
+        identify(
+            logs,
+            robot,
+            still,
+            options=IdentifyOptions(windows=4, terms=(), table=False, folds=count),
+        ).chosen
         for count in (1, 3)
     )
     assert alone == "given"

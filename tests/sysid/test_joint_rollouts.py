@@ -15,6 +15,7 @@ from gaponet.sim.replay import replay
 from gaponet.sim.servo import compiled, simulate_joints
 from gaponet.sysid.identify import identify
 from gaponet.sysid.joint_rollouts import JointRollouts
+from gaponet.sysid.options import IdentifyOptions
 
 FIRST = {
     "kp": 20.0,
@@ -113,7 +114,7 @@ def test_unrecorded_joints_stand_still_and_are_not_counted(tmp_path):
         assert np.array_equal(moved.qpos[:, 0], np.full(250, np.float32(0.4)))
         seen = replace(whole, qpos=moved.qpos, qvel=moved.qvel)
         windows += [seen.rows(slice(a, a + 50)) for a in range(0, 250, 50)]
-    found = identify(windows, robot, terms=())
+    found = identify(windows, robot, options=IdentifyOptions(terms=()))
     assert found.robot.kp[1] == pytest.approx(0.7 * robot.kp[1], rel=0.02)
     assert found.robot.kp[0] == pytest.approx(robot.kp[0], rel=1e-3)
     assert found.after < 0.2 * found.before

@@ -15,9 +15,10 @@ from gaponet.sim.model import build_model, model_hash, with_links
 from gaponet.sysid.axes import CLASSIC, Bounds
 from gaponet.sysid.identify import identify
 from gaponet.sysid.joint_rollouts import JointRollouts
-from gaponet.sysid.link_fit import LinkFit
+from gaponet.sysid.options import IdentifyOptions
 from gaponet.sysid.problem import JointFit
 from gaponet.sysid.robot_rollouts import cut
+from gaponet.sysid.steps.link_fit import LinkFit
 
 WELDED = XML.replace(
     '<joint name="elbow"',
@@ -158,7 +159,10 @@ def test_masses_are_accepted_where_motions_that_were_not_fitted_gain(robot, monk
     true = heavy(robot, factor) if factor != 1 else robot
     train, judges = recorded(true, 4, 200), recorded(true, 3, 200, first=50)
     fitted = identify(
-        train, robot, judges, windows=4, terms=(), table=False, nthread=1, masses=True
+        train,
+        robot,
+        judges,
+        options=IdentifyOptions(windows=4, terms=(), table=False, nthread=1, masses=True),
     )
     comparison = fitted.comparisons[-1]
     assert comparison.name == "masses"

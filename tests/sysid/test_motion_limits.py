@@ -12,6 +12,7 @@ from gaponet.sim.replay import replay
 from gaponet.sysid.identify import identify
 from gaponet.sysid.joint_rollouts import JointRollouts
 from gaponet.sysid.motion_limits import default_terms, target_speeds
+from gaponet.sysid.options import IdentifyOptions
 
 
 def recorded(robot, count=6, rows=400):
@@ -65,7 +66,10 @@ def test_identification_finds_a_ramp_and_warns(tmp_path, servos):
     servos["shoulder"]["target_speed"] = 0.6
     logs = recorded(robot.with_servos(servos), 5, rows=240)
     found = identify(
-        logs[:3], robot, logs[3:], windows=3, terms=(), table=False, nthread=1, folds=1
+        logs[:3],
+        robot,
+        logs[3:],
+        options=IdentifyOptions(windows=3, terms=(), table=False, nthread=1, folds=1),
     )
     assert found.robot.target_speed == pytest.approx([0.6, 0.0], rel=0.04)
     assert found.after < 0.1 * found.before

@@ -14,6 +14,7 @@ from gaponet.sysid.axes import CLASSIC, Bounds
 from gaponet.sysid.identify import identify
 from gaponet.sysid.joint_rollouts import JointRollouts
 from gaponet.sysid.motion_limits import default_terms
+from gaponet.sysid.options import IdentifyOptions
 from gaponet.sysid.problem import JointFit, standard_errors
 
 SERVO = {
@@ -90,7 +91,12 @@ def test_a_torque_limit_of_half_the_files_is_recovered(tmp_path):
         replace(s, qpos=t.qpos, qvel=t.qvel)
         for s, t in zip(asked, replay(asked, weak), strict=True)
     ]
-    found = identify(parts[:4], robot, parts[4:], windows=4, terms=("limit",), table=False, folds=1)
+    found = identify(
+        parts[:4],
+        robot,
+        parts[4:],
+        options=IdentifyOptions(windows=4, terms=("limit",), table=False, folds=1),
+    )
     assert [c.name for c in found.comparisons if c.accepted] == ["limit"]
     np.testing.assert_allclose(found.robot.effort_limit, 2.5, rtol=0.05)
     assert found.after < 0.1 * found.before
@@ -105,7 +111,12 @@ def test_damping_of_an_unmoved_joint_is_recovered_from_the_motion_of_another(tmp
         replace(s, qpos=t.qpos, qvel=t.qvel)
         for s, t in zip(swung, replay(swung, true), strict=True)
     ]
-    found = identify(parts[:2], told, parts[2:], windows=2, terms=(), table=False, folds=1)
+    found = identify(
+        parts[:2],
+        told,
+        parts[2:],
+        options=IdentifyOptions(windows=2, terms=(), table=False, folds=1),
+    )
     assert found.improved
     assert found.after < 0.1 * found.before
     assert any("shoulder: not determined" in text for text in found.warnings)

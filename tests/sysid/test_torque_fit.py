@@ -15,6 +15,7 @@ from gaponet.sim.dynamics import CUTOFF_HZ, inverse_dynamics
 from gaponet.sim.model import build_model, model_hash
 from gaponet.sim.replay import replay
 from gaponet.sysid.identify import identify
+from gaponet.sysid.options import IdentifyOptions
 from gaponet.sysid.torque import TorqueFit
 
 
@@ -108,7 +109,7 @@ def loaded(robot):
 def test_the_fit_from_torque_is_used_if_validation_motions_accept_it(tmp_path):
     robot = write_arm(tmp_path / "arm")
     windows = loaded(robot)
-    found = identify(windows[:12], robot, windows[12:], terms=())
+    found = identify(windows[:12], robot, windows[12:], options=IdentifyOptions(terms=()))
     (tried,) = found.comparisons
     assert (found.chosen, tried.name, tried.accepted, len(tried.before)) == (
         "torque",
@@ -140,7 +141,7 @@ def test_a_refit_with_the_validation_motions_is_dropped_if_it_follows_them_worse
         )
 
     monkeypatch.setattr(TorqueFit, "fit", astray)
-    found = identify(windows[:12], robot, windows[12:], terms=(), folds=1)
+    found = identify(windows[:12], robot, windows[12:], options=IdentifyOptions(terms=(), folds=1))
     assert found.chosen == "torque"
     assert found.held_out[0].robot is found.robot
     assert abs(found.robot.offset).max() < 0.05

@@ -110,6 +110,7 @@ def identify(
     from gaponet.sim.metrics import MIN_RELATIVE_GAIN
     from gaponet.sysid.acceptance import HeldOut, held_out_errors
     from gaponet.sysid.identify import identify as fit
+    from gaponet.sysid.options import IdentifyOptions
     from gaponet.sysid.servo_types import servos_like
 
     data, spec = as_dataset(dataset, robot)
@@ -129,6 +130,7 @@ def identify(
     if budget is not None and seconds is None:
         raise UsageError(f"--budget {budget}: give a time such as 60s or 4m")
     require_other_folder(folder, spec)
+    train_set = data.sequences(split["train"])
     with lock_folder(folder, "robot"):
         gate = pass_gate(
             data,
@@ -137,10 +139,16 @@ def identify(
             despite_errors=despite_errors,
             progress=progress,
         )
-        fitted = fit(
-            data.sequences(split["train"]), start, val, windows, terms, table, threads, progress, seconds, stops,
+        options = IdentifyOptions(
+            windows=windows,
+            terms=terms,
+            table=table,
+            stops=stops,
             masses=masses,
-        )  # fmt: skip
+            seconds=seconds,
+            nthread=threads,
+        )
+        fitted = fit(train_set, start, val, options, progress)
         after, given, nominal = (
             held_out_errors(HeldOut(s, one or own) for s, own in fitted.held_out)
             for one in (None, spec, spec.nominal or spec)
@@ -150,7 +158,6 @@ def identify(
         errors = {"nominal": nominal, "identified": after}
         means = {name: float(e.mean()) for name, e in errors.items()}
         judges = [] if fitted.held_out[0].robot is fitted.robot else fitted.held_out
-        train_set = data.sequences(split["train"])
         with whole_folder(folder, "robot", "robot.toml", OUTDATED_FILES) as place:
             save_robot(fitted.robot, place)
             write_json(

@@ -31,6 +31,7 @@ from gaponet.sim.batch import Condition, speed_limited
 from gaponet.sim.model import model_hash
 from gaponet.sim.replay import replay
 from gaponet.sysid.identify import identify
+from gaponet.sysid.options import IdentifyOptions
 
 T = TypeVar("T")
 
@@ -95,7 +96,9 @@ def fit_plain_servos(
     start = replace(robot, **without)
 
     def fit() -> dict[str, dict[str, float]]:
-        fitted = identify(recordings, start, terms=(), table=False, progress=progress).robot
+        fitted = identify(
+            recordings, start, options=IdentifyOptions(terms=(), table=False), progress=progress
+        ).robot
         return {
             joint: {
                 name: float(v)

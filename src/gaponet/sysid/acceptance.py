@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from collections.abc import Sequence as ListOf
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -40,6 +40,16 @@ class HeldOut(NamedTuple):
 def held_out_errors(folds: Iterable[HeldOut]) -> Array:
     """Return the mean |error| of each motion in rollouts of the robot that was fitted without it, (motions,) rad."""
     return np.concatenate([motion_errors(sequences, robot) for sequences, robot in folds])
+
+
+class Judged(Protocol):
+    """A candidate for comparison: values and links of each fold."""
+
+    @property
+    def values(self) -> list[Values]: ...
+
+    @property
+    def links(self) -> list[Links]: ...
 
 
 Split = tuple[list[Sequence], list[Sequence]]  # recordings to fit, recordings that judge
@@ -97,6 +107,8 @@ class Identified:
             a cross-validation; `robot` itself where nothing was fitted to them afterwards.
         findings: A sentence about each joint that may have backlash, and about each link that changed.
         links: Masses and inertias, if they were fitted and accepted.
+        without_terms: The best fit without terms of the servo model, if the robot has some: what engines without such
+            terms can play.
     """
 
     robot: RobotSpec
@@ -113,6 +125,7 @@ class Identified:
     held_out: tuple[HeldOut, ...] = ()
     findings: tuple[str, ...] = ()
     links: LinkResult | None = None
+    without_terms: RobotSpec | None = None
 
     @property
     def improved(self) -> bool:
@@ -195,9 +208,13 @@ class Judge:
             (total / np.maximum(count, 1)).sum(axis=0) / np.maximum((count > 0).sum(axis=0), 1)
         )
 
-    def compare(self, name: str, before: ListOf[Values], after: ListOf[Values]) -> Comparison:
-        """Compare a candidate with the one before it."""
-        return Comparison(name, self.errors(before), self.errors(after))
+    def compare(self, name: str, before: Judged, after: Judged) -> Comparison:
+        """Compare a state of the fit with the one before it."""
+        return Comparison(
+            name,
+            self.errors(before.values, before.links),
+            self.errors(after.values, after.links),
+        )
 
     def best_by_joint(self, candidates: dict[str, list[Values]]) -> tuple[str, list[Values]]:
         """Return name and values of the first candidate, with another one's values at joints whose motions accept them.

@@ -8,9 +8,7 @@ much better, the robot is identified with it as well.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from collections.abc import Sequence as ListOf
-from dataclasses import replace
 
 import numpy as np
 
@@ -19,9 +17,7 @@ from gaponet.data.sequence import Sequence
 from gaponet.robot.servo_fields import DEFAULT_TERMS, Term
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.batch import speed_limited
-from gaponet.sim.metrics import Comparison
 from gaponet.sim.temperature import temperature_varies
-from gaponet.sysid.acceptance import Identified, held_out_errors
 from gaponet.sysid.axes import greatest_speeds
 
 MIN_PERIOD_S, MAX_LAG_S, LAGS = 0.01, 0.3, 16  # of rows that are compared; lags that are tried
@@ -195,41 +191,3 @@ def _lagged(ctrl: Array, dt: float) -> Array:
     for t, target in enumerate(ctrl):
         lagged[t] = at = at + share * (target - at)
     return lagged
-
-
-def with_speed_limits(
-    fit: Callable[[RobotSpec, float | None], Identified],
-    sequences: ListOf[Sequence],
-    robot: RobotSpec,
-    budget: float | None,
-) -> Identified:
-    """Fit the robot, and again with speed limits where recordings show some; return the fit that validation accepts.
-
-    Speed limits that the robot has are taken as true.
-
-    Args:
-        fit: Function of the robot to start from and of the time that it may take, s.
-        budget: Time of all fits together, s; None for no limit.
-    """
-    speeds = (
-        {}
-        if robot.target_speed.any()
-        else dict(zip(robot.operated, target_speeds(sequences, robot), strict=True))
-    )
-    limits = {j: {"target_speed": float(f"{v:.3g}")} for j, v in speeds.items() if v}
-    if not limits:
-        return fit(robot, budget)
-    fits = [fit(r, budget and budget / 2) for r in (robot, robot.with_servos(limits))]
-    plain, limited = fits
-    comparison = Comparison("ramp", *(held_out_errors(f.held_out) for f in fits))
-    if not comparison.accepted:
-        return replace(plain, comparisons=(*plain.comparisons, comparison))
-    listed = ", ".join(f"{joint} {v['target_speed']:.3g}" for joint, v in limits.items())
-    warning = (
-        f"servos limit the speed of their targets, rad/s: {listed}. That is a setting of theirs (profile velocity, "
-        "goal speed). The simulator has it, so record and run with the same one; engines that load an export do not"
-    )
-    return replace(
-        limited, before=plain.before, chosen=limited.chosen if limited.improved else "ramp",
-        comparisons=(*limited.comparisons, comparison), warnings=(warning, *limited.warnings),
-    )  # fmt: skip

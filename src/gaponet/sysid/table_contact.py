@@ -111,7 +111,7 @@ def _most_wrong(scene: _TableRollouts, away: Array) -> list[Sequence]:
 
 
 def fit_table(
-    parts: list[Sequence], robot: RobotSpec, lowest: float, nthread: int, progress: Callable[[float], None],
+    parts: list[Sequence], robot: RobotSpec, lowest: float, nthread: int, report: Callable[[float], object],
     validation: ListOf[Sequence] = (),
 ) -> TableFit:  # fmt: skip
     """Fit height, friction and stiffness of the table and the zeros, from several starts.
@@ -120,7 +120,7 @@ def fit_table(
         parts: Windows in which a tip is low; those with the largest errors without a table are fitted.
         robot: The robot with fitted servos; if it has a table, the height is taken as measured.
         lowest: Least height of a tip in the windows, m.
-        progress: Called in each iteration with the root mean square error, rad.
+        report: Called in each iteration with the root mean square error, rad; a true answer ends the search.
         validation: Whole recordings that choose among the starts' results; without them the windows do.
     """
     if not parts:
@@ -141,9 +141,17 @@ def fit_table(
     costs = soft_l1(scene.soft_errors(guesses.reshape(-1, 3 + n))).reshape(guesses.shape[:2])
     starts = guesses[np.arange(len(guesses)), costs.argmin(axis=1)]
     pace, best_first = [np.inf], starts[costs.min(axis=1).argsort()]
-    results = [
-        _searched(scene, start, measured is not None, progress, pace) for start in best_first
-    ]
+    over = False
+
+    def tell(error: float) -> bool:
+        nonlocal over
+        over = bool(report(error))
+        return over
+
+    results = []
+    for start in best_first:
+        if not over:
+            results.append(_searched(scene, start, measured is not None, tell, pace))
     tables = [_with_table(robot, x) for x, _ in results]
     errors = [cost for _, cost in results]
     if validation:
@@ -159,7 +167,7 @@ def _searched(
     scene: _TableRollouts,
     start: Array,
     measured: bool,
-    progress: Callable[[float], None],
+    report: Callable[[float], bool],
     pace: list[float],
 ) -> tuple[Array, float]:
     """Return the best table and zeros (3 + n,) near a start, and their cost. A measured height stays.
@@ -183,16 +191,16 @@ def _searched(
         both = np.concatenate([scene.soft_errors(xs), priced], axis=1)
         return both[:, None].astype(np.float32)
 
-    def report(cost: Array) -> bool:
-        """Show the error, and return whether another start was better after as many iterations."""
+    def ends(cost: Array) -> bool:
+        """Show the error, and return whether the time is over, or another start was better after as many iterations."""
         costs.append(float(cost.sum()))
-        progress(ERROR_SCALE_RAD * float(np.sqrt(2 * costs[-1] / rows)))
+        over = report(ERROR_SCALE_RAD * float(np.sqrt(2 * costs[-1] / rows)))
         if len(costs) != FIRST_COMPARISON:
-            return False
+            return over
         behind = costs[-1] > min(pace)
         if not behind:
             pace.append(costs[-1])
-        return behind
+        return behind or over
 
     changes, cost = descend(
         np.zeros((1, 1, len(start))),
@@ -200,7 +208,7 @@ def _searched(
         ((high - start) / large_change)[None],
         errors,
         ITERATIONS,
-        report,
+        ends,
     )
     return start + large_change * changes[0, 0], float(cost[0, 0])
 

@@ -21,15 +21,11 @@ from gaponet.data.sequence import Sequence
 from gaponet.data.signals import differentiate, lowpass
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.dynamics import CUTOFF_HZ
-from gaponet.sim.metrics import Comparison, metrics, runs
 from gaponet.sim.model import build_model
-from gaponet.sim.replay import motion_errors, replay
-from gaponet.sysid.acceptance import HeldOut, Identified, Split, held_out_errors
 from gaponet.sysid.adapt import PRIOR_RAD
-from gaponet.sysid.axes import CLASSIC, Bounds, Changes, first_values, with_values
+from gaponet.sysid.axes import CLASSIC, Changes, first_values, with_values
 from gaponet.sysid.joint_rollouts import ERROR_SCALE_RAD, SLIP_SPEED, JointRollouts
 from gaponet.sysid.least_squares import descend
-from gaponet.sysid.problem import JointFit, standard_errors
 from gaponet.sysid.robot_rollouts import cut
 
 MAX_WINDOWS = 80  # more than elsewhere, since they may be short
@@ -43,7 +39,7 @@ START_DELAY, ITERATIONS = 0.25, 10  # in 20 ms; of the fit of positions
 MAX_HAND_MASS = 5.0  # kg
 
 
-class _Options(NamedTuple):
+class TorqueOptions(NamedTuple):
     """Options of a fit from torque: payload's place from torque, friction as well, and the prior of the positions' fit
     around it, rad per large change."""
 
@@ -53,63 +49,9 @@ class _Options(NamedTuple):
 
 
 OPTIONS = (
-    _Options(True, False, 2.0), _Options(True, False, PRIOR_RAD), _Options(True, True, 2.0),
-    _Options(False, False, PRIOR_RAD),
+    TorqueOptions(True, False, 2.0), TorqueOptions(True, False, PRIOR_RAD), TorqueOptions(True, True, 2.0),
+    TorqueOptions(False, False, PRIOR_RAD),
 )  # fmt: skip
-
-
-def with_torque(
-    fitted: Identified, splits: ListOf[Split], given: RobotSpec, nthread: int
-) -> Identified:
-    """Return the fit from torque if motions that were not fitted accept it, else `fitted`.
-
-    An accepted fit is repeated with all recordings. Without cross-validation it is kept only if the validation motions
-    are followed no worse. `given` is the robot that both fits start from.
-    """
-    every = [*splits[0][0], *splits[0][1]]
-    torques = [TorqueFit(train, given) for train, _ in splits]
-    if not all(t.known for t in torques):
-        return fitted
-    tried = {
-        options: [
-            HeldOut(part, t.fit(options)) for t, (_, part) in zip(torques, splits, strict=True)
-        ]
-        for options in OPTIONS
-        if all(t.several_payloads for t in torques) or not options.place
-    }
-    options = min(tried, key=lambda one: float(held_out_errors(tried[one]).mean()))
-    pair = (held_out_errors(folds) for folds in (fitted.held_out, tried[options]))
-    comparison = Comparison("torque", *pair, equally_complex=given.nominal is None)
-    if not comparison.accepted:
-        return replace(fitted, comparisons=(*fitted.comparisons, comparison))
-    robot, folds, after = (
-        TorqueFit(every, given).fit(options),
-        tuple(tried[options]),
-        float(comparison.after.mean()),
-    )
-    if len(splits) == 1 and motion_errors(splits[0][1], robot).mean() > after:
-        robot = folds[0].robot
-    bounds = Bounds(robot, every)
-    whole = JointFit(
-        JointRollouts(cut(every, MAX_WINDOWS), robot, nthread=nthread), robot, bounds
-    ).robot_fit(nthread)
-    errors = standard_errors(whole, {f: bounds.first[f] for f in CLASSIC})
-    part = [
-        run
-        for sequences, judged in folds
-        for run in runs(
-            sequences,
-            [t.qpos for t in replay(sequences, judged, nthread=nthread, lock_idle=True)],
-            judged,
-        )
-    ]
-    by_joint = {j: metrics(part, [i]).get("mpjae", 0.0) for i, j in enumerate(given.operated)}
-    return replace(
-        fitted, robot=robot, after=after, chosen="torque", std=errors.std, covariance=errors.covariance,
-        warnings=errors.sentences, comparisons=(*fitted.comparisons, comparison),
-        table_fit=None, by_joint={j: (before, by_joint[j]) for j, (before, _) in fitted.by_joint.items()},
-        undetermined=errors.undetermined, held_out=folds,
-    )  # fmt: skip
 
 
 class Gains(NamedTuple):
@@ -298,7 +240,7 @@ class TorqueFit:
 
         return joints, column, tau, qacc, qvel, required
 
-    def fit(self, options: _Options) -> RobotSpec:
+    def fit(self, options: TorqueOptions) -> RobotSpec:
         """Return the robot with values from torque, and near those with values from positions."""
         start = self.payload_placed(options.friction) if options.place else self.robot
         rollouts = JointRollouts(cut(self.sequences, MAX_WINDOWS), start)

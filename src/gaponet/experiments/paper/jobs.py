@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -205,22 +205,23 @@ def measure_baselines(job: Job) -> None:
 def identified_robot(study: Study) -> RobotSpec:
     """Return the robot identified on the training recordings; it is stored in OUT/identified."""
     from gaponet.nn.training.run_folder import MAX_VALIDATION_ROLLOUTS
-    from gaponet.sysid.identify import WINDOWS, identify
+    from gaponet.sysid.identify import identify
+    from gaponet.sysid.options import IdentifyOptions
 
     folder = study.out / "identified"
     if not (folder / "robot.toml").is_file():
         splits = study.splits()
-        options: dict[str, Any] = {"nthread": 1, "windows": study.options.identify_windows}
+        options = IdentifyOptions(nthread=1, windows=study.options.identify_windows)
         judges = MAX_VALIDATION_ROLLOUTS  # as many recordings as judge the networks
-        if study.options.identify_windows < WINDOWS:
+        if options.windows < IdentifyOptions().windows:
             # In a hurry: gains, friction, delay and offset of each joint alone.
-            options |= {"terms": (), "table": False, "joints_alone": True}
+            options = replace(options, terms=(), table=False, joints_alone=True)
             judges = HURRIED_JUDGES
         fitted = identify(
             study.data.sequences(splits["train"]),
             study.robot,
             study.data.sequences(stratified_subset(splits["val"], judges)),
-            **options,
+            options,
         )
         save_robot(fitted.robot, folder)
     return load_robot(folder)

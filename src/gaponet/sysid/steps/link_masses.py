@@ -1,0 +1,55 @@
+"""Masses, centres of mass and inertias of the links, with the servos."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from gaponet.sysid.steps.link_fit import LinkFit
+from gaponet.sysid.steps.step import Fits, FitState
+from gaponet.sysid.torque import TorqueFit
+
+ONE_PAYLOAD = (
+    "masses and gains are known up to a common factor: record two payloads before you trust a third"
+)
+
+
+class LinkMasses:
+    """Fit of the links; gains that follow from recorded torque hold."""
+
+    name = "masses"
+
+    def __init__(self, fits: Fits) -> None:
+        self._fits = fits
+        self._torque_gains: list[dict[str, tuple[float, float]]] = []
+        for recordings in fits.recordings:
+            known = TorqueFit(recordings, fits.joints[0].robot).known
+            self._torque_gains.append({joint: (g.kp, g.error) for joint, g in known.items()})
+
+    def applies(self, state: FitState) -> bool:
+        """Return True."""
+        return True
+
+    def propose(self, state: FitState) -> FitState:
+        """Return the state with links; the same state if no link changes."""
+        links = []
+        values = []
+        for robot, base, gains in zip(state.robots, state.base, self._torque_gains, strict=True):
+            self._fits.progress.begin_search()
+            fit = LinkFit(robot, base, gains)
+            rows = robot.rollouts.rows.sum(keepdims=True)
+            result = fit.descend(self._fits.progress.reporter(self.name, ("all joints",), rows))
+            links.append(result.axes.links(result.x))
+            values.append(result.values)
+        if not result.x.any():
+            return state
+        return replace(state, values=values, base=values, links=links, link_fit=(fit, result))
+
+    def warnings(self, state: FitState) -> list[str]:
+        """Return a warning if links were accepted and nothing tells masses from gains."""
+        recordings = self._fits.recordings[-1]
+        payloads = {s.meta.payload_mass for s in recordings}
+        if not state.links or not self._fits.given.payload_mounts:
+            return []
+        if self._torque_gains[-1] or len(payloads) > 1:
+            return []
+        return [ONE_PAYLOAD]

@@ -1,0 +1,87 @@
+"""A fit that begins with recorded torque, beside the fit to positions alone."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence as ListOf
+from dataclasses import replace
+
+from gaponet.data.sequence import Sequence
+from gaponet.robot.spec import RobotSpec
+from gaponet.sim.metrics import Comparison, metrics, runs
+from gaponet.sim.replay import motion_errors, replay
+from gaponet.sysid.acceptance import HeldOut, Identified, Split, held_out_errors
+from gaponet.sysid.axes import CLASSIC, Bounds
+from gaponet.sysid.joint_rollouts import JointRollouts
+from gaponet.sysid.problem import JointFit, StandardErrors, standard_errors
+from gaponet.sysid.robot_rollouts import cut
+from gaponet.sysid.torque import MAX_WINDOWS, OPTIONS, TorqueFit
+
+
+def with_torque(
+    fitted: Identified, splits: ListOf[Split], given: RobotSpec, nthread: int
+) -> Identified:
+    """Return the fit from torque if motions that were not fitted accept it, else `fitted`.
+
+    An accepted fit is repeated with all recordings. Without cross-validation it is kept only if the validation motions
+    are followed no worse. `given` is the robot that both fits start from.
+    """
+    torques = [TorqueFit(train, given) for train, _ in splits]
+    if not all(t.known for t in torques):
+        return fitted
+    tried = {}
+    for options in OPTIONS:
+        if options.place and not all(t.several_payloads for t in torques):
+            continue
+        tried[options] = [
+            HeldOut(part, t.fit(options)) for t, (_, part) in zip(torques, splits, strict=True)
+        ]
+    options = min(tried, key=lambda one: float(held_out_errors(tried[one]).mean()))
+    folds = tuple(tried[options])
+    comparison = Comparison(
+        "torque",
+        held_out_errors(fitted.held_out),
+        held_out_errors(folds),
+        equally_complex=given.nominal is None,
+    )
+    comparisons = (*fitted.comparisons, comparison)
+    if not comparison.accepted:
+        return replace(fitted, comparisons=comparisons)
+    after = float(comparison.after.mean())
+    every = [*splits[0][0], *splits[0][1]]
+    robot = TorqueFit(every, given).fit(options)
+    if len(splits) == 1 and motion_errors(splits[0][1], robot).mean() > after:
+        robot = folds[0].robot
+    errors = _standard_errors(robot, every, nthread)
+    now = _errors_by_joint(folds, given, nthread)
+    return replace(
+        fitted,
+        robot=robot,
+        after=after,
+        chosen="torque",
+        std=errors.std,
+        covariance=errors.covariance,
+        warnings=errors.sentences,
+        comparisons=comparisons,
+        table_fit=None,
+        by_joint={j: (before, now[j]) for j, (before, _) in fitted.by_joint.items()},
+        undetermined=errors.undetermined,
+        held_out=folds,
+        without_terms=None,
+    )
+
+
+def _standard_errors(robot: RobotSpec, recordings: list[Sequence], nthread: int) -> StandardErrors:
+    """Return the standard errors of a robot's classic fields, from positions."""
+    bounds = Bounds(robot, recordings)
+    rollouts = JointRollouts(cut(recordings, MAX_WINDOWS), robot, nthread=nthread)
+    whole = JointFit(rollouts, robot, bounds).robot_fit(nthread)
+    return standard_errors(whole, {f: bounds.first[f] for f in CLASSIC})
+
+
+def _errors_by_joint(folds: ListOf[HeldOut], robot: RobotSpec, nthread: int) -> dict[str, float]:
+    """Return the mean |error| of each operated joint over recordings that were not fitted, rad."""
+    part = []
+    for sequences, judged in folds:
+        replays = replay(sequences, judged, nthread=nthread, lock_idle=True)
+        part += runs(sequences, [t.qpos for t in replays], judged)
+    return {j: metrics(part, [i]).get("mpjae", 0.0) for i, j in enumerate(robot.operated)}
