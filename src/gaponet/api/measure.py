@@ -43,6 +43,7 @@ def gap(
             used in training; a folder of yours keeps it as gap.json, gap.svg and gap.png.
         executor: Where recordings are simulated: local, ray or ray:ADDRESS (docs/install.md).
     """
+    from gaponet.evaluation.baselines import baseline_errors, command_run
     from gaponet.sim.metrics import Run, summary
     from gaponet.sim.model import model_hash
 
@@ -53,10 +54,16 @@ def gap(
     require_commands(data)
     pair(data, robot=spec, executor=executor, progress=progress)
     entries, simulator = data.select(motions), model_hash(spec)
-    pairs = (data.pair(e, simulator) for e in entries)
-    methods = {"nominal": summary((Run.of(p.real, p.sim.qpos, spec) for p in pairs), spec)}
+    simulated = []
+    commands = []
+    for entry in entries:
+        both = data.pair(entry, simulator)
+        simulated.append(Run.of(both.real, both.sim.qpos, spec))
+        commands.append(command_run(both.real, spec))
+    methods = {"nominal": summary(simulated, spec)}
     return GapResult(methods=methods, table={
         "methods": methods,
+        "baselines": baseline_errors(simulated, commands),
         "dataset": data.path.name,
         "sequences": len(entries),
         "hours": sum(e.rows * e.dt for e in entries) / 3600,

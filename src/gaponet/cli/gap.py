@@ -11,7 +11,7 @@ from gaponet.base.executor import LOCAL
 from gaponet.base.progress import progress_bar
 from gaponet.cli.options import Data, Json, Motions, Robot, like
 from gaponet.cli.out import Out
-from gaponet.cli.show import show_methods, show_verdict
+from gaponet.cli.show import show_baselines, show_methods, show_verdict
 from gaponet.evaluation.methods import title
 from gaponet.evaluation.tables import mrad
 from gaponet.nn.packaged_networks import network_folder
@@ -41,7 +41,10 @@ def gap(
         _show_steps(out, result.table)
         if (folder / "gap.png").is_file():
             out.say(f"figure: {folder / 'gap.png'}")
-    show_verdict(out, result.methods, str(dataset), folder if result.by_cause else None)
+    baselines = result.table["baselines"]
+    show_baselines(out, baselines)
+    own = folder if result.by_cause else None
+    show_verdict(out, result.methods, str(dataset), own, baselines)
     out.result(result.to_dict())
 
 

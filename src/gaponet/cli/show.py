@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from gaponet.base.result_table import ResultTable
 from gaponet.cli.out import Out
-from gaponet.evaluation.tables import by_group, totals
+from gaponet.evaluation.tables import by_group, mrad, totals
 from gaponet.evaluation.verdict import next_step, verdict
 
 UNITS = {"payload": ", kg", "horizon": " (time since the start, s)"}
@@ -15,11 +16,33 @@ GROUPS = ("joint", "payload", "unit", "horizon", "motion")
 SHOWN = 4  # columns of the totals that a screen has room for
 
 
-def show_verdict(out: Out, methods: dict[str, Any], dataset: str, folder: Path | None) -> None:
+def show_verdict(
+    out: Out,
+    methods: dict[str, Any],
+    dataset: str,
+    folder: Path | None,
+    baselines: Mapping[str, float] | None = None,
+) -> None:
     """Print the verdict and the next command. The folder is that of a robot or a run, or None."""
-    for sentence in verdict(methods):
+    for sentence in verdict(methods, baselines):
         out.say(sentence)
     out.next(next_step(methods, dataset, folder))
+
+
+def baseline_rows(baselines: Mapping[str, float]) -> list[list[str]]:
+    """Return rows of title and error, mrad, of predictions that need no identified simulator."""
+    return [
+        ["delay + offset of the nominal simulator", mrad(baselines["delay_offset"])],
+        ["the command itself, delayed and offset", mrad(baselines["command"])],
+    ]
+
+
+def show_baselines(out: Out, baselines: Mapping[str, float]) -> None:
+    """Print the errors of predictions that need no identified simulator."""
+    title = (
+        "Without an identified simulator; delay and offset of each joint fitted to other motions"
+    )
+    out.table(title, ["prediction", "error, mrad"], baseline_rows(baselines))
 
 
 def show_methods(out: Out, result: dict[str, Any], groups: tuple[str, ...] = GROUPS) -> None:

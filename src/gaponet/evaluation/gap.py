@@ -18,6 +18,7 @@ from gaponet.data.repeatability import Repetitions, repetition_difference
 from gaponet.data.sequence import Sequence
 from gaponet.data.signals import encoder_step
 from gaponet.data.store import Dataset
+from gaponet.evaluation.baselines import baseline_errors, command_run
 from gaponet.evaluation.candidate import Candidate, select_entries
 from gaponet.nn.delay_offset import DelayOffset
 from gaponet.robot.servo_fields import SERVO_FIELDS
@@ -47,10 +48,10 @@ def gap_by_step(
         candidate: An identified robot, or a run; its recordings, baseline, simulator and model are used.
 
     Returns:
-        {"methods": {nominal, identified, …: metrics.summary}, "left": {step: rad}, "removed": {step: [rad, standard
-        error]}, "unexplained": rad, "by_joint": {joint: the same and "floor"}, "by_payload": {kg: {step: rad}},
-        "floor": {"encoder": rad, "repeatability": rad, "both": rad}, …}; an unknown floor is None, and so is the
-        error above it.
+        {"methods": {nominal, identified, …: metrics.summary}, "baselines": {delay_offset, command: rad}, "left": {step:
+        rad}, "removed": {step: [rad, standard error]}, "unexplained": rad, "by_joint": {joint: the same and "floor"},
+        "by_payload": {kg: {step: rad}}, "floor": {"encoder": rad, "repeatability": rad, "both": rad}, …}; an unknown
+        floor is None, and so is the error above it.
     """
     robot = candidate.robot
     dataset.require_robot(robot)
@@ -81,6 +82,7 @@ def gap_by_step(
     methods |= {candidate.method: last} if candidate.model is not None else {}
     return {
         "methods": {name: errors_of(done[step], robot) for name, step in methods.items()},
+        "baselines": baseline_errors(done["nominal"], [command_run(s, robot) for s in sequences]),
         **_sources(done, floors["all"]),
         "by_joint": {
             j: _sources(done, floors[j], [i]) for i, j in enumerate(robot.operated) if metrics(done[last], [i])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple, get_args
 
@@ -56,8 +57,13 @@ def network_gain(methods: Scores, own: str) -> NetworkGain:
     )
 
 
-def verdict(methods: Scores) -> list[str]:
-    """Return sentences: the nominal error, the error after identification, and the gain of each network."""
+def verdict(methods: Scores, baselines: Mapping[str, float] | None = None) -> list[str]:
+    """Return sentences: the nominal error, the error after identification, and the gain of each network.
+
+    Args:
+        methods: Method → its metrics.
+        baselines: As of `evaluation.baselines.baseline_errors`; without them nothing is said of the command itself.
+    """
     nominal = methods["nominal"]["mpjae"]
     by_joint = methods["nominal"]["by_joint"]
     worst = max(by_joint, key=lambda joint: by_joint[joint]["mpjae"])
@@ -74,9 +80,16 @@ def verdict(methods: Scores) -> list[str]:
         sentences.append(
             f"After identification the error is {mrad(error)} mrad, {change}, on {count}{end}"
         )
-    return sentences + [
+    sentences += [
         _about_network(methods, own) for own in methods if own.removeprefix(IDENTIFIED) in LEARNED
     ]
+    best = min(scores["mpjae"] for scores in methods.values())
+    if baselines is not None and baselines["command"] <= best:
+        sentences.append(
+            f"The command itself, delayed and offset, is {mrad(baselines['command'])} mrad from the robot. "
+            f"No simulator here is closer ({mrad(best)}), so for motions like these a simulator adds nothing."
+        )
+    return sentences
 
 
 def _about_network(methods: Scores, own: str) -> str:
