@@ -3,12 +3,14 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/$(if $(filter Windows_NT,$(OS)),Scripts,bin)
 TOOLS := PATH="$(CURDIR)/.tools/bin:$$PATH"
+# What the tests and the site need.
+EXTRAS := train,gym,so101,zmq,ros,hdf5,hub,docs,dev
 export PIP_CONSTRAINT := $(CURDIR)/constraints.txt
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 # Two pools of busy-waiting threads on two cores cost a factor of five.
 export OMP_WAIT_POLICY := PASSIVE
 
-.PHONY: setup demo test slow faults peers engines browser adversary tournament results fuzz hostile kills lerobot check workflows windows resolve wheels ends site clean
+.PHONY: setup demo test slow faults peers engines browser adversary tournament results fuzz hostile kills lerobot check workflows windows resolve wheels ends image site clean
 
 setup: $(VENV)/.done
 
@@ -20,7 +22,7 @@ $(VENV)/.done: pyproject.toml constraints.txt
 	$(BIN)/python -c "import torch" 2>/dev/null || PIP_CONSTRAINT= $(BIN)/pip install -q "$(TORCH)" 2>/dev/null \
 	  || PIP_CONSTRAINT= $(BIN)/pip install -q "torch==2.13.0" --index-url https://download.pytorch.org/whl/cpu 2>/dev/null \
 	  || PIP_CONSTRAINT= $(BIN)/pip install -q "torch==2.13.0"
-	$(BIN)/pip install -q -e ".[dev]"
+	$(BIN)/pip install -q -e ".[$(EXTRAS)]"
 	touch $@
 
 demo: setup
@@ -51,7 +53,7 @@ engines: setup
 
 # Chromium looks at gaponet view and at a report (Debian: apt-get install chromium libegl1): two minutes.
 browser: setup
-	$(BIN)/pip install -q -e ".[dev,view]"
+	$(BIN)/pip install -q -e ".[$(EXTRAS),film]"
 	$(BIN)/python -m pytest -m browser -s tests/report/view
 
 # A million random and adversarial states through controller and limits, in simulated time; then found poses against plans and
@@ -125,8 +127,13 @@ TESTS ?= tests
 ends: .tools/.done
 	for end in lowest-direct highest; do \
 	  $(TOOLS) uv venv -q --clear --python $(PYTHON) .ends/$$end && \
-	  $(TOOLS) uv pip install -q --python .ends/$$end --resolution $$end -e ".[dev]" && \
+	  $(TOOLS) uv pip install -q --python .ends/$$end --resolution $$end -e ".[$(EXTRAS)]" && \
 	  .ends/$$end/bin/python -m pytest $(TESTS) || exit 1; done
+
+# The container of Dockerfile, made and started.
+image:
+	docker build -t gaponet .
+	docker run --rm gaponet --version
 
 # docs/ as a site in site/; a broken link or a name that is not in the package ends the build.
 site: setup

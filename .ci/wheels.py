@@ -30,16 +30,14 @@ env.reset(seed=0)
 print("reward", env.step(env.action_space.sample())[1])
 """
 TRIES = {
-    "": ["--version", "formats", "robot check so101", "collect --robot so101 --recipe recipe.toml --out data --nproc 1",
-         "doctor data", "gap data"],
+    "": ["--version", "import --formats", "robot check so101",
+         "collect --robot so101 --recipe recipe.toml --out data --nproc 1", "doctor data", "gap data"],
     "train": [f"train data --out run --budget 1920 {SMALL}", "export run --to torch"],
-    "deploy": ["eval run data", "bench latency run"],
-    "report": ["report run"],
-    "gym": [GYM],
+    "deploy": ["eval run data", "report run"],
+    "deploy,gym": [GYM],
     "ros": ["data export data --to mcap --out bags", "import bags --robot so101 --out again"],
-    "hdf5": ["formats"],
-    "ray": ["collect --robot so101 --recipe recipe.toml --out data2 --nproc 1 --executor ray"],
-    "deploy,view": ["view data --model run --duration 1 --render film.gif"],
+    "hdf5": ["import --formats"],
+    "deploy,film": ["view data --model run --duration 1 --render film.gif"],
 }  # fmt: skip
 
 

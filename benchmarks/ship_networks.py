@@ -11,48 +11,42 @@ path of this machine, and all networks together must be at most MAX_TOTAL_BYTES.
 
 from __future__ import annotations
 
-import json
-import re
 import shutil
 import tempfile
 from dataclasses import asdict, dataclass
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 import onnx
 import tyro
+from shipping import (
+    measure_error,
+    put_into_package,
+    require_public,
+    today,
+    without_names,
+    write_json_line,
+    write_table,
+)
 
 from gaponet.base.errors import UsageError
-from gaponet.base.files import write_text
 from gaponet.data.split import SPLITS
 from gaponet.evaluation.candidate import split_of_run
-from gaponet.evaluation.evaluate import evaluate
 from gaponet.nn.artifact import CARD, WEIGHTS, GapModel, sha256
-from gaponet.nn.network_card import (
-    PUBLISHED,
-    ErrorOnTest,
-    NetworkCard,
-    Published,
-    SourceOfData,
-    folder_size,
-    markdown_table,
-    network_cards,
-)
+from gaponet.nn.network_card import HEADINGS, NetworkCard, network_cards
 from gaponet.nn.onnx_export import MAX_DIFFERENCE_RAD, with_small_matrices
 from gaponet.nn.onnx_network import OnnxNetwork
-from gaponet.nn.packaged_networks import MAX_TOTAL_BYTES, PACKAGE_FOLDER
+from gaponet.nn.packaged_networks import MAX_TOTAL_BYTES, catalogue
+from gaponet.robot.card import PUBLISHED, Published, SourceOfData, markdown_cards
 from gaponet.robot.folder import PackagedRobot, load_stored_robot
 from gaponet.sim.dataset_robot import open_dataset
 from gaponet.sim.model import model_hash
 from gaponet.sim.replay import replay
 
 PAGE = Path(__file__).parents[1] / "docs" / "network.md"
-TABLE = re.compile(r"(?<=<!-- networks -->\n)\n.*?(?=\n<!-- end of networks -->)", re.DOTALL)
 FLOAT32_BYTES = 400_000  # a network up to this size keeps all digits of its weights
 MAX_RECORDINGS = 8  # in which the stored network is compared with the trained one
-HOMES = ("/home/", "/Users/", ":\\\\Users")  # in a path of some machine
 DROPPED = ("parity_rad", "seconds")  # of a card: facts of the machine, not of the network
 
 
@@ -89,17 +83,9 @@ def ship(
         folder = Path(place) / name
         folder.mkdir()
         write_network(run, folder, dataset, source)
-        others = sum(card.size_bytes for card in network_cards() if card.name != name)
-        total = others + folder_size(folder)
-        if total > MAX_TOTAL_BYTES:
-            raise UsageError(
-                f"{name} has {folder_size(folder):,} bytes, all networks together would have {total:,} of at most "
-                f"{MAX_TOTAL_BYTES:,}; train a smaller network"
-            )
-        shutil.rmtree(PACKAGE_FOLDER / name, ignore_errors=True)
-        shutil.copytree(folder, PACKAGE_FOLDER / name)
-    write_page(PAGE)
-    card = NetworkCard.read(PACKAGE_FOLDER / name)
+        total = put_into_package(folder, catalogue(), MAX_TOTAL_BYTES)
+    write_table(PAGE, "networks", markdown_cards(network_cards(), HEADINGS))
+    card = NetworkCard.read(catalogue().place / name)
     test = card.published.test
     print(f"{name}: {card.size_bytes:,} bytes, {total:,} of {MAX_TOTAL_BYTES:,} in all networks")
     print(f"differs by at most {card.published.largest_difference_rad:.1e} rad from {run}")
@@ -122,7 +108,8 @@ def write_network(run: Path, folder: Path, dataset: str, source: Source) -> None
         raise UsageError(f"{run}: its training was interrupted; finish it with --resume")
     packaged_robot(model).write(folder)
     shutil.copyfile(run / "delay_offset.json", folder / "delay_offset.json")
-    write_json_line(folder / "split.json", without_names(split_of_run(run)))
+    split = split_of_run(run)
+    write_json_line(folder / "split.json", {part: without_names(split[part]) for part in SPLITS})
     trained = (model.path / WEIGHTS).read_bytes()
     inputs = visited_inputs(model, run, dataset)
     content, difference = stored_form(trained, inputs)
@@ -132,14 +119,14 @@ def write_network(run: Path, folder: Path, dataset: str, source: Source) -> None
     write_json_line(folder / CARD, card)
     published = Published(
         licence=source.licence,
-        date=datetime.now(UTC).strftime("%Y-%m-%d"),
+        date=today(),
         data=SourceOfData(source.title, source.address, source.data_licence),
-        test=measure_error(folder, dataset),
+        test=measure_error(folder, *open_dataset(dataset, None, folder)),
         limits_of_use=source.limits,
         largest_difference_rad=difference,
     )
     write_json_line(folder / CARD, card | {PUBLISHED: asdict(published)})
-    require_public(folder, run)
+    require_public(folder, run, as_text)
     require_same_outputs(folder, content, inputs)
     NetworkCard.read(folder)
 
@@ -159,13 +146,6 @@ def packaged_robot(model: GapModel) -> PackagedRobot:
             f"{named.gain_scale:g} is {found}; train in the nominal robot of the package"
         )
     return named
-
-
-def without_names(split: dict[str, dict[str, str]]) -> dict[str, dict[str, str]]:
-    """Return a split with numbers in place of the names of recordings; the hashes tell what was seen."""
-    return {
-        part: {str(i): digest for i, digest in enumerate(split[part].values())} for part in SPLITS
-    }
 
 
 def visited_inputs(model: GapModel, run: Path, dataset: str) -> np.ndarray:
@@ -218,42 +198,10 @@ def stored_form(trained: bytes, inputs: np.ndarray) -> tuple[bytes, float]:
     return short, difference
 
 
-def measure_error(folder: Path, dataset: str) -> ErrorOnTest:
-    """Measure a network on its test motions.
-
-    Raises:
-        UsageError: A motion was used in training.
-    """
-    data, robot = open_dataset(dataset, None, folder)
-    result = evaluate([folder], data, robot).result
-    if not result["unseen"]:
-        raise UsageError(
-            f"{dataset}: some test motions were used in training; split the dataset by motion"
-        )
-    method = next(iter(result["artifacts"]))
-    return ErrorOnTest(
-        recordings=result["sequences"],
-        motions=tuple(result["motions"]),
-        nominal_mrad=round(1e3 * result["methods"]["nominal"]["mpjae"], 3),
-        model_mrad=round(1e3 * result["methods"][method]["mpjae"], 3),
-    )
-
-
-def require_public(folder: Path, run: Path) -> None:
-    """Refuse files that name a path of a machine: a home, or where this run and its programs lie."""
-    here = (Path.home(), Path.cwd(), run.resolve().parent, Path(tempfile.gettempdir()))
-    private = [*HOMES, *(str(place) for place in here if place != Path("/"))]
-    for file in sorted(folder.iterdir()):
-        text = words_of_network(file) if file.name == WEIGHTS else file.read_text(encoding="utf-8")
-        for path in private:
-            if path in text:
-                raise UsageError(
-                    f"{file.name} names '{path}', a path of a machine; remove it from the run's files"
-                )
-
-
-def words_of_network(file: Path) -> str:
-    """Return an ONNX file as text without its weights."""
+def as_text(file: Path) -> str:
+    """Return a file as text, an ONNX file without its weights."""
+    if file.name != WEIGHTS:
+        return file.read_text(encoding="utf-8")
     model = onnx.load(str(file))
     del model.graph.initializer[:]
     del model.graph.sparse_initializer[:]
@@ -266,24 +214,6 @@ def require_same_outputs(folder: Path, content: bytes, inputs: np.ndarray) -> No
     stored.simulator()
     if not np.array_equal(stored.infer(inputs), OnnxNetwork(content)(inputs)):
         raise UsageError(f"{folder}: answers otherwise than what was written; write it again")
-
-
-def write_page(page: Path) -> None:
-    """Write the table of all networks into a page, between its two comments."""
-    text = page.read_text(encoding="utf-8")
-    if not TABLE.search(text):
-        raise UsageError(
-            f"{page}: has no place for the table; restore the comments <!-- networks -->"
-        )
-    table = "\n" + markdown_table(network_cards())
-    write_text(page, TABLE.sub(lambda _: table, text))
-
-
-def write_json_line(file: Path, value: Any) -> None:
-    """Write JSON without blanks."""
-    file.write_text(
-        json.dumps(value, ensure_ascii=False, separators=(",", ":")) + "\n", encoding="utf-8"
-    )
 
 
 if __name__ == "__main__":

@@ -24,6 +24,10 @@ def test_the_page_on_installing_names_every_extra():
     )
 
 
+def test_a_user_can_see_all_extras_at_a_glance():
+    assert len(PROJECT["optional-dependencies"]) <= 14
+
+
 def test_hosted_workflows_call_what_is_here():
     """A command of a workflow is .ci/run, a make target that the Makefile has, or one of these few words."""
     targets = set(
@@ -74,9 +78,3 @@ def test_exact_versions_lie_within_the_ranges():
             assert number(low) <= number(exact[name]), name
             assert not high or number(exact[name]) < number(high), name
     assert {"torch", "mujoco", "numpy", "rsl-rl-lib"} <= exact.keys()
-
-
-def test_no_extra_of_our_own_carries_a_marker():
-    """hatchling loses a marker beside the project's own name."""
-    wanted = [line for lines in PROJECT["optional-dependencies"].values() for line in lines]
-    assert not [line for line in wanted if line.startswith("gaponet[") and ";" in line]

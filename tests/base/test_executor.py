@@ -41,7 +41,7 @@ def test_the_job_of_a_killed_worker_is_repeated_and_no_other_job(tmp_path, monke
     assert os.environ["OMP_NUM_THREADS"] == "7"
 
 
-@pytest.mark.skipif(find_spec("ray") is None, reason="needs gaponet[ray]")
+@pytest.mark.skipif(find_spec("ray") is None, reason="needs ray")
 def test_ray_repeats_the_job_of_a_killed_worker(tmp_path, monkeypatch):
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(sys.path))  # jobs.py
     with open_pool("ray", 2, 1) as pool:
@@ -82,7 +82,7 @@ def test_ray_is_imported_on_request_and_a_missing_ray_is_named(tmp_path, capsys,
         str(tmp_path / "ray"),
     ]
     assert main(command) == 2
-    assert "pip install 'gaponet[ray]'" in capsys.readouterr().err
+    assert capsys.readouterr().err.endswith("install ray\n")
 
 
 def test_a_pickled_robot_brings_its_folder(tmp_path):

@@ -5,7 +5,6 @@ import json
 import pytest
 from arm import recordings, write_arm
 
-from gaponet.cli import view as module
 from gaponet.cli.main import main
 from gaponet.data.store import Dataset
 
@@ -54,9 +53,3 @@ def test_mistakes_get_one_line_and_exit_code_2(place, capsys, monkeypatch, words
     monkeypatch.chdir(place)
     assert view(place, *(w.format(place) for w in words)) == 2
     assert complaint in capsys.readouterr().err.strip().splitlines()[-1]
-
-
-def test_a_missing_viewer_is_named_before_anything_is_simulated(place, capsys, monkeypatch):
-    monkeypatch.setattr(module, "find_spec", lambda name: None)
-    assert view(place) == 2
-    assert "gaponet view needs viser; run: pip install 'gaponet[view]'" in capsys.readouterr().err

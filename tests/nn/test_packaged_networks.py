@@ -24,16 +24,15 @@ from gaponet.nn.config import ModelConfig
 from gaponet.nn.network_card import (
     HEADINGS,
     NetworkCard,
-    folder_size,
-    markdown_table,
     network_cards,
 )
 from gaponet.nn.packaged_networks import (
     MAX_TOTAL_BYTES,
     PACKAGE_FOLDER,
-    network_folder,
+    named_folder,
     packaged_networks,
 )
+from gaponet.robot.card import folder_size, markdown_cards
 from gaponet.sim.model import model_hash
 
 ROOT = Path(__file__).parents[2]
@@ -86,12 +85,12 @@ def test_a_folder_of_the_same_name_here_is_refused_as_ambiguous(network, tmp_pat
 def test_an_absolute_path_means_the_folder_of_the_same_name(network, tmp_path):
     copy = tmp_path / NAME
     shutil.copytree(network.folder, copy)
-    assert network_folder(copy) == copy
+    assert named_folder(copy) == copy
 
 
 def test_a_folder_with_another_name_is_itself(network, tmp_path):
     (tmp_path / "run").mkdir()
-    assert network_folder("run") == Path("run")
+    assert named_folder("run") == Path("run")
 
 
 def test_a_simulator_that_the_package_has_no_longer_is_refused_with_the_version(
@@ -188,7 +187,7 @@ def test_its_torch_program_equals_the_artifact(network, tmp_path):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["report", NAME], "a report needs a run folder of gaponet train"),
+        (["report", NAME], "a report lies beside"),
         (["adapt", NAME, "data"], "an adaptation needs a run folder"),
         (["export", NAME, "--to", "onnx"], "give a folder with --out"),
         (["export", NAME, "--to", "mjcf", "--out", "x"], "its simulator is a robot of the package"),
@@ -280,11 +279,11 @@ def test_all_shipped_networks_are_small_together():
 def test_the_page_has_the_table_of_the_cards():
     page = (ROOT / "docs" / "network.md").read_text(encoding="utf-8")
     table = page.partition("<!-- networks -->\n\n")[2].partition("\n<!-- end of networks -->")[0]
-    assert table == markdown_table(network_cards())
+    assert table == markdown_cards(network_cards(), HEADINGS)
 
 
 def test_the_table_has_a_row_for_each_network_and_its_limits(network):
-    table = markdown_table(network_cards()).splitlines()
+    table = markdown_cards(network_cards(), HEADINGS).splitlines()
     assert table[0].count("|") == table[2].count("|") == len(HEADINGS) + 1
     assert table[-1].startswith(f"- `{NAME}`: licence Apache-2.0, gaponet 0.1.0; ")
     assert table[-1].endswith("Made for tests.")

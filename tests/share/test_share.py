@@ -9,13 +9,14 @@ import pytest
 from runs import untrained
 
 from gaponet.base.errors import DatasetError, UsageError
+from gaponet.base.network import RemoteError, network_errors
 from gaponet.cli.main import main
 from gaponet.data.store import Dataset, dataset_hash
 from gaponet.nn.artifact import GapModel
 from gaponet.share import dataset as datasets
 from gaponet.share.hub import Hub
 from gaponet.share.push_pull import pull, push
-from gaponet.share.remote import FileRecord, Index, RemoteError, network_errors
+from gaponet.share.remote import FileRecord, Index
 
 from .conftest import add, same
 
@@ -307,7 +308,7 @@ def test_of_two_first_pushes_to_the_hub_the_slower_one_gets_the_error_too(
 @pytest.mark.parametrize(
     ("address", "error"),
     [
-        ("me/none", "no dataset or run there"),
+        ("me/none", "no dataset, run or robot there"),
         ("not a repo/x y", "Repo id"),
         ("ftp://x/y", "not on the Hub"),
         ("s3://robots/arm", "aws s3 sync"),

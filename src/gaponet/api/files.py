@@ -9,7 +9,12 @@ from gaponet.api.opening import Place
 from gaponet.api.results import ExportResult
 from gaponet.base.errors import UsageError
 from gaponet.base.progress import Progress, no_progress
-from gaponet.nn.packaged_networks import is_packaged, network_folder, require_run_folder
+from gaponet.nn.packaged_networks import (
+    is_packaged,
+    is_packaged_network,
+    named_folder,
+    require_run_folder,
+)
 from gaponet.robot.folder import STORED_ROBOT, has_stored_robot
 from gaponet.robot.spec import load_robot
 
@@ -35,7 +40,7 @@ def export_robot(
     """Write an identified robot, or the simulator of a run, for another program.
 
     Args:
-        robot: Robot folder, or run folder of `train`.
+        robot: Robot folder, name of an identified robot of the package (give `out`), or run folder of `train`.
         to: mjcf (plain MuJoCo), mjlab, isaaclab, newton and drake, each with a check.py that needs no gaponet; urdf
             (damping, friction, effort limits); json (the numbers).
         out: Folder; default one with that name in the robot or run.
@@ -52,12 +57,13 @@ def export_robot(
     from gaponet.export import export_folder as files
     from gaponet.export.plain_servos import read_recordings
 
-    holder = network_folder(robot)
+    holder = named_folder(robot)
     require_run_folder(
         holder,
         f"--to {to}",
         "its simulator is a robot of the package, with the gain_scale that gaponet robot networks shows: export that",
     )
+    require_out(holder, out)
     spec, source = load_robot(simulator_folder(holder)), None if into is None else Path(into)
     recordings, folder = (
         read_recordings(simulator_folder(holder), data, spec),
@@ -93,11 +99,8 @@ def export_network(
     from gaponet.export.export_folder import export_model, export_networks
     from gaponet.nn.artifact import GapModel
 
-    holder = network_folder(run)
-    if is_packaged(holder) and out is None:
-        raise UsageError(
-            f"'{holder.name}' is a network of the package, where nothing is written; give a folder with --out"
-        )
+    holder = named_folder(run)
+    require_out(holder, out)
     if to == "actuator-net":
         instead = "actuator networks are fitted to the recordings of a run: train one"
         require_run_folder(holder, f"--to {to}", instead)
@@ -145,12 +148,21 @@ def randomization(
     from gaponet.export.plain_servos import read_recordings
     from gaponet.export.randomization import judge_units, sample_units, write_randomization
 
-    spec = load_robot(simulator_folder(Path(robot)))
+    spec = load_robot(simulator_folder(named_folder(robot)))
     made = sample_units(spec, scope, tuple(map(Path, units)), engine=engine)
     made = judge_units(
         made, spec, read_recordings(spec.folder, data, spec), progress, ENGINE_TERMS.get(engine, ())
     )
     return write_randomization(made, engine, Path(out)), made
+
+
+def require_out(holder: Path, out: Place | None) -> None:
+    """Refuse to write beside a network or a robot of the package."""
+    if is_packaged(holder) and out is None:
+        raise UsageError(
+            f"'{holder.name}' lies in the package or in the Hub's cache, where nothing is written; give a folder with "
+            "--out"
+        )
 
 
 def simulator_folder(holder: Path) -> Path:
@@ -172,7 +184,7 @@ def _export_onnx(run: Path, out: Path | None) -> ExportResult:
     from gaponet.nn.onnx_export import sample_inputs, trained_network
     from gaponet.robot.folder import load_stored_robot, save_robot
 
-    if out is not None and is_packaged(run):
+    if out is not None and is_packaged_network(run):
         return _copy_packaged(run, out)
     path = out or run / "model"
     card, config = GapModel.read_card(run / "model" / CARD)

@@ -15,7 +15,7 @@ from gaponet.base.errors import UsageError
 from gaponet.base.files import FOLDER_MARKER, write_text
 from gaponet.base.progress import Progress, no_progress
 from gaponet.data.store import Dataset
-from gaponet.nn.packaged_networks import is_packaged, network_folder
+from gaponet.nn.packaged_networks import is_packaged, named_folder
 from gaponet.robot.spec import RobotSpec, load_robot
 
 if TYPE_CHECKING:
@@ -144,7 +144,7 @@ def evaluate(
     if model_hash(own) != model_hash(spec):
         target, spec = spec, own.nominal or own
     evaluation = measuring.evaluate(
-        [folder, *map(network_folder, also)], data, spec, motions, progress, target, units
+        [folder, *map(named_folder, also)], data, spec, motions, progress, target, units
     )
     if not is_packaged(folder):
         evaluation.save(folder)

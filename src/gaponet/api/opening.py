@@ -9,7 +9,7 @@ import numpy as np
 
 from gaponet.base.errors import UsageError
 from gaponet.data.store import Dataset, Entry
-from gaponet.nn.packaged_networks import network_folder
+from gaponet.nn.packaged_networks import named_folder
 from gaponet.robot.spec import RobotSpec, load_robot
 
 if TYPE_CHECKING:
@@ -28,7 +28,7 @@ def as_robot(robot: RobotSpec | Place) -> RobotSpec:
 def as_run(run: GapModel | Place) -> Path:
     """Return the folder of a run, or of a network of the package by name; a trained model lies in it."""
     if isinstance(run, (str, Path)):
-        return network_folder(run)
+        return named_folder(run)
     return run.path.parent if run.path.name == "model" else run.path
 
 

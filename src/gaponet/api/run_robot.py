@@ -36,7 +36,7 @@ from gaponet.hw.targets.live import LiveTargets, Transport
 from gaponet.motion.files import SUFFIXES, read_motion
 from gaponet.motion.library import Library
 from gaponet.motion.motion import Motion
-from gaponet.nn.packaged_networks import network_folder
+from gaponet.nn.packaged_networks import named_folder
 from gaponet.robot.folder import has_stored_robot, load_stored_robot
 from gaponet.robot.spec import RobotSpec, load_robot
 from gaponet.sim.model import require_stored_robot
@@ -230,7 +230,7 @@ def resolve_robot(request: RunRequest) -> RobotSpec:
     """
     options = request.options
     if options.model is not None:
-        model = network_folder(options.model)
+        model = named_folder(options.model)
         run = model.parent if model.name == "model" else model
         if request.robot is not None:
             return require_stored_robot(

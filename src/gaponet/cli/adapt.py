@@ -14,6 +14,7 @@ from gaponet.base.progress import progress_bar
 from gaponet.cli.options import Flag, Folder, Json, Robot, Unit, like
 from gaponet.cli.out import Out
 from gaponet.evaluation.tables import mrad
+from gaponet.nn.packaged_networks import named_folder
 from gaponet.robot.spec import robot_argument
 
 Known = Annotated[
@@ -44,6 +45,7 @@ def adapt(
         payload_mass: kg in each hand, for logs of a robot folder whose format does not state it.
     """
     screen = Out(json)
+    run = named_folder(run)
     if (run / "robot.toml").is_file():
         if out is None:
             raise UsageError(f"{run}: is a robot folder; give --out FOLDER for the adapted one")

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from importlib.util import find_spec
 from pathlib import Path
 
 import tyro
 
-from gaponet.base.errors import UsageError
 from gaponet.base.files import lock_folder
 from gaponet.cli.out import Out
 
@@ -27,8 +25,6 @@ def app(
         port: Port of the page, on this machine; the next free one is taken.
         outside: Other folders that the results in `folder` may use, as gaponet view prints them.
     """
-    if find_spec("viser") is None:
-        raise UsageError("gaponet app needs viser; run: pip install 'gaponet[view,report]'")
     from gaponet.report.view.app import App, serve
 
     with lock_folder(folder, "app"):

@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from gaponet import api
-from gaponet.api.files import NetworkTarget, RobotTarget
+from gaponet.api.files import NetworkTarget, RobotTarget, require_out
 from gaponet.base.errors import UsageError
 from gaponet.base.files import write_text
 from gaponet.base.progress import progress_bar
 from gaponet.cli.options import Flag, Folder, Json, like
 from gaponet.cli.out import Out
 from gaponet.evaluation.tables import mrad
-from gaponet.nn.packaged_networks import is_packaged, network_folder
+from gaponet.nn.packaged_networks import is_packaged, is_packaged_network, named_folder
 from gaponet.robot.spec import load_robot
 
 if TYPE_CHECKING:
@@ -27,7 +27,7 @@ CHECKED_IN = {"mjcf": "MuJoCo", "actuator-net": "mjlab"}
 Holder = Annotated[
     Folder,
     tyro.conf.arg(
-        help="Robot folder, run folder of gaponet train, or a network of the package.",
+        help="Robot folder, run folder of gaponet train, or a name of the package (gaponet robot list, networks).",
         metavar="ROBOT|RUN|NAME",
     ),
 ]
@@ -59,6 +59,7 @@ def export(
         remove: For lerobot: remove the correction.
     """
     screen = Out(json)
+    robot = named_folder(robot)
     for words, unused in (
         (
             "--engine, --scope, --units",
@@ -72,6 +73,7 @@ def export(
         if unused:
             raise UsageError(f"--to {to} does not use {words}; leave out what you gave")
     if to == "randomization":
+        require_out(robot, out)
         _show_ranges(screen, robot, out or robot / "randomization", engine, scope, units, data)
         return
     if to == "lerobot":
@@ -160,7 +162,7 @@ def _attach(
     except (ValueError, KeyError, TypeError, AttributeError):
         raise UsageError(f"{file}: is no processor of LeRobot") from None
     config: dict[str, object] = {}
-    if holder is not None and is_packaged(network_folder(holder)):
+    if holder is not None and is_packaged_network(holder):
         config = {"model": holder.name, "payload_mass": payload_mass, "dynamics": dynamics}
         steps.append({"registry_name": POLICY_STEP, "config": config})
     elif holder is not None:
@@ -172,7 +174,9 @@ def _attach(
                 f"{holder}: is neither a robot folder of gaponet identify nor a run of gaponet train"
             )
         config = {
-            "known" if is_robot else "model": str(holder.resolve()),
+            "known" if is_robot else "model": holder.name
+            if is_packaged(holder)
+            else str(holder.resolve()),
             "payload_mass": payload_mass,
             "dynamics": dynamics,
         }

@@ -14,7 +14,7 @@ from gaponet.cli.out import Out
 from gaponet.cli.show import show_baselines, show_methods, show_verdict
 from gaponet.evaluation.methods import title
 from gaponet.evaluation.tables import mrad
-from gaponet.nn.packaged_networks import network_folder
+from gaponet.nn.packaged_networks import named_folder
 from gaponet.sim.dataset_robot import open_dataset
 
 
@@ -28,7 +28,7 @@ def gap(
     Without --robot the nominal simulator is measured. With an identified robot the causes of the error are shown.
     """
     out = Out(json)
-    run = None if run is None else network_folder(run)
+    run = None if run is None else named_folder(run)
     data, spec = open_dataset(dataset, robot, run)
     with progress_bar("gap") as update:
         result = api.gap(
@@ -38,7 +38,7 @@ def gap(
     if not result.by_cause:
         show_methods(out, result.to_dict())
     else:
-        _show_steps(out, result.table)
+        show_steps(out, result.table)
         if (folder / "gap.png").is_file():
             out.say(f"figure: {folder / 'gap.png'}")
     baselines = result.table["baselines"]
@@ -48,7 +48,7 @@ def gap(
     out.result(result.to_dict())
 
 
-def _show_steps(out: Out, result: Mapping[str, Any]) -> None:
+def show_steps(out: Out, result: Mapping[str, Any]) -> None:
     """Print the error after each step, in total, by joint and by payload, and its reduction in total."""
     who = "VIRTUAL robot" if result["virtual"] else "real robot"
     count = f"{result['sequences']} {'test ' * result['unseen']}recording{'s' * (result['sequences'] != 1)} of a {who}"

@@ -16,7 +16,8 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from gaponet.base.errors import GAPONetError, UsageError, missing_extra
+from gaponet.base.errors import GAPONetError, UsageError
+from gaponet.base.installation import missing_package
 from gaponet.base.plugins import load
 from gaponet.base.text import escape
 
@@ -57,7 +58,7 @@ def main(argv: Sequence[str] | None = None, begin: Callable[[], object] = lambda
     except GAPONetError as error:
         return _say(f"{type(error).__name__.removesuffix('Error')}: {error}")
     except ModuleNotFoundError as error:
-        missing = missing_extra(error)
+        missing = missing_package(error)
         if missing is None:
             raise
         return _say(f"Missing: {missing}")

@@ -15,6 +15,7 @@ from gaponet.base.files import atomic_write
 from gaponet.cli.options import Flag, Folder, Json, Model, actions
 from gaponet.cli.out import Out
 from gaponet.nn.packaged_networks import packaged_networks
+from gaponet.robot.card import ROBOT_HEADINGS, robot_cards
 from gaponet.robot.spec import RobotSpec, load_robot, packaged_robots, robot_argument, servo_table
 from gaponet.robot.toml_file import MEASURED_FIELDS
 from gaponet.sim.dataset_robot import open_dataset
@@ -26,21 +27,28 @@ MAX_POSTURES = 300  # of the logs
 
 
 def list_robots(json: Json = False) -> None:
-    """Robots in the package."""
+    """Robots in the package: as their makers state them, and identified from public recordings."""
     out = Out(json)
     specs = [load_robot(name) for name in packaged_robots()]
     out.table("Robots", ["name", "joints", "operated", "Hz", "payload", "what it is"], [
         [s.name, str(len(s.joint_names)), str(len(s.operated)), f"{1 / s.dt:g}",
          ", ".join(m.side for m in s.payload_mounts) or "–", s.description] for s in specs
     ])  # fmt: skip
-    out.say("Your own: a folder with robot.toml and robot.xml; gaponet robot check FOLDER")
-    out.result(
-        {
-            "robots": [
-                {"name": s.name, "joints": s.joint_names, "operated": s.operated} for s in specs
-            ]
-        }
+    cards = robot_cards()
+    if cards:
+        out.table("Identified robots", list(ROBOT_HEADINGS), [card.row() for card in cards])
+        for card in cards:
+            out.say(f": {card.details()}", card.name)
+    out.say(
+        "A name stands wherever a robot does. Your own: a folder with robot.toml and robot.xml; gaponet robot check "
+        "FOLDER"
     )
+    out.result({
+        "robots": [
+            {"name": s.name, "joints": s.joint_names, "operated": s.operated} for s in specs
+        ],
+        "identified": [asdict(card) for card in cards],
+    })  # fmt: skip
 
 
 def link(

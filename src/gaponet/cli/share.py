@@ -15,11 +15,12 @@ Address = Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="ADDRESS")]
 
 @like(push_pull.push)
 def push(
-    path: Folder, address: Address, private: Flag = False, replace: Flag = False, json: Json = False
-) -> None:
-    """Put a dataset or a run onto the Hugging Face Hub."""
+    path: Folder, address: Address, private: Flag = False, replace: Flag = False, licence: str = "",
+    trained_on: str = "", json: Json = False,
+) -> None:  # fmt: skip
+    """Put a dataset, a run or a robot onto the Hugging Face Hub."""
     screen = Out(json)
-    result = push_pull.push(path, address, private, replace)
+    result = push_pull.push(path, address, private, replace, licence, trained_on)
     size = f"{result.files} files, {result.size / 1e6:,.1f} MB"
     screen.say(f" of {size}, is now at {address}", result.kind)
     screen.say(f"Back: gaponet pull {address} {path.name}")
@@ -30,7 +31,7 @@ def push(
 
 @like(push_pull.pull)
 def pull(address: Address, out: Folder, json: Json = False) -> None:
-    """Fetch a dataset or a run, every file checked by its hash."""
+    """Fetch a dataset, a run or a robot, every file checked by its hash."""
     screen = Out(json)
     result = push_pull.pull(address, out)
     if result.files:

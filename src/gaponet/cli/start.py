@@ -28,7 +28,7 @@ from gaponet.cli.out import Out
 from gaponet.data.checks.gate import refuse_errors
 from gaponet.data.store import Dataset, dataset_hash
 from gaponet.robot.finding import abbreviate
-from gaponet.robot.spec import RobotSpec, load_robot, packaged_robots, robot_argument
+from gaponet.robot.spec import RobotSpec, load_robot, named_robots, robot_argument
 from gaponet.share.remote import FileRecord
 
 if TYPE_CHECKING:
@@ -208,7 +208,7 @@ def inspect_inputs(
     with tempfile.TemporaryDirectory() as place:
         if (model / "robot.toml").is_file():
             robot, packaged = load_robot(model), robot_argument(model)
-        elif not model.exists() and str(model) in packaged_robots():
+        elif not model.exists() and str(model) in named_robots():
             robot = load_robot(packaged := str(model))
         else:
             robot, packaged = new_robot(model, Path(place) / "robot", robot_options).robot, ""

@@ -10,6 +10,7 @@ from typing import Annotated, Literal
 import tyro
 
 from gaponet import api
+from gaponet.base.installation import install_command
 from gaponet.base.progress import progress_bar
 from gaponet.cli.options import Data, Flag, Json, Known, Motions, Robot, like
 from gaponet.cli.out import Out
@@ -68,7 +69,7 @@ def train(
             "Validation error", columns, [[name, mrad(error)] for name, error in rows.items()]
         )
         if "trees" not in trained.candidates:
-            screen.say("boosted trees were not tried: pip install 'gaponet[trees]'")
+            screen.say(f"boosted trees were not tried: {install_command('train')}")
     screen.say(
         f"best on validation: {mrad(val['model'])} mrad, without the network {mrad(val['start'])}, nominal "
         f"{mrad(val['nominal'])} ({val['model'] / val['nominal']:.2f}); {card['steps']:,} control steps in "

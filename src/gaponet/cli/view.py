@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from gaponet.base.errors import UsageError
 from gaponet.base.progress import progress_bar
 from gaponet.cli.options import Data, Json, Robot
 from gaponet.cli.out import Out
 from gaponet.evaluation.methods import title
 from gaponet.evaluation.tables import mrad
-from gaponet.nn.packaged_networks import network_folder
+from gaponet.nn.packaged_networks import named_folder
 from gaponet.sim.dataset_robot import open_dataset
 
 if TYPE_CHECKING:
@@ -49,12 +47,13 @@ def view(
         azimuth: Camera, degrees; 180 looks at the robot's front.
         elevation: Camera, degrees; negative looks down.
     """
-    _require_viewer(render)
+    if render is not None:
+        _require_renderer(render)
     from gaponet.report.view.scene import Scene, View
     from gaponet.report.view.side_by_side import Clip, select_entry, side_by_side
 
     out = Out(json)
-    model = tuple(network_folder(folder) for folder in model)
+    model = tuple(named_folder(folder) for folder in model)
     data, spec = open_dataset(dataset, robot, model[0] if model else None)
     entry = select_entry(
         data, model if spec.nominal is None else (*model, spec.folder), motion, unit, payload_mass
@@ -88,12 +87,8 @@ def view(
     })  # fmt: skip
 
 
-def _require_viewer(render: Path | None) -> None:
-    """Refuse a file that cannot be rendered, or a missing viewer, before anything is simulated."""
-    if render is None:
-        if find_spec("viser") is None:
-            raise UsageError("gaponet view needs viser; run: pip install 'gaponet[view]'")
-        return
+def _require_renderer(render: Path) -> None:
+    """Refuse a file that cannot be rendered before anything is simulated."""
     from gaponet.report.view.gl import choose_gl
 
     choose_gl()

@@ -1,6 +1,6 @@
 """gymnasium: an environment on AlignedSim, and a wrapper that aligns a user's MuJoCo environment.
 
-Needs gymnasium: pip install "gaponet[gym]".
+Needs gymnasium, of the extra `gym`.
 """
 
 from __future__ import annotations
@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 
 from gaponet.base.arrays import Array
-from gaponet.base.errors import UsageError, missing_extra
+from gaponet.base.errors import UsageError
+from gaponet.base.installation import missing_package
 from gaponet.deploy.aligned_sim import AlignedSim
 from gaponet.deploy.mujoco_loop import MujocoAligner
 from gaponet.deploy.transfer import Reference
@@ -22,7 +23,7 @@ from gaponet.robot.spec import load_robot
 try:
     import gymnasium
 except ModuleNotFoundError as error:
-    raise ModuleNotFoundError(missing_extra(error) or str(error), name=error.name) from None
+    raise ModuleNotFoundError(missing_package(error) or str(error), name=error.name) from None
 
 
 class TrackingEnv(gymnasium.Env):

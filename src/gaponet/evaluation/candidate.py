@@ -24,7 +24,7 @@ from gaponet.sim.model import require_same_robot, require_stored_robot
 DATA_HINT = "data of the robot that the run was trained for"
 
 
-class _Origin(TypedDict):
+class Origin(TypedDict):
     """Data that a robot was identified from: dataset (path from the folder), recordings and motions by
     split, the error on validation motions, rad, what was learned about backlash and links, and what the doctor found in
     the recordings (checks/gate.py)."""
@@ -172,7 +172,7 @@ def split_of_run(run: Path) -> dict[str, dict[str, str]]:
     return dict(read_json(SplitHashes, run / "split.json", ModelError, hint))  # type: ignore[arg-type]
 
 
-def read_origin(folder: Path) -> _Origin | None:
+def read_origin(folder: Path) -> Origin | None:
     """Read the data that a robot folder was identified from; None if it is not stated.
 
     Raises:
@@ -182,7 +182,7 @@ def read_origin(folder: Path) -> _Origin | None:
     if not file.is_file():
         return None
     return read_json(
-        _Origin,
+        Origin,
         file,
         RobotError,
         "identify again, or remove it: all recordings then count as seen",

@@ -12,7 +12,7 @@ import numpy as np
 from gaponet.evaluation.methods import IDENTIFIED, title
 from gaponet.evaluation.tables import mrad, mrad_with_error
 from gaponet.nn.config import ModelKind
-from gaponet.nn.packaged_networks import is_packaged, network_folder
+from gaponet.nn.packaged_networks import is_packaged, named_folder
 from gaponet.robot.folder import STORED_ROBOT
 from gaponet.sim.metrics import standard_error
 
@@ -116,7 +116,7 @@ def next_step(
     """
     networks = [own for own in methods if own.removeprefix(IDENTIFIED) in LEARNED]
     helps = any(network_gain(methods, own).helps for own in networks)
-    if folder is not None and is_packaged(network_folder(folder)):
+    if folder is not None and is_packaged(named_folder(folder)):
         if helps:
             name = folder.name
             return f"gaponet export {name} --to torch --out {name}-torch"

@@ -25,6 +25,7 @@ from gaponet.data.sequence import Sequence, SequenceMeta
 from gaponet.data.split import split_entries
 from gaponet.data.store import Dataset
 from gaponet.evaluation.candidate import read_origin
+from gaponet.robot.by_name import identified_catalogue
 from gaponet.robot.servo_fields import SERVO_FIELDS, SERVO_TERMS
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.batch import Condition, speed_limited
@@ -81,7 +82,8 @@ def fit_plain_servos(
 ) -> RobotSpec:
     """Fit the parameters of PD servos, without a servo model but for the terms that the engine has, to recordings.
 
-    The result is stored in the robot folder, and read from there if nothing changed.
+    The result is stored in the robot folder, and read from there if nothing changed. A robot of the package brings it,
+    fitted to the recordings that it was identified from.
 
     Args:
         robot: Identified; table, zeros and stops do not change. Returned unchanged if the engine has its servo model.
@@ -94,6 +96,10 @@ def fit_plain_servos(
     if not any(getattr(robot, name).any() for name in without):
         return robot
     start = replace(robot, **without)
+    kind = dict[str, dict[str, float]]  # joint → SERVO_FIELDS
+    if _ships_plain_servos(robot, engine_terms):
+        stored = read_json(_Stored, robot.folder / CACHE, RobotError)
+        return start.with_servos(validated(kind, stored["content"], CACHE, RobotError))
 
     def fit() -> dict[str, dict[str, float]]:
         fitted = identify(
@@ -108,8 +114,13 @@ def fit_plain_servos(
             for i, joint in enumerate(robot.joint_names)
         }
 
-    kind = dict[str, dict[str, float]]  # joint → SERVO_FIELDS
     return start.with_servos(stored_result(robot.folder / CACHE, kind, fit, start, recordings))
+
+
+def _ships_plain_servos(robot: RobotSpec, engine_terms: tuple[str, ...]) -> bool:
+    """Return True for a robot of the package, whose nearest servos without any further term lie beside it."""
+    packaged = identified_catalogue().holds(robot.folder) and (robot.folder / CACHE).is_file()
+    return packaged and not any(getattr(robot, name).any() for name in engine_terms)
 
 
 def stored_result(

@@ -21,7 +21,7 @@ from gaponet.export.onnx_to_torch import OnnxModule
 from gaponet.export.shipped.gaponet_action import PROGRAM, Past
 from gaponet.nn.artifact import WEIGHTS, GapModel
 from gaponet.nn.onnx_export import MAX_DIFFERENCE_RAD, trained_network
-from gaponet.nn.packaged_networks import is_packaged
+from gaponet.nn.packaged_networks import is_packaged_network
 
 CHECK_PERIODS = 12  # control periods
 CHECK_WORLDS = 3
@@ -124,7 +124,7 @@ def delta_step(model: GapModel, run: Path) -> DeltaStep:
             "with predictor_inputs observation"
         )
     net: nn.Module
-    if is_packaged(model.path):
+    if is_packaged_network(model.path):
         net = OnnxModule(model.path / WEIGHTS)
     else:
         net = trained_network(run, model.config, len(model.card["joint_names"]))

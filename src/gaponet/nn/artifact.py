@@ -23,8 +23,8 @@ from gaponet.base.structure import Json, Name, Number, Sha256, read_format, read
 from gaponet.nn.config import ModelConfig
 from gaponet.nn.loop import DeltaCorrector, DeltaLoop
 from gaponet.nn.onnx_network import Network, OnnxNetwork
-from gaponet.nn.packaged_networks import CARD as CARD
-from gaponet.nn.packaged_networks import network_folder
+from gaponet.nn.packaged_networks import named_folder
+from gaponet.robot.by_name import CARD as CARD
 from gaponet.robot.folder import (
     PackagedRobot,
     has_stored_robot,
@@ -258,7 +258,7 @@ class GapModel:
             UsageError: The name is that of a network of the package and of a folder in the working
                 directory.
         """
-        folder = network_folder(path)
+        folder = named_folder(path)
         folder = folder / "model" if (folder / "model" / CARD).is_file() else folder
         for name in (CARD, WEIGHTS):
             if not (folder / name).is_file():

@@ -4,17 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
-
-from annotated_types import Ge, Len
 
 from gaponet.base.errors import ModelError
 from gaponet.base.structure import validated
 from gaponet.nn.artifact import GapModel
-from gaponet.nn.packaged_networks import CARD, packaged_folders
+from gaponet.nn.packaged_networks import catalogue
+from gaponet.robot.by_name import CARD
+from gaponet.robot.card import PUBLISHED, Published, folder_size
 from gaponet.robot.folder import PackagedRobot
 
-PUBLISHED = "published"  # field of card.json with a Published
 HEADINGS = (
     "name",
     "robot, model",
@@ -25,63 +23,6 @@ HEADINGS = (
     "rate, Hz",
     "training",
 )
-
-Text = Annotated[str, Len(1)]
-
-
-@dataclass(frozen=True)
-class SourceOfData:
-    """Data set that a network was trained on.
-
-    Attributes:
-        title: Its name.
-        address: Where it is, or how to make it.
-        licence: SPDX identifier of its licence.
-    """
-
-    title: Text
-    address: Text
-    licence: Text
-
-
-@dataclass(frozen=True)
-class ErrorOnTest:
-    """Mean |q − q_real| in open-loop rollouts of whole motions that training never saw.
-
-    Attributes:
-        recordings: Number of rollouts.
-        motions: Names of the motions.
-        nominal_mrad: Error of the simulator without correction, mrad.
-        model_mrad: Error with the network, as it is stored here, mrad.
-    """
-
-    recordings: Annotated[int, Ge(1)]
-    motions: Annotated[tuple[str, ...], Len(1)]
-    nominal_mrad: float
-    model_mrad: float
-
-
-@dataclass(frozen=True)
-class Published:
-    """Fields that `benchmarks/ship_networks.py` adds to the card of training.
-
-    Attributes:
-        licence: SPDX identifier of the network's licence.
-        date: Day of publication, YYYY-MM-DD.
-        data: Data set.
-        test: Error on its test motions.
-        limits_of_use: What the network is not for, in a sentence.
-        largest_difference_rad: Largest difference between this network and the one that was
-            trained, whose weights have more digits, over states of the training data, rad. 0 if all
-            weights are equal.
-    """
-
-    licence: Text
-    date: Text
-    data: SourceOfData
-    test: ErrorOnTest
-    limits_of_use: Text
-    largest_difference_rad: Annotated[float, Ge(0)] = 0.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -156,8 +97,6 @@ class NetworkCard:
 
     def row(self) -> list[str]:
         """Return the cells of a table with HEADINGS, for terminal and documentation."""
-        test = self.published.test
-        data = self.published.data
         robot = self.robot
         if self.gain_scale != 1:
             robot += f" × {self.gain_scale:g} gains"
@@ -166,9 +105,7 @@ class NetworkCard:
         return [
             self.name,
             f"{robot}, {self.kind}",
-            f"{data.title} ({data.licence})",
-            f"{test.recordings} recordings of {len(test.motions)} motions",
-            f"{test.nominal_mrad:.2f} → {test.model_mrad:.2f}",
+            *self.published.cells(),
             ", ".join(f"{mass:g}" for mass in self.payloads_kg),
             ", ".join(f"{rate:g}" for rate in self.rates_hz),
             f"{self.steps:,} control steps, seed {self.seed}, {self.published.date}",
@@ -189,28 +126,6 @@ class NetworkCard:
         return text
 
 
-def folder_size(folder: Path) -> int:
-    """Return the size of all files in a folder, bytes."""
-    return sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
-
-
 def network_cards() -> tuple[NetworkCard, ...]:
     """Return the cards of the networks in the package, by name."""
-    return tuple(NetworkCard.read(folder) for folder in packaged_folders())
-
-
-def markdown_table(cards: tuple[NetworkCard, ...]) -> str:
-    """Return the cards as the text of docs/network.md: a table, and a line with the details of
-    each network.
-    """
-    if not cards:
-        return "This version of the package has no networks.\n"
-    lines = [f"| {' | '.join(HEADINGS)} |", "|---" * len(HEADINGS) + "|"]
-    for card in cards:
-        cells = card.row()
-        cells[0] = f"`{cells[0]}`"
-        lines.append(f"| {' | '.join(cells)} |")
-    lines.append("")
-    for card in cards:
-        lines.append(f"- `{card.name}`: {card.details()}")
-    return "\n".join(lines) + "\n"
+    return tuple(NetworkCard.read(folder) for folder in catalogue().folders())

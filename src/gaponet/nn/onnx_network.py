@@ -12,6 +12,7 @@ import numpy as np
 
 from gaponet.base.arrays import Array
 from gaponet.base.errors import ModelError
+from gaponet.base.installation import install_command
 from gaponet.base.sandbox import sandboxed
 
 Network = Callable[[Any], Any]  # x (B, dim) float32 → Δa (B, n) rad; numpy arrays or torch tensors
@@ -98,7 +99,7 @@ def _onnxruntime() -> Any:
         import onnxruntime
     except ImportError:
         raise ModelError(
-            "onnxruntime is not installed; run: pip install 'gaponet[deploy]'"
+            f"onnxruntime is not installed; run: {install_command('deploy')}"
         ) from None
     return onnxruntime
 

@@ -14,52 +14,55 @@ import difflib
 from pathlib import Path
 
 from gaponet.base.errors import ModelError, UsageError
+from gaponet.robot.by_name import Catalogue, hub_folder, identified_catalogue, is_from_hub
 
 PACKAGE_FOLDER = Path(__file__).parent / "trained"
 MAX_TOTAL_BYTES = 2_000_000  # of all networks together, so that the wheel stays small
-CARD = "card.json"
 
 
-def packaged_folders() -> tuple[Path, ...]:
-    """Return the folders of the networks in the package, by name."""
-    return tuple(sorted(file.parent for file in PACKAGE_FOLDER.glob(f"*/{CARD}")))
+def catalogue() -> Catalogue:
+    """Return the networks of the package."""
+    return Catalogue("network", PACKAGE_FOLDER)
 
 
 def packaged_networks() -> tuple[str, ...]:
     """Return the names of the networks in the package."""
-    return tuple(folder.name for folder in packaged_folders())
+    return catalogue().names()
 
 
-def network_folder(name_or_path: str | Path) -> Path:
-    """Return the folder of a network of the package, or the path itself.
+def named_folder(name_or_path: str | Path) -> Path:
+    """Return the folder of a network or an identified robot of the package or of the Hub, or the path itself.
 
-    One word without a slash is a name if the package has a network of that name. All else is a
-    path. The command line drops the slash of "./so101-sage", so a folder of that name in the
-    working directory needs its absolute path.
+    Args:
+        name_or_path: Name, path, or address hf://USER/NAME.
 
     Raises:
-        UsageError: The name is that of a network and of something in the working directory.
-        ModelError: There is neither a network nor a file or folder of that name.
+        UsageError: The name is one of the package, and of something in the working directory.
+        ModelError: There is neither such a name nor a file or folder.
     """
     text = str(name_or_path)
     path = Path(name_or_path)
-    if path.name != text or text == "..":
-        return path
-    if text in packaged_networks():
-        if path.exists():
-            raise UsageError(
-                f"'{text}' is a network of the package and a folder here; for the folder give "
-                f"{path.absolute()}, for the network work in another directory"
-            )
-        return PACKAGE_FOLDER / text
-    if not path.exists():
+    found = (
+        catalogue().find(name_or_path)
+        or identified_catalogue().find(name_or_path)
+        or hub_folder(name_or_path)
+    )
+    if found is not None:
+        return found
+    if path.name == text != ".." and not path.exists():
         raise ModelError(_unknown(text))
     return path
 
 
+def is_packaged_network(folder: Path) -> bool:
+    """Return True for the folder of a network of the package."""
+    return catalogue().holds(folder)
+
+
 def is_packaged(folder: Path) -> bool:
-    """Return True for the folder of a network of the package. Such a folder is never written to."""
-    return folder.parent == PACKAGE_FOLDER
+    """Return True for a folder of the package or of the Hub's cache, which is never written to."""
+    packaged = is_packaged_network(folder) or identified_catalogue().holds(folder)
+    return packaged or is_from_hub(folder)
 
 
 def require_run_folder(run: Path, action: str, instead: str) -> None:
@@ -72,7 +75,7 @@ def require_run_folder(run: Path, action: str, instead: str) -> None:
     Raises:
         UsageError: The folder is that of a network of the package.
     """
-    if is_packaged(run):
+    if is_packaged_network(run):
         raise UsageError(
             f"{action} needs a run folder of gaponet train, and '{run.name}' is a network of the "
             f"package; {instead}"
@@ -80,14 +83,12 @@ def require_run_folder(run: Path, action: str, instead: str) -> None:
 
 
 def _unknown(name: str) -> str:
-    """Return the error for a name that is neither a network nor a path."""
-    names = packaged_networks()
+    """Return the error for a name that the package does not have and that is no path."""
+    names = (*packaged_networks(), *identified_catalogue().names())
     if not names:
-        return (
-            f"{name}: no such folder, and the package has no networks; give a robot or run folder"
-        )
+        return f"{name}: no such folder, and the package has no names; give a robot or run folder"
     nearest = difflib.get_close_matches(name, names, n=1, cutoff=0.0)[0]
     return (
-        f"{name}: no such folder, and no network of the package, which has {', '.join(names)}; "
-        f"nearest: {nearest}; or give a robot or run folder"
+        f"{name}: no such folder, and no name of the package, which has {', '.join(names)}; nearest: {nearest}; or "
+        "give a robot or run folder"
     )

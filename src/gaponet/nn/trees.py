@@ -17,6 +17,7 @@ from torch import Tensor, nn
 
 from gaponet.base.arrays import Array
 from gaponet.base.errors import ModelError, UsageError
+from gaponet.base.installation import install_command
 from gaponet.nn.config import ModelConfig
 from gaponet.nn.layers import DeltaNet
 
@@ -96,7 +97,7 @@ class TreesNet(DeltaNet):
         """
         if not trees_available():
             raise UsageError(
-                "--model trees: scikit-learn is not installed; run: pip install 'gaponet[trees]'"
+                f"--model trees: scikit-learn is not installed; run: {install_command('train')}"
             )
         from sklearn.ensemble import HistGradientBoostingRegressor as Ensemble
 

@@ -28,7 +28,7 @@ from gaponet.evaluation.run_files import (
 from gaponet.evaluation.tables import by_group, mrad, mrad_and_degrees, totals
 from gaponet.evaluation.verdict import network_gain, verdict
 from gaponet.nn.artifact import GapModel
-from gaponet.nn.packaged_networks import network_folder, require_run_folder
+from gaponet.nn.packaged_networks import is_packaged, named_folder
 from gaponet.report.page import inline_image, page_figure, render
 from gaponet.robot.folder import load_stored_robot
 from gaponet.robot.spec import RobotSpec, load_robot
@@ -95,12 +95,12 @@ def write_report(
         ModelError: The folder is damaged or incomplete.
         DatasetError: The dataset of an evaluation is not there.
     """
-    run = network_folder(run)
-    require_run_folder(
-        run,
-        "a report",
-        f"gaponet eval {run.name} DATASET prints its errors, gaponet gap their causes",
-    )
+    run = named_folder(run)
+    if is_packaged(run):
+        raise UsageError(
+            f"a report lies beside what it describes, and '{run.name}' lies in the package; gaponet eval {run.name} "
+            "DATASET prints its errors, gaponet gap their causes"
+        )
     model = None if is_robot(run) else GapModel.load(run)
     given = (
         None

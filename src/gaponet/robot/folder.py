@@ -18,6 +18,7 @@ from annotated_types import Interval
 from gaponet.base.errors import RobotError, UsageError
 from gaponet.base.files import lock_folder, write_json, write_text
 from gaponet.base.structure import Name, read_json
+from gaponet.robot.by_name import FILE_REFERENCES
 from gaponet.robot.servo_fields import SERVO_FIELDS, SERVO_TERMS, TERMS
 from gaponet.robot.spec import PACKAGE_FOLDER, RobotSpec, load_robot, packaged_robots
 
@@ -42,7 +43,6 @@ IDENTIFIED_HEADING = (
 IDENTIFIED_TABLES = re.compile(
     r"^\[identified[._].*?(?=^\[(?!identified[._])|\Z)", re.MULTILINE | re.DOTALL
 )
-FILE_REFERENCES = re.compile(r"<include\b|\bfile\s*=|\b(mesh|texture|asset)dir\s*=")
 
 
 @dataclass(frozen=True)
@@ -147,15 +147,6 @@ def require_other_folder(folder: Path, robot: RobotSpec) -> None:
     """Refuse to write a robot over the folder that it was loaded from."""
     if folder.resolve() == robot.folder.resolve():
         raise UsageError(f"{folder}: is the robot's own folder; choose another")
-
-
-def require_self_contained(folder: Path) -> None:
-    """Refuse a stored robot whose MJCF names other files: a downloaded one could name any file of this machine."""
-    file = folder / "robot.xml"
-    if not file.is_file() or FILE_REFERENCES.search(
-        file.read_text(encoding="utf-8", errors="replace")
-    ):
-        raise RobotError(f"{file}: is missing, or names other files; a stored robot needs none")
 
 
 def load_stored_robot(holder: Path, name: str) -> RobotSpec:

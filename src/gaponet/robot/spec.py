@@ -23,6 +23,7 @@ import numpy as np
 from gaponet.base.arrays import Array
 from gaponet.base.errors import JointMismatchError, RobotError
 from gaponet.base.structure import read_toml
+from gaponet.robot.by_name import hub_folder, identified_catalogue
 from gaponet.robot.servo_fields import SERVO_FIELDS, SERVO_TERMS, warmed
 from gaponet.robot.toml_file import (
     Link,
@@ -363,11 +364,17 @@ def packaged_robots() -> list[str]:
     return sorted(p.parent.name for p in PACKAGE_FOLDER.glob("*/robot.toml"))
 
 
-def load_robot(name_or_path: str | Path) -> RobotSpec:
-    """Read a robot from the package by name, or from a folder by path.
+def named_robots() -> list[str]:
+    """Return the names that load_robot takes: of the robots in the package, then of the identified ones."""
+    return [*packaged_robots(), *identified_catalogue().names()]
 
-    A string without a slash is a name, never a folder of the current directory. A Path, or a string with a slash such
-    as "./g1", is a folder.
+
+def load_robot(name_or_path: str | Path) -> RobotSpec:
+    """Read a robot from the package by name, from a folder by path, or from the Hub by its address hf://USER/NAME.
+
+    A string without a slash is a name: "so101" is a robot as its maker states it, "so101@sage" one that was identified
+    (`gaponet robot list`). It is never a folder of the current directory. A Path, or a string with a slash such as
+    "./g1", is a folder, except for the path that is the name of an identified robot.
 
     Raises:
         RobotError: It names the folder, the field and what to write there.
@@ -392,12 +399,17 @@ def load_robot(name_or_path: str | Path) -> RobotSpec:
 
 def robot_argument(folder: Path) -> str:
     """Return the value of --robot for a robot folder: with a slash, because a string without one is a name."""
+    if identified_catalogue().holds(folder):
+        return folder.name
     return f"./{folder}" if folder.name == str(folder) else str(folder)
 
 
 def _folder(name_or_path: str | Path) -> Path:
     """Return the folder of a robot; refuses an ambiguous name."""
     text, folder = str(name_or_path), Path(name_or_path)
+    found = identified_catalogue().find(name_or_path) or hub_folder(name_or_path)
+    if found is not None:
+        return found
     if isinstance(name_or_path, Path) or folder.name != text or text == "..":
         return folder
     packaged, here = PACKAGE_FOLDER / text, (folder / "robot.toml").is_file()
@@ -408,7 +420,7 @@ def _folder(name_or_path: str | Path) -> Path:
             else "or give a folder, with a slash: ./my_robot"
         )
         raise RobotError(
-            f"no robot '{text}': in the package are {', '.join(packaged_robots())}; {what}"
+            f"no robot '{text}': in the package are {', '.join(named_robots())}; {what}"
         )
     if here and not packaged.samefile(folder):
         raise RobotError(

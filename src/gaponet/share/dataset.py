@@ -17,6 +17,7 @@ from typing import Any
 from gaponet import __version__
 from gaponet.base.errors import DatasetError
 from gaponet.base.files import FOLDER_MARKER, write_text
+from gaponet.base.network import RemoteError
 from gaponet.base.progress import progress_bar
 from gaponet.data.card import card_markdown, make_card
 from gaponet.data.formats.lerobot import read_episodes
@@ -29,10 +30,11 @@ from gaponet.data.sequence import Sequence, SequenceMeta, to_sequence
 from gaponet.data.split import read_split
 from gaponet.data.store import JOURNAL, Dataset
 from gaponet.data.writers.lerobot import write
-from gaponet.robot.folder import STORED_ROBOT, load_stored_robot, require_self_contained, save_robot
+from gaponet.robot.by_name import require_self_contained
+from gaponet.robot.folder import STORED_ROBOT, load_stored_robot, save_robot
 from gaponet.robot.spec import RobotSpec, load_robot
 from gaponet.share.readme import dataset_readme
-from gaponet.share.remote import INDEX, FileRecord, Index, RemoteError
+from gaponet.share.remote import INDEX, FileRecord, Index
 from gaponet.sim.model import model_hash
 
 SIDECAR = "gaponet"  # folder beside the LeRobot set

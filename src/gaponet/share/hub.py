@@ -1,4 +1,4 @@
-"""Repositories of the Hugging Face Hub: datasets as dataset repositories, runs as model repositories.
+"""Repositories of the Hugging Face Hub: datasets as dataset repositories, runs and robots as model repositories.
 
 A push is one commit. huggingface_hub uploads only files that the Hub does not have; it retries and resumes transfers.
 """
@@ -10,20 +10,19 @@ import os
 from contextlib import suppress
 from pathlib import Path
 
+from gaponet.base.network import RemoteError, network_errors
 from gaponet.data.formats.lerobot_set import VERSION as LEROBOT_TAG
 from gaponet.share.remote import (
     INDEX,
     MAX_INDEX_BYTES,
     Index,
     Kind,
-    RemoteError,
     lost_race,
-    network_errors,
     require_pushed_files,
     require_space,
 )
 
-REPOSITORY_TYPES: dict[Kind, str] = {"dataset": "dataset", "run": "model"}
+REPOSITORY_TYPES: dict[Kind, str] = {"dataset": "dataset", "run": "model", "robot": "model"}
 INITIAL_FILES = {".gitattributes", "README.md"}  # of a new repository
 PARENT_CHANGED = 412  # HTTP status of a commit whose parent is not the newest commit
 
@@ -63,7 +62,8 @@ class Hub:
         """Return the content of gaponet.json, None if nothing was pushed; kind: look for this one only."""
         from huggingface_hub.errors import RepositoryNotFoundError
 
-        for wanted in REPOSITORY_TYPES.values() if kind is None else (REPOSITORY_TYPES[kind],):
+        types = dict.fromkeys(REPOSITORY_TYPES.values())
+        for wanted in types if kind is None else (REPOSITORY_TYPES[kind],):
             with network_errors(self.address), suppress(RepositoryNotFoundError):
                 info = self.api.repo_info(
                     self.repo, repo_type=wanted, revision=self.revision, files_metadata=True
@@ -88,7 +88,7 @@ class Hub:
                     )
         if kind is None and not self.type:
             raise RemoteError(
-                f"{self.address}: no dataset or run there that may be read; see hf auth login"
+                f"{self.address}: no dataset, run or robot there that may be read; see hf auth login"
             )
         return None
 

@@ -1,7 +1,7 @@
-"""Push and pull of datasets and runs.
+"""Push and pull of datasets, runs and robots.
 
-Both work in a hidden folder beside the dataset or run, which gets its name when it is complete. The next push or pull
-does not transfer again what a killed one has transferred.
+Both work in a hidden folder beside what is pushed or pulled, which gets its name when it is complete. The next push or
+pull does not transfer again what a killed one has transferred.
 """
 
 from __future__ import annotations
@@ -14,30 +14,36 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import gettempdir
+from typing import Any
 
 from gaponet.base.errors import UsageError
 from gaponet.base.files import FOLDER_MARKER, lock_folder, write_text
+from gaponet.base.network import RemoteError
 from gaponet.data.store import Dataset
 from gaponet.share import dataset as datasets
+from gaponet.share import robot as robots
 from gaponet.share import run as runs
 from gaponet.share.hub import Hub
+from gaponet.share.readme import ModelFacts
 from gaponet.share.remote import (
     FORMAT,
     INDEX,
     FileRecord,
     Index,
     Kind,
-    RemoteError,
     file_errors,
     read_index,
 )
+
+MODELS: dict[Kind, Any] = {"run": runs, "robot": robots}  # of model repositories
+LOST = {"dataset": "{} sequences", "run": "another network", "robot": "another robot"}
 
 
 @dataclass(frozen=True)
 class TransferResult:
     """Result of a push or a pull."""
 
-    kind: Kind  # dataset or run
+    kind: Kind
     files: int  # number of files: all of a push, the downloaded ones of a pull
     size: int  # bytes of these files
 
@@ -47,21 +53,29 @@ def push(
     address: str,
     private: bool = False,
     replace: bool = False,
+    licence: str = "",
+    trained_on: str = "",
 ) -> TransferResult:
-    """Put a dataset or a run where others can pull it, with a card; one that is there already is brought up to date.
+    """Put a dataset, a run or an identified robot where others can pull it, with a card; what is there already is
+    brought up to date.
 
     Args:
-        path: Dataset or run.
+        path: Dataset, run or robot folder.
         address: USER/NAME on the Hugging Face Hub.
         private: Readable by its owner alone, if a new repository is made for it.
         replace: Also replace what this is no newer state of.
+        licence: SPDX identifier for the card of a run or a robot; a dataset states its own.
+        trained_on: Dataset of the Hub that a run or a robot was made from, USER/NAME, for its card.
 
     Raises:
         RemoteError: The place cannot be reached or written, or holds something else.
-        GAPONetError: The dataset or run is damaged.
+        GAPONetError: The dataset, run or robot is damaged.
     """
     path = Path(path).resolve()
     kind = _kind(path)
+    if kind == "dataset" and (licence or trained_on):
+        raise UsageError("--licence and --trained-on are for runs and robots; leave them out")
+    facts = ModelFacts(licence, trained_on)
     hub = Hub(address)
     content = hub.index(kind)
     present = None if replace or content is None else read_index(hub.address, content)
@@ -77,8 +91,10 @@ def push(
         files = folder / "files"
         files.mkdir()
         try:
-            source = datasets if kind == "dataset" else runs
-            contents = source.write_files(path, files, hub.address)
+            if kind == "dataset":
+                contents = datasets.write_files(path, files, hub.address)
+            else:
+                contents = MODELS[kind].write_files(path, files, hub.address, facts)
             _require_newer(present, kind, contents, hub.address)
             records = {
                 file.relative_to(files).as_posix(): FileRecord.of(file)
@@ -103,7 +119,7 @@ def pull(address: str, out: str | Path) -> TransferResult:
         out: New or empty folder, or a dataset of that robot.
 
     Raises:
-        RemoteError: Nothing is there, a file has another hash, or the content is no dataset or run.
+        RemoteError: Nothing is there, a file has another hash, or the content is no dataset, run or robot.
         UsageError: The folder holds something.
     """
     out = Path(out)
@@ -113,7 +129,9 @@ def pull(address: str, out: str | Path) -> TransferResult:
     hub = Hub(address)
     index = read_index(hub.address, hub.index())
     if present is not None and index.kind != "dataset":
-        raise UsageError(f"{out}: is a dataset, and {address} holds a run; choose a new folder")
+        raise UsageError(
+            f"{out}: is a dataset, and {address} holds a {index.kind}; choose a new folder"
+        )
     if present is not None and all(present.find(digest) for digest in index.contents):
         return TransferResult(index.kind, 0, 0)
     with _work_folder(out.absolute(), "pull") as folder:
@@ -124,7 +142,7 @@ def pull(address: str, out: str | Path) -> TransferResult:
         if index.kind == "dataset":
             fetched, new = _pull_dataset(hub, index, work, present)
         else:
-            fetched, new = _pull_run(hub, index, work)
+            fetched, new = _pull_model(hub, index, work)
         if present is None:
             if out.exists():
                 out.rmdir()
@@ -151,14 +169,15 @@ def _pull_dataset(
     return small + recordings, dataset
 
 
-def _pull_run(hub: Hub, index: Index, work: Path) -> tuple[list[str], Path]:
-    """Download and check a run; return its files and its folder."""
+def _pull_model(hub: Hub, index: Index, work: Path) -> tuple[list[str], Path]:
+    """Download and check a run or a robot; return its files and its folder."""
     files = sorted(index.files)
+    model = MODELS[index.kind]
     with file_errors(hub.address, work):
-        runs.require_run_files(index)
+        model.require_files(index)
     hub.download(files, index, work)
     with file_errors(hub.address, work):
-        runs.require_pushed_run(work, index)
+        model.require_pushed(work, index)
     return files, work
 
 
@@ -167,8 +186,10 @@ def _kind(path: Path) -> Kind:
         return "dataset"
     if (path / "split.json").is_file() and (path / "config.json").is_file():
         return "run"
+    if (path / "robot.toml").is_file():
+        return "robot"
     raise UsageError(
-        f"{path}: neither a dataset nor a run of gaponet train; send a robot folder as a .zip"
+        f"{path}: neither a dataset, nor a run of gaponet train, nor a robot of gaponet identify"
     )
 
 
@@ -178,8 +199,9 @@ def _require_newer(
     """Refuse to replace a push with content that this one lacks."""
     lost = set(present.contents) - set(contents) if present else set()
     if present and (present.kind != kind or lost):
-        what = "another network" if kind == "run" else f"{len(lost)} sequences"
-        what = what if present.kind == kind else f"a {present.kind}"
+        what = LOST[kind].format(len(lost))
+        if present.kind != kind:
+            what = f"a {present.kind}"
         hint = "push to another place, or say --replace"
         raise RemoteError(f"{address}: holds {what} that would be lost ('{present.name}'); {hint}")
 

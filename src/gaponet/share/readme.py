@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import json
+from dataclasses import dataclass
 from typing import Any
 
 from gaponet.base.text import escape_markdown
 from gaponet.data.card import NOT_STATED
-from gaponet.evaluation.tables import totals
+from gaponet.evaluation.candidate import Origin
+from gaponet.evaluation.tables import mrad, totals
 from gaponet.nn.artifact import GapModel
+from gaponet.robot.spec import RobotSpec
 
 LICENCES = (
     "apache-2.0",
@@ -49,9 +52,68 @@ def dataset_readme(card: dict[str, Any], text: str, address: str, sets: list[str
     return _page(header, text.splitlines(), use)
 
 
-def run_readme(facts: dict[str, Any], address: str) -> str:
+@dataclass(frozen=True)
+class ModelFacts:
+    """What the user says for the header of a model card.
+
+    Attributes:
+        licence: SPDX identifier; "" if it was not said.
+        trained_on: Dataset of the Hub, USER/NAME; "" if there is none.
+    """
+
+    licence: str = ""
+    trained_on: str = ""
+
+    def header(self, tags: list[str]) -> dict[str, Any]:
+        """Return the header with which the Hub shows and finds a model."""
+        licence = self.licence.lower() or "unknown"
+        named = {} if licence in (*LICENCES, "unknown") else {"license_name": self.licence}
+        return {
+            "license": "other" if named else licence,
+            **named,
+            "library_name": "gaponet",
+            "tags": tags,
+            "datasets": [self.trained_on] if self.trained_on else [],
+            "metrics": ["mae"],  # of joint positions in rollouts
+        }
+
+
+def robot_readme(robot: RobotSpec, origin: Origin | None, address: str, facts: ModelFacts) -> str:
+    """Return a model card: joints, data, and errors on the motions that validated the fit."""
+    name = escape_markdown(robot.name)
+    lines = [
+        f"# {name}: an identified robot",
+        "",
+        f"- identified joints: {escape_markdown(', '.join(robot.operated))}",
+        f"- {escape_markdown(robot.description)}",
+    ]
+    if origin is not None:
+        errors = origin["val_mpjae"]
+        lines += [
+            f"- from {len(origin['parts']['train'])} recordings",
+            f"- mean error on validation motions: {mrad(errors['nominal'])} mrad before, "
+            f"{mrad(errors['identified'])} mrad identified",
+        ]
+    lines += [
+        "",
+        "These are the values of one robot at one time. Identify or adapt yours before you rely on them.",
+    ]
+    short = address.removeprefix("hf://")
+    use = [
+        "```python",
+        "import gaponet as gp",
+        "",
+        f'robot = gp.load_robot("hf://{short}")',
+        "```",
+        "",
+        f"    gaponet export hf://{short} --to mjcf --out my_{robot.name}",
+    ]
+    return _page(facts.header(_tags({"robot": robot.name})), lines, use)
+
+
+def run_readme(found: dict[str, Any], address: str, facts: ModelFacts) -> str:
     """Return a model card: corrected joints, training data, and errors on the test motions."""
-    card, metrics = facts["card"], facts["metrics"]
+    card, metrics = found["card"], found["metrics"]
     virtual, rates = (
         ", trained on VIRTUAL robots",
         ", ".join(f"{1 / dt:.2f}" for dt in card.get("dt", [])),
@@ -64,14 +126,15 @@ def run_readme(facts: dict[str, Any], address: str) -> str:
         f"- trained {escape_markdown(GapModel.how_trained(card))}, on {card.get('hours', 0):.2f} h of dataset "
         f"{escape_markdown(str(card.get('dataset_hash', '')))}",
         f"- at {rates} Hz, in simulator {escape_markdown(card['simulator'])}",
-        f"- weights {facts['weights']}",
+        f"- weights {found['weights']}",
     ]
     if metrics:
         seen = "never seen" if metrics["unseen"] else "seen in training"
         lines += ["", f"Rollouts of {metrics['sequences']} whole sequences, {seen}:", ""]
         lines += [totals(metrics["methods"], simulators=metrics.get("simulators")).markdown()]
-    use = [f"    gaponet pull {address} RUN", "    gaponet run --model RUN …"]
-    return _page({"library_name": "gaponet", "tags": _tags(card)}, lines, use)
+    short = address.removeprefix("hf://")
+    use = [f"    gaponet run --model hf://{short} …", f"    gaponet pull {address} RUN"]
+    return _page(facts.header(_tags(card)), lines, use)
 
 
 def _tags(card: dict[str, Any], *more: str) -> list[str]:

@@ -1,12 +1,10 @@
-"""The index file that lists what was pushed to a repository, and the errors of reaching it."""
+"""The index file that lists what was pushed to a repository."""
 
 from __future__ import annotations
 
 import hashlib
 import json
-import re
 import shutil
-import sys
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
@@ -16,25 +14,16 @@ from typing import Annotated, Literal
 from annotated_types import Interval, Len
 
 from gaponet.base.errors import GAPONetError
+from gaponet.base.network import RemoteError
 from gaponet.base.structure import Name, Sha256, parse_json
 
-Kind = Literal["dataset", "run"]
+Kind = Literal["dataset", "run", "robot"]
 FORMAT = 1
 INDEX = "gaponet.json"
 MAX_INDEX_BYTES = 96 << 20  # 67 bytes per sequence
 MAX_FOLDER_DEPTH = 8
 MAX_PATH_LENGTH = 400  # characters
 MIN_FREE_BYTES = 1 << 28  # disk space that a download leaves free
-# Modules of the network libraries → base classes of their errors that are neither OSError nor ValueError.
-LIBRARY_ERRORS = {
-    "huggingface_hub.errors": (
-        "HTTPError", "EntryNotFoundError", "CorruptedCacheException", "RevisionResolutionError", "XetDownloadError",
-    ),
-}  # fmt: skip
-
-
-class RemoteError(GAPONetError):
-    """A remote place cannot be reached, or its content differs from its index."""
 
 
 @dataclass(frozen=True)
@@ -137,33 +126,6 @@ def require_pushed_files(address: str, index: Index, paths: list[str], folder: P
                 f"{address}: {path} is not the file that was pushed, by its size or hash; push it "
                 "again with --replace"
             )
-
-
-def _network_error_types() -> tuple[type[Exception], ...]:
-    """Return the errors that network libraries raise; a library that was not imported cannot have raised one."""
-    loaded = (
-        (sys.modules[module], names)
-        for module, names in LIBRARY_ERRORS.items()
-        if module in sys.modules
-    )
-    own = (
-        getattr(module, name) for module, names in loaded for name in names if hasattr(module, name)
-    )
-    return (OSError, ValueError, RuntimeError, *own)  # Xet raises RuntimeError
-
-
-@contextmanager
-def network_errors(address: str) -> Iterator[None]:
-    """Turn errors of the network libraries into a RemoteError with the address and without secrets."""
-    try:
-        yield
-    except _network_error_types() as error:
-        text = re.sub(r"\?\S+", "?…", " ".join(str(error).split()))  # a query may hold a signature
-        missing, refused = (
-            isinstance(error, kind) for kind in (FileNotFoundError, PermissionError)
-        )
-        reason = "not found: " * missing + "no permission: " * refused
-        raise RemoteError(f"{address}: {reason}{text[:300] or type(error).__name__}") from None
 
 
 @contextmanager

@@ -9,16 +9,17 @@ from typing import Any
 
 from gaponet.base.errors import ModelError
 from gaponet.base.files import lock_folder, write_text
+from gaponet.base.network import RemoteError
 from gaponet.evaluation.run_files import read_config, read_metrics
 from gaponet.nn.artifact import CARD, WEIGHTS, GapModel, sha256
+from gaponet.robot.by_name import require_self_contained
 from gaponet.robot.folder import (
     STORED_ROBOT,
     has_stored_robot,
     load_stored_robot,
-    require_self_contained,
 )
-from gaponet.share.readme import run_readme
-from gaponet.share.remote import Index, RemoteError
+from gaponet.share.readme import ModelFacts, run_readme
+from gaponet.share.remote import Index
 
 README = "README.md"
 FILES = re.compile(
@@ -29,11 +30,11 @@ FILES = re.compile(
 )
 
 
-def write_files(run: Path, folder: Path, address: str) -> tuple[str, ...]:
+def write_files(run: Path, folder: Path, address: str, facts: ModelFacts) -> tuple[str, ...]:
     """Copy the files of a run, with a README, into an empty folder; return the hash of its network."""
     if not (run / "model" / CARD).is_file():
         raise ModelError(f"{run}: no model yet; train it first")
-    write_text(folder / README, run_readme(_facts(run), address))
+    write_text(folder / README, run_readme(_facts(run), address, facts))
     for file in sorted(run.rglob("*")):
         if file.is_file() and FILES.fullmatch(path := file.relative_to(run).as_posix()):
             (folder / path).parent.mkdir(parents=True, exist_ok=True)
@@ -41,14 +42,14 @@ def write_files(run: Path, folder: Path, address: str) -> tuple[str, ...]:
     return (sha256(run / "model" / WEIGHTS),)
 
 
-def require_run_files(index: Index) -> None:
+def require_files(index: Index) -> None:
     """Refuse an index with files that no run has."""
     for path in index.files.keys() - {README}:
         if not FILES.fullmatch(path):
             raise RemoteError(f"{path}: a run has no such file")
 
 
-def require_pushed_run(folder: Path, index: Index) -> None:
+def require_pushed(folder: Path, index: Index) -> None:
     """Check that downloaded files are the run that was pushed, and mark the folder as a run.
 
     Raises:

@@ -24,6 +24,7 @@ from typing import Any
 import numpy as np
 
 from gaponet.base.arrays import Array
+from gaponet.base.installation import install_command
 from gaponet.hw.control.driver import DriverError
 from gaponet.hw.drivers import hg
 
@@ -38,7 +39,7 @@ try:
     from cyclonedds.sub import DataReader
     from cyclonedds.topic import Topic
 except ImportError:
-    raise DriverError("cyclonedds is not installed; run: pip install 'gaponet[dds]'") from None
+    raise DriverError(f"cyclonedds is not installed; run: {install_command('dds')}") from None
 
 QUEUE_LENGTH = 64  # messages buffered between two reads: 128 ms at 500 Hz
 MAX_SAMPLE_KIB = 64  # of a message that is put together from fragments

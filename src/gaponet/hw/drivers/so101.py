@@ -25,6 +25,7 @@ import numpy as np
 
 from gaponet.base.arrays import Array
 from gaponet.base.errors import UsageError
+from gaponet.base.installation import install_command
 from gaponet.hw.control.driver import DriverError, EndAction, Fault, State
 from gaponet.hw.control.hardware import accepted_folder, require_known_limits
 from gaponet.hw.drivers import feetech as reg
@@ -205,7 +206,7 @@ class SO101Driver:
             import serial
         except ImportError:
             raise DriverError(
-                "pyserial is not installed; run: pip install 'gaponet[so101]'"
+                f"pyserial is not installed; run: {install_command('so101')}"
             ) from None
         try:
             self._serial = serial.Serial(

@@ -18,6 +18,7 @@ from typing import Any
 
 from gaponet.base.errors import UsageError
 from gaponet.base.files import write_json
+from gaponet.base.installation import pip
 from gaponet.data.sequence import Sequence, require_same_gains
 from gaponet.data.split import Splits, resolve_splits, stratified_subset
 from gaponet.data.store import Dataset, dataset_hash
@@ -199,9 +200,7 @@ class Loggers:
                     _tensorboard(out) if kind == "tensorboard" else _wandb(out, config)
                 )
             except ImportError:
-                raise UsageError(
-                    f"--log {kind}: not installed; run: pip install 'gaponet[{kind}]'"
-                ) from None
+                raise UsageError(f"--log {kind}: not installed; run: {pip()} {kind}") from None
 
     def write(self, line: dict[str, Any]) -> None:
         """Log one line of progress.jsonl."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import io
 import warnings
 from collections.abc import Callable, Iterator, Mapping
@@ -15,6 +14,7 @@ import numpy as np
 from gaponet.base.arrays import Array
 from gaponet.base.errors import UsageError
 from gaponet.base.files import atomic_write
+from gaponet.base.installation import install_command
 from gaponet.data.sequence import Sequence, SequenceMeta
 from gaponet.evaluation.methods import colour, title
 from gaponet.report.view.gl import INSTALL_HINT
@@ -253,8 +253,6 @@ def require_writable(path: Path) -> None:
         raise UsageError(f"--render {path}: name a file that ends in {', '.join(SUFFIXES)}")
     if not path.parent.is_dir():
         raise UsageError(f"--render {path}: there is no folder {path.parent}; make it first")
-    if importlib.util.find_spec("PIL") is None:
-        raise UsageError("--render needs Pillow; run: pip install 'gaponet[view]'")
     if path.suffix.lower() == ".mp4":
         _ffmpeg()
 
@@ -316,6 +314,6 @@ def _ffmpeg() -> Any:
         import imageio_ffmpeg
     except ImportError:
         raise UsageError(
-            "MP4 needs imageio-ffmpeg; run: pip install 'gaponet[view]', or render a .gif"
+            f"MP4 needs imageio-ffmpeg; run: {install_command('film')}, or render a .gif"
         ) from None
     return imageio_ffmpeg

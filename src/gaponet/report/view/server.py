@@ -18,6 +18,7 @@ from importlib import import_module
 from typing import Any
 
 from gaponet.base.errors import UsageError
+from gaponet.base.installation import pip
 
 HOST = "127.0.0.1"  # private; forward the port for another machine
 FRAME_S = 1 / 30
@@ -28,7 +29,7 @@ HEADERS = {
     "X-Content-Type-Options": "nosniff",
     "Cache-Control": "no-store",
 }
-TESTED_VISER = "pip install 'viser>=1.1,<1.2'"
+TESTED_VISER = "viser>=1.1,<1.2"
 
 # viser's page holds one script. It unpacks the application and puts it into the page as a second script, which needs
 # the nonce too. Only the first script that is created gets it.
@@ -83,7 +84,9 @@ def open_server(label: str, port: int, script: str = "") -> tuple[Any, str]:
         transport.serve = serve
     if not guarded:
         server.stop()
-        raise UsageError(f"viser {viser.__version__} cannot be protected; run: {TESTED_VISER}")
+        raise UsageError(
+            f"viser {viser.__version__} cannot be protected; run: {pip()} '{TESTED_VISER}'"
+        )
     server.request_share_url = lambda *_, **__: None  # would publish the page on the internet
     server.gui.configure_theme(show_logo=False, show_share_button=False)
     server.gui.main_panel.dock_right()  # beside the robots, not in front of them
@@ -137,7 +140,9 @@ def with_nonce(page: str, script: str, nonce: str) -> str:
     before, head, after = page.partition("<head>")
     start, tag, rest = after.partition("<script")
     if not head or not tag:
-        raise UsageError(f"this version of viser has a page that is not known; run: {TESTED_VISER}")
+        raise UsageError(
+            f"this version of viser has a page that is not known; run: {pip()} '{TESTED_VISER}'"
+        )
     code = PASS_NONCE_ON.replace("NONCE", nonce) + LEAVE_OUT_SPLATS + script
     own = f'<script nonce="{nonce}">{code}</script>'
     return f'{before}{head}{own}{start}{tag} nonce="{nonce}"{rest}'

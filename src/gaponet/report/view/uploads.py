@@ -26,8 +26,10 @@ from typing import Any
 
 from gaponet.base.errors import GAPONetError, UsageError
 from gaponet.base.files import FOLDER_MARKER
+from gaponet.base.installation import pip
 from gaponet.base.text import escape_markdown
 from gaponet.report.view.jobs import Jobs
+from gaponet.report.view.server import TESTED_VISER
 
 PLACES = ("logs", "model", "new_logs")
 INCOMING = "incoming"  # folder of complete uploads that wait
@@ -186,9 +188,7 @@ def connect_upload_button(button: Any, receive: Callable[[str, bytes], None]) ->
     """
     state: Any = getattr(button, "_impl", None)
     if not isinstance(getattr(state, "update_cb", None), list):
-        raise UsageError(
-            "this version of viser mixes up uploads; run: pip install 'viser>=1.1,<1.2'"
-        )
+        raise UsageError(f"this version of viser mixes up uploads; run: {pip()} '{TESTED_VISER}'")
     state.update_cb = _CallbacksOfEachFile(button, receive)
 
 
