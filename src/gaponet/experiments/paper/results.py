@@ -112,3 +112,7 @@ class Results:
     def over_joints(self, q_dis: Array) -> Array:
         """Mean over the eight joints: (recordings, n) → (recordings,) rad·s."""
         return np.asarray(q_dis[:, self.eight_joints].mean(axis=1))
+
+    def mean_over_joints(self, q_dis: Array) -> float:
+        """Mean over the eight joints and all recordings, (recordings, n) → rad·s."""
+        return float(self.over_joints(q_dis).mean())

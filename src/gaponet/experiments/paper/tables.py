@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from gaponet.base.arrays import Array
 from gaponet.base.result_table import MeanStd, ResultTable
 from gaponet.experiments.paper.commands import (
     NETWORK_WAYS,
@@ -70,37 +71,31 @@ def table_1(results: Results, block: Block) -> ResultTable:
 
 def commands_table(results: Results, block: Block) -> ResultTable:
     """Return the error of the robot by way of commanding it, and the gain over the same way without a network."""
-    raw = results.over_joints(results.plain_command_q_dis("raw")).mean()
+    raw = results.mean_over_joints(results.plain_command_q_dis("raw"))
     rows: list[tuple[Any, ...]] = []
+
+    def add_plain(title: str, q_dis: Array) -> None:
+        error = results.mean_over_joints(q_dis)
+        rows.append((title, 1e3 * error, _less(error, raw), None))
+
     for way in PLAIN_WAYS:
-        error = results.over_joints(results.plain_command_q_dis(way)).mean()
-        rows.append((PLAIN_TITLES[way], float(error), 100 * (1 - error / raw), None))
-    identified = results.over_joints(
-        results.plain_command_q_dis("feedforward", "identified")
-    ).mean()
-    rows.append(
-        (
-            "feed-forward of the identified model",
-            float(identified),
-            100 * (1 - identified / raw),
-            None,
-        )
-    )
+        add_plain(PLAIN_TITLES[way], results.plain_command_q_dis(way))
+    identified = results.plain_command_q_dis("feedforward", "identified")
+    add_plain("feed-forward of the identified model", identified)
+
     for name in results.networks(block):
         for way in NETWORK_WAYS:
-            reference = results.over_joints(results.plain_command_q_dis(REFERENCE_WAY[way])).mean()
-            seeds = [
-                results.over_joints(q_dis).mean()
-                for q_dis in results.command_q_dis(block, name, way)
-            ]
-            rows.append(
-                (
-                    f"{name}: {WAY_TITLES[way]}",
-                    MeanStd.from_values(seeds),
-                    MeanStd.from_values([100 * (1 - seed / raw) for seed in seeds]),
-                    MeanStd.from_values([100 * (1 - seed / reference) for seed in seeds]),
-                )
+            without = results.mean_over_joints(results.plain_command_q_dis(REFERENCE_WAY[way]))
+            seeds = []
+            for q_dis in results.command_q_dis(block, name, way):
+                seeds.append(results.mean_over_joints(q_dis))
+            row = (
+                f"{name}: {WAY_TITLES[way]}",
+                MeanStd.from_values([1e3 * error for error in seeds]),
+                MeanStd.from_values([_less(error, raw) for error in seeds]),
+                MeanStd.from_values([_less(error, without) for error in seeds]),
             )
+            rows.append(row)
     caption = (
         "Q_dis between target and robot, mean over joints without wrists, motions and payloads; ± is the standard "
         "deviation over training seeds. The gain is over the same way without a network: over targets as they are for "
@@ -108,11 +103,16 @@ def commands_table(results: Results, block: Block) -> ResultTable:
     )
     columns = (
         "command",
-        "Q_dis, rad·s",
+        "Q_dis, mrad·s",
         "less than targets as they are, %",
         "gain of the network, %",
     )
-    return ResultTable(f"commands_{block}", columns, tuple(rows), caption, digits=4)
+    return ResultTable(f"commands_{block}", columns, tuple(rows), caption, digits=1)
+
+
+def _less(error: float, reference: float) -> float:
+    """Return by how much an error is below a reference, %."""
+    return 100 * (1 - error / reference)
 
 
 def large_gaps_table(results: Results, block: Block) -> ResultTable:
