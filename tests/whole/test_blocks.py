@@ -53,6 +53,7 @@ NOT_RUN = {
     "from actuators import": "needs mjlab, Isaac Lab and Newton; make engines",
     "mujoco_servos.Servos": "needs an exported folder; tests/export plays it",
     'driver="so101"': "moves a real arm; tests/api/test_run_robot.py",
+    'follow="nominal"': "runs beside a robot without end; tests/deploy/test_follow.py",
     "gp.RemoteRobot()": "needs a run that takes live targets; tests/hw/targets",
 }
 # First words of console lines that are not gaponet's → why they are not run here.
