@@ -17,7 +17,12 @@ from gaponet.cli.main import main
 from gaponet.export import export_folder as exporting
 from gaponet.export import plain_servos
 from gaponet.export.export_folder import export_robot
-from gaponet.export.plain_servos import fit_plain_servos, own_motions, rollout_error
+from gaponet.export.plain_servos import (
+    fit_plain_servos,
+    keep_plain_servos,
+    own_motions,
+    rollout_error,
+)
 from gaponet.export.shipped.mujoco_servos import Check, delay_weights, play
 from gaponet.export.simulator_facts import simulator_facts
 from gaponet.robot.folder import save_robot
@@ -394,3 +399,15 @@ def test_facts_hold_both_forms(robot, lawful):
     assert facts["law"] == ["stribeck", "stribeck_speed", "friction_motor"]
     assert (facts["joints"]["elbow"]["kp"], facts["plain"]["elbow"]["kp"]) == (24.0, 25.0)
     assert replay(own_motions(robot, count=1), robot)[0].qpos.shape[1] == 2
+
+
+def test_an_export_takes_the_fit_without_terms_that_identify_kept(lawful, tmp_path, monkeypatch):
+    folder = tmp_path / "identified"
+    save_robot(lawful, folder)
+    motions = own_motions(lawful, count=2)
+    without = lawful.with_servos({j: dict.fromkeys(SERVO_TERMS, 0.0) | {"kp": 23.0} for j in FOUND})
+    keep_plain_servos(folder, without, motions)
+    monkeypatch.delattr(plain_servos, "identify")  # no fit is possible
+    plain = fit_plain_servos(load_robot(folder), motions[::-1])
+    assert not plain.has_servo_model
+    assert plain.kp[plain.operated_index].tolist() == [23.0] * len(plain.operated)

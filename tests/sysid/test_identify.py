@@ -1,12 +1,14 @@
 """Identification finds the servo that made the recordings."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from arm import TOML, commands, record, recordings, write_arm
 
 from gaponet.base.errors import UsageError
+from gaponet.base.progress import no_progress
 from gaponet.robot.spec import load_robot
 from gaponet.sim.metrics import Comparison
 from gaponet.sim.replay import motion_errors
@@ -15,8 +17,11 @@ from gaponet.sysid.axes import Bounds
 from gaponet.sysid.identify import identify
 from gaponet.sysid.motion_limits import with_stops
 from gaponet.sysid.options import IdentifyOptions
-from gaponet.sysid.problem import KinematicChains
+from gaponet.sysid.problem import KinematicChains, contradicted_gains
 from gaponet.sysid.robot_rollouts import cut
+from gaponet.sysid.search_progress import ROBOT_ITERATIONS, SearchProgress
+from gaponet.sysid.steps.classic import robot_candidates
+from gaponet.sysid.steps.step import Fits
 
 
 @pytest.fixture(scope="module")
@@ -238,3 +243,56 @@ def test_a_joint_takes_a_fit_only_if_its_own_motions_accept_it():
     worse = {"kp": np.full(2, 3.0)}
     errors[3.0] = errors[1.0] + 1.0
     assert Payloads().best_by_joint({"given": [given], "limbs": [worse]}) == ("given", [given])
+
+
+@pytest.mark.parametrize(
+    ("damping", "kp", "doubted"),
+    [
+        (1.0, 20.0, ""),  # kd and damping of the file, N·m·s/rad
+        (4.5, 20.0, "kd"),
+        (0.05, 20.0, "kd"),
+        (1.0, 80.0, "kp"),
+    ],
+)
+def test_a_gain_of_the_file_from_which_recordings_are_far_is_doubted(
+    tmp_path, damping, kp, doubted
+):
+    robot = write_arm(tmp_path, TOML.replace("kp = 20.0", "kp = 20.0\nkd = 0.5"))
+    bounds = Bounds(robot, recordings(robot, 1, rows=60))
+    found = {"damping": np.full(2, damping - 0.5), "kp": np.full(2, kp)}
+    sure = {joint: {"kp": 0.5, "damping": 0.01} for joint in robot.operated}
+    unsure = {joint: {"kp": 100.0, "damping": 10.0} for joint in robot.operated}
+    said = contradicted_gains(bounds, found, sure)
+    assert len(said) == (2 if doubted else 0)
+    assert all(f" {doubted}" in text for text in said)
+    assert contradicted_gains(bounds, found, unsure) == []
+
+
+@pytest.mark.parametrize(("helps", "kept"), [(True, {"whole", "limbs"}), (False, set())])
+def test_all_joints_are_fitted_together_only_where_the_first_iterations_help(helps, kept):
+    """Three motions judge: the fit of all joints together is a tenth better or worse than that of single joints."""
+    alone = [{"kp": np.array([20.0])}]
+    together = [{"kp": np.array([21.0])}]
+    error = {20.0: 1.0, 21.0: 0.9 if helps else 1.1}
+    judge = SimpleNamespace(
+        names=np.array(["a", "b", "c"]),
+        errors=lambda values: np.full(3, error[float(values[0]["kp"][0])]),
+    )
+    asked = []
+
+    def descend(fields, rest, starts, iterations, report):
+        asked.append(sum(iterations))
+        return together[0]
+
+    robot = SimpleNamespace(
+        robot=SimpleNamespace(operated=("elbow",)),
+        rollouts=SimpleNamespace(rows=np.ones(1)),
+        bounds=SimpleNamespace(start={}),
+        descend=descend,
+        descend_chains=lambda values, report: values,
+    )
+    progress = SearchProgress(None, 0, 1, no_progress)
+    fits = Fits([], None, [], judge, progress, 1)
+    assert set(robot_candidates(fits, [robot], alone)) == kept
+    assert len(asked) == (2 if helps else 1)
+    assert asked[0] < sum(ROBOT_ITERATIONS)

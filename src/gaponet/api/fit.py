@@ -105,6 +105,7 @@ def identify(
     from gaponet.base.files import lock_folder, whole_folder
     from gaponet.data.checks.gate import pass_gate, used_recordings
     from gaponet.data.split import split_entries
+    from gaponet.export.plain_servos import keep_plain_servos
     from gaponet.nn.training.config import Budget
     from gaponet.robot.folder import require_other_folder, save_robot
     from gaponet.sim.metrics import MIN_RELATIVE_GAIN
@@ -160,6 +161,8 @@ def identify(
         judges = [] if fitted.held_out[0].robot is fitted.robot else fitted.held_out
         with whole_folder(folder, "robot", "robot.toml", OUTDATED_FILES) as place:
             save_robot(fitted.robot, place)
+            if fitted.without_terms is not None:
+                keep_plain_servos(place, fitted.without_terms, train_set)
             write_json(
                 place / PROVENANCE_FILE, _origin(folder, data, split, means, gate, fitted.findings)
             )

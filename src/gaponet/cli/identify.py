@@ -97,7 +97,10 @@ def _show(screen: Out, made: IdentifyResult, details: bool) -> None:
     ratio = errors["identified"].mean() / errors["nominal"].mean()
     count = len(errors["nominal"])
     folds = fit.held_out
-    measured_on = f"Measured on {count} independent validation motions, which chose among the fits."
+    measured_on = (
+        f"Measured on {count} independent validation motions, which chose among the fits. Test motions are others: "
+        "gaponet gap measures those."
+    )
     if count == 1:
         measured_on = (
             "Measured on a single validation motion: the error of other motions is not known. "
@@ -148,8 +151,8 @@ def _show(screen: Out, made: IdentifyResult, details: bool) -> None:
         if touch.accepted and table is not None:
             what = f"height {table.height:.4f} m, friction {table.friction:.2f}, {table.stiffness:.0f} N/m"
         screen.say(
-            f"table: {what}; error with a low tip {mrad(touch.before.mean())} → {mrad(touch.after.mean())} mrad, in "
-            f"{', '.join(touch.motions)}"
+            f"table: {what}; mean |error| of fitted windows with a low tip {mrad(touch.before.mean())} → "
+            f"{mrad(touch.after.mean())} mrad, in {', '.join(touch.motions)}"
         )
     screen.findings(made.doctor.findings)
     unknown = [w for w in fit.warnings if UNDETERMINED in w]

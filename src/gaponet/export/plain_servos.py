@@ -27,7 +27,7 @@ from gaponet.data.store import Dataset
 from gaponet.evaluation.candidate import read_origin
 from gaponet.robot.by_name import identified_catalogue
 from gaponet.robot.servo_fields import SERVO_FIELDS, SERVO_TERMS
-from gaponet.robot.spec import RobotSpec
+from gaponet.robot.spec import RobotSpec, load_robot
 from gaponet.sim.batch import Condition, speed_limited
 from gaponet.sim.model import model_hash
 from gaponet.sim.replay import replay
@@ -35,6 +35,8 @@ from gaponet.sysid.identify import identify
 from gaponet.sysid.options import IdentifyOptions
 
 T = TypeVar("T")
+
+PlainServos = dict[str, dict[str, float]]  # joint → SERVO_FIELDS
 
 CACHE = "plain_servos.json"  # in the robot folder
 MAX_CHECK_MOTIONS = 5
@@ -90,31 +92,73 @@ def fit_plain_servos(
         recordings: Motions that it was fitted to, or its own (`own_motions`).
         progress: Called with done, total and a note, as by `identify`.
     """
-    without: dict[str, Any] = {
-        name: np.array(0.0) for name in SERVO_TERMS if name not in engine_terms
-    }
-    if not any(getattr(robot, name).any() for name in without):
+    start = _without_terms(robot, engine_terms)
+    if start is robot:
         return robot
-    start = replace(robot, **without)
-    kind = dict[str, dict[str, float]]  # joint → SERVO_FIELDS
     if _ships_plain_servos(robot, engine_terms):
         stored = read_json(_Stored, robot.folder / CACHE, RobotError)
-        return start.with_servos(validated(kind, stored["content"], CACHE, RobotError))
+        return start.with_servos(validated(PlainServos, stored["content"], CACHE, RobotError))
 
-    def fit() -> dict[str, dict[str, float]]:
-        fitted = identify(
-            recordings, start, options=IdentifyOptions(terms=(), table=False), progress=progress
-        ).robot
-        return {
-            joint: {
-                name: float(v)
-                for name in SERVO_FIELDS
-                if np.isfinite(v := getattr(fitted, name)[i])
-            }
-            for i, joint in enumerate(robot.joint_names)
-        }
+    def fit() -> PlainServos:
+        options = IdentifyOptions(terms=(), table=False)
+        return _servos(identify(recordings, start, options=options, progress=progress).robot)
 
-    return start.with_servos(stored_result(robot.folder / CACHE, kind, fit, start, recordings))
+    servos = stored_result(robot.folder / CACHE, PlainServos, fit, start, recordings)
+    return start.with_servos(servos)
+
+
+def keep_plain_servos(folder: Path, fitted: RobotSpec, recordings: ListOf[Sequence]) -> None:
+    """Store a fit without terms in a robot folder, where `fit_plain_servos` finds it.
+
+    Args:
+        folder: The robot, with terms of the servo model.
+        fitted: The robot without terms, fitted to the same recordings.
+    """
+    start = _without_terms(load_robot(folder))
+    content = _servos(fitted)
+    write_json(folder / CACHE, {"key": _key(start, recordings), "content": content})
+
+
+def _without_terms(robot: RobotSpec, engine_terms: tuple[str, ...] = ()) -> RobotSpec:
+    """Return the robot without terms of the servo model but those of the engine; `robot` itself if it has none."""
+    names = [name for name in SERVO_TERMS if name not in engine_terms]
+    if not any(getattr(robot, name).any() for name in names):
+        return robot
+    without: dict[str, Any] = {name: np.array(0.0) for name in names}
+    return replace(robot, **without)
+
+
+def _servos(robot: RobotSpec) -> PlainServos:
+    """Return the parameters of all servos that have a value."""
+    servos: PlainServos = {}
+    for i, joint in enumerate(robot.joint_names):
+        values = {name: float(getattr(robot, name)[i]) for name in SERVO_FIELDS}
+        servos[joint] = {name: value for name, value in values.items() if np.isfinite(value)}
+    return servos
+
+
+def _key(robot: RobotSpec, recordings: ListOf[Sequence], *other: Array) -> str:
+    """Return a hash of all that a stored result depends on; the recordings' order is of no account."""
+    key = hashlib.sha256(
+        f"{__version__} {mujoco.__version__} {model_hash(robot)} {robot.operated}".encode()
+    )
+    for one in (robot, robot.before_identification):
+        for name in SERVO_FIELDS:
+            key.update(getattr(one, name).tobytes())
+    for digest in sorted(_recording_digest(s) for s in recordings):
+        key.update(digest)
+    for values in other:
+        key.update(np.ascontiguousarray(values).tobytes())
+    return key.hexdigest()
+
+
+def _recording_digest(sequence: Sequence) -> bytes:
+    meta = sequence.meta
+    told = (sequence.dt, meta.kp, meta.kd, meta.payload_mass, meta.payload_side)
+    digest = hashlib.sha256(json.dumps(told).encode())
+    for channel in (sequence.ctrl, sequence.qpos, sequence.qvel):
+        digest.update(np.ascontiguousarray(channel).tobytes())
+    return digest.digest()
 
 
 def _ships_plain_servos(robot: RobotSpec, engine_terms: tuple[str, ...]) -> bool:
@@ -137,29 +181,17 @@ def stored_result(
         kind: Type of the result, for `validated`.
         robot, recordings, other: All that the result depends on.
     """
-    key = hashlib.sha256(
-        f"{__version__} {mujoco.__version__} {model_hash(robot)} {robot.operated}".encode()
-    )
-    for one in (robot, robot.before_identification):
-        for name in SERVO_FIELDS:
-            key.update(getattr(one, name).tobytes())
-    for s in recordings:
-        meta = (s.dt, s.meta.kp, s.meta.kd, s.meta.payload_mass, s.meta.payload_side)
-        key.update(json.dumps(meta).encode())
-        for channel in (s.ctrl, s.qpos, s.qvel):
-            key.update(np.ascontiguousarray(channel).tobytes())
-    for values in other:
-        key.update(np.ascontiguousarray(values).tobytes())
+    key = _key(robot, recordings, *other)
     with suppress(RobotError):  # missing or damaged
         stored = read_json(_Stored, file, RobotError)
-        if stored["key"] == key.hexdigest():
+        if stored["key"] == key:
             return validated(kind, stored["content"], file, RobotError)
     result = compute()
     with (
         suppress(FolderError, OSError),
         lock_folder(file.parent, "robot"),
     ):  # not of gaponet, or not writable
-        write_json(file, {"key": key.hexdigest(), "content": result})
+        write_json(file, {"key": key, "content": result})
     return result
 
 

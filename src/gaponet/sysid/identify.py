@@ -29,7 +29,13 @@ from gaponet.sysid.axes import Bounds, with_values
 from gaponet.sysid.joint_rollouts import JointRollouts
 from gaponet.sysid.motion_limits import default_terms, stop_questions, with_stops
 from gaponet.sysid.options import IdentifyOptions
-from gaponet.sysid.problem import JointFit, StandardErrors, fitted_fields, standard_errors
+from gaponet.sysid.problem import (
+    JointFit,
+    StandardErrors,
+    contradicted_gains,
+    fitted_fields,
+    standard_errors,
+)
 from gaponet.sysid.robot_rollouts import cut
 from gaponet.sysid.search_progress import SearchProgress
 from gaponet.sysid.servo_types import far_from_servo_type
@@ -152,6 +158,7 @@ def _fit_positions(
     warnings += [w for step in steps if isinstance(step, LinkMasses) for w in step.warnings(state)]
     values = state.values[-1]
     warnings += fits.joints[-1].bounds.warnings(values, fitted_fields(values))
+    warnings += contradicted_gains(fits.joints[-1].bounds, values, errors.std)
     warnings += stop_questions(given, robot)
     warnings += far_from_servo_type(fitted)
     warnings += errors.sentences

@@ -43,6 +43,9 @@ PRIOR_LOG_STD = {
 }  # of the robot file's values; damping with kd
 PRIORS = len(PRIOR_LOG_STD)
 MIN_SHARE = 1e-3  # of the file's value; less counts as this
+MAX_GAIN_RATIO = (
+    2.7  # to the file's gain, one standard deviation of damping's prior; more is doubted
+)
 STATED_KP_LOG_STD = 0.1  # of a kp that recordings state
 RELATIVE_GAP_STD = 0.06  # of backlash, by the physics step and by what else crosses the gap (benchmarks/backlash.py)
 UNIFORM_STD = 0.29  # of what is uniformly distributed over one step
@@ -355,6 +358,39 @@ def standard_errors(problem: FitProblem, values: Values) -> StandardErrors:
         {j: (names, wide[i]) for i, j in enumerate(joints)},
         {j: fields for j, (fields, _) in unknown.items()}, tuple(text for _, text in unknown.values()),
     )  # fmt: skip
+
+
+def contradicted_gains(bounds: Bounds, values: Values, std: Std) -> list[str]:
+    """Return a sentence for each gain of the robot's file from which the recordings are far, for sure.
+
+    Damping counts with kd, since a motion shows their sum. A gain of zero says nothing, and so does a joint that no
+    command moves.
+
+    Args:
+        values: Fitted values, (n,).
+        std: Joint → field → standard error.
+    """
+    total_given = bounds.first["damping"] + bounds.kd
+    total_found = values["damping"] + bounds.kd
+    sentences = []
+    for i, (joint, errors) in enumerate(std.items()):
+        gains = [
+            ("kp", "N·m/rad", bounds.first["kp"][i], values["kp"][i], errors["kp"]),
+            ("kd with damping", "N·m·s/rad", total_given[i], total_found[i], errors["damping"]),
+        ]
+        if bounds.unexcited[i]:
+            continue
+        for name, unit, given, found, error in gains:
+            if given <= 0 or (name != "kp" and bounds.kd[i] <= 0):
+                continue
+            far = max(found, MIN_SHARE * given) / given
+            surely = abs(found - given) > 2 * error
+            if surely and not 1 / MAX_GAIN_RATIO < far < MAX_GAIN_RATIO:
+                sentences.append(
+                    f"{joint}: {name} of the file, {given:.3g} {unit}, contradicts the recordings, which show "
+                    f"{format_uncertainty(found, error)}; check what the servo was set to"
+                )
+    return sentences
 
 
 def cluster_sums(x: Array, window: Array) -> tuple[Array, Array]:

@@ -20,7 +20,7 @@ def fit_classic(fits: Fits, *, joints_alone: bool) -> FitState:
     fits.progress.begin_search()
     together: dict[str, list[Values]] = {}
     if not joints_alone:
-        together = _robot_candidates(fits, robots, candidates["joints"])
+        together = robot_candidates(fits, robots, candidates["joints"])
     candidates |= together
     candidates = {name: candidates[name] for name in CANDIDATES if name in candidates}
     if fits.given.nominal is not None:
@@ -49,7 +49,7 @@ def _joint_candidates(joints: JointFit, progress: SearchProgress) -> dict[str, V
     return {"given": given, "joints": alone, "delay and offset": late}
 
 
-def _robot_candidates(
+def robot_candidates(
     fits: Fits, robots: list[RobotFit], alone: list[Values]
 ) -> dict[str, list[Values]]:
     """Fit all joints together, from their own fits and from the robot's file; return nothing if that does not help.
