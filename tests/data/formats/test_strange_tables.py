@@ -8,7 +8,8 @@ from arm import TOML, XML, write_arm
 from logs import arm_columns, table_text
 
 from gaponet.base.errors import LogError
-from gaponet.data.formats import read_logs
+from gaponet.data.describe.guess import guess_logs
+from gaponet.data.formats import look, read_logs
 
 SI = {"position_unit": "rad", "time_unit": "s"}
 ROWS = 200
@@ -142,3 +143,33 @@ def test_a_joint_that_turns_on_is_continued_beside_its_command(tmp_path, wrapped
     off = log.channels["qpos"].values[:, 0] - log.channels["ctrl"].values[:, 0]
     assert np.allclose(off, true["qpos"] - true["ctrl"], atol=1e-9)
     assert "shoulder" in log.meta["notes"]["turns"]
+
+
+@pytest.mark.parametrize(
+    "files",
+    [
+        ("{}_desired.csv", "{}_measured.csv", "{}_time.csv"),
+        ("cmd-{}.txt", "actual-{}.txt", "timestamp-{}.txt"),
+        ("{}PosTarget.csv", "{}PosActual.csv", "{}Time.csv"),
+    ],
+)
+def test_files_that_belong_together_are_proposed_and_then_read_as_one_recording(
+    tmp_path, arm, files
+):
+    for name in ("run1", "run2"):
+        columns = arm_columns(ROWS)
+        command, state = (
+            np.stack([columns[f"{channel}.{joint}"] for joint in JOINTS], axis=1)
+            for channel in ("ctrl", "qpos")
+        )
+        for pattern, values in zip(files, (command, state, columns["time"]), strict=True):
+            np.savetxt(tmp_path / pattern.format(name), values, delimiter=",")
+    if files[0].endswith("txt"):
+        (tmp_path / "logs.toml").write_text('format = "table"\n')
+    kind, known, found = look(tmp_path)
+    (tmp_path / "logs.toml").write_text(guess_logs(found, arm, kind, dict(known)))
+    logs = dict(read_logs(tmp_path, arm, fmt="table"))
+    assert list(logs) == ["run1", "run2"]
+    assert np.array_equal(logs["run1"].channels["ctrl"].values, command)
+    assert np.array_equal(logs["run1"].channels["qpos"].values, state)
+    assert np.allclose(logs["run1"].channels["qpos"].time, columns["time"])

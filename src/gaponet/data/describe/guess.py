@@ -6,6 +6,7 @@ import json
 import re
 from collections import Counter, defaultdict
 from itertools import groupby
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -56,6 +57,9 @@ def guess_logs(
     """
     if not recordings:
         raise LogError("no recording found")
+    family = _family([Path(r.source).name for r in recordings])
+    if family:
+        return _guess_family(recordings, robot, fmt, family)
     first = recordings[0]
     specified = dict(known) | {k: v for k, v in first.default.items() if k not in known}
     lines = [f"# {fmt}; the first recording: {first.where or first.source}",
@@ -81,6 +85,88 @@ def guess_logs(
               '# manifest = "sheet.csv"', '# unit = "…"', "# payload = 0.0        # kg",
               "# kp = …               # N·m/rad while recording; default: robot.toml's"]  # fmt: skip
     return "\n".join(lines) + "\n"
+
+
+def _family(files: list[str]) -> dict[str, str]:
+    """Return channel or "time" → pattern of its files, where each recording has a file for each: {name}_desired.csv.
+
+    Empty where files are recordings of their own.
+    """
+    names: dict[str, dict[str, str]] = defaultdict(dict)  # {name} → kind → pattern
+    for file in files:
+        stem, _, suffix = file.rpartition(".")
+        words = [m[0] for m in re.finditer(r"[A-Z]?[a-z]+|[A-Z]+", stem)]
+        known = [w for w in words if _kind(w) or w.lower() in CLOCKS]
+        if not known:
+            return {}
+        name = stem
+        for word in known:
+            name = re.sub(rf"[-_. ]?{word}", "", name, count=1)
+        name = name.strip("-_. ")
+        kind = _kind(stem) or "time"
+        pattern = stem.replace(name, "{name}", 1) if name else stem
+        names[name][kind] = f"{pattern}.{suffix}"
+    families = list(names.values())
+    kinds = families[0]
+    alike = all(
+        family.keys() == kinds.keys() for family in families[:-1]
+    )  # the last may be cut off
+    return kinds if alike and "qpos" in kinds and len(kinds) > 1 else {}
+
+
+def _guess_family(
+    recordings: list[RawRecording], robot: RobotSpec, fmt: str, family: dict[str, str]
+) -> str:
+    """The text of a logs.toml for signals in files of their own. family: of _family."""
+    by_kind = {
+        kind: next(r for r in recordings if _fits(Path(r.source).name, pattern))
+        for kind, pattern in family.items()
+    }
+    state = by_kind["qpos"]
+    joints = list(state.columns)
+    values = np.stack([state.load([c])[c].values[:ROWS] for c in state.signals], axis=1)
+    span = float(np.nanmax(np.abs(values)))
+    lines = [f"# {fmt}; files that belong together: {', '.join(family.values())}",
+             "# Lines with a ? are guesses: look at them.", "",
+             f"state_file = {_text(family['qpos'])}  # ?"]  # fmt: skip
+    if "ctrl" in family:
+        lines.append(f"command_file = {_text(family['ctrl'])}  # ?")
+    if "time" in family:
+        clock = by_kind["time"]
+        column = next(iter(clock.signals))
+        lines += [
+            f"time_file = {_text(family['time'])}  # ?",
+            _time_unit(clock.load([column])[column].values),
+        ]
+    else:
+        lines.append("rate = 50.0  # ? Hz: no file holds times")
+    unit = "rad" if span <= 7 else "ticks" if look_like_ticks(values) else "deg"
+    lines += [
+        f'position_unit = "{unit}"  # ? values up to {span:.3g}',
+        'ctrl = "{joint}"',
+        'qpos = "{joint}"',
+    ]
+    others = [p for kind, p in family.items() if kind not in ("qpos", "ctrl", "time")]
+    if others:
+        lines.append(f"# not read: {', '.join(others)}")
+    lines += _names({"qpos": "{joint}"}, joints, robot)
+    return "\n".join(lines) + "\n"
+
+
+def _fits(file: str, pattern: str) -> bool:
+    before, _, after = pattern.partition("{name}")
+    return file.startswith(before) and file.endswith(after)
+
+
+def _time_unit(stamps: Array) -> str:
+    """The line of time_unit for a clock."""
+    low, period, high = np.percentile(np.diff(stamps[:ROWS]), [5, 50, 95])
+    units = [u for u, s in SECONDS.items() if 5e-4 <= period * s <= 0.2]
+    unit = units[0] if units else "s"
+    uneven = ""
+    if high - low > 0.2 * period:
+        uneven = f"; uneven: {low * SECONDS[unit]:.3g} to {high * SECONDS[unit]:.3g} s"
+    return f'time_unit = "{unit}"  # the median period is {period * SECONDS[unit]:.6g} s{uneven}'
 
 
 def _text(value: str) -> str:
@@ -193,23 +279,11 @@ def _clock(recording: RawRecording, specified: dict[str, Any]) -> list[str]:
     if clock is None:
         own = [n for n in list(recording.signals)[:1] if recording.load([n])[n].time is not None]
         return [] if own else ["rate = 50.0  # ? Hz: the log has no clock"]
-    signal = recording.load([clock])[clock]
-    low, period, high = np.percentile(np.diff(signal.values[:ROWS]), [5, 50, 95])
-    units = [u for u, s in SECONDS.items() if 5e-4 <= period * s <= 0.2]
-    unit = units[0] if units else "s"
     lines = [] if clock == "time" else [f"time = {_text(clock)}"]
     others = {name: other for name, other in periods.items() if name != clock}
     if others and clock in periods:
         lines = _which_clock(clock, periods[clock], others)
-    uneven = (
-        f"; uneven: {low * SECONDS[unit]:.3g} to {high * SECONDS[unit]:.3g} s"
-        if high - low > 0.2 * period
-        else ""
-    )
-    return [
-        *lines,
-        f'time_unit = "{unit}"  # the median period is {period * SECONDS[unit]:.6g} s{uneven}',
-    ]
+    return [*lines, _time_unit(recording.load([clock])[clock].values)]
 
 
 def _which_clock(clock: str, period: float, others: dict[str, float]) -> list[str]:

@@ -58,7 +58,10 @@ class LogsFile(TypedDict, total=False):
     tau: Text
     temperature: Text
     feedforward_torque: Text  # N·m that the controller added to its PD torque
-    command_file: Text  # where commands lie in a file beside the state's: "{name}_cmd.csv"
+    # where a recording's signals lie in files of their own: "{name}_measured.csv"; {name}: default the state file's
+    state_file: Text
+    command_file: Text
+    time_file: Text
     header: Annotated[list[str], Len(1, 2000)]  # names of the columns of a table that has none
     joints: Annotated[
         list[str], Len(1, 500)

@@ -28,6 +28,7 @@ WIDEST = 500  # columns of an array that may be joints
 SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 SAY_UNITS = "--position-unit rad --time-unit s (or position_unit and time_unit in logs.toml)"
 COMMAND = "command:"  # before the names of signals that lie in a command_file
+TIME = "time:"  # and in a time_file
 NO_COMMANDS = (
     "without commanded positions there is no gap to measure. Record the position controller's targets beside the "
     "state, or play the recorded positions again (gaponet run) and record both. If torque or current is the command: "
@@ -79,16 +80,16 @@ class RawRecording:
         ]
         return ", ".join(names[:most]) + (", …" if len(names) > most else "")
 
-    def beside(self, commands: RawRecording) -> RawRecording:
-        """This recording with the signals of another file, under COMMAND."""
+    def beside(self, other: RawRecording, prefix: str = COMMAND) -> RawRecording:
+        """This recording with the signals of another file, whose names begin with the prefix here."""
 
         def load(names: list[str]) -> dict[str, Signal]:
-            theirs = [n.removeprefix(COMMAND) for n in names if n.startswith(COMMAND)]
-            loaded = {COMMAND + n: s for n, s in commands.load(theirs).items()} if theirs else {}
-            return self.load([n for n in names if not n.startswith(COMMAND)]) | loaded
+            theirs = [n.removeprefix(prefix) for n in names if n.startswith(prefix)]
+            loaded = {prefix + n: s for n, s in other.load(theirs).items()} if theirs else {}
+            return self.load([n for n in names if not n.startswith(prefix)]) | loaded
 
-        signals = self.signals | {COMMAND + n: labels for n, labels in commands.signals.items()}
-        return replace(self, signals=signals, load=load, files=self.files + commands.files)
+        signals = self.signals | {prefix + n: labels for n, labels in other.signals.items()}
+        return replace(self, signals=signals, load=load, files=self.files + other.files)
 
     @classmethod
     def of_arrays(
@@ -343,12 +344,16 @@ def _matching(
         re.compile("(?P<joint>.+?)".join(map(re.escape, p.split("{joint}"))))
         for p in (pattern, *longer)
     ]
-    return [
-        (m["joint"], column)
-        for column in recording.columns
-        if column not in taken and (m := mine.fullmatch(column)) and column.startswith(COMMAND) <= (channel in COMMANDS)
-        and not any(other.fullmatch(column) for other in others)
-    ]  # fmt: skip
+    found = []
+    for column in recording.columns:
+        match = mine.fullmatch(column)
+        if match is None or column in taken or column.startswith(TIME):
+            continue
+        if column.startswith(COMMAND) and channel not in COMMANDS:
+            continue
+        if not any(other.fullmatch(column) for other in others):
+            found.append((match["joint"], column))
+    return found
 
 
 def _gain_columns(

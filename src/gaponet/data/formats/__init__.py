@@ -38,7 +38,7 @@ from gaponet.base.errors import LogError, UsageError
 from gaponet.base.plugins import attempt
 from gaponet.data.describe.logs_file import LogsFile, Naming, read_logs_file
 from gaponet.data.describe.plausibility import require_plausible
-from gaponet.data.describe.raw_recording import COMMAND, RawRecording
+from gaponet.data.describe.raw_recording import COMMAND, TIME, RawRecording
 from gaponet.data.describe.repeats import without_repeated_rows
 from gaponet.data.describe.turns import continued_turns
 from gaponet.data.log import COMMANDS, Channel, Log, skipped_rows
@@ -48,6 +48,7 @@ FORMATS = {
     name: f"gaponet.data.formats.{name}"
     for name in ("sage", "table", "npz", "lerobot", "bam", "rosbag", "hdf5", "mat", "pace", "asap")
 }
+FILES = {"state_file", "command_file", "time_file"}
 LOOK = 20  # recordings that are looked at before they are described
 ALWAYS = ("names", "ignore", "signs", "offsets", "posture", "motion", "manifest", "unit", "payload", "side", "kp", "kd",
           "format")  # fmt: skip
@@ -225,15 +226,9 @@ def _loaders(
         )
         return
     recordings = _recordings(reader, path, specified)
-    if "command_file" in specified:
-        full = _defaults(reader) | specified
-        beside = {
-            c: COMMAND + str(full.get(c, "")) for c in COMMANDS if c == "ctrl" or c in specified
-        }
-        specified = cast(
-            "LogsFile", specified | beside | {"clock": _beside_clock(full, tuple(beside))}
-        )
-        recordings = _with_commands(list(recordings), specified["command_file"])
+    if FILES & specified.keys():
+        recordings = _with_files(list(recordings), specified)
+        specified = _with_prefixes(_defaults(reader) | specified, specified)
     for recording in recordings:
         yield recording.name, partial(recording.to_log, robot, specified, names or None)
 
@@ -248,18 +243,68 @@ def _defaults(reader: ModuleType) -> LogsFile:
     return getattr(reader, "DEFAULT", LogsFile())
 
 
-def _with_commands(recordings: list[RawRecording], pattern: str) -> Iterator[RawRecording]:
-    """Each recording together with its command_file, which is then no recording of its own."""
+def _with_prefixes(full: LogsFile, specified: LogsFile) -> LogsFile:
+    """Return logs.toml where signals of other files than the state's have their prefix; full: with the defaults."""
+    changes: dict[str, Any] = {}
+    if "command_file" in specified:
+        commands = tuple(c for c in COMMANDS if c == "ctrl" or c in specified)
+        changes = {c: COMMAND + str(full.get(c, "")) for c in commands}
+        if "time_file" not in specified:
+            changes["clock"] = _beside_clock(full, commands)
+    if "time_file" in specified and "time" in specified:
+        changes["time"] = TIME + specified["time"]
+    return cast("LogsFile", specified | changes)
+
+
+def _with_files(recordings: list[RawRecording], specified: LogsFile) -> Iterator[RawRecording]:
+    """Join each state file with its command_file and time_file, which are then no recordings of their own."""
     by_file = {Path(r.source).name: r for r in recordings}
-    wanted = {r.source: pattern.replace("{name}", r.name) for r in recordings}
-    for recording in recordings:
-        if Path(recording.source).name in wanted.values():
+    states = {file: Path(file).stem for file in by_file}
+    if "state_file" in specified:
+        states = _named_by(specified["state_file"], by_file)
+    commands = _files_beside(states, specified.get("command_file"))
+    clocks = _files_beside(states, specified.get("time_file"))
+    beside = {*commands.values(), *clocks.values()}
+    for file, name in states.items():
+        if file in beside:
             continue
-        if wanted[recording.source] not in by_file:
-            raise LogError(
-                f'{recording.source}: its command_file "{wanted[recording.source]}" is not beside it'
-            )
-        yield recording.beside(by_file[wanted[recording.source]])
+        recording = replace(by_file[file], name=name)
+        for what, prefix, others in (
+            ("command_file", COMMAND, commands),
+            ("time_file", TIME, clocks),
+        ):
+            if file not in others:
+                continue
+            if others[file] not in by_file:
+                raise LogError(f'{recording.source}: its {what} "{others[file]}" is not beside it')
+            recording = recording.beside(by_file[others[file]], prefix)
+        if file in clocks and len(columns := by_file[clocks[file]].signals) == 1:
+            only = TIME + next(iter(columns))
+            recording = replace(recording, default=recording.default | {"time": only})
+        yield recording
+
+
+def _files_beside(states: dict[str, str], pattern: str | None) -> dict[str, str]:
+    """Return state file → file of the pattern for its name. states: state file → name."""
+    if pattern is None:
+        return {}
+    return {file: pattern.replace("{name}", name) for file, name in states.items()}
+
+
+def _named_by(pattern: str, files: Iterable[str]) -> dict[str, str]:
+    """Return file → its {name} in the pattern, or its stem where the pattern has none; files that fit."""
+    before, _, after = pattern.partition("{name}")
+    named = {}
+    for file in files:
+        if file == pattern:
+            named[file] = Path(file).stem
+        elif "{name}" in pattern and file.startswith(before) and file.endswith(after):
+            named[file] = file[len(before) : len(file) - len(after)] or Path(file).stem
+    if not named:
+        raise LogError(
+            f'no file looks like state_file = "{pattern}"; there are: {", ".join(files)}'
+        )
+    return named
 
 
 def _beside_clock(specified: LogsFile, commands: tuple[str, ...]) -> dict[str, str]:
