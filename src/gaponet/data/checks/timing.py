@@ -10,7 +10,7 @@ import numpy as np
 from gaponet.base.arrays import Array
 from gaponet.data.checks.check import Check
 from gaponet.data.checks.survey import SPECTRUM_HZ, Survey
-from gaponet.data.signals import FAST_COMMAND_RAD_S, Response
+from gaponet.data.signals import FAST_COMMAND_RAD_S, SHIFTS_S, Response
 from gaponet.robot.finding import Finding, abbreviate
 from gaponet.robot.spec import RobotSpec
 
@@ -20,6 +20,8 @@ MIN_SHIFT_S, SHIFT_SCATTERS = (
     0.012,
     4.0,
 )  # by which a recording follows later than the others; times their scatter
+MIN_SHIFT_PERIODS = 0.75  # of the rows, by which it must follow later
+MIN_AGREEMENT = 0.5  # of such a shift that the delays of single joints must show
 UNEVEN_ROWS_SHARE = 2.0  # of the unevenness of rows: a command may be that late, and an interpolated state that early
 MIN_LEAD_S = 0.015  # by which joints begin to move before their commands
 MIN_EARLY_RATIO = 1.08  # unexplained motion without future commands over that with them, if joints move before them
@@ -122,12 +124,16 @@ def _late_recordings(surveys: list[Survey], unknown: float) -> Iterator[Finding]
         return
     shifts = shifts - np.nanmedian(shifts)
     scatter = max(1.48 * float(np.nanmedian(np.abs(shifts))), 1e-3)
-    limit = max(MIN_SHIFT_S, SHIFT_SCATTERS * scatter, unknown)
+    period = float(np.median([1 / s.rate_hz for s in surveys]))
+    limit = max(MIN_SHIFT_S, SHIFT_SCATTERS * scatter, unknown, MIN_SHIFT_PERIODS * period)
+    delays = _relative_delays(surveys)
     far = [
         (s, late)
-        for s, late in zip(surveys, shifts.tolist(), strict=True)
-        if abs(late) > limit and max(s.speed) >= FAST_COMMAND_RAD_S
-    ]  # stiction delays slow motions
+        for s, late, delay in zip(surveys, shifts.tolist(), delays.tolist(), strict=True)
+        if abs(late) > limit
+        and max(s.speed) >= FAST_COMMAND_RAD_S  # stiction delays slow motions
+        and _agree(late, delay)
+    ]
     for word, group in (
         ("later", [f for f in far if f[1] > 0]),
         ("sooner", [f for f in far if f[1] < 0]),
@@ -150,6 +156,29 @@ def _late_recordings(surveys: list[Survey], unknown: float) -> Iterator[Finding]
                 "late_s": [late for _, late in part],
             }
             yield Finding("warning", "lag", text, (), values)
+
+
+def _relative_delays(surveys: list[Survey]) -> Array:
+    """Return how much longer the measured delays of each recording are than those of the same joints in all, (N) s.
+
+    NaN where no joint's delay is known.
+    """
+    delays = np.array([s.delay for s in surveys])  # (recordings, n)
+    usual = np.full(delays.shape[1], np.nan)
+    known = np.isfinite(delays).sum(axis=0) > 1
+    usual[known] = np.nanmedian(delays[:, known], axis=0)
+    longer = delays - usual
+    result = np.full(len(surveys), np.nan)
+    some = np.isfinite(longer).any(axis=1)
+    result[some] = np.nanmedian(longer[some], axis=1)
+    return result
+
+
+def _agree(late: float, delay: float) -> bool:
+    """Return True if the delays that the same page shows do not contradict a shift; both relative to the others, s."""
+    if np.isnan(delay):
+        return abs(late) < SHIFTS_S[-1]
+    return delay * late > 0 and abs(delay) >= min(MIN_AGREEMENT * abs(late), MIN_SHIFT_S)
 
 
 def _drift(surveys: list[Survey], shifts: Array, unknown: float = 0.0) -> Iterator[Finding]:
