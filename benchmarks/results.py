@@ -23,6 +23,7 @@ from datetime import date
 from pathlib import Path
 from typing import Any
 
+import page_charts
 import page_numbers
 
 from gaponet.experiments.real.page import write_page
@@ -136,6 +137,7 @@ def write(answers: dict[str, dict[str, Any]], work: Path) -> None:
     for paper in sorted(work.glob("paper_*/paper.json")):
         store_paper(paper)
     page_numbers.main()
+    page_charts.main()
 
 
 def store_paper(paper: Path) -> None:

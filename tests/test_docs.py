@@ -222,3 +222,9 @@ def test_a_stale_number_of_a_page_is_replaced_also_across_a_line_break(page_numb
 def test_a_sentence_that_no_page_has_any_more_is_an_error(page_numbers):
     with pytest.raises(LookupError, match="no such sentence"):
         page_numbers.filled("other words", {"text": "in {a} s", "a": "seconds; collect"})
+
+
+def test_the_charts_have_the_numbers_of_the_tables_beside_them(monkeypatch):
+    monkeypatch.syspath_prepend(ROOT / "benchmarks")
+    for chart in importlib.import_module("page_charts").CHARTS:
+        assert (ROOT / "docs" / chart.picture).read_text(encoding="utf-8") == chart.svg()
