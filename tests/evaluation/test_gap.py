@@ -17,6 +17,7 @@ from gaponet.evaluation.methods import title
 from gaponet.evaluation.run_files import read_gap
 from gaponet.evaluation.verdict import LEARNED
 from gaponet.report.figures.evaluation import waterfall
+from gaponet.robot.folder import save_robot
 from gaponet.sim.metrics import Run
 from gaponet.sim.model import model_hash
 from gaponet.sim.replay import replay, rollout_errors
@@ -190,3 +191,18 @@ def test_a_joint_that_nobody_recorded_has_no_bar_and_dilutes_nothing(tmp_path):
     assert both.mean() == pytest.approx(
         found["methods"]["nominal"]["by_joint"]["shoulder"]["mpjae"], rel=1e-3
     )
+
+
+def test_a_gap_that_is_measured_again_simulates_nothing(tmp_path, monkeypatch):
+    robot = write_arm(tmp_path / "arm")
+    data = Dataset.create(tmp_path / "data", robot)
+    for sequence in recordings(robot, 3, rows=60, kp=0.5):
+        data.append(sequence)
+    changed = {"kp": 15.0, "frictionloss": 0.1}
+    fitted = robot.with_servos(dict.fromkeys(robot.joint_names, changed))
+    save_robot(fitted, tmp_path / "fitted")
+    candidate = Candidate.load(tmp_path / "fitted", robot)
+    first = gap_by_step(candidate, data)
+    monkeypatch.delattr("gaponet.sim.replay.rollout")
+    assert gap_by_step(candidate, Dataset(data.path)) == first
+    assert first["left"]["friction"] != first["left"]["creep"]

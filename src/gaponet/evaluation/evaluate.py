@@ -20,7 +20,7 @@ from gaponet.base.progress import Progress, no_progress, with_note
 from gaponet.data.pair import SimulatedReplay
 from gaponet.data.repeatability import MIN_MOTION_RAD
 from gaponet.data.sequence import Sequence
-from gaponet.data.store import Dataset
+from gaponet.data.store import Dataset, Entry
 from gaponet.deploy.transfer import TransferCorrector
 from gaponet.evaluation.candidate import Candidate, is_robot, select_entries
 from gaponet.evaluation.methods import IDENTIFIED, title
@@ -32,7 +32,7 @@ from gaponet.nn.loop import DeltaCorrector
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.metrics import Run, runs, summary
 from gaponet.sim.model import model_hash
-from gaponet.sim.replay import Corrector, replay
+from gaponet.sim.replay import Corrector, kept_replays, replay
 
 T = TypeVar("T")
 STORED_TRAJECTORIES = 8  # for the report
@@ -121,10 +121,9 @@ def evaluate(
     dataset.require_robot(robot)
     candidates = _load_candidates(folders, robot)
     entries, unseen = select_entries(list(folders), dataset, motions, units)
-    sequences = dataset.sequences(entries)
+    rollouts = _Rollouts(dataset, entries, robot, candidates)
     for candidate in candidates.values():
-        _require_control_periods(candidate, sequences)
-    rollouts = _Rollouts(sequences, robot, candidates)
+        _require_control_periods(candidate, rollouts.sequences)
     nominal = rollouts.first.robot.before_identification
     for name, simulator, corrector in _methods(candidates, nominal, target):
         rollouts.add_method(name, simulator, corrector, with_note(progress, name))
@@ -176,11 +175,17 @@ class _Rollouts:
     """
 
     def __init__(
-        self, sequences: list[Sequence], robot: RobotSpec, candidates: dict[str, Candidate]
+        self,
+        dataset: Dataset,
+        entries: list[Entry],
+        robot: RobotSpec,
+        candidates: dict[str, Candidate],
     ) -> None:
-        self.sequences = sequences
+        self.sequences = dataset.sequences(entries)
+        self._dataset = dataset
+        self._entries = entries
         self.first = next(iter(candidates.values()))
-        self.ctrl = [s.ctrl[:, robot.operated_index] for s in sequences]
+        self.ctrl = [s.ctrl[:, robot.operated_index] for s in self.sequences]
         self.runs: dict[str, list[Run]] = {}
         self.deltas: dict[str, list[Array]] = {}
         self.notes: list[str] = []
@@ -198,9 +203,12 @@ class _Rollouts:
     ) -> None:
         """Roll out a method. A transfer that is refused is a note if the network could be told its simulator."""
         try:
-            replays = replay(
-                self.sequences, simulator, corrector, progress=progress, lock_idle=True
-            )
+            if corrector is None:
+                replays = kept_replays(self._dataset, self._entries, simulator, progress)
+            else:
+                replays = replay(
+                    self.sequences, simulator, corrector, progress=progress, lock_idle=True
+                )
         except ModelError as error:
             if name != "transfer" or "told" not in self.runs:
                 raise

@@ -26,7 +26,7 @@ from gaponet.robot.spec import RobotSpec
 from gaponet.sim.metrics import Run, mean_reduction, metrics, runs
 from gaponet.sim.metrics import summary as errors_of
 from gaponet.sim.model import model_hash
-from gaponet.sim.replay import Corrector, replay
+from gaponet.sim.replay import Corrector, kept_replays, replay
 
 MAX_COMPARED = 60  # recordings that are searched for equal commands
 
@@ -61,14 +61,10 @@ def gap_by_step(
     causes, done = cause_steps(robot), {}
     for name, physics, corrector in _steps(candidate, causes):
         report = with_note(progress, name)
-        replays = replay(
-            sequences,
-            physics,
-            corrector,
-            lock_idle=True,
-            progress=report,
-            creeps=name == "friction",
-        )
+        if corrector is None:
+            replays = kept_replays(dataset, entries, physics, report, creeps=name == "friction")
+        else:
+            replays = replay(sequences, physics, corrector, lock_idle=True, progress=report)
         done[name] = runs(sequences, [t.qpos for t in replays], robot)
     units = {s.meta.unit_id for s in sequences}
     others = (dataset.sequences([e])[0] for e in dataset.entries if e.meta.unit_id in units)

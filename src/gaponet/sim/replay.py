@@ -64,7 +64,9 @@ def replay(
         _idle_limbs(sequences, robot) if lock_idle else [()] * len(sequences)
     )
     locked = [_held(s, robot, limbs) for s, limbs in zip(sequences, idle, strict=True)]
-    digest, total, done = model_hash(robot), sum(len(s) - 1 for s in sequences), 0
+    digest = _replay_hash(robot, creeps)
+    total = sum(len(s) - 1 for s in sequences)
+    done = 0
     replays: dict[int, SimulatedReplay] = {}
     for chunk in _chunks(sequences, locked):
         part, clamped, home = (
@@ -86,6 +88,27 @@ def replay(
             replays[chunk[i]] = SimulatedReplay(digest, *out[:, : len(s), i].astype(np.float32))
         done += sum(len(s) - 1 for s in part)
     return [replays[i] for i in range(len(sequences))]
+
+
+def _replay_hash(robot: RobotSpec, creeps: bool) -> str:
+    """Return the hash under which replays are kept: the simulator's, and whether friction creeps as MuJoCo's own."""
+    return f"{model_hash(robot)}-creeps" if creeps else model_hash(robot)
+
+
+def kept_replays(
+    dataset: Dataset,
+    entries: list[Entry],
+    robot: RobotSpec,
+    progress: Progress = no_progress,
+    creeps: bool = False,
+) -> list[SimulatedReplay]:
+    """Return `replay` of a dataset's recordings with idle limbs locked, out of the dataset where it keeps them.
+
+    What it lacks is simulated and kept by the simulator's hash.
+    """
+    pair_dataset(dataset, robot, progress, entries, lock_idle=True, creeps=creeps)
+    digest = _replay_hash(robot, creeps)
+    return [dataset.pair(entry, digest).sim for entry in entries]
 
 
 def rollout_errors(
@@ -195,14 +218,15 @@ def pair_dataset(
     entries: list[Entry] | None = None,
     lock_idle: bool = False,
     executor: str | Executor = LOCAL,
+    creeps: bool = False,
 ) -> int:
     """Replay the sequences that have no replay by this simulator yet, and store the replays; return their number.
 
-    All sequences, or only some; `lock_idle` as in replay. Locally on threads of this process, else on an executor.
-    Replays are stored per simulator hash: a changed gain makes new ones and leaves the old.
+    All sequences, or only some; `lock_idle` and `creeps` as in replay. Locally on threads of this process, else on an
+    executor. Replays are stored per simulator hash: a changed gain makes new ones and leaves the old.
     """
     dataset.require_robot(robot)
-    digest = model_hash(robot)
+    digest = _replay_hash(robot, creeps)
     todo = sorted(
         (e for e in entries or dataset.entries if not dataset.has_replay(e, digest)),
         key=lambda e: e.rows,
@@ -213,7 +237,7 @@ def pair_dataset(
     parts = [todo[start : start + BATCH] for start in range(0, len(todo), BATCH)]
     sequences, work = (
         map(dataset.sequences, parts),
-        partial(replay, robot=robot, lock_idle=lock_idle),
+        partial(replay, robot=robot, lock_idle=lock_idle, creeps=creeps),
     )
     with dataset.writing_replays(), ExitStack() as stack:
         if executor == LOCAL:
