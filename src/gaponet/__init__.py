@@ -33,6 +33,8 @@ if TYPE_CHECKING:
     from gaponet.deploy.mujoco_loop import MujocoAligner as MujocoAligner
     from gaponet.experiments.paper.experiment import PaperResult as PaperResult
     from gaponet.experiments.paper.options import PaperOptions as PaperOptions
+    from gaponet.export.scene import Applied as Applied
+    from gaponet.export.scene import apply as apply
     from gaponet.hw.control.controller import Controller as Controller
     from gaponet.hw.targets.client import RemoteRobot as RemoteRobot
     from gaponet.nn.artifact import GapModel as GapModel
@@ -77,6 +79,8 @@ else:
         "AlignedSim": "gaponet.deploy.aligned_sim",
         "MujocoAligner": "gaponet.deploy.mujoco_loop",
         "Compensator": "gaponet.deploy.compensator",
+        "apply": "gaponet.export.scene",
+        "Applied": "gaponet.export.scene",
         "Controller": "gaponet.hw.control.controller",
         "RemoteRobot": "gaponet.hw.targets.client",
     }  # fmt: skip

@@ -411,3 +411,22 @@ def test_an_export_takes_the_fit_without_terms_that_identify_kept(lawful, tmp_pa
     plain = fit_plain_servos(load_robot(folder), motions[::-1])
     assert not plain.has_servo_model
     assert plain.kp[plain.operated_index].tolist() == [23.0] * len(plain.operated)
+
+
+@pytest.mark.skipif(not hasattr(mujoco.MjsActuator, "set_to_pid"), reason="needs MuJoCo 4")
+def test_the_mjcf_limits_the_speed_of_targets_by_itself(tmp_path):
+    """gaponet moves a target once per period of 20 ms, MuJoCo in each step of 5 ms: up to 0.5 · 0.02 rad apart."""
+    speed = 0.5
+    slow = {joint: {"target_speed": speed} for joint in FOUND}
+    robot = write_arm(tmp_path / "arm").with_servos(slow)
+
+    exported = export_robot(robot, "mjcf", tmp_path / "out")
+
+    assert exported.file is not None
+    model = mujoco.MjModel.from_xml_path(str(exported.file))
+    check = Check(tmp_path / "out")
+    targets = check.motions[0]["ctrl"]
+    assert np.abs(np.diff(targets, axis=0)).max() > 2 * speed * robot.dt
+    for motion in check.motions:
+        played = play(model, check.facts, motion, form="plain")
+        assert np.abs(played - motion["qpos"]).max() < speed * robot.dt

@@ -6,6 +6,7 @@ It is not a test of pytest, and is never executed.
 from pathlib import Path
 from typing import assert_type
 
+import mujoco
 import numpy as np
 
 import gaponet as gp
@@ -55,6 +56,8 @@ sim = gp.AlignedSim(robot)
 compensator = gp.Compensator(robot)
 assert_type(sim, gp.AlignedSim)
 assert_type(compensator, gp.Compensator)
+follower = gp.Compensator(robot, follow="nominal")
+assert_type(gp.apply(robot, mujoco.MjSpec()), gp.Applied)
 delta = trained.model.loop().delta(np.zeros(5), np.zeros(5), np.zeros(5), payload_mass=0.0)
 options = gp.RunOptions(connection=gp.Connection(port="/dev/ttyACM0"), payload_mass=0.1)
 played = gp.run_robot(robot, motion="sweep-elbow_flex", driver="so101", options=options)

@@ -20,7 +20,7 @@ from gaponet.base.files import atomic_write, lock_folder, write_text
 from gaponet.base.progress import Progress, no_progress
 from gaponet.data.sequence import Sequence
 from gaponet.export.engine_configs import TEMPLATES, engine_config
-from gaponet.export.mjcf_edit import edit_mjcf
+from gaponet.export.mjcf_edit import MUJOCO_HAS_RAMPS, edit_mjcf
 from gaponet.export.plain_servos import (
     check_motions,
     comparable,
@@ -138,7 +138,8 @@ def export_robot(
     facts = simulator_facts(
         robot, control_period(robot, (s.dt for s in validation)), payload_mass, plain
     )
-    motions = check_motions(validation, robot)
+    has_ramps = to == "mjcf" and MUJOCO_HAS_RAMPS
+    motions = check_motions(validation, robot, ramped=not has_ramps)
     facts |= {"file": ROBOT, "prefix": prefix, "virtual": validation[0].meta.virtual}
     facts["error_mrad"] = {
         form: 1e3 * rollout_error(motions, r) for form, r in (("joints", robot), ("plain", plain))
@@ -198,9 +199,16 @@ def _notes(robot: RobotSpec, facts: dict[str, Any], to: str) -> list[str]:
         ramps = ", ".join(
             f"{n} {v:.3g}" for n, v in zip(robot.joint_names, robot.target_speed, strict=True) if v
         )
-        notes.append(
-            f"servos' own ramps ({ramps} rad/s) are in no engine: limit targets so, as in check.npz"
-        )
+        if to == "mjcf" and MUJOCO_HAS_RAMPS:
+            notes.append(
+                f"servos' own ramps ({ramps} rad/s) are <pid slewmax> of MuJoCo 4: call fill_delays of "
+                "mujoco_servos.py after each reset; MJX and older versions do not have them"
+            )
+        else:
+            notes.append(
+                f"servos' own ramps ({ramps} rad/s) are not in this file: limit targets so, as in "
+                "check.npz. MuJoCo 4 has them (--to mjcf)"
+            )
     if robot.friction_per_kelvin.any():
         warm = ", ".join(f"{t:.0f}" for t in robot.friction_temperature[robot.operated_index])
         notes.append(f"friction and damping are those at {warm} °C: no engine has a temperature")

@@ -34,6 +34,8 @@ from gaponet.sim.model import (
     build_model,
 )
 
+MUJOCO_HAS_RAMPS = hasattr(mujoco.MjsActuator, "set_to_pid")  # from MuJoCo 4 on
+
 SERVO_ATTRIBUTES = ("name", "class", "group", "user")  # that a servo keeps
 JOINT_ATTRIBUTES = ("armature", "damping", "frictionloss")  # that are identified
 START_TAG = re.compile(rb"""<(?:[^"'>]|"[^"]*"|'[^']*')*>""")
@@ -269,12 +271,26 @@ def _servo(servo: dict[str, Any], samples: int, own: dict[str, str]) -> str:
         samples: Length of its delay buffer, physics steps; 0 for no delay.
         own: Attributes that stay as they are in the file.
     """
-    kp, kd, limit = servo["kp"], servo["kd"], servo["effort_limit"]
-    bias = kp * servo["offset"]
+    kp = servo["kp"]
+    limit = servo["effort_limit"]
     attributes = own | {
-        "gear": "1", "dyntype": "none", "gaintype": "fixed", "gainprm": text_of(kp), "biastype": "affine",
-        "biasprm": text_of(bias, -kp, -kd), "forcelimited": "true", "forcerange": text_of(-limit, limit),
-    }  # fmt: skip
+        "gear": "1",
+        "dyntype": "none",
+        "gaintype": "fixed",
+        "gainprm": text_of(kp),
+        "biastype": "affine",
+        "biasprm": text_of(kp * servo["offset"], -kp, -servo["kd"]),
+        "forcelimited": "true",
+        "forcerange": text_of(-limit, limit),
+    }
+    if _is_ramped(servo):
+        attributes |= {
+            "dyntype": "pid",
+            "dynprm": text_of(0.0, servo["target_speed"]),
+            "gaintype": "pid",
+            "gainprm": "0",
+            "input": "pos",
+        }
     if samples:
         attributes |= {
             "delay": text_of(servo["delay"]),
@@ -282,6 +298,11 @@ def _servo(servo: dict[str, Any], samples: int, own: dict[str, str]) -> str:
             "interp": "linear",
         }
     return f"<general {_attributes(attributes)}/>"
+
+
+def _is_ramped(servo: dict[str, Any]) -> bool:
+    """Return True for a servo that limits the speed of its targets, where MuJoCo can do that (<pid slewmax>)."""
+    return MUJOCO_HAS_RAMPS and servo["target_speed"] > 0
 
 
 def _servo_attributes(tag: Tag, model: mujoco.MjModel, joint: str) -> dict[str, str]:
@@ -409,11 +430,11 @@ def _require(
             *now.actuator_biasprm[i, :3],
             now.actuator_forcerange[i, 1],
         ]
-        kp, bias = servo["kp"], servo["kp"] * servo["offset"]
+        kp = servo["kp"]
         wanted = [
             *(servo[f] for f in JOINT_ATTRIBUTES),
-            kp,
-            bias,
+            0.0 if _is_ramped(servo) else kp,
+            kp * servo["offset"],
             -kp,
             -servo["kd"],
             servo["effort_limit"],

@@ -246,15 +246,21 @@ def mean_error(recorded: np.ndarray, played: np.ndarray) -> float:
     return float(np.abs(np.asarray(played, float) - recorded)[1:].mean())
 
 
-def check_motions(recordings: ListOf[Sequence], robot: RobotSpec) -> list[Sequence]:
-    """Return the first motions by name, cut in length, for check.npz; targets are ramped as the servos ramp them."""
+def check_motions(
+    recordings: ListOf[Sequence], robot: RobotSpec, ramped: bool = True
+) -> list[Sequence]:
+    """Return the first motions by name, cut in length, for check.npz.
+
+    ramped: Targets change as slowly as the servos change them, for engines that do not limit the speed of targets.
+    """
     first = {s.meta.motion: s for s in reversed(recordings)}
     low, high = robot.qpos_range.T
     cut = [
         s.rows(slice(0, round(MAX_CHECK_MOTION_S / s.dt)))
         for s in list(first.values())[:MAX_CHECK_MOTIONS]
     ]
-    speed = np.where(robot.target_speed > 0, robot.target_speed, np.inf)
+    limited = ramped & (robot.target_speed > 0)
+    speed = np.where(limited, robot.target_speed, np.inf)
     return [
         replace(s, ctrl=speed_limited(np.clip(s.ctrl, low, high), s.qpos[0], speed, s.dt))
         for s in cut

@@ -17,6 +17,9 @@ import numpy as np
 from gaponet.sim.servo import SERVO_TERMS, Play, friction_limit, present, servo_bias, torque_range
 
 CHECK_WORLDS = 3
+SLEW_MAX = 1  # place of slewmax in the dynprm of a <pid>
+MAX_RAMP_LEAD_RAD = 0.05  # of a limited target beyond its joint at a start, and at its speed
+MAX_RAMP_LEAD_S = 0.1
 Motion = dict[str, Any]  # one of check.npz: ctrl, qpos, qvel (T, n) in rad and rad/s, dt in s
 
 
@@ -52,10 +55,10 @@ class Servos:
             column["armature"],
             column["damping"],
         )
-        model.actuator_gainprm[self.servo, 0], model.actuator_biasprm[self.servo, 0] = (
-            self.kp,
-            self.bias,
-        )
+        # A servo that limits the speed of its targets (<pid slewmax>) has its stiffness in biasprm alone.
+        self._ramped = np.array([ramp_speed(model, i) > 0 for i in self.servo])
+        model.actuator_gainprm[self.servo, 0] = np.where(self._ramped, 0.0, self.kp)
+        model.actuator_biasprm[self.servo, 0] = self.bias
         model.actuator_biasprm[self.servo, 1], model.actuator_biasprm[self.servo, 2] = (
             -self.kp,
             -column["kd"],
@@ -84,7 +87,8 @@ class Servos:
         if "no_load_speed" in self.terms:
             limits = torque_range(self.effort, qvel / self.terms["no_load_speed"])
             model.actuator_forcerange[self.servo] = np.stack(limits, axis=-1)
-        bias = servo_bias(self.terms, self.kp, self.bias, data.ctrl[self.servo], q)
+        targets = self._targets_in_force(data)
+        bias = servo_bias(self.terms, self.kp, self.bias, targets, q)
         if "backlash" in self.terms:
             h = model.opt.timestep
             if data.time != self._play_time:  # a new state
@@ -100,6 +104,26 @@ class Servos:
         model.dof_frictionloss[self.dof] = limit
         model.actuator_biasprm[self.servo, 0] = bias
 
+    def _targets_in_force(self, data: Any) -> Any:
+        """Return the targets of the next physics step, rad: where a servo limits their speed, as far as they are."""
+        targets = np.array(data.ctrl[self.servo])
+        for k in np.flatnonzero(self._ramped):
+            i = self.servo[k]
+            step = self.model.opt.timestep * ramp_speed(self.model, i)
+            now = data.act[self.model.actuator_actadr[i]]
+            targets[k] = np.clip(targets[k], now - step, now + step)
+        return targets
+
+
+def ramp_speed(model: Any, actuator: int) -> float:
+    """Return the limit of the speed of an actuator's targets, rad/s; 0: none."""
+    import mujoco
+
+    pid = getattr(mujoco.mjtDyn, "mjDYN_PID", None)
+    if pid is None or model.actuator_dyntype[actuator] != pid:
+        return 0.0
+    return max(float(model.actuator_dynprm[actuator, SLEW_MAX]), 0.0)
+
 
 def addresses(model: Any, joints: list[str], prefix: str = "") -> tuple[Any, Any, Any]:
     """Return the indices of joints in qvel and in qpos, and of the actuators that drive them."""
@@ -109,9 +133,19 @@ def addresses(model: Any, joints: list[str], prefix: str = "") -> tuple[Any, Any
 
 
 def fill_delays(model: Any, data: Any) -> None:
-    """Let each delayed actuator act as if data.ctrl had always been in force; MuJoCo's reset lets it begin at 0."""
+    """Let each delayed actuator act as if data.ctrl had always been in force; MuJoCo's reset lets it begin at 0.
+
+    Where a servo limits the speed of its targets, these begin at most 0.05 rad and the way of 0.1 s from the joint.
+    """
     import mujoco
 
+    for i in range(len(model.actuator_trnid)):
+        speed = ramp_speed(model, i)
+        if speed > 0:
+            position = data.qpos[model.jnt_qposadr[model.actuator_trnid[i, 0]]]
+            lead = MAX_RAMP_LEAD_RAD + MAX_RAMP_LEAD_S * speed
+            start = np.clip(data.ctrl[i], position - lead, position + lead)
+            data.act[model.actuator_actadr[i]] = start
     for i, samples in enumerate(model.actuator_history[:, 0] if model.nhistory else ()):
         if samples:
             mujoco.mj_initCtrlHistory(model, data, i, None, np.full(samples, data.ctrl[i]))
