@@ -279,20 +279,46 @@ def test_all_joints_are_fitted_together_only_where_the_first_iterations_help(hel
         errors=lambda values: np.full(3, error[float(values[0]["kp"][0])]),
     )
     asked = []
-
-    def descend(fields, rest, starts, iterations, report):
-        asked.append(sum(iterations))
-        return together[0]
-
-    robot = SimpleNamespace(
-        robot=SimpleNamespace(operated=("elbow",)),
-        rollouts=SimpleNamespace(rows=np.ones(1)),
-        bounds=SimpleNamespace(start={}),
-        descend=descend,
-        descend_chains=lambda values, report: values,
-    )
+    robot = robot_fit(together[0], asked)
     progress = SearchProgress(None, 0, 1, no_progress)
     fits = Fits([], None, [], judge, progress, 1)
     assert set(robot_candidates(fits, [robot], alone)) == kept
     assert len(asked) == (2 if helps else 1)
     assert asked[0] < sum(ROBOT_ITERATIONS)
+
+
+def test_all_joints_are_not_fitted_together_where_the_time_is_too_short(monkeypatch):
+    """The judge simulates 100 rows in a second, so that 176 rollouts of 100 rows do not fit into a minute."""
+    clock = [0.0]
+    monkeypatch.setattr("time.monotonic", lambda: clock[0])
+
+    def errors(values):
+        clock[0] += 1.0
+        return np.ones(1)
+
+    judge = SimpleNamespace(names=np.array(["a"]), rows=100, errors=errors)
+    alone = [{"kp": np.array([20.0])}]
+    for seconds, count in ((60.0, 0), (6000.0, 1)):
+        asked = []
+        progress = SearchProgress(seconds, 0, 1, no_progress)
+        progress.begin_search()
+        progress.begin_search()
+        fits = Fits([], None, [], judge, progress, 1)
+        robot_candidates(fits, [robot_fit(alone[0], asked)], alone)
+        assert len(asked) == count
+
+
+def robot_fit(values, asked):
+    """A fit in the whole robot's simulator that finds values and notes how many iterations were asked of it."""
+
+    def descend(fields, rest, starts, iterations, report):
+        asked.append(sum(iterations))
+        return values
+
+    return SimpleNamespace(
+        robot=SimpleNamespace(operated=("elbow",)),
+        rollouts=SimpleNamespace(rows=np.ones(1), parts=[range(100)] * 8),
+        bounds=SimpleNamespace(start={}),
+        descend=descend,
+        descend_chains=lambda values, report: values,
+    )

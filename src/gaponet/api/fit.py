@@ -92,7 +92,8 @@ def identify(
             rollouts better at otherwise equal values; then temperature where it varies at equal gains and payload.
         table: Look for a table under the robot's tips ([[tip]] in robot.toml).
         threads: 0 for all cores.
-        budget: Time such as 60s or 4m that the searches may take, without the table; default no limit.
+        budget: Time such as 60s or 4m that the fit may take, the table included; default no limit. What does not fit
+            into it is left out and named in a warning. Results are the same on every machine only without a limit.
         stops: Add an end stop to joints that stayed behind several commands; otherwise they are reported.
         masses: Fit masses, centres of mass and inertias of the links too; accepted as a term is.
         despite_errors: Go on although the doctor finds an error in the recordings; the result keeps the errors.

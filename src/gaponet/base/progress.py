@@ -75,8 +75,9 @@ def _progress(title: str) -> Iterator[_Show]:
         TextColumn("{task.description}", style="bold", markup=False),
         BarColumn(),
         TextColumn("{task.percentage:3.0f} %"),
+        TextColumn("elapsed"),
         TimeElapsedColumn(),
-        TextColumn("left"),
+        TextColumn("· left, about"),
         TimeRemainingColumn(),
         TextColumn("{task.fields[note]}", markup=False),
     )

@@ -175,6 +175,7 @@ class Judge:
             self._folds.append((rollouts, list(rows.values())))
             names += [motion for motion, *_ in rows]
         self.names = np.array(names)  # of all motions, (motions,)
+        self.rows = sum(len(s) for sequences in folds for s in sequences)  # of all recordings
         self._sums_of: dict[tuple[int, bytes], Array] = {}
 
     def _sums(self, candidate: ListOf[Values], links: ListOf[Links] = ()) -> tuple[Array, Array]:

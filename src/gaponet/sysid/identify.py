@@ -15,6 +15,7 @@ Where few motions validate, all of this is done for folds of a cross-validation 
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence as ListOf
 from dataclasses import dataclass, replace
 
@@ -118,8 +119,11 @@ def _identify(
     recordings: Recordings, robot: RobotSpec, options: IdentifyOptions, progress: Progress
 ) -> Identified:
     """Fit to positions, and then from recorded torque, with the speed limits that the robot's servos have."""
+    began = time.monotonic()
     fitted = _fit_positions(recordings, robot, options, progress)
     if not recordings.validation:
+        return fitted
+    if options.seconds is not None and time.monotonic() - began > options.seconds:
         return fitted
     return with_torque(fitted, recordings.splits, robot, options.nthread)
 

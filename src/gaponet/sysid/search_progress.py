@@ -90,6 +90,15 @@ class SearchProgress:
         """Return whether the time of the present search is over."""
         return time.monotonic() - self._began > self._end
 
+    def has_time_for(self, seconds: float) -> bool:
+        """Return whether so many seconds are left for the present search."""
+        return time.monotonic() - self._began + seconds <= self._end
+
+    @property
+    def is_limited(self) -> bool:
+        """True if the time of all searches is limited."""
+        return self._seconds is not None
+
     def all_is_over(self) -> bool:
         """Return whether the time of all searches is over."""
         return self._seconds is not None and time.monotonic() - self._began > self._seconds

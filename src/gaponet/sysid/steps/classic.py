@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import time
+
 from gaponet.sysid.acceptance import MIN_JUDGES
 from gaponet.sysid.axes import CLASSIC, Values
+from gaponet.sysid.least_squares import DAMPING_FACTORS
 from gaponet.sysid.problem import JointFit, RobotFit
 from gaponet.sysid.search_progress import ROBOT_ITERATIONS, SearchProgress
 from gaponet.sysid.steps.step import Fits, FitState
@@ -59,6 +62,8 @@ def robot_candidates(
     0.2 mrad worse.
     """
     judge = fits.judge
+    if not _has_time_for_iterations(fits, robots, alone):
+        return {}
     if len(set(judge.names.tolist())) >= MIN_JUDGES:
         first = _fit_together(fits, robots, alone, ROBOT_ITERATIONS[:1])
         if judge.errors(first).mean() >= judge.errors(alone).mean():
@@ -75,6 +80,22 @@ def robot_candidates(
             )
         )
     return {"whole": whole_robot, "limbs": chains}
+
+
+def _has_time_for_iterations(fits: Fits, robots: list[RobotFit], alone: list[Values]) -> bool:
+    """Return whether the time is enough for the first iterations of all joints together.
+
+    What they take follows from the time that the judge's motions take, which are simulated once in any case.
+    """
+    if not fits.progress.is_limited:
+        return True
+    began = time.monotonic()
+    fits.judge.errors(alone)
+    seconds_per_row = (time.monotonic() - began) / fits.judge.rows
+    starts = 2
+    candidates = starts * (len(CLASSIC) + 1 + len(DAMPING_FACTORS))
+    rows = sum(len(part) for robot in robots for part in robot.rollouts.parts)
+    return fits.progress.has_time_for(seconds_per_row * rows * candidates * ROBOT_ITERATIONS[0])
 
 
 def _fit_together(

@@ -35,7 +35,8 @@ class ServoTerm:
     def _fitted(self, state: FitState, alone: list[Values]) -> list[Values]:
         """Return values from fits of single joints, polished in the whole robot's simulator where that helps."""
         values = alone
-        if state.together and not any(SERVO_FIELDS[f].single_joint for f in TERMS[self._term]):
+        single = any(SERVO_FIELDS[f].single_joint for f in TERMS[self._term])
+        if state.together and not single and not self._fits.progress.search_is_over():
             polished = [self._polish(*one) for one in zip(state.robots, alone, strict=True)]
             judge = self._fits.judge
             if judge.errors(polished).mean() < judge.errors(alone).mean():
