@@ -6,7 +6,7 @@ and exits with 2.
 
 from gaponet.base.text import remove_credentials
 
-# of a message; the middle of a longer one is omitted, as its ends say where and what to do
+# Of a message; the middle of a longer one is omitted, as its ends say where and what to do.
 MAX_CHARACTERS = 1000
 
 

@@ -285,5 +285,5 @@ def _set_limit(kind: int, soft: int) -> None:
 
 
 if __name__ == "__main__":
-    # not as __main__: functions know this module by its name
+    # Not as __main__: functions know this module by its name.
     import_module("gaponet.base.sandbox")._serve()

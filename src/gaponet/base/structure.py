@@ -69,7 +69,7 @@ Name = Annotated[str, AfterValidator(_name)]  # may become the name of a file
 Sha256 = Annotated[str, AfterValidator(_hex)]
 Count = Annotated[int, Interval(ge=0, le=10**15)]
 Angle = Annotated[float, Interval(ge=-1e3, le=1e3)]  # rad
-# infinity too, but no NaN
+# Infinity too, but no NaN.
 Extended = Annotated[float, AllowInfNan(True), Interval(ge=-math.inf, le=math.inf)]
 # A measured number; in a file, None stands for a missing one.
 Number = Annotated[

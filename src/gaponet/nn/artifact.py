@@ -52,7 +52,7 @@ FACTS_IN_NETWORK = (
     "model",
     "context",
 )
-# beyond the answers of training, as a share of their range, at which the network is still used
+# Beyond the answers of training, as a share of their range, at which the network is still used.
 MAX_DISTANCE = 0.1
 MIN_WIDTH_RAD = 1e-4  # narrower ranges of training are taken to be this wide
 GAIN_TOLERANCE = 0.02  # relative, between recorded and real gains

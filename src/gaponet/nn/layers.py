@@ -26,7 +26,7 @@ def dense(
     """Return linear layers with ELU between them. With zero_output, the initial output is 0."""
     layers: list[nn.Module] = []
     for width in hidden:
-        # in place: half the memory traffic
+        # In place: half the memory traffic.
         layers += [
             nn.Linear(inputs, width),
             nn.ELU(inplace=True),
@@ -86,7 +86,7 @@ class Features(nn.Module):
         self.layout = Layout(config, n)
         self.dim = self.layout.query.stop
         self.standardise = Standardise(self.dim)
-        # features that a shift of each joint changes
+        # Features that a shift of each joint changes.
         moved = self.layout.shifted(np.eye(n))[:, self.layout.query]
         moved[:, self.layout.q] = 0.0
         self.register_buffer("position_column", torch.from_numpy(moved.argmax(0)), persistent=False)

@@ -201,7 +201,7 @@ class DeltaLoop:
                 f"{self.num_envs} robots each, or make another loop for another number of robots: "
                 "model.loop(num_envs)"
             )
-        # the fastest test for finite numbers
+        # The fastest test for finite numbers.
         if not (self._numpy and np.vdot(ctrl, ctrl) < np.inf):
             ctrl = self._finite(qpos, ctrl)
         self.observe(qpos, qvel, ctrl, payload_mass)

@@ -30,7 +30,7 @@ class OnnxNetwork:
         options.intra_op_num_threads = threads
         options.inter_op_num_threads = 1
         options.log_severity_level = 3
-        # idle threads do not use a core
+        # Idle threads do not use a core.
         options.add_session_config_entry("session.intra_op.allow_spinning", "0")
         self.session = ort.InferenceSession(content, options, providers=["CPUExecutionProvider"])
 
@@ -65,7 +65,7 @@ class OnnxNetwork:
         """
         delta = self(x)
         binding = self.session.io_binding()
-        # on the CPU it shares the array's memory
+        # On the CPU it shares the array's memory.
         value = _onnxruntime().OrtValue.ortvalue_from_numpy
         binding.bind_ortvalue_input("x", value(x))
         binding.bind_ortvalue_output(self.session.get_outputs()[0].name, value(delta))

@@ -39,7 +39,7 @@ class ProbeOracle:
         self.dt = np.array([c[2] for c in conditions])
         self.absolute = config.sensor_target == "absolute"
         m = len(self.offsets)
-        # a delayed servo would not respond within the control period
+        # A delayed servo would not respond within the control period.
         no_delay = np.zeros(len(robot.joint_names))
         copies = [c for c in conditions for _ in range(m)]
         self.sim = sim = BatchSim(replace(robot, delay=no_delay), copies, nthread, locked)

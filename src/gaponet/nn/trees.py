@@ -21,16 +21,14 @@ from gaponet.base.installation import install_command
 from gaponet.nn.config import ModelConfig
 from gaponet.nn.layers import DeltaNet
 
-# per joint; per tree
-TREES = 120
-LEAVES = 31
+TREES = 120  # of each joint
+LEAVES = 31  # of a tree
 MAX_DEPTH = 8
-NODES = 2 * LEAVES - 1
-# of a leaf; of the fit of a joint; of the error of a fit
+NODES = 2 * LEAVES - 1  # of a tree
 MIN_LEAF_ROWS = 60
-MAX_ROWS = 60_000
-MEASURED_ROWS = 2_000
-# between scikit-learn and the stored trees, in units of the RMS of the labels
+MAX_ROWS = 60_000  # from which the trees of a joint are fitted
+MEASURED_ROWS = 2_000  # from which the error of a fit is measured
+# Between scikit-learn and the stored trees, in units of the RMS of the labels
 MAX_DIFFERENCE = 1e-4
 
 
@@ -139,7 +137,7 @@ class TreesNet(DeltaNet):
             part = slice(start, start + len(nodes))
             children = [start + np.where(leaf, own, nodes[side]) for side in ("left", "right")]
             limits = np.where(leaf, 0.0, nodes["num_threshold"])
-            # rounded down: float32 inputs then fall on the same side
+            # Rounded down: float32 inputs then fall on the same side.
             near = limits.astype(np.float32)
             lower = np.where(near > limits, np.nextafter(near, np.float32(-np.inf)), near)
             self.feature[part] = torch.from_numpy(np.where(leaf, 0, nodes["feature_idx"]))

@@ -34,7 +34,7 @@ from gaponet.virtual.play import Job, library, play
 __all__ = ["CollectResult", "Recipe", "collect", "load_recipe"]
 
 COLLECT_FILE = "collect.json"  # fleet, seed and payloads of a collected dataset
-# least and most; more lose more when killed, fewer spend more time in numpy
+# Least and most; more lose more when killed, fewer spend more time in numpy.
 TAKES_PER_JOB = (
     36,
     144,
@@ -93,7 +93,7 @@ def collect(
     """
     start = time.monotonic()
     robot = robot.with_gain_scale(fleet.gain_scale or robot.gain_scale)
-    # command-line options may have changed it
+    # Command-line options may have changed it.
     recipe = validated(Recipe, asdict(recipe), "recipe", UsageError)
     if not 0 <= nproc <= MAX_WORKERS or not 0 <= seed < 2**63:
         raise UsageError(
@@ -123,7 +123,7 @@ def collect(
             Job(robot, fleet, recipe, files, seed, tuple(part))
             for part in _batches(missing, nproc or Pool.cores(1))
         ]
-        # of sequences whose replay a killed run did not store
+        # Of sequences whose replay a killed run did not store.
         pair_dataset(dataset, robot, lock_idle=True)
         for sequence, simulated in _play_jobs(jobs, nproc, executor):
             dataset.write_replay(dataset.append(sequence), simulated)

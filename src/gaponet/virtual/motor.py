@@ -327,7 +327,7 @@ class CommandLink:
             dt: Time between two packets, s.
         """
         self.p = physics
-        # packets under way, one in force
+        # Packets under way, one in force.
         self.slots = int(np.ceil((physics.delay + physics.jitter).max() / dt)) + 2
         count, n = physics.kp_scale.shape
         self.packets = np.zeros((count, self.slots, n))

@@ -56,7 +56,7 @@ class VirtualSO101:
             link: Symbolic link to the port; an existing link is replaced.
             frame: Simulated time per goal position, s; default: real time.
         """
-        # the arm rests on it while its torque is off
+        # The arm rests on it while its torque is off.
         robot = replace(robot, table=robot.table or Table(height=0.0))
         self.robot = robot
         self._frame = None if frame is None else round(frame / PERIOD)
@@ -183,7 +183,7 @@ class VirtualSO101:
         """Write readings into the registers."""
         order = self._order
         qpos, qvel, tau, temperature = self.live.read()
-        # may pass the limits
+        # May pass the limits.
         steps = np.rint(qpos / (STEP_RAD * self.calibration.sign) + self.calibration.zero)[order]
         share = (tau / self.robot.effort_limit)[order]
         values = {

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import ClassVar, Protocol
 
-# last part of a wait, spent in a busy loop: on a quiet Linux a sleep ends up to this much late
+# Last part of a wait, spent in a busy loop: on a quiet Linux a sleep ends up to this much late.
 SPIN_S = 0.0003
 
 START_RANGE_S = (1e3, 1e6)  # of a simulated clock: computers are on for an hour or some days

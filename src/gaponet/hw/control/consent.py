@@ -51,13 +51,13 @@ def require_consent(
     descriptor = require_terminal(option)
     import termios  # not on Windows
 
-    # an answer typed before the question was shown answers nothing
+    # An answer typed before the question was shown answers nothing.
     termios.tcflush(descriptor, termios.TCIFLUSH)
     sys.stderr.write(
         f"{escape(statement)} {question} Type '{word}' to start; anything else leaves: "
     )
     sys.stderr.flush()
-    # not sys.stdin, which may hold earlier bytes
+    # Not sys.stdin, which may hold earlier bytes.
     line = os.read(descriptor, 1024).decode(errors="replace")
     if not line.endswith("\n"):  # end of file, also behind a word
         sys.stderr.write("\n")

@@ -38,7 +38,7 @@ from gaponet.hw.control.watchdog import Watchdog
 from gaponet.hw.targets.policy import Policy, motion_policy
 from gaponet.robot.spec import RobotSpec
 
-# control periods without a heartbeat after which the watchdog damps the robot
+# Control periods without a heartbeat after which the watchdog damps the robot.
 WATCHDOG_PERIODS = 5.0
 
 
@@ -125,10 +125,9 @@ class Controller:
         self._use_watchdog = watchdog
         self._on_event = on_event
         self._on_connect = on_connect
-        # this period, its start in s, first period of the phase
-        self._k = 0
-        self._now = 0.0
-        self._phase_start = 0
+        self._k = 0  # this period
+        self._now = 0.0  # its start, s
+        self._phase_start = 0  # first period of the phase
         self._state: State | None = None  # last one
         self._error: BaseException | None = None  # of other code; raised when the robot is damped
         self._reported_full_disk = False
@@ -165,7 +164,7 @@ class Controller:
         driver = self.driver
         output = self.output
         with ExitStack() as stack:
-            # exited last: during one no heartbeat is sent
+            # Left last: during a collection no heartbeat is sent.
             stack.enter_context(no_garbage_collection())
             lock = stack.enter_context(sole_publisher(driver.address))
             stack.callback(lambda: driver.close(hold=output.damping_since is None))
@@ -174,38 +173,43 @@ class Controller:
             output.limits = output.servo_limits()
             self._on_connect(driver)
             stack.enter_context(stop_on_signals(self.stop))
-            # counts from the consent on
+            # Keys count from the consent on.
             pressed = stack.enter_context(StopKeys(self.stop)) if keys else None
-            gains = {
-                name: getattr(driver, name)[self.context.joints].tolist() for name in ("kp", "kd")
-            }
+            joints = self.context.joints
+            gains = {"kp": driver.kp[joints].tolist(), "kd": driver.kd[joints].tolist()}
             self.recording.meta |= gains | driver.facts
             if self._folder:
                 self.recording.write_to(self._folder)
             stack.callback(self.recording.rows.close)
-            if self._use_watchdog and (spec := driver.watchdog()) is not None:
-                watchdog = output.watchdog = Watchdog(
-                    spec, lock, WATCHDOG_PERIODS * self.dt, self.config.damp
-                )
+            spec = driver.watchdog() if self._use_watchdog else None
+            if spec is not None:
+                patience = WATCHDOG_PERIODS * self.dt
+                watchdog = Watchdog(spec, lock, patience, self.config.damp)
+                output.watchdog = watchdog
                 stack.callback(lambda: watchdog.release(output.unconfirmed))
                 watchdog.wait_ready()
-            if policy is None:
-                if self.plan is None or self.plan.motion is None:
-                    raise UsageError(
-                        "there is nothing to play: give a policy, or a plan with a motion"
-                    )
-                policy = motion_policy(self.plan.motion, self.dt)
-            self._loop(policy, pressed)
+            self._loop(policy or self._policy_of_plan(), pressed)
             self._verify()
         if self._error:
             raise self._error
         return self.recording
 
+    def _policy_of_plan(self) -> Policy:
+        """Return the policy that plays the motion of the plan.
+
+        Raises:
+            UsageError: There is no plan, or it has no motion.
+        """
+        if self.plan is None or self.plan.motion is None:
+            raise UsageError("there is nothing to play: give a policy, or a plan with a motion")
+        return motion_policy(self.plan.motion, self.dt)
+
     def _loop(self, policy: Policy, keys: StopKeys | None) -> None:
-        # due: the period after the last one; _k: the next one that is possible
+        """Run periods until the robot has stopped."""
         start = self.clock.now()
-        due = 0
-        self._now = self.readiness.since = start
+        due = 0  # the period after the last one; self._k is the next one that is possible
+        self._now = start
+        self.readiness.since = start
         self._fire(Trigger.CONSENT, "waiting for fresh states")
         for remark in self.driver.facts.get("remarks", ()):
             self._note(remark)
@@ -215,14 +219,15 @@ class Controller:
             self.output.due = start + due * self.dt
             self.recording.late.append(self._now - self.output.due)
             self._period(policy, keys)
-            # whole periods by which this one ran over
-            lost = int((self.clock.now() - start) / self.dt) - self._k
-            self.recording.missed += max(lost - 1, 0)
-            self._k, due = self._k + max(1, lost), self._k + 1
+            passed = int((self.clock.now() - start) / self.dt) - self._k  # whole periods
+            self.recording.missed += max(passed - 1, 0)
+            due = self._k + 1
+            self._k += max(1, passed)
 
     def _period(self, policy: Policy, keys: StopKeys | None) -> None:
         """Look for stops, read, check, send, record. After any error in it the robot damps."""
-        state = sent = None
+        state = None
+        sent = None
         try:
             self._look_for_stops(keys)
             state, fault = self._read()
@@ -240,12 +245,17 @@ class Controller:
         if phase is Phase.DAMP:
             self._damp()
         if state:
-            target, ctrl = sent or (None, None)
-            self.recording.rows.append(Row(self._now, phase.value, target, ctrl, state))
-            full = self.recording.rows.error
-            if full and not self._reported_full_disk:
-                self._reported_full_disk = True
-                self._note(f"nothing more is recorded ({full.strerror}); what was written is kept")
+            self._record(phase, state, sent)
+
+    def _record(self, phase: Phase, state: State, sent: tuple[Array, Array] | None) -> None:
+        """Append a row; sent: target and command, (n) rad each, if there was one."""
+        target, ctrl = sent or (None, None)
+        rows = self.recording.rows
+        rows.append(Row(self._now, phase.value, target, ctrl, state))
+        if rows.error and not self._reported_full_disk:
+            self._reported_full_disk = True
+            reason = rows.error.strerror
+            self._note(f"nothing more is recorded ({reason}); what was written is kept")
 
     def _look_for_stops(self, keys: StopKeys | None) -> None:
         """Request a stop if a key was pressed, or if the watchdog could not damp the robot."""
@@ -257,25 +267,30 @@ class Controller:
 
     def _read(self) -> tuple[State | None, Fault | None]:
         """Return the newest state, and the fault that stops the robot now."""
-        state = fault = None
+        state = None
         try:
             state = self.driver.read()
         except (DriverError, OSError) as error:
-            fault = Fault("driver", str(error))
-        if state:
-            # While the robot is let go no joint must follow.
-            ctrl = None if self.recording.disobedience else self.output.ctrl
-            requested = None if ctrl is None else self.output.expected()
-            late = self._now - self.output.due
-            fault = self.monitor.check(self._now, state, ctrl, late, requested)
-            if self.phase in MOVING:
-                fault = fault or self.following.check(state, self.output)
-            elif self.phase is Phase.IDLE and (fault is None or fault.kind != "stop"):
-                self.readiness.count(fault)
-                fault = None
+            fault: Fault | None = Fault("driver", str(error))
+        else:
+            fault = self._check(state)
         if self.stop.reason:
             return state, Fault("stop", f"asked to stop: {self.stop.reason}")
         return state, self.output.suspended() or fault
+
+    def _check(self, state: State) -> Fault | None:
+        """Return what is wrong with a state; while the robot is idle only readiness hears of it."""
+        # While the robot is let go no joint must follow.
+        ctrl = None if self.recording.disobedience else self.output.ctrl
+        requested = None if ctrl is None else self.output.expected()
+        late = self._now - self.output.due
+        fault = self.monitor.check(self._now, state, ctrl, late, requested)
+        if self.phase in MOVING:
+            return fault or self.following.check(state, self.output)
+        if self.phase is Phase.IDLE and (fault is None or fault.kind != "stop"):
+            self.readiness.count(fault)
+            return None
+        return fault
 
     def _start(self, state: State, policy: Policy) -> None:
         """Leave idle if the robot may be commanded."""
@@ -311,9 +326,7 @@ class Controller:
         left = self.output.damping_left(self._now)
         try:
             self.output.damp(left)
-        except (
-            Exception
-        ) as error:  # of any kind: damp again in the next period, raise it at the end
+        except Exception as error:  # of any kind: damp again next period, raise it at the end
             if not isinstance(error, DriverError | OSError):
                 self._error = self._error or error
             if not any(e.text == str(error) for e in self.recording.events):
@@ -377,8 +390,6 @@ class Controller:
         self.recording.events.append(event)
         try:
             self._on_event(event)
-        except (
-            Exception
-        ) as error:  # the caller's code may raise anything: damp, raise it at the end
+        except Exception as error:  # the caller's code: damp, raise it at the end
             self._error = self._error or error
             self.stop(f"its listener failed: {error}")

@@ -10,10 +10,10 @@ from gaponet.hw.control.output import Context, Output
 from gaponet.sim.dynamics import static_torque
 from gaponet.sim.model import build_model
 
-# time constant of the reference servo with which joints are compared; slower than any real one
+# Time constant of the reference servo with which joints are compared; slower than any real one.
 REFERENCE_LAG_S = 0.15
 STRIDE_RAD = 0.05  # way of the reference after which a joint must have moved along
-# span of the reference without that; friction was seen to hold a joint in a band of 0.14 rad
+# Span of the reference without that; friction was seen to hold a joint in a band of 0.14 rad.
 MAX_UNFOLLOWED_RAD = 0.25
 MIN_PUSH_SHARE = 0.5  # of its effort limit with which a joint counts as pushing …
 MIN_LOAD_SHARE = 0.5  # … if gravity alone requires at least this share of MIN_PUSH_SHARE
@@ -34,11 +34,15 @@ class FollowingMonitor:
         self.shown = np.zeros(len(context.joints), bool)
         self._model = build_model(robot, context.payload_mass or 0.0) if self.share else None
         self._reference: Array | None = None
-        # Ends of the reference's current stride and the joint's position at them; span of the
-        # reference without a followed stride.
-        self._low, self._high, self._qpos_low, self._qpos_high, self._span_low, self._span_high = (
-            np.zeros((6, len(self.shown)))
-        )
+        none = np.zeros(len(self.shown))
+        # Ends of the reference's current stride, and the joint's position at them, rad.
+        self._low = none
+        self._high = none
+        self._qpos_low = none
+        self._qpos_high = none
+        # Span of the reference without a followed stride, rad.
+        self._span_low = none
+        self._span_high = none
         self._state_time = -np.inf
 
     def check(self, state: State, output: Output) -> Fault | None:
@@ -54,27 +58,12 @@ class FollowingMonitor:
         limit = output.limits.effort / self.context.safety.torque_share
         command = output.expected()
         qpos = state.qpos[joints]
-        if self._reference is None:
-            self._reference = command.copy()
-            self._low, self._high, self._span_low, self._span_high = (
-                command.copy() for _ in range(4)
-            )
-            self._qpos_low = qpos.copy()
-            self._qpos_high = qpos.copy()
-        reference = self._reference + (command - self._reference) * min(
-            1.0, self.context.dt / REFERENCE_LAG_S
-        )
-        self._reference = reference
-        lower = reference < self._low
-        higher = reference > self._high
-        self._low = np.where(lower, reference, self._low)
-        self._qpos_low = np.where(lower, qpos, self._qpos_low)
-        self._high = np.where(higher, reference, self._high)
-        self._qpos_high = np.where(higher, qpos, self._qpos_high)
+        reference = self._move_reference(command, qpos)
+        self._extend_stride(reference, qpos)
         up = reference - self._low >= STRIDE_RAD
         down = self._high - reference >= STRIDE_RAD
+        done = up | down  # joints whose reference has made a stride
         distance = np.where(up, qpos - self._qpos_low, self._qpos_high - qpos)
-        done = up | down
         side = np.sign(command - qpos)
         pushes = state.tau[joints] / limit * side >= MIN_PUSH_SHARE
         if (done & pushes).any():
@@ -84,12 +73,42 @@ class FollowingMonitor:
         self.shown |= follows & ~pushes
         self._span_low = np.where(follows, reference, np.minimum(self._span_low, reference))
         self._span_high = np.where(follows, reference, np.maximum(self._span_high, reference))
-        for edge in (self._low, self._high):
-            edge[done] = reference[done]
-        for position in (self._qpos_low, self._qpos_high):
-            position[done] = qpos[done]
+        self._begin_stride(done, reference, qpos)
         unresponsive = self._span_high - self._span_low >= MAX_UNFOLLOWED_RAD
         return self.fault(int(unresponsive.argmax())) if unresponsive.any() else None
+
+    def _move_reference(self, command: Array, qpos: Array) -> Array:
+        """Move the reference towards the command by a period; return it, rad.
+
+        The first command is where the reference begins.
+        """
+        if self._reference is None:
+            self._reference = command.copy()
+            self._low = command.copy()
+            self._high = command.copy()
+            self._span_low = command.copy()
+            self._span_high = command.copy()
+            self._qpos_low = qpos.copy()
+            self._qpos_high = qpos.copy()
+        share = min(1.0, self.context.dt / REFERENCE_LAG_S)
+        self._reference = self._reference + (command - self._reference) * share
+        return self._reference
+
+    def _extend_stride(self, reference: Array, qpos: Array) -> None:
+        """Let the present stride reach to the reference, if it passes one of its ends."""
+        lower = reference < self._low
+        higher = reference > self._high
+        self._low = np.where(lower, reference, self._low)
+        self._qpos_low = np.where(lower, qpos, self._qpos_low)
+        self._high = np.where(higher, reference, self._high)
+        self._qpos_high = np.where(higher, qpos, self._qpos_high)
+
+    def _begin_stride(self, joints: Array, reference: Array, qpos: Array) -> None:
+        """Begin the next stride of these joints, (n) bool, at the reference."""
+        self._low[joints] = reference[joints]
+        self._high[joints] = reference[joints]
+        self._qpos_low[joints] = qpos[joints]
+        self._qpos_high[joints] = qpos[joints]
 
     def fault(self, joint: int) -> Fault:
         """Return the fault of a joint that does not follow."""

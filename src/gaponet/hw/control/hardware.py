@@ -26,9 +26,8 @@ ROBOT_OF_DRIVER = {"unitree": "h1_2", "so101": "so101"}
 # of an identified command offset; a larger one is a wrong zero, which calibration removes
 MAX_OFFSET_RAD = 0.1
 KP_RATIO_BOUNDS = (0.25, 4.0)  # of identified kp to nominal kp
-# of the effort limit, for identified masses; postures in which they are compared
-MAX_WEIGHT_SHARE = 0.5
-POSTURES = 64
+MAX_WEIGHT_SHARE = 0.5  # of the effort limit, that identified masses may weigh on a joint
+POSTURES = 64  # in which identified masses are weighed
 RELATIVE_TOLERANCE = 1e-6  # between values of two files
 RANGE_TOLERANCE_RAD = 1e-6  # between joint ranges of two files
 MAX_KP = 300.0  # N·m/rad of any joint; the H1-2's legs have 200

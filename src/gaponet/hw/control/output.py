@@ -19,7 +19,7 @@ from gaponet.robot.spec import RobotSpec
 
 MAX_BEYOND_RANGE_RAD = 0.05  # at the start, where only the MJCF says where a joint's range ends
 MAX_SEND_DELAY_S = 0.001  # between the last reading of the clock and the sending of a command
-# less than any suspend, more than two clocks that are read in turn differ by
+# Less than any suspend, more than two clocks that are read in turn differ by.
 MAX_SUSPENDED_S = 0.05
 
 
@@ -67,12 +67,17 @@ class Output:
         self.monitor = monitor
         self.watchdog: Watchdog | None = None
         self.limits = self.servo_limits()
-        self.due = self.suspended_before = 0.0
-        self._start = self._requested = self._delta = np.zeros(len(context.joints))
+        self.due = 0.0
+        self.suspended_before = 0.0
+        at_rest = np.zeros(len(context.joints))
+        self._start = at_rest
+        self._requested = at_rest
+        self._delta = at_rest  # last correction of the target
         self.ctrl: Array | None = None
         self.weight: float | None = None
         self.damping_since: float | None = None
-        self.unconfirmed = self._lower = False
+        self.unconfirmed = False
+        self._lower = False
 
     def servo_limits(self) -> Limits:
         """Return the limits with gains and ranges of the driver's servos."""
@@ -122,7 +127,10 @@ class Output:
 
     def begin(self, qpos: Array) -> None:
         """Take the measured position, (n) rad, as the command in force."""
-        self._start = self._requested = self.ctrl = qpos[self.context.joints]
+        at = qpos[self.context.joints]
+        self._start = at
+        self._requested = at
+        self.ctrl = at
 
     def expected(self) -> Array:
         """Return where the joints are requested to be, rad, as far as the robot is handed over.
@@ -141,7 +149,8 @@ class Output:
         context = self.context
         limits = self.limits
         joints = self.context.joints
-        full = corrected = state.qpos_with(joints, target)
+        full = state.qpos_with(joints, target)
+        corrected = full
         if context.compensator:
             corrected = context.compensator.step(full, state.qpos, state.qvel)
         if not np.isfinite(target).all() or not np.isfinite(corrected[joints]).all():
@@ -161,29 +170,28 @@ class Output:
         context = self.context
         joints = self.context.joints
         before = self.ctrl
-        last_look = -np.inf
         q = state.qpos[joints]
         v = state.qvel[joints]
         assert before is not None
-        # before the command, so that it guards the first one too
+        # Before the command, so that the watchdog guards the first one too.
         if self.watchdog and not self.watchdog.beat(weight):
             return Fault("stop", "the watchdog ended")
+        last_look = -np.inf
         while (now := context.clock.now()) - last_look > MAX_SEND_DELAY_S:
             last_look = now
-            fault = self.monitor.overrun(now - self.due) or self.suspended()
-            if fault or (self.watchdog and self.watchdog.fired()):
-                return fault or Fault("overrun", "this process stood still")
-            out = limit_command(
-                ctrl, before, q, v, context.dt, self.limits, now + MAX_SEND_DELAY_S - state.time
-            )
+            fault = self._stood_still(now)
+            if fault:
+                return fault
+            age = now + MAX_SEND_DELAY_S - state.time  # of the state, when the command arrives, s
+            out = limit_command(ctrl, before, q, v, context.dt, self.limits, age)
         if not out.feasible.all():
             joint = context.driver.commanded[int(np.argmin(out.feasible))]
-            if limit_command(ctrl, before, q, v, context.dt, self.limits).feasible.all():
-                age = f"{(now - state.time) * 1e3:.0f} ms"
+            fresh = limit_command(ctrl, before, q, v, context.dt, self.limits)
+            if fresh.feasible.all():
                 return Fault(
                     "stale",
-                    f"the newest state is {age} old; no command is safe wherever {joint} can be "
-                    "by now",
+                    f"the newest state is {(now - state.time) * 1e3:.0f} ms old; no command is "
+                    f"safe wherever {joint} can be by now",
                 )
             return Fault("torque", f"{joint}: no command is within range, rate and torque")
         self.ctrl = out.ctrl
@@ -194,6 +202,15 @@ class Output:
         except (DriverError, OSError) as error:
             return Fault("driver", str(error))
         return full
+
+    def _stood_still(self, now: float) -> Fault | None:
+        """Return a fault if this period, the computer or this process stood still until now."""
+        fault = self.monitor.overrun(now - self.due) or self.suspended()
+        if fault:
+            return fault
+        if self.watchdog and self.watchdog.fired():
+            return Fault("overrun", "this process stood still")
+        return None
 
     def begin_damping(self, now: float, lower: bool) -> None:
         """Let `damp` begin now; lower: a robot that cannot brake is lowered, else its torque goes

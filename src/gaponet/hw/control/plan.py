@@ -184,7 +184,7 @@ class Planner:
         free = self.collision.along(goal[None])
         if (free < np.minimum(required, 0.0)).any():
             raise UsageError(f"the first target brings {self._describe(free)}")
-        # a goal within the clearance is not gone to entirely
+        # A goal within the clearance is not gone to entirely.
         shares = np.linspace(1.0, 0.0, GOAL_SHARES)[:, None]
         clear = (self.collision.distances(start + shares * (goal - start)) >= required).all(axis=1)
         goal = start + float(shares[int(clear.argmax()), 0]) * (goal - start)

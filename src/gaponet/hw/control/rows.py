@@ -192,7 +192,7 @@ class Rows:
             except OSError as error:
                 self.error = error
             self._written += done // size
-            # overwrites, which works on a full disk unless its file system copies
+            # Overwrites, which works on a full disk unless its file system copies.
             with suppress(OSError):
                 os.pwrite(descriptor, self._header(self._written), 0)
             self._pending.task_done()

@@ -378,9 +378,8 @@ class StateMonitor:
         self.noisy = noisy
         self._last: State | None = None
         self._last_ctrl: Array | None = None
-        # of all readings; rad of commands meanwhile
-        self._equal_states = 0
-        self._travel = np.zeros(len(commanded))
+        self._equal_states = 0  # states in a row whose readings are all equal
+        self._travel = np.zeros(len(commanded))  # way of the commands meanwhile, rad
         # Of joints whose position stands still: the command then, the integral of the velocity
         # since, states since.
         self._anchor: Array | None = None

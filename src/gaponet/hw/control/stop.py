@@ -72,9 +72,10 @@ class StopKeys:
             self._terminal = sys.stdin.fileno()
             self._settings_before = termios.tcgetattr(self._terminal)
             mode = termios.tcgetattr(self._terminal)
-            mode[0] &= ~(termios.IXON | termios.IGNCR)  # input flags
-            # local flags
-            mode[3] &= ~(termios.ICANON | termios.ECHO | termios.ISIG | termios.IEXTEN)
+            input_flags = termios.IXON | termios.IGNCR
+            local_flags = termios.ICANON | termios.ECHO | termios.ISIG | termios.IEXTEN
+            mode[0] &= ~input_flags
+            mode[3] &= ~local_flags
             mode[6][termios.VMIN] = 1
             mode[6][termios.VTIME] = 0
             # TCSANOW: keys typed before this count, and output that Ctrl-S holds back is not waited

@@ -26,16 +26,17 @@ from gaponet.motion.motion import blend
 from gaponet.motion.path_planner import Search, Trajectory
 
 MIN_GOOD_STATES = 5  # periods in a row without a fault before anything is commanded
-MAX_WAIT_S = 5.0  # for them
+MAX_WAIT_S = 5.0  # for so many good states
 NO_STATE = Fault("stale", "no fresh state")
 SEARCH_SHARE = 0.3  # of a period in which a search for a clear path is continued
-MAX_UNPROVEN_WEIGHT = 0.3  # until a joint has followed, where one goes …
-FAR_RAD = 0.4  # … this far to the first target: at that weight more than friction may hide
+# Weight until a joint has followed, where one goes FAR_RAD to the first target: at this weight that
+# is more than friction may hide.
+MAX_UNPROVEN_WEIGHT = 0.3
+FAR_RAD = 0.4
 FULL_WEIGHT = 1.0 - 1e-9
-# of the run, after which the estimated payload is compared with the stated one
+# Time of the run after which the estimated payload is compared with the stated one.
 PAYLOAD_CHECK_S = 2.0
-# by Driver.at_end
-END_TEXTS = {
+END_TEXTS = {  # by Driver.at_end
     "hand_over": "held while it is handed over",
     "hold": "hold",
     "damp": "damp",
@@ -63,64 +64,80 @@ class Readiness:
 
     def count(self, fault: Fault | None) -> None:
         """Count a state; a fault begins anew."""
-        self._good_states, self._fault = (0, fault) if fault else (self._good_states + 1, NO_STATE)
+        if fault:
+            self._good_states = 0
+            self._fault = fault
+        else:
+            self._good_states += 1
+            self._fault = NO_STATE
 
     def first_target(self, now: float, state: State, policy: Policy) -> Array | Fault | None:
-        """Return the first target, (n) rad, if the robot may go there now; None: wait; a fault: it
-        may not.
+        """Return the first target, (n) rad, if the robot may go there now.
+
+        None: wait. A fault: the robot may not go there.
         """
-        compensator = self.context.compensator
-        planner = self.context.planner
+        waits_too_long = now - self.since > MAX_WAIT_S
         if self._good_states < MIN_GOOD_STATES:
-            never = Fault(self._fault.kind, f"never ready: {self._fault.text}")
-            return never if now - self.since > MAX_WAIT_S else None
-        # takes longer than a period; then wait for fresh states again
-        if compensator and not self._prepared:
-            compensator.reset(state.qpos, self.context.payload_mass)
-            self._prepared = True
-            self._good_states = 0
+            if waits_too_long:
+                return Fault(self._fault.kind, f"never ready: {self._fault.text}")
+            return None
+        if not self._prepared:
+            self._prepare(state)
             return None
         first = policy(0, state)
         if isinstance(first, NotYet):
             self.since = now  # all else is well
             return None
-        if isinstance(first, Fault):  # senders of live targets wait while it plans
-            waits = first.kind == "silence" and self.plan and now - self.since <= MAX_WAIT_S
-            return None if waits else first
+        if isinstance(first, Fault):
+            # Senders of live targets wait while the robot plans.
+            is_planning = first.kind == "silence" and self.plan and not waits_too_long
+            return None if is_planning else first
         if first is None or not np.isfinite(first[self.context.joints]).all():
             return Fault("target", "the motion has no first target, or it is not a number")
         before = self.plan
         fault = self._update_plan(first, state, now) or self.output.admit(state.qpos)
-        if fault or (planner and (before is None or self.plan is not before)):
+        if fault:
             return fault
+        plan_is_new = before is None or self.plan is not before
+        if self.context.planner and plan_is_new:
+            return None  # planning took time: look at a fresh state
         return first
 
+    def _prepare(self, state: State) -> None:
+        """Prepare the compensator. This takes longer than a period: fresh states must follow."""
+        if self.context.compensator:
+            self.context.compensator.reset(state.qpos, self.context.payload_mass)
+        self._prepared = True
+        self._good_states = 0
+
     def _update_plan(self, first: Array, state: State, now: float) -> Fault | None:
-        """Let a plan begin where the robot is, if there is a planner; this may take several
-        periods.
+        """Let a plan begin where the robot is, if there is a planner.
+
+        The search may take several periods.
         """
+        context = self.context
         if self.plan is not None:
-            moved = np.abs(state.qpos - self.plan.start)[self.context.joints]
-            joint = self.context.driver.commanded[int(moved.argmax())]
+            moved = np.abs(state.qpos - self.plan.start)[context.joints]
             if moved.max() <= MAX_START_DRIFT_RAD:
                 return None
             if self.plan.motion is not None:
+                joint = context.driver.commanded[int(moved.argmax())]
                 return Fault(
                     "plan",
                     f"{joint} moved by {moved.max():.2f} rad since the plan was made; run it again",
                 )
             self.plan = None
-        if self.context.planner is not None:
-            self._search = self._search or self.context.planner.begin(first, state.qpos)
-            try:
-                self.plan = advance(
-                    self._search, self.context.clock, SEARCH_SHARE * self.context.dt
-                )
-            except UsageError as error:
-                return Fault("plan", str(error))
-            if self.plan:
-                self._search = None
-            self.since = now
+        if context.planner is None:
+            return None
+        if self._search is None:
+            self._search = context.planner.begin(first, state.qpos)
+        try:
+            self.plan = advance(self._search, context.clock, SEARCH_SHARE * context.dt)
+        except UsageError as error:
+            return Fault("plan", str(error))
+        if self.plan:
+            self._search = None
+        self.since = now
         return None
 
 
@@ -155,19 +172,21 @@ class TargetGenerator:
         self.context = context
         self.following = following
         self.plan = plan
-        self.start = self._last = self._origin = state.qpos[context.joints]
-        self.path = (
-            plan.approach if plan else self._straight(self.start, first[context.joints], state)
-        )
-        live = context.planner and plan and plan.motion is None
-        self._guard = (
-            CollisionGuard(context.planner, state.qpos) if context.planner and live else None
-        )
+        self.start = state.qpos[context.joints]
+        self._last = self.start
+        self._origin = self.start  # of the way back
+        if plan:
+            self.path = plan.approach
+        else:
+            self.path = self._straight(self.start, first[context.joints], state)
+        self._guard: CollisionGuard | None = None
+        if context.planner and plan and plan.motion is None:  # targets are live
+            self._guard = CollisionGuard(context.planner, state.qpos)
         self._search: Search[Trajectory] | None = None  # for the way back
         self._back_since = 0  # period of blend_out in which the way back began
-        self.weight = self._handed = self._progress = (
-            0.0  # weights; s on the path to the first target
-        )
+        self.weight = 0.0
+        self._handed = 0.0  # weight that was reached before the run
+        self._progress = 0.0  # s on the path to the first target
         self._obstacle = ""
         self._checked_payload = False
         self.remarks: list[str] = []
@@ -193,17 +212,19 @@ class TargetGenerator:
         planner = self.context.planner
         joints = self.context.joints
         self._origin = self._last
-        self.path = (self.plan and self.plan.retreat) or self._straight(
-            self._last, self.start, state
-        )
+        retreat = self.plan.retreat if self.plan else None
+        self.path = retreat or self._straight(self._last, self.start, state)
         if self._guard and planner:
             self._guard.allow_start_clearance()
-            ends = state.qpos_with(joints, self._last), state.qpos_with(joints, self.start)
-            self._search = planner.back(*ends) if self.context.dt >= MIN_SEARCH_PERIOD_S else None
+            self._search = None
+            if self.context.dt >= MIN_SEARCH_PERIOD_S:
+                last = state.qpos_with(joints, self._last)
+                start = state.qpos_with(joints, self.start)
+                self._search = planner.back(last, start)
 
     def _blend_in(self, state: State, policy: Policy) -> Array | PhaseChange | Fault:
+        """Go to the first target, and raise the weight to 1."""
         config = self.context.config
-        dt = self.context.dt
         following = self.following
         arrived = self._progress >= self.path.duration + config.settle
         if arrived and self._handed > FULL_WEIGHT:
@@ -213,19 +234,24 @@ class TargetGenerator:
         if isinstance(first, Fault):
             return first
         goal = self.start if first is None else first[self.context.joints]
-        far = np.abs(goal - self.start)
-        unproven = bool(following.share) and far.max() >= FAR_RAD and not following.shown.any()
+        distance = np.abs(goal - self.start)
+        is_far = distance.max() >= FAR_RAD
+        unproven = bool(following.share) and is_far and not following.shown.any()
         if unproven and arrived:
-            return following.fault(int(far.argmax()))
+            return following.fault(int(distance.argmax()))
         self._last = self._on_path(self._progress, self.start, goal)
-        max_weight = MAX_UNPROVEN_WEIGHT if unproven else 1.0
-        self._handed = max(self._handed, min(self._handed + dt / config.blend, max_weight))
+        self._hand_over(MAX_UNPROVEN_WEIGHT if unproven else 1.0)
         partly = self.context.driver.at_end == "hand_over" and self._handed < FULL_WEIGHT
         # While it is handed over joints lag, each in its own way: the target stands meanwhile.
-        if unproven or not (partly and far.max() >= FAR_RAD):
-            self._progress += dt
-        self.weight = self._handed
+        if unproven or not (partly and is_far):
+            self._progress += self.context.dt
         return self._last
+
+    def _hand_over(self, max_weight: float) -> None:
+        """Raise the weight by a period of the blend, up to max_weight; never lower it."""
+        step = self.context.dt / self.context.config.blend
+        self._handed = max(self._handed, min(self._handed + step, max_weight))
+        self.weight = self._handed
 
     def _take_remarks(self, policy: Policy) -> None:
         """Take over what a policy has to remark; only that of live targets has remarks."""
@@ -241,8 +267,9 @@ class TargetGenerator:
             return target
         if not self._checked_payload and n * self.context.dt >= PAYLOAD_CHECK_S:
             self._checked_payload = True
-            # not every compensator estimates the payload
-            if doubt := getattr(self.context.compensator, "doubt", ""):
+            # Not every compensator estimates the payload.
+            doubt = getattr(self.context.compensator, "doubt", "")
+            if doubt:
                 self.remarks.append(f"compensation: {doubt}")
         if target is not None:
             self._last = np.array(target[self.context.joints], float)
@@ -287,9 +314,8 @@ class TargetGenerator:
         """Return the target as far as limbs and plane leave the way free."""
         joints = self.context.joints
         guard.qpos = state.qpos_with(joints, guard.qpos[joints])
-        self._last = guard.step(state.qpos_with(joints, target), state.qpos, self.context.dt)[
-            joints
-        ]
+        wanted = state.qpos_with(joints, target)
+        self._last = guard.step(wanted, state.qpos, self.context.dt)[joints]
         if guard.obstacle and guard.obstacle != self._obstacle:
             self.remarks.append(f"targets are cut: {guard.obstacle} would come too near")
         self._obstacle = guard.obstacle or self._obstacle

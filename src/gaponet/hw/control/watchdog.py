@@ -25,15 +25,13 @@ from gaponet.base import child_process
 from gaponet.hw.control.driver import Driver, DriverError
 
 RELEASE = b"\xff"  # from the controller: it has stopped, and the watchdog ends
-# from the watchdog
-READY = b"\x01"
+READY = b"\x01"  # from the watchdog, as the next two
 ANSWER = b"\x02"
 FIRED = b"\x03"
 WEIGHT_STEPS = 200  # a heartbeat is the weight in steps of 1/200
 MAX_RETRY_S = 600.0  # for which it tries to damp a robot that does not confirm it
-# between two messages, and after a message that failed
-DAMP_INTERVAL_S = 0.01
-RETRY_INTERVAL_S = 0.1
+DAMP_INTERVAL_S = 0.01  # between two damping messages
+RETRY_INTERVAL_S = 0.1  # after a damping message that failed
 READY_TIMEOUT_S = 20.0
 END_TIMEOUT_S = 5.0
 

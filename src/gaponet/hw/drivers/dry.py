@@ -23,7 +23,7 @@ class DryRun:
     def __init__(self, driver: Driver) -> None:
         """Take the driver of the robot, which must publish nothing when it connects."""
         self.driver = driver
-        # the same lock: a serial bus has one master, also one that only reads
+        # The same lock: a serial bus has one master, also one that only reads.
         self.address = driver.address
         self.joint_names = driver.joint_names
         self.commanded = driver.commanded

@@ -24,7 +24,7 @@ WRITE = 3
 SYNC_READ = 0x82
 SYNC_WRITE = 0x83
 BROADCAST = 0xFE
-# status bits; bit 4: torque is on
+# Meaning of the status bits; bit 4 says that the torque is on.
 ERRORS = (
     "voltage",
     "angle sensor",
@@ -199,35 +199,46 @@ class ServoBus:
         An adapter with one wire for both directions echoes the request, which is then skipped.
         """
         replies: dict[int, bytes] = {}
-        # bytes
         data = b""
-        patience = MAX_BYTES_RATIO * (expected + 6) * len(servos)
+        reply_bytes = expected + 6
+        patience = MAX_BYTES_RATIO * reply_bytes * len(servos)  # bytes
         silent = time.monotonic() + self.timeout
         while len(replies) < len(servos) and patience > 0:
-            more = self.stream.read(
-                max(1, (len(servos) - len(replies)) * (expected + 6) - len(data))
-            )
+            wanted = (len(servos) - len(replies)) * reply_bytes - len(data)
+            more = self.stream.read(max(1, wanted))
             if more:
                 silent = time.monotonic() + self.timeout
             elif time.monotonic() >= silent:
                 break
-            data = data + more
-            patience = patience - len(more)
-            while (start := data.find(b"\xff\xff")) >= 0 and len(data) >= start + 6:
-                body = data[start + 2 : start + 4 + data[start + 3]]
-                if not 2 <= data[start + 3] <= MAX_REPLY_BYTES:
-                    data = data[start + 1 :]
-                elif len(body) < 2 + body[1]:
-                    break
-                elif checksum(body[:-1]) != body[-1]:
-                    self.refused += body[0] in servos
-                    data = data[start + 1 :]  # the next packet may begin within the damaged one
-                elif body == request[2:]:
-                    data = data[start + len(request) :]
-                else:
-                    data = data[start + 2 + len(body) :]
-                    self._count_foreign(body)
-                    self.errors[body[0]] = self.errors.get(body[0], 0) | body[2]
-                    if body[0] in servos and body[1] - 2 in sizes:
-                        replies[body[0]] = body[3:-1]
+            patience -= len(more)
+            bodies, data = self._intact_bodies(data + more, servos)
+            for body in bodies:
+                if body == request[2:]:
+                    continue
+                self._count_foreign(body)
+                servo = body[0]
+                self.errors[servo] = self.errors.get(servo, 0) | body[2]
+                if servo in servos and body[1] - 2 in sizes:
+                    replies[servo] = body[3:-1]
         return replies
+
+    def _intact_bodies(self, data: bytes, servos: list[int]) -> tuple[list[bytes], bytes]:
+        """Return the intact packets in some bytes, without FF FF, and the bytes that are left.
+
+        What is left may be the beginning of a packet.
+        """
+        bodies = []
+        while (start := data.find(b"\xff\xff")) >= 0 and len(data) >= start + 6:
+            length = data[start + 3]
+            body = data[start + 2 : start + 4 + length]
+            if not 2 <= length <= MAX_REPLY_BYTES:
+                data = data[start + 1 :]
+            elif len(body) < 2 + length:
+                break
+            elif checksum(body[:-1]) != body[-1]:
+                self.refused += body[0] in servos
+                data = data[start + 1 :]  # the next packet may begin within the damaged one
+            else:
+                bodies.append(body)
+                data = data[start + 2 + len(body) :]
+        return bodies, data

@@ -137,7 +137,7 @@ class Message:
         highest bit first.
         """
         ordered = np.append(data, np.uint8(0))[self._gather]
-        # zlib's is the same with all bits mirrored
+        # Zlib's is the same with all bits mirrored.
         mirrored = zlib.crc32(MIRRORED_BYTES[ordered].tobytes()) ^ 0xFFFFFFFF
         return int(f"{mirrored:032b}"[::-1], 2)
 

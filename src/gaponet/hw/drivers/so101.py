@@ -47,7 +47,7 @@ except ImportError:  # Windows, where only one program can open a port
     PORT_ERRORS: tuple[type[Exception], ...] = (OSError,)
     EXCLUSIVE = SHARED = 0
 else:
-    # pyserial's own errors are OSErrors; a removed port also raises the other
+    # Pyserial's own errors are OSErrors; a removed port also raises the other.
     PORT_ERRORS = (
         OSError,
         termios.error,
@@ -91,6 +91,11 @@ LIMITS = {
     "goal_velocity": reg.GOAL_VELOCITY,
     "torque_limit": reg.TORQUE_LIMIT,
 }
+UNUSUAL_SETTINGS = (  # setting, usual value, what another value means
+    ("i", 0, "I is not 0: limits and simulator do not contain an integrator"),
+    ("torque_limit", FULL_TORQUE, "the torque limit is below 100 %"),
+    ("goal_velocity", 0, "the servo limits its speed"),
+)
 READINGS = {
     "qpos": reg.PRESENT_POSITION,
     "qvel": reg.PRESENT_VELOCITY,
@@ -163,9 +168,8 @@ class SO101Driver:
         self._torque_on: set[int] = set()  # servos that have reported it
         self._mismatches: Counter[tuple[str, int]] = Counter()
         self._settings: dict[int, dict[str, int]] = {}  # at the start, by servo
-        # servo whose settings were read last, and when, s
-        self._settings_index = 0
-        self._settings_time = 0.0
+        self._settings_index = 0  # servo whose settings were read last
+        self._settings_time = 0.0  # when they were read, s
         self._disobedience: Fault | None = None
         self._goals_before: set[int] = set()  # that the servos held when they were found
         self._goals_sent: deque[set[int]] = deque(maxlen=REMEMBERED_GOALS)
@@ -227,7 +231,7 @@ class SO101Driver:
         """Let other programs open the port (SHARED), or not (EXCLUSIVE); who has it open, as our
         watchdog, keeps it.
         """
-        # a port without a descriptor, or removed
+        # A port without a descriptor, or removed.
         with contextlib.suppress(*PORT_ERRORS, AttributeError, ValueError):
             if mode:
                 fcntl.ioctl(self._serial.fileno(), mode)  # type: ignore[union-attr]
@@ -253,30 +257,12 @@ class SO101Driver:
         """
         servos = self.arm.servos
         numbers = dict(zip(self.joint_names, servos, strict=True))
-        settings, running = (bus.sync_read(servos, block) for block in (reg.SETTINGS, reg.RUNNING))
+        settings = bus.sync_read(servos, reg.SETTINGS)
+        running = bus.sync_read(servos, reg.RUNNING)
         for joint, servo in numbers.items():
-            if servo not in settings or servo not in running:
-                raise DriverError(
-                    f"{self.port}: servo {servo} ({joint}) does not answer; check power and cable"
-                )
-            model, mode = (
-                register.value_in(reg.SETTINGS, settings[servo])
-                for register in (reg.MODEL, reg.MODE)
-            )
-            if model != reg.STS3215 or mode != 0:
-                raise DriverError(
-                    f"{self.port}: servo {servo} ({joint}) is model {model} in mode {mode}; the "
-                    f"driver needs an STS3215 ({reg.STS3215}) in position mode (0)"
-                )
+            self._require_sts3215(joint, servo, settings, running)
         self._settings = {servo: _settings(settings[servo]) for servo in servos}
-        stored = {
-            joint: ServoRow(
-                id=servo,
-                drive_mode=0,
-                **{name: self._settings[servo][name] for name in CALIBRATION},
-            )
-            for joint, servo in numbers.items()
-        }
+        stored = {joint: self._stored_calibration(servo) for joint, servo in numbers.items()}
         self.arm = resolve_calibration(self.file_calibration, stored, self.robot, self.port)
         self.qpos_range = self.arm.qpos_range
         servo_facts = {name: [self._settings[servo][name] for servo in servos] for name in GAINS}
@@ -294,31 +280,46 @@ class SO101Driver:
             "remarks": self._remarks(servo_facts),
         }
 
+    def _require_sts3215(
+        self, joint: str, servo: int, settings: dict[int, bytes], running: dict[int, bytes]
+    ) -> None:
+        """Refuse a servo that did not answer, or is of another model or in another mode."""
+        where = f"{self.port}: servo {servo} ({joint})"
+        if servo not in settings or servo not in running:
+            raise DriverError(f"{where} does not answer; check power and cable")
+        model = reg.MODEL.value_in(reg.SETTINGS, settings[servo])
+        mode = reg.MODE.value_in(reg.SETTINGS, settings[servo])
+        if model != reg.STS3215 or mode != 0:
+            raise DriverError(
+                f"{where} is model {model} in mode {mode}; the driver needs an STS3215 "
+                f"({reg.STS3215}) in position mode (0)"
+            )
+
+    def _stored_calibration(self, servo: int) -> ServoRow:
+        """Return the calibration that a servo stores."""
+        stored = {name: self._settings[servo][name] for name in CALIBRATION}
+        return ServoRow(id=servo, drive_mode=0, **stored)
+
     def _remarks(self, facts: dict[str, list[int]]) -> list[str]:
         """Return how the servos' settings differ from the robot's, in sentences."""
         notes = []
         nominal = self._nominal.kp
-        odd = [
-            (j, p, kp, k)
-            for j, p, kp, k in zip(self.joint_names, facts["p"], self.kp, nominal, strict=True)
-            if abs(kp - k) > RELATIVE_KP_TOLERANCE * k
-        ]
-        if odd:
-            joints = "all joints" if len(odd) == len(nominal) else ", ".join(j for j, *_ in odd)
-            _, p, kp, k = odd[0]
+        odd = np.flatnonzero(np.abs(self.kp - nominal) > RELATIVE_KP_TOLERANCE * nominal)
+        if odd.size:
+            joints = ", ".join(self.joint_names[i] for i in odd)
+            if odd.size == len(nominal):
+                joints = "all joints"
+            first = odd[0]
             notes.append(
-                f"P of {joints} is {p}, about {kp:.3g} N·m/rad, robot.toml says {k:.3g}; "
-                "limits and recordings use what the servos have"
+                f"P of {joints} is {facts['p'][first]}, about {self.kp[first]:.3g} N·m/rad, "
+                f"robot.toml says {nominal[first]:.3g}; limits and recordings use what the servos "
+                "have"
             )
-        for name, usual, what in (
-            ("i", 0, "I is not 0: limits and simulator do not contain an integrator"),
-            ("torque_limit", FULL_TORQUE, "the torque limit is below 100 %"),
-            ("goal_velocity", 0, "the servo limits its speed"),
-        ):
-            joints = ", ".join(
-                j for j, x in zip(self.joint_names, facts[name], strict=True) if x != usual
-            )
-            notes += [f"{joints}: {what}"] if joints else []
+        for name, usual, what in UNUSUAL_SETTINGS:
+            values = zip(self.joint_names, facts[name], strict=True)
+            joints = ", ".join(joint for joint, value in values if value != usual)
+            if joints:
+                notes.append(f"{joints}: {what}")
         return notes
 
     def read(self) -> State:
@@ -398,29 +399,32 @@ class SO101Driver:
         wrong: list[tuple[int, str]] = []
         for i, (servo, block) in enumerate(blocks.items()):
             if self._goal is not None:
-                on, goal = (
-                    register.value_in(reg.RUNNING, block)
-                    for register in (reg.TORQUE_ENABLE, reg.GOAL_POSITION)
-                )
-                if on:
-                    self._torque_on.add(servo)
-                sent = self._goal[servo]
-                if not on and (servo in self._torque_on or self._mismatch("torque", servo)):
-                    wrong.append(
-                        (servo, "its torque is off, though it was switched on: it has reset itself")
-                    )
-                elif goal == sent:
-                    self._mismatches["goal", servo] = 0
-                elif self._mismatch("goal", servo):
-                    wrong.append((servo, f"it holds the goal {goal}, not {sent} as it was told"))
+                what = self._check_goal(servo, self._goal[servo], block)
+                if what:
+                    wrong.append((servo, what))
             for name, register in LIMITS.items():
+                if name == "torque_limit" and self._goal is None:
+                    continue  # it may change until the first goal is sent
                 before = self.facts["servos"][name][i]
                 now = register.value_in(reg.RUNNING, block)
-                if now != before and not (name == "torque_limit" and self._goal is None):
-                    wrong.append(
-                        (servo, f"its {name.replace('_', ' ')} went from {before} to {now}")
-                    )
+                if now != before:
+                    what = f"its {name.replace('_', ' ')} went from {before} to {now}"
+                    wrong.append((servo, what))
         return self._disobedience_fault(wrong)
+
+    def _check_goal(self, servo: int, sent: int, block: bytes) -> str:
+        """Return what is wrong with torque or goal of a servo that was told a goal, or nothing."""
+        is_on = reg.TORQUE_ENABLE.value_in(reg.RUNNING, block)
+        goal = reg.GOAL_POSITION.value_in(reg.RUNNING, block)
+        if is_on:
+            self._torque_on.add(servo)
+        if not is_on and (servo in self._torque_on or self._mismatch("torque", servo)):
+            return "its torque is off, though it was switched on: it has reset itself"
+        if goal == sent:
+            self._mismatches["goal", servo] = 0
+        elif self._mismatch("goal", servo):
+            return f"it holds the goal {goal}, not {sent} as it was told"
+        return ""
 
     def _mismatch(self, what: str, servo: int) -> bool:
         """Count a reading that differs from what was sent; return True after more than lost
@@ -444,19 +448,14 @@ class SO101Driver:
         """Return a fault if gains, ranges or zeros have changed; a servo that does not answer has
         changed none.
         """
-        settings = bus.sync_read(servos, reg.SETTINGS, retries)
-        return self._disobedience_fault(
-            [
-                (
-                    servo,
-                    f"its {name.replace('_', ' ')} went from {self._settings[servo][name]} to "
-                    f"{value}",
-                )
-                for servo, data in settings.items()
-                for name, value in _settings(data).items()
-                if value != self._settings[servo][name]
-            ]
-        )
+        wrong = []
+        for servo, data in bus.sync_read(servos, reg.SETTINGS, retries).items():
+            for name, value in _settings(data).items():
+                before = self._settings[servo][name]
+                if value != before:
+                    what = f"its {name.replace('_', ' ')} went from {before} to {value}"
+                    wrong.append((servo, what))
+        return self._disobedience_fault(wrong)
 
     def _disobedience_fault(self, wrong: list[tuple[int, str]]) -> Fault | None:
         """Return the fault of servos and what is wrong with each, by joint; None if nothing is."""

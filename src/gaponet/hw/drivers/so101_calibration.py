@@ -17,7 +17,7 @@ from gaponet.robot.spec import RobotSpec
 
 STEPS_PER_TURN = 4096  # of an encoder
 STEP_RAD = 2 * np.pi / STEPS_PER_TURN
-# servo 1 to 6
+# Joints of servo 1 to 6.
 JOINTS = (
     "shoulder_pan",
     "shoulder_lift",
@@ -26,9 +26,8 @@ JOINTS = (
     "wrist_roll",
     "gripper",
 )
-# without stops; with its zero at a stop
-CONTINUOUS_JOINT = "wrist_roll"
-GRIPPER = "gripper"
+CONTINUOUS_JOINT = "wrist_roll"  # it has no stops
+GRIPPER = "gripper"  # its zero is at a stop
 USUAL_FILE = "~/.cache/huggingface/lerobot/calibration/robots/so_follower/ID.json"
 
 Position = Annotated[int, at.Interval(ge=0, le=STEPS_PER_TURN - 1)]

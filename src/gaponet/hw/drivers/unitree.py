@@ -56,16 +56,8 @@ MOTOR_NAMES = (
     *(f"{side}_{joint}_joint" for side in ("left", "right") for joint in ARM),
 )
 FIRST_MOTOR = {"arms": 13, "upper_body": 12, "all": 0}  # of the commanded ones
-# not all 0 in a slot with a motor
-MOTOR_FIELDS = (
-    "mode",
-    "q",
-    "dq",
-    "tau_est",
-    "temperature",
-    "vol",
-    "motorstate",
-)
+# Not all 0 in a slot with a motor.
+MOTOR_FIELDS = ("mode", "q", "dq", "tau_est", "temperature", "vol", "motorstate")
 STATES_TOPIC = "rt/lowstate"
 WEIGHT_MOTOR = 27
 # of damping: 8 N·m·s/rad at the shoulder, where a straight arm then sinks at about 1 rad/s
@@ -74,15 +66,8 @@ VIRTUAL_MARK = 0x54524956  # "VIRT" in LowState.reserve[0], written by our virtu
 TICK_PERIODS_S = (0.001, 0.002)  # that the robot's tick may have
 MAX_CLOCK_DRIFT = 2e-4  # of the robot's clock, relative to ours
 # mode_machine of a G1 (unitree_ros); 6 may be either, slots decide
-G1_MACHINES = (
-    1,
-    2,
-    3,
-    4,
-    5,
-    *range(10, 17),
-)
-# stop keys in bytes 2 and 3 of wireless_remote
+G1_MACHINES = (*range(1, 6), *range(10, 17))
+# Stop keys in bytes 2 and 3 of wireless_remote.
 SELECT = 1 << 3
 L2_B = 1 << 5 | 1 << 9
 MAX_QUATERNION_ERROR = 0.1  # of its length
@@ -162,15 +147,15 @@ class UnitreeDriver:
         self._at = robot.index(self.commanded)
         # As in Unitree's own arm_sdk example: with weight 1 the waist is ours, whether a motion
         # moves it or not.
-        held = [
-            n
-            for n in robot.joint_names
-            if n == "torso_joint" and n not in self.commanded and topic == "arm_sdk"
-        ]
+        held = []
+        if topic == "arm_sdk" and "torso_joint" not in self.commanded:
+            held.append("torso_joint")
         self._held = robot.index(held)
         self._held_qpos: Array | None = None  # of the held joints at the first command, rad
         self._command = hg.LowCmd.new()
-        self._refused = self.received = self._machine = 0
+        self._refused = 0  # messages
+        self.received = 0  # messages
+        self._machine = 0  # mode_machine
         # the first one that the robot reported; it may be in one message only
         self._fault: Fault | None = None
         self._state: State | None = None
@@ -337,9 +322,10 @@ class UnitreeDriver:
         q, dq, tau = (
             message.motors(data, name)[at].astype(float) for name in ("q", "dq", "tau_est")
         )
-        # case and winding
+        # Case and winding.
         temperature = message.motors(data, "temperature")[at].max(axis=1).astype(float)
-        _, x, y, _ = quaternion = message.view(data, "imu_state.quaternion").astype(float)
+        quaternion = message.view(data, "imu_state.quaternion").astype(float)
+        _, x, y, _ = quaternion
         # The vertical's component along the trunk; an invalid quaternion gives NaN, which counts as
         # tilt.
         valid = abs(np.linalg.norm(quaternion) - 1.0) < MAX_QUATERNION_ERROR

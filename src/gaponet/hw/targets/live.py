@@ -202,11 +202,10 @@ class LiveTargets:
         self._sender: Hashable | None = None
         self._joints: tuple[str, ...] = ()
         self._target: Array | None = None  # the last accepted one, all joints, rad
-        # on the way to the target, rad; the last step, rad
-        self._position = np.zeros(0)
-        self._step = np.zeros(0)
-        # least arrival − time, s; our time of the last update
-        self._offset = self._offset_time = np.inf
+        self._position = np.zeros(0)  # on the way to the target, rad
+        self._step = np.zeros(0)  # the last one, rad
+        self._offset = np.inf  # least arrival − time, s
+        self._offset_time = np.inf  # our time of its last update, s
         self._sender_time = -np.inf  # of the last accepted target, sender's clock
         self._start: float | None = None
         self._accepted_time = 0.0  # our time of the last accepted target
@@ -221,9 +220,12 @@ class LiveTargets:
         accepted for long.
         """
         now = self.clock.now()
-        self._start = now if self._start is None else self._start
+        if self._start is None:
+            self._start = now
         self.transport.publish(self._sender, self._published(state))
-        if not (self._ended and k > 0):
+        # Row 0 is also the goal of the blend: it is asked for again and again.
+        running = k > 0
+        if not (self._ended and running):
             unproven = self._target is None
             self._receive(now, state)
             if unproven and self._has_second_sender():
@@ -232,17 +234,9 @@ class LiveTargets:
                     f"more than one program sends targets to {self.transport.address}; end all "
                     "but one",
                 )
-        # row 0 is also the goal of the blend
-        ending = self._ended and (k > 0 or self._target is None)
         if self._target is None:
-            if ending:
-                return None
-            waited = now - self._start
-            kind = NotYet if waited < self.config.wait else Fault
-            return kind(
-                "silence",
-                f"no target came on {self.transport.address} in {waited:.0f} s{self._rejection}",
-            )
+            return None if self._ended else self._still_silent(now - self._start)
+        ending = self._ended and running
         silent = now - self._accepted_time
         if silent > self.config.hold and not ending:
             return Fault(
@@ -251,8 +245,17 @@ class LiveTargets:
         self._advance(self._target)
         if ending and not self._step.any():
             return None
-        self.counts["held"] += int(silent > 0 and not ending)
+        if silent > 0 and not ending:
+            self.counts["held"] += 1
         return self._position
+
+    def _still_silent(self, waited: float) -> Fault:
+        """Return why there is no first target after some s: not yet, or a fault."""
+        kind = NotYet if waited < self.config.wait else Fault
+        return kind(
+            "silence",
+            f"no target came on {self.transport.address} in {waited:.0f} s{self._rejection}",
+        )
 
     def close(self, reason: str) -> None:
         """Send the sender the reason why the run is over, and close the transport."""
@@ -298,25 +301,30 @@ class LiveTargets:
         since = now - self._accepted_time
         accepted = None
         for message in self.transport.receive():
+            target = None
             kind, why = self._reject(message, now)
-            target, kind, why = (
-                (None, kind, why) if kind else self._full_target(message, before, since, state)
-            )
+            if not kind:
+                target, kind, why = self._full_target(message, before, since, state)
             if kind:
-                if kind == "stranger" and not self.counts["refused"][kind]:
-                    self.remarks.append(
-                        f"targets of a second sender, {sender_name(message.sender)}, are rejected"
-                    )
-                self.counts["refused"][kind] += 1
-                self._rejection = f"; the last one was rejected: {why}"
+                self._count_rejection(message, kind, why)
             elif target is not None:
                 accepted = target
-                self._sender_time = message.time if message.time is not None else self._sender_time
+                if message.time is not None:
+                    self._sender_time = message.time
                 self.counts["taken"] += 1
         if accepted is not None:
             self._target = accepted
             self._accepted_time = now
             self._rejection = ""
+
+    def _count_rejection(self, message: Message, kind: str, why: str) -> None:
+        """Count a rejected message; remark on the first one of a second sender."""
+        if kind == "stranger" and not self.counts["refused"][kind]:
+            self.remarks.append(
+                f"targets of a second sender, {sender_name(message.sender)}, are rejected"
+            )
+        self.counts["refused"][kind] += 1
+        self._rejection = f"; the last one was rejected: {why}"
 
     def _reject(self, message: Message, now: float) -> tuple[str, str]:
         """Return kind and reason if sender or time of a message are wrong, else empty strings."""

@@ -82,7 +82,7 @@ class ROS2Transport:
         self._bus = dds.Bus(domain, interface)
         self._reader = self._bus.reader(topic, JointTrajectory, QUEUE_LENGTH)
         self._writer = self._bus.writer(states, JointState)
-        # decoding the first one takes long
+        # Decoding the first one takes long.
         point = JointTrajectoryPoint([0.0], [], [], [], Duration(0, 0))
         to_message("", encode(JointTrajectory(Header(Time(0, 0), ""), ["joint"], [point])))
 

@@ -265,7 +265,7 @@ def command(
     words = ["gaponet", "train", str(dataset), "--out", str(out), "--budget", limit]
     words += ["--robot", str(robot.folder)] if robot.nominal is not None else []
     words += ["--holdout-units", *holdout_units] if holdout_units else []
-    # the command's default is auto
+    # The command's default is auto.
     words += ["--model", "gaponet"] if config.model.kind == "gaponet" else []
     return shlex.join(words + config.options())
 

@@ -110,7 +110,7 @@ def _commanded(sequence: Sequence, delta: Array, op: Array) -> Sequence:
 
 
 HUBER_DELTA = 0.5  # in units of the RMS of the labels
-# if more are visited, the pool takes a part of the environments of each period, in turn
+# If more are visited, the pool takes a part of the environments of each period, in turn.
 MAX_POOL_STATES = 2_000_000
 
 
@@ -147,7 +147,7 @@ class Pretraining:
         self.optimiser = torch.optim.AdamW(
             self.parameters, lr=config.learning_rate, weight_decay=config.weight_decay
         )
-        # network and random numbers before the rollouts of each round
+        # Network and random numbers before the rollouts of each round.
         self.rollout_states: list[dict[str, Any]] = []
 
     @property
@@ -239,7 +239,7 @@ class Pretraining:
         net = self.net
         (x,) = self.pool_x
         (labels,) = self.pool_labels
-        # read after the last step
+        # Read after the last step.
         squares = torch.zeros(config.gradient_steps, dtype=torch.double, device=x.device)
         net.train()
         net.features.noise_std = config.noise

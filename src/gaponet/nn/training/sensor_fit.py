@@ -27,7 +27,7 @@ VELOCITY_NOISE_RAD_S = 0.3
 # R² on held-out states {"mean", "by_joint": {name: …}, "by_probe": […]}
 SensorReport = dict[str, Any]
 
-# origin of a state; 0 for one that was visited
+# Origin of a state; 0 for one that was visited.
 NEAR = 1
 RANDOM = 2
 
