@@ -3,12 +3,14 @@
 A package names them in its metadata, as entry points of one of three groups:
 
     gaponet.formats   a module that reads logs (gaponet.data.formats says what it has)
-    gaponet.drivers   a function (robot, **options) that returns a Driver (gaponet.hw.control.driver). `gaponet run`
-                      gives it those options of --help that are its parameters, such as port
-    gaponet.methods   a function that `gaponet experiment real --method NAME` compares (docs/benchmark.md)
+    gaponet.drivers   a function (robot, **options) that returns a Driver
+                      (gaponet.hw.control.driver). `gaponet run` gives it those options of --help
+                      that are its parameters, such as port
+    gaponet.methods   a function that `gaponet experiment real --method NAME` compares
+    (docs/benchmark.md)
 
-A built-in name cannot be replaced. A failure of an extension is logged once as a warning, and gaponet continues
-without the extension.
+A built-in name cannot be replaced. A failure of an extension is logged once as a warning, and
+gaponet continues without the extension.
 """
 
 from __future__ import annotations
@@ -64,7 +66,9 @@ def load(where: str) -> Any:
 
 
 def attempt(where: str, call: Callable[[], Result], otherwise: Result) -> Result:
-    """Return call(), or `otherwise` and a warning where it fails and `where` belongs to an extension."""
+    """Return call(), or `otherwise` and a warning where it fails and `where` belongs to an
+    extension.
+    """
     try:
         return call()
     except (Exception, SystemExit) as error:

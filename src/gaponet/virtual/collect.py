@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from concurrent.futures import Executor
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from gaponet.base.errors import DatasetError, UsageError
 from gaponet.base.executor import LOCAL, MAX_WORKERS, Pool, open_pool
@@ -93,7 +93,7 @@ def collect(
     """
     start = time.monotonic()
     robot = robot.with_gain_scale(fleet.gain_scale or robot.gain_scale)
-    # Command-line options may have changed it.
+    # Options of the command line may have changed the recipe.
     recipe = validated(Recipe, asdict(recipe), "recipe", UsageError)
     if not 0 <= nproc <= MAX_WORKERS or not 0 <= seed < 2**63:
         raise UsageError(
@@ -108,34 +108,27 @@ def collect(
         dataset = Dataset.create(out, robot)
         require_stored_robot(dataset.path, robot, DatasetError, MOVE_STORED_ROBOT)
         _require_same_source(dataset, robot, fleet, recipe, seed)
-        present = {
-            _key(e.meta.motion, e.meta.unit_id, e.meta.payload_mass, e.dt, e.meta.repetition)
-            for e in dataset.entries
-        }
-        missing = [
-            t
-            for t in wanted
-            if _key(t.motion, t.unit, t.payload, 1 / t.rate, t.repetition) not in present
-        ]
-        written = 0
-        seconds = 0.0
-        jobs = [
-            Job(robot, fleet, recipe, files, seed, tuple(part))
-            for part in _batches(missing, nproc or Pool.cores(1))
-        ]
-        # Of sequences whose replay a killed run did not store.
+        missing = _missing(wanted, dataset)
+        batches = _batches(missing, nproc or Pool.cores(1))
+        jobs = [Job(robot, fleet, recipe, files, seed, tuple(batch)) for batch in batches]
+        # A run that was killed may have stored sequences without their replays.
         pair_dataset(dataset, robot, lock_idle=True)
+        written = 0
+        hours = 0.0
+        seconds = 0.0
         for sequence, simulated in _play_jobs(jobs, nproc, executor):
             dataset.write_replay(dataset.append(sequence), simulated)
             written += 1
             seconds += sequence.duration
-            progress(
-                written,
-                len(missing),
-                f"{written} of {len(missing)}, {seconds / 3600:.2f} h recorded",
-            )
+            hours = seconds / 3600
+            note = f"{written} of {len(missing)}, {hours:.2f} h recorded"
+            progress(written, len(missing), note)
     return CollectResult(
-        Path(out), written, len(wanted) - len(missing), seconds / 3600, time.monotonic() - start
+        dataset=Path(out),
+        written=written,
+        present=len(wanted) - len(missing),
+        hours=hours,
+        seconds=time.monotonic() - start,
     )
 
 
@@ -151,9 +144,30 @@ def _read_source(path: Path) -> dict[str, Any]:
     )
 
 
-def _key(motion: str, unit: str, payload: float, dt: float, repetition: int) -> tuple[object, ...]:
-    """Return the identity of a take."""
-    return motion, unit, payload, round(dt * 1e9), repetition
+class _Identity(NamedTuple):
+    """What tells a take from the others of a dataset."""
+
+    motion: str
+    unit: str
+    payload: float
+    dt_ns: int
+    repetition: int
+
+
+def _missing(wanted: list[Take], dataset: Dataset) -> list[Take]:
+    """Return the takes that a dataset lacks."""
+    present = set()
+    for entry in dataset.entries:
+        meta = entry.meta
+        dt_ns = round(entry.dt * 1e9)
+        present.add(_Identity(meta.motion, meta.unit_id, meta.payload_mass, dt_ns, meta.repetition))
+    missing = []
+    for take in wanted:
+        dt_ns = round(1 / take.rate * 1e9)
+        identity = _Identity(take.motion, take.unit, take.payload, dt_ns, take.repetition)
+        if identity not in present:
+            missing.append(take)
+    return missing
 
 
 def _require_same_source(

@@ -1,4 +1,6 @@
-"""Servo drives of virtual robots: PD control whose gain and torque limit the hidden physics changes."""
+"""Servo drives of virtual robots: PD control whose gain and torque limit the hidden physics
+changes.
+"""
 
 from __future__ import annotations
 

@@ -127,20 +127,24 @@ def load_fleet(name_or_path: str | Path, robot: RobotSpec) -> Fleet:
     table = validated(FleetTable, loaded, path, UsageError)
     seed = table["seed"]
     distributions = table["distribution"]
+    _require_parameters([d.name for d in distributions], path)
+    units = {}
+    for number in range(1, UNITS + 1):
+        unit_id = f"virtual-{number}"
+        units[unit_id] = sample_unit(robot, distributions, seed, number)
+        _require_possible(units[unit_id], f"{path}: unit '{unit_id}'")
+    return Fleet(table.get("name", path.stem), seed, distributions, units)
+
+
+def _require_parameters(names: list[str], path: Path) -> None:
+    """Refuse distributions of unknown parameters, or two of one."""
     parameters = [f.name for f in fields(Physics)]
-    names = [d.name for d in distributions]
     for name in names:
         if name not in parameters or names.count(name) > 1:
             raise UsageError(
                 f"{path}: [[distribution]] names '{name}' twice, or not one of "
                 f"{', '.join(parameters)}"
             )
-    units = {
-        f"virtual-{k}": sample_unit(robot, distributions, seed, k) for k in range(1, UNITS + 1)
-    }
-    for unit_id, unit in units.items():
-        _require_possible(unit, f"{path}: unit '{unit_id}'")
-    return Fleet(table.get("name", path.stem), seed, distributions, units)
 
 
 def sample_unit(
@@ -156,13 +160,13 @@ def sample_unit(
     values = {}
     for d in distributions:
         stream = int(hashlib.sha256(d.name.encode()).hexdigest()[:8], 16)
-        kind = np.random.default_rng([seed, stream, 0])
-        own = np.random.default_rng([seed, stream, unit])
+        of_type = np.random.default_rng([seed, stream, 0])
+        of_unit = np.random.default_rng([seed, stream, unit])
         size = n if scope[d.name] == "joint" else 1
         deviation = (
-            d.type_spread * kind.standard_normal(size)
-            + d.unit_spread * own.standard_normal()
-            + d.joint_spread * own.standard_normal(size)
+            d.type_spread * of_type.standard_normal(size)
+            + d.unit_spread * of_unit.standard_normal()
+            + d.joint_spread * of_unit.standard_normal(size)
         )
         value = np.clip(d.mean + deviation, d.low, d.high)
         if d.of_effort:
@@ -175,9 +179,12 @@ def _require_possible(unit: Physics, where: str) -> None:
     """Refuse parameters that no robot can have."""
     for f in fields(Physics):
         value = getattr(unit, f.name)
-        limit = MAX_DELAY_S if f.name in ("delay", "jitter", "drop") else MAX_PARAMETER
-        good = (value <= limit) & (value >= (-limit if f.name in SIGNED else 0.0))
+        highest = MAX_DELAY_S if f.name in ("delay", "jitter", "drop") else MAX_PARAMETER
+        lowest = -highest if f.name in SIGNED else 0.0
+        possible = (lowest <= value) & (value <= highest)
         if f.name == "corner":
-            good &= value < 1.0
-        if not (good | ((value == np.inf) & (f.metadata["neutral"] == np.inf))).all():
+            possible &= value < 1.0
+        if f.metadata["neutral"] == np.inf:
+            possible |= value == np.inf
+        if not possible.all():
             raise UsageError(f"{where}: {f.name} is {value.tolist()}; correct its [[distribution]]")

@@ -58,58 +58,76 @@ def play(job: Job) -> list[Sequence]:
     locked = {name: _resting_joints(job.robot, motion) for name, motion in motions.items()}
     done: dict[Take, Sequence] = {}
     for joints in dict.fromkeys(locked.values()):
-        group = [t for t in job.takes if locked[t.motion] == joints]
-        group.sort(key=lambda t: -len(motions[t.motion].ctrl))
+        group = [take for take in job.takes if locked[take.motion] == joints]
+        group.sort(key=lambda take: -len(motions[take.motion].ctrl))
         done |= zip(group, _record(job, group, motions, joints), strict=True)
-    return [done[t] for t in job.takes]
+    return [done[take] for take in job.takes]
 
 
 def _resting_joints(robot: RobotSpec, motion: Motion) -> tuple[str, ...]:
     """Return the joints of kinematic chains that stay at home during a motion."""
-    away = np.abs(motion.ctrl - robot.qpos_home).max(axis=0) > 1e-9
-    return idle_joints(
-        robot, tuple(name for name, a in zip(robot.joint_names, away, strict=True) if a)
-    )
+    moves = np.abs(motion.ctrl - robot.qpos_home).max(axis=0) > 1e-9
+    moved = tuple(robot.joint_names[i] for i in np.flatnonzero(moves))
+    return idle_joints(robot, moved)
 
 
 def _record(
     job: Job, group: list[Take], motions: dict[str, Motion], locked: tuple[str, ...]
 ) -> list[Sequence]:
-    """Record takes in parallel, longest first, so that the running ones are always the first
-    rows.
-    """
+    """Record takes in parallel, longest first: the running ones are always the first rows."""
     dt = 1.0 / group[0].rate
-    ctrl = [motions[t.motion].sample(dt) for t in group]
-    lengths = np.array([len(c) for c in ctrl])
-    longest = len(ctrl[0])
-    targets = np.stack(
-        [np.concatenate([c, np.repeat(c[-1:], longest - len(c), axis=0)]) for c in ctrl], axis=1
-    )
-    payloads = [(t.payload, job.recipe.payload_side) for t in group]
-    robots = VirtualRobot(
-        job.robot, [job.fleet.unit(t.unit) for t in group], payloads, dt, locked=locked
-    )
-    seeds = [t.seed(job.seed) for t in group]
-    warmth = np.array(
-        [_warmth(job.fleet.unit(t.unit), s) for t, s in zip(group, seeds, strict=True)]
-    )
-    robots.reset(targets[0], seeds, warmth)
-    readings = np.empty((4, *targets.shape), np.float32)
-    for t in range(longest):  # row t: the state at t·dt, then the command of [t·dt, (t+1)·dt)
-        reading = robots.read()
-        readings[:, t] = reading.qpos, reading.qvel, reading.tau, reading.temperature
-        robots.step(targets[t], rows=np.arange(int((lengths > t).sum())))
+    ctrl = [motions[take.motion].sample(dt) for take in group]  # (rows, n) rad each
+    units = [job.fleet.unit(take.unit) for take in group]
+    payloads = [(take.payload, job.recipe.payload_side) for take in group]
+    seeds = [take.seed(job.seed) for take in group]
+    warmth = np.array([_warmth(u, seed) for u, seed in zip(units, seeds, strict=True)])  # (k,) K
+    robots = VirtualRobot(job.robot, units, payloads, dt, locked=locked)
+    readings = _readings(robots, ctrl, seeds, warmth)
+
     models = {p: build_model(job.robot, *p, dt, physics_only=True) for p in dict.fromkeys(payloads)}
     sequences = []
-    for i, (take, c) in enumerate(zip(group, ctrl, strict=True)):
-        qpos, qvel, tau, temperature = readings[:, : len(c), i]
+    for i, take in enumerate(group):
+        qpos, qvel, tau, temperature = readings[:, : len(ctrl[i]), i]
         torque, qacc = equivalent_torque(models[payloads[i]], qpos, dt)
         notes = {"rate_hz": take.rate, "warmth_K": round(float(warmth[i]), 2), "seed": job.seed}
-        meta = _meta(job, take, motions[take.motion].level, notes)
         sequences.append(
-            Sequence(meta, job.robot.joint_names, dt, c, qpos, qvel, qacc, tau, torque, temperature)
+            Sequence(
+                meta=_meta(job, take, motions[take.motion].level, notes),
+                joint_names=job.robot.joint_names,
+                dt=dt,
+                ctrl=ctrl[i],
+                qpos=qpos,
+                qvel=qvel,
+                qacc=qacc,
+                tau=tau,
+                tau_eq=torque,
+                temperature=temperature,
+            )
         )
     return sequences
+
+
+def _readings(robots: VirtualRobot, ctrl: list[Array], seeds: list[int], warmth: Array) -> Array:
+    """Play targets, the longest first; return qpos, qvel, tau, temperature, (4, rows, k, n).
+
+    Row t has the state at t·dt, then the command of [t·dt, (t+1)·dt). Rows after the end of a take
+    mean nothing.
+    """
+    lengths = np.array([len(targets) for targets in ctrl])
+    targets = np.stack([_extended(c, lengths[0]) for c in ctrl], axis=1)  # (rows, k, n) rad
+    robots.reset(targets[0], seeds, warmth)
+    readings = np.empty((4, *targets.shape), np.float32)
+    for t in range(lengths[0]):
+        reading = robots.read()
+        readings[:, t] = reading.qpos, reading.qvel, reading.tau, reading.temperature
+        running = int((lengths > t).sum())
+        robots.step(targets[t], rows=np.arange(running))
+    return readings
+
+
+def _extended(ctrl: Array, rows: int) -> Array:
+    """Return targets (T, n) with their last row repeated, (rows, n)."""
+    return np.concatenate([ctrl, np.repeat(ctrl[-1:], rows - len(ctrl), axis=0)])
 
 
 def _warmth(unit: Physics, seed: int) -> float:

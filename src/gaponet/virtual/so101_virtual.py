@@ -36,6 +36,7 @@ from gaponet.virtual.virtual_driver import LiveUnit
 PERIOD = 0.005  # s between two steps of the physics
 MAX_LAG_S = 0.5  # behind real time; a longer lag, as of an interrupted process, is dropped
 MAX_CATCH_UP_STEPS = 4  # between two looks at the bus
+GRIPPER_SHIFT_STEPS = 300  # of the middle of the gripper's range against that of the encoder
 FREE_DAMPING = 0.3  # N·m·s/rad of the gears while the torque is off (assumed)
 
 
@@ -56,7 +57,7 @@ class VirtualSO101:
             link: Symbolic link to the port; an existing link is replaced.
             frame: Simulated time per goal position, s; default: real time.
         """
-        # The arm rests on it while its torque is off.
+        # The arm rests on a table while its torque is off.
         robot = replace(robot, table=robot.table or Table(height=0.0))
         self.robot = robot
         self._frame = None if frame is None else round(frame / PERIOD)
@@ -72,26 +73,12 @@ class VirtualSO101:
             if link.is_symlink():
                 link.unlink()
             link.symlink_to(self.port)
-        self.memory = [bytearray(128) for _ in JOINTS]
-        for joint, memory in zip(JOINTS, self.memory, strict=True):
-            row = self.calibration.rows[joint]
-            for register, value in (
-                (reg.MODEL, reg.STS3215),
-                (reg.MIN_POSITION, row.range_min),
-                (reg.MAX_POSITION, row.range_max),
-                (reg.HOMING_OFFSET, row.homing_offset),
-                (reg.MAX_TORQUE, FULL_TORQUE),
-                (reg.TORQUE_LIMIT, FULL_TORQUE),
-                (reg.P, 32),
-                (reg.D, 32),
-                (reg.PROTECTION_CURRENT, 500),
-                (reg.PRESENT_VOLTAGE, 120),
-            ):
-                _put(memory, register, value)
+        self.memory = [_new_memory(self.calibration.rows[joint]) for joint in JOINTS]
         self.silent: set[int] = set()  # servos that do not answer
         self.damaged = False  # replies have a wrong checksum
         self.status = [0] * len(JOINTS)  # error bits in replies
-        self._buffer = self._replies = b""
+        self._buffer = b""  # bytes of the bus that are no whole packet yet
+        self._replies = b""
         self._apply()
 
     @no_garbage_collection()
@@ -101,9 +88,9 @@ class VirtualSO101:
         start = began - self.live.steps * PERIOD
         while time.monotonic() - began < seconds:
             due = start + self.live.steps * PERIOD
-            wait = (
-                min(max(0.0, due - time.monotonic()), PERIOD) if self._frame is None else MAX_LAG_S
-            )
+            wait = MAX_LAG_S
+            if self._frame is None:
+                wait = min(max(0.0, due - time.monotonic()), PERIOD)
             readable, _, _ = select.select([self._master], [], [], wait)
             if readable:
                 os.write(self._master, self.receive(os.read(self._master, 4096)))
@@ -140,27 +127,34 @@ class VirtualSO101:
         return self._replies
 
     def _execute(self, servo: int, instruction: int, parameters: bytes) -> None:
+        """Do what a packet asks for, and append the replies."""
         if instruction == reg.PING:
             self._answer(servo, b"")
         elif instruction == reg.READ:
             self._refresh()
             self._answer(servo, self._bytes(servo, parameters[0], parameters[1]))
         elif instruction == reg.WRITE:
-            for one in range(1, len(JOINTS) + 1) if servo == reg.BROADCAST else (servo,):
-                self._store(one, parameters[0], parameters[1:])
+            receivers = range(1, len(JOINTS) + 1) if servo == reg.BROADCAST else (servo,)
+            for receiver in receivers:
+                self._store(receiver, parameters[0], parameters[1:])
             self._answer(servo, b"")
         elif instruction == reg.SYNC_READ:
             self._refresh()
-            for one in parameters[2:]:
-                self._answer(one, self._bytes(one, parameters[0], parameters[1]))
+            for receiver in parameters[2:]:
+                self._answer(receiver, self._bytes(receiver, parameters[0], parameters[1]))
         elif instruction == reg.SYNC_WRITE:
-            size = parameters[1] + 1
-            for i in range(2, len(parameters), size):
-                self._store(parameters[i], parameters[0], parameters[i + 1 : i + size])
+            size = parameters[1]
+            for i in range(2, len(parameters), size + 1):  # number of a servo, then its data
+                data = parameters[i + 1 : i + 1 + size]
+                self._store(parameters[i], parameters[0], data)
         self._apply()
         if instruction == reg.SYNC_WRITE and parameters[0] == reg.GOAL_POSITION.address:
-            for _ in range(self._frame or 0):
-                self.live.step()
+            self._play_frame()
+
+    def _play_frame(self) -> None:
+        """Simulate the time that one goal position stands for, if time is not real."""
+        for _ in range(self._frame or 0):
+            self.live.step()
 
     def _answer(self, servo: int, data: bytes) -> None:
         if not 1 <= servo <= len(JOINTS) or servo in self.silent:
@@ -169,11 +163,9 @@ class VirtualSO101:
         self._replies += reply[:-1] + bytes([reply[-1] ^ self.damaged])
 
     def _bytes(self, servo: int, address: int, size: int) -> bytes:
-        return (
-            bytes(self.memory[servo - 1][address : address + size])
-            if 1 <= servo <= len(JOINTS)
-            else b""
-        )
+        if not 1 <= servo <= len(JOINTS):
+            return b""
+        return bytes(self.memory[servo - 1][address : address + size])
 
     def _store(self, servo: int, address: int, data: bytes) -> None:
         if 1 <= servo <= len(JOINTS):
@@ -183,11 +175,11 @@ class VirtualSO101:
         """Write readings into the registers."""
         order = self._order
         qpos, qvel, tau, temperature = self.live.read()
-        # May pass the limits.
-        steps = np.rint(qpos / (STEP_RAD * self.calibration.sign) + self.calibration.zero)[order]
+        calibration = self.calibration
+        steps = np.rint(qpos / (STEP_RAD * calibration.sign) + calibration.zero)[order]
         share = (tau / self.robot.effort_limit)[order]
         values = {
-            reg.PRESENT_POSITION: np.clip(steps, 0, STEPS_PER_TURN - 1),
+            reg.PRESENT_POSITION: np.clip(steps, 0, STEPS_PER_TURN - 1),  # beyond its limits too
             reg.PRESENT_VELOCITY: np.rint(qvel[order] / STEP_RAD),
             reg.PRESENT_LOAD: np.clip(np.rint(1000 * share), -1000, 1000),
             reg.PRESENT_CURRENT: np.rint(share * STALL_CURRENT_STEPS),
@@ -210,8 +202,9 @@ class VirtualSO101:
                 kp[joint] = 0.0
                 kd[joint] = FREE_DAMPING
                 continue
-            limits = _get(memory, reg.MIN_POSITION), _get(memory, reg.MAX_POSITION)
-            goals[joint] = np.clip(_get(memory, reg.GOAL_POSITION), *limits)
+            lowest = _get(memory, reg.MIN_POSITION)
+            highest = _get(memory, reg.MAX_POSITION)
+            goals[joint] = np.clip(_get(memory, reg.GOAL_POSITION), lowest, highest)
             self.live.ctrl[joint] = self.calibration.qpos(goals)[joint]
         self.live.set_gains(kp, kd, effort)
 
@@ -221,15 +214,41 @@ def _as_calibrated(robot: RobotSpec) -> dict[str, ServoRow]:
     rows = {}
     for number, joint in enumerate(JOINTS, 1):
         low, high = robot.qpos_range[robot.index([joint])[0]]
-        half = (
-            (STEPS_PER_TURN - 1) / 2 if joint == CONTINUOUS_JOINT else (high - low) / 2 / STEP_RAD
+        half = (high - low) / 2 / STEP_RAD  # steps
+        middle = STEPS_PER_TURN / 2
+        if joint == CONTINUOUS_JOINT:
+            half = (STEPS_PER_TURN - 1) / 2
+            middle -= 0.5
+        elif joint == GRIPPER:
+            middle -= GRIPPER_SHIFT_STEPS
+        rows[joint] = ServoRow(
+            id=number,
+            drive_mode=0,
+            homing_offset=17 * number,  # any that differ
+            range_min=int(np.ceil(middle - half)),
+            range_max=int(np.floor(middle + half)),
         )
-        middle = STEPS_PER_TURN / 2 - (
-            0.5 if joint == CONTINUOUS_JOINT else 300 if joint == GRIPPER else 0
-        )
-        ends = {"range_min": int(np.ceil(middle - half)), "range_max": int(np.floor(middle + half))}
-        rows[joint] = ServoRow(id=number, drive_mode=0, homing_offset=17 * number, **ends)
     return rows
+
+
+def _new_memory(row: ServoRow) -> bytearray:
+    """Return the registers of a calibrated servo with the values of its manufacturer."""
+    values = {
+        reg.MODEL: reg.STS3215,
+        reg.MIN_POSITION: row.range_min,
+        reg.MAX_POSITION: row.range_max,
+        reg.HOMING_OFFSET: row.homing_offset,
+        reg.MAX_TORQUE: FULL_TORQUE,
+        reg.TORQUE_LIMIT: FULL_TORQUE,
+        reg.P: 32,
+        reg.D: 32,
+        reg.PROTECTION_CURRENT: 500,
+        reg.PRESENT_VOLTAGE: 120,
+    }
+    memory = bytearray(128)
+    for register, value in values.items():
+        _put(memory, register, value)
+    return memory
 
 
 def _put(memory: bytearray, register: reg.Register, value: int) -> None:

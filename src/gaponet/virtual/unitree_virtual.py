@@ -10,7 +10,7 @@ controller.
 from __future__ import annotations
 
 from collections import deque
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -42,7 +42,30 @@ FaultKind = Literal[
 
 LATE_S = 0.3  # delay of messages in the fault "late"
 CLOCK_STEP_S = 10.0  # by which the robot's clock is ahead in the fault "clock"
+L2_AND_B = (0x20, 0x02)  # keys of the remote, bytes 2 and 3 of wireless_remote
 FIRST_ARM_MOTOR = 12  # rt/arm_sdk commands this motor and all after it
+
+
+class MotorCommands(NamedTuple):
+    """Command of a LowCmd message, by motor, (27,) each: rad, N·m/rad, N·m·s/rad, rad/s, N·m."""
+
+    q: Array
+    kp: Array
+    kd: Array
+    dq: Array
+    tau: Array
+    mode: Array
+
+    @classmethod
+    def of_message(cls, data: Array) -> MotorCommands:
+        """Read a message."""
+        motors = len(MOTOR_NAMES)
+        fields = [hg.LowCmd.motors(data, name).astype(float)[:motors] for name in cls._fields]
+        return cls(*fields)
+
+    def is_finite(self) -> bool:
+        """Return True if all numbers are finite."""
+        return all(np.isfinite(values).all() for values in self)
 
 
 class VirtualH12:
@@ -73,7 +96,7 @@ class VirtualH12:
         """
         from gaponet.hw.drivers import dds
 
-        robot = robot.nominal or robot
+        robot = robot.before_identification
         bus = dds.Bus(domain, interface)
         self.robot = robot
         self.rate = rate
@@ -88,7 +111,8 @@ class VirtualH12:
         self.clock = MonotonicClock()
         self.heard = list[dict[str, Any]]()
         self.first_command: float | None = None
-        self.refused = self.missed = 0
+        self.refused = 0  # damaged or senseless commands
+        self.missed = 0  # periods in which nothing was simulated
         self._message = hg.LowState.new()
         hg.LowState.view(self._message, "reserve")[0] = VIRTUAL_MARK
         self.machine = 6  # mode_machine of an H1-2, by reports; no document of Unitree states it
@@ -119,62 +143,64 @@ class VirtualH12:
                 self._apply(topic, data, now)
 
     def _apply(self, topic: str, data: Array, now: float) -> None:
-        names = ("q", "kp", "kd", "mode", "dq", "tau")
-        q, kp, kd, mode, dq, tau = (hg.LowCmd.motors(data, name).astype(float) for name in names)
-        if not all(np.isfinite(values).all() for values in (q, kp, kd, dq, tau)):
+        """Note a command, and set the drives between it and the robot's own by the weight."""
+        command = MotorCommands.of_message(data)
+        if not command.is_finite():
             self.refused += 1
             return
-        weight = 1.0 if topic == "lowcmd" else float(np.clip(q[WEIGHT_MOTOR], 0.0, 1.0))
+        own_weight = hg.LowCmd.motors(data, "q").astype(float)[WEIGHT_MOTOR]
+        weight = 1.0 if topic == "lowcmd" else float(np.clip(own_weight, 0.0, 1.0))
+        self._note(command, topic, weight, now)
+
+        share = np.zeros(len(MOTOR_NAMES))
+        share[0 if topic == "lowcmd" else FIRST_ARM_MOTOR :] = weight
+        enabled = (command.mode == 1) | (topic == "arm_sdk")
+        kp = np.where(enabled, command.kp, 0.0)
+        kd = np.where(enabled, command.kd, 0.0)
+        torque = np.where(enabled, command.tau + command.kd * command.dq, 0.0)
         robot = self.robot
-        motors = len(MOTOR_NAMES)
+        self.live.ctrl[self._order] = self._blend(robot.qpos_home, command.q, share)
+        blended_kp = robot.kp.copy()
+        blended_kd = robot.kd.copy()
+        blended_torque = np.zeros_like(robot.kp)
+        blended_kp[self._order] = self._blend(robot.kp, kp, share)
+        blended_kd[self._order] = self._blend(robot.kd, kd, share)
+        blended_torque[self._order] = self._blend(np.zeros_like(robot.kp), torque, share)
+        self.live.set_gains(blended_kp, blended_kd, torque=blended_torque)
+
+    def _blend(self, own: Array, commanded: Array, share: Array) -> Array:
+        """Return the robot's own values, in its order, and commanded ones, by motor, as shared."""
+        return (1 - share) * own[self._order] + share * commanded
+
+    def _note(self, command: MotorCommands, topic: str, weight: float, now: float) -> None:
+        """Append a command to `heard`, with the state of the joints."""
         qpos, qvel, *_ = self.live.read()
         self.heard.append(
             {
                 "time": now,
                 "topic": topic,
-                "ctrl": q[:motors],
-                "kp": kp[:motors],
-                "kd": kd[:motors],
-                "mode": mode[:motors],
+                "ctrl": command.q,
+                "kp": command.kp,
+                "kd": command.kd,
+                "mode": command.mode,
                 "weight": weight,
                 "qpos": qpos[self._order],
                 "qvel": qvel[self._order],
             }
         )
-        share = np.zeros(motors)
-        share[0 if topic == "lowcmd" else FIRST_ARM_MOTOR :] = weight
-        enabled = (mode[:motors] == 1) | (topic == "arm_sdk")
-        gains = robot.kp.copy()
-        dampers = robot.kd.copy()
-        torque = np.zeros_like(robot.kp)
-        forward = tau[:motors] + kd[:motors] * dq[:motors]
-        for out, mine, theirs in (
-            (self.live.ctrl, robot.qpos_home, q[:motors]),
-            (gains, robot.kp, np.where(enabled, kp[:motors], 0.0)),
-            (dampers, robot.kd, np.where(enabled, kd[:motors], 0.0)),
-            (torque, np.zeros_like(robot.kp), np.where(enabled, forward, 0.0)),
-        ):
-            out[self._order] = (1 - share) * mine[self._order] + share * theirs
-        self.live.set_gains(gains, dampers, torque=torque)
 
     def _send_state(self, k: int, now: float) -> None:
         wrong = self.first_command is not None and now - self.first_command >= self.fault_at
         fault = self.fault if wrong else "none"
         if fault == "stop":
             return
-        readings = self._readings(fault)
         message = hg.LowState
         data = self._message
+        self._set_readings(fault)
         if fault != "repeat":
             ahead = CLOCK_STEP_S if fault == "clock" else 0.0
             message.view(data, "tick")[0] = round(1000 * (k / self.rate + ahead)) % 2**32
         self._set_status(fault)
-        for name, values in zip(("q", "dq", "tau_est", "temperature"), readings, strict=True):
-            column = np.zeros((hg.MOTORS, 2) if name == "temperature" else hg.MOTORS)
-            column[: len(MOTOR_NAMES)] = (
-                values[self._order, None] if name == "temperature" else values[self._order]
-            )
-            message.set_motors(data, name, column)
         message.seal(data)
         if fault == "checksum":
             message.view(data, "crc")[0] ^= 1
@@ -182,17 +208,29 @@ class VirtualH12:
         while self._delayed and self._delayed[0][0] <= now:
             self._writer.send(self._delayed.popleft()[1])
 
+    def _set_readings(self, fault: str) -> None:
+        """Set the motors' readings in the message, with a fault."""
+        motors = len(MOTOR_NAMES)
+        qpos, qvel, tau, temperature = self._readings(fault)
+        for name, values in (("q", qpos), ("dq", qvel), ("tau_est", tau)):
+            column = np.zeros(hg.MOTORS)
+            column[:motors] = values[self._order]
+            hg.LowState.set_motors(self._message, name, column)
+        case_and_winding = np.zeros((hg.MOTORS, 2))
+        case_and_winding[:motors] = temperature[self._order, None]
+        hg.LowState.set_motors(self._message, "temperature", case_and_winding)
+
     def _set_status(self, fault: str) -> None:
         """Set the status fields of the message, with a fault."""
         message = hg.LowState
         data = self._message
         half = 0.5 if fault == "fall" else 0.0  # half of the angle by which it leans forward
         message.view(data, "imu_state.quaternion")[:] = (np.cos(half), 0.0, np.sin(half), 0.0)
-        # L2 + B
-        message.view(data, "wireless_remote")[2:4] = (0x20, 0x02) if fault == "remote" else 0
+        message.view(data, "wireless_remote")[2:4] = L2_AND_B if fault == "remote" else 0
         message.view(data, "mode_machine")[0] = 5 if fault == "machine" else self.machine
         errors = np.zeros(hg.MOTORS)
-        errors[MOTOR_NAMES.index("left_elbow_joint")] = 4 * (fault == "motor")
+        if fault == "motor":
+            errors[MOTOR_NAMES.index("left_elbow_joint")] = 4
         message.set_motors(data, "motorstate", errors)
 
     def _readings(self, fault: str) -> tuple[Array, ...]:

@@ -208,7 +208,9 @@ class VirtualRobot:
         )
 
     def step(self, ctrl: Array, rows: Array | None = None) -> None:
-        """Send targets (N, n) rad and simulate one control period, only for `rows` (k,) if given."""
+        """Send targets (N, n) rad and simulate one control period, only for `rows` (k,) if
+        given.
+        """
         arrays = self._arrays
         self._link.send(self._servo_target(ctrl), self._now, self._noise.chances())
         self._squares[:] = 0.0
