@@ -1,4 +1,6 @@
-"""Offline HTML pages from the Jinja2 templates in report/templates; figures are part of the page."""
+"""Offline HTML pages from the Jinja2 templates in report/templates; figures are part of the
+page.
+"""
 
 from __future__ import annotations
 
@@ -39,9 +41,14 @@ def render(template: str, **values: Any) -> str:
 @cache
 def _environment() -> Environment:
     return Environment(
-        loader=PackageLoader("gaponet.report"), autoescape=True, finalize=_printable, undefined=StrictUndefined,
-        trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True,
-    )  # fmt: skip
+        loader=PackageLoader("gaponet.report"),
+        autoescape=True,
+        finalize=_printable,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+    )
 
 
 def _printable(value: Any) -> Any:

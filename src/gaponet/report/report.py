@@ -1,4 +1,6 @@
-"""The offline HTML report about an identified robot or a run: data, errors, figures, warnings, commands."""
+"""The offline HTML report about an identified robot or a run: data, errors, figures, warnings,
+commands.
+"""
 
 from __future__ import annotations
 
@@ -37,12 +39,27 @@ from gaponet.sim.model import require_stored_robot
 
 Picture = Callable[[RobotSpec, SequenceMeta, float, dict[str, Array]], bytes]
 OPEN_TRAJECTORIES = 3  # motions shown without a click
-CARD_FACTS = ("dt", "payload_seen", "units", "hours", "steps", "seconds", "seed", "excess_delay", "parity_rad",
-              "motions", "versions", "dataset_hash")  # fmt: skip
+CARD_FACTS = (
+    "dt",
+    "payload_seen",
+    "units",
+    "hours",
+    "steps",
+    "seconds",
+    "seed",
+    "excess_delay",
+    "parity_rad",
+    "motions",
+    "versions",
+    "dataset_hash",
+)
 
 
 class _Evaluated(NamedTuple):
-    """An evaluated run or robot folder; own is its method. Of a robot folder, card is None, config and curve empty."""
+    """An evaluated run or robot folder; own is its method.
+
+    Of a robot folder, card is None, config and curve empty.
+    """
 
     robot: RobotSpec
     own: str
@@ -57,17 +74,14 @@ class _Evaluated(NamedTuple):
     def read(cls, folder: Path, model: GapModel | None, robot: RobotSpec) -> _Evaluated:
         """Read the folder; ModelError where a file is missing, damaged or incomplete."""
         own = "identified" if model is None else method(model.config.kind, robot)
-        card, config = (None, {}) if model is None else (model.card, read_config(folder))
-        metrics, curve = read_metrics(folder), read_progress(folder)
-        missing = [] if card is None else [name for name in CARD_FACTS if name not in card]
-        moves, joints = (
-            set(metrics.get("moves", ())),
-            set(metrics["methods"]["nominal"]["by_joint"]),
-        )
-        complete = {"date", "command", "shown"} <= metrics.keys() and joints <= moves == set(
-            robot.operated
-        )
-        if not complete or own not in metrics["methods"]:
+        card = None if model is None else model.card
+        config = {} if model is None else read_config(folder)
+        metrics = read_metrics(folder)
+        curve = read_progress(folder)
+        missing = []
+        if card is not None:
+            missing += [name for name in CARD_FACTS if name not in card]
+        if not _is_complete(metrics, robot) or own not in metrics["methods"]:
             missing.append(f"a whole evaluation of {title(own)}")
         if card is not None and not curve:
             missing.append("progress.jsonl")
@@ -79,15 +93,27 @@ class _Evaluated(NamedTuple):
         return cls(robot, own, card, config, metrics, arrays, curve, read_gap(folder))
 
 
+def _is_complete(metrics: dict[str, Any], robot: RobotSpec) -> bool:
+    """Return True if an evaluation has all fields that the page shows, of all operated joints."""
+    moves = set(metrics.get("moves", ()))
+    joints = set(metrics["methods"]["nominal"]["by_joint"])
+    has_facts = {"date", "command", "shown"} <= metrics.keys()
+    return has_facts and joints <= moves and moves == set(robot.operated)
+
+
 def write_report(
-    run: Path, dataset: Path | None = None, robot: str | None = None, progress: Progress = no_progress,
+    run: Path,
+    dataset: Path | None = None,
+    robot: str | None = None,
+    progress: Progress = no_progress,
     picture: Picture | None = None,
-) -> Path:  # fmt: skip
-    """Write report.html into a run or robot folder from its newest evaluation; evaluate first if there is none.
+) -> Path:
+    """Write report.html into a run or robot folder from its newest evaluation; evaluate first if
+    there is none.
 
     Args:
-        dataset: Evaluate on this dataset first. Default: the newest evaluation, or the test motions of the dataset that
-            was fitted to.
+        dataset: Evaluate on this dataset first. Default: the newest evaluation, or the test motions
+            of the dataset that was fitted to.
         robot: Robot name or folder, if not the one that the run stores.
         picture: Draws the robot (view.portrait).
 
@@ -102,31 +128,27 @@ def write_report(
             "DATASET prints its errors, gaponet gap their causes"
         )
     model = None if is_robot(run) else GapModel.load(run)
-    given = (
-        None
-        if robot is None
-        else require_stored_robot(run, load_robot(robot), ModelError, "leave --robot out")
-    )
-    spec = (
-        load_robot(run) if model is None else given or load_stored_robot(run, model.card["robot"])
-    )
+    given = None
+    if robot is not None:
+        given = require_stored_robot(run, load_robot(robot), ModelError, "leave --robot out")
+    if model is None:
+        spec = load_robot(run)
+    else:
+        spec = given or load_stored_robot(run, model.card["robot"])
     if dataset is not None or not (run / "trajectories.npz").is_file():
         _evaluate(run, dataset, given, progress)
     evaluated = _Evaluated.read(run, model, spec)
     progress(0, 1, "drawing")
     values = _values(evaluated, picture)
+    command = f"gaponet report {shlex.quote(str(run))}"
     path = run / "report.html"
-    write_text(
-        path,
-        render(
-            "report.html.j2", report_command=f"gaponet report {shlex.quote(str(run))}", **values
-        ),
-    )
+    write_text(path, render("report.html.j2", report_command=command, **values))
     progress(1, 1, "drawing")
     return path
 
 
 def _evaluate(run: Path, dataset: Path | None, robot: RobotSpec | None, progress: Progress) -> None:
+    """Evaluate a folder on a dataset, by default on that which it was fitted to."""
     from gaponet.evaluation.evaluate import evaluate
 
     origin = read_origin(run) if is_robot(run) else read_config(run)
@@ -147,44 +169,53 @@ def _values(e: _Evaluated, picture: Picture | None) -> dict[str, Any]:
     from gaponet.report.figures import evaluation as draw
     from gaponet.report.figures.style import joint_label
 
-    methods, name = e.metrics["methods"], title(e.own)
+    methods = e.metrics["methods"]
+    name = title(e.own)
+    by_joint = draw.by_group(methods, "joint", joint_label)
+    by_horizon = draw.by_horizon(methods)
     bars = [
-        page_figure(
-            draw.by_group(methods, "joint", joint_label),
-            "Mean |q_sim − q_robot| of each operated joint.",
-        ),
-        page_figure(
-            draw.by_horizon(methods), "Error in the last half of the time since the common start."
-        ),
+        page_figure(by_joint, "Mean |q_sim − q_robot| of each operated joint."),
+        page_figure(by_horizon, "Error in the last half of the time since the common start."),
     ]
     if len(methods["nominal"]["by_payload"]) > 1:
-        bars.append(
-            page_figure(draw.by_group(methods, "payload", "{} kg".format), "Payload in each hand.")
-        )
+        by_payload = draw.by_group(methods, "payload", "{} kg".format)
+        bars.append(page_figure(by_payload, "Payload in each hand."))
     joint_columns, joint_rows = _by_joint(e)
-    shown, trajectories = e.metrics["shown"], []
+    shown = e.metrics["shown"]
+    trajectories = []
     drawn = draw.trajectories(e.arrays, shown, e.robot.operated, list(methods))
     for row, fig in drawn.items():
         caption = f" (unit {shown[row]['unit_id']}, {shown[row]['payload_mass']:g} kg)"
         trajectories.append(page_figure(fig, caption, shown[row]["motion"]))
     simulators = e.metrics.get("simulators", {}).items()
     values: dict[str, Any] = {
-        "title": f"{e.robot.name} {name}", "heading": f"{e.robot.description}: {name}", "metrics": e.metrics,
-        "card": e.card, "config": e.config, "verdict": " ".join(verdict(methods)),
+        "title": f"{e.robot.name} {name}",
+        "heading": f"{e.robot.description}: {name}",
+        "metrics": e.metrics,
+        "card": e.card,
+        "config": e.config,
+        "verdict": " ".join(verdict(methods)),
         "warnings": warnings(e.card, e.own, e.metrics),
-        "totals": totals(methods, mrad_and_degrees), "best": int(np.argmin([m["mpjae"] for m in methods.values()])),
+        "totals": totals(methods, mrad_and_degrees),
+        "best": int(np.argmin([m["mpjae"] for m in methods.values()])),
         "simulators": "; ".join(f"{title(name)} {simulator}" for name, simulator in simulators),
-        "adapted_title": title("adapted"), "joint_columns": joint_columns, "joint_rows": joint_rows, "bars": bars,
-        "trajectories": trajectories, "open_trajectories": OPEN_TRAJECTORIES,
-        "by_motion": by_group(methods, "motion", mrad_and_degrees), "waterfall": None,
+        "adapted_title": title("adapted"),
+        "joint_columns": joint_columns,
+        "joint_rows": joint_rows,
+        "bars": bars,
+        "trajectories": trajectories,
+        "open_trajectories": OPEN_TRAJECTORIES,
+        "by_motion": by_group(methods, "motion", mrad_and_degrees),
+        "waterfall": None,
         **_photo(e, next(iter(drawn), None), picture),
-    }  # fmt: skip
+    }
     if e.gap is not None:
         caption = "Reduction of the mean |error| by each step (hollow: increase)."
         values["waterfall"] = page_figure(draw.waterfall(e.gap), caption)
     if e.card is not None:
         caption = "Free run over whole validation motions; the circled model was selected."
-        delta, artifacts = e.metrics["delta"].items(), e.metrics["artifacts"].items()
+        delta = e.metrics["delta"].items()
+        artifacts = e.metrics["artifacts"].items()
         values |= {
             "training_curve": page_figure(draw.training_curve(e.curve), caption),
             "how_trained": GapModel.how_trained(e.card),
@@ -196,99 +227,117 @@ def _values(e: _Evaluated, picture: Picture | None) -> dict[str, Any]:
 
 
 def _by_joint(e: _Evaluated) -> tuple[list[str], list[list[str]]]:
-    """Return columns and rows: errors of every method, static and dynamic error of the folder's own, motions."""
-    methods, own = e.metrics["methods"], title(e.own)
-    table, joints = by_group(methods, "joint"), methods[e.own]["by_joint"]
+    """Return columns and rows: errors of every method, static and dynamic error of the folder's
+    own, motions.
+    """
+    methods = e.metrics["methods"]
+    own = title(e.own)
+    table = by_group(methods, "joint")
+    joints = methods[e.own]["by_joint"]
     rows = []
     for joint, *errors in table.texts():
         moving = e.metrics["moves"][joint]
         moves = f"{moving} of {e.metrics['sequences']}" if moving else "none: stands still"
-        rows.append(
-            [joint, *errors, *(mrad(joints[joint][k]) for k in ("static", "dynamic")), moves]
-        )
+        static = mrad(joints[joint]["static"])
+        dynamic = mrad(joints[joint]["dynamic"])
+        rows.append([joint, *errors, static, dynamic, moves])
     return [*table.columns, f"{own} static", f"{own} dynamic", "moves in"], rows
 
 
 def _photo(e: _Evaluated, row: int | None, picture: Picture | None) -> dict[str, Any]:
-    """Draw the robot in a motion with stored trajectories. Return photo, or the reason for its absence."""
-    metrics, arrays = e.metrics, e.arrays
+    """Draw the robot in a motion with stored trajectories.
+
+    Return photo, or the reason for its absence.
+    """
+    metrics = e.metrics
+    arrays = e.arrays
     if picture is None or row is None:
         return {"photo": None, "photo_error": ""}
     shown = metrics["shown"][row]
     meta = SequenceMeta(
-        e.robot.name,
-        shown["unit_id"],
-        shown["motion"],
-        shown["payload_mass"],
+        robot=e.robot.name,
+        unit_id=shown["unit_id"],
+        motion=shown["motion"],
+        payload_mass=shown["payload_mass"],
         virtual=metrics["virtual"],
     )
-    qpos = {
-        n: arrays[f"{row}/{n}"] for n in dict.fromkeys(("command", "nominal", e.own, "recorded"))
-    }
-    qpos["command"] = np.roll(
-        qpos["command"], 1, axis=0
-    )  # the command of row t is the target at t + 1
+    names = dict.fromkeys(("command", "nominal", e.own, "recorded"))
+    qpos = {name: arrays[f"{row}/{name}"] for name in names}
+    # The command of row t is the target at t + 1.
+    qpos["command"] = np.roll(qpos["command"], 1, axis=0)
     qpos["command"][0] = qpos["recorded"][0]
     try:
-        return {
-            "photo": inline_image(picture(e.robot, meta, shown["dt"], qpos), "image/png"),
-            "photo_error": "",
-        }
+        photo = inline_image(picture(e.robot, meta, shown["dt"], qpos), "image/png")
     except UsageError as error:
         return {"photo": None, "photo_error": str(error)}
+    return {"photo": photo, "photo_error": ""}
 
 
 def warnings(card: dict[str, Any] | None, own: str, metrics: dict[str, Any]) -> list[str]:
     """Return warnings about the evaluation; own is its method, card that of its model if any."""
-    out, methods = [], metrics["methods"]
+    found = _warnings_of_data(metrics)
+    if card is not None:
+        found += _warnings_of_model(card, own, metrics["methods"])
+    return found + _warnings_of_joints(own, metrics["methods"])
+
+
+def _warnings_of_data(metrics: dict[str, Any]) -> list[str]:
+    """Warn where the recordings do not show what the page seems to say."""
+    found = []
     if metrics["virtual"]:
-        out.append(
-            "The recordings come from a virtual robot: these numbers say nothing about real hardware."
+        found.append(
+            "The recordings come from a virtual robot: these numbers say nothing about real "
+            "hardware."
         )
     if not metrics["unseen"]:
-        out.append(
+        found.append(
             "Some recordings were used in training or for choosing the model: not a test result."
         )
-    worse = [
-        j
-        for j, m in methods[own]["by_joint"].items()
-        if m["mpjae"] > methods["nominal"]["by_joint"][j]["mpjae"]
-    ]
-    last = [f"Worse than the nominal simulator on: {', '.join(worse)}."] if worse else []
-    if card is None:
-        return out + last
-    better = [
-        n
-        for n, m in methods.items()
-        if n not in (own, "adapted") and m["mpjae"] <= methods[own]["mpjae"]
-    ]
+    return found
+
+
+def _warnings_of_joints(own: str, methods: dict[str, Any]) -> list[str]:
+    """Warn of joints that became worse."""
+    nominal = methods["nominal"]["by_joint"]
+    worse = []
+    for joint, errors in methods[own]["by_joint"].items():
+        if errors["mpjae"] > nominal[joint]["mpjae"]:
+            worse.append(joint)
+    return [f"Worse than the nominal simulator on: {', '.join(worse)}."] if worse else []
+
+
+def _warnings_of_model(card: dict[str, Any], own: str, methods: dict[str, Any]) -> list[str]:
+    """Warn where a model does not help, or was trained on too little or for too short a time."""
+    found = []
+    others = {name: m for name, m in methods.items() if name not in (own, "adapted")}
+    better = [name for name, m in others.items() if m["mpjae"] <= methods[own]["mpjae"]]
     if better:
-        out.append(f"The model does not beat {', '.join(map(title, better))}: do not use it.")
-    seen, evaluated = card["payload_seen"], [float(p) for p in methods["nominal"]["by_payload"]]
-    outside = [p for p in evaluated if not min(seen) <= p <= max(seen)]
+        found.append(f"The model does not beat {', '.join(map(title, better))}: do not use it.")
+    lightest = min(card["payload_seen"])
+    heaviest = max(card["payload_seen"])
+    evaluated = [float(payload) for payload in methods["nominal"]["by_payload"]]
+    outside = [payload for payload in evaluated if not lightest <= payload <= heaviest]
     if outside:
-        out.append(
-            f"Payloads {outside} kg lie outside those trained on ({min(seen):g} to {max(seen):g} kg)."
+        found.append(
+            f"Payloads {outside} kg lie outside those trained on ({lightest:g} to {heaviest:g} kg)."
         )
     if len(card["units"]) == 1:
-        out.append(
-            f"Trained on one unit ({card['units'][0]}): another unit's zero offsets and friction are unknown to it."
+        found.append(
+            f"Trained on one unit ({card['units'][0]}): another unit's zero offsets and friction "
+            "are unknown to it."
         )
-    span = card["model"]["history"] * card["model"]["stride"] * min(card["dt"])
+    span = card["model"]["history"] * card["model"]["stride"] * min(card["dt"])  # s
     if card["excess_delay"] > span + 1e-6:
-        out.append(
-            f"The robot lags the simulator by {card['excess_delay'] * 1e3:.0f} ms, the history spans "
-            f"{span * 1e3:.0f} ms: raise --model.history or --model.stride."
+        found.append(
+            f"The robot lags the simulator by {card['excess_delay'] * 1e3:.0f} ms, the history "
+            f"spans {span * 1e3:.0f} ms: raise --model.history or --model.stride."
         )
     done, planned = card.get("stages", {}).get("pretraining_rounds", (0, 0))
     if done < planned:
-        longer = (
-            ""
-            if "identified" in methods and not network_gain(methods, own).helps
-            else "; train longer"
-        )
+        is_useless = "identified" in methods and not network_gain(methods, own).helps
+        advice = "" if is_useless else "; train longer"
         rounds = f"{done} of {planned} rounds of supervised pre-training"
-        out.append(f"Undertrained: the budget ended after {rounds}{longer}.")
+        found.append(f"Undertrained: the budget ended after {rounds}{advice}.")
     if card.get("interrupted"):
-        out.append("Training was interrupted before its budget was out.")
-    return out + last
+        found.append("Training was interrupted before its budget was out.")
+    return found

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import re
 from collections import defaultdict
+from collections.abc import Callable
 from pathlib import Path
 from textwrap import fill
 from typing import Any
 
 import matplotlib as mpl
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MultipleLocator
 
@@ -25,7 +27,8 @@ from gaponet.report.figures.style import figure, joint_label, legend, save, styl
 from gaponet.robot.finding import Finding
 from gaponet.robot.spec import RobotSpec
 
-MAX_RANGE_SEQUENCES, MAX_RANGE_ROWS = 400, 40_000  # of joint_ranges
+MAX_RANGE_SEQUENCES = 400  # of joint_ranges
+MAX_RANGE_ROWS = 40_000  # of joint_ranges
 MAX_TORQUE_MOTIONS = 60  # compared to find the motion with the largest change of torque
 MAX_PAYLOADS = 4  # of torque_temperature
 MAX_JOINTS = 3  # of a figure
@@ -35,7 +38,9 @@ LEVEL_COLOURS = dict(zip(LEVELS, ("#9ecae1", "#4292c6", "#084594"), strict=True)
 SINGLE_POINTS = 250  # single rows drawn for each joint
 FINDING_S = 8.0  # of the recording with a finding
 TORQUE_CHECKS = ("torque", "saturation", "gravity")
-COMMAND_COLOUR, STATE_COLOUR, TORQUE_COLOUR = "#222222", "#d9662b", "#3b7dd8"
+COMMAND_COLOUR = "#222222"
+STATE_COLOUR = "#d9662b"
+TORQUE_COLOUR = "#3b7dd8"
 
 
 class _NoDataError(Exception):
@@ -45,7 +50,9 @@ class _NoDataError(Exception):
 def write_figures(
     dataset: Dataset, robot: RobotSpec, out: Path, progress: Progress = no_progress
 ) -> tuple[list[Path], dict[str, str]]:
-    """Write every figure for which the dataset has data; return the files, and {figure: reason for its absence}."""
+    """Write every figure for which the dataset has data; return the files, and {figure: reason for
+    its absence}.
+    """
     dataset.require_robot(robot)
     dataset.require_sequences()
     with lock_folder(out, "figures"):
@@ -57,7 +64,8 @@ def draw_figures(
     dataset: Dataset, robot: RobotSpec, progress: Progress = no_progress
 ) -> tuple[dict[str, Figure], dict[str, str]]:
     """Draw all figures. Return them, and {figure: reason for its absence}."""
-    figures, left_out = dict[str, Figure](), dict[str, str]()
+    figures = dict[str, Figure]()
+    left_out = dict[str, str]()
     for i, (name, draw) in enumerate(FIGURES.items()):
         progress(i, len(FIGURES), name)
         try:
@@ -83,7 +91,10 @@ def joint_ranges(dataset: Dataset, robot: RobotSpec) -> Figure:
     positions = {joint: np.concatenate(rows[joint]) for joint in robot.operated if joint in rows}
     limits = {j: tuple(robot.qpos_range[robot.joint_names.index(j)]) for j in positions}
     part = f"{len(entries)} of " if len(entries) < len(dataset) else ""
-    title = f"{robot_label(entries)}: where joints were while commanded to move, {part}{len(dataset):,} sequences"
+    title = (
+        f"{robot_label(entries)}: where joints were while commanded to move, "
+        f"{part}{len(dataset):,} sequences"
+    )
     return draw_joint_ranges(positions, limits, title)
 
 
@@ -91,7 +102,8 @@ def joint_ranges(dataset: Dataset, robot: RobotSpec) -> Figure:
 def draw_joint_ranges(
     positions: dict[str, Array], limits: dict[str, tuple[float, float]], title: str
 ) -> Figure:
-    """Draw a raincloud of each joint: density, quartiles with 1 % and 99 %, single rows; grey: the joint's range.
+    """Draw a raincloud of each joint: density, quartiles with 1 % and 99 %, single rows; grey: the
+    joint's range.
 
     Args:
         positions: {joint: (k,) rad}.
@@ -101,11 +113,11 @@ def draw_joint_ranges(
     ax = fig.subplots()
     rng = np.random.default_rng(0)
     for row, (joint, values) in enumerate(positions.items()):
-        y, tint = -row, SIDES[next((s for s in ("left", "right") if joint.startswith(s)), "")]
-        if np.isfinite(limits[joint]).all():
-            ax.barh(
-                y, np.ptp(limits[joint]), 0.86, limits[joint][0], color="#000000", alpha=0.05, lw=0
-            )
+        y = -row
+        tint = _side_colour(joint)
+        lowest, highest = limits[joint]
+        if np.isfinite([lowest, highest]).all():
+            ax.barh(y, highest - lowest, 0.86, lowest, color="#000000", alpha=0.05, lw=0)
         x, density = _density(values)
         ax.fill_between(x, y + 0.06, y + 0.06 + 0.36 * density, color=tint, alpha=0.75, lw=0)
         low, q1, middle, q3, high = np.percentile(values, [1, 25, 50, 75, 99])
@@ -113,15 +125,8 @@ def draw_joint_ranges(
         ax.plot([q1, q3], [y, y], color=tint, lw=4, solid_capstyle="butt")
         ax.plot(middle, y, "o", ms=3.2, mfc="white", mec=tint, mew=1)
         rain = rng.choice(values, min(SINGLE_POINTS, len(values)), replace=False)
-        ax.plot(
-            rain,
-            y - 0.23 + rng.uniform(-0.12, 0.12, len(rain)),
-            ".",
-            ms=1.6,
-            mew=0,
-            color=tint,
-            alpha=0.5,
-        )
+        heights = y - 0.23 + rng.uniform(-0.12, 0.12, len(rain))
+        ax.plot(rain, heights, ".", ms=1.6, mew=0, color=tint, alpha=0.5)
     ax.set_yticks(-np.arange(len(positions)), [joint_label(j, wrapped=False) for j in positions])
     ax.tick_params(axis="y", length=0)
     ax.grid(axis="y", visible=False)
@@ -130,7 +135,8 @@ def draw_joint_ranges(
     low, high = ax.dataLim.intervalx
     ax.set_xlim(low - 0.1, high + 0.1)
     ax.set_xlabel(
-        "position, rad\nthick: quartiles, thin: 1–99 %, circle: median, points: single rows, grey: range of the joint"
+        "position, rad\nthick: quartiles, thin: 1–99 %, circle: median, points: single rows, "
+        "grey: range of the joint"
     )
     degrees = ax.secondary_xaxis("top", functions=(np.degrees, np.radians))
     degrees.xaxis.set_major_locator(MultipleLocator(45))
@@ -140,9 +146,18 @@ def draw_joint_ranges(
     return fig
 
 
+def _side_colour(joint: str) -> str:
+    """Return the colour of the robot's side at which a joint is."""
+    for side in ("left", "right"):
+        if joint.startswith(side):
+            return SIDES[side]
+    return SIDES[""]
+
+
 def _density(values: Array) -> tuple[Array, Array]:
     """Return positions and kernel density over the values' range, scaled to a peak of 1."""
-    low, high = values.min(), values.max()
+    low = values.min()
+    high = values.max()
     width = np.clip(0.015 * (high - low), 1e-3, 0.04)  # rad, of the kernel
     x = np.linspace(low - 3 * width, high + 3 * width, 400)
     counts, edges = np.histogram(values, 400, (x[0], x[-1]))
@@ -153,45 +168,24 @@ def _density(values: Array) -> tuple[Array, Array]:
 
 @styled
 def composition(dataset: Dataset, robot: RobotSpec) -> Figure:
-    """Draw hours by payload, unit and rate, stacked by level, with the number of sequences over each bar."""
-    entries, motions = dataset.entries, len({e.meta.motion for e in dataset.entries})
+    """Draw hours by payload, unit and rate, stacked by level.
+
+    The numbers over the bars are sequences.
+    """
+    entries = dataset.entries
+    motions = len({e.meta.motion for e in entries})
     title = f"{robot_label(entries)}: {dataset.hours():.2f} h, {motions} motions"
-    keys = {
-        "payload, kg per hand": lambda e: e.meta.payload_mass,
-        "unit": lambda e: e.meta.unit_id,
-        "rate, Hz": lambda e: round(1 / e.dt, 2),
+    groups = {
+        "payload, kg per hand": _grouped(entries, lambda e: e.meta.payload_mass),
+        "unit": _grouped(entries, lambda e: e.meta.unit_id),
+        "rate, Hz": _grouped(entries, lambda e: round(1 / e.dt, 2)),
     }
-    names = [sorted({key(e) for e in entries}) for key in keys.values()]
     fig = figure(7.0, 2.9)
-    axes = fig.subplots(1, 3, sharey=True, width_ratios=[max(2, len(n)) for n in names])
-    present = [level for level in LEVELS if any(e.meta.level == level for e in entries)]
-    for ax, (label, key), values in zip(axes, keys.items(), names, strict=True):
-        base = np.zeros(len(values))
-        for level in present:
-            part = [e for e in entries if e.meta.level == level]
-            hours = np.array(
-                [sum(e.rows * e.dt for e in part if key(e) == v) / 3600 for v in values]
-            )
-            ax.bar(
-                range(len(values)),
-                hours,
-                0.72,
-                base,
-                color=LEVEL_COLOURS[level],
-                label=level.replace("_", " "),
-            )
-            base = base + hours
-        for x, v in enumerate(values):
-            ax.annotate(f"{sum(key(e) == v for e in entries):,}", (x, base[x]), (0, 2), textcoords="offset points",
-                        ha="center", fontsize=7.5)  # fmt: skip
-        ticks = [v if isinstance(v, str) else f"{v:g}" for v in values]
-        long = max(map(len, ticks)) > 5
-        ax.set_xticks(
-            range(len(values)), ticks, rotation=30 if long else 0, ha="right" if long else "center"
-        )
-        ax.set_xlim(-0.6, len(values) - 0.4)
+    widths = [max(2, len(group)) for group in groups.values()]
+    axes = fig.subplots(1, 3, sharey=True, width_ratios=widths)
+    for ax, (label, group) in zip(axes, groups.items(), strict=True):
+        _stack_hours(ax, group, {e.meta.level for e in entries})
         ax.set_xlabel(label)
-        ax.grid(axis="x", visible=False)
     axes[0].set_ylabel("recorded, h")
     axes[0].margins(y=0.09)
     fig.align_xlabels(axes)
@@ -199,8 +193,52 @@ def composition(dataset: Dataset, robot: RobotSpec) -> Figure:
     return fig
 
 
+def _grouped(entries: list[Entry], key: Callable[[Entry], Any]) -> dict[Any, list[Entry]]:
+    """Return the entries by a value, in its order."""
+    groups: dict[Any, list[Entry]] = defaultdict(list)
+    for entry in entries:
+        groups[key(entry)].append(entry)
+    return dict(sorted(groups.items()))
+
+
+def _stack_hours(ax: Axes, groups: dict[Any, list[Entry]], levels: set[str]) -> None:
+    """Draw a bar of recorded hours for each group, stacked by level."""
+    base = np.zeros(len(groups))
+    x = range(len(groups))
+    for level in LEVELS:
+        if level not in levels:
+            continue
+        hours = np.array([_hours(group, level) for group in groups.values()])
+        name = level.replace("_", " ")
+        ax.bar(x, hours, 0.72, base, color=LEVEL_COLOURS[level], label=name)
+        base = base + hours
+    for i, group in enumerate(groups.values()):
+        ax.annotate(
+            f"{len(group):,}",
+            (i, base[i]),
+            (0, 2),
+            textcoords="offset points",
+            ha="center",
+            fontsize=7.5,
+        )
+    ticks = [value if isinstance(value, str) else f"{value:g}" for value in groups]
+    if max(map(len, ticks)) > 5:
+        ax.set_xticks(x, ticks, rotation=30, ha="right")
+    else:
+        ax.set_xticks(x, ticks, rotation=0, ha="center")
+    ax.set_xlim(-0.6, len(groups) - 0.4)
+    ax.grid(axis="x", visible=False)
+
+
+def _hours(entries: list[Entry], level: str) -> float:
+    """Return the recorded time of the entries of a level, h."""
+    return sum(e.rows * e.dt for e in entries if e.meta.level == level) / 3600
+
+
 def torque_temperature(dataset: Dataset, robot: RobotSpec) -> Figure:
-    """Draw the motion with the largest change of torque at several payloads, and the joints that bear it."""
+    """Draw the motion with the largest change of torque at several payloads, and the joints that
+    bear it.
+    """
     group = largest_torque_change(dataset, robot)
     payloads = evenly_spaced(sorted({e.meta.payload_mass for e in group}), MAX_PAYLOADS)
     takes = {}
@@ -212,9 +250,8 @@ def torque_temperature(dataset: Dataset, robot: RobotSpec) -> Figure:
     size = swing(heaviest.tau[:, robot.operated_index])
     joints = [robot.operated[i] for i in sorted(np.argsort(-size)[:MAX_JOINTS])]
     meta = heaviest.meta
-    return draw_torque_temperature(
-        takes, joints, f"{robot_label(group)}: {meta.motion}, {meta.unit_id}"
-    )
+    title = f"{robot_label(group)}: {meta.motion}, {meta.unit_id}"
+    return draw_torque_temperature(takes, joints, title)
 
 
 FIGURES = {
@@ -232,54 +269,63 @@ def draw_torque_temperature(takes: dict[float, Sequence], joints: list[str], tit
         takes: {payload kg: recording} in ascending order, with torque or temperature or both.
     """
     first = next(iter(takes.values()))
-    rows = [("qpos", "position, rad"), ("tau", "torque, N·m"), ("temperature", "warming, K")]
-    rows = [(c, label) for c, label in rows if getattr(first, c) is not None]
+    labels = {"qpos": "position, rad", "tau": "torque, N·m", "temperature": "warming, K"}
+    rows = [channel for channel in labels if getattr(first, channel) is not None]
     fig = figure(7.0, 0.9 + 1.45 * len(rows))
     axes = fig.subplots(len(rows), len(joints), sharex=True, squeeze=False)
     for ax in axes[1:, 1:].flat:  # one scale for a row, so that joints can be compared
         ax.sharey(axes[ax.get_subplotspec().rowspan.start, 0])
         ax.tick_params(labelleft=False)
-    colours = mpl.colormaps["plasma"](
-        np.linspace(0.85, 0.05, len(takes)) if len(takes) > 1 else [0.4]
-    )
+    shades = np.linspace(0.85, 0.05, len(takes)) if len(takes) > 1 else [0.4]
+    colours = mpl.colormaps["plasma"](shades)
     for colour, (payload, take) in zip(colours, takes.items(), strict=True):
         time = np.arange(len(take)) * take.dt
         for column, joint in enumerate(joints):
             j = take.joint_names.index(joint)
-            for row, (channel, _) in enumerate(rows):
+            for row, channel in enumerate(rows):
                 values = getattr(take, channel)[:, j]
-                values = values - values[0] if channel == "temperature" else values
+                if channel == "temperature":
+                    values = values - values[0]
                 axes[row, column].plot(time, values, color=colour, lw=0.9, label=f"{payload:g} kg")
     for column, joint in enumerate(joints):
         axes[0, column].set_title(joint_label(joint, wrapped=False))
         axes[-1, column].set_xlabel("time, s")
         axes[0, column].margins(x=0.01)
-    for row, (_, label) in enumerate(rows):
-        axes[row, 0].set_ylabel(label)
+    for row, channel in enumerate(rows):
+        axes[row, 0].set_ylabel(labels[channel])
     fig.align_ylabels(axes[:, 0])
     legend(fig, title)
     return fig
 
 
 def largest_torque_change(dataset: Dataset, robot: RobotSpec) -> list[Entry]:
-    """Return the entries of the motion with the largest change of torque, among those with the most payloads."""
-    takes: dict[tuple[Any, ...], list[Entry]] = defaultdict(
-        list
-    )  # that differ only in payload and repetition
+    """Return the entries of the motion with the largest change of torque.
+
+    Only motions with the most payloads count.
+    """
+    # Entries of a group differ only in payload and repetition.
+    takes: dict[tuple[Any, ...], list[Entry]] = defaultdict(list)
     for e in dataset.entries:
         takes[e.meta.motion, e.meta.unit_id, e.meta.payload_side, round(e.dt, 7)].append(e)
-    groups = [g for g in takes.values() if all("tau" in e.channels for e in g)]
+    groups = [group for group in takes.values() if all("tau" in e.channels for e in group)]
     if not groups:
         raise _NoDataError("no torque was recorded")
-    count = lambda g: len({e.meta.payload_mass for e in g})  # noqa: E731
-    full = {g[0].meta.motion: g for g in reversed(groups) if count(g) == max(map(count, groups))}
+    most = max(map(_count_payloads, groups))
+    by_motion: dict[str, list[Entry]] = {}  # the first group of each motion; the last motion first
+    for group in reversed(groups):
+        if _count_payloads(group) == most:
+            by_motion[group[0].meta.motion] = group
 
     def torque(group: list[Entry]) -> float:
         entry = max(group, key=lambda e: e.meta.payload_mass)
         rows = dataset.channels(entry, ("tau",))["tau"][: round(SHOWN_S / entry.dt)]
         return float(swing(rows[:, robot.operated_index]).mean())
 
-    return max(evenly_spaced(list(full.values()), MAX_TORQUE_MOTIONS), key=torque)
+    return max(evenly_spaced(list(by_motion.values()), MAX_TORQUE_MOTIONS), key=torque)
+
+
+def _count_payloads(entries: list[Entry]) -> int:
+    return len({e.meta.payload_mass for e in entries})
 
 
 def swing(values: Array) -> Array:
@@ -291,19 +337,24 @@ def swing(values: Array) -> Array:
 def draw_findings(
     dataset: Dataset, robot: RobotSpec, findings: list[Finding], out: Path
 ) -> list[Path]:
-    """Write a figure (SVG, PNG) for each warning, error, and note about a joint. Return the files."""
-    shown = [
-        f for f in findings if f.level in ("warning", "error") or (f.level == "note" and f.joints)
-    ]
+    """Write a figure (SVG, PNG) for each warning, error, and note about a joint.
+
+    Return the files.
+    """
+    shown = [finding for finding in findings if _deserves_figure(finding)]
     written = []
     for number, finding in enumerate(shown, 1):
         sequence = dataset.read(_entry(dataset.entries, finding))
-        joints = [j for j in finding.joints or robot.operated if j in robot.joint_names][
-            :MAX_JOINTS
-        ]
-        fig = _draw_finding(finding, sequence, robot.index(joints))
+        joints = [j for j in finding.joints or robot.operated if j in robot.joint_names]
+        fig = _draw_finding(finding, sequence, robot.index(joints[:MAX_JOINTS]))
         written += save(fig, out / f"{number:02d}-{finding.check}")
     return written
+
+
+def _deserves_figure(finding: Finding) -> bool:
+    if finding.level == "note":
+        return bool(finding.joints)
+    return finding.level in ("warning", "error")
 
 
 def _entry(entries: list[Entry], finding: Finding) -> Entry:
@@ -340,10 +391,12 @@ def _draw_finding(finding: Finding, sequence: Sequence, joints: Array) -> Figure
 
 def _window(finding: Finding, sequence: Sequence, joints: Array, torque: Array | None) -> slice:
     """Return the rows around the largest error, jump or torque."""
-    ctrl, qpos = sequence.ctrl[:, joints], sequence.qpos[:, joints]
+    ctrl = sequence.ctrl[:, joints]
+    qpos = sequence.qpos[:, joints]
     worst = np.abs(torque[:, joints]) if torque is not None else np.abs(ctrl - qpos)
     if finding.check == "jumps":
         worst = np.abs(np.diff(qpos, n=2, axis=0, prepend=qpos[:1], append=qpos[-1:]))
-    middle, half = int(worst.max(axis=1).argmax()), round(FINDING_S / 2 / sequence.dt)
+    middle = int(worst.max(axis=1).argmax())
+    half = round(FINDING_S / 2 / sequence.dt)
     start = min(max(0, middle - half), max(0, len(qpos) - 2 * half))
     return slice(start, start + 2 * half)

@@ -43,23 +43,21 @@ MAX_INTERVAL = 3.0  # of the joints' range; a wider interval is drawn as unknown
 
 def by_group(methods: dict[str, Any], group: str, label: Callable[[str], str]) -> Figure:
     """Draw the MPJAE of each method by joint or payload; label names a bar's group."""
-    group, heading = f"by_{group}", f"MPJAE by {group}"
-    keys = list(methods["nominal"][group])
-    values = {
-        title(n): (colour(n), [MeanStd.from_values([m[group][k]["mpjae"]], 1e3) for k in keys])
-        for n, m in methods.items()
-    }
-    return _degrees(bars([label(k) for k in keys], values, "mrad", heading))
+    field = f"by_{group}"
+    keys = list(methods["nominal"][field])
+    values = {}
+    for name, metrics in methods.items():
+        errors = [MeanStd.from_values([metrics[field][key]["mpjae"]], 1e3) for key in keys]
+        values[title(name)] = (colour(name), errors)
+    return _degrees(bars([label(key) for key in keys], values, "mrad", f"MPJAE by {group}"))
 
 
 @styled
 def by_horizon(methods: dict[str, Any]) -> Figure:
     """Draw the MPJAE of each method against the time since the common start."""
     horizons = [k for k in methods["nominal"]["by_horizon"] if k != "whole"]
-    ticks = {
-        **{float(k): f"{float(k):g} s" for k in horizons},
-        4 * float(horizons[-1]): "whole\nmotion",
-    }
+    ticks = {float(k): f"{float(k):g} s" for k in horizons}
+    ticks[4 * float(horizons[-1])] = "whole\nmotion"
     fig = figure(4.2, 3.2)
     ax = fig.subplots()
     for name, metrics in methods.items():
@@ -102,8 +100,14 @@ def training_curve(progress: list[dict[str, Any]]) -> Figure:
     best = int(value.argmin())
     ax.plot(steps[best], value[best], "o", ms=9, mfc="none", mec="#111111", label="selected")
     ax.axhline(progress[0]["nominal_mpjae"] * 1e3, color=colour("nominal"), ls="--", lw=1)
-    ax.annotate("nominal", (1, progress[0]["nominal_mpjae"] * 1e3), xycoords=("axes fraction", "data"), ha="right",
-                va="bottom", color=colour("nominal"))  # fmt: skip
+    ax.annotate(
+        "nominal",
+        (1, progress[0]["nominal_mpjae"] * 1e3),
+        xycoords=("axes fraction", "data"),
+        ha="right",
+        va="bottom",
+        color=colour("nominal"),
+    )
     ax.set_ylim(bottom=0)
     ax.set_xlabel("control steps, million")
     ax.set_ylabel("validation MPJAE, mrad")
@@ -135,74 +139,104 @@ def trajectories(
 def _trajectory(
     arrays: dict[str, Array], row: int, joints: tuple[str, ...], methods: list[str], dt: float
 ) -> Figure:
-    """Draw the three joints with the largest nominal error, a column each; moving joints come first.
+    """Draw the three joints with the largest nominal error, a column each; moving joints come
+    first.
 
-    From top to bottom: positions, positions around the largest turn of the command, errors, and corrections.
+    From top to bottom: positions, positions around the largest turn of the command, errors, and
+    corrections.
     """
-    recorded, count = arrays[f"{row}/recorded"], round(SHOWN_S / dt)
-    window = slice(start := busiest_window(recorded, count), min(start + count, len(recorded)))
-    time, command = np.arange(len(recorded))[window] * dt, arrays[f"{row}/command"][window]
-    still = np.ptp(command, axis=0) <= MIN_MOTION_RAD
-    columns = np.lexsort((-np.abs(arrays[f"{row}/nominal"] - recorded).mean(axis=0), still))[:3]
-    learned = [
-        n for n in methods if np.abs(arrays.get(f"{row}/delta/{n}", 0.0)).max() > MIN_CORRECTION
-    ]
-    heights = {"position, rad": 1.8, "zoom, rad": 1.6, "error, mrad": 1.1} | (
-        {"Δa, mrad": 0.9} if learned else {}
-    )
+    recorded = arrays[f"{row}/recorded"]
+    count = round(SHOWN_S / dt)
+    start = busiest_window(recorded, count)
+    window = slice(start, min(start + count, len(recorded)))
+    time = np.arange(len(recorded))[window] * dt
+    command = arrays[f"{row}/command"][window]
+    still = np.ptp(command, axis=0) <= MIN_MOTION_RAD  # (n,)
+    nominal_error = np.abs(arrays[f"{row}/nominal"] - recorded).mean(axis=0)
+    columns = np.lexsort((-nominal_error, still))[:3]
+    simulated = {name: arrays[f"{row}/{name}"][window] for name in methods}  # (T, n) rad each
+    deltas = {}
+    for name in methods:
+        delta = arrays.get(f"{row}/delta/{name}")
+        if delta is not None and np.abs(delta).max() > MIN_CORRECTION:
+            deltas[name] = delta[window]
+    heights = {"position, rad": 1.8, "zoom, rad": 1.6, "error, mrad": 1.1}
+    if deltas:
+        heights["Δa, mrad"] = 0.9
     fig = figure(3.6 * len(columns), 1.0 + 1.1 * sum(heights.values()))
     axes = fig.subplots(
         len(heights), len(columns), squeeze=False, height_ratios=list(heights.values())
     )
     for column, j in zip(axes.T, sorted(columns.tolist()), strict=True):
-        zoom, real = _turn(command[:, j], dt), recorded[window, j]
-        for ax, part in zip(column, (slice(None), zoom), strict=False):
-            ax.step(time[part], command[part, j], where="post", color=colour("command"), ls=DOTTED, lw=1.1,
-                    label=title("command"))  # fmt: skip
-            for n in methods:
-                ax.plot(
-                    time[part],
-                    arrays[f"{row}/{n}"][window, j][part],
-                    color=colour(n),
-                    label=title(n),
-                )
-            ax.plot(
-                time[part],
-                real[part],
-                color=colour("recorded"),
-                ls=DASHED,
-                lw=1.0,
-                label=title("recorded"),
-            )
-            low, high = ax.get_ylim()
-            if high - low < MIN_POSITION_SPAN:
-                ax.set_ylim(
-                    (low + high - MIN_POSITION_SPAN) / 2, (low + high + MIN_POSITION_SPAN) / 2
-                )
+        zoom = _turn(command[:, j], dt)
+        real = recorded[window, j]
+        positions = {name: qpos[:, j] for name, qpos in simulated.items()}
+        whole = slice(None)
+        _draw_positions(column[0], time, command[:, j], positions, real, whole)
+        _draw_positions(column[1], time, command[:, j], positions, real, zoom)
         column[0].axvspan(*time[zoom][[0, -1]], color="#000000", alpha=0.06, lw=0)
-        for n in methods:
-            column[2].plot(
-                time, (arrays[f"{row}/{n}"][window, j] - real) * 1e3, color=colour(n), lw=1.0
-            )
+        for name, qpos in positions.items():
+            column[2].plot(time, (qpos - real) * 1e3, color=colour(name), lw=1.0)
         column[2].axhline(0, color="#111111", lw=0.6)
-        for n in learned:
-            delta = arrays[f"{row}/delta/{n}"][window, j]
-            column[3].plot(time[: len(delta)], delta * 1e3, color=colour(n), lw=0.9)
-        column[0].set_title(
-            joint_label(joints[j], wrapped=False) + (" (stands still)" if still[j] else "")
-        )
+        for name, delta in deltas.items():
+            column[3].plot(time[: len(delta)], delta[:, j] * 1e3, color=colour(name), lw=0.9)
+        heading = joint_label(joints[j], wrapped=False)
+        column[0].set_title(f"{heading} (stands still)" if still[j] else heading)
         column[-1].set_xlabel("time, s")
         for ax in (column[0], *column[2:]):
             ax.set_xlim(time[0], time[-1])
     for line, label in zip(axes, heights, strict=True):
         line[0].set_ylabel(label)
     for line in axes[2:]:
-        end = 1.08 * max(abs(v) for ax in line for v in ax.dataLim.intervaly) or 1.0
-        for ax in line:
-            ax.set_ylim(-end, end)
+        _centre_on_zero(line)
     fig.align_ylabels(axes[:, 0])
     legend(fig)
     return fig
+
+
+def _draw_positions(
+    ax: Axes,
+    time: Array,
+    command: Array,
+    simulated: dict[str, Array],
+    recorded: Array,
+    part: slice,
+) -> None:
+    """Draw some rows of a joint's command, of its positions by each method, and as recorded, rad.
+
+    All arrays are (T,).
+    """
+    ax.step(
+        time[part],
+        command[part],
+        where="post",
+        color=colour("command"),
+        ls=DOTTED,
+        lw=1.1,
+        label=title("command"),
+    )
+    for name, qpos in simulated.items():
+        ax.plot(time[part], qpos[part], color=colour(name), label=title(name))
+    ax.plot(
+        time[part],
+        recorded[part],
+        color=colour("recorded"),
+        ls=DASHED,
+        lw=1.0,
+        label=title("recorded"),
+    )
+    low, high = ax.get_ylim()
+    if high - low < MIN_POSITION_SPAN:
+        middle_twice = low + high
+        ax.set_ylim((middle_twice - MIN_POSITION_SPAN) / 2, (middle_twice + MIN_POSITION_SPAN) / 2)
+
+
+def _centre_on_zero(line: Array) -> None:
+    """Give axes that stand in a line one vertical range, with zero in the middle."""
+    ends = [np.abs(ax.dataLim.intervaly).max() for ax in line]
+    end = 1.08 * max(ends) or 1.0
+    for ax in line:
+        ax.set_ylim(-end, end)
 
 
 def _turn(command: Array, dt: float) -> slice:
@@ -210,14 +244,15 @@ def _turn(command: Array, dt: float) -> slice:
     half = round(1 / dt)
     if len(command) <= 2 * half:
         return slice(0, len(command))
-    start = int(
-        np.abs(2 * command[half:-half] - command[: -2 * half] - command[2 * half :]).argmax()
-    )
+    change = 2 * command[half:-half] - command[: -2 * half] - command[2 * half :]
+    start = int(np.abs(change).argmax())
     return slice(start, start + 2 * half)
 
 
 def write_gap(gap: dict[str, Any], folder: Path) -> None:
-    """Write the result of evaluation.gap.gap_by_step as gap.json, gap.svg and gap.png into a robot folder or a run."""
+    """Write the result of evaluation.gap.gap_by_step as gap.json, gap.svg and gap.png into a robot
+    folder or a run.
+    """
     with lock_folder(folder, "robot" if is_robot(folder) else "run"):
         write_text(folder / "gap.json", json.dumps(gap, indent=1) + "\n")
         save(waterfall(gap), folder / "gap")
@@ -225,7 +260,9 @@ def write_gap(gap: dict[str, Any], folder: Path) -> None:
 
 @styled
 def waterfall(gap: dict[str, Any]) -> Figure:
-    """Draw the reduction of the mean |error| by each step (hollow: increase), all joints first, and the error floor."""
+    """Draw the reduction of the mean |error| by each step (hollow: increase), all joints first,
+    and the error floor.
+    """
     panels = {"all joints": {"left": gap["left"], "floor": gap["floor"]}} | gap["by_joint"]
     steps = list(gap["left"])
     rows = -(-len(panels) // MAX_COLUMNS)
@@ -234,27 +271,31 @@ def waterfall(gap: dict[str, Any]) -> Figure:
     axes = fig.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
     for ax in axes.flat[len(panels) :]:
         ax.set_visible(False)
-    for i, (ax, (name, panel)) in enumerate(zip(axes.flat, panels.items(), strict=False)):
-        _waterfall_panel(
-            ax, steps, {k: 1e3 * v for k, v in panel["left"].items()}, panel["floor"]["both"]
-        )
+    for i, (name, panel) in enumerate(panels.items()):
+        ax = axes.flat[i]
+        errors = {step: 1e3 * error for step, error in panel["left"].items()}  # mrad
+        _waterfall_panel(ax, steps, errors, panel["floor"]["both"])
         ax.set_title(joint_label(name, wrapped=False))
-        ax.xaxis.set_tick_params(labelbottom=i + columns >= len(panels))
-        if i + columns >= len(panels):
+        is_lowest = i + columns >= len(panels)
+        ax.xaxis.set_tick_params(labelbottom=is_lowest)
+        if is_lowest:
             ax.set_xlabel("MPJAE, mrad")
     axes[0, 0].set_yticks(range(len(steps) + 1), [*map(title, steps), "remaining"])
     for ax in axes[:, 0]:
         ax.tick_params(axis="y", labelsize=7)
     axes[0, 0].invert_yaxis()
-    robot, end = (
-        f"{'VIRTUAL' if gap['virtual'] else 'real'} {gap['robot']}",
-        "s" * (gap["sequences"] != 1),
-    )
+    robot = f"{'VIRTUAL' if gap['virtual'] else 'real'} {gap['robot']}"
+    recordings = "test recording" if gap["unseen"] else "recording"
+    if gap["sequences"] != 1:
+        recordings += "s"
     fig.suptitle(
-        f"{robot}, {gap['sequences']} {'test ' if gap['unseen'] else ''}recording{end}: reduction "
-        "of the error by each step (hollow: increase)\ndashed: floor, by encoder and repeatability (– unknown)",
-        fontsize=9, x=0.01, ha="left",
-    )  # fmt: skip
+        f"{robot}, {gap['sequences']} {recordings}: reduction "
+        "of the error by each step (hollow: increase)\ndashed: floor, by encoder and "
+        "repeatability (– unknown)",
+        fontsize=9,
+        x=0.01,
+        ha="left",
+    )
     return fig
 
 
@@ -262,15 +303,30 @@ def _waterfall_panel(
     ax: Axes, steps: list[str], errors: dict[str, float], floor: float | None
 ) -> None:
     """Draw one panel; errors after each step in mrad, floor in rad."""
-    start = before = errors[steps[0]]
+    start = errors[steps[0]]
+    before = start
     ax.barh(0, before, color=colour("nominal"))
     for k, step in enumerate(steps[1:], 1):
         after = errors[step]
-        ax.barh(k, abs(before - after), left=min(before, after), color="white" if after > before else colour(step),
-                edgecolor=colour(step), lw=1.0)  # fmt: skip
+        ax.barh(
+            k,
+            abs(before - after),
+            left=min(before, after),
+            color="white" if after > before else colour(step),
+            edgecolor=colour(step),
+            lw=1.0,
+        )
         ax.plot([before, before], [k - 0.6, k + 0.4], color="#555555", lw=0.6)
-        ax.annotate(f"{after - before:+.1f}".replace("-", "−"), (max(before, after), k), (2, 0), ha="left", va="center",
-                    textcoords="offset points", fontsize=6.5, color=shade(colour(step), -0.25))  # fmt: skip
+        ax.annotate(
+            f"{after - before:+.1f}".replace("-", "−"),
+            (max(before, after), k),
+            (2, 0),
+            ha="left",
+            va="center",
+            textcoords="offset points",
+            fontsize=6.5,
+            color=shade(colour(step), -0.25),
+        )
         before = after
     ax.plot([before, before], [len(steps) - 0.6, len(steps) + 0.4], color="#555555", lw=0.6)
     ax.barh(len(steps), before, color="#333333")
@@ -308,7 +364,8 @@ def draw_uncertainty(uncertainty: ParameterUncertainty, heading: str) -> Figure:
         ax.set_visible(False)
     y = np.arange(len(joints))[::-1]
     for place, (ax, field) in enumerate(zip(axes.flat, fields, strict=False)):
-        name, factor = SERVO_FIELDS[field].heading, SERVO_FIELDS[field].factor
+        name = SERVO_FIELDS[field].heading
+        factor = SERVO_FIELDS[field].factor
         values = np.array([s.values[field] * factor for s in summaries])
         half = np.array([QUANTILE_90 * s.errors[field] * factor for s in summaries])
         span = max(float(np.ptp(values)), float(np.abs(values).max()) * 0.1, 1e-9)
@@ -324,11 +381,8 @@ def draw_uncertainty(uncertainty: ParameterUncertainty, heading: str) -> Figure:
             color="#1f5fa8",
         )
         ax.plot(values[~shown], y[~shown], "o", ms=4, mfc="none", color="#999999")
-        labels = (
-            [joint_label(j, wrapped=False) for j in joints]
-            if place % columns == 0
-            else [""] * len(joints)
-        )
+        is_leftmost = place % columns == 0
+        labels = [joint_label(j, wrapped=False) if is_leftmost else "" for j in joints]
         ax.set_yticks(y, labels)
         ax.set_title(name)
         ax.set_ylim(-0.6, len(joints) - 0.4)

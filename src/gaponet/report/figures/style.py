@@ -42,8 +42,10 @@ STYLE: dict[Any, Any] = {
 }
 DASHED = (0, (4, 1.5))
 DOTTED = (0, (1, 1))
-MAX_LEGEND_ENTRY, LETTER = 1.9, 0.09  # inches: widest entry of a legend, width of a letter
-MAX_LINE, MAX_LABEL = 120, 40  # letters of a line, and of a label of an axis or a legend
+MAX_LEGEND_ENTRY_INCH = 1.9
+LETTER_WIDTH_INCH = 0.09
+MAX_LINE = 120  # letters
+MAX_LABEL = 40  # letters of a label of an axis or a legend
 
 
 def figure(width: float, height: float) -> Figure:
@@ -67,41 +69,60 @@ def styled(draw: Callable[P, Figure]) -> Callable[P, Figure]:
 
 
 def _printable(fig: Figure) -> Figure:
-    """Escape control characters, which an SVG may not hold, and shorten long lines in the middle."""
+    """Escape control characters, which an SVG may not hold, and shorten long lines in the
+    middle.
+    """
     from matplotlib.legend import Legend
     from matplotlib.text import Text
     from matplotlib.ticker import FixedFormatter, FuncFormatter
 
-    def lines(text: str, limit: int) -> str:
-        every = map(escape, text.split("\n"))
-        return "\n".join(
-            s if len(s) <= limit else f"{s[: limit // 2]}…{s[-limit // 2 :]}" for s in every
-        )
-
-    for axis in (axis for ax in fig.axes for axis in (ax.xaxis, ax.yaxis)):
-        ticks = axis.get_major_formatter()
-        if isinstance(ticks, (FixedFormatter, FuncFormatter)):
-            axis.set_major_formatter(
-                FuncFormatter(lambda at, i, ticks=ticks: lines(ticks(at, i), MAX_LABEL))
-            )
-    entries = {text for legend in fig.findobj(Legend) for text in legend.get_texts()}
+    for ax in fig.axes:
+        for axis in (ax.xaxis, ax.yaxis):
+            ticks = axis.get_major_formatter()
+            if isinstance(ticks, (FixedFormatter, FuncFormatter)):
+                axis.set_major_formatter(
+                    FuncFormatter(lambda at, i, ticks=ticks: _shortened(ticks(at, i), MAX_LABEL))
+                )
+    entries: set[Text] = set()
+    for legend in fig.findobj(Legend):
+        entries.update(legend.get_texts())
     for text in fig.findobj(Text):
-        text.set_text(lines(text.get_text(), MAX_LABEL if text in entries else MAX_LINE))
+        text.set_text(_shortened(text.get_text(), MAX_LABEL if text in entries else MAX_LINE))
     return fig
 
 
+def _shortened(text: str, limit: int) -> str:
+    """Return a text with its control characters escaped, and long lines cut in the middle."""
+    lines = []
+    for line in map(escape, text.split("\n")):
+        if len(line) > limit:
+            line = f"{line[: limit // 2]}…{line[-limit // 2 :]}"
+        lines.append(line)
+    return "\n".join(lines)
+
+
 def legend(fig: Figure, title: str = "") -> None:
-    """Add one legend for all axes above the figure, in as many columns as fit; title is that of the figure."""
+    """Add one legend for all axes above the figure, in as many columns as fit; title is that of
+    the figure.
+    """
     handles: dict[str, Any] = {}
     for ax in fig.axes:
         for handle, label in zip(*ax.get_legend_handles_labels(), strict=True):
             handles.setdefault(label, handle)
-    width = min(MAX_LEGEND_ENTRY, 0.5 + LETTER * max(map(len, handles), default=0))
+    longest = max(map(len, handles), default=0)  # letters
+    width = min(MAX_LEGEND_ENTRY_INCH, 0.5 + LETTER_WIDTH_INCH * longest)
+    columns = min(len(handles), int(fig.get_figwidth() / width))
     fig.legend(
-        list(handles.values()), list(handles), loc="outside upper left",
-        ncols=max(1, min(len(handles), int(fig.get_figwidth() / width))), columnspacing=1.1, handlelength=1.4,
-        title=title or None, alignment="left", title_fontproperties={"weight": "bold", "size": 9},
-    )  # fmt: skip
+        list(handles.values()),
+        list(handles),
+        loc="outside upper left",
+        ncols=max(1, columns),
+        columnspacing=1.1,
+        handlelength=1.4,
+        title=title or None,
+        alignment="left",
+        title_fontproperties={"weight": "bold", "size": 9},
+    )
 
 
 @styled
@@ -120,13 +141,11 @@ def draw_curves(time: Array, curves: Mapping[str, tuple[Array, str]], label: str
 @styled
 def bars(groups: ListOf[str], methods: Bars, axis: str, title: str) -> Figure:
     """Draw bars with error bars, the methods of each group side by side."""
-    word = max((len(word) for group in groups for word in group.split()), default=0)
-    fig = figure(
-        max(
-            5.2, 0.17 * len(groups) * len(methods) + 1.7, (LETTER * word + 0.05) * len(groups) + 1.3
-        ),
-        3.3,
-    )
+    words = " ".join(groups).split()
+    longest = max(map(len, words), default=0)  # letters
+    width_of_bars = 0.17 * len(groups) * len(methods) + 1.7
+    width_of_labels = (LETTER_WIDTH_INCH * longest + 0.05) * len(groups) + 1.3
+    fig = figure(max(5.2, width_of_bars, width_of_labels), 3.3)
     ax = fig.subplots()
     draw_bars(ax, groups, methods)
     ax.set_ylabel(axis)
@@ -140,22 +159,34 @@ def draw_bars(ax: Axes, groups: ListOf[str], methods: Bars, size: float | None =
     width = 0.84 / len(methods)
     for i, (label, (colour, values)) in enumerate(methods.items()):
         x = np.arange(len(groups)) + (i - (len(methods) - 1) / 2) * width
-        std = np.array([v.std if v.std == v.std else 0.0 for v in values])
-        ax.bar(x, [v.mean for v in values], width * 0.92, yerr=std if std.any() else None, color=colour, label=label,
-               error_kw={"lw": 0.7, "capsize": 1.2, "capthick": 0.6})  # fmt: skip
+        std = np.nan_to_num([v.std for v in values])
+        ax.bar(
+            x,
+            [v.mean for v in values],
+            width * 0.92,
+            yerr=std if std.any() else None,
+            color=colour,
+            label=label,
+            error_kw={"lw": 0.7, "capsize": 1.2, "capthick": 0.6},
+        )
     ax.set_xticks(np.arange(len(groups)), groups, fontsize=size)
     ax.tick_params(axis="x", length=0)
     ax.grid(axis="x", visible=False)
 
 
 def joint_label(joint: str, wrapped: bool = True) -> str:
-    """Return left_shoulder_pitch_joint as left shoulder pitch; wrapped: one word per line, for neighbouring ticks."""
+    """Return left_shoulder_pitch_joint as left shoulder pitch; wrapped: one word per line, for
+    neighbouring ticks.
+    """
     words = joint.removesuffix("_joint").replace("_", " ")
     return words.replace(" ", "\n") if wrapped else words
 
 
 def save(fig: Figure, path: Path) -> list[Path]:
-    """Write an SVG, with letters as outlines so that no font is needed, and a PNG. Return both files."""
+    """Write an SVG, with letters as outlines so that no font is needed, and a PNG.
+
+    Return both files.
+    """
     import matplotlib as mpl
 
     files = [path.with_suffix(".svg"), path.with_suffix(".png")]

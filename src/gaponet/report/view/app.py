@@ -1,7 +1,9 @@
-"""The page of `gaponet app`: six steps from logs to an identified simulator, each by commands in one folder.
+"""The page of `gaponet app`: six steps from logs to an identified simulator, each by commands in
+one folder.
 
-The folder may come from somebody else. Markdown and HTML of the page hold its texts only escaped; jobs.py validates
-what commands left there, inside.py keeps to files of the folder, and server.py lets no other script run.
+The folder may come from somebody else. Markdown and HTML of the page hold its texts only escaped;
+jobs.py validates what commands left there, inside.py keeps to files of the folder, and server.py
+lets no other script run.
 """
 
 from __future__ import annotations
@@ -45,6 +47,8 @@ MODEL_SUFFIXES = (".xml", ".mjcf", ".urdf")
 POSITION_UNITS = ("as the logs state", "rad", "deg", "fraction", "ticks", "signed_percent")
 TARGETS = ("mjcf", "urdf", "mjlab", "isaaclab", "newton", "drake", "json")
 NETWORK_TARGETS = ("onnx", "torch")  # of a trained network
+# Target → engine that applies parameter sets; others read a file.
+ENGINES = {"mjcf": "mujoco", "mjlab": "mjlab", "isaaclab": "isaaclab"}
 POLL_S = 0.5
 PANEL_WIDTH = 560  # pixels
 TEMPLATES = files("gaponet.report").joinpath("templates")
@@ -54,10 +58,12 @@ class App:
     """Controls, texts and pictures of the page. All pages of a server show the same."""
 
     def __init__(self, folder: Path, port: int, outside: tuple[Path, ...] = ()) -> None:
-        """Serve the page of a folder, an absolute path, which holds logs, models, commands and their results.
+        """Serve the page of a folder, an absolute path, which holds logs, models, commands and
+        their results.
 
         Args:
-            outside: Other folders, absolute paths, that stored commands may use: a robot, a dataset.
+            outside: Other folders, absolute paths, that stored commands may use: a robot, a
+                dataset.
 
         Raises:
             UsageError: A folder in it is a link.
@@ -84,11 +90,17 @@ class App:
         self.dismiss.visible = False
         self.unreadable = self.gui.add_markdown("")
         tabs = self.gui.add_tab_group()
-        for number, step in enumerate(
-            (self._robot, self._logs, self._check, self._gap, self._identify, self._use), 1
-        ):
-            with tabs.add_tab(f"{number} {step.__name__.strip('_').capitalize()}"):
-                step()
+        steps: dict[str, Callable[[], None]] = {
+            "1 Robot": self._robot,
+            "2 Logs": self._logs,
+            "3 Check": self._check,
+            "4 Gap": self._gap,
+            "5 Identify": self._identify,
+            "6 Use": self._use,
+        }
+        for title, add_controls in steps.items():
+            with tabs.add_tab(title):
+                add_controls()
         self._attempt(self.refresh)
 
     def tick(self, elapsed: float) -> None:
@@ -118,33 +130,24 @@ class App:
         self._text("robot", "Choose a robot of the package, or upload a model of yours.")
 
     def _use_robot(self, _: Any) -> None:
-        given = {
-            f"--{name}": box.value.split()
-            for name, box in self.options.items()
-            if box.value.split()
-        }
-        if any(word.startswith("-") for words in given.values() for word in words):
-            raise UsageError("joints, kp and kd are names and numbers, without a dash in front")
-        if (name := str(self.model.value)) in packaged_robots():
+        options = []
+        for name, box in self.options.items():
+            words = box.value.split()
+            if any(word.startswith("-") for word in words):
+                raise UsageError("joints, kp and kd are names and numbers, without a dash in front")
+            if words:
+                options += [f"--{name}", *words]
+        name = str(self.model.value)
+        if name in packaged_robots():
             self.jobs.start("robot", "robot", "check", name)
         else:
-            self.jobs.start(
-                "robot",
-                "robot",
-                "new",
-                name,
-                "--out",
-                OUT,
-                *(w for k in given for w in (k, *given[k])),
-            )
+            self.jobs.start("robot", "robot", "new", name, "--out", OUT, *options)
 
     def _logs(self) -> None:
         self._upload("Upload a log, or a .zip of logs", "logs")
         self.gui.add_markdown(f"Or copy them into {escape_markdown(str(self.folder / 'logs'))}.")
-        self.unit, self.mass = (
-            self.gui.add_text("unit", "lab"),
-            self.gui.add_number("payload, kg", 0.0, min=0.0),
-        )
+        self.unit = self.gui.add_text("unit", "lab")
+        self.mass = self.gui.add_number("payload, kg", 0.0, min=0.0)
         self.position = self.gui.add_dropdown("positions in", POSITION_UNITS)
         self.cut = self.gui.add_number(
             "cut into pieces, s", 0.0, min=0.0, hint="0: not cut; 3 motions are needed"
@@ -156,12 +159,12 @@ class App:
         self._button("Set these logs aside", self._set_aside)
         self._button("Read the logs", self._read)
         self._text("import", "Choose the robot first. Then upload logs, and read them.")
-        self.recording, self.joint = (
-            self.gui.add_dropdown(name, ("–",)) for name in ("recording", "joint")
-        )
+        self.recording = self.gui.add_dropdown("recording", ("–",))
+        self.joint = self.gui.add_dropdown("joint", ("–",))
+        nothing = np.zeros(2)
         lines = {
-            name: (np.zeros(2), colour(key))
-            for name, key in (("target", "target"), ("measured", "gaponet"))
+            "target": (nothing, colour("target")),
+            "measured": (nothing, colour("gaponet")),
         }
         self.curves = draw_curves(self.gui, np.arange(2), lines, "rad")
         for choice in (self.recording, self.joint):
@@ -189,16 +192,12 @@ class App:
         self.jobs.require_idle()
         if self.described.value.strip():  # otherwise a file of the user's stays as it is
             write_text(self.folder / logs / "logs.toml", self.described.value)
-        words = [
-            f"--unit-id={self.unit.value}",
-            f"--payload-mass={self.mass.value:g}",
-            "--out",
-            OUT,
-        ]
-        words += [f"--position-unit={self.position.value}"] * (
-            self.position.value in POSITION_UNITS[1:]
-        )
-        words += [f"--cut={self.cut.value:g}"] * (self.cut.value > 0)
+        words = [f"--unit-id={self.unit.value}", f"--payload-mass={self.mass.value:g}"]
+        words += ["--out", OUT]
+        if self.position.value in POSITION_UNITS[1:]:
+            words.append(f"--position-unit={self.position.value}")
+        if self.cut.value > 0:
+            words.append(f"--cut={self.cut.value:g}")
         self.jobs.start(step, "import", logs, f"--robot={robot.out}", *words)
 
     def _check(self) -> None:
@@ -230,12 +229,15 @@ class App:
         )
 
     def _show(self, _: Any) -> None:
-        data, identified = self._dataset(), self.jobs.result("identify")
-        robot = (
-            dataset_robot(data) if identified is None else load_robot(self.folder / identified.out)
-        )
+        data = self._dataset()
+        identified = self.jobs.result("identify")
+        if identified is None:
+            robot = dataset_robot(data)
+        else:
+            robot = load_robot(self.folder / identified.out)
         entry = next(e for e in data.entries if e.id == self.recording.value)
-        runs = [self.folder / network.out] if (network := self._network()) else []
+        network = self._network()
+        runs = [self.folder / network.out] if network else []
         self.play(side_by_side(data, entry, robot, runs))
 
     def _identify(self) -> None:
@@ -249,12 +251,16 @@ class App:
         self._text("causes", "")
 
     def _fit(self) -> list[str]:
-        if reason := self._locked():
+        reason = self._locked()
+        if reason:
             raise UsageError(reason)
-        words = [f"--budget={time}" for time in self.limit.value.split()[:1]] + ["--no-table"] * (
-            not self.table.value
-        )
-        return ["identify", self._need("import").out, "--out", OUT, *words]
+        words = ["identify", self._need("import").out, "--out", OUT]
+        limit = self.limit.value.strip()
+        if limit:
+            words.append(f"--budget={limit}")
+        if not self.table.value:
+            words.append("--no-table")
+        return words
 
     def _locked(self) -> str:
         """Return why identification may not start; "" if it may."""
@@ -268,22 +274,10 @@ class App:
         return f"Locked: the check finds an error ({names}). Step Check says what to do."
 
     def _use(self) -> None:
-        out, self.target = lambda step: self._need(step).out, self.gui.add_dropdown("for", TARGETS)
-        robot = lambda: (self.jobs.result("adapt") or self._need("identify")).out  # noqa: E731
-        engines = {
-            "mjcf": "mujoco",
-            "mjlab": "mjlab",
-            "isaaclab": "isaaclab",
-        }  # that apply parameter sets
-        network = lambda: str(self.target.value) in NETWORK_TARGETS  # noqa: E731
-        self._run("Export", "export", lambda: (
-            "export", out("train") if network() else robot(), "--to", str(self.target.value), "--out", OUT
-        ))  # fmt: skip
+        self.target = self.gui.add_dropdown("for", TARGETS)
+        self._run("Export", "export", self._export)
         self._text("export", "Identify the robot first. Then export it for your simulator.")
-        self._run("Parameter sets for training", "randomization", lambda: (
-            "export", robot(), "--to", "randomization", "--engine", engines.get(str(self.target.value), "json"),
-            "--out", OUT,
-        ))  # fmt: skip
+        self._run("Parameter sets for training", "randomization", self._parameter_sets)
         self._text(
             "randomization",
             "A policy is then trained on robots that these logs cannot tell from yours.",
@@ -295,27 +289,44 @@ class App:
         )
         self._text(
             "new",
-            "Identify the robot first. Unit, payload, positions and logs.toml are those of step Logs.",
+            "Identify the robot first. Unit, payload, positions and logs.toml are those of step "
+            "Logs.",
         )
-        self._run(
-            "Check whether the robot changed",
-            "check",
-            lambda: ("check", out("identify"), out("new")),
-        )
+        self._run("Check whether the robot changed", "check", self._check_for_change)
         self._text(
             "check", "Read new logs first. Then check whether the identified robot still fits them."
         )
-        self._run(
-            "Calibrate with the new logs",
-            "adapt",
-            lambda: ("adapt", out("identify"), out("new"), "--out", OUT),
-        )
+        self._run("Calibrate with the new logs", "adapt", self._adapt)
         self._text("adapt", "Read new logs first. The calibrated robot is then exported.")
         self.budget = self.gui.add_text("training time", "10m")
-        self._run("Train a network", "train", lambda: (
-            "train", out("import"), f"--robot={out('identify')}", f"--budget={self.budget.value}", "--out", OUT
-        ))  # fmt: skip
+        self._run("Train a network", "train", self._train)
         self._text("train", "A network can be exported if validation says that it helps.")
+
+    def _export(self) -> list[str]:
+        target = str(self.target.value)
+        exported = self._need("train").out if target in NETWORK_TARGETS else self._best_robot()
+        return ["export", exported, "--to", target, "--out", OUT]
+
+    def _parameter_sets(self) -> list[str]:
+        engine = ENGINES.get(str(self.target.value), "json")
+        words = ["export", self._best_robot(), "--to", "randomization", "--engine", engine]
+        return [*words, "--out", OUT]
+
+    def _check_for_change(self) -> list[str]:
+        return ["check", self._need("identify").out, self._need("new").out]
+
+    def _adapt(self) -> list[str]:
+        return ["adapt", self._need("identify").out, self._need("new").out, "--out", OUT]
+
+    def _train(self) -> list[str]:
+        data = self._need("import").out
+        robot = self._need("identify").out
+        budget = self.budget.value
+        return ["train", data, f"--robot={robot}", f"--budget={budget}", "--out", OUT]
+
+    def _best_robot(self) -> str:
+        """Return the folder of the robot that was calibrated last, or else identified."""
+        return (self.jobs.result("adapt") or self._need("identify")).out
 
     def _network(self) -> Job | None:
         """Return the training if its network helps on validation motions."""
@@ -331,20 +342,15 @@ class App:
     # What the page shows: only what the files say.
 
     def refresh(self) -> None:
-        """Show the running command; when one starts or ends, also the results and what may be done next."""
+        """Show the running command; when one starts or ends, also the results and what may be done
+        next.
+        """
         with self.jobs.lock:  # a job that is being started is neither running nor ended
-            running, every = self.jobs.running, self.jobs.all
+            running = self.jobs.running
+            every = self.jobs.all
             elsewhere = self.jobs.running_elsewhere
         self._show_progress(running, elsewhere)
-        models = [
-            f
-            for f in sorted((self.folder / "model").rglob("*"))
-            if f.suffix.lower() in MODEL_SUFFIXES
-        ]
-        self.model.options = [
-            *packaged_robots(),
-            *(f.relative_to(self.folder).as_posix() for f in models),
-        ]
+        self.model.options = [*packaged_robots(), *self._uploaded_models()]
         living = running or elsewhere
         state = (len(every), living.folder.name if living else "")
         if self.seen == state:
@@ -360,6 +366,14 @@ class App:
             self._show_recordings()
         self._go_on(living, every)
         self.seen = state  # last: after an error all is shown again
+
+    def _uploaded_models(self) -> list[str]:
+        """Return the files of models in the page's folder, relative to it."""
+        found = []
+        for file in sorted((self.folder / "model").rglob("*")):
+            if file.suffix.lower() in MODEL_SUFFIXES:
+                found.append(file.relative_to(self.folder).as_posix())
+        return found
 
     def _show_progress(self, running: Job | None, elsewhere: Job | None) -> None:
         """Show how far the running command is."""
@@ -405,7 +419,9 @@ class App:
         self._draw_recording()
 
     def _go_on(self, living: Job | None, every: list[Job]) -> None:
-        """After an identification compare it with the nominal robot; before the first recording show the robot."""
+        """After an identification compare it with the nominal robot; before the first recording
+        show the robot.
+        """
         last = self.jobs.result("identify")
         fitted = last is not None and last.number == every[-1].number and living is None
         if last is not None and fitted and self.jobs.started_here(last):
@@ -419,7 +435,9 @@ class App:
         """Show a scene, or motions, in place of what was shown before."""
         scene = shown if isinstance(shown, Scene) else Scene(shown)
         clip = clip or Clip.from_start(scene.shown, 0.0, 3600.0)
-        before, self.player = self.player, None  # `tick` advances it in another thread
+        # `tick` advances it in another thread
+        before = self.player
+        self.player = None
         if before is not None:
             before.remove()
         with self.stage:
@@ -431,11 +449,10 @@ class App:
         entry = next((e for e in data.entries if e.id == self.recording.value), None)
         if entry is None or self.joint.value not in data.joint_names:
             return  # the choices are being replaced
-        real, j = data.read(entry), data.joint_names.index(self.joint.value)
-        self.curves.data = (
-            real.dt * np.arange(len(real)),
-            *(x[:, j].astype(float) for x in (real.ctrl, real.qpos)),
-        )
+        real = data.read(entry)
+        j = data.joint_names.index(self.joint.value)
+        time = real.dt * np.arange(len(real))
+        self.curves.data = (time, real.ctrl[:, j].astype(float), real.qpos[:, j].astype(float))
 
     def _pictures(self, step: str, job: Job | None) -> str:
         """Return the figures of a result as HTML, with links that save them."""
@@ -478,11 +495,9 @@ class App:
         try:
             act(*arguments)
         except Exception as error:  # whatever it is, the page and the running command go on
-            kind = (
-                ""
-                if isinstance(error, (GAPONetError, OSError))
-                else f"Unexpected {type(error).__name__}: "
-            )
+            kind = ""
+            if not isinstance(error, (GAPONetError, OSError)):
+                kind = f"Unexpected {type(error).__name__}: "
             self.status.content = f"**Not done.** {kind}{escape_markdown(str(error))}"
 
     def _need(self, step: str) -> Job:
@@ -502,7 +517,9 @@ class App:
 
 
 def _make_places(folder: Path) -> None:
-    """Make the folders that the page writes into; a link, which could lead elsewhere, is refused."""
+    """Make the folders that the page writes into; a link, which could lead elsewhere, is
+    refused.
+    """
     for name in (*PLACES, "jobs", "incoming"):
         if (folder / name).is_symlink():
             raise UsageError(
@@ -519,7 +536,9 @@ def _findings(job: Job) -> list[Finding]:
 
 
 def _picture(folder: Path, name: str) -> str:
-    """Return a picture of the page's folder as HTML with a link that saves it, or why it is not shown."""
+    """Return a picture of the page's folder as HTML with a link that saves it, or why it is not
+    shown.
+    """
     try:
         data = base64.b64encode(read_inside(folder, name)).decode()
     except UsageError as error:
@@ -568,7 +587,9 @@ def _report(job: Job) -> str:
 
 
 def _report_line(line: str) -> list[str]:
-    """Return a line that a command printed as lines of Markdown; a table of rich becomes one of Markdown."""
+    """Return a line that a command printed as lines of Markdown; a table of rich becomes one of
+    Markdown.
+    """
     text = re.sub("[┃│]", "|", escape_markdown(line.strip()))
     if line.startswith("┡"):
         return [f"| --- |{' ---: |' * line.count('╇')}"]
@@ -584,8 +605,8 @@ def _report_line(line: str) -> list[str]:
 def serve(page: App, say: Callable[[str], None], step: str = "") -> None:
     """Serve a page until Ctrl-C; `step` is the number of the step that is shown first.
 
-    SIGTERM and SIGHUP (the terminal was closed) end it in the same way. The running command ends with it, also after
-    `kill -9` (run_job.py).
+    SIGTERM and SIGHUP (the terminal was closed) end it in the same way. The running command ends
+    with it, also after `kill -9` (run_job.py).
     """
     _end_on_signals()
     query = f"?step={step}" if step else ""
@@ -611,7 +632,10 @@ def _end_on_signals() -> None:
 def serve_dataset(
     data: Dataset, scene: Scene, clip: Clip, port: int, magnify: float, say: Callable[[str], None]
 ) -> None:
-    """Serve a dataset and a scene of it at step Gap. The page's folder stays if a command has written into it."""
+    """Serve a dataset and a scene of it at step Gap.
+
+    The page's folder stays if a command has written into it.
+    """
     folder = Path(tempfile.mkdtemp(prefix="gaponet_view_"))
     robot = scene.shown.robot.folder.resolve()
     dataset = data.path.resolve()

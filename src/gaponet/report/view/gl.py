@@ -44,6 +44,8 @@ def choose_gl() -> None:
 
 
 def prepare() -> None:
-    """Choose the backend before anything imports mujoco; without one, only pictures are missing later."""
+    """Choose the backend before anything imports mujoco; without one, only pictures are missing
+    later.
+    """
     with suppress(UsageError):
         choose_gl()

@@ -1,4 +1,6 @@
-"""Files and folders that somebody else may have put into the page's folder: only what lies inside is read."""
+"""Files and folders that somebody else may have put into the page's folder: only what lies inside
+is read.
+"""
 
 from __future__ import annotations
 

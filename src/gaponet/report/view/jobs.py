@@ -1,7 +1,7 @@
 """Commands that the page runs, each in a process of its own, and their results in a folder.
 
-The folder may come from somebody else. Everything that is read here is validated, nothing that is stored runs again,
-and a job that does not look like one of the page is left out, with the reason.
+The folder may come from somebody else. Everything that is read here is validated, nothing that is
+stored runs again, and a job that does not look like one of the page is left out, with the reason.
 """
 
 from __future__ import annotations
@@ -30,12 +30,21 @@ from gaponet.report.view.inside import path_inside, read_inside, require_inside_
 from gaponet.report.view.run_job import CANCELLED, ENDED, LOCK, WITH_SERVER, write_ending
 from gaponet.robot.finding import Finding
 
-# Step → the step whose result it uses. A result that is older than what it was made from is out of date.
+# Step → the step whose result it uses. A result that is older than what it was made from is out of
+# date.
 NEEDS = {
-    "import": "robot", "doctor": "import", "gap": "import", "identify": "import", "causes": "identify",
-    "export": "identify", "randomization": "identify", "train": "identify", "new": "identify", "check": "new",
+    "import": "robot",
+    "doctor": "import",
+    "gap": "import",
+    "identify": "import",
+    "causes": "identify",
+    "export": "identify",
+    "randomization": "identify",
+    "train": "identify",
+    "new": "identify",
+    "check": "new",
     "adapt": "new",
-}  # fmt: skip
+}
 OUT = "\0"  # word that `start` replaces by the name of a new folder
 PROGRESS_LINE = re.compile(r"^[^:]+: (\d+) %, \d+ s(?:, (.*))?$")
 FOLDER_NAME = re.compile(r"(\d{1,6})-([a-z_]{1,40})")  # number and step
@@ -120,7 +129,9 @@ class Job:
 
     @cached_property
     def result(self) -> Result | None:
-        """Result of the command; None if it failed, was cancelled, has not ended, or is not one of gaponet."""
+        """Result of the command; None if it failed, was cancelled, has not ended, or is not one of
+        gaponet.
+        """
         try:
             return self.read_result()
         except UsageError:
@@ -152,7 +163,9 @@ class Job:
 
     @property
     def ending(self) -> Ending | None:
-        """How the command ended; None if it runs, or was killed, or an older gaponet did not store it."""
+        """How the command ended; None if it runs, or was killed, or an older gaponet did not store
+        it.
+        """
         try:
             content = read_inside(self._root, f"{self._name}/{ENDED}")
             return parse_json(Ending, content, ENDED, UsageError)
@@ -230,11 +243,15 @@ class Jobs:
         return Job(self.folder, self.started.folder.name, self.outside)
 
     def started_here(self, job: Job) -> bool:
-        """Return True for the job that was started last here: neither by an earlier page nor by a stranger."""
+        """Return True for the job that was started last here: neither by an earlier page nor by a
+        stranger.
+        """
         return self.started is not None and self.started.number == job.number
 
     def result(self, step: str) -> Job | None:
-        """Return the last successful job of a step with its folder, unless what it was made from is newer."""
+        """Return the last successful job of a step with its folder, unless what it was made from
+        is newer.
+        """
         last = None
         for job in self.all:
             if job.step == step and job.result is not None and self._has_folder(job):
@@ -261,7 +278,9 @@ class Jobs:
         return Job(self.folder, folder.name, self.outside)
 
     def _new_number(self, step: str) -> int:
-        """Return a number above those of all jobs, readable or not, whose output folder does not exist."""
+        """Return a number above those of all jobs, readable or not, whose output folder does not
+        exist.
+        """
         names = [FOLDER_NAME.fullmatch(path.name) for path in (self.folder / "jobs").glob("*")]
         number = 1 + max((int(name[1]) for name in names if name), default=0)
         while os.path.lexists(self.folder / f"{step}{number}"):
@@ -276,12 +295,18 @@ class Jobs:
                 "gaponet.report.view.run_job", str(job.folder), *job.words, "--json"
             )
             variables = {LINE_INTERVAL_VARIABLE: "0.5", "COLUMNS": "9999"}  # s; no table is divided
-            result, log = job.folder / "result.json", job.folder / "log.txt"
+            result = job.folder / "result.json"
+            log = job.folder / "log.txt"
             with result.open("wb") as stdout, log.open("wb") as stderr:
                 self.process = subprocess.Popen(
-                    command, stdin=subprocess.PIPE, stdout=stdout, stderr=stderr, cwd=self.folder,
-                    env=os.environ | variables, start_new_session=True,
-                )  # fmt: skip
+                    command,
+                    stdin=subprocess.PIPE,
+                    stdout=stdout,
+                    stderr=stderr,
+                    cwd=self.folder,
+                    env=os.environ | variables,
+                    start_new_session=True,
+                )
             self.started = job
 
     @contextmanager
@@ -299,7 +324,8 @@ class Jobs:
         job = self.running_elsewhere
         if job is not None:
             raise UsageError(
-                f"gaponet {job.words[0]} of an earlier page is still running (jobs/{job.folder.name}); wait for it"
+                f"gaponet {job.words[0]} of an earlier page is still running "
+                f"(jobs/{job.folder.name}); wait for it"
             )
 
     @property
@@ -311,7 +337,9 @@ class Jobs:
         return jobs[-1]
 
     def cancel(self, how: str = CANCELLED) -> None:
-        """End the running command. Files are written whole or not at all, and each command has its own folder.
+        """End the running command.
+
+        Files are written whole or not at all, and each command has its own folder.
 
         Args:
             how: CANCELLED by the user, or WITH_SERVER.

@@ -1,4 +1,6 @@
-"""Pictures and films of a scene, and of models in a row: MuJoCo renders, Pillow labels, imageio-ffmpeg writes MP4."""
+"""Pictures and films of a scene, and of models in a row: MuJoCo renders, Pillow labels,
+imageio-ffmpeg writes MP4.
+"""
 
 from __future__ import annotations
 
@@ -26,10 +28,14 @@ if TYPE_CHECKING:
     from PIL.Image import Image
     from PIL.ImageDraw import ImageDraw
 
-INK, FAINT, ALARM = "#222222", "#777777", "#c8102e"
+INK = "#222222"
+FAINT = "#777777"
+ALARM = "#c8102e"
 SEPARATOR = "  ·  "  # Pillow's own font has this, but no ×
 MAX_HEIGHT = 0.7  # of the width
-SIDE, HEAD = 480, 30  # pixels of one model's square and of its label
+# Pixels of one model's square and of its label.
+SIDE = 480
+HEAD = 30
 GIF_COLOURS = 200  # shared by all frames
 SUFFIXES = (".gif", ".mp4", ".png")
 FLOOR = mujoco.mjtGeom.mjGEOM_PLANE
@@ -51,13 +57,18 @@ class Camera:
         """
         if not 160 <= width <= 3840:
             raise UsageError(f"--width is {width}; give 160 to 3840 pixels")
-        self.scene, self.clip, self.magnify, self.width = scene, clip, magnify, width - width % 2
-        letters, tall = max(width / 960, 0.5), scene.box[3] - scene.box[2]
-        self.head, labels = round(34 * letters), round(60 * letters)  # pixels
+        self.scene = scene
+        self.clip = clip
+        self.magnify = magnify
+        self.width = width - width % 2
+        letters = max(width / 960, 0.5)
+        tall = scene.box[3] - scene.box[2]
+        # Pixels.
+        self.head = round(34 * letters)
+        labels = round(60 * letters)
         room = MAX_HEIGHT * self.width - self.head - labels
-        self.scale = min(
-            self.width / (scene.spacing * len(scene.base)), room / tall
-        )  # pixels per metre
+        # Pixels per metre.
+        self.scale = min(self.width / (scene.spacing * len(scene.base)), room / tall)
         self.robots = round(1.1 * tall * self.scale)
         self.robots += (self.head + self.robots + labels) % 2  # h264 wants even sizes
         self.height = self.head + self.robots + labels
@@ -91,21 +102,23 @@ class Camera:
         lens.orthographic = scene.model.vis.global_.orthographic = (
             1  # MuJoCo 3 reads the model only
         )
-        lens.azimuth, lens.elevation = scene.view.azimuth, scene.view.elevation
+        lens.azimuth = scene.view.azimuth
+        lens.elevation = scene.view.elevation
         lens.lookat[:] = scene.middle
         lens.distance = 4 * scene.extent
         scene.model.vis.global_.fovy = self.robots / self.scale  # m, of an orthographic picture
-        scene.model.vis.map.znear, scene.model.vis.map.zfar = 0.01, 20
+        scene.model.vis.map.znear = 0.01
+        scene.model.vis.map.zfar = 20
         return lens
 
     def _write(self, draw: ImageDraw, time: float) -> None:
-        row, small, large = self.scene.row(time), self.fonts[13], self.fonts[17]
+        row = self.scene.row(time)
+        small = self.fonts[13]
+        large = self.fonts[17]
         self._head(draw, time)
-        top, pitch, k = (
-            self.head + self.robots,
-            self.scene.spacing * self.scale,
-            len(self.scene.base),
-        )
+        top = self.head + self.robots
+        pitch = self.scene.spacing * self.scale
+        k = len(self.scene.base)
         for i, m in enumerate(self.scene.shown.motions):
             x = self.width / 2 + (i - (k - 1) / 2) * pitch
             tint = colour(m.method)
@@ -124,7 +137,9 @@ class Camera:
 
     def _head(self, draw: ImageDraw, time: float) -> None:
         """Write VIRTUAL where it applies, the recording on the left, and the time on the right."""
-        shown, pad, font = self.scene.shown, self.head // 3, self.fonts[15]
+        shown = self.scene.shown
+        pad = self.head // 3
+        font = self.fonts[15]
         meta = shown.real.meta
         facts = [
             meta.robot,
@@ -135,7 +150,8 @@ class Camera:
         facts += [] if shown.seen is None else ["seen in training" if shown.seen else "new motion"]
         clock = [f"speed {self.clip.speed:g}x"] if self.clip.speed != 1 else []
         clock += [f"differences drawn {self.magnify:g}x"] if self.magnify != 1 else []
-        left, right = SEPARATOR.join(facts), SEPARATOR.join([*clock, f"{time:6.2f} s"])
+        left = SEPARATOR.join(facts)
+        right = SEPARATOR.join([*clock, f"{time:6.2f} s"])
         mark = "VIRTUAL ROBOT   " if meta.virtual else ""
         while font.getlength(mark + left + right) > self.width - 4 * pad and font.size > 8:
             font = font.font_variant(size=font.size - 0.5)
@@ -176,7 +192,8 @@ def renderer(model: mujoco.MjModel, height: int, width: int) -> mujoco.Renderer:
 
 
 def still(models: list[tuple[str, mujoco.MjModel, Array]]) -> bytes:
-    """Return a PNG of models (label, model, qpos) in a row, all with the camera that fits the first.
+    """Return a PNG of models (label, model, qpos) in a row, all with the camera that fits the
+    first.
 
     Raises:
         UsageError: Nothing can be rendered here; the message says what to install.
@@ -188,7 +205,8 @@ def still(models: list[tuple[str, mujoco.MjModel, Array]]) -> bytes:
     draw = Draw(image)
     camera = mujoco.MjvCamera()
     mujoco.mjv_defaultFreeCamera(models[0][1], camera)
-    camera.azimuth, camera.elevation = 140, -15
+    camera.azimuth = 140
+    camera.elevation = -15
     for i, (label, model, qpos) in enumerate(models):
         data = mujoco.MjData(model)
         data.qpos[:] = qpos
@@ -248,7 +266,9 @@ def portrait(robot: RobotSpec, meta: SequenceMeta, dt: float, qpos: Mapping[str,
 
 
 def require_writable(path: Path) -> None:
-    """Refuse an unknown file suffix, a missing folder or a missing library before any work is done."""
+    """Refuse an unknown file suffix, a missing folder or a missing library before any work is
+    done.
+    """
     if path.suffix.lower() not in SUFFIXES:
         raise UsageError(f"--render {path}: name a file that ends in {', '.join(SUFFIXES)}")
     if not path.parent.is_dir():
@@ -266,10 +286,10 @@ def write(
         Number of pictures.
     """
     require_writable(path)
-    clip, suffix = camera.clip, path.suffix.lower()
-    hundredths = max(
-        round(100 / clip.fps), 2
-    )  # a GIF counts in 1/100 s, and viewers slow down below 2
+    clip = camera.clip
+    suffix = path.suffix.lower()
+    # A GIF counts in 1/100 s, and viewers slow down below 2.
+    hundredths = max(round(100 / clip.fps), 2)
     times = clip.times(hundredths / 100 if suffix == ".gif" else 1 / clip.fps)
 
     def pictures() -> Iterator[Image]:

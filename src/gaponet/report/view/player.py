@@ -1,4 +1,6 @@
-"""A scene in the page: orbit with the mouse, play, pause, move through the clip, errors beside it."""
+"""A scene in the page: orbit with the mouse, play, pause, move through the clip, errors beside
+it.
+"""
 
 from __future__ import annotations
 
@@ -17,14 +19,15 @@ from gaponet.report.view.scene import Scene
 from gaponet.report.view.side_by_side import Clip, largest_error_time
 
 CURVE_ROWS = 1000  # of a chart
-DARK, LIGHTER = (
-    0.22,
-    np.array([0.20, 0.26, 0.38]),
-)  # rgb; a body darker than that cannot be seen on a dark page
+# Rgb; a body darker than that cannot be seen on a dark page.
+DARK = 0.22
+LIGHTER = np.array([0.20, 0.26, 0.38])
 
 
 class Player:
-    """The bodies of a scene as viser frames with meshes, and controls in the current container of the page."""
+    """The bodies of a scene as viser frames with meshes, and controls in the current container of
+    the page.
+    """
 
     def __init__(self, server: Any, scene: Scene, clip: Clip, magnify: float = 1.0) -> None:
         """Draw a scene.
@@ -34,13 +37,17 @@ class Player:
             clip: Part that is played; it repeats.
             magnify: Stated in the page.
         """
-        self.server, self.scene, self.clip = server, scene, clip
+        self.server = server
+        self.scene = scene
+        self.clip = clip
         self.root = server.scene.add_frame("/robots", show_axes=False)
         self.frames = self._bodies()
         self._aim()
         self.copies = {title(m.method): m for m in scene.shown.motions if m.method != "recorded"}
-        shown, worst = scene.shown, largest_error_time(scene.shown, clip)
-        meta, gui = shown.real.meta, server.gui
+        shown = scene.shown
+        worst = largest_error_time(scene.shown, clip)
+        meta = shown.real.meta
+        gui = server.gui
         self.folder = gui.add_folder(None, visible=len(shown.real) > 2)  # otherwise nothing moves
         with self.folder:
             heading = "**VIRTUAL ROBOT**\n\n" if meta.virtual else ""
@@ -64,18 +71,21 @@ class Player:
 
         @self.worst.on_click
         def _(_: Any) -> None:
-            self.playing.value, self.time.value = False, worst
+            self.playing.value = False
+            self.time.value = worst
 
         self.update()
 
     def update(self) -> None:
         """Show the scene at the slider's time."""
-        scene, now = self.scene, float(self.time.value)
+        scene = self.scene
+        now = float(self.time.value)
         self.updated = now
         scene.pose(now)
         with self.server.atomic():
             for body, frame in self.frames.items():
-                frame.position, frame.wxyz = scene.data.xpos[body], scene.data.xquat[body]
+                frame.position = scene.data.xpos[body]
+                frame.wxyz = scene.data.xquat[body]
         row = scene.row(now)
         rows = "\n".join(
             f"| {escape_markdown(name)} | {1e3 * copy.error[row]:.1f} | {1e3 * copy.mpjae:.1f} |"
@@ -99,7 +109,8 @@ class Player:
         self.root.remove()
 
     def _bodies(self) -> dict[int, Any]:
-        model, frames = self.scene.model, {}
+        model = self.scene.model
+        frames = {}
         seen = np.flatnonzero(
             (model.geom_group < 3) & (model.geom_type != mujoco.mjtGeom.mjGEOM_PLANE)
         )
@@ -112,9 +123,14 @@ class Player:
             for g in geoms:
                 vertices, faces = _surface(model, int(g))
                 self.server.scene.add_mesh_simple(
-                    f"{name}/{g}", vertices, faces, color=_page_colour(model.geom_rgba[g, :3]),
-                    opacity=float(model.geom_rgba[g, 3]), position=model.geom_pos[g], wxyz=model.geom_quat[g],
-                )  # fmt: skip
+                    f"{name}/{g}",
+                    vertices,
+                    faces,
+                    color=_page_colour(model.geom_rgba[g, :3]),
+                    opacity=float(model.geom_rgba[g, 3]),
+                    position=model.geom_pos[g],
+                    wxyz=model.geom_quat[g],
+                )
         across = float(2.5 * self.scene.extent)
         self.server.scene.add_grid(
             "/robots/floor", across, across, position=(0, 0, self.scene.floor)
@@ -127,10 +143,9 @@ class Player:
         return frames
 
     def _aim(self) -> None:
-        (across, up), far = (
-            self.scene.view.axes,
-            2.2 + 1.2 / len(self.scene.base),
-        )  # one robot may point at the camera
+        # One robot may point at the camera.
+        across, up = self.scene.view.axes
+        far = 2.2 + 1.2 / len(self.scene.base)
         self.server.initial_camera.fov = np.radians(45)
         for camera in (
             self.server.initial_camera,
@@ -141,23 +156,30 @@ class Player:
 
 
 def _page_colour(rgb: Array) -> Array:
-    """Return a colour (3,) of 0 to 1 as one of 0 to 255 that a light and a dark page show: black becomes slate."""
+    """Return a colour (3,) of 0 to 1 as one of 0 to 255 that a light and a dark page show: black
+    becomes slate.
+    """
     return (255 * (rgb + LIGHTER * (rgb.max() < DARK))).astype(int)
 
 
 def draw_curves(gui: Any, time: Array, curves: Mapping[str, tuple[Array, str]], title: str) -> Any:
-    """Return a new chart over time (T), s, above a button that saves it; curves: name → values (T) and colour."""
+    """Return a new chart over time (T), s, above a button that saves it; curves: name → values (T)
+    and colour.
+    """
     from viser.uplot import Scale, Series
 
-    rows, colours = (
-        np.unique(np.linspace(0, len(time) - 1, CURVE_ROWS).astype(int)),
-        [c for _, c in curves.values()],
-    )
+    rows = np.unique(np.linspace(0, len(time) - 1, CURVE_ROWS).astype(int))
+    colours = [c for _, c in curves.values()]
     chart = gui.add_uplot(
         (time[rows], *(values[rows] for values, _ in curves.values())),
-        (Series(label="time, s"), *(Series(label=n, stroke=c, width=2) for n, c in zip(curves, colours, strict=True))),
-        title=title, aspect=2.2, scales={"x": Scale(time=False)},
-    )  # fmt: skip
+        (
+            Series(label="time, s"),
+            *(Series(label=n, stroke=c, width=2) for n, c in zip(curves, colours, strict=True)),
+        ),
+        title=title,
+        aspect=2.2,
+        scales={"x": Scale(time=False)},
+    )
 
     def save_chart(event: Any) -> None:
         from gaponet.report.figures.style import draw_curves, save
@@ -178,11 +200,13 @@ def _surface(model: mujoco.MjModel, geom: int) -> tuple[Array, Array]:
     """Return vertices (k, 3), m in the geom's frame, and triangles (m, 3)."""
     from trimesh import creation
 
-    kind, (a, b, c) = model.geom_type[geom], (float(x) for x in model.geom_size[geom])
+    kind = model.geom_type[geom]
+    a, b, c = (float(x) for x in model.geom_size[geom])
     match kind:
         case mujoco.mjtGeom.mjGEOM_MESH:
             mesh = model.mesh(model.geom_dataid[geom])
-            first, face = mesh.vertadr[0], mesh.faceadr[0]
+            first = mesh.vertadr[0]
+            face = mesh.faceadr[0]
             return model.mesh_vert[first : first + mesh.vertnum[0]], model.mesh_face[
                 face : face + mesh.facenum[0]
             ]

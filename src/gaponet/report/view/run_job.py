@@ -1,7 +1,7 @@
 """The process of one command of the page. It ends with the page's server, however that ends.
 
-The server holds the writing end of a pipe, and never writes. The system closes this end when the server ends, also by
-`kill -9`. The command then ends itself and everything that it started:
+The server holds the writing end of a pipe, and never writes. The system closes this end when the
+server ends, also by `kill -9`. The command then ends itself and everything that it started:
 
 - Linux, macOS: it is the first process of a group of its own, and kills the group.
 - Windows: it ends itself, and its worker processes end because they look after their parent.
@@ -24,7 +24,9 @@ from gaponet.base.files import LOCK_RETRY_S, WINDOWS, lock_file, write_json
 
 LOCK = "lock"  # file of a job, locked while its process lives
 ENDED = "ended.json"  # file of a job, written when it ends
-BY_ITSELF, CANCELLED, WITH_SERVER = "exit", "cancelled", "server"
+BY_ITSELF = "exit"
+CANCELLED = "cancelled"
+WITH_SERVER = "server"
 
 
 def write_ending(folder: Path, how: str, code: int = 0) -> None:
@@ -68,7 +70,9 @@ def _lock_job(path: Path) -> int:
 
 
 def _take_standard_input() -> int:
-    """Return a descriptor of the server's pipe; the command itself finds an empty standard input."""
+    """Return a descriptor of the server's pipe; the command itself finds an empty standard
+    input.
+    """
     pipe = os.dup(0)
     empty = os.open(os.devnull, os.O_RDONLY)
     os.dup2(empty, 0)

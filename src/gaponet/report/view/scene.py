@@ -1,7 +1,8 @@
 """Several copies of a robot side by side in one MuJoCo scene, one colour per method.
 
-Nothing is simulated here: body positions follow from given joint angles. The robots of the package have no meshes.
-Housings about the joints and the shells of look.toml or collision.toml are drawn instead.
+Nothing is simulated here: body positions follow from given joint angles. The robots of the package
+have no meshes. Housings about the joints and the shells of look.toml or collision.toml are drawn
+instead.
 """
 
 from __future__ import annotations
@@ -21,6 +22,9 @@ from gaponet.robot.collision import Shapes
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.model import build_spec
 
+COLLISION_RADIUS_SHARE = (
+    0.85  # drawn of the shapes of collision.toml, which are larger than the robot
+)
 PAYLOAD_RGBA = (0.93, 0.60, 0.10, 1.0)
 GHOST_RGBA = (0.07, 0.07, 0.07, 0.4)  # the recording inside each other copy
 GHOST_THICKNESS = 0.9  # of the limbs: a copy without error covers its ghost
@@ -49,26 +53,34 @@ class Scene:
     """The copies of a SideBySide in one MuJoCo model.
 
     Attributes:
-        model, data: MuJoCo model and data of all copies together; copy i's bodies and joints are called METHOD/NAME.
+        model, data: MuJoCo model and data of all copies together; copy i's bodies and joints are
+            called METHOD/NAME.
         spacing: Between neighbours along the picture, m.
         extent: Half the size of the scene, m.
-        box: Outline of one robot on the picture over all frames, relative to its base: (left, right, bottom, top), m.
+        box: Outline of one robot on the picture over all frames, relative to its base: (left,
+            right, bottom, top), m.
         base: Base of each copy, (k, 3), m.
     """
 
     def __init__(
-        self, shown: SideBySide, view: View = View(), rows: slice = slice(None), flat: bool = False,
+        self,
+        shown: SideBySide,
+        view: View = View(),
+        rows: slice = slice(None),
+        flat: bool = False,
         closeup: bool = False,
-    ) -> None:  # fmt: skip
+    ) -> None:
         """Build the model and fit the picture.
 
         Args:
             view: The camera's direction decides the direction of the row.
             rows: Frames that have to fit.
-            flat: Put ghosts behind their copies, for an orthographic picture: only the differences are visible.
+            flat: Put ghosts behind their copies, for an orthographic picture: only the differences
+                are visible.
             closeup: Limbs without an operated joint need not fit.
         """
-        self.shown, self.view = shown, view
+        self.shown = shown
+        self.view = view
         self.ghosts = any(m.method == "recorded" for m in shown.motions) and len(shown.motions) > 1
         self.box, self.floor = self._fit(rows, closeup)
         self.spacing = 1.1 * (self.box[1] - self.box[0])
@@ -93,8 +105,11 @@ class Scene:
             ]
 
     def pose(self, time: float) -> None:
-        """Set the positions of every copy at a time of the recording, s, interpolated between rows."""
-        dt, rows = self.shown.real.dt, len(self.shown.real)
+        """Set the positions of every copy at a time of the recording, s, interpolated between
+        rows.
+        """
+        dt = self.shown.real.dt
+        rows = len(self.shown.real)
         x = float(np.clip(time / dt, 0, rows - 1))
         i = min(int(x), rows - 2)
         for motion, address in self.address:
@@ -120,7 +135,8 @@ class Scene:
 
     def _fit(self, rows: slice, closeup: bool) -> tuple[tuple[float, float, float, float], float]:
         """Return the outline of one robot on the picture over all motions, and its lowest point."""
-        robot, meta = self.shown.robot, self.shown.real.meta
+        robot = self.shown.robot
+        meta = self.shown.real.meta
         model = visual_spec(robot, "#808080", meta.payload_mass, meta.payload_side).compile()
         data = mujoco.MjData(model)
         seen = np.flatnonzero(
@@ -132,10 +148,13 @@ class Scene:
             )
         near = _operated_bodies(model, robot) if closeup else set(range(model.nbody))
         fits = np.array([model.geom_bodyid[g] in near for g in seen])
-        middle, half = model.geom_aabb[seen, None, :3], model.geom_aabb[seen, None, 3:]
+        middle = model.geom_aabb[seen, None, :3]
+        half = model.geom_aabb[seen, None, 3:]
         corners = middle + half * np.array(np.meshgrid(*[[-1, 1]] * 3)).reshape(3, 8).T  # (k, 8, 3)
         address = [model.joint(name).qposadr[0] for name in robot.joint_names]
-        low, high, floor = np.full(2, np.inf), np.full(2, -np.inf), np.inf
+        low = np.full(2, np.inf)
+        high = np.full(2, -np.inf)
+        floor = np.inf
         axes = np.stack(self.view.axes)
         for motion in self.shown.motions:
             part = motion.qpos[rows]
@@ -147,14 +166,13 @@ class Scene:
                 )
                 floor = min(floor, float(points[..., 2].min()))
                 places = points[fits].reshape(-1, 3) @ axes.T
-                low, high = (
-                    np.minimum(low, places.min(axis=0)),
-                    np.maximum(high, places.max(axis=0)),
-                )
+                low = np.minimum(low, places.min(axis=0))
+                high = np.maximum(high, places.max(axis=0))
         return (float(low[0]), float(high[0]), float(low[1]), float(high[1])), floor
 
     def _compose(self, base: Array, behind: Array) -> mujoco.MjModel:
-        scene, meta = mujoco.MjSpec(), self.shown.real.meta
+        scene = mujoco.MjSpec()
+        meta = self.shown.real.meta
         scene.compiler.degree = False
         _light(scene, self.floor, self.extent)
         for motion, place in zip(self.shown.motions, base, strict=True):
@@ -163,9 +181,8 @@ class Scene:
                 parts[f"{motion.method}-ghost"] = ("", place + behind)
             for prefix, (colour, pos) in parts.items():
                 spec = visual_spec(self.shown.robot, colour, meta.payload_mass, meta.payload_side)
-                scene.nuser_actuator = (
-                    spec.nuser_actuator
-                )  # of the servo model; MuJoCo warns of a difference
+                # User data of the servo model: MuJoCo warns if scene and robot differ in it.
+                scene.nuser_actuator = spec.nuser_actuator
                 scene.attach(spec, prefix=f"{prefix}/", frame=scene.worldbody.add_frame(pos=pos))
         return scene.compile()
 
@@ -175,28 +192,15 @@ def visual_spec(
 ) -> mujoco.MjSpec:
     """Return the robot in one colour with housings, shells and payload; colour "" gives a ghost."""
     spec = build_spec(robot, payload_mass, payload_side)
-    spec.option = mujoco.MjSpec().option  # nothing is simulated; all copies must agree
-    for part in (
-        *spec.actuators,
-        *spec.lights,
-        *spec.cameras,
-        *spec.sensors,
-        *spec.keys,
-        *spec.pairs,
-        *spec.excludes,
-    ):
-        spec.delete(part)
-    for geom in [g for g in spec.geoms if g.type == mujoco.mjtGeom.mjGEOM_PLANE]:
-        spec.delete(geom)  # the scene has its own ground
-    payload = {f"payload_{m.side}" for m in robot.payload_mounts}
+    _delete_invisible_parts(spec)
+    payload_bodies = {f"payload_{mount.side}" for mount in robot.payload_mounts}
     rgba = rgb(colour) if colour else GHOST_RGBA
+    payload_rgba = PAYLOAD_RGBA if colour else GHOST_RGBA
     dark = (*(0.55 * np.array(rgba[:3])), rgba[3])
-    meshes = any(g.type == mujoco.mjtGeom.mjGEOM_MESH for g in spec.geoms)
+    meshes = any(geom.type == mujoco.mjtGeom.mjGEOM_MESH for geom in spec.geoms)
     for geom in spec.geoms:
         geom.material = ""
-        geom.rgba = (
-            (PAYLOAD_RGBA if colour else GHOST_RGBA) if geom.parent.name in payload else rgba
-        )
+        geom.rgba = payload_rgba if geom.parent.name in payload_bodies else rgba
     if not meshes:
         for body in spec.bodies[1:]:  # asked for the world's parent, MuJoCo 3.10 ends the process
             _add_housings(body, dark)
@@ -208,6 +212,19 @@ def visual_spec(
     return spec
 
 
+def _delete_invisible_parts(spec: mujoco.MjSpec) -> None:
+    """Delete all but bodies, joints and shapes: nothing is simulated, and all copies must agree.
+
+    The ground goes too, because the scene has its own.
+    """
+    spec.option = mujoco.MjSpec().option
+    parts = [*spec.actuators, *spec.lights, *spec.cameras, *spec.sensors]
+    parts += [*spec.keys, *spec.pairs, *spec.excludes]
+    parts += [geom for geom in spec.geoms if geom.type == mujoco.mjtGeom.mjGEOM_PLANE]
+    for part in parts:
+        spec.delete(part)
+
+
 def rgb(colour: str) -> tuple[float, float, float, float]:
     """Return #rrggbb as rgba, a little lighter, since a black body shows no shape."""
     parts = [int(colour[i : i + 2], 16) / 255 for i in (1, 3, 5)]
@@ -217,49 +234,47 @@ def rgb(colour: str) -> tuple[float, float, float, float]:
 def _add_housings(body: mujoco.MjsBody, rgba: tuple[float, ...]) -> None:
     """Add a short cylinder about each joint axis, a third wider than the limb."""
     around = [*body.geoms, *body.parent.geoms]
-    sizes = [g.size[0] for g in around if g.type == mujoco.mjtGeom.mjGEOM_CAPSULE]
+    sizes = [geom.size[0] for geom in around if geom.type == mujoco.mjtGeom.mjGEOM_CAPSULE]
     if not sizes:
         return
     radius = 1.35 * max(sizes)
     for joint in body.joints:
-        middle, half = (
-            np.array(joint.pos),
-            1.1 * radius * np.array(joint.axis) / np.linalg.norm(joint.axis),
-        )
-        _add(
-            body, mujoco.mjtGeom.mjGEOM_CYLINDER, [*(middle - half), *(middle + half)], radius, rgba
-        )
+        middle = np.array(joint.pos)
+        half = 1.1 * radius * np.array(joint.axis) / np.linalg.norm(joint.axis)
+        ends = [*(middle - half), *(middle + half)]
+        _add(body, mujoco.mjtGeom.mjGEOM_CYLINDER, ends, radius, rgba)
 
 
 def _add_shells(spec: mujoco.MjSpec, robot: RobotSpec, rgba: tuple[float, ...]) -> None:
-    """Add the shapes of look.toml, or else those of collision.toml, which are larger than the robot."""
-    for name, share in (("look.toml", 1.0), ("collision.toml", 0.85)):
-        path = robot.folder / name
-        if path.is_file():
-            table = read_toml(Shapes, path, RobotError, "docs/new-robot.md lists the fields")
-            for part in (*(c["body"] for c in table.capsule), *(b.body for b in table.box)):
-                if spec.body(part) is None:
-                    raise RobotError(f"{path}: names body '{part}', which {robot.mjcf.name} lacks")
-            for c in table.capsule:
-                ends = [*c["from"], *c["to"]]
-                _add(
-                    spec.body(c["body"]),
-                    mujoco.mjtGeom.mjGEOM_CAPSULE,
-                    ends,
-                    share * c["radius"],
-                    rgba,
-                )
-            for b in table.box:
-                spec.body(b.body).add_geom(
-                    type=mujoco.mjtGeom.mjGEOM_BOX,
-                    pos=b.pos,
-                    size=b.size,
-                    mass=0,
-                    contype=0,
-                    conaffinity=0,
-                    rgba=rgba,
-                )
-            return
+    """Add the shapes of look.toml, or else those of collision.toml, which are larger than the
+    robot.
+    """
+    path = robot.folder / "look.toml"
+    share = 1.0
+    if not path.is_file():
+        path = robot.folder / "collision.toml"
+        share = COLLISION_RADIUS_SHARE
+    if not path.is_file():
+        return
+    table = read_toml(Shapes, path, RobotError, "docs/new-robot.md lists the fields")
+    bodies = [capsule["body"] for capsule in table.capsule] + [box.body for box in table.box]
+    for name in bodies:
+        if spec.body(name) is None:
+            raise RobotError(f"{path}: names body '{name}', which {robot.mjcf.name} lacks")
+    for capsule in table.capsule:
+        body = spec.body(capsule["body"])
+        ends = [*capsule["from"], *capsule["to"]]
+        _add(body, mujoco.mjtGeom.mjGEOM_CAPSULE, ends, share * capsule["radius"], rgba)
+    for box in table.box:
+        spec.body(box.body).add_geom(
+            type=mujoco.mjtGeom.mjGEOM_BOX,
+            pos=box.pos,
+            size=box.size,
+            mass=0,
+            contype=0,
+            conaffinity=0,
+            rgba=rgba,
+        )
 
 
 def _add(
@@ -290,29 +305,41 @@ def _light(scene: mujoco.MjSpec, floor: float, extent: float) -> None:
     """Add a light ground, one light that casts shadows and one that fills them."""
     world = scene.worldbody
     ground = world.add_geom(
-        type=mujoco.mjtGeom.mjGEOM_PLANE, size=(0, 0, 1), pos=(0, 0, floor), rgba=(*[GROUND_GREY] * 3, 1),
-        contype=0, conaffinity=0,
-    )  # fmt: skip
+        type=mujoco.mjtGeom.mjGEOM_PLANE,
+        size=(0, 0, 1),
+        pos=(0, 0, floor),
+        rgba=(*[GROUND_GREY] * 3, 1),
+        contype=0,
+        conaffinity=0,
+    )
     _cast_no_shadow(ground)  # onto itself
     scene.add_texture(
-        name="sky", type=mujoco.mjtTexture.mjTEXTURE_SKYBOX, builtin=mujoco.mjtBuiltin.mjBUILTIN_FLAT,
-        rgb1=[GROUND_GREY] * 3, rgb2=[GROUND_GREY] * 3, width=8, height=48,
-    )  # fmt: skip
-    sun, fill = np.array([-0.25, 0.15, -1.0]), np.array([-0.6, -0.5, -0.4])
+        name="sky",
+        type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
+        builtin=mujoco.mjtBuiltin.mjBUILTIN_FLAT,
+        rgb1=[GROUND_GREY] * 3,
+        rgb2=[GROUND_GREY] * 3,
+        width=8,
+        height=48,
+    )
+    sun = np.array([-0.25, 0.15, -1.0])
+    fill = np.array([-0.6, -0.5, -0.4])
     for direction, bright, shadow in ((sun, 0.5, True), (fill, 0.3, False)):
         world.add_light(
-            type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL, pos=[0, 0, floor] - 2 * extent * direction, dir=direction,
-            diffuse=[bright] * 3, specular=[0.3 * bright] * 3, castshadow=shadow,
-        )  # fmt: skip
+            type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
+            pos=[0, 0, floor] - 2 * extent * direction,
+            dir=direction,
+            diffuse=[bright] * 3,
+            specular=[0.3 * bright] * 3,
+            castshadow=shadow,
+        )
     scene.visual.headlight.ambient = [0.32] * 3
     scene.visual.headlight.diffuse = [0.1] * 3
     scene.visual.headlight.specular = [0.0] * 3
     scene.visual.map.shadowclip = 1.2
-    (
-        scene.visual.quality.shadowsize,
-        scene.visual.quality.numslices,
-        scene.visual.quality.numstacks,
-    ) = 2048, 18, 10
+    scene.visual.quality.shadowsize = 2048
+    scene.visual.quality.numslices = 18
+    scene.visual.quality.numstacks = 10
     scene.visual.global_.offwidth = scene.visual.global_.offheight = 4096
     scene.stat.extent = extent
     scene.stat.center = [0, 0, floor]

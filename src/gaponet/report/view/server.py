@@ -1,8 +1,9 @@
 """A viser server for one user of this machine.
 
-Its address holds a secret; Host and Origin are checked. The page's Content-Security-Policy lets only the scripts run
-that are in the page when it is sent. A script in a name or a result that somebody else wrote does not run, and nothing
-is sent or loaded anywhere but to and from this server.
+Its address holds a secret; Host and Origin are checked. The page's Content-Security-Policy lets
+only the scripts run that are in the page when it is sent. A script in a name or a result that
+somebody else wrote does not run, and nothing is sent or loaded anywhere but to and from this
+server.
 """
 
 from __future__ import annotations
@@ -31,8 +32,8 @@ HEADERS = {
 }
 TESTED_VISER = "viser>=1.1,<1.2"
 
-# viser's page holds one script. It unpacks the application and puts it into the page as a second script, which needs
-# the nonce too. Only the first script that is created gets it.
+# viser's page holds one script. It unpacks the application and puts it into the page as a second
+# script, which needs the nonce too. Only the first script that is created gets it.
 PASS_NONCE_ON = """
 document.createElement = (name, ...options) => {
   const element = Document.prototype.createElement.call(document, name, ...options);
@@ -43,7 +44,8 @@ document.createElement = (name, ...options) => {
   return element;
 };
 """
-# viser sorts Gaussian splats, which no page of ours shows, with functions made from text. The policy refuses that.
+# viser sorts Gaussian splats, which no page of ours shows, with functions made from text. The
+# policy refuses that.
 LEAVE_OUT_SPLATS = """
 addEventListener("unhandledrejection", (event) => {
   if (event.reason instanceof EvalError) event.preventDefault();
@@ -54,7 +56,8 @@ addEventListener("unhandledrejection", (event) => {
 def open_server(label: str, port: int, script: str = "") -> tuple[Any, str]:
     """Start a viser server that only answers requests below /TOKEN/.
 
-    viser has no hook for this. The check is put into the handshake of its websockets server, which serves the page too.
+    viser has no hook for this. The check is put into the handshake of its websockets server, which
+    serves the page too.
 
     Args:
         script: JavaScript of ours that the page runs before viser's.
@@ -109,11 +112,12 @@ def run_until_interrupt(server: Any, tick: Callable[[float], None]) -> None:
 def content_policy(host: str, nonce: str) -> str:
     """Return the Content-Security-Policy of the page.
 
-    viser's client compiles WebAssembly, starts a worker from a blob, which opens the WebSocket, and styles elements
-    in place; pictures and files to save are data or blobs.
+    viser's client compiles WebAssembly, starts a worker from a blob, which opens the WebSocket, and
+    styles elements in place; pictures and files to save are data or blobs.
 
     Args:
-        host: Name and port under which the page was requested. Not every browser counts ws: as 'self'.
+        host: Name and port under which the page was requested. Not every browser counts ws: as
+            'self'.
         nonce: Secret of this answer, which its scripts carry.
     """
     directives = (

@@ -1,4 +1,6 @@
-"""Targets, simulations and recording of one sequence: the joint angles that `gaponet view` shows."""
+"""Targets, simulations and recording of one sequence: the joint angles that `gaponet view`
+shows.
+"""
 
 from __future__ import annotations
 
@@ -41,9 +43,8 @@ class SideBySide:
     real: Sequence
     robot: RobotSpec
     motions: tuple[Copy, ...]  # target, nominal, identified, models and recording, in this order
-    seen: (
-        bool | None
-    )  # True if a model was trained or validated on this recording; None without a model
+    # True if a model was trained or validated on this recording; None without a model
+    seen: bool | None
 
     def only(self, methods: tuple[str, ...]) -> SideBySide:
         """Return some motions in this order; "aligned" stands for the motions of all models.
@@ -51,23 +52,32 @@ class SideBySide:
         Raises:
             UsageError: No such motion, or none at all.
         """
-        have = {m.method: m for m in self.motions}
-        models = [m for m in have if m not in ("target", "nominal", "recorded")]
-        wanted = [m for name in methods for m in (models if name == "aligned" else [name])]
-        if unknown := [name for name in wanted if name not in have]:
-            raise UsageError(
-                f"--show {unknown[0]}: here are {', '.join(have)}; models are given with --model RUN"
-            )
+        have = {motion.method: motion for motion in self.motions}
+        wanted: list[str] = []
+        for name in methods:
+            if name == "aligned":
+                wanted += [m for m in have if m not in ("target", "nominal", "recorded")]
+            elif name in have:
+                wanted.append(name)
+            else:
+                raise UsageError(
+                    f"--show {name}: here are {', '.join(have)}; models are given with --model RUN"
+                )
         if not wanted:
             raise UsageError("--show: nothing is selected; aligned motion needs --model RUN")
         return replace(self, motions=tuple(have[name] for name in dict.fromkeys(wanted)))
 
     def magnified(self, factor: float) -> SideBySide:
-        """Return the motions with their differences from the recording times a factor; errors are unchanged."""
+        """Return the motions with their differences from the recording times a factor; errors are
+        unchanged.
+        """
         if not factor > 0:
             raise UsageError(f"--magnify is {factor}; give a positive factor, 1 for the truth")
-        grow = lambda m: replace(m, qpos=self.real.qpos + factor * (m.qpos - self.real.qpos))  # noqa: E731
-        return replace(self, motions=tuple(grow(m) for m in self.motions))
+        real = self.real.qpos
+        motions = []
+        for motion in self.motions:
+            motions.append(replace(motion, qpos=real + factor * (motion.qpos - real)))
+        return replace(self, motions=tuple(motions))
 
 
 @dataclass(frozen=True)
@@ -80,9 +90,10 @@ class Clip:
     fps: float = 20.0  # pictures per second of the film
 
     def __post_init__(self) -> None:
-        for name, low, high in (("duration", 0, 3600), ("speed", 0, 100), ("fps", 0, 120)):
-            if not low < (value := getattr(self, name)) <= high:
-                raise UsageError(f"--{name} is {value}; give more than {low} and at most {high}")
+        for name, highest in (("duration", 3600), ("speed", 100), ("fps", 120)):
+            value = getattr(self, name)
+            if not 0 < value <= highest:
+                raise UsageError(f"--{name} is {value}; give more than 0 and at most {highest}")
 
     @classmethod
     def from_start(
@@ -93,13 +104,15 @@ class Clip:
         speed: float = 1.0,
         fps: float = 20.0,
     ) -> Clip:
-        """Return the part from start on, or the part with the most motion, cut at the recording's end."""
-        real, dt = shown.real, shown.real.dt
+        """Return the part from start on, or the part with the most motion, cut at the recording's
+        end.
+        """
+        real = shown.real
+        dt = shown.real.dt
         recorded_s = (len(real) - 1) * dt
         if start is None:
-            start = dt * busiest_window(
-                real.qpos[:, shown.robot.operated_index], max(round(duration / dt), 1)
-            )
+            rows = max(round(duration / dt), 1)
+            start = dt * busiest_window(real.qpos[:, shown.robot.operated_index], rows)
         if not 0 <= start < recorded_s:
             raise UsageError(f"--start is {start:g} s; the recording lasts {recorded_s:.1f} s")
         return cls(start, min(duration, recorded_s - start), speed, fps)
@@ -139,14 +152,16 @@ def select_entry(
     entries = dataset.select((motion,) if motion else ())
     entries = sorted(entries, key=lambda e: was_used(e, runs))
     matching = [
-        e for e in entries
-        if unit in ("", e.meta.unit_id) and (payload_mass is None or abs(payload_mass - e.meta.payload_mass) < 1e-6)
-    ]  # fmt: skip
+        e
+        for e in entries
+        if unit in ("", e.meta.unit_id)
+        and (payload_mass is None or abs(payload_mass - e.meta.payload_mass) < 1e-6)
+    ]
     if not matching:
         there = sorted({f"{e.meta.unit_id} with {e.meta.payload_mass:g} kg" for e in entries})
         raise DatasetError(
-            f"{dataset.path}: no such recording of {motion or 'any motion'}; there are {', '.join(there)}. "
-            "Change --unit or --payload-mass"
+            f"{dataset.path}: no such recording of {motion or 'any motion'}; there are "
+            f"{', '.join(there)}. Change --unit or --payload-mass"
         )
     return matching[0]
 
@@ -158,7 +173,8 @@ def side_by_side(
     runs: ListOf[Path] = (),
     progress: Progress = no_progress,
 ) -> SideBySide:
-    """Replay a recording in the nominal simulator, in identified ones, and with each run's exported model.
+    """Replay a recording in the nominal simulator, in identified ones, and with each run's
+    exported model.
 
     Args:
         robot: Identified, it is shown beside the nominal one.
@@ -166,9 +182,8 @@ def side_by_side(
     """
     dataset.require_robot(robot)
     real = dataset.read(entry)
-    simulators: dict[str, tuple[RobotSpec, Corrector | None]] = {
-        "nominal": (robot.before_identification, None)
-    }
+    simulators: dict[str, tuple[RobotSpec, Corrector | None]] = {}
+    simulators["nominal"] = (robot.before_identification, None)
     if robot.nominal is not None:
         simulators["identified"] = (robot, None)
     for run in runs:
@@ -180,35 +195,36 @@ def side_by_side(
                 f"{run}: a second run of {title(candidate.method)}; give runs of different methods"
             )
         simulators[candidate.method] = (candidate.robot, candidate.corrector())
-    target = np.concatenate(
-        [real.qpos[:1], real.ctrl[:-1]]
-    )  # the command of row t is the target at t + 1
+    # The command of row t is the target at t + 1.
+    target = np.concatenate([real.qpos[:1], real.ctrl[:-1]])
     shown = {"target": target}
     for name, (simulator, corrector) in simulators.items():
         report = with_note(progress, name)
         shown[name] = replay([real], simulator, corrector, progress=report, lock_idle=True)[0].qpos
     shown["recorded"] = real.qpos
-    op = robot.operated_index
-    motions = tuple(Copy(k, q, np.abs(q - real.qpos)[:, op].mean(axis=1)) for k, q in shown.items())
-    folders = [*runs, *([robot.folder] if robot.nominal is not None else [])]
-    return SideBySide(real, robot, motions, was_used(entry, folders) if folders else None)
+    motions = []
+    for name, qpos in shown.items():
+        error = np.abs(qpos - real.qpos)[:, robot.operated_index].mean(axis=1)  # (T,) rad
+        motions.append(Copy(name, qpos, error))
+    folders = list(runs)
+    if robot.nominal is not None:
+        folders.append(robot.folder)
+    seen = was_used(entry, folders) if folders else None
+    return SideBySide(real, robot, tuple(motions), seen)
 
 
 def standing(robot: RobotSpec) -> SideBySide:
     """Return a robot at home."""
-    home, still = np.tile(robot.qpos_home, (2, 1)), np.zeros(2)
-    real = Sequence(
-        SequenceMeta(robot.name, "home", "home", 0.0),
-        robot.joint_names,
-        robot.dt,
-        home,
-        home,
-        0 * home,
-    )
+    home = np.tile(robot.qpos_home, (2, 1))
+    still = np.zeros(2)
+    meta = SequenceMeta(robot.name, "home", "home", 0.0)
+    real = Sequence(meta, robot.joint_names, robot.dt, home, home, np.zeros_like(home))
     return SideBySide(real, robot, (Copy("nominal", home, still),), None)
 
 
 def was_used(entry: Entry, folders: ListOf[Path]) -> bool:
-    """Return True if any run or robot folder was fitted or validated on a recording, or does not say."""
+    """Return True if any run or robot folder was fitted or validated on a recording, or does not
+    say.
+    """
     data = [FittedData.of_folder(folder) for folder in folders]
     return any(d is None or entry in d for d in data)

@@ -1,10 +1,12 @@
-"""Files that a browser sends to the page: each is stored whole, in its own event, over no other file.
+"""Files that a browser sends to the page: each is stored whole, in its own event, over no other
+file.
 
 An upload passes three places, and is renamed from one to the next:
 
 1. `.gaponet-PROCESS-…`: it is written, or unpacked, here. What is not readable never leaves it.
 2. `incoming/logs-1`: it is complete, and waits while a command runs.
-3. `logs`: its files are moved here. If the server is killed in between, the next one moves the others.
+3. `logs`: its files are moved here. If the server is killed in between, the next one moves the
+others.
 """
 
 from __future__ import annotations
@@ -37,7 +39,8 @@ WAITING_NAME = re.compile(rf"({'|'.join(PLACES)})-(\d{{1,9}})")
 MAX_UNPACKED_BYTES = 2 << 30  # of a .zip; the page holds an upload in memory
 MAX_SHOWN_STORED = 5  # lines of stored files; the newest
 MAX_SHOWN_REFUSED = 20  # lines of refused files; the oldest, and the number of the others
-# Errors of the disk. Any other OSError comes from the .zip: a file where it has a folder, a name that is too long.
+# Errors of the disk. Any other OSError comes from the .zip: a file where it has a folder, a name
+# that is too long.
 DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EIO, errno.EMFILE)
 
 
@@ -54,7 +57,8 @@ class Uploads:
         """Look after the uploads of a folder.
 
         Args:
-            show: Is called with the notices, in Markdown, and whether there is one that must be dismissed.
+            show: Is called with the notices, in Markdown, and whether there is one that must be
+                dismissed.
         """
         self.folder = folder
         self.jobs = jobs
@@ -64,7 +68,9 @@ class Uploads:
         self._lock = threading.Lock()
 
     def receive(self, name: str, content: bytes, place: str) -> None:
-        """Store an uploaded file in logs, model or new_logs, now or when the running command has ended."""
+        """Store an uploaded file in logs, model or new_logs, now or when the running command has
+        ended.
+        """
         try:
             with tempfile.TemporaryDirectory(
                 prefix=f"{FOLDER_MARKER}-{os.getpid()}-", dir=self.folder
@@ -180,8 +186,8 @@ class Notices:
 def connect_upload_button(button: Any, receive: Callable[[str, bytes], None]) -> None:
     """Call receive(name, content) in a thread for each file that an upload button of viser gets.
 
-    viser stores every file as `value` of the one button that all pages share, and calls back later, in a thread. Of two
-    files that arrive together, both callbacks would read the second one.
+    viser stores every file as `value` of the one button that all pages share, and calls back later,
+    in a thread. Of two files that arrive together, both callbacks would read the second one.
 
     Raises:
         UsageError: This version of viser keeps its callbacks elsewhere.
@@ -193,7 +199,10 @@ def connect_upload_button(button: Any, receive: Callable[[str, bytes], None]) ->
 
 
 class _CallbacksOfEachFile(list[Any]):
-    """Callbacks of an upload button. viser walks through them at once when a file is complete: it is taken then."""
+    """Callbacks of an upload button.
+
+    viser walks through them at once when a file is complete: it is taken then.
+    """
 
     def __init__(self, button: Any, receive: Callable[[str, bytes], None]) -> None:
         super().__init__()
@@ -226,13 +235,20 @@ def unpack(name: str, content: bytes, folder: Path) -> None:
                 raise UsageError(f"it unpacks to more than {size}; give it in parts")
             archive.extractall(folder)  # which drops .. and a leading / from names
     except (
-        zipfile.BadZipFile, zlib.error, lzma.LZMAError, EOFError, RuntimeError, ValueError, OSError,
-    ) as error:  # fmt: skip
+        zipfile.BadZipFile,
+        zlib.error,
+        lzma.LZMAError,
+        EOFError,
+        RuntimeError,
+        ValueError,
+        OSError,
+    ) as error:
         if isinstance(error, OSError) and error.errno in DISK_ERRORS:
             raise
         reason = error.strerror if isinstance(error, OSError) else str(error)
         raise UsageError(
-            f"the .zip is broken or has a password ({reason}); pack it again. Nothing of it is stored"
+            f"the .zip is broken or has a password ({reason}); pack it again. Nothing of it is "
+            "stored"
         ) from None
     files = _files(folder)
     if not files:
@@ -242,10 +258,12 @@ def unpack(name: str, content: bytes, folder: Path) -> None:
 
 
 def move_files(source: Path, target: Path) -> None:
-    """Move the files below one folder to the same places below another: all, or none if one has no place.
+    """Move the files below one folder to the same places below another: all, or none if one has no
+    place.
 
     Raises:
-        UsageError: A file exists, a file stands where a folder is needed, or a link leads out of the target.
+        UsageError: A file exists, a file stands where a folder is needed, or a link leads out of
+            the target.
         OSError: One could not be moved; those before it are moved back.
     """
     files = _files(source)
