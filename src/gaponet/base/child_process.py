@@ -38,9 +38,10 @@ def _module_path() -> list[str]:
     """
     current = _real(".")
     home = os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
-    return [
-        p for p in sys.path if os.path.isabs(p) and (_real(p) != current or current == _real(home))
-    ]
+    absolute = [path for path in sys.path if os.path.isabs(path)]
+    if current == _real(home):
+        return absolute
+    return [path for path in absolute if _real(path) != current]
 
 
 def _real(path: str) -> str:

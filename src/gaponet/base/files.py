@@ -72,10 +72,8 @@ def write_text(path: Path, text: str) -> None:
 
 def write_json(path: Path, value: Any) -> None:
     """Write a JSON file atomically, with the conversions of `json_compatible`."""
-    write_text(
-        path,
-        json.dumps(json_compatible(value), indent=1, ensure_ascii=False, allow_nan=False) + "\n",
-    )
+    text = json.dumps(json_compatible(value), indent=1, ensure_ascii=False, allow_nan=False)
+    write_text(path, text + "\n")
 
 
 def json_compatible(value: Any) -> Any:
@@ -125,13 +123,11 @@ def require_own_folder(folder: Path, kind: str) -> None:
         raise FolderError(
             f"{folder}: holds gaponet's {marked[0]}, not {kind}; choose another folder"
         )
-    if marked or any(
-        any(folder.glob(sign)) for sign in UNMARKED_FOLDERS.get(kind, (FOLDER_MARKER,))
-    ):
+    signs = UNMARKED_FOLDERS.get(kind, (FOLDER_MARKER,))
+    if marked or any(any(folder.glob(sign)) for sign in signs):
         return
-    others = sorted(
-        child.name for child in folder.iterdir() if not child.name.startswith(FOLDER_MARKER)
-    )
+    names = sorted(child.name for child in folder.iterdir())
+    others = [name for name in names if not name.startswith(FOLDER_MARKER)]
     if others:
         more = f" and {len(others) - 3} more" if len(others) > 3 else ""
         raise FolderError(
@@ -175,11 +171,10 @@ def lock_folder(folder: Path, kind: str, wait: float = 0.0) -> Iterator[None]:
     _locked_here.add(key)
     succeeded = False
     try:
-        if not os.fstat(descriptor).st_size:
+        size = os.fstat(descriptor).st_size
+        if size == 0:
             _write_at(descriptor, 0, kind_line)
-        elif os.fstat(descriptor).st_size > len(
-            kind_line
-        ):  # a second line names a writer that was killed
+        elif size > len(kind_line):  # a second line names a writer that was killed
             _remove_unfinished(folder)
         _write_at(descriptor, len(kind_line), f"{os.getpid()}\n".encode())
         yield

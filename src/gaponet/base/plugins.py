@@ -25,7 +25,10 @@ from typing import Any, TypeVar
 from gaponet.base.errors import UsageError
 from gaponet.base.text import escape
 
-GROUPS = FORMATS, DRIVERS, METHODS = "gaponet.formats", "gaponet.drivers", "gaponet.methods"
+FORMATS = "gaponet.formats"
+DRIVERS = "gaponet.drivers"
+METHODS = "gaponet.methods"
+GROUPS = (FORMATS, DRIVERS, METHODS)
 Result = TypeVar("Result")
 _WARNED: set[str] = set()
 
@@ -72,9 +75,7 @@ def attempt(where: str, call: Callable[[], Result], otherwise: Result) -> Result
     try:
         return call()
     except (Exception, SystemExit) as error:
-        package = next(
-            (_package(p) for group in GROUPS for p in _points(group) if p.value == where), ""
-        )
+        package = _package_of(where)
         if not package:
             raise
         _warn(
@@ -91,6 +92,15 @@ def _points(group: str) -> tuple[EntryPoint, ...]:
 
 def _package(point: EntryPoint) -> str:
     return point.dist.name if point.dist else point.module
+
+
+def _package_of(where: str) -> str:
+    """Return the package whose extension brings `module:attribute`; "" if none does."""
+    for group in GROUPS:
+        for point in _points(group):
+            if point.value == where:
+                return _package(point)
+    return ""
 
 
 def _warn(what: str, text: str) -> None:

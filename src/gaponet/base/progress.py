@@ -97,7 +97,8 @@ def _progress(title: str) -> Iterator[_Show]:
             )
 
         yield show
-        if (task := progress.tasks[0]).percentage >= 100 * MAX_UNFINISHED:
+        task = progress.tasks[0]
+        if task.percentage >= 100 * MAX_UNFINISHED:
             progress.update(whole, completed=task.total)
 
 

@@ -86,34 +86,39 @@ class ResultTable:
         """Return the table as CSV at full precision; a column with MeanStd is followed by its std
         and count.
         """
-        with_std = [
-            any(isinstance(cell, MeanStd) for cell in column)
-            for column in zip(*self.rows, strict=True)
-        ]
-        with_std = with_std or [False] * len(self.columns)
+        has_std = [self._has_std(i) for i in range(len(self.columns))]
         out = io.StringIO()
         writer = csv.writer(out, lineterminator="\n")
-        names = (
-            (c, f"{c}: std", f"{c}: n") if wide else (c,)
-            for c, wide in zip(self.columns, with_std, strict=True)
-        )
-        writer.writerow([name for group in names for name in group])
+        header = []
+        for name, with_std in zip(self.columns, has_std, strict=True):
+            header.append(name)
+            if with_std:
+                header += [f"{name}: std", f"{name}: n"]
+        writer.writerow(header)
         for row in self.rows:
             line: list[Any] = []
-            for cell, wide in zip(row, with_std, strict=True):
-                values = (
-                    [cell.mean, cell.std, cell.count]
-                    if isinstance(cell, MeanStd)
-                    else [cell, None, None]
-                )
-                line += values if wide else values[:1]
-            writer.writerow(
-                [
-                    "" if v is None or (isinstance(v, float) and not math.isfinite(v)) else v
-                    for v in line
-                ]
-            )
+            for cell, with_std in zip(row, has_std, strict=True):
+                line += _csv_values(cell, with_std)
+            writer.writerow(line)
         return out.getvalue()
+
+    def _has_std(self, column: int) -> bool:
+        """Return True if a column has at least one cell with a standard deviation."""
+        return any(isinstance(row[column], MeanStd) for row in self.rows)
+
+
+def _csv_values(cell: Any, with_std: bool) -> list[Any]:
+    """Return a cell, or a cell with its standard deviation and count; "" where there is none."""
+    values = [cell.mean, cell.std, cell.count] if isinstance(cell, MeanStd) else [cell, None, None]
+    if not with_std:
+        values = values[:1]
+    return [_csv_value(value) for value in values]
+
+
+def _csv_value(value: Any) -> Any:
+    if value is None or (isinstance(value, float) and not math.isfinite(value)):
+        return ""
+    return value
 
 
 def format_cell(cell: Any, digits: int = 2) -> str:

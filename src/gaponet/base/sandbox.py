@@ -140,11 +140,8 @@ def _size(path: Path) -> int:
     with suppress(OSError):
         if path.is_dir() or path.suffix in (".xml", ".urdf"):
             folder = path if path.is_dir() else path.parent
-            return sum(
-                f.stat().st_size
-                for f in islice(folder.rglob("*"), MAX_FILES_BESIDE_MODEL)
-                if f.is_file()
-            )
+            around = islice(folder.rglob("*"), MAX_FILES_BESIDE_MODEL)
+            return sum(file.stat().st_size for file in around if file.is_file())
         return path.stat().st_size
     return 0
 
@@ -171,7 +168,8 @@ class _Child:
     def current_or_new(cls) -> _Child:
         child = cls.current
         if child is None or child.owner != os.getpid() or child.process.poll() is not None:
-            child = cls.current = cls()
+            child = cls()
+            cls.current = child
         return child
 
     def request(self, request: Any, seconds: float) -> tuple[Any, str]:
@@ -183,21 +181,14 @@ class _Child:
         try:
             _write(self.process.stdin, request)
             return pickle.load(self.process.stdout)
-        except (
-            EOFError,
-            BrokenPipeError,
-            pickle.UnpicklingError,
-        ):  # the last: the child ended within its answer
+        except (EOFError, BrokenPipeError, pickle.UnpicklingError):
+            # The child has ended, the last error: within its answer.
             code = self.process.wait()
             if code == 0:
                 return None, IDLE
-            timed_out = code == -getattr(signal, "SIGXCPU", 0) or not timeout.is_alive()
-            return (
-                None,
-                "time"
-                if timed_out
-                else f"its parser ended with code {code}: damaged, or too large",
-            )
+            if code == -getattr(signal, "SIGXCPU", 0) or not timeout.is_alive():
+                return None, "time"
+            return None, f"its parser ended with code {code}: damaged, or too large"
         except BaseException:  # an unread answer would be taken for the next one
             self.close()
             raise
@@ -272,16 +263,18 @@ def _set_limits(seconds: float) -> None:
     _set_limit(resource.RLIMIT_FSIZE, MEMORY_BYTES)
     _set_limit(resource.RLIMIT_NOFILE, MAX_OPEN_FILES)
     with suppress(OSError):  # /proc exists on Linux only
-        status = dict(
-            line.split(":") for line in Path("/proc/self/status").read_text().splitlines()
-        )
-        resident, private = (int(status[name].split()[0]) << 10 for name in ("VmRSS", "VmData"))
+        lines = Path("/proc/self/status").read_text().splitlines()
+        status = dict(line.split(":") for line in lines)
+        resident = int(status["VmRSS"].split()[0]) << 10  # bytes
+        private = int(status["VmData"].split()[0]) << 10  # bytes
         _set_limit(resource.RLIMIT_DATA, private + max(MEMORY_BYTES - resident, 0))
 
 
 def _set_limit(kind: int, soft: int) -> None:
     _, hard = resource.getrlimit(kind)
-    resource.setrlimit(kind, (soft if hard == resource.RLIM_INFINITY else min(soft, hard), hard))
+    if hard != resource.RLIM_INFINITY:
+        soft = min(soft, hard)
+    resource.setrlimit(kind, (soft, hard))
 
 
 if __name__ == "__main__":

@@ -32,13 +32,8 @@ MAX_ARRAYS_BYTES = 512 << 20  # of the arrays in one file
 
 
 def _name(text: str) -> str:
-    if (
-        not 0 < len(text) <= 200
-        or "/" in text
-        or "\\" in text
-        or text in (".", "..")
-        or min(text) < " "
-    ):
+    has_separator = "/" in text or "\\" in text
+    if not 0 < len(text) <= 200 or has_separator or text in (".", "..") or min(text) < " ":
         raise ValueError(
             "should be 1 to 200 letters, none of them a slash, a backslash or a control character"
         )
@@ -48,10 +43,12 @@ def _name(text: str) -> str:
 def _all_finite(value: Any) -> Any:
     if isinstance(value, float) and not math.isfinite(value):
         raise ValueError("holds a number that is not finite")
-    for part in (
-        value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
-    ):
-        _all_finite(part)
+    if isinstance(value, dict):
+        for part in value.values():
+            _all_finite(part)
+    elif isinstance(value, list):
+        for part in value:
+            _all_finite(part)
     return value
 
 
@@ -239,9 +236,10 @@ def _first_error(invalid: ValidationError) -> str:
     errors = invalid.errors(include_url=False)
     kind = errors[0]["type"]
     given = errors[0]["input"]
-    field = "".join(
-        f"[{part}]" if isinstance(part, int) else f".{part}" for part in errors[0]["loc"]
-    ).lstrip(".")
+    field = ""
+    for part in errors[0]["loc"]:
+        field += f"[{part}]" if isinstance(part, int) else f".{part}"
+    field = field.lstrip(".")
     reason = errors[0]["msg"].removeprefix("Input ").removeprefix("Value error, ").rstrip(".")
     if kind == "missing":
         reason = "is missing"
@@ -249,8 +247,9 @@ def _first_error(invalid: ValidationError) -> str:
         reason = "is not a known field"
     elif kind != "json_invalid" and not isinstance(given, (dict, list)):
         reason += f", not {given!r:.60}"
-    rest = f" (and {len(errors) - 1} more)" if len(errors) > 1 else ""
-    return f"{field}{': ' if field else ''}{reason}{rest}"
+    if len(errors) > 1:
+        reason += f" (and {len(errors) - 1} more)"
+    return f"{field}: {reason}" if field else reason
 
 
 def _message(where: str | Path, reason: str, hint: str) -> str:

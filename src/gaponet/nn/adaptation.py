@@ -93,14 +93,13 @@ class Adaptation:
                 "unit"
             )
         fitted = adapt(sequences, simulator, seconds, model.corrector(simulator), progress)
-        servos = {
-            j: {f: float(getattr(fitted.robot, f)[simulator.joint_names.index(j)]) for f in FIELDS}
-            for j in simulator.operated
-        }
+        servos = {}
+        for joint in simulator.operated:
+            j = simulator.joint_names.index(joint)
+            servos[joint] = {field: float(getattr(fitted.robot, field)[j]) for field in FIELDS}
         logs = tuple(s.content_hash() for s in sequences)
-        return Adaptation(
-            units[0], model.weights_hash(), servos, logs, seconds, fitted.before, fitted.after
-        )
+        weights = model.weights_hash()
+        return Adaptation(units[0], weights, servos, logs, seconds, fitted.before, fitted.after)
 
     @classmethod
     def load(cls, run: Path, weights: str) -> dict[str, Adaptation]:

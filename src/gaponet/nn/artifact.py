@@ -70,16 +70,16 @@ def make_card(config: ModelConfig, robot: RobotSpec, **facts: Any) -> dict[str, 
     """
     from gaponet.sim.model import model_hash
 
+    ranges = []
+    for low, high in robot.qpos_range[robot.operated_index].tolist():
+        ranges.append([low if np.isfinite(low) else None, high if np.isfinite(high) else None])
     return {
         "format": FORMAT,
         "robot": robot.name,
         "joint_names": list(robot.operated),
-        "kp": [float(robot.kp[i]) for i in robot.operated_index],
-        "kd": [float(robot.kd[i]) for i in robot.operated_index],
-        "qpos_range": [
-            [float(x) if np.isfinite(x) else None for x in robot.qpos_range[i]]
-            for i in robot.operated_index
-        ],
+        "kp": robot.kp[robot.operated_index].tolist(),
+        "kd": robot.kd[robot.operated_index].tolist(),
+        "qpos_range": ranges,
         "simulator": model_hash(robot),
         "model": asdict(config),
     } | facts
@@ -141,18 +141,42 @@ def _require_output(
     """Refuse a network whose output for inputs (k, inputs) is not (k, outputs), finite, and at
     most `largest` rad.
     """
+    reason = f"{inputs} numbers in do not give {outputs} finite ones up to {largest:g} rad out"
+    fits = True
     try:
-        deltas = [network(np.zeros((k, inputs), np.float32)) for k in (1, 2)]
-        fits = all(delta.shape == (k, outputs) for k, delta in enumerate(deltas, 1))
-        fits = fits and all(
-            np.isfinite(delta).all() and np.abs(delta).max() <= largest + 1e-3 for delta in deltas
-        )
-        reason = f"{inputs} numbers in do not give {outputs} finite ones up to {largest:g} rad out"
+        for rows in (1, 2):
+            delta = network(np.zeros((rows, inputs), np.float32))
+            fits = fits and delta.shape == (rows, outputs) and _is_within(delta, largest + 1e-3)
     except Exception as error:  # an unknown network can raise anything
         fits = False
         reason = f"it does not run: {' '.join(str(error).split())[:120]}"
     if not fits:
         raise ModelError(f"{file}: does not fit its card ({reason}); copy or train the model again")
+
+
+def _is_within(delta: Array, largest: float) -> bool:
+    """Return True if all corrections are finite and at most `largest` rad."""
+    return bool(np.isfinite(delta).all() and np.abs(delta).max() <= largest)
+
+
+def _contradiction(card: dict[str, Any], config: ModelConfig) -> str:
+    """Return which field of a card has the wrong length or an impossible value; "" if none has."""
+    n = len(card["joint_names"])
+    lists = {name: card.get(name) for name in ("kp", "kd", "qpos_range")}
+    for name, values in card.get("recorded", {}).items():
+        lists[f"recorded.{name}"] = values
+    for name, values in lists.items():
+        if values is not None and len(values) != n:
+            return f"{name}: should have one entry for each of {n} joints"
+    if config.context:
+        answers = card.get("context", {})
+        for name in ("nominal", "low", "high"):
+            if len(answers.get(name, ())) != config.context_dim(n):
+                return f"context.{name}: should have {config.context_dim(n)} numbers"
+    for low, high in card.get("qpos_range", []):
+        if low is not None and high is not None and not low < high:
+            return f"qpos_range: {low} to {high} is no range"
+    return ""
 
 
 def facts_in_network(card: dict[str, Any]) -> dict[str, Any]:
@@ -259,7 +283,8 @@ class GapModel:
                 directory.
         """
         folder = named_folder(path)
-        folder = folder / "model" if (folder / "model" / CARD).is_file() else folder
+        if (folder / "model" / CARD).is_file():
+            folder = folder / "model"
         for name in (CARD, WEIGHTS):
             if not (folder / name).is_file():
                 raise ModelError(
@@ -271,7 +296,8 @@ class GapModel:
         n = len(card["joint_names"])
         _require_output(network, config.input_dim(n), n, config.delta_max, file)
         _require_stored_facts(network, card, folder)
-        if card.get("sha256", {}).get(WEIGHTS, digest := sha256(file)) != digest:
+        digest = sha256(file)
+        if card.get("sha256", {}).get(WEIGHTS, digest) != digest:
             raise ModelError(
                 f"{file}: is not of its {CARD}: an export was cut short; run gaponet export RUN "
                 "again"
@@ -283,10 +309,9 @@ class GapModel:
         """Limits of the operated joints, (n, 2) rad; ±inf where there is none, or the card does
         not have them.
         """
-        limits = self.card.get("qpos_range", [[None, None]] * len(self.card["joint_names"]))
-        return np.array(
-            [[-np.inf if a is None else a, np.inf if b is None else b] for a, b in limits]
-        )
+        no_limits = [[None, None]] * len(self.card["joint_names"])
+        limits = np.array(self.card.get("qpos_range", no_limits), float)  # None becomes NaN
+        return np.where(np.isnan(limits), (-np.inf, np.inf), limits)
 
     @property
     def known_simulators(self) -> KnownSimulators | None:
@@ -486,23 +511,9 @@ class GapModel:
         read_format(_Card, file, FORMAT, ModelError, mend)
         card = read_json(dict[str, Any], file, ModelError, mend)
         config = validated(ModelConfig, card["model"], f"{file}: model", ModelError, mend)
-        n = len(card["joint_names"])
-        lists = {name: card.get(name) for name in ("kp", "kd", "qpos_range")}
-        lists |= {f"recorded.{name}": values for name, values in card.get("recorded", {}).items()}
-        for name, values in lists.items():
-            if values is not None and len(values) != n:
-                raise ModelError(
-                    f"{file}: {name}: should have one entry for each of {n} joints; {mend}"
-                )
-        answers = card.get("context", {})
-        for name in ("nominal", "low", "high") if config.context else ():
-            if len(answers.get(name, ())) != config.context_dim(n):
-                raise ModelError(
-                    f"{file}: context.{name}: should have {config.context_dim(n)} numbers; {mend}"
-                )
-        for low, high in card.get("qpos_range", []):
-            if low is not None and high is not None and not low < high:
-                raise ModelError(f"{file}: qpos_range: {low} to {high} is no range; {mend}")
+        contradiction = _contradiction(card, config)
+        if contradiction:
+            raise ModelError(f"{file}: {contradiction}; {mend}")
         return card, config
 
     @staticmethod

@@ -172,8 +172,11 @@ class ModelConfig:
             raise UsageError(
                 f"context: model {self.kind} has no such input; use {' or '.join(CONTEXT_KINDS)}"
             )
-        for name in PAPER_ONLY if self.kind != "paper" else ():
-            if (value := getattr(self, name)) != getattr(ModelConfig, name):
+        if self.kind == "paper":
+            return
+        for name in PAPER_ONLY:
+            value = getattr(self, name)
+            if value != getattr(ModelConfig, name):
                 raise UsageError(
                     f"{name} {value}: model {self.kind} has no such switch; use --model paper"
                 )

@@ -55,25 +55,27 @@ class DelayOffset:
         names = robot.operated
         dt = float(np.median([s.dt for s in pieces]))
         delays = dt * np.arange(int(MAX_DELAY_S / dt) + 1)
-        error = np.empty((len(delays), len(op)))
-        offset = np.empty((len(delays), len(op)))
+        error = np.empty((len(delays), len(op)))  # rad
+        offset = np.empty((len(delays), len(op)))  # rad
         zero = dict.fromkeys(names, 0.0)
         for i, delay in enumerate(delays):
             candidate = DelayOffset(dict.fromkeys(names, float(delay)), zero)
             rollouts = replay(pieces, robot, candidate.corrector(robot), nthread, lock_idle=True)
             for k, (j, name) in enumerate(zip(op, names, strict=True)):
-                pairs = zip(pieces, rollouts, strict=True)
-                errors = [
-                    (s.qpos - r.qpos)[1:, j] for s, r in pairs if name not in s.meta.unrecorded
-                ]
-                e = np.concatenate(errors or [np.zeros(1)])
-                offset[i, k] = np.median(e)
-                error[i, k] = np.abs(e - offset[i, k]).mean()
-        best = error.argmin(axis=0)
-        return DelayOffset(
-            {j: round(float(delays[best[k]]), 6) for k, j in enumerate(names)},
-            {j: round(float(offset[best[k], k]), 6) for k, j in enumerate(names)},
-        )
+                errors = []
+                for piece, rollout in zip(pieces, rollouts, strict=True):
+                    if name not in piece.meta.unrecorded:
+                        errors.append((piece.qpos - rollout.qpos)[1:, j])
+                every_row = np.concatenate(errors or [np.zeros(1)])
+                offset[i, k] = np.median(every_row)
+                error[i, k] = np.abs(every_row - offset[i, k]).mean()
+        best = error.argmin(axis=0)  # index of the delay of each joint, (n,)
+        best_delays = {}
+        best_offsets = {}
+        for k, name in enumerate(names):
+            best_delays[name] = round(float(delays[best[k]]), 6)
+            best_offsets[name] = round(float(offset[best[k], k]), 6)
+        return DelayOffset(best_delays, best_offsets)
 
     @staticmethod
     def pieces(

@@ -56,10 +56,12 @@ class DeltaLoop:
         self.config = config
         self.n = n
         self.num_envs = num_envs
-        self.layout = layout = Layout(config, n)
-        self.x = x = zeros_like(
-            np.empty(0, np.float32) if like is None else like, num_envs, layout.dim
-        )
+        layout = Layout(config, n)
+        self.layout = layout
+        if like is None:
+            like = np.empty(0, np.float32)
+        x = zeros_like(like, num_envs, layout.dim)
+        self.x = x
         self.history = History(config, n, x)
         self._numpy = isinstance(x, np.ndarray)
         self._xp = array_module(x)
@@ -67,16 +69,15 @@ class DeltaLoop:
         shape = (n,) if num_envs == 1 else (num_envs, n)
         self._shapes = {shape, (num_envs, n)}
         rows = x[0] if num_envs == 1 else x
-        self._q, self._v, self._action = (
-            rows[..., part] for part in (layout.q, layout.v, layout.action)
-        )
+        self._q = rows[..., layout.q]
+        self._v = rows[..., layout.v]
+        self._action = rows[..., layout.action]
         self._payload = x[:, layout.payload.start] if config.payload_input else None
         self._bound = AnswerBound(config.delta_max)
         self.answer = self._bind(network, shape)
-        self.low, self.high = (
-            np.array(side, float) if self._numpy else x.new_tensor(side)
-            for side in np.transpose(qpos_range)
-        )
+        low, high = np.transpose(qpos_range)
+        self.low = np.array(low, float) if self._numpy else x.new_tensor(low)
+        self.high = np.array(high, float) if self._numpy else x.new_tensor(high)
         self._applied: Any = zeros_like(x, *shape)
         self.holds = config.holds
         self.age = zeros_like(x, num_envs)
@@ -151,8 +152,8 @@ class DeltaLoop:
             payload_mass: kg, one number or (num_envs,).
         """
         if self.any_fresh:
-            frames = (x.reshape(-1, 1, self.n)[self.fresh] for x in (qpos, qvel, ctrl))
-            self.begin(self.fresh.copy(), *frames)
+            q, v, u = (x.reshape(-1, 1, self.n)[self.fresh] for x in (qpos, qvel, ctrl))
+            self.begin(self.fresh.copy(), q, v, u)
         if self.config.sensor_hold == 1:
             self._q[...] = qpos
             self._v[...] = qvel
@@ -165,10 +166,12 @@ class DeltaLoop:
         self._action[...] = ctrl
         if self._payload is not None:
             self._payload[...] = payload_mass / self.config.payload_max
-        if self.extra is not None and (due := self._due(self.config.sensor_hold)[0]).any():
-            extra = self.extra()
-            start = self.layout.query.stop
-            self.x[due, start : start + extra.shape[1]] = extra[due]
+        if self.extra is not None:
+            due, _ = self._due(self.config.sensor_hold)
+            if due.any():
+                extra = self.extra()
+                start = self.layout.query.stop
+                self.x[due, start : start + extra.shape[1]] = extra[due]
         return self.x
 
     def delta(self, qpos: Any, qvel: Any, ctrl: Any, payload_mass: Any) -> Any:
@@ -207,12 +210,11 @@ class DeltaLoop:
         self.observe(qpos, qvel, ctrl, payload_mass)
         delta = self.answer()
         if self.config.delta_hold > 1:
-            delta = self.held = self._xp.where(
-                self._due(self.config.delta_hold)[1], delta, self.held
-            )
-        self._applied = applied = self._xp.minimum(
-            self._xp.maximum(ctrl + delta, self.low), self.high
-        )
+            _, due = self._due(self.config.delta_hold)
+            delta = self._xp.where(due, delta, self.held)
+            self.held = delta
+        applied = self._xp.minimum(self._xp.maximum(ctrl + delta, self.low), self.high)
+        self._applied = applied
         if self.holds:
             self.push(qpos, qvel, applied)
         else:

@@ -65,11 +65,11 @@ class Layout:
         shift, (k, n) rad.
         """
         k, n = shift.shape
+        frame = np.concatenate([shift, np.zeros((k, n)), shift], axis=1)  # [q | q̇ | u]
         out = np.zeros((k, self.dim))
-        out[:, self.q] = out[:, self.action] = shift
-        out[:, self.past] = np.tile(
-            np.concatenate([shift, np.zeros((k, n)), shift], axis=1), (1, self.history)
-        )
+        out[:, self.q] = shift
+        out[:, self.action] = shift
+        out[:, self.past] = np.tile(frame, (1, self.history))
         return out
 
 
@@ -94,8 +94,11 @@ class History:
         memory = self._past if self._in_x else zeros_like(x, len(x), 3 * n * self.depth)
         self.frames = memory.reshape(len(x), self.depth, 3 * n)  # a view
         self._numpy = isinstance(x, np.ndarray)
-        # Internal arrays of one robot have one dimension: numpy needs half the time.
-        memory, self._present = (a[0] if len(x) == 1 else a for a in (memory, x[:, layout.state]))
+        self._present = x[:, layout.state]
+        if len(x) == 1:
+            # Internal arrays of one robot have one dimension: numpy needs half the time.
+            memory = memory[0]
+            self._present = self._present[0]
         self._q = memory[..., :n]
         self._v = memory[..., n : 2 * n]
         self._u = memory[..., 2 * n : 3 * n]

@@ -38,13 +38,14 @@ class ProbeOracle:
         self.offsets = self.probe_offsets(config, len(robot.operated))
         self.dt = np.array([c[2] for c in conditions])
         self.absolute = config.sensor_target == "absolute"
-        m = len(self.offsets)
         # A delayed servo would not respond within the control period.
-        no_delay = np.zeros(len(robot.joint_names))
-        copies = [c for c in conditions for _ in range(m)]
-        self.sim = sim = BatchSim(replace(robot, delay=no_delay), copies, nthread, locked)
-        self.operated = np.array([sim.joint_names.index(name) for name in robot.operated])
-        self.target = np.zeros(sim.qpos.shape)
+        no_delay = replace(robot, delay=np.zeros(len(robot.joint_names)))
+        copies = []  # a simulation for each probe of each state
+        for condition in conditions:
+            copies += [condition] * len(self.offsets)
+        self.sim = BatchSim(no_delay, copies, nthread, locked)
+        self.operated = np.array([self.sim.joint_names.index(name) for name in robot.operated])
+        self.target = np.zeros(self.sim.qpos.shape)
 
     @staticmethod
     def probe_offsets(config: ModelConfig, n: int) -> Array:
@@ -77,17 +78,15 @@ class ProbeOracle:
         q = qpos[state]
         v = qvel[state]
         target = q.astype(float)
-        target[:, op] += (
-            np.tile(self.offsets, (k, 1)) if offsets is None else offsets.reshape(k * m, -1)
-        )
+        if offsets is None:
+            target[:, op] += np.tile(self.offsets, (k, 1))
+        else:
+            target[:, op] += offsets.reshape(k * m, -1)
         sim.reset(rows, q, v, past=target[:, None])
         self.target[rows] = target
         sim.step(self.target, None if len(rows) == sim.num_envs else rows)
         start = 0.0 if self.absolute else 1.0
         positions = sim.qpos[rows][:, op] - start * q[:, op]
         velocities = (sim.qvel[rows][:, op] - start * v[:, op]) * self.dt[state][:, None]
-        return (
-            np.concatenate([positions, velocities], axis=1)
-            .astype(np.float32)
-            .reshape(k, m, 2 * len(op))
-        )
+        values = np.concatenate([positions, velocities], axis=1).astype(np.float32)
+        return values.reshape(k, m, 2 * len(op))

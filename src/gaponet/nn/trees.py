@@ -103,27 +103,24 @@ class TreesNet(DeltaNet):
         inputs = self.prepare(x[rows]).cpu().numpy()
         targets = labels[rows].cpu().numpy()
         for j, column in enumerate(targets.T / self.bounded.scale.item()):
-            if len(some := np.flatnonzero(np.isfinite(column))[:MAX_ROWS]):
-                ensemble = Ensemble(
-                    max_iter=TREES,
-                    max_leaf_nodes=LEAVES,
-                    max_depth=MAX_DEPTH,
-                    min_samples_leaf=MIN_LEAF_ROWS,
-                    early_stopping=False,
-                ).fit(inputs[some], column[some])
-                self._store(j, ensemble)
-                stored = (
-                    self._sums(torch.from_numpy(inputs[some[:MIN_LEAF_ROWS]]).to(x.device))[:, j]
-                    .cpu()
-                    .numpy()
+            labelled = np.flatnonzero(np.isfinite(column))[:MAX_ROWS]
+            if not labelled.size:
+                continue
+            ensemble = Ensemble(
+                max_iter=TREES,
+                max_leaf_nodes=LEAVES,
+                max_depth=MAX_DEPTH,
+                min_samples_leaf=MIN_LEAF_ROWS,
+                early_stopping=False,
+            ).fit(inputs[labelled], column[labelled])
+            self._store(j, ensemble)
+            some = inputs[labelled[:MIN_LEAF_ROWS]]
+            stored = self._sums(torch.from_numpy(some).to(x.device))[:, j].cpu().numpy()
+            difference = np.abs(stored - ensemble.predict(some)).max()
+            if not difference < MAX_DIFFERENCE:
+                raise ModelError(
+                    "this scikit-learn stores trees in an unknown form; install 1.5 to 1.9"
                 )
-                if (
-                    not np.abs(stored - ensemble.predict(inputs[some[:MIN_LEAF_ROWS]])).max()
-                    < MAX_DIFFERENCE
-                ):
-                    raise ModelError(
-                        "this scikit-learn stores trees in an unknown form; install 1.5 to 1.9"
-                    )
         error = self(x[rows[:MEASURED_ROWS]]).cpu().numpy() - targets[:MEASURED_ROWS]
         return np.array([np.nanmean(error**2)])
 

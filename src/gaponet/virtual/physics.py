@@ -129,13 +129,13 @@ class Physics:
 
     def only(self, effects: tuple[str, ...] | list[str]) -> Physics:
         """Return the unit with all other effects switched off."""
-        if unknown := sorted(set(effects) - set(EFFECTS)):
+        unknown = sorted(set(effects) - set(EFFECTS))
+        if unknown:
             raise UsageError(f"effect '{unknown[0]}' is unknown; effects are {', '.join(EFFECTS)}")
-        off = {
-            f.name: np.full_like(getattr(self, f.name), f.metadata["neutral"])
-            for f in fields(self)
-            if f.metadata["effect"] not in effects
-        }
+        off = {}
+        for f in fields(self):
+            if f.metadata["effect"] not in effects:
+                off[f.name] = np.full_like(getattr(self, f.name), f.metadata["neutral"])
         return replace(self, **off)
 
 
@@ -144,13 +144,11 @@ EFFECTS: tuple[str, ...] = tuple(dict.fromkeys(f.metadata["effect"] for f in fie
 
 def neutral(n: int) -> Physics:
     """Return the physics of the nominal simulator, without any effect, for n joints."""
-    size = {"joint": (n,), "unit": (1,)}
-    return Physics(
-        **{
-            f.name: np.full(size[f.metadata["scope"]], f.metadata["neutral"])
-            for f in fields(Physics)
-        }
-    )
+    size = {"joint": n, "unit": 1}
+    values = {}
+    for f in fields(Physics):
+        values[f.name] = np.full(size[f.metadata["scope"]], f.metadata["neutral"])
+    return Physics(**values)
 
 
 def stack(units: list[Physics], columns: Array) -> Physics:
@@ -158,7 +156,7 @@ def stack(units: list[Physics], columns: Array) -> Physics:
     rows = {}
     for f in fields(Physics):
         table = np.stack([np.atleast_1d(getattr(u, f.name)) for u in units])
-        rows[f.name] = np.ascontiguousarray(
-            table[:, columns] if f.metadata["scope"] == "joint" else table
-        )
+        if f.metadata["scope"] == "joint":
+            table = table[:, columns]
+        rows[f.name] = np.ascontiguousarray(table)
     return Physics(**rows)
