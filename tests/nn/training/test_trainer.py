@@ -156,7 +156,7 @@ def test_ppo_alone_has_statistics_of_its_inputs_and_a_fitted_predictor(
     trainer = Trainer(trained[0], robot, tmp_path / "run", config, Budget(steps=16 * 16))
     model = trainer.run()
     assert trainer.net.features.standardise.std.min() < 0.9
-    assert (trainer.state.sensor_r2 is None) == (sensors == "off")
+    assert (trainer.progress.state.sensor_r2 is None) == (sensors == "off")
     if sensors == "predicted":
         assert model.card["sensor_r2"]["mean"] > 0.3
 
@@ -183,8 +183,10 @@ def test_ppo_starts_untrained_if_pretraining_increases_the_error(
     seen = []
 
     def error(validator, net, robot=None):
-        seen.append((trainer.stage, net is not None and bool(net.trunk[-1].weight.any())))
-        return np.full(len(validator.sequences), 0.6 if trainer.stage == "pretraining" else 0.5)
+        seen.append((trainer.progress.stage, net is not None and bool(net.trunk[-1].weight.any())))
+        return np.full(
+            len(validator.sequences), 0.6 if trainer.progress.stage == "pretraining" else 0.5
+        )
 
     monkeypatch.setattr(Validator, "errors", error)
     config = replace(SMALL, pretraining=replace(SMALL.pretraining, rounds=2), validate_every=1,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import re
 import shlex
@@ -263,10 +264,12 @@ def command(
     """Return the shell command that repeats a run."""
     limit = str(budget.steps) if budget.seconds is None else f"{budget.seconds:g}s"
     words = ["gaponet", "train", str(dataset), "--out", str(out), "--budget", limit]
-    words += ["--robot", str(robot.folder)] if robot.nominal is not None else []
-    words += ["--holdout-units", *holdout_units] if holdout_units else []
-    # The command's default is auto.
-    words += ["--model", "gaponet"] if config.model.kind == "gaponet" else []
+    if robot.nominal is not None:
+        words += ["--robot", str(robot.folder)]
+    if holdout_units:
+        words += ["--holdout-units", *holdout_units]
+    if config.model.kind == "gaponet":  # the command's default is auto
+        words += ["--model", "gaponet"]
     return shlex.join(words + config.options())
 
 
@@ -277,11 +280,14 @@ def _options(config: dict[str, Any], defaults: dict[str, Any], prefix: str) -> l
         name = key.replace("_", "-")
         if isinstance(default, dict):
             words += _options(value, default, f"{prefix}{name}.")
+        elif value == default:
+            continue
         elif isinstance(value, bool):
-            words += [] if value == default else [prefix + ("" if value else "no-") + name]
-        elif value != default:
+            words.append(prefix + name if value else f"{prefix}no-{name}")
+        else:
             option = "--model" if prefix + name == "--model.kind" else prefix + name
-            words += [option, *map(str, value if isinstance(value, tuple) else [value])]
+            values = value if isinstance(value, tuple) else (value,)
+            words += [option, *map(str, values)]
     return words
 
 
@@ -314,7 +320,9 @@ class Budget:
                 f"--budget {text}: {number:g} control steps teach nothing; is it {text}s or "
                 f"{text}m?"
             )
-        return cls(seconds=number * SECONDS[unit]) if unit else cls(steps=int(number))
+        if unit:
+            return cls(seconds=number * SECONDS[unit])
+        return cls(steps=int(number))
 
     def part(self, share: float) -> Budget:
         """Return a share of this budget."""
@@ -324,7 +332,9 @@ class Budget:
 
     def spent(self, seconds: float, steps: int) -> float:
         """Return the used share of the budget; 1 or more at its end."""
-        return seconds / self.seconds if self.seconds is not None else steps / (self.steps or 1)
+        if self.seconds is not None:
+            return seconds / self.seconds
+        return steps / (self.steps or 1)
 
 
 @dataclass(frozen=True)
@@ -346,11 +356,10 @@ class Status:
     @property
     def note(self) -> str:
         """Stage, reward, validation error and speed as text."""
-        reward = "" if self.reward != self.reward else f", reward {self.reward:.4f}"
-        best = f"(best {self.best_mpjae / self.nominal_mpjae:.2f} of nominal)"
-        error = (
-            ""
-            if self.val_mpjae != self.val_mpjae
-            else f", validation {self.val_mpjae * 1e3:.2f} mrad {best}"
-        )
-        return f"{self.stage}{reward}{error}, {self.steps / max(self.seconds, 1e-9):,.0f} steps/s"
+        text = self.stage
+        if not math.isnan(self.reward):
+            text += f", reward {self.reward:.4f}"
+        if not math.isnan(self.val_mpjae):
+            ratio = self.best_mpjae / self.nominal_mpjae
+            text += f", validation {self.val_mpjae * 1e3:.2f} mrad (best {ratio:.2f} of nominal)"
+        return f"{text}, {self.steps / max(self.seconds, 1e-9):,.0f} steps/s"

@@ -1,9 +1,10 @@
 """PPO in which each joint has its own reward, value, advantage and probability ratio.
 
-The correction of a joint acts on the error of that joint. In a sum over the robot, the errors of other joints would be
-noise in its advantage, and a common ratio would be clipped when any joint moves. So the robot is n agents that share
-one network. The critic is trained alone until it explains the returns, by its own optimiser (Andrychowicz et al.
-2021). Exploration noise is correlated in time, because a servo filters white noise (Korenkevych et al. 2019).
+The correction of a joint acts on the error of that joint. In a sum over the robot, the errors of
+other joints would be noise in its advantage, and a common ratio would be clipped when any joint
+moves. So the robot is n agents that share one network. The critic is trained alone until it
+explains the returns, by its own optimiser (Andrychowicz et al. 2021). Exploration noise is
+correlated in time, because a servo filters white noise (Korenkevych et al. 2019).
 """
 
 from __future__ import annotations
@@ -29,10 +30,8 @@ class Critic(nn.Module):
 
     def __init__(self, features: int, observations: int, hidden: tuple[int, ...], n: int) -> None:
         super().__init__()
-        self.standardise, self.net = (
-            Standardise(observations),
-            dense(features + observations, hidden, n),
-        )
+        self.standardise = Standardise(observations)
+        self.net = dense(features + observations, hidden, n)
 
     def forward(self, features: Tensor, observations: Tensor) -> Tensor:
         standardised = self.standardise(observations).clamp(-MAX_FEATURE, MAX_FEATURE)
@@ -49,7 +48,8 @@ class Batch:
         critic_observations: Observations of the critic.
         mean: Corrections without exploration, (B, n) rad.
         actions: Corrections with the new part of the exploration noise, (B, n) rad.
-        exploration_mask: 1 where a joint explores, (B, n). Other joints do not contribute to the gradient.
+        exploration_mask: 1 where a joint explores, (B, n). Other joints do not contribute to the
+            gradient.
         advantage, returns: One value per joint, (B, n).
     """
 
@@ -67,9 +67,8 @@ class Batch:
 class Update:
     """Metrics of one update."""
 
-    explained_variance: float = float(
-        "nan"
-    )  # share of the variance of the returns that the critic explains
+    # Share of the variance of the returns that the critic explains.
+    explained_variance: float = float("nan")
     kl: float = float("nan")  # KL divergence of the actor's step, per joint
     learning_rate: float = float("nan")
     critic_learning_rate: float = float("nan")
@@ -83,27 +82,29 @@ class PPO:
 
     def __init__(self, env: DeltaEnv, net: DeltaNet, config: PPOConfig) -> None:
         """net: The actor; it is trained in place, except its sensor predictor."""
-        self.env, self.net, self.config = env, net.train(), config
+        self.env = env
+        self.net = net.train()
+        self.config = config
         if net.predictor is not None:
             net.predictor.requires_grad_(False)
         observations = env.get_observations()["critic"]
         device = observations.device
         width = observations.shape[1]
-        self.critic = Critic(net.features.dim, width, config.critic_hidden, env.num_actions).to(
-            device
-        )
-        self.optimiser = torch.optim.Adam(
-            [p for p in net.parameters() if p.requires_grad], lr=config.learning_rate
-        )
+        critic = Critic(net.features.dim, width, config.critic_hidden, env.num_actions)
+        self.critic = critic.to(device)
+        trained = [p for p in net.parameters() if p.requires_grad]
+        self.optimiser = torch.optim.Adam(trained, lr=config.learning_rate)
         self.critic_optimiser = torch.optim.Adam(
             self.critic.parameters(), lr=config.critic_learning_rate
         )
         decision_s = env.robot.dt * env.config.delta_hold
-        self.noise_correlation = (
-            math.exp(-decision_s / config.noise_time) if config.noise_time else 0.0
-        )
+        self.noise_correlation = 0.0  # from decision to decision
+        if config.noise_time:
+            self.noise_correlation = math.exp(-decision_s / config.noise_time)
         self.noise = torch.zeros(env.num_envs, env.num_actions, device=device)
-        self.updates, self.actor_enabled, self.metrics = 0, False, Update()
+        self.updates = 0
+        self.actor_enabled = False
+        self.metrics = Update()
 
     @property
     def innovation_std(self) -> float:
@@ -123,18 +124,24 @@ class PPO:
     def observe(self) -> dict[str, Tensor]:
         """Return inputs, mean correction and value of the present states."""
         observed = self.env.get_observations()
-        x, observations = observed["actor"], observed["critic"]
+        x = observed["actor"]
+        observations = observed["critic"]
         if not self.updates and not self.critic.standardise.mean.any():
             self.critic.standardise.fit(observations)
-        prepared, features = self.net.prepare(x), self.net.features(x)
+        prepared = self.net.prepare(x)
+        features = self.net.features(x)
         return {
-            "prepared": prepared, "features": features, "critic_observations": observations,
-            "mean": self.net.correct(prepared), "value": self.critic(features, observations),
-        }  # fmt: skip
+            "prepared": prepared,
+            "features": features,
+            "critic_observations": observations,
+            "mean": self.net.correct(prepared),
+            "value": self.critic(features, observations),
+        }
 
     def collect(self) -> Batch:
         """Simulate with the present network; return the decisions and their advantages."""
-        env, config = self.env, self.config
+        env = self.env
+        config = self.config
         mask = (torch.rand_like(self.noise) < config.noise_share).float()
         self.noise *= mask
         rows: list[dict[str, Tensor]] = []
@@ -145,13 +152,13 @@ class PPO:
                 correlated = self.noise_correlation * self.noise
                 self.noise = correlated + self.innovation_std * mask * torch.randn_like(correlated)
                 delta = row["mean"] + self.noise
-                reward, done = (torch.as_tensor(x) for x in env.step(delta))
-                row |= {
-                    "actions": delta - correlated,
-                    "exploration_mask": mask,
-                    "done": done.float()[:, None],
-                }
-                # The end of a recording is a time-out: the value of the last state stands for the rewards to come.
+                reward, done = env.step(delta)
+                reward = torch.as_tensor(reward)
+                row["actions"] = delta - correlated
+                row["exploration_mask"] = mask
+                row["done"] = torch.as_tensor(done).float()[:, None]
+                # The end of a recording is a time-out: the value of the last state stands for the
+                # rewards to come.
                 row["reward"] = (1 - gamma) * reward + gamma * row["value"] * row["done"]
                 rows.append(row)
             steps = {name: torch.stack([row[name] for row in rows]) for name in rows[0]}
@@ -161,11 +168,13 @@ class PPO:
             )
             steps["returns"] = steps["advantage"] + steps["value"]
             self._measure(steps)
-        return Batch(
-            **{name: steps[name].flatten(0, 1).clone() for name in Batch.__dataclass_fields__}
-        )
+        decisions = {}
+        for name in Batch.__dataclass_fields__:
+            decisions[name] = steps[name].flatten(0, 1).clone()
+        return Batch(**decisions)
 
     def _measure(self, steps: dict[str, Tensor]) -> None:
+        """Measure the collected decisions; enable the actor if the critic explains the returns."""
         residual = (steps["returns"] - steps["value"]).flatten(0, 1).var(0)
         unexplained = residual / steps["returns"].flatten(0, 1).var(0)
         size = steps["mean"].abs()
@@ -177,49 +186,48 @@ class PPO:
             at_limit=float(at_limit),
             reward=float(self.env.mean_reward()),
         )
-        self.actor_enabled |= (
-            self.updates >= self.config.critic_warmup and explained >= self.config.explained
-        )
+        is_warm = self.updates >= self.config.critic_warmup
+        if is_warm and explained >= self.config.explained:
+            self.actor_enabled = True
 
     def learn(self, batch: Batch) -> None:
         """Fit the critic, and the actor once the critic explains the returns."""
-        config, mask = self.config, batch.exploration_mask
+        config = self.config
+        mask = batch.exploration_mask
         count = mask.sum(0).clamp_min(1.0)  # with few environments, no one may explore with a joint
         centred = batch.advantage - (mask * batch.advantage).sum(0) / count
         batch.advantage = centred / ((mask * centred**2).sum(0) / count).sqrt().clamp_min(1e-8)
         divergences = []
         for _ in range(config.epochs):
-            for rows in torch.randperm(len(centred), device=centred.device).chunk(
-                config.mini_batches
-            ):
+            shuffled = torch.randperm(len(centred), device=centred.device)
+            for rows in shuffled.chunk(config.mini_batches):
                 value = self.critic(batch.features[rows], batch.critic_observations[rows])
                 self._descend(self.critic_optimiser, (value - batch.returns[rows]).square().mean())
                 if self.actor_enabled:
                     divergences.append(self._actor_step(batch, rows))
         self.metrics.kl = sum(divergences) / max(len(divergences), 1)
-        self.metrics.learning_rate = (
-            self.optimiser.param_groups[0]["lr"] if self.actor_enabled else 0.0
-        )
+        self.metrics.learning_rate = 0.0
+        if self.actor_enabled:
+            self.metrics.learning_rate = self.optimiser.param_groups[0]["lr"]
         self.metrics.critic_learning_rate = self.config.critic_learning_rate
 
     def _actor_step(self, batch: Batch, rows: Tensor) -> float:
-        """Take one gradient step; return the KL divergence from the collecting network, per exploring joint."""
-        mean, old, actions = (
-            self.net.correct(batch.prepared[rows]),
-            batch.mean[rows],
-            batch.actions[rows],
-        )
-        weight = batch.exploration_mask[rows] / batch.exploration_mask[rows].sum().clamp_min(1.0)
-        ratio = (
-            ((actions - old) ** 2 - (actions - mean) ** 2) / (2 * self.innovation_std**2)
-        ).exp()
+        """Take one gradient step.
+
+        Return the KL divergence from the collecting network, per exploring joint.
+        """
+        mean = self.net.correct(batch.prepared[rows])
+        old = batch.mean[rows]
+        actions = batch.actions[rows]
+        mask = batch.exploration_mask[rows]
+        weight = mask / mask.sum().clamp_min(1.0)
+        twice_variance = 2 * self.innovation_std**2
+        ratio = (((actions - old) ** 2 - (actions - mean) ** 2) / twice_variance).exp()
         clipped = ratio.clamp(1 - self.config.clip, 1 + self.config.clip)
         advantage = batch.advantage[rows]
-        self._descend(
-            self.optimiser, -(weight * torch.minimum(ratio * advantage, clipped * advantage)).sum()
-        )
-        squares = float((weight * (mean.detach() - old) ** 2).sum())
-        kl = float(squares / (2 * self.innovation_std**2))
+        surrogate = torch.minimum(ratio * advantage, clipped * advantage)
+        self._descend(self.optimiser, -(weight * surrogate).sum())
+        kl = float((weight * (mean.detach() - old) ** 2).sum()) / twice_variance
         lowest, highest = LEARNING_RATE_BOUNDS
         for group in self.optimiser.param_groups:
             if kl > 2 * self.config.desired_kl:
@@ -239,10 +247,13 @@ class PPO:
     def state_dict(self) -> dict[str, Any]:
         """Return the state without network and environment, for a checkpoint."""
         return {
-            "critic": self.critic.state_dict(), "optimiser": self.optimiser.state_dict(),
-            "critic_optimiser": self.critic_optimiser.state_dict(), "noise": self.noise,
-            "updates": self.updates, "ready": self.actor_enabled,
-        }  # fmt: skip
+            "critic": self.critic.state_dict(),
+            "optimiser": self.optimiser.state_dict(),
+            "critic_optimiser": self.critic_optimiser.state_dict(),
+            "noise": self.noise,
+            "updates": self.updates,
+            "ready": self.actor_enabled,
+        }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore a state."""
@@ -250,7 +261,8 @@ class PPO:
         self.optimiser.load_state_dict(state["optimiser"])
         self.critic_optimiser.load_state_dict(state["critic_optimiser"])
         self.noise.copy_(state["noise"])
-        self.updates, self.actor_enabled = state["updates"], state["ready"]
+        self.updates = state["updates"]
+        self.actor_enabled = state["ready"]
 
 
 def advantages(
@@ -259,17 +271,20 @@ def advantages(
     """Return generalised advantage estimates (Schulman et al. 2016), (T, N, n).
 
     Args:
-        reward: (T, N, n). The reward of a recording's last step includes the discounted value of that step.
+        reward: (T, N, n). The reward of a recording's last step includes the discounted value of
+            that step.
         value: (T, N, n), before each step.
         last: Value after the last step, (N, n).
         done: 1 where a recording ended, (T, N, 1).
         gamma: Discount per step.
         lam: λ.
     """
-    estimates, following = torch.empty_like(reward), torch.zeros_like(last)
+    estimates = torch.empty_like(reward)
+    following = torch.zeros_like(last)
     for t in reversed(range(len(reward))):
         continues = 1 - done[t]
         temporal_difference = reward[t] + gamma * continues * last - value[t]
         following = temporal_difference + gamma * lam * continues * following
-        estimates[t], last = following, value[t]
+        estimates[t] = following
+        last = value[t]
     return estimates

@@ -39,6 +39,9 @@ ITERATIONS = 3
 LEARNING_GAIN = 0.8
 LEAD_S = 0.12  # after this time a correction shows in the position
 SMOOTHING_S = 0.06  # σ of the filter
+HUBER_DELTA = 0.5  # in units of the RMS of the labels
+# If more are visited, the pool takes a part of the environments of each period, in turn.
+MAX_POOL_STATES = 2_000_000
 TABLE_CLEARANCE_M = 0.01  # below it, a tip is taken to touch the table
 
 
@@ -65,53 +68,71 @@ def trajectory_labels(
         tick: Called in each iteration.
     """
     op = robot.operated_index
-    deltas = [np.zeros((len(s), len(op))) for s in sequences]
-    best = [(np.inf, d) for d in deltas]
+    searches = [_LabelSearch(sequence, op) for sequence in sequences]
     for iteration in range(ITERATIONS + 1):
         tick()
-        commanded = [_commanded(s, d, op) for s, d in zip(sequences, deltas, strict=True)]
+        commanded = [search.commanded() for search in searches]
         rollouts = replay(commanded, robot, nthread=nthread, lock_idle=True)
-        errors = [
-            (s.qpos - r.qpos)[:, op].astype(float) for s, r in zip(sequences, rollouts, strict=True)
-        ]
-        costs = [float(np.nan_to_num(np.abs(e), nan=np.pi).mean()) for e in errors]
-        candidates = zip(costs, deltas, strict=True)
-        best = [min(pair, key=lambda x: x[0]) for pair in zip(best, candidates, strict=True)]
-        if iteration < ITERATIONS:
-            deltas = [
-                _improved(*x, limit)
-                for x in zip(deltas, errors, (s.dt for s in sequences), strict=True)
-            ]
-    labels = np.concatenate([d for _, d in best]).astype(np.float32)
-    unlabelled = np.concatenate(
-        [np.tile([j in s.meta.unrecorded for j in robot.operated], (len(s), 1)) for s in sequences]
-    )
+        for search, rollout in zip(searches, rollouts, strict=True):
+            search.note(rollout.qpos)
+            if iteration < ITERATIONS:
+                search.improve(limit)
+    labels = np.concatenate([search.best_delta for search in searches]).astype(np.float32)
+    return np.where(_unlabelled(sequences, robot), np.nan, labels).astype(np.float32)
+
+
+class _LabelSearch:
+    """Iterative learning control of one recording.
+
+    Attributes:
+        best_delta: Corrections of the best iteration so far, (T, n) rad.
+    """
+
+    def __init__(self, sequence: Sequence, op: Array) -> None:
+        """op: Joints that are corrected."""
+        self._sequence = sequence
+        self._op = op
+        self._delta = np.zeros((len(sequence), len(op)))  # of this iteration, rad
+        self._error = np.zeros_like(self._delta)  # of this iteration, rad
+        self._best_cost = np.inf
+        self.best_delta = self._delta
+
+    def commanded(self) -> Sequence:
+        """Return the recording with corrected targets."""
+        ctrl = self._sequence.ctrl.copy()
+        ctrl[:, self._op] += self._delta.astype(ctrl.dtype)
+        return replace(self._sequence, ctrl=ctrl)
+
+    def note(self, simulated: Array) -> None:
+        """Note the positions that the corrections lead to, (T, n_all) rad."""
+        difference = self._sequence.qpos - simulated
+        self._error = difference[:, self._op].astype(float)
+        cost = float(np.nan_to_num(np.abs(self._error), nan=np.pi).mean())
+        if cost < self._best_cost:
+            self._best_cost = cost
+            self.best_delta = self._delta
+
+    def improve(self, limit: float) -> None:
+        """Correct the next iteration by the error a little later, within ±limit rad."""
+        dt = self._sequence.dt
+        rows = len(self._error)
+        later = np.minimum(np.arange(rows) + round(LEAD_S / dt), rows - 1)
+        raised = self._delta + LEARNING_GAIN * np.nan_to_num(self._error)[later]
+        smooth = gaussian_filter1d(raised, SMOOTHING_S / dt, axis=0, mode="nearest")
+        self._delta = np.clip(smooth, -limit, limit)
+
+
+def _unlabelled(sequences: ListOf[Sequence], robot: RobotSpec) -> Array:
+    """Return the rows and joints without a label, (rows of all recordings, n) bool."""
+    parts = []
+    for sequence in sequences:
+        unrecorded = [joint in sequence.meta.unrecorded for joint in robot.operated]
+        parts.append(np.tile(unrecorded, (len(sequence), 1)))
+    unlabelled = np.concatenate(parts)
     if robot.table is not None:
-        unlabelled[
-            np.concatenate(tip_heights(sequences, robot)) < robot.table.height + TABLE_CLEARANCE_M
-        ] = True
-    return np.where(unlabelled, np.nan, labels).astype(np.float32)
-
-
-def _improved(delta: Array, error: Array, dt: float, limit: float) -> Array:
-    """Return Δa of the next iteration, (T, n) rad."""
-    later = np.minimum(np.arange(len(error)) + round(LEAD_S / dt), len(error) - 1)
-    raised = delta + LEARNING_GAIN * np.nan_to_num(error)[later]
-    return np.clip(
-        gaussian_filter1d(raised, SMOOTHING_S / dt, axis=0, mode="nearest"), -limit, limit
-    )
-
-
-def _commanded(sequence: Sequence, delta: Array, op: Array) -> Sequence:
-    """Return a recording whose targets of the joints op are raised by delta, (T, n) rad."""
-    ctrl = sequence.ctrl.copy()
-    ctrl[:, op] += delta.astype(ctrl.dtype)
-    return replace(sequence, ctrl=ctrl)
-
-
-HUBER_DELTA = 0.5  # in units of the RMS of the labels
-# If more are visited, the pool takes a part of the environments of each period, in turn.
-MAX_POOL_STATES = 2_000_000
+        heights = np.concatenate(tip_heights(sequences, robot))
+        unlabelled[heights < robot.table.height + TABLE_CLEARANCE_M] = True
+    return unlabelled
 
 
 class Pretraining:
@@ -141,9 +162,10 @@ class Pretraining:
         self.generator = torch.Generator().manual_seed(seed)
         self.pool_x: list[Tensor] = []
         self.pool_labels: list[Tensor] = []
-        self.parameters = [
-            p for name, p in net.named_parameters() if not name.startswith(("predictor", "probes"))
-        ]
+        self.parameters = []
+        for name, parameter in net.named_parameters():
+            if not name.startswith(("predictor", "probes")):
+                self.parameters.append(parameter)
         self.optimiser = torch.optim.AdamW(
             self.parameters, lr=config.learning_rate, weight_decay=config.weight_decay
         )
@@ -239,7 +261,7 @@ class Pretraining:
         net = self.net
         (x,) = self.pool_x
         (labels,) = self.pool_labels
-        # Read after the last step.
+        # On the device until the last step: reading it in each step would wait.
         squares = torch.zeros(config.gradient_steps, dtype=torch.double, device=x.device)
         net.train()
         net.features.noise_std = config.noise
@@ -293,11 +315,10 @@ def _mean_over_hold(labels: Array, hold: int) -> Array:
 
     Averages across the end of a recording are not used.
     """
-    return (
-        np.mean([labels[i : len(labels) - hold + 1 + i] for i in range(hold)], axis=0)
-        if hold > 1
-        else labels
-    )
+    if hold == 1:
+        return labels
+    rows = len(labels) - hold + 1
+    return np.mean([labels[i : i + rows] for i in range(hold)], axis=0)
 
 
 def _rms(squares: Array) -> float:

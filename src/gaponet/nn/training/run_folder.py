@@ -13,6 +13,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from dataclasses import asdict
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -62,21 +63,26 @@ class TrainingData:
         self.holdout_units = holdout_units
         self.splits = training_splits(dataset, config, holdout_units)
         if not config.mixed_gains:
-            metas = (e.meta for entries in self.splits.values() for e in entries)
+            every_entry = chain.from_iterable(self.splits.values())
+            metas = (entry.meta for entry in every_entry)
             require_same_gains(metas, dataset.joint_names, robot.operated)
         self.config = config
         self.recorded = dataset.sequences(self.splits["train"], optional=False)
         self.train = in_many_simulators(self.recorded, robot, config)
         val = stratified_subset(self.splits["val"], MAX_VALIDATION_ROLLOUTS)
         self.val = in_validation_simulators(dataset.sequences(val, optional=False), robot, config)
-        if not config.mixed_gains and (
-            other := next((c for c in self.conditions if c.kp or c.kd), None)
-        ):
-            raise UsageError(
-                f"the recordings were made with kp {other.kp} and kd {other.kd}, robot.toml says "
-                "others: write there what the robot runs with, or add --mixed-gains to train in "
-                "simulators of the recordings' own gains"
-            )
+        if not config.mixed_gains:
+            self._require_gains_of_robot()
+
+    def _require_gains_of_robot(self) -> None:
+        """Refuse recordings with other gains than the robot's."""
+        for condition in self.conditions:
+            if condition.kp or condition.kd:
+                raise UsageError(
+                    f"the recordings were made with kp {condition.kp} and kd {condition.kd}, "
+                    "robot.toml says others: write there what the robot runs with, or add "
+                    "--mixed-gains to train in simulators of the recordings' own gains"
+                )
 
     @property
     def conditions(self) -> set[Condition]:
@@ -116,17 +122,18 @@ def require_suitable(run: Path, robot: RobotSpec, resume: bool) -> None:
     Raises:
         UsageError: The folder does not fit.
     """
-    if not resume and any((run / name).exists() for name in (CHECKPOINT, "model/card.json")):
-        raise UsageError(
-            f"{run}: holds a run already; add --resume to go on with it, or choose another --out"
-        )
-    if resume and not (run / CHECKPOINT).is_file():
+    if not resume:
+        if (run / CHECKPOINT).exists() or (run / "model/card.json").exists():
+            raise UsageError(
+                f"{run}: holds a run already; add --resume to go on with it, or choose another "
+                "--out"
+            )
+        return
+    if not (run / CHECKPOINT).is_file():
         raise UsageError(f"{run}: nothing to resume (no {CHECKPOINT}); train without --resume")
-    if (
-        resume
-        and has_stored_robot(run)
-        and model_hash(load_stored_robot(run, robot.name)) != model_hash(robot)
-    ):
+    if not has_stored_robot(run):
+        return
+    if model_hash(load_stored_robot(run, robot.name)) != model_hash(robot):
         raise UsageError(
             f"{run}: was trained in another simulator; resume with --robot {run / STORED_ROBOT}"
         )
@@ -143,36 +150,26 @@ def write_setup(
     """Write config.json, split.json and the robot."""
     dataset = data.dataset
     robot = data.robot
-    words = command(
-        dataset.path,
-        run,
-        budget,
-        config,
-        robot,
-        data.holdout_units,
-    )
+    words = command(dataset.path, run, budget, config, robot, data.holdout_units)
     if despite_errors:
         words += " --despite-errors"
-    write_json(
-        run / "config.json",
-        asdict(config)
-        | {
-            "budget": asdict(budget),
-            "holdout_units": data.holdout_units,
-            "robot": robot.name,
-            "command": words,
-            "dataset": os.path.relpath(dataset.path, run),
-            "dataset_hash": dataset_hash(dataset.entries),
-        },
-    )
-    if robot.folder.resolve() != (run / STORED_ROBOT).resolve() and not (
-        resume and has_stored_robot(run)
-    ):
+    facts = {
+        "budget": asdict(budget),
+        "holdout_units": data.holdout_units,
+        "robot": robot.name,
+        "command": words,
+        "dataset": os.path.relpath(dataset.path, run),
+        "dataset_hash": dataset_hash(dataset.entries),
+    }
+    write_json(run / "config.json", asdict(config) | facts)
+    is_stored_there = robot.folder.resolve() == (run / STORED_ROBOT).resolve()
+    is_kept = resume and has_stored_robot(run)
+    if not is_stored_there and not is_kept:
         save_robot(robot, run / STORED_ROBOT)
-    write_json(
-        run / "split.json",
-        {part: {e.id: e.hash for e in entries} for part, entries in data.splits.items()},
-    )
+    split = {}
+    for part, entries in data.splits.items():
+        split[part] = {entry.id: entry.hash for entry in entries}
+    write_json(run / "split.json", split)
 
 
 LOG_KINDS = ("tensorboard", "wandb")
@@ -196,19 +193,20 @@ class Loggers:
         self.writers: list[Writer] = []
         for kind in kinds:
             try:
-                self.writers.append(
-                    _tensorboard(out) if kind == "tensorboard" else _wandb(out, config)
-                )
+                if kind == "tensorboard":
+                    self.writers.append(_tensorboard(out))
+                else:
+                    self.writers.append(_wandb(out, config))
             except ImportError:
                 raise UsageError(f"--log {kind}: not installed; run: {pip()} {kind}") from None
 
     def write(self, line: dict[str, Any]) -> None:
         """Log one line of progress.jsonl."""
-        numbers = {
-            k: float(v)
-            for k, v in line.items()
-            if isinstance(v, (int, float)) and v == v and k != "steps"
-        }
+        numbers = {}
+        for name, value in line.items():
+            is_number = isinstance(value, (int, float)) and value == value
+            if is_number and name != "steps":
+                numbers[name] = float(value)
         for write, _ in self.writers:
             write(numbers, line["steps"])
 

@@ -1,6 +1,8 @@
-"""Choice of the network by validation: each kind is trained with a part of the budget, and the best gets the rest.
+"""Choice of the network by validation: each kind is trained with a part of the budget, and the
+best gets the rest.
 
-Trees need no more than their part. If they are best, the best network gets the rest, and validation decides again.
+Trees need no more than their part. If they are best, the best network gets the rest, and validation
+decides again.
 """
 
 from __future__ import annotations
@@ -18,21 +20,18 @@ from gaponet.nn.config import ModelKind
 from gaponet.nn.training.checkpoint import CHECKPOINT
 from gaponet.nn.trees import trees_available
 
-CANDIDATES: tuple[ModelKind, ...] = (
-    "gaponet",
-    "shared_mlp",
-    "mlp",
-    "trees",
-)  # trees if scikit-learn is installed
+# Trees are a candidate if scikit-learn is installed.
+CANDIDATES: tuple[ModelKind, ...] = ("gaponet", "shared_mlp", "mlp", "trees")
 SHARE = 0.2  # of the budget, for each candidate
-FOLDER, ERRORS = "candidates", "candidates.json"
-Train = Callable[
-    [ModelKind, Path, float, float, bool], GapModel
-]  # kind, run, share of the budget, share spent, resume
+FOLDER = "candidates"
+ERRORS = "candidates.json"
+# Arguments: kind, run, share of the budget, share spent, resume.
+Train = Callable[[ModelKind, Path, float, float, bool], GapModel]
 
 
 def train_best(out: Path, resume: bool, train: Train) -> GapModel:
-    """Train each candidate in OUT/candidates, copy the run with the least validation error to OUT, and go on with it.
+    """Train each candidate in OUT/candidates, copy the run with the least validation error to OUT,
+    and go on with it.
 
     OUT/candidates.json has the validation error of each candidate, rad.
 
@@ -43,13 +42,12 @@ def train_best(out: Path, resume: bool, train: Train) -> GapModel:
     begun = (out / FOLDER).is_dir()
     if resume and present and not begun:
         return train(present, out, 1.0, 0.0, True)
-    if resume != begun or (not resume and present):
-        problem = (
-            "nothing to resume; train without --resume"
-            if resume
-            else "holds a run already; add --resume"
+    if resume and not begun:
+        raise UsageError(
+            f"{out}: nothing to resume; train without --resume, or choose another --out"
         )
-        raise UsageError(f"{out}: {problem}, or choose another --out")
+    if not resume and (begun or present):
+        raise UsageError(f"{out}: holds a run already; add --resume, or choose another --out")
     errors = candidate_errors(out)
     kinds = [kind for kind in CANDIDATES if kind != "trees" or trees_available()]
     for i, kind in enumerate(kinds):
@@ -59,30 +57,37 @@ def train_best(out: Path, resume: bool, train: Train) -> GapModel:
         again = (run / CHECKPOINT).is_file()
         model = train(kind, run, SHARE, i * SHARE, again)
         if model.card["interrupted"]:
-            _copy(out, min(errors, key=errors.__getitem__, default=kind))
+            _copy(out, _best(errors) if errors else kind)
             return GapModel.load(out)
-        errors[kind] = model.card["val_mpjae"]["model"]
+        errors[kind] = _validation_error(model)
         write_json(out / ERRORS, errors)
-    best = min(errors, key=errors.__getitem__)
+    best = _best(errors)
     if _kind(out) != best:
         _copy(out, best)
     spent = SHARE * (len(kinds) - 1)
     if best != "trees":
         return train(best, out, 1 - spent, spent, True)
-    network = min(errors.keys() - {"trees"}, key=errors.__getitem__)
-    model = train(network, out / FOLDER / network, 1 - spent, spent, True)
-    if model.card["val_mpjae"]["model"] < errors["trees"]:
-        _copy(out, network)
+    best_network = _best({kind: error for kind, error in errors.items() if kind != "trees"})
+    model = train(best_network, out / FOLDER / best_network, 1 - spent, spent, True)
+    if _validation_error(model) < errors["trees"]:
+        _copy(out, best_network)
     return GapModel.load(out)
+
+
+def _best(errors: dict[ModelKind, float]) -> ModelKind:
+    """Return the kind with the least validation error."""
+    return min(errors, key=errors.__getitem__)
+
+
+def _validation_error(model: GapModel) -> float:
+    return float(model.card["val_mpjae"]["model"])
 
 
 def candidate_errors(run: Path) -> dict[ModelKind, float]:
     """Return the validation error of each candidate of a run, rad; empty if one kind was given."""
-    return (
-        read_json(dict[ModelKind, float], run / ERRORS, ModelError)
-        if (run / ERRORS).is_file()
-        else {}
-    )
+    if not (run / ERRORS).is_file():
+        return {}
+    return read_json(dict[ModelKind, float], run / ERRORS, ModelError)
 
 
 def _kind(run: Path) -> ModelKind | None:
@@ -95,7 +100,6 @@ def _kind(run: Path) -> ModelKind | None:
 def _copy(out: Path, kind: ModelKind) -> None:
     """Put the run of a candidate in the place of OUT's own, all of it or nothing."""
     source = out / FOLDER / kind
+    markers = shutil.ignore_patterns(FOLDER_MARKER + "*")
     with whole_folder(out, "run", last=CHECKPOINT) as place:
-        shutil.copytree(
-            source, place, dirs_exist_ok=True, ignore=shutil.ignore_patterns(FOLDER_MARKER + "*")
-        )
+        shutil.copytree(source, place, dirs_exist_ok=True, ignore=markers)

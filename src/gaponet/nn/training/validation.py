@@ -1,8 +1,9 @@
 """Validation error of networks during training, and the choice of the correction gain.
 
-A correction that was learned from an hour of recordings is partly noise. If the simulator is already close to the
-robot, for example after identification, half of the correction can have a smaller error than all of it. All joints
-share one gain: gains per joint would fit the few validation motions rather than the robot.
+A correction that was learned from an hour of recordings is partly noise. If the simulator is
+already close to the robot, for example after identification, half of the correction can have a
+smaller error than all of it. All joints share one gain: gains per joint would fit the few
+validation motions rather than the robot.
 """
 
 from __future__ import annotations
@@ -33,11 +34,15 @@ class Validator:
         self, sequences: ListOf[Sequence], robot: RobotSpec, config: ModelConfig, nthread: int
     ) -> None:
         """robot: The simulator that the network corrects."""
-        self.sequences, self.robot, self.config, self.nthread = sequences, robot, config, nthread
+        self.sequences = sequences
+        self.robot = robot
+        self.config = config
+        self.nthread = nthread
         self._cache: dict[bytes, Array] = {}
 
     def errors(self, net: DeltaNet | None, robot: RobotSpec | None = None) -> Array:
-        """Return the mean position error of a rollout of each recording over the joints that it holds, (k,) rad.
+        """Return the mean position error of a rollout of each recording over the joints that it
+        holds, (k,) rad.
 
         Args:
             net: The network; None for the simulator without correction.
@@ -49,18 +54,22 @@ class Validator:
         return self._cache[key]
 
     def improvement(self, net: DeltaNet) -> tuple[float, float]:
-        """Return the error reduction by a network, rad: mean and standard error over independent motions."""
+        """Return the error reduction by a network, rad: mean and standard error over independent
+        motions.
+        """
         return mean_reduction((s.meta for s in self.sequences), self.errors(None), self.errors(net))
 
     @staticmethod
     def _key(net: DeltaNet | None, robot: RobotSpec | None = None) -> bytes:
-        weights = (
-            [] if net is None else [x.cpu().numpy().tobytes() for x in net.state_dict().values()]
-        )
-        return hashlib.sha256(b"".join([repr(robot).encode(), *weights])).digest()
+        key = hashlib.sha256(repr(robot).encode())
+        if net is not None:
+            for weights in net.state_dict().values():
+                key.update(weights.cpu().numpy().tobytes())
+        return key.digest()
 
     def _rollout_errors(self, net: DeltaNet | None, robot: RobotSpec | None) -> Array:
-        robot, corrector = robot or self.robot, None
+        robot = robot or self.robot
+        corrector = None
         if net is not None:  # on onnxruntime, as it ships; torch needs twice the time
             network = OnnxNetwork(onnx_content(copy.deepcopy(net).cpu().eval()))
             corrector = DeltaCorrector(network, self.config, robot)
@@ -68,18 +77,23 @@ class Validator:
 
 
 def choose_gain(net: DeltaNet, error: Callable[[], float], full_error: float) -> float:
-    """Set the gain with the least validation error and return it. The search stops when a smaller gain is worse.
+    """Set the gain with the least validation error and return it.
+
+    The search stops when a smaller gain is worse.
 
     Args:
         net: The network; its gain is changed in place.
         error: Returns the validation error of the network as it is now.
         full_error: Validation error with gain 1.
     """
-    best_gain, best_error = 1.0, full_error
+    best_gain = 1.0
+    best_error = full_error
     for gain in GAINS:
         net.bounded.gain.fill_(gain)
-        if (candidate := error()) >= best_error:
+        candidate = error()
+        if candidate >= best_error:
             break
-        best_gain, best_error = gain, candidate
+        best_gain = gain
+        best_error = candidate
     net.bounded.gain.fill_(best_gain)
     return best_gain
