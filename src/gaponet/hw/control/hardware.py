@@ -160,9 +160,8 @@ def _require_light(robot: RobotSpec, nominal: RobotSpec) -> None:
     """
     low, high = np.clip(nominal.qpos_range.T, -np.pi, np.pi)
     postures = np.random.default_rng(0).uniform(low, high, (POSTURES, len(robot.kp)))
-    with_mass, without = (
-        static_torque(build_model(replace(r, table=None)), postures) for r in (robot, nominal)
-    )
+    with_mass = static_torque(build_model(replace(robot, table=None)), postures)
+    without = static_torque(build_model(replace(nominal, table=None)), postures)
     share = np.abs(with_mass - without).max(axis=0) / nominal.effort_limit
     if not share.max() <= MAX_WEIGHT_SHARE:
         joint = robot.joint_names[int(share.argmax())]

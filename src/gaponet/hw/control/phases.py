@@ -95,12 +95,19 @@ TRANSITIONS: tuple[tuple[tuple[Phase, ...], tuple[Trigger, ...], Phase | None, A
     (ENDED, tuple(Trigger), None, Action.IGNORE),
     ((*_WAITING, *COMMANDING), tuple(Trigger), None, Action.RAISE),
 )
-TRANSITION_TABLE = {
-    (phase, trigger): (next_phase or phase, action)
-    for phases, triggers, next_phase, action in reversed(TRANSITIONS)
-    for phase in phases
-    for trigger in triggers
-}
+
+
+def _transition_table() -> dict[tuple[Phase, Trigger], tuple[Phase, Action]]:
+    """Return phase, trigger → next phase, action; the first row of TRANSITIONS that fits counts."""
+    table: dict[tuple[Phase, Trigger], tuple[Phase, Action]] = {}
+    for phases, triggers, next_phase, action in TRANSITIONS:
+        for phase in phases:
+            for trigger in triggers:
+                table.setdefault((phase, trigger), (next_phase or phase, action))
+    return table
+
+
+TRANSITION_TABLE = _transition_table()
 
 
 @dataclass(frozen=True)

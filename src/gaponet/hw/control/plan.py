@@ -267,15 +267,12 @@ class Planner:
         return np.minimum(free - MAX_APPROACH_M, self.collision.clearance)
 
     def _describe(self, free: Array) -> str:
-        at = float(free.min())
-        near = (
-            f"{100 * at:.1f} cm from each other"
-            if at > 0
-            else f"{-100 * at:.1f} cm into each other"
-        )
-        return (
-            f"{self.collision.nearest(free)} {near}; {100 * self.collision.clearance:g} cm are kept"
-        )
+        distance_cm = 100 * float(free.min())
+        near = f"{distance_cm:.1f} cm from each other"
+        if distance_cm <= 0:
+            near = f"{-distance_cm:.1f} cm into each other"
+        kept_cm = 100 * self.collision.clearance
+        return f"{self.collision.nearest(free)} {near}; {kept_cm:g} cm are kept"
 
     def back(self, end: Array, start: Array) -> Search[Trajectory]:
         """Search the path from where live targets ended back to the start, both (n,) rad, step by
@@ -284,12 +281,10 @@ class Planner:
         Raises:
             UsageError: No path keeps clear.
         """
-        required = np.minimum(
-            self._required_clearance(start), self.collision.along(end[None]) - 1e-9
-        )
-        return self._find_path(
-            end, start, self.robot.index(self.commanded), required, "back to where it was found"
-        )
+        free_at_end = self.collision.along(end[None]) - 1e-9
+        required = np.minimum(self._required_clearance(start), free_at_end)
+        columns = self.robot.index(self.commanded)
+        return self._find_path(end, start, columns, required, "back to where it was found")
 
     def _find_path(
         self, start: Array, goal: Array, columns: Array, required: Array, label: str
@@ -300,18 +295,17 @@ class Planner:
         low[columns] = self.limits.low[columns]
         high[columns] = self.limits.high[columns]
         home = np.clip(self.robot.qpos_home, low, high)
-        heavy = [
-            np.abs(static_torque(m, np.stack([start, goal]))).max(axis=0)
-            for m in self.limits.models
-        ]
-        most = np.maximum(self.limits.limit * MAX_STATIC_SHARE, np.max(heavy, axis=0) + 1e-6)
+        ends = np.stack([start, goal])
+        models = self.limits.models
+        at_ends = [np.abs(static_torque(model, ends)).max(axis=0) for model in models]  # N·m
+        most = np.maximum(self.limits.limit * MAX_STATIC_SHARE, np.max(at_ends, axis=0) + 1e-6)
 
         def free(rows: Array) -> bool:
+            """Return True if postures (rows, n) rad keep clear and need not too much torque."""
             if (self.collision.distances(rows) < required).any():
                 return False
-            return all(
-                (np.abs(static_torque(m, rows[::4])) <= most).all() for m in self.limits.models
-            )
+            some = rows[::4]
+            return all((np.abs(static_torque(model, some)) <= most).all() for model in models)
 
         points = yield from find_points(free, start, goal, low, high, home)
         if points is None:
@@ -388,11 +382,11 @@ class CollisionGuard:
         self.safety = planner.safety
         self.qpos = np.array(qpos, float)
         self.obstacle = ""
-        # Free space now and at the start, to be kept, and its reduction by sagging, (pairs +
-        # shells,) m.
-        self._free = self._start_free = self.collision.along(self.qpos[None])
-        self._keep = np.full_like(self._free, self.collision.clearance)
-        self._sag = np.zeros_like(self._free)
+        # Free space, (pairs + shells,) m each.
+        self._free = self.collision.along(self.qpos[None])  # now
+        self._start_free = self._free
+        self._keep = np.full_like(self._free, self.collision.clearance)  # to be kept
+        self._sag = np.zeros_like(self._free)  # by how much sagging reduces it
         self._cut = False
         self._approach_time = APPROACH_TIME_S
         self._max_sag = MAX_SAG_M

@@ -4,7 +4,6 @@ files.
 
 from __future__ import annotations
 
-import itertools
 import json
 from array import array
 from dataclasses import dataclass, field
@@ -135,29 +134,23 @@ class Recording:
         start = table["time"][0] if len(table) else 0.0
         late = np.array(self.late or [0.0])
         ages = table["time"] - table["state_time"] if len(table) else np.zeros(1)
+        events = []
+        for event in self.events:
+            events.append([round(event.time - start, 4), event.phase, event.kind, event.text])
         incomplete = {"not_whole": self.rows.error.strerror} if self.rows.error else {}
-        return (
-            incomplete
-            | self.meta
-            | {
-                "robot": self.robot,
-                "virtual": self.virtual,
-                "obeyed": not self.disobedience,
-                "rate_hz": 1 / self.dt,
-                "periods": len(table),
-                "missed": self.missed,
-                "late_ms": {
-                    q: round(float(np.quantile(late, p)) * 1e3, 3) for q, p in QUANTILES.items()
-                },
-                "state_age_ms": {
-                    q: round(float(np.quantile(ages, p)) * 1e3, 3) for q, p in QUANTILES.items()
-                },
-                "refused_messages": int(table["refused"][-1]) if len(table) else 0,
-                "events": [
-                    [round(e.time - start, 4), e.phase, e.kind, e.text] for e in self.events
-                ],
-            }
-        )
+        facts = {
+            "robot": self.robot,
+            "virtual": self.virtual,
+            "obeyed": not self.disobedience,
+            "rate_hz": 1 / self.dt,
+            "periods": len(table),
+            "missed": self.missed,
+            "late_ms": _quantiles_ms(late),
+            "state_age_ms": _quantiles_ms(ages),
+            "refused_messages": int(table["refused"][-1]) if len(table) else 0,
+            "events": events,
+        }
+        return incomplete | self.meta | facts
 
     def save(self, folder: Path, name: str) -> Path:
         """Write NAME.parquet for gaponet import, all periods as NAME.cycles.npy, and NAME.json.
@@ -175,16 +168,7 @@ class Recording:
         import pyarrow.parquet as pq
 
         with lock_folder(folder, FOLDER_KIND):
-            taken = {
-                file.name.removesuffix(end)
-                for end in (".json", ROWS_SUFFIX)
-                for file in folder.glob(f"*{end}")
-            }
-            name = next(
-                n
-                for k in itertools.count(1)
-                if (n := f"{name}-{k}" if k > 1 else name) not in taken
-            )
+            name = _free_name(folder, name)
             self.rows.save(folder / f"{name}{ROWS_SUFFIX}")
             path = folder / f"{name}.parquet"
             try:
@@ -192,13 +176,10 @@ class Recording:
                     log = self._log(str(path))
                     columns = {"time": log.channels["ctrl"].time}
                     for channel, (_, values) in log.channels.items():
-                        columns |= {
-                            f"{channel}.{j}": values[:, i] for i, j in enumerate(log.joint_names)
-                        }
-                    table = pa.table(
-                        columns,
-                        metadata={NOT_OBEYED: self.disobedience} if self.disobedience else None,
-                    )
+                        for i, joint in enumerate(log.joint_names):
+                            columns[f"{channel}.{joint}"] = values[:, i]
+                    metadata = {NOT_OBEYED: self.disobedience} if self.disobedience else None
+                    table = pa.table(columns, metadata=metadata)
                     with atomic_write(path) as temporary:
                         pq.write_table(table, temporary)
                 write_text(
@@ -212,3 +193,25 @@ class Recording:
                 )
                 raise OSError(error.errno, explanation, error.filename) from error
             return path
+
+
+def _quantiles_ms(seconds: Array) -> dict[str, float]:
+    """Return the quantiles of some durations, s, in ms."""
+    return {
+        name: round(float(np.quantile(seconds, share)) * 1e3, 3)
+        for name, share in QUANTILES.items()
+    }
+
+
+def _free_name(folder: Path, name: str) -> str:
+    """Return a name under which no recording lies in a folder: name, name-2, and so on."""
+    taken = set()
+    for suffix in (".json", ROWS_SUFFIX):
+        for file in folder.glob(f"*{suffix}"):
+            taken.add(file.name.removesuffix(suffix))
+    free = name
+    number = 1
+    while free in taken:
+        number += 1
+        free = f"{name}-{number}"
+    return free

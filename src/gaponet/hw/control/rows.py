@@ -57,18 +57,19 @@ class Rows:
             ("refused", "<i8"),
             ("phase", "<U9"),
         ]
-        vectors = ("target", "ctrl", *READINGS)
-        self._dtype = np.dtype([*scalars, *((name, "<f8", (n,)) for name in vectors)])
-        self._columns = scalars + [
-            (f"{name}.{joint}", "<f8") for name in vectors for joint in joint_names
-        ]
+        vectors = [(name, "<f8", (n,)) for name in ("target", "ctrl", *READINGS)]
+        self._dtype = np.dtype([*scalars, *vectors])
+        self._columns = list(scalars)
+        for name, kind, _ in vectors:
+            self._columns += [(f"{name}.{joint}", kind) for joint in joint_names]
         self._chunk = np.empty(CHUNK_ROWS, self._dtype)
         self._count = 0
         self._absent = np.full(n, np.nan)
         self._file: IO[bytes] | None = None
         self.path: Path | None = None
         self.error: OSError | None = None
-        self._written, self._header_size = 0, len(self._header(0))  # rows in the file; bytes
+        self._written = 0  # rows in the file
+        self._header_size = len(self._header(0))  # bytes
         self._pending: queue.Queue[bytes | None] = queue.Queue()
         self._writer: threading.Thread | None = None
 
@@ -85,7 +86,8 @@ class Rows:
 
     def append(self, row: Row) -> None:
         """Append a row."""
-        target, ctrl = (self._absent if x is None else x for x in (row.target, row.ctrl))
+        target = self._absent if row.target is None else row.target
+        ctrl = self._absent if row.ctrl is None else row.ctrl
         state = row.state
         self._chunk[self._count % CHUNK_ROWS] = (
             row.time,
@@ -151,17 +153,13 @@ class Rows:
 
     def __getitem__(self, index: Any) -> Any:
         records = self.table()[index]
-        return (
-            [self._row(record) for record in records]
-            if isinstance(index, slice)
-            else self._row(records)
-        )
+        if isinstance(index, slice):
+            return [self._row(record) for record in records]
+        return self._row(records)
 
     def _row(self, record: Any) -> Row:
-        target, ctrl = (
-            None if np.isnan(record[name]).all() else np.array(record[name])
-            for name in ("target", "ctrl")
-        )
+        target = None if np.isnan(record["target"]).all() else np.array(record["target"])
+        ctrl = None if np.isnan(record["ctrl"]).all() else np.array(record["ctrl"])
         qpos, qvel, tau, temperature = (np.array(record[name]) for name in READINGS)
         refused = int(record["refused"])
         tilt = float(record["tilt"])

@@ -28,21 +28,23 @@ from gaponet.base.errors import UsageError
 from gaponet.hw.control.driver import Fault, State
 from gaponet.robot.spec import RobotSpec
 
-# of a bound: kept free, so that rounding does not exceed a limit that is computed back
+# Share of a bound that is kept free, so that rounding does not exceed a limit that is computed back.
 RELATIVE_ROUNDING = 1e-9
-# new states in which one joint must read the same; at a turn two may by chance
+# New states in which one joint must read the same; at a turn two may by chance.
 MIN_STILL_STATES = 4
 CHECKSUM_WINDOW_S = 1.0  # in which wrong checksums are counted
 # More is degrees, milliseconds or Fahrenheit, and would switch the check off.
-MAX_OPTIONS = dict.fromkeys(
-    ("delta", "frozen_travel", "frozen_joint", "tilt", "tracking"), (np.pi, "up to π rad")
-)
-MAX_OPTIONS |= {
+MAX_OPTIONS = {
+    "delta": (np.pi, "up to π rad"),
+    "frozen_travel": (np.pi, "up to π rad"),
+    "frozen_joint": (np.pi, "up to π rad"),
+    "tilt": (np.pi, "up to π rad"),
+    "tracking": (np.pi, "up to π rad"),
     "tracking_time": (60, "up to 60 s"),
     "temperature": (150, "up to 150 °C"),
     "torque_share": (1, "to 1"),
 }
-# with which a joint comes nearer to where it is asked to be; less is standing
+# Speed with which a joint comes nearer to where it is asked to be; less is standing.
 MIN_APPROACH_RAD_S = 0.2
 MIN_SPEED_RAD_S = 1e-6  # below it a joint counts as standing still for damping
 MAX_BELIEVED_SPEED_RAD_S = 12.0  # for damping; a joint that moves faster than this has jumped
@@ -146,31 +148,32 @@ class Limits:
         Raises:
             UsageError: The margin is wider than the range of a joint.
         """
-        nominal = robot.nominal or robot
+        nominal = robot.before_identification
         kp, kd = gains or (nominal.kp, nominal.kd)
         at = robot.index(joints)
-        ranges = np.stack(
-            [robot.qpos_range, robot.qpos_range if qpos_range is None else qpos_range]
-        )[:, at]
-        low = ranges[..., 0].max(axis=0) + config.margin
-        high = ranges[..., 1].min(axis=0) - config.margin
+        low, high = robot.qpos_range[at].T
+        if qpos_range is not None:
+            low = np.maximum(low, qpos_range[at, 0])
+            high = np.minimum(high, qpos_range[at, 1])
+        low = low + config.margin
+        high = high - config.margin
         if (low > high).any():
             joint = joints[int(np.argmax(low > high))]
             raise UsageError(
                 f"safety: margin {config.margin} leaves nothing of the range of {joint}; make it "
                 "smaller"
             )
-        full = lambda value: np.full(len(joints), value)  # noqa: E731
+        n = len(joints)
         return cls(
-            low,
-            high,
-            full(config.speed),
-            config.torque_share * nominal.effort_limit[at],
-            kp[at],
-            kd[at],
-            full(config.delta),
-            full(config.delta_rate),
-            full(config.acceleration),
+            low=low,
+            high=high,
+            speed=np.full(n, config.speed),
+            effort=config.torque_share * nominal.effort_limit[at],
+            kp=kp[at],
+            kd=kd[at],
+            delta=np.full(n, config.delta),
+            delta_rate=np.full(n, config.delta_rate),
+            acceleration=np.full(n, config.acceleration),
         )
 
 
@@ -192,9 +195,8 @@ def limit_delta(delta: Array, previous: Array, dt: float, limits: Limits) -> Arr
     correction.
     """
     step = limits.delta_rate * dt
-    wanted = np.clip(
-        np.where(np.isfinite(delta), delta, previous), previous - step, previous + step
-    )
+    wanted = np.where(np.isfinite(delta), delta, previous)
+    wanted = np.clip(wanted, previous - step, previous + step)
     return np.clip(wanted, -limits.delta, limits.delta)
 
 
@@ -380,10 +382,9 @@ class StateMonitor:
         self._last_ctrl: Array | None = None
         self._equal_states = 0  # states in a row whose readings are all equal
         self._travel = np.zeros(len(commanded))  # way of the commands meanwhile, rad
-        # Of joints whose position stands still: the command then, the integral of the velocity
-        # since, states since.
-        self._anchor: Array | None = None
-        self._integral = np.zeros(len(commanded))
+        # Of joints whose position stands still, since it does:
+        self._anchor: Array | None = None  # the command when it began, rad
+        self._integral = np.zeros(len(commanded))  # of the velocity, rad
         self._still_states = np.zeros(len(commanded), int)
         self._tracking_s = 0.0  # for which a joint has been far from its command
         self._refused: list[tuple[float, int]] = []  # time, s, and messages refused until then
@@ -482,10 +483,10 @@ class StateMonitor:
         last = self._last
         if last is None or state.time <= last.time or not self.config.frozen:
             return None
-        if any(
-            not np.array_equal(getattr(state, name), getattr(last, name))
-            for name in ("qpos", "qvel", "tau")
-        ):
+        same_motion = np.array_equal(state.qpos, last.qpos) and np.array_equal(
+            state.qvel, last.qvel
+        )
+        if not (same_motion and np.array_equal(state.tau, last.tau)):
             self._equal_states = 0
             self._travel[:] = 0.0
             return None

@@ -13,9 +13,8 @@ from types import FrameType
 from typing import Any
 
 # By name: Windows has only the first two.
-STOP_SIGNALS = tuple(
-    s for s in signal.Signals if s.name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT", "SIGTSTP")
-)
+_STOP_NAMES = ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT", "SIGTSTP")
+STOP_SIGNALS = tuple(number for number in signal.Signals if number.name in _STOP_NAMES)
 
 
 class StopRequest:

@@ -178,7 +178,10 @@ def _damp(driver: Driver, seconds: float, weight: float) -> None:
     start = time.monotonic()
     damping_since = None
     last_error = ""
-    report = lambda text: print(f"watchdog: {driver.address} {text}", file=sys.stderr, flush=True)  # noqa: E731
+
+    def report(text: str) -> None:
+        print(f"watchdog: {driver.address} {text}", file=sys.stderr, flush=True)
+
     while True:
         now = time.monotonic()
         wait = DAMP_INTERVAL_S

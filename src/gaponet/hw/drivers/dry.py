@@ -89,12 +89,17 @@ def summarize_commands(recording: Recording, limits: Limits) -> dict[str, dict[s
     if not len(rows):
         return {}
     at = [recording.joint_names.index(name) for name in recording.commanded]
-    ctrl, qpos, qvel = (rows[name][:, at] for name in ("ctrl", "qpos", "qvel"))
+    ctrl = rows["ctrl"][:, at]
+    qpos = rows["qpos"][:, at]
+    qvel = rows["qvel"][:, at]
     speed = np.abs(np.diff(ctrl, axis=0, prepend=ctrl[:1])).max(axis=0) / recording.dt
     torque = np.abs(limits.kp * (ctrl - qpos) - limits.kd * qvel).max(axis=0)
-    values = np.stack([ctrl.min(axis=0), ctrl.max(axis=0), speed, torque], axis=1).tolist()
-    names = ("lowest_rad", "highest_rad", "fastest_rad_s", "torque_nm")
-    return {
-        joint: dict(zip(names, row, strict=True))
-        for joint, row in zip(recording.commanded, values, strict=True)
-    }
+    summary = {}
+    for i, joint in enumerate(recording.commanded):
+        summary[joint] = {
+            "lowest_rad": float(ctrl[:, i].min()),
+            "highest_rad": float(ctrl[:, i].max()),
+            "fastest_rad_s": float(speed[i]),
+            "torque_nm": float(torque[i]),
+        }
+    return summary

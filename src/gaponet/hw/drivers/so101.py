@@ -343,10 +343,10 @@ class SO101Driver:
             if old is not None:
                 self._state = replace(old, refused=bus.refused, fault=self._fault(bus))
             return
-        raw = {
-            name: np.array([field.value_in(reg.RUNNING, blocks[s]) for s in servos], float)
-            for name, field in READINGS.items()
-        }
+        raw = {}  # registers of all servos, (n,) each
+        for name, register in READINGS.items():
+            values = [register.value_in(reg.RUNNING, blocks[servo]) for servo in servos]
+            raw[name] = np.array(values, float)
         self._disobedience = (
             self._disobedience
             or self._check_source(bus, blocks, now)
@@ -356,12 +356,12 @@ class SO101Driver:
         sign = self.arm.sign
         share = np.abs(raw["current"]) / STALL_CURRENT_STEPS * np.sign(raw["load"])
         self._state = State(
-            now,
-            self.arm.qpos(raw["qpos"]),
-            raw["qvel"] * STEP_RAD * sign,
-            share * self._nominal.effort_limit * sign,
-            raw["temperature"],
-            bus.refused,
+            time=now,
+            qpos=self.arm.qpos(raw["qpos"]),
+            qvel=raw["qvel"] * STEP_RAD * sign,
+            tau=share * self._nominal.effort_limit * sign,
+            temperature=raw["temperature"],
+            refused=bus.refused,
             fault=self._fault(bus),
         )
 
@@ -473,18 +473,15 @@ class SO101Driver:
 
     def _fault(self, bus: reg.ServoBus) -> Fault | None:
         """Return the errors that the servos have reported in any reply, else their disobedience."""
-        numbers = dict(zip(self.arm.servos, self.joint_names, strict=True))
-        reports = [
-            f"servo {servo} ({joint}): "
-            + ", ".join(w for bit, w in enumerate(reg.ERRORS) if w and errors >> bit & 1)
-            for servo, joint in numbers.items()
-            if (errors := bus.errors.get(servo, 0) & reg.FAULTY)
-        ]
-        return (
-            Fault("robot", "; ".join(reports) + "; look at load, supply and cables")
-            if reports
-            else self._disobedience
-        )
+        reports = []
+        for servo, joint in zip(self.arm.servos, self.joint_names, strict=True):
+            errors = bus.errors.get(servo, 0) & reg.FAULTY
+            if errors:
+                words = [w for bit, w in enumerate(reg.ERRORS) if w and errors >> bit & 1]
+                reports.append(f"servo {servo} ({joint}): {', '.join(words)}")
+        if reports:
+            return Fault("robot", f"{'; '.join(reports)}; look at load, supply and cables")
+        return self._disobedience
 
     def write(self, ctrl: Array, weight: float = 1.0) -> None:
         """Send goal positions of all servos in one packet, within the calibrated range.
@@ -497,10 +494,9 @@ class SO101Driver:
         goal = dict(zip(self.arm.servos, self.arm.steps(np.asarray(ctrl)).tolist(), strict=True))
         with self._port_errors():
             bus.sync_write(reg.GOAL_POSITION, goal)
-            if not self._torque_on.issuperset(goal):
-                bus.sync_write(
-                    reg.TORQUE_ENABLE, {servo: 1 for servo in goal if servo not in self._torque_on}
-                )
+            without_torque = [servo for servo in goal if servo not in self._torque_on]
+            if without_torque:
+                bus.sync_write(reg.TORQUE_ENABLE, dict.fromkeys(without_torque, 1))
         self._goal = goal
         self._goals_sent.append(set(goal.values()))
 
@@ -545,11 +541,10 @@ class SO101Driver:
         bus = self._open()
         with self._port_errors():
             blocks = bus.sync_read(servos, reg.TORQUE_ENABLE)
-            stiff = [
-                f"{servo} ({joint})"
-                for servo, joint in zip(servos, self.joint_names, strict=True)
-                if servo not in blocks or any(blocks[servo])
-            ]
+            stiff = []
+            for servo, joint in zip(servos, self.joint_names, strict=True):
+                if servo not in blocks or any(blocks[servo]):
+                    stiff.append(f"{servo} ({joint})")
             if stiff:
                 raise DriverError(
                     f"{self.port}: no word that the torque is off in servo {', '.join(stiff)}"
@@ -607,7 +602,6 @@ class SO101Driver:
 
 
 def _settings(block: bytes) -> dict[str, int]:
-    return {
-        name: register.value_in(reg.SETTINGS, block)
-        for name, register in (GAINS | CALIBRATION).items()
-    }
+    """Return gains and calibration in the registers of a servo."""
+    registers = GAINS | CALIBRATION
+    return {name: register.value_in(reg.SETTINGS, block) for name, register in registers.items()}

@@ -65,9 +65,8 @@ class ArmCalibration:
         ordered = [rows[joint] for joint in robot.joint_names]
         self.rows = rows
         self.servos = [row.id for row in ordered]
-        self.low, self.high = (
-            np.array([getattr(row, end) for row in ordered]) for end in ("range_min", "range_max")
-        )
+        self.low = np.array([row.range_min for row in ordered])
+        self.high = np.array([row.range_max for row in ordered])
         self.sign = np.array([-1.0 if row.drive_mode else 1.0 for row in ordered])
         self.zero = (self.low + self.high) / 2
         jaw = robot.index([GRIPPER])[0]
@@ -85,9 +84,8 @@ class ArmCalibration:
 
     def steps(self, qpos: Array) -> Array:
         """Return the nearest whole steps (n) within the calibrated range, of rad (n)."""
-        return np.clip(
-            np.rint(qpos / (STEP_RAD * self.sign) + self.zero), self.low, self.high
-        ).astype(int)
+        nearest = np.rint(qpos / (STEP_RAD * self.sign) + self.zero)
+        return np.clip(nearest, self.low, self.high).astype(int)
 
 
 def read_calibration(path: str | Path, robot: RobotSpec) -> ArmCalibration:
@@ -112,12 +110,11 @@ def read_calibration(path: str | Path, robot: RobotSpec) -> ArmCalibration:
 
 def uncalibrated(robot: RobotSpec) -> ArmCalibration:
     """Return a calibration with the whole range of each encoder, for servos with the ids 1 to 6."""
-    rows = {
-        joint: ServoRow(
-            id=i + 1, drive_mode=0, homing_offset=0, range_min=0, range_max=STEPS_PER_TURN - 1
+    rows = {}
+    for servo, joint in enumerate(JOINTS, 1):
+        rows[joint] = ServoRow(
+            id=servo, drive_mode=0, homing_offset=0, range_min=0, range_max=STEPS_PER_TURN - 1
         )
-        for i, joint in enumerate(JOINTS)
-    }
     return ArmCalibration(rows, robot)
 
 
@@ -131,10 +128,12 @@ def resolve_calibration(
         DriverError: The two differ, or neither has the ends of the joints.
     """
     if file is None:
-        whole = {
-            j for j in JOINTS if stored[j].range_max - stored[j].range_min >= STEPS_PER_TURN - 1
-        }
-        blank = [j for j in JOINTS if j in whole and j != CONTINUOUS_JOINT]
+        blank = []
+        for joint in JOINTS:
+            row = stored[joint]
+            is_whole_turn = row.range_max - row.range_min >= STEPS_PER_TURN - 1
+            if is_whole_turn and joint != CONTINUOUS_JOINT:
+                blank.append(joint)
         if blank:
             raise DriverError(
                 f"{port}: the servos hold no calibration (no limits in {', '.join(blank)}); run "

@@ -5,7 +5,7 @@ The predictor learns the simulator's answers to probes at visited and at random 
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -16,6 +16,7 @@ from gaponet.base.errors import UsageError
 from gaponet.nn.layers import DeltaNet
 from gaponet.nn.sensor import ProbeOracle
 from gaponet.nn.training.env import DeltaEnv
+from gaponet.robot.spec import RobotSpec
 
 FIT_STEPS = 600  # gradient steps
 BATCH_SIZE = 256
@@ -87,62 +88,120 @@ def _probe(
             f"--pretraining.sensor-states {states}: too few to fit a predictor on; give "
             f"{MIN_STATES} or more"
         )
+    visited = _visited_states(env, states, reset=not refit)
+    count = len(visited.x)
     rng = np.random.default_rng(seed)
-    visited: list[tuple[Array, Array, Array]] = []
-    while len(visited) * env.num_envs < states:
-        if not refit:
-            env.reset()
-        x = to_numpy(env.get_observations()["actor"])
-        visited.append((x, copy_array(to_numpy(env.sim.qpos)), copy_array(to_numpy(env.sim.qvel))))
-    x, q, v = (np.concatenate(part) for part in zip(*visited, strict=True))
-    env_of_state = np.tile(np.arange(env.num_envs), len(visited))
-    chosen = rng.permutation(np.sort(rng.permutation(len(x))[:states]))
-    origin = rng.integers(0, 3, len(x))
-    # the same states repeat: the copies are moved, so that none is both fitted and held out
+    chosen = rng.permutation(np.sort(rng.permutation(count)[:states]))
+    origin = rng.integers(0, 3, count)
     if refit:
+        # The same states repeat: the copies are moved, so that none is both fitted and held out.
         origin[env.num_envs :] = NEAR + origin[env.num_envs :] % 2
-    conditions = [env.rows.conditions[g] for g in env.rows.group[env_of_state[chosen]]]
-    oracle = ProbeOracle(env.robot, net.config, conditions, nthread, env.rows.locked)
-    x = x[chosen]
-    q = q[chosen]
-    v = v[chosen]
     origin = origin[chosen]
+    groups = env.rows.group[visited.env[chosen]]
+    conditions = [env.rows.conditions[group] for group in groups]
+    oracle = ProbeOracle(env.robot, net.config, conditions, nthread, env.rows.locked)
+    sample = visited.rows(chosen)
 
     rng = np.random.default_rng(seed)
-    n = net.n
-    layout = net.features.layout
-    op = oracle.operated
     near = np.flatnonzero(origin == NEAR)
     far = np.flatnonzero(origin == RANDOM)
-    position_noise = rng.normal(0, POSITION_NOISE_RAD, (len(near), n))
-    velocity_noise = rng.normal(0, VELOCITY_NOISE_RAD_S, (len(near), n))
-    q[np.ix_(near, op)] += position_noise
-    v[np.ix_(near, op)] += velocity_noise
+    _add_noise(sample, near, net, oracle.operated, rng)
+    _move_to_random_postures(sample, far, net, env.robot, oracle.operated, rng)
+    with torch.inference_mode():
+        inputs = net.sensor_inputs(torch.from_numpy(sample.x.astype(np.float32)))
+    offsets = None
+    if net.config.sensor_source == "learned":
+        probes = _random_probes(len(sample.x), net.config.num_probes, net.n, rng)
+        offsets = net.config.probe_limit * probes
+        repeated = inputs.repeat_interleave(net.config.num_probes, 0)
+        inputs = torch.cat([repeated, torch.from_numpy(probes).float().flatten(0, 1)], dim=1)
+    answers = oracle(sample.qpos, sample.qvel, offsets)
+    return inputs.clone(), torch.from_numpy(answers.reshape(len(inputs), -1))
+
+
+class _States(NamedTuple):
+    """States of an environment's simulations, k rows.
+
+    Attributes:
+        x: Inputs of the network, (k, dim).
+        qpos, qvel: Joints that are not locked, (k, n_free) rad, rad/s.
+        env: Simulation that each row was in, (k,).
+    """
+
+    x: Array
+    qpos: Array
+    qvel: Array
+    env: Array
+
+    def rows(self, chosen: Array) -> _States:
+        """Return a copy of some rows."""
+        return _States(*(values[chosen] for values in self))
+
+
+def _visited_states(env: DeltaEnv, count: int, reset: bool) -> _States:
+    """Return at least `count` states; reset: each time at other recorded rows."""
+    x: list[Array] = []
+    qpos: list[Array] = []
+    qvel: list[Array] = []
+    while len(x) * env.num_envs < count:
+        if reset:
+            env.reset()
+        x.append(to_numpy(env.get_observations()["actor"]))
+        qpos.append(copy_array(to_numpy(env.sim.qpos)))
+        qvel.append(copy_array(to_numpy(env.sim.qvel)))
+    env_of_state = np.tile(np.arange(env.num_envs), len(x))
+    return _States(np.concatenate(x), np.concatenate(qpos), np.concatenate(qvel), env_of_state)
+
+
+def _add_noise(
+    sample: _States, near: Array, net: DeltaNet, op: Array, rng: np.random.Generator
+) -> None:
+    """Move states away from their recorded ones by noise.
+
+    Args:
+        near: Rows to move.
+        op: Operated joints in qpos.
+    """
+    layout = net.features.layout
+    position_noise = rng.normal(0, POSITION_NOISE_RAD, (len(near), net.n))
+    velocity_noise = rng.normal(0, VELOCITY_NOISE_RAD_S, (len(near), net.n))
+    sample.qpos[np.ix_(near, op)] += position_noise
+    sample.qvel[np.ix_(near, op)] += velocity_noise
     if net.config.observes_real_state:
         # These columns are relative to q and v. They stay zero where the recorded state is hidden.
-        real = x[near, layout.real]
+        real = sample.x[near, layout.real]
         visible = real[:, -1:]
         real[:, :-1] -= visible * np.hstack([position_noise, velocity_noise])
-        x[near, layout.real] = real
-    x[:, layout.q], x[:, layout.v] = q[:, op], v[:, op]
-    low, high = np.clip(env.robot.qpos_range[env.robot.operated_index].T, -np.pi, np.pi)
-    shift = rng.uniform(low, high, (len(far), n)) - q[np.ix_(far, op)]
-    q[np.ix_(far, op)] += shift
-    x[far] += layout.shifted(shift)
-    with torch.inference_mode():
-        inputs = net.sensor_inputs(torch.from_numpy(x.astype(np.float32)))
-    offsets = None
-    m = net.config.num_probes
-    if net.config.sensor_source == "learned":
-        # Each probe moves a random subset of the joints.
-        probes = rng.uniform(-1, 1, (len(q), m, n)) * (
-            rng.random((len(q), m, n)) < rng.random((len(q), m, 1))
-        )
-        offsets = net.config.probe_limit * probes
-        inputs = torch.cat(
-            [inputs.repeat_interleave(m, 0), torch.from_numpy(probes).float().flatten(0, 1)], dim=1
-        )
-    return inputs.clone(), torch.from_numpy(oracle(q, v, offsets).reshape(len(inputs), -1))
+        sample.x[near, layout.real] = real
+    sample.x[:, layout.q] = sample.qpos[:, op]
+    sample.x[:, layout.v] = sample.qvel[:, op]
+
+
+def _move_to_random_postures(
+    sample: _States,
+    far: Array,
+    net: DeltaNet,
+    robot: RobotSpec,
+    op: Array,
+    rng: np.random.Generator,
+) -> None:
+    """Move states to random postures within the joint limits, with history and targets.
+
+    Args:
+        far: Rows to move.
+        op: Operated joints in qpos.
+    """
+    low, high = np.clip(robot.qpos_range[robot.operated_index].T, -np.pi, np.pi)
+    shift = rng.uniform(low, high, (len(far), net.n)) - sample.qpos[np.ix_(far, op)]
+    sample.qpos[np.ix_(far, op)] += shift
+    sample.x[far] += net.features.layout.shifted(shift)
+
+
+def _random_probes(states: int, probes: int, n: int, rng: np.random.Generator) -> Array:
+    """Return probes that each move a random subset of the joints, (states, probes, n) in ±1."""
+    sizes = rng.uniform(-1, 1, (states, probes, n))
+    moves = rng.random((states, probes, n)) < rng.random((states, probes, 1))
+    return sizes * moves
 
 
 def _fit_predictor(
