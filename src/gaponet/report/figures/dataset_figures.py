@@ -57,7 +57,10 @@ def write_figures(
     dataset.require_sequences()
     with lock_folder(out, "figures"):
         figures, left_out = draw_figures(dataset, robot, progress)
-        return [file for name, fig in figures.items() for file in save(fig, out / name)], left_out
+        written = []
+        for name, fig in figures.items():
+            written += save(fig, out / name)
+    return written, left_out
 
 
 def draw_figures(

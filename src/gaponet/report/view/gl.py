@@ -21,26 +21,27 @@ def choose_gl() -> None:
     Raises:
         UsageError: No backend works; the message says what to install.
     """
-    display = not sys.platform.startswith("linux") or any(
-        os.environ.get(k) for k in ("DISPLAY", "WAYLAND_DISPLAY")
-    )
-    ours = not display and not os.environ.get("MUJOCO_GL")
+    ours = not _has_display() and not os.environ.get("MUJOCO_GL")
     if ours:
-        installed = [
-            name
-            for name, library in (("egl", "EGL"), ("osmesa", "OSMesa"))
-            if find_library(library)
-        ]
-        if not installed:
+        if find_library("EGL"):
+            os.environ["MUJOCO_GL"] = "egl"
+        elif find_library("OSMesa"):
+            os.environ["MUJOCO_GL"] = "osmesa"
+        else:
             raise UsageError(
                 f"no display and no OpenGL library for rendering off screen. {INSTALL_HINT}"
             )
-        os.environ["MUJOCO_GL"] = installed[0]
     try:
         import mujoco  # noqa: F401
     except Exception as error:  # each backend that is not installed fails in its own way
         chosen = os.environ.pop("MUJOCO_GL") if ours else os.environ.get("MUJOCO_GL")
         raise UsageError(f"MUJOCO_GL={chosen}: {error}. {INSTALL_HINT}") from None
+
+
+def _has_display() -> bool:
+    if not sys.platform.startswith("linux"):
+        return True
+    return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 
 def prepare() -> None:

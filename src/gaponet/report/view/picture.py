@@ -33,9 +33,8 @@ FAINT = "#777777"
 ALARM = "#c8102e"
 SEPARATOR = "  ·  "  # Pillow's own font has this, but no ×
 MAX_HEIGHT = 0.7  # of the width
-# Pixels of one model's square and of its label.
-SIDE = 480
-HEAD = 30
+SIDE = 480  # of one model's square, pixels
+HEAD = 30  # of its label, pixels
 GIF_COLOURS = 200  # shared by all frames
 SUFFIXES = (".gif", ".mp4", ".png")
 FLOOR = mujoco.mjtGeom.mjGEOM_PLANE
@@ -63,10 +62,9 @@ class Camera:
         self.width = width - width % 2
         letters = max(width / 960, 0.5)
         tall = scene.box[3] - scene.box[2]
-        # Pixels.
-        self.head = round(34 * letters)
-        labels = round(60 * letters)
-        room = MAX_HEIGHT * self.width - self.head - labels
+        self.head = round(34 * letters)  # pixels
+        labels = round(60 * letters)  # pixels
+        room = MAX_HEIGHT * self.width - self.head - labels  # pixels
         # Pixels per metre.
         self.scale = min(self.width / (scene.spacing * len(scene.base)), room / tall)
         self.robots = round(1.1 * tall * self.scale)
@@ -99,9 +97,8 @@ class Camera:
         """Return an orthographic camera, which shows every copy from the same side."""
         scene = self.scene
         lens = mujoco.MjvCamera()
-        lens.orthographic = scene.model.vis.global_.orthographic = (
-            1  # MuJoCo 3 reads the model only
-        )
+        lens.orthographic = 1
+        scene.model.vis.global_.orthographic = 1  # MuJoCo 3 reads the model only
         lens.azimuth = scene.view.azimuth
         lens.elevation = scene.view.elevation
         lens.lookat[:] = scene.middle
@@ -112,6 +109,7 @@ class Camera:
         return lens
 
     def _write(self, draw: ImageDraw, time: float) -> None:
+        """Write the heading, and name and errors below each robot."""
         row = self.scene.row(time)
         small = self.fonts[13]
         large = self.fonts[17]
@@ -119,20 +117,20 @@ class Camera:
         top = self.head + self.robots
         pitch = self.scene.spacing * self.scale
         k = len(self.scene.base)
-        for i, m in enumerate(self.scene.shown.motions):
+        for i, copy in enumerate(self.scene.shown.motions):
             x = self.width / 2 + (i - (k - 1) / 2) * pitch
-            tint = colour(m.method)
+            tint = colour(copy.method)
             draw.text(
                 (x, top),
-                title(m.method),
+                title(copy.method),
                 tint,
                 large,
                 anchor="ma",
                 stroke_width=0.3,
                 stroke_fill=tint,
             )
-            if m.method != "recorded":
-                text = f"{m.error[row] * 1e3:.1f} mrad now, {m.mpjae * 1e3:.1f} mean"
+            if copy.method != "recorded":
+                text = f"{copy.error[row] * 1e3:.1f} mrad now, {copy.mpjae * 1e3:.1f} mean"
                 draw.text((x, top + 1.5 * large.size), text, FAINT, small, anchor="ma")
 
     def _head(self, draw: ImageDraw, time: float) -> None:
@@ -147,11 +145,16 @@ class Camera:
             f"unit {meta.unit_id}",
             _payload(meta.payload_mass, meta.payload_side),
         ]
-        facts += [] if shown.seen is None else ["seen in training" if shown.seen else "new motion"]
-        clock = [f"speed {self.clip.speed:g}x"] if self.clip.speed != 1 else []
-        clock += [f"differences drawn {self.magnify:g}x"] if self.magnify != 1 else []
+        if shown.seen is not None:
+            facts.append("seen in training" if shown.seen else "new motion")
+        clock = []
+        if self.clip.speed != 1:
+            clock.append(f"speed {self.clip.speed:g}x")
+        if self.magnify != 1:
+            clock.append(f"differences drawn {self.magnify:g}x")
+        clock.append(f"{time:6.2f} s")
         left = SEPARATOR.join(facts)
-        right = SEPARATOR.join([*clock, f"{time:6.2f} s"])
+        right = SEPARATOR.join(clock)
         mark = "VIRTUAL ROBOT   " if meta.virtual else ""
         while font.getlength(mark + left + right) > self.width - 4 * pad and font.size > 8:
             font = font.font_variant(size=font.size - 0.5)
@@ -161,11 +164,9 @@ class Camera:
 
 
 def _payload(mass: float, side: str) -> str:
-    return (
-        "empty-handed"
-        if mass == 0
-        else f"{mass:g} kg " + ("in each hand" if side == "both" else f"in {side} hand")
-    )
+    if mass == 0:
+        return "empty-handed"
+    return f"{mass:g} kg in each hand" if side == "both" else f"{mass:g} kg in {side} hand"
 
 
 def font(size: float) -> Any:
@@ -248,13 +249,13 @@ def portrait(robot: RobotSpec, meta: SequenceMeta, dt: float, qpos: Mapping[str,
     for method, q in qpos.items():
         whole[method] = np.tile(robot.qpos_home, (len(q), 1))
         whole[method][:, robot.operated_index] = q
+    motions = []
+    for method, q in whole.items():
+        error = np.abs(qpos[method] - qpos["recorded"]).mean(axis=1)  # (T,) rad
+        motions.append(Copy(method, q, error))
     base = whole["recorded"]
-    motions = tuple(
-        Copy(m, q, np.abs(qpos[m] - qpos["recorded"]).mean(axis=1)) for m, q in whole.items()
-    )
-    shown = SideBySide(
-        Sequence(meta, robot.joint_names, dt, base, base, 0 * base), robot, motions, None
-    )
+    real = Sequence(meta, robot.joint_names, dt, base, base, np.zeros_like(base))
+    shown = SideBySide(real, robot, tuple(motions), None)
     clip = Clip.from_start(shown, None, 8.0)
     moment = largest_error_time(shown, clip)
     row = min(round(moment / dt), len(base) - 2)

@@ -87,13 +87,12 @@ class Player:
                 frame.position = scene.data.xpos[body]
                 frame.wxyz = scene.data.xquat[body]
         row = scene.row(now)
-        rows = "\n".join(
-            f"| {escape_markdown(name)} | {1e3 * copy.error[row]:.1f} | {1e3 * copy.mpjae:.1f} |"
-            for name, copy in self.copies.items()
-        )
-        self.table.content = (
-            f"| mean error, mrad | now | whole motion |\n| --- | ---: | ---: |\n{rows}"
-        )
+        lines = ["| mean error, mrad | now | whole motion |", "| --- | ---: | ---: |"]
+        for name, copy in self.copies.items():
+            error = 1e3 * copy.error[row]
+            mean = 1e3 * copy.mpjae
+            lines.append(f"| {escape_markdown(name)} | {error:.1f} | {mean:.1f} |")
+        self.table.content = "\n".join(lines)
 
     def advance(self, elapsed: float) -> None:
         """Advance by `elapsed` s of wall time; the clip repeats."""
@@ -207,9 +206,9 @@ def _surface(model: mujoco.MjModel, geom: int) -> tuple[Array, Array]:
             mesh = model.mesh(model.geom_dataid[geom])
             first = mesh.vertadr[0]
             face = mesh.faceadr[0]
-            return model.mesh_vert[first : first + mesh.vertnum[0]], model.mesh_face[
-                face : face + mesh.facenum[0]
-            ]
+            vertices = model.mesh_vert[first : first + mesh.vertnum[0]]
+            triangles = model.mesh_face[face : face + mesh.facenum[0]]
+            return vertices, triangles
         case mujoco.mjtGeom.mjGEOM_CAPSULE:
             shape = creation.capsule(2 * b, a, count=[12, 12])
             shape.apply_translation(-shape.bounds.mean(axis=0))

@@ -88,21 +88,18 @@ class Scene:
         self.base = (np.arange(k) - (k - 1) / 2)[:, None] * self.spacing * view.axes[0]
         self.extent = max(0.5 * k * self.spacing, self.box[3] - self.box[2])
         across, up = view.axes
-        behind = (
-            GHOST_DISTANCE * (self.box[3] - self.box[2]) * np.cross(up, across)
-            if flat
-            else np.zeros(3)
-        )
+        behind = np.zeros(3)
+        if flat:
+            behind = GHOST_DISTANCE * (self.box[3] - self.box[2]) * np.cross(up, across)
         self.model = self._compose(self.base, behind)
         self.data = mujoco.MjData(self.model)
-        self.address = [(i, self._address(m.method)) for i, m in enumerate(shown.motions)]
+        methods = [motion.method for motion in shown.motions]
+        self.address = [(i, self._address(method)) for i, method in enumerate(methods)]
         if self.ghosts:
-            last = next(i for i, m in enumerate(shown.motions) if m.method == "recorded")
-            self.address += [
-                (last, self._address(f"{m.method}-ghost"))
-                for m in shown.motions
-                if m.method != "recorded"
-            ]
+            recorded = methods.index("recorded")
+            for method in methods:
+                if method != "recorded":
+                    self.address.append((recorded, self._address(f"{method}-ghost")))
 
     def pose(self, time: float) -> None:
         """Set the positions of every copy at a time of the recording, s, interpolated between
@@ -340,6 +337,7 @@ def _light(scene: mujoco.MjSpec, floor: float, extent: float) -> None:
     scene.visual.quality.shadowsize = 2048
     scene.visual.quality.numslices = 18
     scene.visual.quality.numstacks = 10
-    scene.visual.global_.offwidth = scene.visual.global_.offheight = 4096
+    scene.visual.global_.offwidth = 4096
+    scene.visual.global_.offheight = 4096
     scene.stat.extent = extent
     scene.stat.center = [0, 0, floor]

@@ -130,11 +130,12 @@ class Clip:
 
 def largest_error_time(shown: SideBySide, clip: Clip) -> float:
     """Return the time of the largest error of the first simulated copy, s."""
-    first, last = (round(t / shown.real.dt) for t in (clip.start, clip.stop))
-    simulated = [m for m in shown.motions if m.method not in ("target", "recorded")] or list(
-        shown.motions
-    )
-    return (first + int(simulated[0].error[first : last + 1].argmax())) * shown.real.dt
+    dt = shown.real.dt
+    first = round(clip.start / dt)
+    last = round(clip.stop / dt)
+    simulated = [m for m in shown.motions if m.method not in ("target", "recorded")]
+    copy = simulated[0] if simulated else shown.motions[0]
+    return (first + int(copy.error[first : last + 1].argmax())) * dt
 
 
 def select_entry(
@@ -151,19 +152,17 @@ def select_entry(
     """
     entries = dataset.select((motion,) if motion else ())
     entries = sorted(entries, key=lambda e: was_used(e, runs))
-    matching = [
-        e
-        for e in entries
-        if unit in ("", e.meta.unit_id)
-        and (payload_mass is None or abs(payload_mass - e.meta.payload_mass) < 1e-6)
-    ]
-    if not matching:
-        there = sorted({f"{e.meta.unit_id} with {e.meta.payload_mass:g} kg" for e in entries})
-        raise DatasetError(
-            f"{dataset.path}: no such recording of {motion or 'any motion'}; there are "
-            f"{', '.join(there)}. Change --unit or --payload-mass"
-        )
-    return matching[0]
+    for entry in entries:
+        meta = entry.meta
+        is_unit = unit in ("", meta.unit_id)
+        is_mass = payload_mass is None or abs(payload_mass - meta.payload_mass) < 1e-6
+        if is_unit and is_mass:
+            return entry
+    there = sorted({f"{e.meta.unit_id} with {e.meta.payload_mass:g} kg" for e in entries})
+    raise DatasetError(
+        f"{dataset.path}: no such recording of {motion or 'any motion'}; there are "
+        f"{', '.join(there)}. Change --unit or --payload-mass"
+    )
 
 
 def side_by_side(

@@ -37,6 +37,15 @@ PLACES = ("logs", "model", "new_logs")
 INCOMING = "incoming"  # folder of complete uploads that wait
 WAITING_NAME = re.compile(rf"({'|'.join(PLACES)})-(\d{{1,9}})")
 MAX_UNPACKED_BYTES = 2 << 30  # of a .zip; the page holds an upload in memory
+BROKEN_ZIP_ERRORS = (
+    zipfile.BadZipFile,
+    zlib.error,
+    lzma.LZMAError,
+    EOFError,
+    RuntimeError,
+    ValueError,
+    OSError,
+)
 MAX_SHOWN_STORED = 5  # lines of stored files; the newest
 MAX_SHOWN_REFUSED = 20  # lines of refused files; the oldest, and the number of the others
 # Errors of the disk. Any other OSError comes from the .zip: a file where it has a folder, a name
@@ -234,15 +243,7 @@ def unpack(name: str, content: bytes, folder: Path) -> None:
                 size = f"{MAX_UNPACKED_BYTES >> 30} GiB"
                 raise UsageError(f"it unpacks to more than {size}; give it in parts")
             archive.extractall(folder)  # which drops .. and a leading / from names
-    except (
-        zipfile.BadZipFile,
-        zlib.error,
-        lzma.LZMAError,
-        EOFError,
-        RuntimeError,
-        ValueError,
-        OSError,
-    ) as error:
+    except BROKEN_ZIP_ERRORS as error:
         if isinstance(error, OSError) and error.errno in DISK_ERRORS:
             raise
         reason = error.strerror if isinstance(error, OSError) else str(error)
