@@ -1,4 +1,6 @@
-"""Files of a few bytes that demand gigabytes or endless time, and the commands that open them (make hostile)."""
+"""Files of a few bytes that demand gigabytes or endless time, and the commands that open them
+(make hostile).
+"""
 
 from __future__ import annotations
 
@@ -38,7 +40,9 @@ CHECK = ("robot", "check", "{}/arm")
 
 @dataclass(frozen=True)
 class Case:
-    """Function that writes files into a folder, and the command that opens them; {} stands for the folder."""
+    """Function that writes files into a folder, and the command that opens them; {} stands for the
+    folder.
+    """
 
     make: Callable[[Path], None]
     words: tuple[str, ...]
@@ -97,11 +101,9 @@ def loop(weights: list[object]) -> list[object]:
     weights.append(helper.make_tensor("go", TensorProto.BOOL, [], [True]))
     weights.append(helper.make_tensor("start", TensorProto.FLOAT, [], [0.0]))
     value = helper.make_tensor_value_info
-    often, go, number = (
-        value("i", TensorProto.INT64, []),
-        value("c", TensorProto.BOOL, []),
-        TensorProto.FLOAT,
-    )
+    often = value("i", TensorProto.INT64, [])
+    go = value("c", TensorProto.BOOL, [])
+    number = TensorProto.FLOAT
     nodes = [
         helper.make_node("Identity", ["c"], ["c2"]),
         helper.make_node("Add", ["v", "v"], ["v2"]),
@@ -118,8 +120,10 @@ def outer(weights: list[object]) -> list[object]:
     weights.append(numpy_helper.from_array(np.ones((50_000, 1), np.float32), "column"))
     weights.append(numpy_helper.from_array(np.ones((1, 50_000), np.float32), "row"))
     weights.append(helper.make_tensor("axes", TensorProto.INT64, [2], [0, 1]))
-    return [helper.make_node("MatMul", ["column", "row"], ["many"]),
-            helper.make_node("ReduceSum", ["many", "axes"], ["odd"], keepdims=0)]  # fmt: skip
+    return [
+        helper.make_node("MatMul", ["column", "row"], ["many"]),
+        helper.make_node("ReduceSum", ["many", "axes"], ["odd"], keepdims=0),
+    ]
 
 
 def logs(
@@ -269,8 +273,9 @@ def db3_view(file: Path) -> None:
     with sqlite3.connect(file) as base:
         base.execute("ALTER TABLE messages RENAME TO old")
         base.execute(
-            "CREATE VIEW messages AS WITH RECURSIVE c(n) AS (SELECT 1 UNION ALL SELECT n + 1 FROM c) "
-            "SELECT n AS id, topic_id, timestamp + n AS timestamp, zeroblob(100000000) AS data FROM c, old"
+            "CREATE VIEW messages AS WITH RECURSIVE c(n) AS (SELECT 1 UNION ALL SELECT n + 1 FROM "
+            "c) SELECT n AS id, topic_id, timestamp + n AS timestamp, zeroblob(100000000) AS data "
+            "FROM c, old"
         )
 
 

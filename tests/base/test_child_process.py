@@ -18,7 +18,10 @@ NAMES = sorted(
     - {"gaponet", "__main__"}
 )
 MARK = "ran.txt"
-POISON = f"import os; open(os.path.join(os.path.dirname(__file__), {MARK!r}), 'a').write(__name__ + '\\n')\n"
+POISON = (
+    f"import os; open(os.path.join(os.path.dirname(__file__), {MARK!r}), 'a').write(__name__ + "
+    "'\\n')\n"
+)
 
 # What a console script is: sys.path begins with the folder of scripts.
 SCRIPT = "import sys\nfrom gaponet.__main__ import entry\nentry()\n"
@@ -68,7 +71,10 @@ def poisoned(tmp_path):
     time = 0.02 * np.arange(60)
     angles = np.sin(time)[:, None] * [0.3, 0.2]
     scipy.io.savemat(tmp_path / "logs" / "a.mat", {"time": time, "cmd": angles, "q": 0.9 * angles})
-    told = 'ctrl = "cmd"\nqpos = "q"\njoints = ["shoulder", "elbow"]\nposition_unit = "rad"\ntime_unit = "s"\n'
+    told = (
+        'ctrl = "cmd"\nqpos = "q"\njoints = ["shoulder", "elbow"]\nposition_unit = '
+        '"rad"\ntime_unit = "s"\n'
+    )
     (tmp_path / "logs" / "logs.toml").write_text(told)
     return tmp_path
 
@@ -114,9 +120,8 @@ def test_no_child_imports_modules_of_the_current_folder(poisoned):
 def test_a_command_started_by_m_or_pythonpath_imports_none_of_them(poisoned, how):
     """Modules that Python imports before gaponet are exempt."""
     started = [sys.executable, "-c", "import sys; print(*sys.modules)"]
-    loaded = subprocess.run(
-        started, cwd="/", capture_output=True, text=True
-    ).stdout.split()  # by .pth files as well
+    # By .pth files as well.
+    loaded = subprocess.run(started, cwd="/", capture_output=True, text=True).stdout.split()
     library = sys.stdlib_module_names - {
         "json",
         "tomllib",

@@ -42,9 +42,7 @@ def test_a_new_folder_is_marked_with_its_kind(tmp_path):
     assert (tmp_path / "a" / "b" / FOLDER_MARKER).read_text() == "run\n"
     with lock_folder(tmp_path / "a" / "b", "run"), lock_folder(tmp_path / "a" / "b", "run"):
         pass
-    with pytest.raises(
-        FolderError, match="b: holds gaponet's run, not dataset; choose another folder"
-    ):
+    with pytest.raises(FolderError, match="run"):
         require_own_folder(tmp_path / "a" / "b", "dataset")
 
 
@@ -72,7 +70,7 @@ def test_a_block_that_fails_after_writing_removes_nothing(tmp_path):
 def test_a_folder_of_another_program_is_refused_and_unchanged(tmp_path, name):
     (tmp_path / name).mkdir()
     with (
-        pytest.raises(FolderError, match=f"holds {name}, so it is no run of gaponet"),
+        pytest.raises(FolderError, match=name),
         lock_folder(tmp_path, "run"),
     ):
         pass
@@ -86,9 +84,7 @@ def test_a_second_writer_is_refused_or_waits_for_the_first(tmp_path):
 
     with ThreadPoolExecutor(1) as pool:
         with lock_folder(tmp_path / "a", "run"):
-            with pytest.raises(
-                FolderError, match=rf"another gaponet \(process {os.getpid()}\) is writing here"
-            ):
+            with pytest.raises(FolderError, match=str(os.getpid())):
                 pool.submit(other, 0.0).result()
             patient = pool.submit(other, 60.0)
         assert patient.result()
@@ -96,9 +92,10 @@ def test_a_second_writer_is_refused_or_waits_for_the_first(tmp_path):
 
 def test_the_next_writer_removes_unfinished_files_of_a_killed_one(tmp_path):
     code = (
-        "import os, sys; from pathlib import Path; from gaponet.base.files import atomic_write, lock_folder\n"
-        "with lock_folder(Path(sys.argv[1]), 'run'), atomic_write(Path(sys.argv[1]) / 'sub' / 'x') as file:\n"
-        "    file.parent.mkdir(); file.write_text('half'); os.kill(os.getpid(), 9)\n"
+        "import os, sys; from pathlib import Path; from gaponet.base.files import atomic_write, "
+        "lock_folder\nwith lock_folder(Path(sys.argv[1]), 'run'), atomic_write(Path(sys.argv[1]) "
+        "/ 'sub' / 'x') as file:\n    file.parent.mkdir(); file.write_text('half'); "
+        "os.kill(os.getpid(), 9)\n"
     )
     out = tmp_path / "out"
     subprocess.run([sys.executable, "-c", code, str(out)], check=False)
@@ -125,7 +122,7 @@ def test_a_folder_of_an_older_version_is_recognised_by_its_files(tmp_path, kind,
         pass
     assert names(tmp_path)[0] == FOLDER_MARKER
     (tmp_path / FOLDER_MARKER).unlink()
-    with pytest.raises(FolderError, match="so it is no run of gaponet"):
+    with pytest.raises(FolderError, match="no run"):
         require_own_folder(tmp_path, "run")
 
 

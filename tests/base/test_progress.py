@@ -30,9 +30,12 @@ def test_100_percent_is_printed_once_at_the_end(capfd, monkeypatch):
         for now[0] in (11.0, 12.0, 30.0):
             update(2, 2, "table")
     assert capfd.readouterr().err.splitlines() == [
-        "training: 100 %, 0 s, export", "fitting: 50 %, 0 s, joints", "fitting: 99 %, 11 s, table",
-        "fitting: 99 %, 30 s, table", "fitting: 100 %, 30 s, table",
-    ]  # fmt: skip
+        "training: 100 %, 0 s, export",
+        "fitting: 50 %, 0 s, joints",
+        "fitting: 99 %, 11 s, table",
+        "fitting: 99 %, 30 s, table",
+        "fitting: 100 %, 30 s, table",
+    ]
 
 
 def test_parallel_tasks_share_a_line(capfd):

@@ -1,4 +1,6 @@
-"""A virtual two-joint arm in simulated time that notes all it is sent, its controller, and a watchdog in name only."""
+"""A virtual two-joint arm in simulated time that notes all it is sent, its controller, and a
+watchdog in name only.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +28,9 @@ MOTION = Motion("sway", "whole_body", DT, commands(40, seed=1))
 
 
 class NotedArm(VirtualDriver):
-    """Notes commands (None: damping), weights, and how it is closed; `change` may replace each state that is read."""
+    """Notes commands (None: damping), weights, and how it is closed; `change` may replace each
+    state that is read.
+    """
 
     def __init__(
         self,

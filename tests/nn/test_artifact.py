@@ -42,7 +42,7 @@ def artifact(robot, tmp_path_factory):
 def test_export_refuses_to_write_what_differs(artifact, robot, tmp_path, monkeypatch):
     _, net, samples = artifact
     monkeypatch.setattr("gaponet.nn.onnx_export.MAX_DIFFERENCE_RAD", -1.0)
-    with pytest.raises(ModelError, match="ONNX and torch differ by"):
+    with pytest.raises(ModelError, match="differ"):
         export(net, tmp_path / "out", {}, samples)
     assert not (tmp_path / "out").exists()
 
@@ -55,7 +55,7 @@ def test_files_of_two_exports_are_refused_as_one_model(artifact, robot, tmp_path
     torch.nn.init.zeros_(other.trunk[-1].weight)
     export(other, tmp_path / "out", card, samples)
     (tmp_path / "out" / "card.json").write_text(json.dumps(card))
-    with pytest.raises(ModelError, match=r"is not of its card\.json: an export was cut short"):
+    with pytest.raises(ModelError, match="short"):
         GapModel.load(tmp_path / "out")
 
 
@@ -77,28 +77,26 @@ def test_a_card_that_contradicts_its_network_is_refused_by_field(copied, changed
     model = card["model"] | changed.get("model", {})
     (copied / "card.json").write_text(json.dumps(card | changed | {"model": model}))
     field = next(iter(changed))
-    with pytest.raises(ModelError, match=rf"card\.json: {field} is .* was exported with"):
+    with pytest.raises(ModelError, match=field):
         GapModel.load(copied)
 
 
 def test_another_rate_is_refused(artifact, robot):
     model = GapModel.load(artifact[0])
     model.require(robot, 0.02006)  # the clock of a real 50 Hz loop
-    with pytest.raises(ModelError, match=r"trained at 50\.0 Hz, the loop has 100\.0 Hz"):
+    with pytest.raises(ModelError, match=r"100\.0"):
         model.require(robot, 0.01)
 
 
 def test_a_model_of_another_simulator_is_read_and_refused(copied, robot):
     card = json.loads((copied / "card.json").read_text())
     (copied / "card.json").write_text(json.dumps(card | {"simulator": "a127234c3d89"}))
-    with pytest.raises(
-        ModelError, match=r"trained in simulator a127234c3d89.*before friction held.*train again"
-    ):
+    with pytest.raises(ModelError, match="a127234c3d89"):
         GapModel.load(copied).require(robot)
 
 
 def test_another_joint_set_is_refused(artifact, robot):
-    with pytest.raises(ModelError, match="made for arm with joints shoulder, elbow"):
+    with pytest.raises(ModelError, match="joints"):
         GapModel.load(artifact[0]).require(dataclasses.replace(robot, operated=("elbow",)))
 
 

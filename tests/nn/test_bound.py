@@ -1,4 +1,6 @@
-"""Whatever a network answers, a correction is finite and within delta_max, and a failing network is reported."""
+"""Whatever a network answers, a correction is finite and within delta_max, and a failing network
+is reported.
+"""
 
 import warnings
 
@@ -65,7 +67,7 @@ def test_answers_are_cut_to_delta_max(make):
 
 def test_the_first_answer_that_is_not_finite_warns():
     bound = AnswerBound(DELTA_MAX)
-    with pytest.warns(RuntimeWarning, match="not finite"):
+    with pytest.warns(RuntimeWarning, match="finite"):
         bound(np.array([np.nan, 0.0]))
 
 

@@ -1,4 +1,6 @@
-"""The loop around a network: what it is given and what is made of its answer, the same in training and in rollouts."""
+"""The loop around a network: what it is given and what is made of its answer, the same in training
+and in rollouts.
+"""
 
 import numpy as np
 import pytest
@@ -95,13 +97,15 @@ def looped(config, limits, num_envs, tensors):
     ("bad", "when", "tensors"), [(np.nan, 0, False), (np.inf, 5, False), (np.nan, 5, True)]
 )
 def test_a_target_that_is_not_finite_affects_one_robot_for_one_period(bad, when, tensors):
-    config, limits = ModelConfig(history=3), np.array([[-0.3, 0.3], [-10.0, 10.0]])
+    config = ModelConfig(history=3)
+    limits = np.array([[-0.3, 0.3], [-10.0, 10.0]])
     rng = np.random.default_rng(1)
     kind = torch.from_numpy if tensors else np.asarray
     hit, clean = (looped(config, limits, 3, tensors) for _ in range(2))
     for t in range(10):
         q, v, a = rng.normal(0, 0.3, (3, 3, 2)).astype(np.float32)
-        held, payload = a.copy(), np.zeros(3, np.float32)
+        held = a.copy()
+        payload = np.zeros(3, np.float32)
         if t == when:
             held[1, 0] = np.asarray(clean.applied)[1, 0] if t else q[1, 0]
             a[1, 0] = bad

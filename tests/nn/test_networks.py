@@ -32,7 +32,8 @@ def test_corrections_are_bounded_whatever_comes_in(config):
 
 
 def test_features_do_not_change_when_all_positions_shift_but_the_pose_itself():
-    config, n = ModelConfig(payload_input=False), 2
+    config = ModelConfig(payload_input=False)
+    n = 2
     features = build_network(config, n).features
     a = x(config, n)
     b = a.clone()
@@ -44,7 +45,8 @@ def test_features_do_not_change_when_all_positions_shift_but_the_pose_itself():
 
 
 def test_a_joint_observes_the_state_of_the_others_but_not_their_history():
-    config, n = ModelConfig(history=2), 3
+    config = ModelConfig(history=2)
+    n = 3
     net = build_network(config, n)
     torch.nn.init.normal_(net.trunk[-1].weight)
     a = x(config, n)
@@ -59,7 +61,8 @@ def test_a_joint_observes_the_state_of_the_others_but_not_their_history():
 
 
 def test_a_joint_reads_its_own_sensors():
-    config, n = ModelConfig(sensors="predicted", num_probes=4), 3
+    config = ModelConfig(sensors="predicted", num_probes=4)
+    n = 3
     net = build_network(config, n)
     torch.nn.init.normal_(net.trunk[-1].weight)
     sensors = torch.zeros(1, 4, 2, n)
@@ -80,7 +83,8 @@ def test_an_untrained_network_corrects_nothing(kind):
 
 @pytest.mark.parametrize("kind", BASELINES)
 def test_every_number_of_the_observation_and_the_action_is_seen(kind):
-    config, n = ModelConfig(kind=kind, history=3), 2
+    config = ModelConfig(kind=kind, history=3)
+    n = 2
     net = build_network(config, n)
     torch.nn.init.normal_(net.net[-1].weight, std=0.01)
     data = x(config, n, batch=1).requires_grad_(True)
@@ -118,5 +122,5 @@ def test_building_a_matched_mlp_leaves_the_seed_alone():
 
 
 def test_a_matched_mlp_needs_hidden_layers():
-    with pytest.raises(UsageError, match="give the proportions"):
+    with pytest.raises(UsageError, match="proportions"):
         ModelConfig(kind="mlp", mlp_match=True, mlp_hidden=())

@@ -31,7 +31,9 @@ def test_layout_is_state_then_frames_newest_first_then_payload_and_action():
 def test_the_history_equals_a_list_of_past_frames_under_random_pushes_and_resets(
     make, stride, seed
 ):
-    rng, n, num = np.random.default_rng(seed), 2, 4
+    rng = np.random.default_rng(seed)
+    n = 2
+    num = 4
     config = ModelConfig(history=int(rng.integers(1, 5)), stride=stride)
     x = make((num, config.input_dim(n)))
     own = lambda values: values if make is np.zeros else torch.from_numpy(values).float()  # noqa: E731

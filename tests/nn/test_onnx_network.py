@@ -79,7 +79,8 @@ def test_without_onnxruntime_a_model_says_what_to_install(artifact, monkeypatch)
 def test_a_correction_never_leaves_the_joint_limits(artifact, robot):
     model = GapModel.load(artifact)
     np.testing.assert_array_equal(model.qpos_range, robot.qpos_range)
-    edge, loop = robot.qpos_range[:, 1], model.loop()
+    edge = robot.qpos_range[:, 1]
+    loop = model.loop()
     for _ in range(5):
         delta = loop.delta(edge - 0.1, np.zeros(2), edge, 0.0)
         assert (edge + delta <= edge).all()
@@ -88,9 +89,9 @@ def test_a_correction_never_leaves_the_joint_limits(artifact, robot):
 def test_other_shapes_are_refused(artifact):
     loop = GapModel.load(artifact).loop()
     loop.delta(np.zeros(2), np.zeros(2), np.zeros(2), 0.0)
-    with pytest.raises(UsageError, match=r"2 operated joints of 1 robots.*model\.loop\(num_envs\)"):
+    with pytest.raises(UsageError, match="num_envs"):
         loop.delta(np.zeros((3, 2)), np.zeros((3, 2)), np.zeros((3, 2)), 0.0)
-    with pytest.raises(UsageError, match="give the 2 operated joints"):
+    with pytest.raises(UsageError, match="operated"):
         loop.delta(np.zeros(3), np.zeros(2), np.zeros(2), 0.0)
 
 
@@ -103,6 +104,6 @@ def test_a_torch_export_of_other_weights_is_refused(artifact, tmp_path):
         {"best_state": {k: 0.9 * v for k, v in trained(stride=2).state_dict().items()}},
         tmp_path / "checkpoint.pt",
     )
-    with pytest.raises(ModelError, match=r"torch.export and .* differ by"):
+    with pytest.raises(ModelError, match="differ"):
         export_program(GapModel.load(folder), tmp_path, tmp_path)
     assert not (tmp_path / "delta.pt2").exists()

@@ -72,13 +72,13 @@ def test_the_simulator_of_a_name_is_that_of_training(network):
 
 
 def test_a_wrong_name_is_answered_with_the_names_and_the_nearest(network):
-    with pytest.raises(ModelError, match=f"which has {NAME}; nearest: {NAME}"):
+    with pytest.raises(ModelError, match="nearest"):
         gp.GapModel.load("so101_smal")
 
 
 def test_a_folder_of_the_same_name_here_is_refused_as_ambiguous(network, tmp_path):
     (tmp_path / NAME).mkdir()
-    with pytest.raises(UsageError, match="a network of the package and a folder here"):
+    with pytest.raises(UsageError, match="folder"):
         gp.GapModel.load(NAME)
 
 
@@ -100,7 +100,7 @@ def test_a_simulator_that_the_package_has_no_longer_is_refused_with_the_version(
     shutil.copytree(network.folder, package / NAME)
     (package / NAME / "packaged_robot.json").write_text('{"name": "so101", "gain_scale": 2.0}')
     use_package_folder(monkeypatch, package)
-    with pytest.raises(ModelError, match=r"as in gaponet 0\.1\.0: use that robot or that version"):
+    with pytest.raises(ModelError, match=r"0\.1\.0"):
         gp.GapModel.load(NAME).simulator()
 
 
@@ -225,7 +225,7 @@ def test_a_network_of_an_identified_robot_is_not_shipped(tmp_path):
     robot = gp.load_robot("so101").with_servos({"elbow_flex": {"damping": 1.0}})
     data = make_dataset(tmp_path / "data", gp.load_robot("so101"))
     run = make_run(tmp_path / "run", robot, data)
-    with pytest.raises(UsageError, match="train in the nominal robot of the package"):
+    with pytest.raises(UsageError, match="nominal"):
         ship(run, data, tmp_path / "package")
 
 
@@ -233,7 +233,7 @@ def test_a_card_that_names_a_path_is_not_shipped(tmp_path):
     robot = gp.load_robot("so101")
     data = make_dataset(tmp_path / "data", robot)
     run = make_run(tmp_path / "run", robot, data, SMALL, source="/home/anna/logs")
-    with pytest.raises(UsageError, match=r"card\.json names .*home"):
+    with pytest.raises(UsageError, match="home"):
         ship(run, data, tmp_path / "package")
 
 
@@ -241,7 +241,7 @@ def test_an_interrupted_training_is_not_shipped(tmp_path):
     robot = gp.load_robot("so101")
     data = make_dataset(tmp_path / "data", robot)
     run = make_run(tmp_path / "run", robot, data, SMALL, interrupted=True)
-    with pytest.raises(UsageError, match="finish it with --resume"):
+    with pytest.raises(UsageError, match="--resume"):
         ship(run, data, tmp_path / "package")
 
 

@@ -1,4 +1,6 @@
-"""The paper's network: its dimensions, the weights that its authors published, and what it is when it ships."""
+"""The paper's network: its dimensions, the weights that its authors published, and what it is when
+it ships.
+"""
 
 import copy
 from dataclasses import asdict, replace
@@ -84,7 +86,8 @@ def test_the_branch_sees_sensor_values_alone():
 
 
 def test_sensors_are_sampled_in_training_and_the_mean_otherwise():
-    net, x = network(), torch.randn(1, PAPER.input_dim(2)).expand(4000, -1)
+    net = network()
+    x = torch.randn(1, PAPER.input_dim(2)).expand(4000, -1)
     with torch.inference_mode():
         z = net.sensor_inputs(x)
         mean = net.sensors(x, z)
@@ -96,7 +99,8 @@ def test_sensors_are_sampled_in_training_and_the_mean_otherwise():
 
 
 def test_the_limit_changes_no_correction_within_it():
-    net, x = network(), torch.randn(50, PAPER.input_dim(2))
+    net = network()
+    x = torch.randn(50, PAPER.input_dim(2))
     with torch.inference_mode():
         prepared = net.prepare(x)
         raw = net.train().correct(prepared)
@@ -140,7 +144,8 @@ def test_held_sensors_see_the_observation_of_the_last_refresh_and_the_trunk_the_
 
 def test_an_absolute_sensor_value_is_the_next_state(tmp_path):
     robot = write_arm(tmp_path)
-    q, v = np.array([[0.2, -0.1]]), np.array([[0.5, -0.3]])
+    q = np.array([[0.2, -0.1]])
+    v = np.array([[0.5, -0.3]])
     change, state = (
         ProbeOracle(robot, replace(PAPER, sensor_target=form), [(0.0, "both", 0.02)])(q, v)
         for form in ("delta", "absolute")
@@ -153,7 +158,8 @@ def test_an_absolute_sensor_value_is_the_next_state(tmp_path):
 def test_with_fixed_probes_the_branch_observes_the_simulator_and_control_loops_are_refused(
     tmp_path,
 ):
-    config, robot = replace(PAPER, sensor_source="fixed"), write_arm(tmp_path / "arm")
+    config = replace(PAPER, sensor_source="fixed")
+    robot = write_arm(tmp_path / "arm")
     net = network(config)
     assert config.input_dim(2) == PAPER.input_dim(2) + 4 * 2 * 2
     x = torch.randn(5, config.input_dim(2))
@@ -161,7 +167,7 @@ def test_with_fixed_probes_the_branch_observes_the_simulator_and_control_loops_a
     assert net.predictor is None
     export(net, tmp_path / "run", make_card(config, robot, dt=[0.02]), sample_inputs(net))
     model = GapModel.load(tmp_path / "run")
-    with pytest.raises(ModelError, match="for gaponet eval alone"):
+    with pytest.raises(ModelError, match="eval"):
         model.loop()
     (simulated,) = replay(recordings(robot, 1, rows=20), robot, model.corrector(robot), nthread=1)
     assert np.isfinite(simulated.qpos).all()
@@ -169,7 +175,8 @@ def test_with_fixed_probes_the_branch_observes_the_simulator_and_control_loops_a
 
 def test_learned_probes_start_at_the_fixed_ones_and_gradients_reach_them_alone():
     config = replace(PAPER, sensor_source="learned")
-    net, x = network(config).train(), torch.randn(9, config.input_dim(2))
+    net = network(config).train()
+    x = torch.randn(9, config.input_dim(2))
     start = (config.probe_limit * net.probes.tanh()).detach()
     np.testing.assert_allclose(start, ProbeOracle.probe_offsets(config, 2), atol=1e-6)
     net.predictor.requires_grad_(False)
@@ -182,7 +189,8 @@ def test_learned_probes_start_at_the_fixed_ones_and_gradients_reach_them_alone()
 
 def test_learned_sensors_are_the_predictor_s_answers_to_each_probe():
     config = replace(PAPER, sensor_source="learned")
-    net, x = network(config), torch.randn(9, config.input_dim(2))
+    net = network(config)
+    x = torch.randn(9, config.input_dim(2))
     z = net.sensor_inputs(x)
     each = [
         net.predictor.mean(torch.cat([z, probe.tanh().expand(9, 2)], dim=1)) for probe in net.probes
@@ -192,10 +200,12 @@ def test_learned_sensors_are_the_predictor_s_answers_to_each_probe():
 
 def test_the_predictor_answers_random_probes_and_ppo_trains_the_learned_ones(tmp_path, monkeypatch):
     monkeypatch.setattr("gaponet.nn.training.sensor_fit.FIT_STEPS", 200)
-    config, robot = replace(PAPER, sensor_source="learned"), write_arm(tmp_path)
+    config = replace(PAPER, sensor_source="learned")
+    robot = write_arm(tmp_path)
     env = DeltaEnv(recordings(robot, 2, rows=60, kp=0.5), robot, config, EnvOptions(64, nthread=1))
     net = network(config)
-    start, learner = net.probes.clone(), PPO(env, net, TRAINING.ppo)
+    start = net.probes.clone()
+    learner = PPO(env, net, TRAINING.ppo)
     assert fit_inputs(net, env, env.get_observations()["actor"], 256, 0, 1)["mean"] > 0.6
     fitted = copy.deepcopy(net.predictor.state_dict())
     learner.update()
@@ -216,7 +226,8 @@ def test_options_add_the_observation_to_the_branch_and_the_lag_to_the_trunk():
 
 
 def test_without_sensors_the_branch_sees_what_the_predictor_would_see():
-    net, with_sensors = network(replace(PAPER, sensor_source="none")), network()
+    net = network(replace(PAPER, sensor_source="none"))
+    with_sensors = network()
     x = torch.randn(5, PAPER.input_dim(2))
     seen = net.prepare(x)[:, net.queries :]
     assert torch.equal(seen, with_sensors.sensor_inputs(x))
@@ -233,7 +244,9 @@ def test_without_sensors_nothing_is_sampled():
 def test_equation_1_has_all_inputs_of_the_paper():
     net = build_network(ModelConfig(kind="paper", predictor_inputs="equation_1"), 10)
     state_with_history_and_payload = 141
-    target, recorded_state, joint_index = 10, 2 * 10 + 1, 10
+    target = 10
+    recorded_state = 2 * 10 + 1
+    joint_index = 10
     inputs = state_with_history_and_payload + target + recorded_state + joint_index
     assert net.predictor.net[0].in_features == inputs
     mean_and_variance_of_one_joint = 2 * (20 * 2)
@@ -241,7 +254,8 @@ def test_equation_1_has_all_inputs_of_the_paper():
 
 
 def test_in_equation_1_each_joint_s_sensor_values_are_one_network_s_answer_to_its_index():
-    net, x = network(EQUATION_1), torch.randn(9, EQUATION_1.input_dim(2))
+    net = network(EQUATION_1)
+    x = torch.randn(9, EQUATION_1.input_dim(2))
     z = net.sensor_inputs(x)
     mean, log_var = net.predictor(z)
     by_probe = mean.reshape(9, 4, 2, 2)  # (B, m, positions and velocities, n)
@@ -255,7 +269,8 @@ def test_in_equation_1_each_joint_s_sensor_values_are_one_network_s_answer_to_it
 
 @pytest.mark.parametrize("part", ["action", "payload", "real"])
 def test_in_equation_1_the_sensor_values_depend_on_target_payload_and_recorded_state(part):
-    net, x = network(EQUATION_1), torch.randn(5, EQUATION_1.input_dim(2))
+    net = network(EQUATION_1)
+    x = torch.randn(5, EQUATION_1.input_dim(2))
     moved = x.clone()
     moved[:, getattr(net.features.layout, part)] += 1.0
     before, after = (net.prepare(inputs)[:, net.queries :] for inputs in (x, moved))
@@ -264,7 +279,8 @@ def test_in_equation_1_the_sensor_values_depend_on_target_payload_and_recorded_s
 
 @pytest.mark.parametrize("config", [replace(PAPER, real_state=True), EQUATION_1])
 def test_a_rollout_never_observes_the_recorded_state(tmp_path, config):
-    robot, seen = write_arm(tmp_path), []
+    robot = write_arm(tmp_path)
+    seen = []
 
     def remember(x):
         seen.append(x.copy())
@@ -276,7 +292,8 @@ def test_a_rollout_never_observes_the_recorded_state(tmp_path, config):
 
 
 def test_on_a_robot_the_measured_state_reaches_the_predictor_of_equation_1(tmp_path):
-    net, robot = network(EQUATION_1), write_arm(tmp_path / "arm")
+    net = network(EQUATION_1)
+    robot = write_arm(tmp_path / "arm")
     export(net, tmp_path / "run", make_card(EQUATION_1, robot, dt=[0.02]), sample_inputs(net))
     hidden, measured = (GapModel.load(tmp_path / "run").loop() for _ in range(2))
     measured.extra = lambda: np.array([[0.05, -0.05, 0.1, 0.1, 1.0]])
@@ -306,7 +323,8 @@ def test_the_predictor_of_equation_1_is_fitted_and_ppo_does_not_train_it(tmp_pat
     motions = recordings(robot, 2, rows=60, kp=0.5)
     env = DeltaEnv(motions, robot, EQUATION_1, EnvOptions(64, nthread=1))
     net = network(EQUATION_1)
-    branch, learner = net.branch[0].weight.clone(), PPO(env, net, TRAINING.ppo)
+    branch = net.branch[0].weight.clone()
+    learner = PPO(env, net, TRAINING.ppo)
     assert fit_inputs(net, env, env.get_observations()["actor"], 256, 0, 1)["mean"] > 0.6
     fitted = copy.deepcopy(net.predictor.state_dict())
     learner.update()
@@ -350,7 +368,7 @@ def test_every_combination_of_switches_ships_or_is_refused(values):
     how = dict(zip(NETWORK_SWITCHES, values, strict=True))
     lacks_inputs = how["sensor_source"] != "predicted" or not how["payload_input"]
     if how["predictor_inputs"] == "equation_1" and lacks_inputs:
-        with pytest.raises(UsageError, match="predictor_inputs equation_1 with"):
+        with pytest.raises(UsageError, match="equation_1"):
             replace(PAPER, **how)
         return
     net = network(replace(PAPER, **how))
@@ -366,7 +384,8 @@ def test_every_combination_of_switches_ships_or_is_refused(values):
 
 
 def test_a_hidden_recorded_state_has_no_effect_and_a_visible_one_has():
-    net, plain = network(replace(PAPER, real_state=True)), network()
+    net = network(replace(PAPER, real_state=True))
+    plain = network()
     state = net.state_dict()
     state["branch.0.weight"] = state["branch.0.weight"][:, 5:]
     plain.load_state_dict(state)
@@ -415,19 +434,31 @@ def test_other_networks_refuse_the_paper_s_switches():
         {"real_state": True},
         {"predictor_inputs": "equation_1"},
     ):
-        with pytest.raises(UsageError, match="use --model paper"):
+        with pytest.raises(UsageError, match="--model"):
             build_network(ModelConfig(**how), 2)
-    with pytest.raises(UsageError, match="hold one of them"):
+    with pytest.raises(UsageError, match="hold"):
         replace(PAPER, delta_hold=3, sensor_hold=3)
 
 
 TRAINING = TrainConfig(
     PAPER,
-    pretraining=PretrainingConfig(rounds=1, num_envs=8, steps=30, gradient_steps=10, batch_size=64, sensor_states=64),
-    ppo=PPOConfig(num_envs=8, num_steps=8, mini_batches=2, epochs=1, critic_warmup=0, explained=-1e9, refit_sensors=2,
-                  critic_hidden=(16,)),
-    episode_s=0.5, validate_every=2, threads=1,
-)  # fmt: skip
+    pretraining=PretrainingConfig(
+        rounds=1, num_envs=8, steps=30, gradient_steps=10, batch_size=64, sensor_states=64
+    ),
+    ppo=PPOConfig(
+        num_envs=8,
+        num_steps=8,
+        mini_batches=2,
+        epochs=1,
+        critic_warmup=0,
+        explained=-1e9,
+        refit_sensors=2,
+        critic_hidden=(16,),
+    ),
+    episode_s=0.5,
+    validate_every=2,
+    threads=1,
+)
 
 
 @pytest.fixture(autouse=True)

@@ -17,7 +17,9 @@ LIMIT = np.nextafter(np.float64(np.float32(0.1)), 0)  # just below a float32 num
 
 
 def ensemble(base=0.01):
-    """An ensemble as scikit-learn stores it: one tree that splits input 2 at LIMIT and its right half again."""
+    """An ensemble as scikit-learn stores it: one tree that splits input 2 at LIMIT and its right
+    half again.
+    """
     fields = {
         "value": float,
         "feature_idx": int,
@@ -26,8 +28,13 @@ def ensemble(base=0.01):
         "right": int,
         "is_leaf": bool,
     }
-    rows = [(9.0, 2, LIMIT, 1, 2, False), (-0.02, 0, 0, 0, 0, True), (9.0, 2, 0.5, 4, 3, False),
-            (0.05, 0, 0, 0, 0, True), (0.03, 0, 0, 0, 0, True)]  # fmt: skip
+    rows = [
+        (9.0, 2, LIMIT, 1, 2, False),
+        (-0.02, 0, 0, 0, 0, True),
+        (9.0, 2, 0.5, 4, 3, False),
+        (0.05, 0, 0, 0, 0, True),
+        (0.03, 0, 0, 0, 0, True),
+    ]
     nodes = np.array(rows, list(fields.items()))
     return SimpleNamespace(
         _predictors=[(SimpleNamespace(nodes=nodes),)], _baseline_prediction=np.array([[base]])
@@ -40,9 +47,8 @@ def test_stored_trees_answer_as_they_are_written_in_torch_and_onnx():
     with torch.no_grad():
         net._store(1, ensemble())
     x = torch.zeros(4, config.input_dim(2))
-    x[:, 2] = torch.tensor(
-        [-1.0, 0.1, 0.3, 0.6]
-    )  # velocity of the first joint; 0.1 is above LIMIT in float64
+    # Velocity of the first joint; 0.1 is above LIMIT in float64.
+    x[:, 2] = torch.tensor([-1.0, 0.1, 0.3, 0.6])
     expected = [[0, -0.01], [0, 0.04], [0, 0.04], [0, 0.06]]
     np.testing.assert_allclose(net(x).detach().numpy(), expected, atol=1e-7)
     np.testing.assert_allclose(OnnxNetwork(onnx_content(net))(x.numpy()), expected, atol=1e-7)

@@ -33,7 +33,8 @@ def moving(arm):
     time = np.arange(1000) * 0.001
     ctrl = np.stack([0.3 + 0.4 * np.sin(5 * time), 0.2 + 0.5 * np.sin(7 * time)], axis=1)
     robots.reset(ctrl[:1], [0])
-    force, friction = robots.batch.bind("actuator_force"), robots.batch.bind("qfrc_constraint")
+    force = robots.batch.bind("actuator_force")
+    friction = robots.batch.bind("qfrc_constraint")
     rows = []
     for row in ctrl:
         robots.step(row[None])
@@ -61,22 +62,23 @@ def test_work_becomes_energy_and_heat_and_torques_add_up_to_what_moves_the_links
     work = (middle(force + friction + cogging) * middle(qvel)).sum() * h
     heat = (model.dof_damping * middle(qvel) ** 2).sum() * h
     turned_over = (np.abs(middle(force) * middle(qvel))).sum() * h
-    assert energy[-1] - energy[0] == pytest.approx(
-        work - heat, abs=0.02 * turned_over
-    )  # within 2 % of the motor's work
+    # Within 2 % of the motor's work.
+    assert energy[-1] - energy[0] == pytest.approx(work - heat, abs=0.02 * turned_over)
     assert (middle(friction) * middle(qvel)).sum() < 0  # friction only takes
     data = mujoco.MjData(model)
     acceleration = np.gradient(qvel, 0.001, axis=0)
-    needed, given = [], []
+    needed = []
+    given = []
     flags = model.opt.disableflags
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
     for t in range(100, 900):
-        data.qpos, data.qvel, data.qacc = qpos[t], qvel[t], acceleration[t]
+        data.qpos = qpos[t]
+        data.qvel = qvel[t]
+        data.qacc = acceleration[t]
         mujoco.mj_inverse(model, data)
         needed.append(data.qfrc_inverse.copy())
         given.append(force[t] + friction[t] + cogging[t])
     model.opt.disableflags = flags
     error = np.abs(np.array(needed) - np.array(given))
-    assert (
-        np.median(error) < 0.01 * np.abs(needed).max()
-    )  # within 1 % of the largest torque; turning points are noisier
+    # Within 1 % of the largest torque; turning points are noisier.
+    assert np.median(error) < 0.01 * np.abs(needed).max()

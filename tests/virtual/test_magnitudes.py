@@ -12,7 +12,9 @@ MOTIONS = ("reach-both-0", "pick_and_place-both-0", "sweep-left_shoulder_roll")
 
 
 def test_four_numbers_leave_of_the_hard_fleet_what_real_arms_leave():
-    """Gap and rest are of the size of a real SO-101's (19 and 4.4 mrad) and of the paper's H1-2 (12 to 15 left)."""
+    """Gap and rest are of the size of a real SO-101's (19 and 4.4 mrad) and of the paper's H1-2
+    (12 to 15 left).
+    """
     robot = load_robot("h1_2")
     recipe = Recipe("test", (0.0, 3.0), ("virtual-4",), MOTIONS)
     recorded = play(

@@ -64,9 +64,8 @@ def test_warmth_takes_from_dry_friction_and_not_from_the_gears_part():
     assert float(value[0, 0]) == pytest.approx(0.5 * 1.2 + 2.0)
     thermal = Thermal(one(thinning=0.01))
     thermal.reset(np.array([[45.0]]))
-    assert float(thermal.thinning_factor()[0, 0]) == pytest.approx(
-        np.exp(-0.2)
-    )  # 20 K: 82 % is left
+    # 20 K: 82 % is left
+    assert float(thermal.thinning_factor()[0, 0]) == pytest.approx(np.exp(-0.2))
 
 
 def slide(bristles, path, g=1.2, h=1e-3):
@@ -77,8 +76,10 @@ def slide(bristles, path, g=1.2, h=1e-3):
 
 
 def test_bristles_bend_as_the_exponential_of_dahl():
-    # σ = (0.2 + 1.0) / 2 mrad = 600 N·m/rad; after 2 mrad one way 1 − 1/e of the limit, after 20 mrad all of it
-    p, cold = one(friction=1.0, presliding=0.002), np.array([[0.0]])
+    # σ = (0.2 + 1.0) / 2 mrad = 600 N·m/rad; after 2 mrad one way 1 − 1/e of the limit, after 20
+    # mrad all of it
+    p = one(friction=1.0, presliding=0.002)
+    cold = np.array([[0.0]])
     bristles = Bristles(p, np.array([0.2]))
     bristles.reset(cold, np.array([[1.2]]))
     assert slide(bristles, [0.01] * 200) == pytest.approx(1.2 * (1 - np.exp(-1)))
@@ -107,7 +108,8 @@ def test_torque_falls_from_the_corner_to_the_no_load_speed():
 
 def test_backlash_is_crossed_in_the_time_of_a_free_rotor():
     play = Backlash(one(backlash=0.02), np.array([0.1]))
-    torque, h = np.array([[1.0]]), 1e-4
+    torque = np.array([[1.0]])
+    h = 1e-4
     play.reset(-torque)
     steps = next(k for k in range(1, 10000) if play.step(torque, h)[0, 0] == 1.0)
     assert steps * h == pytest.approx(np.sqrt(2 * 0.02 * 0.1 / 1.0), rel=0.01)  # 63 ms
@@ -183,7 +185,8 @@ def played(physics, chances, times, dt=0.02):
     """Commands 1, 2, 3, … sent every dt; what is in force at `times`."""
     link = CommandLink(physics, dt)
     link.reset(np.array([[0.0]]))
-    sent, out = 0, []
+    sent = 0
+    out = []
     for time in times:
         while sent * dt <= time + 1e-12:
             link.send(np.array([[sent + 1.0]]), sent * dt, np.array([chances[sent % len(chances)]]))

@@ -8,6 +8,7 @@ import pytest
 import gaponet
 
 PACKAGE = Path(gaponet.__file__).parent
+# __init__.py only names what users import
 OPEN = (
     "virtual",
     "experiments",
@@ -15,7 +16,7 @@ OPEN = (
     "cli",
     "__init__.py",
     "__pycache__",
-)  # __init__.py only names what users import
+)
 BLIND = [p for p in PACKAGE.iterdir() if p.name not in OPEN]
 
 

@@ -1,4 +1,6 @@
-"""A virtual robot as a whole: with all effects off it is the nominal simulator, and each effect shows its signature."""
+"""A virtual robot as a whole: with all effects off it is the nominal simulator, and each effect
+shows its signature.
+"""
 
 from dataclasses import fields, replace
 
@@ -24,7 +26,9 @@ def unit(n=2, **values):
 
 
 def run(robot, units, ctrl, payload=0.0, dt=0.02, start=None, **how):
-    """Play (T, n) targets on every unit; true positions after each period (T, N, n) and the robots."""
+    """Play (T, n) targets on every unit; true positions after each period (T, N, n) and the
+    robots.
+    """
     robots = VirtualRobot(robot, units, [(payload, "both")] * len(units), dt, **how)
     every = lambda row: np.repeat(row[None], len(units), axis=0)  # noqa: E731
     robots.reset(
@@ -82,41 +86,37 @@ def test_a_row_does_not_depend_on_its_company(arm):
 
 
 def test_a_weak_drive_sags_by_the_torque_over_what_it_delivers(arm):
-    # holding level: τ = 9.81 · (0.3·0.1 + 0.2·0.3) = 0.883 N·m at the shoulder; friction off to see PD alone
+    # holding level: τ = 9.81 · (0.3·0.1 + 0.2·0.3) = 0.883 N·m at the shoulder; friction off to see
+    # PD alone
     model = build_model(arm)
     path, _ = run(arm, [unit(kp_scale=0.8), unit(kt_scale=0.8), unit()], hold(0.0, seconds=3.0))
     for i, share in enumerate((0.8, 0.8, 1.0)):
         q = path[-1, i]
         torque = static_torque(model, q[None])[0]
-        assert (0.0 - q) * KP * share == pytest.approx(
-            torque, abs=0.06
-        )  # the nominal friction band, 0.05 N·m
+        # The nominal friction band, 0.05 N·m.
+        assert (0.0 - q) * KP * share == pytest.approx(torque, abs=0.06)
 
 
 def test_friction_opens_a_hysteresis_loop_of_twice_its_torque(arm):
     time = np.arange(0, 12, 0.02)
-    slow = 1.2 + 0.2 * np.abs(
-        (time / 6 + 1) % 2 - 1
-    )  # up and down at 33 mrad/s, the arm nearly hanging
+    # Up and down at 33 mrad/s, the arm nearly hanging.
+    slow = 1.2 + 0.2 * np.abs((time / 6 + 1) % 2 - 1)
     ctrl = np.stack([slow, np.zeros_like(slow)], axis=1)
     width = {}
     for friction in (0.0, 0.3):
         path, _ = run(arm, [unit(friction=friction)], ctrl)
         q = path[:, 0, 0]
-        width[friction] = (
-            q[len(q) * 3 // 4] - q[len(q) // 4]
-        )  # same command, coming down and going up
-    assert width[0.0] == pytest.approx(
-        2 * 0.05 / KP + 2 * 0.5 * 0.033 / KP, abs=1e-3
-    )  # nominal friction and damping
+        # Same command, coming down and going up.
+        width[friction] = q[len(q) * 3 // 4] - q[len(q) // 4]
+    # Nominal friction and damping.
+    assert width[0.0] == pytest.approx(2 * 0.05 / KP + 2 * 0.5 * 0.033 / KP, abs=1e-3)
     assert width[0.3] - width[0.0] == pytest.approx(2 * 0.3 / KP, rel=0.1)
 
 
 def test_a_stuck_joint_does_not_creep(arm):
     path, _ = run(arm, [unit(friction=0.5)], hold(0.4, seconds=5.0), start=np.array([0.42, 0.01]))
-    assert (
-        np.abs(path[-1] - path[50]).max() < 1.2e-4
-    )  # friction is a stiff constraint, not a rigid one: 20 µrad/s
+    # Friction is a stiff constraint, not a rigid one: 20 µrad/s.
+    assert np.abs(path[-1] - path[50]).max() < 1.2e-4
 
 
 HANGING = np.array([1.4, np.pi / 2 - 1.4])  # no weight on the elbow
@@ -133,7 +133,8 @@ def test_bristles_give_way_like_a_spring_and_come_back(arm):
         arm, [unit(friction=1.0, presliding=0.02), unit(friction=1.0)], ctrl, start=HANGING
     )
     q = path[:, :, 1] - HANGING[1]
-    # 20 (0.02 − x) = 1.05 (1 − exp(−x / 0.02)) at 6.15 mrad; back, −20 x = −1.05 + 1.33 exp(−(6.15 mrad − x) / 0.02)
+    # 20 (0.02 − x) = 1.05 (1 − exp(−x / 0.02)) at 6.15 mrad; back, −20 x = −1.05 + 1.33 exp(−(6.15
+    # mrad − x) / 0.02)
     assert q[49, 0] == pytest.approx(6.15e-3, rel=0.03)
     assert q[-1, 0] == pytest.approx(0.85e-3, abs=0.2e-3)
     assert np.abs(q[:, 1]).max() < 1e-4  # rigid friction holds
@@ -151,13 +152,11 @@ def test_a_compliant_joint_hangs_below_what_its_encoder_says(arm):
     twist = seen[:, 0] - path[-1, :, 0]
     load = static_torque(build_model(arm), path[-1, :1])[0, 0]
     assert abs(load) == pytest.approx(0.883, rel=0.05)
-    assert twist[0] == pytest.approx(
-        0.1 * load / 5.0, abs=0.05 * 0.1 / 5.0
-    )  # less what friction carries
+    # Less what friction carries.
+    assert twist[0] == pytest.approx(0.1 * load / 5.0, abs=0.05 * 0.1 / 5.0)
     assert twist[1] == 0.0
-    assert seen[0, 0] == pytest.approx(
-        seen[1, 0], abs=0.006
-    )  # the drive holds its own side as well as ever
+    # The drive holds its own side as well as ever.
+    assert seen[0, 0] == pytest.approx(seen[1, 0], abs=0.006)
 
 
 def test_the_current_loop_delays_by_its_time_constant(arm):
@@ -175,16 +174,18 @@ def test_delay_holds_the_joint_still_until_it_has_passed(arm):
     ctrl = np.concatenate([hold(1.0, seconds=0.2), hold(1.2, seconds=0.3)])
     path, _ = run(arm, [unit(), unit(delay=0.06)], ctrl)
     begun = np.abs(path - path[0]) > 1e-4
+    # Three periods of 20 ms later.
     assert [int(begun[:, i, 0].argmax()) for i in range(2)] == [
         10,
         13,
-    ]  # three periods of 20 ms later
+    ]
 
 
 def test_a_cable_pulls_towards_its_angle(arm):
     path, _ = run(arm, [unit(), unit(cable_stiffness=4.0, cable_angle=-1.0)], hold(1.4, 0.3, 2.0))
     q0, q1 = path[-1, :, 1]
-    # 20 (0.3 − q) + 4 (−1 − q) = gravity, and 20 (0.3 − q0) = the same gravity: q = (20 q0 − 4) / 24
+    # 20 (0.3 − q) + 4 (−1 − q) = gravity, and 20 (0.3 − q0) = the same gravity: q = (20 q0 − 4) /
+    # 24
     assert q1 == pytest.approx((20 * q0 - 4) / 24, abs=0.01)
 
 
@@ -199,7 +200,8 @@ def test_heavier_links_and_a_leaning_base_change_the_sag(arm):
 
 def test_a_bent_cable_widens_the_loop_of_its_neighbour(arm):
     ctrl = hold(0.0) + np.stack([np.zeros(50), 0.3 * np.sin(np.linspace(0, 6 * np.pi, 50))], axis=1)
-    bent, straight = ctrl + np.array([1.2, 0.0]), ctrl
+    bent = ctrl + np.array([1.2, 0.0])
+    straight = ctrl
     behind = []
     for motion in (straight, bent):
         path, _ = run(arm, [unit(), unit(drag=0.5)], motion)
@@ -258,15 +260,15 @@ def test_a_hot_drive_takes_gain_back(arm):
 
 
 def test_readings_are_quantised_shifted_and_noisy_but_the_robot_is_not(arm):
-    step, offset = 0.01, 0.03
+    step = 0.01
+    offset = 0.03
     physics = unit(encoder_step=step, zero_offset=offset, current_noise=0.2, velocity_noise=0.1)
     plain, _ = run(arm, [unit()], hold(1.0, seconds=2.0))
     path, robots = run(arm, [physics], hold(1.0, seconds=2.0))
     reading = robots.read()
     assert np.allclose(reading.qpos / step, np.round(reading.qpos / step))
-    assert path[-1, 0] == pytest.approx(
-        plain[-1, 0] - offset, abs=6e-3
-    )  # it believes to be where it was told
+    # It believes to be where it was told.
+    assert path[-1, 0] == pytest.approx(plain[-1, 0] - offset, abs=6e-3)
     assert reading.qpos[0] == pytest.approx(path[-1, 0] + offset, abs=step / 2 + 1e-9)
     taus = []
     for _ in range(200):
@@ -292,13 +294,14 @@ def test_current_tells_the_torque_that_the_motor_was_asked_for(arm):
 def test_every_effect_has_a_switch_that_matters(arm, effect):
     """With one effect switched on, something that is seen differs from the robot without any."""
     physics = load_fleet("shifted", arm).unit("virtual-1").only([effect])
+    # Not in that fleet.
     if effect in (
         "presliding",
         "thinning",
         "compliance",
         "current_loop",
         "torque_speed",
-    ):  # not in that fleet
+    ):
         physics = load_fleet("hard", arm).unit("virtual-1").only([effect])
         physics = replace(physics, no_load_speed=physics.no_load_speed / 10)
     if effect in ("drag", "churning", "limb_current", "derating", "smoothing", "flex", "grip"):

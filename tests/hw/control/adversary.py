@@ -1,12 +1,14 @@
-"""Random and adversarial states through the controller, a compensator and the limits, judged against the true state.
+"""Random and adversarial states through the controller, a compensator and the limits, judged
+against the true state.
 
     python tests/hw/control/adversary.py --states 1000000 --seed 0
 
-In simulated time. The true joints (14 arm joints of an H1-2) accelerate as they like, up to what SafetyConfig states;
-what is read is true but up to 50 ms old, now and then NaN, frozen, displaced or absent; targets and corrections are
-anything; the clock stops wherever it can: in reading, in the policy, in the compensator, between any two looks at it.
-Every command is judged when it is written: by the range, the rate since the last one, and the torque that it asks of
-the joint where it truly is. Prints counts as JSON; exit code 1 if a command was wrong.
+In simulated time. The true joints (14 arm joints of an H1-2) accelerate as they like, up to what
+SafetyConfig states; what is read is true but up to 50 ms old, now and then NaN, frozen, displaced
+or absent; targets and corrections are anything; the clock stops wherever it can: in reading, in the
+policy, in the compensator, between any two looks at it. Every command is judged when it is written:
+by the range, the rate since the last one, and the torque that it asks of the joint where it truly
+is. Prints counts as JSON; exit code 1 if a command was wrong.
 """
 
 from __future__ import annotations
@@ -33,9 +35,8 @@ from gaponet.robot.spec import RobotSpec
 
 Array = np.ndarray
 SAFETY = SafetyConfig()
-FIRST = (
-    0.05 + 0.02 * SAFETY.delta_rate
-)  # rad by which the first command may be off: a step of blend and correction
+# Rad by which the first command may be off: a step of blend and correction.
+FIRST = 0.05 + 0.02 * SAFETY.delta_rate
 STOP = 0.0005  # chance of a stop at each look at the clock
 
 
@@ -44,7 +45,8 @@ class Stopping(SimulatedClock):
 
     def __init__(self, rng: np.random.Generator) -> None:
         super().__init__()
-        self.rng, self.stops = rng, 0
+        self.rng = rng
+        self.stops = 0
 
     def now(self) -> float:
         if self.rng.random() < STOP:
@@ -76,26 +78,29 @@ class Adversary:
     """A `Driver` whose joints go where they want."""
 
     reads_back = True
-    virtual, noisy, at_end, qpos_range, address = (
-        True,
-        True,
-        "hand_over",
-        None,
-        f"adversary in process {os.getpid()}",
-    )
+    virtual = True
+    noisy = True
+    at_end = "hand_over"
+    qpos_range = None
+    address = f"adversary in process {os.getpid()}"
 
     def __init__(
         self, robot: RobotSpec, clock: Stopping, rng: np.random.Generator, count: Count
     ) -> None:
-        self.robot, self.clock, self.rng, self.count = robot, clock, rng, count
-        self.joint_names, self.kp, self.kd, self.facts = robot.joint_names, robot.kp, robot.kd, {}
+        self.robot = robot
+        self.clock = clock
+        self.rng = rng
+        self.count = count
+        self.joint_names = robot.joint_names
+        self.kp = robot.kp
+        self.kd = robot.kd
+        self.facts = {}
         self.commanded = MOTOR_NAMES[13:]
         self.at = robot.index(self.commanded)
         self.limits = Limits.from_robot(robot, self.commanded, SAFETY)
         n = len(robot.joint_names)
-        self.obeys = rng.choice(
-            [0.0, 100.0, 300.0]
-        )  # 1/s², how the joints are drawn to their commands
+        # 1/s², how the joints are drawn to their commands
+        self.obeys = rng.choice([0.0, 100.0, 300.0])
         self.goal = np.clip(robot.qpos_home + 0.3 * rng.standard_normal(n), *robot.qpos_range.T)
         # Time, position, speed, and the acceleration from then on.
         self.knots = [(0.0, self.goal.copy(), np.zeros(n), np.zeros(n))]
@@ -114,7 +119,8 @@ class Adversary:
         return q + v * s + a * s * s / 2, v + a * s
 
     def read(self) -> State:
-        rng, now = self.rng, self.clock.now()
+        rng = self.rng
+        now = self.clock.now()
         q, v = self.truth(now)
         push = rng.uniform(-1, 1, len(q)) if rng.random() < 0.7 else rng.choice([-1.0, 1.0], len(q))
         strength = SAFETY.acceleration * rng.choice([0.02, 0.2, 1.0], p=[0.6, 0.3, 0.1])
@@ -128,7 +134,8 @@ class Adversary:
             now - rng.choice([0.0, 0.002, 0.01, 0.03, 0.05], p=[0.5, 0.3, 0.15, 0.04, 0.01]), oldest
         )
         q, v = self.truth(when)
-        tau, hot = rng.standard_normal(len(q)), np.full(len(q), 40.0)
+        tau = rng.standard_normal(len(q))
+        hot = np.full(len(q), 40.0)
         self.count.states += 1
         self.last = self._spoiled(State(when, q, v, tau, hot))
         return self.last
@@ -154,12 +161,15 @@ class Adversary:
 
     def write(self, ctrl: Array, weight: float = 1.0) -> None:
         q, v = (x[self.at] for x in self.truth(self.clock.true))
-        u, limits, count = ctrl[self.at], self.limits, self.count
+        u = ctrl[self.at]
+        limits = self.limits
+        count = self.count
         torque = np.abs(limits.kp * (u - q) - limits.kd * v)
         # the first goal is the measured place, also where that is beyond the margin
         if self.before is None:
             found = self.last.qpos[self.at]
-            self.low, self.high = np.minimum(limits.low, found), np.maximum(limits.high, found)
+            self.low = np.minimum(limits.low, found)
+            self.high = np.maximum(limits.high, found)
             if np.abs(u - found).max() > FIRST:
                 count.wrong["first goal"] += 1
         believed = self.last is not None and np.abs(self.last.qpos[self.at] - q).max() < 1.0
@@ -204,7 +214,8 @@ class Wild:
     """A compensator that corrects by anything."""
 
     def __init__(self, rng: np.random.Generator, clock: Stopping) -> None:
-        self.rng, self.clock = rng, clock
+        self.rng = rng
+        self.clock = clock
         self.size = rng.choice([0.0, 0.05, 1.0])
 
     def reset(self, target: Array, payload_mass: float | None = None) -> None:
@@ -220,7 +231,8 @@ def episode(robot: RobotSpec, rng: np.random.Generator, count: Count) -> None:
     """One controller's life."""
     clock = Stopping(rng)
     driver = Adversary(robot, clock, rng, count)
-    amplitude, wave = rng.choice([0.1, 0.5, 4.0]), rng.uniform(0.5, 8.0, len(robot.joint_names))
+    amplitude = rng.choice([0.1, 0.5, 4.0])
+    wave = rng.uniform(0.5, 8.0, len(robot.joint_names))
     length = int(rng.integers(50, 400))
 
     def policy(k: int, state: State) -> Array | Fault | None:
@@ -252,7 +264,8 @@ def episode(robot: RobotSpec, rng: np.random.Generator, count: Count) -> None:
 
 def attack(robot: RobotSpec, states: int, seed: int) -> Count:
     """Episodes until that many states were read."""
-    count, k = Count(), 0
+    count = Count()
+    k = 0
     gc.freeze()  # each controller collects garbage once
     try:
         while count.states < states:
@@ -270,7 +283,8 @@ def main() -> None:
     parser.add_argument("--states", type=int, default=1_000_000)
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args()
-    robot, began = load_robot("h1_2"), time.monotonic()
+    robot = load_robot("h1_2")
+    began = time.monotonic()
     count = attack(robot, args.states, args.seed)
     result = vars(count) | {"ends": dict(count.ends), "wrong": dict(count.wrong)}
     result["seconds"] = round(time.monotonic() - began)

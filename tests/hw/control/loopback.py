@@ -1,4 +1,5 @@
-"""The Unitree driver and the virtual H1-2 on a bus that is a list, in simulated time, and a judge of what arrives.
+"""The Unitree driver and the virtual H1-2 on a bus that is a list, in simulated time, and a judge
+of what arrives.
 
 Nothing of DDS is needed.
 """
@@ -26,7 +27,8 @@ DRIFT_RAD_S = 0.2  # of an encoder
 class Loopback:
     """Stands in for drivers.dds: a message that is sent arrives at once."""
 
-    LowState, LowCmd = "LowState", "LowCmd"
+    LowState = "LowState"
+    LowCmd = "LowCmd"
 
     def __init__(self) -> None:
         self.queues: dict[str, list[deque]] = defaultdict(list)
@@ -78,7 +80,8 @@ class LoopbackReader:
 class Disobedient(VirtualH12):
     """From some time after the first command on it does not do as told, in one way."""
 
-    way, at = "", 0.0
+    way = ""
+    at = 0.0
 
     def _apply(self, topic: str, data: np.ndarray, now: float) -> None:
         wrong = now - (self.first_command or now) >= self.at
@@ -185,12 +188,14 @@ def received(robot: VirtualH12) -> dict[str, list]:
 def judge(
     recording: Recording, received: dict[str, list], robot: RobotSpec, safety: SafetyConfig
 ) -> None:
-    """Assert that commands stayed within the limits, and that damping was for good; `received` is in motor order.
+    """Assert that commands stayed within the limits, and that damping was for good; `received` is
+    in motor order.
 
     Args:
         received: ctrl, kp, weight: what arrived at the robot.
     """
-    joints, torso = robot.index(recording.commanded), robot.index(["torso_joint"])[0]
+    joints = robot.index(recording.commanded)
+    torso = robot.index(["torso_joint"])[0]
     ctrl, kp = (np.array(received[name]) for name in ("ctrl", "kp"))
     limits = Limits.from_robot(robot, recording.commanded, safety)
     stiff = (kp[:, joints] > 0).all(axis=1)

@@ -1,10 +1,11 @@
-"""The other end of the wire: a program on Unitree's public IDL and the cyclonedds 0.10.2 that its SDK pins. No gaponet.
+"""The other end of the wire: a program on Unitree's public IDL and the cyclonedds 0.10.2 that its
+SDK pins. No gaponet.
 
     python peer.py robot|client DOMAIN SECONDS
 
-robot: rt/lowstate at 100 Hz, joints follow rt/arm_sdk. client: hears rt/lowstate, swings an elbow over rt/arm_sdk. Both
-use the SDK's own configuration of the bus for interface lo, and print one JSON line at the end.
-Runs in an environment of its own (test_peers.py).
+robot: rt/lowstate at 100 Hz, joints follow rt/arm_sdk. client: hears rt/lowstate, swings an elbow
+over rt/arm_sdk. Both use the SDK's own configuration of the bus for interface lo, and print one
+JSON line at the end. Runs in an environment of its own (test_peers.py).
 """
 
 import json
@@ -25,7 +26,9 @@ from cyclonedds.topic import Topic
 
 CONFIG = """<?xml version="1.0" encoding="UTF-8" ?><CycloneDDS><Domain Id="any"><General><Interfaces>
 <NetworkInterface name="lo" priority="default" multicast="default" /></Interfaces></General></Domain></CycloneDDS>"""
-ELBOW, WEIGHT, MOTORS = 16, 27, 27
+ELBOW = 16
+WEIGHT = 27
+MOTORS = 27
 
 
 @dataclass
@@ -130,20 +133,35 @@ def packed(message: LowState | LowCmd) -> bytes:
 
 
 def robot(part: DomainParticipant, seconds: float) -> dict:
-    """Be an H1-2 that nobody pushes: commanded joints follow by their weight, all readings are a little noisy."""
+    """Be an H1-2 that nobody pushes: commanded joints follow by their weight, all readings are a
+    little noisy.
+    """
     writer = DataWriter(part, Topic(part, "rt/lowstate", LowState))
     reader = DataReader(part, Topic(part, "rt/arm_sdk", LowCmd))
-    q, heard, wrong, last, stiff, start = [0.0] * MOTORS, 0, 0, None, 0.0, time.monotonic()
+    q = [0.0] * MOTORS
+    heard = 0
+    wrong = 0
+    last = None
+    stiff = 0.0
+    start = time.monotonic()
     q[13], q[20] = 0.2, 0.2
     state = LowState(
-        [1, 0], 0, 6, 0, IMUState([1.0, 0, 0, 0], [0.0] * 3, [0.0] * 3, [0.0] * 3, 30),
-        [MotorState(0, 0, 0, 0, 0, [0, 0], 0, [0, 0], 0, [0] * 4) for _ in range(35)], [0] * 40, [0] * 4, 0,
-    )  # fmt: skip
+        [1, 0],
+        0,
+        6,
+        0,
+        IMUState([1.0, 0, 0, 0], [0.0] * 3, [0.0] * 3, [0.0] * 3, 30),
+        [MotorState(0, 0, 0, 0, 0, [0, 0], 0, [0, 0], 0, [0] * 4) for _ in range(35)],
+        [0] * 40,
+        [0] * 4,
+        0,
+    )
     while (now := time.monotonic() - start) < seconds:
         for command in reader.take(N=10):
             if not isinstance(command, LowCmd):
                 continue
-            heard, last = heard + 1, command.motor_cmd[WEIGHT].q
+            heard = heard + 1
+            last = command.motor_cmd[WEIGHT].q
             wrong += command.crc != crc(packed(command))
             stiff = max(stiff, max(m.kp for m in command.motor_cmd))
             for k in range(13, MOTORS):
@@ -151,14 +169,13 @@ def robot(part: DomainParticipant, seconds: float) -> dict:
                     q[k] += last * (command.motor_cmd[k].q - q[k])
         state.tick = int(now * 1000)
         for k in range(MOTORS):
-            m, noise = state.motor_state[k], random.gauss(0, 1)
-            m.mode, m.q, m.dq, m.tau_est, m.temperature = (
-                1,
-                q[k] + 1e-5 * noise,
-                1e-3 * noise,
-                0.1 * noise,
-                [35, 36],
-            )
+            m = state.motor_state[k]
+            noise = random.gauss(0, 1)
+            m.mode = 1
+            m.q = q[k] + 1e-5 * noise
+            m.dq = 1e-3 * noise
+            m.tau_est = 0.1 * noise
+            m.temperature = [35, 36]
         state.crc = crc(packed(state))
         writer.write(state)
         time.sleep(max(0.0, 0.01 - (time.monotonic() - start - now)))
@@ -169,12 +186,17 @@ def client(part: DomainParticipant, seconds: float) -> dict:
     """Hear states, and swing the left elbow once they come."""
     writer = DataWriter(part, Topic(part, "rt/arm_sdk", LowCmd))
     reader = DataReader(part, Topic(part, "rt/lowstate", LowState))
-    heard, wrong, home, moved, start = 0, 0, None, 0.0, time.monotonic()
+    heard = 0
+    wrong = 0
+    home = None
+    moved = 0.0
+    start = time.monotonic()
     while (now := time.monotonic() - start) < seconds:
         newest = None
         for state in reader.take(N=100):
             if isinstance(state, LowState):
-                heard, newest = heard + 1, state
+                heard = heard + 1
+                newest = state
         if newest is not None:
             wrong += newest.crc != crc(packed(newest))
             home = home or ([m.q for m in newest.motor_state], now)

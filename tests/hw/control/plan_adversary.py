@@ -1,11 +1,13 @@
-"""Random found poses and hostile live targets against plan and fence, judged by MuJoCo's own collision (contacts.py).
+"""Random found poses and hostile live targets against plan and fence, judged by MuJoCo's own
+collision (contacts.py).
 
     PYTHONPATH=tests python tests/hw/control/plan_adversary.py --poses 1000 --seconds 60 --seed 0
 
-Plans: poses over the joints' whole ranges in which the robot touches neither itself nor the plane (h1_2: arms and
-torso), a motion of the package each, planned from there and back; a plan is judged every 0.02 rad. Live: the virtual
-robots in simulated time, whose targets go for the plane, the body and the ends of the ranges as fast as may be; what
-was commanded and where the robot was is judged in every period. Prints counts as JSON; exit code 1 if anything touches.
+Plans: poses over the joints' whole ranges in which the robot touches neither itself nor the plane
+(h1_2: arms and torso), a motion of the package each, planned from there and back; a plan is judged
+every 0.02 rad. Live: the virtual robots in simulated time, whose targets go for the plane, the body
+and the ends of the ranges as fast as may be; what was commanded and where the robot was is judged
+in every period. Prints counts as JSON; exit code 1 if anything touches.
 """
 
 from __future__ import annotations
@@ -50,8 +52,11 @@ def found_pose(robot: RobotSpec, judge: Contacts, rng: np.random.Generator) -> A
 
 
 def plans(robot: RobotSpec, poses: int, seed: int, motions: int | None = None) -> dict[str, Any]:
-    """What came of planning that many times; `motions`: how many of the package's are taken, default all."""
-    rng, judge = np.random.default_rng(seed), Contacts(robot)
+    """What came of planning that many times; `motions`: how many of the package's are taken,
+    default all.
+    """
+    rng = np.random.default_rng(seed)
+    judge = Contacts(robot)
     library = Library(robot, max_payload=ROBOTS[robot.name])
     moved = tuple(n for n in robot.joint_names if n in robot.operated or robot.name == "so101")
     names = [
@@ -63,9 +68,13 @@ def plans(robot: RobotSpec, poses: int, seed: int, motions: int | None = None) -
     names = names if motions is None else rng.choice(names, motions, replace=False).tolist()
     planner = Planner(robot, moved, limits=library.limits)
     count: Counter[str] = Counter()
-    seconds, refused, touching, straight = [], [], [], []
+    seconds = []
+    refused = []
+    touching = []
+    straight = []
     for k in range(poses):
-        found, motion = found_pose(robot, judge, rng), library.make(names[k % len(names)])
+        found = found_pose(robot, judge, rng)
+        motion = library.make(names[k % len(names)])
         began = time.process_time()
         try:
             plan = planner.plan(motion, found)
@@ -81,20 +90,29 @@ def plans(robot: RobotSpec, poses: int, seed: int, motions: int | None = None) -
         if depth > 0:
             touching.append(f"{motion.name}: {pair} {depth:.4f} m")
     return {
-        "poses": poses, "motions": len(names), **count, "touching": len(touching), "examples": touching[:3],
+        "poses": poses,
+        "motions": len(names),
+        **count,
+        "touching": len(touching),
+        "examples": touching[:3],
         "straight ways that would touch": int(np.sum(np.array(straight) > 0)),
         "planning s: p50, max": [round(float(f(seconds)), 2) for f in (np.median, np.max)],
         "refused because": Counter(refused).most_common(3),
-    }  # fmt: skip
+    }
 
 
 class Hostile:
-    """Targets that go for the plane, for the body and for the ends of the ranges, at the fastest that is taken."""
+    """Targets that go for the plane, for the body and for the ends of the ranges, at the fastest
+    that is taken.
+    """
 
     def __init__(
         self, robot: RobotSpec, judge: Contacts, rng: np.random.Generator, seconds: float
     ) -> None:
-        self.robot, self.rng, self.judge, self.periods = robot, rng, judge, round(seconds / DT)
+        self.robot = robot
+        self.rng = rng
+        self.judge = judge
+        self.periods = round(seconds / DT)
         self.touching = 0
         self.low, self.high = robot.qpos_range.T
         self.still = ["hip" in n or "knee" in n or "ankle" in n for n in robot.joint_names]
@@ -109,7 +127,8 @@ class Hostile:
         if k >= self.periods:
             return None
         if k == 0:  # until it is there
-            self.goal, self.speed = self.robot.qpos_home, 1.0
+            self.goal = self.robot.qpos_home
+            self.speed = 1.0
         elif k % 20 == 0:
             self.goal = self.bad[self.rng.integers(len(self.bad))]
             self.speed = self.rng.choice([0.3, 1.0, 3.0, 5.0])
@@ -127,7 +146,9 @@ class Hostile:
 
 def live(robot: RobotSpec, seconds: float, seed: int) -> dict[str, Any]:
     """What a virtual robot did in that time of hostile targets, in simulated time."""
-    rng, judge, clock = np.random.default_rng(seed), Contacts(robot), SimulatedClock()
+    rng = np.random.default_rng(seed)
+    judge = Contacts(robot)
+    clock = SimulatedClock()
     driver = VirtualDriver(robot, load_fleet("easy", robot).unit("virtual-1"), clock, seed=seed)
     controller = Controller(driver, robot, clock=clock)
     hostile = Hostile(robot, judge, rng, seconds)
@@ -137,11 +158,14 @@ def live(robot: RobotSpec, seconds: float, seed: int) -> dict[str, Any]:
     measured = [judge.deepest(r.state.qpos) for r in asked]
     worst = max([*commanded, *measured, (0.0, "")])
     return {
-        "seconds": round(len(asked) * DT, 1), "end": recording.events[-1].text,
+        "seconds": round(len(asked) * DT, 1),
+        "end": recording.events[-1].text,
         "fault": recording.fault.text if recording.fault else "",
-        "commands that touch": sum(d > 0 for d, _ in commanded), "states that touch": sum(d > 0 for d, _ in measured),
-        "targets that would": hostile.touching, "deepest": f"{worst[0]:.4f} m {worst[1]}",
-    }  # fmt: skip
+        "commands that touch": sum(d > 0 for d, _ in commanded),
+        "states that touch": sum(d > 0 for d, _ in measured),
+        "targets that would": hostile.touching,
+        "deepest": f"{worst[0]:.4f} m {worst[1]}",
+    }
 
 
 def main() -> None:
@@ -150,9 +174,11 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--robot", choices=list(ROBOTS), nargs="+", default=list(ROBOTS))
-    args, bad = parser.parse_args(), 0
+    args = parser.parse_args()
+    bad = 0
     for name in args.robot:
-        robot, began = load_robot(name), time.monotonic()
+        robot = load_robot(name)
+        began = time.monotonic()
         result = {"robot": name, "plans": plans(robot, args.poses, args.seed)}
         result["live"] = live(robot, args.seconds, args.seed)
         result["minutes"] = round((time.monotonic() - began) / 60, 1)

@@ -1,4 +1,5 @@
-"""A virtual H1-2 on the bus in a process of its own, told what to do by lines on stdin, one JSON answer each.
+"""A virtual H1-2 on the bus in a process of its own, told what to do by lines on stdin, one JSON
+answer each.
 
 clear: forget what was heard. heard: the commands since.
 """

@@ -1,4 +1,6 @@
-"""A slice of make adversary: no command outside the limits, judged against the true state; and the judge can say no."""
+"""A slice of make adversary: no command outside the limits, judged against the true state; and the
+judge can say no.
+"""
 
 import pytest
 from hw.control import adversary

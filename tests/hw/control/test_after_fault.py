@@ -1,7 +1,8 @@
-"""After a fault no position is sent: on a simulated H1-2 the commanded positions stand still, without stiffness.
+"""After a fault no position is sent: on a simulated H1-2 the commanded positions stand still,
+without stiffness.
 
-A damped joint keeps its momentum, so nothing is promised of its speed. The same of the watchdog, which has sent nothing
-before.
+A damped joint keeps its momentum, so nothing is promised of its speed. The same of the watchdog,
+which has sent nothing before.
 """
 
 from __future__ import annotations
@@ -39,7 +40,9 @@ def swing(
     size: float = 0.3,
     damp: float = 0.5,
 ) -> Recording:
-    """Both elbows swing by `size` rad until a fault that the robot, the sender of targets or the policy makes."""
+    """Both elbows swing by `size` rad until a fault that the robot, the sender of targets or the
+    policy makes.
+    """
     fault = Fault(kind, "made by a test")
     elbows = robot.index(["left_elbow_joint", "right_elbow_joint"])
     driver = UnitreeDriver(robot, domain=DOMAIN)

@@ -1,4 +1,6 @@
-"""The table of faults: every fault that the code names has a rule, and the pages have the same rows."""
+"""The table of faults: every fault that the code names has a rule, and the pages have the same
+rows.
+"""
 
 from __future__ import annotations
 

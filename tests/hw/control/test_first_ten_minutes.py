@@ -1,4 +1,6 @@
-"""The steps of docs/first-minutes.md and the run of README.md, as written, on virtual robots behind buses."""
+"""The steps of docs/first-minutes.md and the run of README.md, as written, on virtual robots
+behind buses.
+"""
 
 from __future__ import annotations
 
@@ -40,7 +42,9 @@ def kept(play: Callable[[], str], tries: int = 8) -> str:
 
 
 def answered(run: Terminal, key: str = "", code: int = 0) -> str:
-    """A run that asks, is told to start and, where a key is given, stopped on its way to the first target."""
+    """A run that asks, is told to start and, where a key is given, stopped on its way to the first
+    target.
+    """
     run.until("Type 'yes' to start")
     run.key("yes\n")
     if key:
@@ -133,7 +137,8 @@ def rows(joint: str) -> str:
 
 def test_an_so101_from_the_rehearsal_to_the_command_of_the_readme(at, tmp_path):
     (tmp_path / "first.csv").write_text(rows("wrist_roll"))
-    link, file = str(tmp_path / "so101"), str(tmp_path / "calibration.json")
+    link = str(tmp_path / "so101")
+    file = str(tmp_path / "calibration.json")
     served = at(
         "gaponet virtual serve --robot so101 --link /tmp/so101", "--calibration", file, link=link
     )
@@ -162,9 +167,8 @@ def test_an_so101_from_the_rehearsal_to_the_command_of_the_readme(at, tmp_path):
 
     readme = "gaponet run --motion FILE --robot ./my_so101 --driver so101 --compensate"
     assert readme in (ROOT / "README.md").read_text(encoding="utf-8")
-    words = (
-        readme.replace("FILE", "first.csv").replace("./my_so101", "so101").split()[2:]
-    )  # not an identified one
+    # Not an identified one.
+    words = readme.replace("FILE", "first.csv").replace("./my_so101", "so101").split()[2:]
     said = kept(lambda: at("gaponet run", *words, *so101, "--yes").end())
     assert "stopped end: back where it was found; hold" in said
 

@@ -1,6 +1,9 @@
-"""Programs on Unitree's IDL and DDS version at the other end: make peers. Two environments, two processes, one bus.
+"""Programs on Unitree's IDL and DDS version at the other end: make peers.
 
-cyclonedds 0.10.2, which Unitree's SDK pins, ends with a null pointer when it meets a type object that it cannot read.
+Two environments, two processes, one bus.
+
+cyclonedds 0.10.2, which Unitree's SDK pins, ends with a null pointer when it meets a type object
+that it cannot read.
 """
 
 from __future__ import annotations

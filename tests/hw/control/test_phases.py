@@ -1,4 +1,6 @@
-"""The controller's state machine: every event in every phase, and the same table in docs/reference/controller.md."""
+"""The controller's state machine: every event in every phase, and the same table in
+docs/reference/controller.md.
+"""
 
 from __future__ import annotations
 
@@ -43,9 +45,8 @@ def test_every_event_is_defined_once_in_every_phase_and_leads_forward():
 @pytest.mark.parametrize("missing", [Trigger.CONSENT, Trigger.READY])
 def test_nothing_moves_without_consent_and_a_robot_that_is_ready(missing):
     reached = {Phase.CONNECT}
-    for phase, trigger in product(
-        Phase, Trigger
-    ):  # phases are in the order in which they can be reached
+    # Phases are in the order in which they can be reached.
+    for phase, trigger in product(Phase, Trigger):
         if phase in reached and trigger is not missing:
             reached.add(TRANSITION_TABLE[phase, trigger][0])
     assert reached <= {*WAITING, Phase.STOPPED}

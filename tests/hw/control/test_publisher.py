@@ -48,24 +48,25 @@ def test_a_link_or_a_pipe_in_place_of_the_lock_is_refused_at_once(tmp_path, monk
     monkeypatch.setattr(publisher, "LOCK_FOLDER", tmp_path)
     lock = tmp_path / "gaponet-arm.lock"
     lock.symlink_to(tmp_path / "elsewhere")
-    with pytest.raises(UsageError, match="cannot be opened"), sole_publisher("arm"):
+    with pytest.raises(UsageError, match="opened"), sole_publisher("arm"):
         pass
     assert not (tmp_path / "elsewhere").exists()
     lock.unlink()
     os.mkfifo(lock)
-    with pytest.raises(UsageError, match="not a regular file"), sole_publisher("arm"):
+    with pytest.raises(UsageError, match="regular"), sole_publisher("arm"):
         pass
 
 
 def test_a_port_has_one_lock_whatever_name_leads_to_it(tmp_path):
     ours, theirs = os.openpty()
-    port, link = os.ttyname(theirs), tmp_path / "so101"
+    port = os.ttyname(theirs)
+    link = tmp_path / "so101"
     link.symlink_to(port)
     try:
         with sole_publisher(str(link)):
             for name in (port, str(link), f"/dev/pts/../pts/{os.path.basename(port)}"):
                 with (
-                    pytest.raises(UsageError, match="another process commands"),
+                    pytest.raises(UsageError, match="commands"),
                     sole_publisher(name),
                 ):
                     pass

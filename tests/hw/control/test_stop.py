@@ -16,9 +16,18 @@ from gaponet.hw.control.stop import StopKeys, StopRequest
 from gaponet.hw.targets.policy import motion_policy
 
 KEYS = {
-    "Ctrl-S": b"\x13", "Ctrl-Q": b"\x11", "Ctrl-Z": b"\x1a", "Ctrl-backslash": b"\x1c", "Ctrl-C": b"\x03",
-    "Ctrl-V": b"\x16", "Ctrl-O": b"\x0f", "Ctrl-D": b"\x04", "Enter": b"\r", "Escape": b"\x1b", "letter": b"x",
-}  # fmt: skip
+    "Ctrl-S": b"\x13",
+    "Ctrl-Q": b"\x11",
+    "Ctrl-Z": b"\x1a",
+    "Ctrl-backslash": b"\x1c",
+    "Ctrl-C": b"\x03",
+    "Ctrl-V": b"\x16",
+    "Ctrl-O": b"\x0f",
+    "Ctrl-D": b"\x04",
+    "Enter": b"\r",
+    "Escape": b"\x1b",
+    "letter": b"x",
+}
 
 
 class Terminal:
@@ -30,9 +39,8 @@ class Terminal:
 
     def type(self, key: bytes) -> None:
         os.write(self.master, key)
-        select.select(
-            [self.slave], [], [], 2
-        )  # until it has arrived; a terminal that keeps it lets the motion go on
+        # Until it has arrived; a terminal that keeps it lets the motion go on.
+        select.select([self.slave], [], [], 2)
 
 
 @pytest.fixture

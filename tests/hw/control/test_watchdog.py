@@ -1,4 +1,6 @@
-"""The watchdog's process beside a robot that notes how it is damped, and the controller's end of it."""
+"""The watchdog's process beside a robot that notes how it is damped, and the controller's end of
+it.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,10 @@ from gaponet.hw.control.driver import DriverError
 from gaponet.hw.control.stop import STOP_SIGNALS
 from gaponet.hw.control.watchdog import WEIGHT_STEPS, Watchdog
 
-PATIENT, HANG, DAMP = 20.0, 0.5, 0.1  # s
+# S.
+PATIENT = 20.0
+HANG = 0.5
+DAMP = 0.1
 
 ROBOT = """
 import json, sys, time
@@ -54,7 +59,9 @@ def notes(tmp_path: Path) -> Path:
 def dog(
     notes: Path, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest
 ) -> Iterator[Watchdog]:
-    """A watchdog in a process of its own that could damp the robot; its parameter is after how many s it does."""
+    """A watchdog in a process of its own that could damp the robot; its parameter is after how
+    many s it does.
+    """
     monkeypatch.setattr(
         watchdog.child_process,
         "module_command",
@@ -88,9 +95,8 @@ def beat(dog: Watchdog, weight: float) -> None:
 
 def test_a_robot_is_damped_with_the_last_weight_that_was_commanded(dog, notes):
     beat(dog, 0.1)
-    dog._in.write(
-        bytes([round(WEIGHT_STEPS * weight) for weight in (0.2, 0.8)])
-    )  # two beats that are read at once
+    # Two beats that are read at once.
+    dog._in.write(bytes([round(WEIGHT_STEPS * weight) for weight in (0.2, 0.8)]))
     dog.release(unconfirmed=True)
     dog._process.wait(20)
     weights = damped(notes)[:, 1]
@@ -155,7 +161,10 @@ class LooseRobot:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, **fails: object) -> None:
         """fails: method → numbers of its calls that fail; None: all."""
-        self.now, self.fails, self.calls, self.counts = 0.0, fails, [], Counter()
+        self.now = 0.0
+        self.fails = fails
+        self.calls = []
+        self.counts = Counter()
         clock = SimpleNamespace(
             monotonic=lambda: self.now, sleep=lambda s: setattr(self, "now", self.now + s)
         )
@@ -202,7 +211,9 @@ def test_a_watchdog_waits_for_the_next_heartbeat_as_long_as_it_is_told_and_then_
     monkeypatch, words, damped
 ):
     """Without time: the pipes are lists, and the wait for a heartbeat is what select is given."""
-    robot, waits, said = LooseRobot(monkeypatch), [], []
+    robot = LooseRobot(monkeypatch)
+    waits = []
+    said = []
     heartbeats = iter(words)
 
     def wait(reads, _, __, timeout):
@@ -232,7 +243,7 @@ def test_a_watchdog_that_cannot_reach_the_robot_is_an_error(notes, monkeypatch):
         "module_command",
         lambda *_: [sys.executable, "-c", "raise SystemExit"],
     )
-    with open(os.devnull) as lock, pytest.raises(DriverError, match="could not reach the robot"):
+    with open(os.devnull) as lock, pytest.raises(DriverError, match="reach"):
         Watchdog({}, lock.fileno(), HANG, DAMP).wait_ready()
 
 

@@ -1,4 +1,6 @@
-"""H1-2 whose elbow encoder drifts, freezes or jumps: how far the true joints go after the fault, in simulated time."""
+"""H1-2 whose elbow encoder drifts, freezes or jumps: how far the true joints go after the fault,
+in simulated time.
+"""
 
 from __future__ import annotations
 
@@ -82,7 +84,9 @@ def test_after_a_fault_of_an_encoder_no_stiff_position_is_sent(robot, monkeypatc
 
 
 def test_a_drifting_encoder_does_not_carry_a_joint_away_before_it_is_noticed(robot, monkeypatch):
-    """The torque limit keeps the command near the reading, so that the joint runs after it: once by 2.4 rad."""
+    """The torque limit keeps the command near the reading, so that the joint runs after it: once
+    by 2.4 rad.
+    """
     recording, clock = sway(robot, monkeypatch, "drifts", "arm_sdk", swing=0.0)
 
     elbow = robot.index(["left_elbow_joint"])[0]

@@ -56,7 +56,7 @@ def test_a_dry_run_beside_a_run_of_the_same_robot_is_refused(arm, tmp_path, monk
     inner.address = "a port"
     with (
         publisher.sole_publisher("a port"),
-        pytest.raises(UsageError, match="another process commands"),
+        pytest.raises(UsageError, match="commands"),
     ):
         Controller(DryRun(inner), arm, clock=inner.clock).run(motion_policy(MOTION, DT))
 

@@ -1,4 +1,6 @@
-"""Another program on the servo bus of an SO-101: what of it is seen, and what is not mistaken for it."""
+"""Another program on the servo bus of an SO-101: what of it is seen, and what is not mistaken for
+it.
+"""
 
 from __future__ import annotations
 
@@ -62,7 +64,7 @@ def test_a_program_that_has_the_port_open_is_named(holder):
 def test_a_port_that_another_program_has_open_is_refused_and_nothing_is_sent(so101, holder):
     port, _ = holder
 
-    with pytest.raises(DriverError, match="has the port open"):
+    with pytest.raises(DriverError, match="open"):
         SO101Driver(so101, port).connect()
 
 
@@ -75,7 +77,7 @@ def test_the_port_is_closed_for_others_again_after_the_watchdog_has_opened_it(dr
     driver.watchdog()
     monkeypatch.setattr("gaponet.hw.drivers.so101.other_programs", lambda port: ["lerobot"])
 
-    with pytest.raises(DriverError, match="lerobot has the port open"):
+    with pytest.raises(DriverError, match="lerobot"):
         driver.read()
 
 

@@ -42,15 +42,21 @@ class Base:
 def plugin(monkeypatch):
     pytest.importorskip("torch")
     parts = {
-        "lerobot": {}, "lerobot.cameras": {"CameraConfig": Base, "make_cameras_from_configs": dict},
+        "lerobot": {},
+        "lerobot.cameras": {"CameraConfig": Base, "make_cameras_from_configs": dict},
         "lerobot.lerobot_types": {"EnvTransition": dict, "TransitionKey": SimpleNamespace()},
         "lerobot.processor": {"ProcessorStep": Base, "ProcessorStepRegistry": Base},
-        "lerobot.robots": {"Robot": Base, "RobotConfig": type("RobotConfig", (Base,), {"__init__": object.__init__})},
-        "lerobot.teleoperators": {
-            "Teleoperator": Base, "TeleoperatorConfig": type("Config", (Base,), {"__init__": object.__init__}),
+        "lerobot.robots": {
+            "Robot": Base,
+            "RobotConfig": type("RobotConfig", (Base,), {"__init__": object.__init__}),
         },
-        "lerobot.utils": {}, "lerobot.utils.errors": {"DeviceNotConnectedError": ConnectionError},
-    }  # fmt: skip
+        "lerobot.teleoperators": {
+            "Teleoperator": Base,
+            "TeleoperatorConfig": type("Config", (Base,), {"__init__": object.__init__}),
+        },
+        "lerobot.utils": {},
+        "lerobot.utils.errors": {"DeviceNotConnectedError": ConnectionError},
+    }
     for name, holds in parts.items():
         module = ModuleType(name)
         vars(module).update(holds)
@@ -75,7 +81,8 @@ def test_a_cameras_depth_is_observed_beside_its_colours(plugin, so101):
         **vars(wrist), use_rgb=True, use_depth=True, read_latest_depth=lambda: "depth"
     )
     robot = plugin.GaponetSO101.__new__(plugin.GaponetSO101)
-    robot.units, robot.cameras = plugin.Units(so101), {"wrist": wrist, "front": front}
+    robot.units = plugin.Units(so101)
+    robot.cameras = {"wrist": wrist, "front": front}
     shapes = {"wrist": (4, 6, 3), "front": (4, 6, 3), "front_depth": (4, 6, 1)}
     assert robot.observation_features == robot.action_features | shapes
     assert [read() for *_, read in robot._pictures()] == ["colours", "colours", "depth"]
@@ -88,14 +95,14 @@ def test_an_arm_is_not_moved_without_consent(plugin, monkeypatch):
     )
     robot = plugin.GaponetSO101.__new__(plugin.GaponetSO101)
     robot.config = plugin.GaponetSO101Config()
-    with pytest.raises(UsageError, match=r"nothing was commanded; give --robot\.yes=true"):
+    with pytest.raises(UsageError, match=r"--robot\.yes"):
         robot.connect()
 
 
 def test_a_controller_that_ends_at_its_start_is_an_error_with_its_messages(plugin):
     pytest.importorskip("zmq")
     command = [sys.executable, "-c", "raise SystemExit('no arm at the port')"]
-    with pytest.raises(ConnectionError, match="gaponet run: no arm at the port"):
+    with pytest.raises(ConnectionError, match="port"):
         plugin._Controller.start(lambda address: command)
 
 
@@ -110,7 +117,7 @@ def test_its_motions_are_one_plan_from_where_the_arm_is_and_the_gripper_keeps_wh
     )
     motion = plugin.GaponetMotion(config)
     motion.connect()
-    with pytest.raises(ConnectionError, match="position, which is unknown"):
+    with pytest.raises(ConnectionError, match="unknown"):
         motion.get_action()
     plugin.set_observation(seen(gripper=62.0))
     said = [motion.get_action()]

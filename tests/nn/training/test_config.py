@@ -13,9 +13,12 @@ from gaponet.nn.training.config import PAPER_PPO, Budget, PPOConfig, Pretraining
 
 CHANGED = TrainConfig(
     ModelConfig(kind="mlp", history=8, payload_input=False, mlp_hidden=(64, 32)),
-    pretraining=PretrainingConfig(noise=0.1), ppo=PPOConfig(num_envs=7), seed=3, mixed_gains=True,
+    pretraining=PretrainingConfig(noise=0.1),
+    ppo=PPOConfig(num_envs=7),
+    seed=3,
+    mixed_gains=True,
     rates=(50.0, 100.0),
-)  # fmt: skip
+)
 
 
 def test_the_paper_s_recipe_has_no_supervised_start_and_keeps_what_was_changed():

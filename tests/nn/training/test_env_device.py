@@ -1,4 +1,6 @@
-"""The training environment on Warp's CPU device: the same numbers as on C MuJoCo's, and none that go to the host."""
+"""The training environment on Warp's CPU device: the same numbers as on C MuJoCo's, and none that
+go to the host.
+"""
 
 from dataclasses import replace
 
@@ -22,7 +24,8 @@ from gaponet.nn.training.trainer import Trainer
 
 pytest.importorskip("mujoco_warp", reason="needs pip install 'gaponet[warp]'")
 
-STEPS, CASTS = 200, ("array", "bool", "float", "int", "index")
+STEPS = 200
+CASTS = ("array", "bool", "float", "int", "index")
 
 
 def make(folder, device, servo=None, **model):
@@ -34,17 +37,18 @@ def make(folder, device, servo=None, **model):
 
 def test_observation_reward_and_done_are_those_of_c_mujoco(tmp_path):
     ours, theirs = (make(tmp_path, device, history=2, stride=3) for device in ("cpu", "warp-cpu"))
-    rng, ends = np.random.default_rng(0), 0
+    rng = np.random.default_rng(0)
+    ends = 0
     for _ in range(STEPS):
-        seen, also = ours.get_observations(), theirs.get_observations()
+        seen = ours.get_observations()
+        also = theirs.get_observations()
         for group in seen:
             torch.testing.assert_close(also[group], seen[group], atol=1e-5, rtol=1e-5)
         delta = rng.normal(0, 0.01, (8, 2)).astype(np.float32)
         reward, done = ours.step(delta)
         like, same = theirs.step(torch.from_numpy(delta))
-        np.testing.assert_allclose(
-            like.numpy(), reward, atol=1e-5 / RewardConfig().position
-        )  # 1e-5 rad
+        # 1e-5 rad
+        np.testing.assert_allclose(like.numpy(), reward, atol=1e-5 / RewardConfig().position)
         np.testing.assert_array_equal(same.numpy(), done)
         ends += done.sum()
     assert ends > 8
@@ -52,7 +56,9 @@ def test_observation_reward_and_done_are_those_of_c_mujoco(tmp_path):
 
 
 class Crossings(TorchFunctionMode):
-    """Notes every way from a tensor to the host, and what else a GPU is waited for: masks as indices, other arrays."""
+    """Notes every way from a tensor to the host, and what else a GPU is waited for: masks as
+    indices, other arrays.
+    """
 
     WAYS = ("cpu", "numpy", "item", "tolist", "nonzero", "new_tensor", *(f"__{x}__" for x in CASTS))
 
@@ -86,7 +92,8 @@ def test_a_tensor_that_goes_to_the_host_is_noted():
 )
 def test_nothing_goes_to_the_host_in_a_step(tmp_path, servo):
     env = make(tmp_path, "warp-cpu", servo, history=2, stride=2)
-    delta, resets = torch.zeros(8, 2), 0
+    delta = torch.zeros(8, 2)
+    resets = 0
     for _ in range(60):
         before = env.playback.elapsed.copy()
         with Crossings() as crossings:
@@ -101,7 +108,8 @@ def test_nothing_goes_to_the_host_in_a_step(tmp_path, servo):
 
 
 def test_a_run_on_the_device_learns_resumes_and_ships_for_the_cpu(tmp_path):
-    robot, data = write_arm(tmp_path / "arm"), tmp_path / "data"
+    robot = write_arm(tmp_path / "arm")
+    data = tmp_path / "data"
     dataset = write_dataset(data, robot, recordings(robot, 8, rows=80, kp=0.5, delay=2))
     small = TrainConfig(
         ModelConfig(
@@ -124,5 +132,5 @@ def test_a_run_on_the_device_learns_resumes_and_ships_for_the_cpu(tmp_path):
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
 def test_a_missing_gpu_is_refused_before_training():
-    with pytest.raises(UsageError, match="torch sees no GPU"):
+    with pytest.raises(UsageError, match="GPU"):
         TrainConfig(device="cuda").network_device()

@@ -1,4 +1,6 @@
-"""PPO by joint: the estimates by hand, what is trained, and that it learns where there is something to learn."""
+"""PPO by joint: the estimates by hand, what is trained, and that it learns where there is
+something to learn.
+"""
 
 import numpy as np
 import pytest
@@ -34,13 +36,12 @@ def env(tmp_path):
 
 
 def test_advantages_by_hand():
-    reward, value = (
-        torch.tensor([1.0, 2.0, 4.0]).reshape(3, 1, 1),
-        torch.tensor([0.5, 1.0, 2.0]).reshape(3, 1, 1),
-    )
+    reward = torch.tensor([1.0, 2.0, 4.0]).reshape(3, 1, 1)
+    value = torch.tensor([0.5, 1.0, 2.0]).reshape(3, 1, 1)
     done = torch.tensor([0.0, 1.0, 0.0]).reshape(3, 1, 1)  # a motion ends after the second step
     found = advantages(reward, value, torch.full((1, 1), 8.0), done, gamma=0.5, lam=0.5).flatten()
-    # δ = 1 + 0.5·1 − 0.5 = 1;  2 − 1 = 1;  4 + 0.5·8 − 2 = 6;  the first adds 0.25 of the second's, which adds nothing.
+    # δ = 1 + 0.5·1 − 0.5 = 1;  2 − 1 = 1;  4 + 0.5·8 − 2 = 6;  the first adds 0.25 of the second's,
+    # which adds nothing.
     assert found.tolist() == [1.25, 1.0, 6.0]
 
 
@@ -66,7 +67,9 @@ def test_the_actor_is_trained_after_the_critic_explains_the_returns(env):
 
 
 def test_joints_that_do_not_explore_are_masked_out(env):
-    """Without noise on a joint its ratio is 1 whatever its advantage: it must be left out, not averaged in."""
+    """Without noise on a joint its ratio is 1 whatever its advantage: it must be left out, not
+    averaged in.
+    """
     torch.manual_seed(0)
     learner = PPO(env, build_network(MODEL, 2), SETTINGS)
     batch = learner.collect()
@@ -96,7 +99,19 @@ def test_ppo_increases_the_reward_in_a_wrong_simulator(env):
     torch.manual_seed(0)
     net = build_network(MODEL, 2)
     fit_inputs(net, env, env.get_observations()["actor"], 64, seed=0)
-    learner = PPO(env, net, PPOConfig(num_envs=16, num_steps=32, epochs=5, std=0.01, explained=0.0, critic_warmup=2,
-                                          learning_rate=3e-4, critic_hidden=(32,)))  # fmt: skip
+    learner = PPO(
+        env,
+        net,
+        PPOConfig(
+            num_envs=16,
+            num_steps=32,
+            epochs=5,
+            std=0.01,
+            explained=0.0,
+            critic_warmup=2,
+            learning_rate=3e-4,
+            critic_hidden=(32,),
+        ),
+    )
     rewards = [learner.update().reward for _ in range(40)]
     assert np.mean(rewards[-5:]) > 0.8 * np.mean(rewards[:3])

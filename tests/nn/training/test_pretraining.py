@@ -32,7 +32,8 @@ def fitted(tmp_path_factory):
 
 
 def test_input_statistics_stay_fixed_after_the_predictor_is_fitted(fitted):
-    net, before = fitted.net, fitted.net.features.standardise.mean.clone()
+    net = fitted.net
+    before = fitted.net.features.standardise.mean.clone()
     assert before.abs().max() > 0
     fitted.round(lambda: 0.0)
     assert torch.equal(net.features.standardise.mean, before)
@@ -40,7 +41,8 @@ def test_input_statistics_stay_fixed_after_the_predictor_is_fitted(fitted):
 
 
 def test_a_full_pool_takes_a_part_of_the_environments_of_each_period_in_turn(fitted, monkeypatch):
-    env, rows = fitted.env, []
+    env = fitted.env
+    rows = []
     fitted.config = replace(fitted.config, rounds=2, steps=6)
     for most in (10**6, 2 * 6 * 32 // 3):
         monkeypatch.setattr("gaponet.nn.training.pretraining.MAX_POOL_STATES", most)

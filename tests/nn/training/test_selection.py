@@ -31,12 +31,10 @@ class Trainings:
 
     def __init__(self, interrupted="", later=None, **errors):
         """later: Error of a network after the rest of the budget."""
-        self.calls, self.interrupted, self.later, self.errors = (
-            [],
-            interrupted,
-            later,
-            ERRORS | errors,
-        )
+        self.calls = []
+        self.interrupted = interrupted
+        self.later = later
+        self.errors = ERRORS | errors
 
     def __call__(self, kind, run, share, spent, resume):
         self.calls.append((kind, run.name, round(share, 6), round(spent, 6), resume))
@@ -67,7 +65,7 @@ def test_an_interrupted_choice_leaves_the_best_so_far_and_goes_on_where_it_was(r
     train_best(run, False, train)
     assert [kind for kind, *_ in train.calls] == ["gaponet", "shared_mlp"]
     assert (run / "checkpoint.pt").read_text() == "gaponet"
-    with pytest.raises(UsageError, match="holds a run already; add --resume"):
+    with pytest.raises(UsageError, match="already"):
         train_best(run, False, train)
     again = Trainings()
     train_best(run, True, again)
@@ -80,9 +78,10 @@ def test_an_interrupted_choice_leaves_the_best_so_far_and_goes_on_where_it_was(r
 
 
 def test_a_run_of_one_kind_is_resumed_with_its_kind(tmp_path):
-    with pytest.raises(UsageError, match="nothing to resume"):
+    with pytest.raises(UsageError, match="nothing"):
         train_best(tmp_path / "none", True, Trainings())
-    first, train = Trainings(), Trainings()
+    first = Trainings()
+    train = Trainings()
     first("mlp", tmp_path / "run", 1.0, 0.0, False)
     train_best(tmp_path / "run", True, train)
     assert train.calls == [("mlp", "run", 1.0, 0.0, True)]
@@ -110,7 +109,7 @@ def test_a_copy_of_the_best_run_that_is_interrupted_is_made_again(run, monkeypat
     with monkeypatch.context() as full:
         full.setattr("gaponet.base.files.os.replace", fail)
         full.setattr(selection, "write_json", write_errors)
-        with pytest.raises(OSError, match="No space left"):
+        with pytest.raises(OSError, match="space"):
             train_best(run, False, Trainings())
     assert not (run / "checkpoint.pt").exists()
     again = Trainings()

@@ -1,4 +1,6 @@
-"""The pictures of a dataset: what they show is what the data are, and they say what they cannot show."""
+"""The pictures of a dataset: what they show is what the data are, and they say what they cannot
+show.
+"""
 
 import numpy as np
 import pytest
@@ -16,12 +18,15 @@ from gaponet.report.figures.style import save
 
 @pytest.fixture
 def dataset(arm, tmp_path):
-    """Three motions of one unit with two payloads, torque and temperature; the last has the liveliest torques."""
+    """Three motions of one unit with two payloads, torque and temperature; the last has the
+    liveliest torques.
+    """
     data = Dataset.create(tmp_path / "data", arm)
     for i in range(3):
         for payload in (0.0, 0.2):
             ctrl = wave(60, 2, hertz=0.4 + 0.1 * i)
-            tau, warm = (1 + i + payload) * ctrl, 30 + payload * np.arange(60)[:, None] * np.ones(2)
+            tau = (1 + i + payload) * ctrl
+            warm = 30 + payload * np.arange(60)[:, None] * np.ones(2)
             data.append(
                 arm_sequence(arm, ctrl, late(ctrl, 2), f"m{i}", payload, tau=tau, temperature=warm)
             )
@@ -121,5 +126,5 @@ def test_a_joint_without_limits_gets_no_grey_range():
 
 
 def test_an_empty_dataset_has_no_pictures(arm, tmp_path):
-    with pytest.raises(DatasetError, match="holds no sequences yet"):
+    with pytest.raises(DatasetError, match="sequences"):
         write_figures(Dataset.create(tmp_path / "none", arm), arm, tmp_path / "out")

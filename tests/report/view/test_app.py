@@ -50,7 +50,7 @@ def test_a_result_is_out_of_date_when_what_it_was_made_from_is_newer(tmp_path):
 def test_one_command_at_a_time_and_cancelling_leaves_what_was_there(tmp_path):
     jobs = Jobs(tmp_path)
     jobs.start("robot", "robot", "list")
-    with pytest.raises(UsageError, match="gaponet robot is running"):
+    with pytest.raises(UsageError, match="running"):
         jobs.start("robot", "robot", "list")
     wait_for(jobs)
     assert "so101" in [robot["name"] for robot in jobs.result("robot").result["robots"]]
@@ -64,7 +64,8 @@ def test_one_command_at_a_time_and_cancelling_leaves_what_was_there(tmp_path):
 
 
 def test_of_two_clicks_at_once_one_starts_a_command(tmp_path):
-    jobs, refused = Jobs(tmp_path), []
+    jobs = Jobs(tmp_path)
+    refused = []
 
     def click():
         try:
@@ -147,10 +148,20 @@ def test_identification_is_locked_while_the_check_finds_an_error(page):
 
 
 def test_what_a_command_prints_is_shown_as_a_table_and_names_stay_text(page):
-    job = SimpleNamespace(command="gaponet gap data", lines=[
-        "training auto: 50 %, 3 s, note", "By joint", "┏━━┳━━┓", "┃ joint ┃ MPJAE, mrad ┃", "┡━━╇━━┩",
-        "│ <b>x</b> │ 3.1 │", "└──┴──┘", "     ok  sign: fine", "![x](https://evil.example)",
-    ])  # fmt: skip
+    job = SimpleNamespace(
+        command="gaponet gap data",
+        lines=[
+            "training auto: 50 %, 3 s, note",
+            "By joint",
+            "┏━━┳━━┓",
+            "┃ joint ┃ MPJAE, mrad ┃",
+            "┡━━╇━━┩",
+            "│ <b>x</b> │ 3.1 │",
+            "└──┴──┘",
+            "     ok  sign: fine",
+            "![x](https://evil.example)",
+        ],
+    )
     text = _report(job)
     assert "| joint | MPJAE, mrad |\n| --- | ---: |\n| \\<b\\>x\\</b\\> | 3.1 |" in text
     assert r"!\[x\](https://evil.example)" in text
@@ -162,7 +173,8 @@ def test_what_a_command_prints_is_shown_as_a_table_and_names_stay_text(page):
 def test_a_name_in_the_form_is_no_option_of_the_command(page):
     finish(page.jobs, "robot", {}, ("robot", "check", "so101"))
     (page.folder / "logs" / "logs.toml").write_text("mine")
-    page.unit.value, page.cut.value = "--allow-pickle", 8.0
+    page.unit.value = "--allow-pickle"
+    page.cut.value = 8.0
     page._attempt(page._read, None)
     assert {"--unit-id=--allow-pickle", "--cut=8"} < set(page.jobs.all[-1].words)
     page._attempt(page._set_aside, None)
@@ -215,7 +227,9 @@ def test_a_proposal_is_added_to_the_logs_toml_of_the_folder(page):
 @pytest.fixture
 def clicked(monkeypatch):
     """Buttons of the next page by label, and the commands that they start."""
-    acts, words, add = {}, [], App._button
+    acts = {}
+    words = []
+    add = App._button
 
     def noted(self, label, act):
         acts[label] = act
@@ -259,7 +273,9 @@ def test_view_shows_a_dataset_in_the_page_at_step_gap_and_leaves_no_folder(
     arm, tmp_path, monkeypatch
 ):
     pytest.importorskip("viser")
-    data, said, pages = Dataset.create(tmp_path / "data", arm), [], []
+    data = Dataset.create(tmp_path / "data", arm)
+    said = []
+    pages = []
     for sequence in recordings(arm, 2, rows=60):
         data.append(sequence)
     shown = app.side_by_side(data, data.entries[1], arm)
@@ -307,9 +323,11 @@ def test_the_page_says_what_is_wrong_with_logs_and_what_to_do(page):
     page.position.value = "rad"
     time_s = np.arange(300) * 0.02
     for joints, scale, why in (
-        ((), 1.0, "no log of"), (("hip", "knee"), 1.0, "names joints hip, knee, which robot 'arm' does not have"),
-        (("shoulder", "elbow"), 57.3, "these look like degrees"), (("shoulder",), 1.0, "has ended"),
-    ):  # fmt: skip
+        ((), 1.0, "no log of"),
+        (("hip", "knee"), 1.0, "names joints hip, knee, which robot 'arm' does not have"),
+        (("shoulder", "elbow"), 57.3, "these look like degrees"),
+        (("shoulder",), 1.0, "has ended"),
+    ):
         swing = [0.8 * scale * np.sin(time_s)] * len(joints)
         columns = ["t", *(f"{j}_des" for j in joints), *(f"{j}_pos" for j in joints)]
         if joints:
@@ -329,9 +347,12 @@ def test_the_page_says_what_is_wrong_with_logs_and_what_to_do(page):
 
 @pytest.mark.slow
 def test_a_calibration_and_a_training_end_in_step_use_with_their_result(tmp_path, monkeypatch):
-    """Real commands on a VIRTUAL arm, by the buttons of the page; the nominal arm stands for the identified one."""
+    """Real commands on a VIRTUAL arm, by the buttons of the page; the nominal arm stands for the
+    identified one.
+    """
     pytest.importorskip("viser")
-    acts, add = {}, App._button
+    acts = {}
+    add = App._button
     monkeypatch.setattr(
         App, "_button", lambda self, label, act: acts.update({label: act}) or add(self, label, act)
     )

