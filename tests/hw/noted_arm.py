@@ -38,6 +38,7 @@ class NotedArm(VirtualDriver):
         clock: SimulatedClock | None = None,
         change: Callable[[State], State] = lambda state: state,
     ) -> None:
+        self.robot = robot.before_identification
         self.change = change
         unit = load_fleet("easy", robot).unit("virtual-1")
         super().__init__(robot, unit, clock or SimulatedClock(), period=0.01)
@@ -82,7 +83,7 @@ class NotedArm(VirtualDriver):
 def control(driver: NotedArm, **options: Any) -> Controller:
     """A controller of the arm, quick and in simulated time."""
     return Controller(
-        driver, driver._given[0], config=options.pop("config", QUICK), clock=driver.clock, **options
+        driver, driver.robot, config=options.pop("config", QUICK), clock=driver.clock, **options
     )
 
 

@@ -305,7 +305,7 @@ def test_when_targets_end_it_stands_until_a_clear_way_back_is_found_or_ends_ther
         *given,
     ):
         for _ in find_points(*given) if found_way else range(50):
-            controller.clock._now += 0.001
+            controller.clock.advance(0.001)
             yield
         return finish_search(find_points(*given)) if found_way else None
 

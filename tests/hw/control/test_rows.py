@@ -70,7 +70,7 @@ def test_memory_holds_none_of_an_hours_rows():
             rows.append(one)
             if k % 1000 == 0:
                 # A busy machine's disk may be behind; what waits for it is in memory.
-                rows._pending.join()
+                rows.wait_written()
         rows.close()
         assert tracemalloc.get_traced_memory()[1] < 10e6  # bytes; all rows are 28 MB
     finally:
@@ -82,7 +82,7 @@ def test_a_killed_process_leaves_its_periods_readable_by_name(tmp_path):
     script = (
         "import os, sys; sys.path.insert(0, 'tests')\n"
         "from pathlib import Path; from hw.control.test_rows import recording\n"
-        "made = recording(300, Path(sys.argv[1])); made.rows._pending.join(); "
+        "made = recording(300, Path(sys.argv[1])); made.rows.wait_written(); "
         "os.kill(os.getpid(), 9)\n"
     )
     folder = tmp_path / "logs"

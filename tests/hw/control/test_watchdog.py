@@ -73,8 +73,8 @@ def dog(
     os.close(lock)
     dog.wait_ready()
     yield dog
-    dog._process.kill()
-    dog._process.wait()
+    dog.process.kill()
+    dog.process.wait()
 
 
 hanging = pytest.mark.parametrize("dog", [HANG], indirect=True)
@@ -88,8 +88,8 @@ def damped(notes: Path) -> np.ndarray:
 def beat(dog: Watchdog, weight: float) -> None:
     """Beat, and wait until the watchdog has answered it."""
     assert dog.beat(weight)
-    before = dog._answer_time
-    while dog._answer_time == before and not dog.problem():
+    before = dog.answer_time
+    while dog.answer_time == before and not dog.problem():
         time.sleep(0.001)
 
 
@@ -98,7 +98,7 @@ def test_a_robot_is_damped_with_the_last_weight_that_was_commanded(dog, notes):
     # Two beats that are read at once.
     dog._in.write(bytes([round(WEIGHT_STEPS * weight) for weight in (0.2, 0.8)]))
     dog.release(unconfirmed=True)
-    dog._process.wait(20)
+    dog.process.wait(20)
     weights = damped(notes)[:, 1]
     assert weights[0] == pytest.approx(0.8, abs=0.02), "what the robot still held goes on holding"
     assert weights[-1] == 0.0
@@ -115,24 +115,24 @@ def test_it_holds_the_controllers_lock_until_its_end(dog, notes):
 
 def test_a_watchdog_without_any_heartbeat_sends_nothing(dog, notes):
     dog.release(unconfirmed=True)
-    assert dog._process.wait(20) == 0
+    assert dog.process.wait(20) == 0
     assert notes.read_text() == "closed, held\n"
 
 
 def test_signals_that_ask_to_stop_end_the_controller_and_not_its_watchdog(dog, notes):
     beat(dog, 1.0)
     for number in STOP_SIGNALS:
-        os.kill(dog._process.pid, number)
+        os.kill(dog.process.pid, number)
         beat(dog, 1.0)
         assert dog.problem() == ""
     dog.release()
-    assert dog._process.wait(20) == 0
+    assert dog.process.wait(20) == 0
     assert notes.read_text() == "closed, held\n"
 
 
 @hanging
 def test_a_watchdog_that_hangs_is_in_trouble_and_only_from_the_first_beat_on(dog):
-    os.kill(dog._process.pid, signal.SIGSTOP)
+    os.kill(dog.process.pid, signal.SIGSTOP)
     time.sleep(1.2 * HANG)
     assert dog.problem() == ""
     for _ in range(1000):
@@ -141,13 +141,13 @@ def test_a_watchdog_that_hangs_is_in_trouble_and_only_from_the_first_beat_on(dog
             break
         time.sleep(HANG / 20)
     assert dog.problem() == "the watchdog does not answer"
-    os.kill(dog._process.pid, signal.SIGCONT)
+    os.kill(dog.process.pid, signal.SIGCONT)
 
 
 @hanging
 def test_a_watchdog_that_took_the_controller_for_hanging_says_so(dog, notes):
     beat(dog, 1.0)
-    dog._process.wait(20)
+    dog.process.wait(20)
     assert dog.fired()
     assert dog.problem() == "the watchdog ended"
     assert not dog.beat(1.0)
@@ -255,6 +255,6 @@ def test_the_time_from_the_last_sign_of_life_to_damping_is_bounded(dog, notes, d
     last = time.monotonic()
     if dies:
         dog.release(unconfirmed=True)
-    dog._process.wait(20)
+    dog.process.wait(20)
     first = damped(notes)[0, 0] - last
     assert (0.0 if dies else 0.9 * HANG) < first < (0.2 if dies else HANG + 0.2)

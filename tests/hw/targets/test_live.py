@@ -384,7 +384,7 @@ def test_a_sender_that_waits_for_states_survives_a_plan_that_took_long(so101):
 
     def slow(first, found):
         for _ in range(400):
-            clock._now += 0.005
+            clock.advance(0.005)
             yield
         return (yield from begin(first, found))
 

@@ -89,6 +89,10 @@ class SimulatedClock:
         self._now = max(self._now, deadline)
         return self._now
 
+    def advance(self, seconds: float) -> None:
+        """Let some time pass outside `wait_until`, as code that takes long does."""
+        self._now += seconds
+
     def suspended(self) -> float:
         """Return `suspended_s`."""
         return self.suspended_s

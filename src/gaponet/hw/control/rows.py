@@ -115,6 +115,10 @@ class Rows:
             return self._chunk[:0]
         return np.memmap(self._file, self._dtype, "r", self._header_size, (self._written,))
 
+    def wait_written(self) -> None:
+        """Wait until all whole chunks are in the file."""
+        self._pending.join()
+
     def close(self) -> None:
         """Finish writing; a file without any row is removed."""
         if self._writer:

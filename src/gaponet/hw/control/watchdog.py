@@ -37,7 +37,12 @@ END_TIMEOUT_S = 5.0
 
 
 class Watchdog:
-    """The controller's end."""
+    """The controller's end.
+
+    Attributes:
+        process: The process that damps the robot.
+        answer_time: When it last answered, s of time.monotonic.
+    """
 
     def __init__(self, spec: dict[str, object], lock: int, timeout: float, damp: float) -> None:
         """
@@ -49,7 +54,7 @@ class Watchdog:
             damp: Duration of damping, s.
         """
         text = json.dumps(spec | {"timeout": timeout, "damp": damp})
-        self._process = subprocess.Popen(
+        self.process = subprocess.Popen(
             child_process.module_command("gaponet.hw.control.watchdog", text),
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
@@ -57,16 +62,16 @@ class Watchdog:
             start_new_session=True,
             bufsize=0,
         )
-        assert self._process.stdin
-        assert self._process.stdout
-        self._in = self._process.stdin
-        self._out = self._process.stdout
+        assert self.process.stdin
+        assert self.process.stdout
+        self._in = self.process.stdin
+        self._out = self.process.stdout
         for pipe in (self._in, self._out):
             os.set_blocking(pipe.fileno(), False)
         self._fired = False
         self._timeout = timeout
         # monotonic s of the last answer, or of the first heartbeat before it
-        self._answer_time: float | None = None
+        self.answer_time: float | None = None
 
     def wait_ready(self) -> None:
         """Return when it could damp the robot.
@@ -76,18 +81,16 @@ class Watchdog:
         """
         ready, _, _ = select.select([self._out], [], [], READY_TIMEOUT_S)
         if not ready or self._out.read(1) != READY:
-            self._process.kill()
+            self.process.kill()
             raise DriverError("the watchdog could not reach the robot; see its message above")
 
     def problem(self) -> str:
         """Return why this watchdog cannot damp the robot: it ended or does not answer; empty if it
         can.
         """
-        if self.fired() or self._process.poll() is not None:
+        if self.fired() or self.process.poll() is not None:
             return "the watchdog ended"
-        hangs = (
-            self._answer_time is not None and time.monotonic() - self._answer_time > self._timeout
-        )
+        hangs = self.answer_time is not None and time.monotonic() - self.answer_time > self._timeout
         return "the watchdog does not answer" if hangs else ""
 
     def fired(self) -> bool:
@@ -96,7 +99,7 @@ class Watchdog:
         """
         answer = self._out.read(4096) or b""  # None: nothing new; does not wait
         if ANSWER in answer:
-            self._answer_time = time.monotonic()
+            self.answer_time = time.monotonic()
         self._fired = self._fired or FIRED in answer
         return self._fired
 
@@ -104,15 +107,15 @@ class Watchdog:
         """Send a heartbeat with the weight of the command that follows; return False if the
         watchdog has ended.
         """
-        if self._answer_time is None:
-            self._answer_time = time.monotonic()
+        if self.answer_time is None:
+            self.answer_time = time.monotonic()
         try:
             self._in.write(bytes([round(WEIGHT_STEPS * weight)]))
         except BlockingIOError:
             return True
         except (BrokenPipeError, ValueError):
             return False
-        return self._process.poll() is None
+        return self.process.poll() is None
 
     def release(self, unconfirmed: bool = False) -> None:
         """Let the watchdog end without sending anything: the controller has stopped.
@@ -132,9 +135,9 @@ class Watchdog:
         if unconfirmed:
             return
         try:
-            self._process.wait(END_TIMEOUT_S)
+            self.process.wait(END_TIMEOUT_S)
         except subprocess.TimeoutExpired:
-            self._process.kill()
+            self.process.kill()
 
 
 def main(spec: dict[str, Any]) -> None:
