@@ -228,8 +228,9 @@ def _connect_ray(
 
 @contextmanager
 def _child_environment(threads: int) -> Iterator[None]:
-    """Set the environment that a process started in the block inherits; Ctrl-C reaches its parent
-    only.
+    """Set the environment that a process started in the block inherits.
+
+    Ctrl-C reaches its parent only.
     """
     variables = dict.fromkeys(THREAD_VARIABLES, str(threads)) | {SAFE_PATH_VARIABLE: "1"}
     before = {name: os.environ.get(name) for name in variables}

@@ -195,8 +195,9 @@ def lock_folder(folder: Path, kind: str, wait: float = 0.0) -> Iterator[None]:
 def whole_folder(
     folder: Path, kind: str, last: str, obsolete: tuple[str, ...] = ()
 ) -> Iterator[Path]:
-    """Lock a folder and yield an empty one; when the block succeeds, its files replace those of
-    `folder`.
+    """Lock a folder and yield an empty one.
+
+    When the block succeeds, its files replace those of `folder`.
 
     The folder is complete if `last` is there: this file is taken away first and put back last. If
     the process is killed before, or the block fails, `folder` stays as it was.

@@ -41,8 +41,9 @@ def with_note(progress: Progress, note: str) -> Callable[[int, int], None]:
 
 @contextmanager
 def progress_bar(title: str) -> Iterator[Callable[[float, float, str], None]]:
-    """Show a progress bar on stderr; yields update(done, total, note), to be given as
-    `progress`.
+    """Show a progress bar on stderr.
+
+    Yields update(done, total, note), to be given as `progress`.
     """
     with _progress(title) as show:
 

@@ -24,8 +24,9 @@ class MeanStd:
 
     @classmethod
     def from_values(cls, values: Iterable[float], scale: float = 1.0) -> MeanStd:
-        """Summarise the finite values, times `scale` (1e3 turns rad into mrad); without any, the
-        mean is NaN.
+        """Summarise the finite values, times `scale` (1e3 turns rad into mrad).
+
+        Without any, the mean is NaN.
         """
         finite = np.array([v for v in values if math.isfinite(v)]) * scale
         std = float(finite.std(ddof=1)) if len(finite) > 1 else math.nan
@@ -83,8 +84,9 @@ class ResultTable:
         return f"{table}\n\n{escape_markdown(self.caption)}" if self.caption else table
 
     def csv(self) -> str:
-        """Return the table as CSV at full precision; a column with MeanStd is followed by its std
-        and count.
+        """Return the table as CSV at full precision.
+
+        A column with MeanStd is followed by its std and count.
         """
         has_std = [self._has_std(i) for i in range(len(self.columns))]
         out = io.StringIO()

@@ -134,8 +134,9 @@ def _run(
 
 
 def _size(path: Path) -> int:
-    """Return the bytes of a file or folder; a model counts with the files around it, which it may
-    name.
+    """Return the bytes of a file or folder.
+
+    A model counts with the files around it, which it may name.
     """
     with suppress(OSError):
         if path.is_dir() or path.suffix in (".xml", ".urdf"):

@@ -139,8 +139,9 @@ def read_json(
 def read_format(
     kind: type[T], path: Path, newest: int, error: type[GAPONetError], hint: str = ""
 ) -> T:
-    """Read a JSON file with a "format" of at most `newest`; fields that `kind` does not name are
-    kept.
+    """Read a JSON file with a "format" of at most `newest`.
+
+    Fields that `kind` does not name are kept.
     """
     table = read_json(_Format, path, error, hint, allow_extra=True)
     if table["format"] > newest:

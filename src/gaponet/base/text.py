@@ -1,5 +1,6 @@
-"""Text for people: names that other people chose may hold any character; measured numbers carry
-their uncertainty.
+"""Text for people: names that other people chose may hold any character.
+
+Measured numbers carry their uncertainty.
 """
 
 from __future__ import annotations

@@ -306,8 +306,9 @@ class GapModel:
 
     @property
     def qpos_range(self) -> Array:
-        """Limits of the operated joints, (n, 2) rad; ±inf where there is none, or the card does
-        not have them.
+        """Limits of the operated joints, (n, 2) rad.
+
+        ±inf where there is none, or the card does not have them.
         """
         no_limits = [[None, None]] * len(self.card["joint_names"])
         limits = np.array(self.card.get("qpos_range", no_limits), float)  # None becomes NaN
@@ -322,8 +323,9 @@ class GapModel:
 
     @property
     def nominal_context(self) -> Array:
-        """Answers of the robot's own simulator to fixed probes, (8n) rad; (0) if the network is
-        not told them.
+        """Answers of the robot's own simulator to fixed probes, (8n) rad.
+
+        (0) if the network is not told them.
         """
         known = self.known_simulators
         return np.zeros(0, np.float32) if known is None else known.nominal
@@ -341,8 +343,9 @@ class GapModel:
         return known is not None and known.include(self.context_of(robot, dt))
 
     def context_of(self, robot: RobotSpec, dt: float) -> Array:
-        """Measure a simulator's answers to fixed probes with empty hands, (8n) rad; dt is the
-        control period, s.
+        """Measure a simulator's answers to fixed probes with empty hands, (8n) rad.
+
+        dt is the control period, s.
         """
         from gaponet.sim.batch import Condition
 
@@ -441,8 +444,9 @@ class GapModel:
 
     @property
     def max_payload(self) -> float:
-        """Largest payload in the training data, kg; the largest possible input if the card does
-        not have it.
+        """Largest payload in the training data, kg.
+
+        The largest possible input if the card does not have it.
         """
         return float(max(self.card.get("payload_seen", [self.config.payload_max])))
 
@@ -489,8 +493,9 @@ class GapModel:
             )
 
     def corrector(self, robot: RobotSpec) -> DeltaCorrector:
-        """Return the corrections for rollouts of sim.replay; refuse a simulator that the network
-        does not know.
+        """Return the corrections for rollouts of sim.replay.
+
+        Refuse a simulator that the network does not know.
         """
         if not self.knows(robot, robot.dt):
             self.require(robot)

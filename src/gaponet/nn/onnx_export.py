@@ -219,8 +219,9 @@ def trained_network(run: Path, config: ModelConfig, n: int) -> DeltaNet:
 
 
 def sample_inputs(net: DeltaNet, count: int = 256, seed: int = 0) -> Array:
-    """Return inputs x with the statistics of the training data, (count, dim) float32; sensor
-    values are 0.
+    """Return inputs x with the statistics of the training data, (count, dim) float32.
+
+    Sensor values are 0.
     """
     features = net.features
     generator = torch.Generator().manual_seed(seed)

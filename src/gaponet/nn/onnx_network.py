@@ -39,8 +39,9 @@ class OnnxNetwork:
 
     @property
     def stored_facts(self) -> dict[str, Any]:
-        """Fields of the card that export wrote into the file; empty for a file of an older version
-        or another program.
+        """Fields of the card that export wrote into the file.
+
+        Empty for a file of an older version or another program.
 
         Raises:
             ValueError: What is stored there is not a JSON object.

@@ -1,5 +1,6 @@
-"""Offline HTML pages from the Jinja2 templates in report/templates; figures are part of the
-page.
+"""Offline HTML pages from the Jinja2 templates in report/templates.
+
+Figures are part of the page.
 """
 
 from __future__ import annotations

@@ -108,8 +108,9 @@ def write_report(
     progress: Progress = no_progress,
     picture: Picture | None = None,
 ) -> Path:
-    """Write report.html into a run or robot folder from its newest evaluation; evaluate first if
-    there is none.
+    """Write report.html into a run or robot folder from its newest evaluation.
+
+    Evaluate first if there is none.
 
     Args:
         dataset: Evaluate on this dataset first. Default: the newest evaluation, or the test motions

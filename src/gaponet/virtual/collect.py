@@ -173,8 +173,9 @@ def _missing(wanted: list[Take], dataset: Dataset) -> list[Take]:
 def _require_same_source(
     dataset: Dataset, robot: RobotSpec, fleet: Fleet, recipe: Recipe, seed: int
 ) -> None:
-    """Write fleet, seed and payloads into a new dataset; refuse a dataset that was recorded with
-    others.
+    """Write fleet, seed and payloads into a new dataset.
+
+    Refuse a dataset that was recorded with others.
     """
     path = dataset.path / COLLECT_FILE
     source = {

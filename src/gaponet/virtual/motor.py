@@ -1,5 +1,6 @@
-"""Effects of the motors of virtual robots, on (N, n) arrays for N simulations at once; parameters
-are in Physics.
+"""Effects of the motors of virtual robots, on (N, n) arrays for N simulations at once.
+
+Parameters are in Physics.
 
 MuJoCo integrates the joints. The effects only change the gains and limits of its actuators and
 friction constraints, once per effect period. So friction sticks as in MuJoCo, and with neutral
@@ -251,8 +252,9 @@ class Backlash:
         self.speed = np.zeros_like(self.half)
 
     def step(self, torque: Array, h: float) -> Array:
-        """Advance by h s under the motor torque (N, n); return 1 where it reaches the link, 0 in
-        the gap.
+        """Advance by h s under the motor torque (N, n).
+
+        Return 1 where it reaches the link, 0 in the gap.
         """
         pressed = (np.abs(self.gap) >= self.half) & (self.gap * torque >= 0)
         speed = np.where(pressed, 0.0, self.speed + torque / self.armature * h)
@@ -317,8 +319,9 @@ def supply_factor(physics: Physics, power: Array) -> Array:
 
 
 class CommandLink:
-    """Delayed commands: each packet arrives after delay + jitter, or is lost; the newest arrived
-    one is in force.
+    """Delayed commands: each packet arrives after delay + jitter, or is lost.
+
+    The newest arrived one is in force.
     """
 
     def __init__(self, physics: Physics, dt: float) -> None:

@@ -23,8 +23,9 @@ MAX_LAG_S = 0.5  # simulated time behind the clock, once the robot was commanded
 
 
 class LiveUnit:
-    """One virtual unit, stepped in equal periods without a clock; base of every virtual bus and
-    driver.
+    """One virtual unit, stepped in equal periods without a clock.
+
+    Base of every virtual bus and driver.
     """
 
     def __init__(

@@ -25,8 +25,9 @@ class Clock(Protocol):
         """Return the time at or after an absolute deadline; at once if it has passed."""
 
     def suspended(self) -> float:
-        """Return the s for which the computer was suspended since some fixed moment; `now` stood
-        still meanwhile.
+        """Return the s for which the computer was suspended since some fixed moment.
+
+        `now` stood still meanwhile.
         """
 
 

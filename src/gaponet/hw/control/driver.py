@@ -14,8 +14,9 @@ EndAction = Literal["hand_over", "hold", "damp"]
 
 
 class DriverError(GAPONetError):
-    """A robot cannot be reached, does not answer, or gives invalid answers; the message says what
-    to check.
+    """A robot cannot be reached, does not answer, or gives invalid answers.
+
+    The message says what to check.
     """
 
 
@@ -120,8 +121,9 @@ class Driver(Protocol):
         """Compare all that can be read back with what was sent; may take several periods."""
 
     def damp(self, weight: float = 1.0, share: float = 0.0) -> None:
-        """Brake all joints without a position command; joints that cannot brake sink as their
-        torque is reduced.
+        """Brake all joints without a position command.
+
+        Joints that cannot brake sink as their torque is reduced.
 
         Args:
             weight: Our share of control; decreases to 0.

@@ -208,8 +208,9 @@ def require_known_limits(robot: RobotSpec, packaged: str) -> None:
 
 
 def accepted_folder(robot: RobotSpec) -> str | None:
-    """Return the folder whose limits the user accepted for this robot, as another process finds
-    it; or None.
+    """Return the folder whose limits the user accepted for this robot, or None.
+
+    The path is as another process finds it.
     """
     nominal = robot.before_identification
     return str(nominal.folder.resolve()) if nominal.limits_accepted else None

@@ -1,5 +1,6 @@
-"""Output: commands to a robot within its limits, and damping; and what all parts of a controller
-share.
+"""Output: commands to a robot within its limits, and damping.
+
+Also what all parts of a controller share.
 """
 
 from __future__ import annotations
@@ -100,8 +101,9 @@ class Output:
         )
 
     def admit(self, qpos: Array) -> Fault | None:
-        """Widen the limits to the measured position, (n) rad, so that it can be the first command;
-        or refuse it.
+        """Widen the limits to the measured position, (n) rad, so that it can be the first command.
+
+        If it is too far beyond its range, refuse it.
         """
         driver = self.context.driver
         joints = self.context.joints
@@ -225,8 +227,9 @@ class Output:
         return max(1.0 - (now - (self.damping_since or 0.0)) / self.context.config.damp, 0.0)
 
     def damp(self, left: float) -> None:
-        """Damp for a period, with this share of the last weight; may raise whatever a driver
-        raises.
+        """Damp for a period, with this share of the last weight.
+
+        May raise whatever a driver raises.
         """
         weight = left * (self.weight or 0.0)
         if self.watchdog and not self.watchdog.fired():

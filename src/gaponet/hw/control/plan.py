@@ -52,13 +52,15 @@ class TargetCompensator(Protocol):
     """Changes targets so that the robot reaches them (deploy.compensator). All joints, (n)."""
 
     def reset(self, target: Array, payload_mass: float | None = None) -> None:
-        """Begin at rest at `target` (n) rad, with a payload in kg or an unknown one; may take
-        long.
+        """Begin at rest at `target` (n) rad, with a payload in kg or an unknown one.
+
+        May take long.
         """
 
     def step(self, target: Array, qpos: Array | None, qvel: Array | None = None) -> Array:
-        """Return the command with which the robot reaches `target`, (n) rad; qpos None: no state
-        was measured.
+        """Return the command with which the robot reaches `target`, (n) rad.
+
+        qpos None: no state was measured.
         """
 
 
@@ -319,8 +321,9 @@ class Planner:
         )
 
     def _check(self, plan: Plan, required: Array) -> Plan:
-        """Check the whole plan again, however it was made; return it with its clearance and
-        torque.
+        """Check the whole plan again, however it was made.
+
+        Return it with its clearance and torque.
         """
         rows = plan.rows
         free = self.collision.along(rows)
@@ -428,8 +431,9 @@ class CollisionGuard:
         return np.where(self._free > keep, shrunk, self._free - 1e-9)
 
     def _try(self, move: Array, shares: tuple[float, ...], dt: float) -> bool:
-        """Make the largest of these shares of a move that leaves enough free space; return False
-        if none does.
+        """Make the largest of these shares of a move that leaves enough free space.
+
+        Return False if none does.
         """
         for share in shares:
             posture = self.qpos + share * move

@@ -1,5 +1,6 @@
-"""Lock that admits one controller per robot on this machine; the system releases it when its
-holder ends.
+"""Lock that admits one controller per robot on this machine.
+
+The system releases it when its holder ends.
 """
 
 from __future__ import annotations
@@ -44,8 +45,9 @@ def sole_publisher(address: str) -> Iterator[int]:
 
 
 def _device(address: str) -> str:
-    """Return the number of the device at an address, as a word; the address itself if it is no
-    device.
+    """Return the number of the device at an address, as a word.
+
+    The address itself if it is no device.
     """
     try:
         status = os.stat(address)

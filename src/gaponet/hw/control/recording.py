@@ -82,8 +82,9 @@ class Recording:
         return next((e for e in self.events if e.kind in FAULT_KINDS), None)
 
     def log(self, source: str = "controller") -> Log:
-        """Return the periods of the phase `run` as a Log of the commanded joints; its time begins
-        with them, s.
+        """Return the periods of the phase `run` as a Log of the commanded joints.
+
+        Its time begins with them, s.
 
         A row has the state read at the start of a period and the command sent in it, as to_sequence
         requires.

@@ -74,8 +74,9 @@ class Rows:
         self._writer: threading.Thread | None = None
 
     def write_to(self, folder: Path) -> None:
-        """Make the file in a folder; without this call it is a temporary one, which ends with the
-        process.
+        """Make the file in a folder.
+
+        Without this call it is a temporary one, which ends with the process.
 
         Raises:
             OSError: No file can be made there.

@@ -191,8 +191,9 @@ class LimitedCommand(NamedTuple):
 
 
 def limit_delta(delta: Array, previous: Array, dt: float, limits: Limits) -> Array:
-    """Return a correction (..., n) rad bounded in size and rate; NaN becomes the previous
-    correction.
+    """Return a correction (..., n) rad bounded in size and rate.
+
+    NaN becomes the previous correction.
     """
     step = limits.delta_rate * dt
     wanted = np.where(np.isfinite(delta), delta, previous)
@@ -239,8 +240,9 @@ def limit_command(
 
 
 def damping_gains(kd: Array, qvel: Array, effort: Array) -> Array:
-    """Return gains (n), at most kd, whose torque kd |q̇| stays within the effort limits; kd where
-    q̇ is unknown.
+    """Return gains (n), at most kd, whose torque kd |q̇| stays within the effort limits.
+
+    Where q̇ is unknown they are kd.
 
     A speed above MAX_BELIEVED_SPEED_RAD_S is a wrong reading, and counts as that speed: a joint
     always brakes.

@@ -34,8 +34,9 @@ class StopRequest:
 
 @contextmanager
 def stop_on_signals(stop: StopRequest) -> Iterator[None]:
-    """Let STOP_SIGNALS request a stop instead of ending or suspending the process; works in the
-    main thread only.
+    """Let STOP_SIGNALS request a stop instead of ending or suspending the process.
+
+    Works in the main thread only.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -53,8 +54,9 @@ def stop_on_signals(stop: StopRequest) -> Iterator[None]:
 
 
 class StopKeys:
-    """Any key on the terminal requests a stop, also Ctrl-C, Ctrl-Z and Ctrl-S; so does the end of
-    the terminal.
+    """Any key on the terminal requests a stop, also Ctrl-C, Ctrl-Z and Ctrl-S.
+
+    So does the end of the terminal.
 
     It is polled once per period. Without a terminal it does nothing.
     """

@@ -85,8 +85,9 @@ class Watchdog:
             raise DriverError("the watchdog could not reach the robot; see its message above")
 
     def problem(self) -> str:
-        """Return why this watchdog cannot damp the robot: it ended or does not answer; empty if it
-        can.
+        """Return why this watchdog cannot damp the robot: it ended or does not answer.
+
+        Empty if it can.
         """
         if self.fired() or self.process.poll() is not None:
             return "the watchdog ended"
@@ -104,8 +105,9 @@ class Watchdog:
         return self._fired
 
     def beat(self, weight: float) -> bool:
-        """Send a heartbeat with the weight of the command that follows; return False if the
-        watchdog has ended.
+        """Send a heartbeat with the weight of the command that follows.
+
+        Return False if the watchdog has ended.
         """
         if self.answer_time is None:
             self.answer_time = time.monotonic()
@@ -175,8 +177,9 @@ def _send(word: bytes) -> None:
 
 
 def _damp(driver: Driver, seconds: float, weight: float) -> None:
-    """Damp for some seconds from the first success on, and until the robot confirms it; retry what
-    fails.
+    """Damp for some seconds from the first success on, and until the robot confirms it.
+
+    Retry what fails.
     """
     start = time.monotonic()
     damping_since = None

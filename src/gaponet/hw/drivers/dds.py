@@ -60,8 +60,9 @@ def make_struct(typename: str, **fields: Any) -> Any:
 
 
 def _struct(name: str, fields: hg.Fields, **parts: type[IdlStruct]) -> type[IdlStruct]:
-    """Return the IDL type of a message of drivers.hg under its name in Unitree's IDL; parts: its
-    structs, by field.
+    """Return the IDL type of a message of drivers.hg under its name in Unitree's IDL.
+
+    parts: its structs, by field.
     """
     members = {field: (parts.get(field) or SCALARS[kind], count) for field, kind, count in fields}
     hints = {
@@ -79,8 +80,9 @@ LowCmd = _struct("LowCmd", hg.LOW_CMD, motor_cmd=MotorCmd)
 
 
 def as_bytes(kind: type[IdlStruct]) -> type[IdlStruct]:
-    """Change a type so that its samples are bytes (`.data`, after the CDR header); on the bus it
-    stays the same.
+    """Change a type so that its samples are bytes (`.data`, after the CDR header).
+
+    On the bus it stays the same.
     """
 
     def serialize(self: Any, *_: Any, **__: Any) -> bytes:
@@ -155,8 +157,9 @@ class Reader:
         return messages
 
     def publishers(self) -> set[int]:
-        """Return the handles of the publishers of the topic that are connected now; takes some
-        µs.
+        """Return the handles of the publishers of the topic that are connected now.
+
+        Takes some µs.
         """
         try:
             handles = self._reader.get_matched_publications()

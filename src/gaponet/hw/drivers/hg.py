@@ -95,8 +95,9 @@ class Message:
     def _bytes(
         self, wire: list[tuple[str, str, int, int]], packed: list[tuple[str, str, int, int]]
     ) -> Array:
-        """Return the wire offset of every byte of the padded struct; padding points behind the
-        message, at a 0.
+        """Return the wire offset of every byte of the padded struct.
+
+        Padding points behind the message, at a 0.
         """
         source = np.full(self.packed_size, self.wire_size)
         for (_, kind, count, at), (_, _, _, to) in zip(wire, packed, strict=True):

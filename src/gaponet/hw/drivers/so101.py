@@ -228,8 +228,9 @@ class SO101Driver:
         return self._bus
 
     def _set_sharing(self, mode: int) -> None:
-        """Let other programs open the port (SHARED), or not (EXCLUSIVE); who has it open, as our
-        watchdog, keeps it.
+        """Let other programs open the port (SHARED), or not (EXCLUSIVE).
+
+        Who has it open, as our watchdog, keeps it.
         """
         # A port without a descriptor, or removed.
         with contextlib.suppress(*PORT_ERRORS, AttributeError, ValueError):
@@ -252,8 +253,9 @@ class SO101Driver:
             )
 
     def _identify(self, bus: reg.ServoBus) -> None:
-        """Read and check model and mode of each servo; then read its gains, limits and
-        calibration.
+        """Read and check model and mode of each servo.
+
+        Then read its gains, limits and calibration.
         """
         servos = self.arm.servos
         numbers = dict(zip(self.joint_names, servos, strict=True))
@@ -427,8 +429,9 @@ class SO101Driver:
         return ""
 
     def _mismatch(self, what: str, servo: int) -> bool:
-        """Count a reading that differs from what was sent; return True after more than lost
-        packets can explain.
+        """Count a reading that differs from what was sent.
+
+        Return True after more than lost packets can explain.
         """
         self._mismatches[what, servo] += 1
         return self._mismatches[what, servo] >= MAX_MISMATCHES
@@ -445,8 +448,9 @@ class SO101Driver:
     def _check_settings(
         self, bus: reg.ServoBus, servos: list[int], retries: int = reg.RETRIES
     ) -> Fault | None:
-        """Return a fault if gains, ranges or zeros have changed; a servo that does not answer has
-        changed none.
+        """Return a fault if gains, ranges or zeros have changed.
+
+        A servo that does not answer has changed none.
         """
         wrong = []
         for servo, data in bus.sync_read(servos, reg.SETTINGS, retries).items():
@@ -501,8 +505,9 @@ class SO101Driver:
         self._goals_sent.append(set(goal.values()))
 
     def damp(self, weight: float = 1.0, share: float = 0.0) -> None:
-        """Lower the arm: torque limits decrease with `share`; at 0 the torque of all servos on the
-        bus is switched off.
+        """Lower the arm: torque limits decrease with `share`.
+
+        At 0 the torque of all servos on the bus is switched off.
 
         Everything is sent in every period, so that a lost packet does not matter. Nothing is read,
         except by the watchdog before it lowers: the controller may have died while it lowered.
@@ -559,8 +564,9 @@ class SO101Driver:
 
     @contextlib.contextmanager
     def _port_errors(self) -> Iterator[None]:
-        """Turn errors of the port into DriverErrors and close it; the next `damp` opens it
-        again.
+        """Turn errors of the port into DriverErrors and close it.
+
+        The next `damp` opens it again.
         """
         try:
             yield
@@ -584,8 +590,9 @@ class SO101Driver:
         self._serial = None
 
     def watchdog(self) -> dict[str, object] | None:
-        """Return the options of a driver that is silent until it damps; let it open the port until
-        the next `read`.
+        """Return the options of a driver that is silent until it damps.
+
+        Let it open the port until the next `read`.
         """
         calibration = str(self.calibration) if self.calibration else None
         self._set_sharing(SHARED)

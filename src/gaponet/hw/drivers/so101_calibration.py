@@ -35,8 +35,9 @@ Position = Annotated[int, at.Interval(ge=0, le=STEPS_PER_TURN - 1)]
 
 @dataclass(frozen=True)
 class ServoRow:
-    """Calibration of one joint: row of the file; all but id and drive_mode are also registers of
-    the servo.
+    """Calibration of one joint: row of the file.
+
+    All but id and drive_mode are also registers of the servo.
     """
 
     id: Annotated[int, at.Interval(ge=1, le=253)]

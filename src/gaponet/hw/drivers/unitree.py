@@ -268,8 +268,9 @@ class UnitreeDriver:
         )
 
     def read(self) -> State:
-        """Return the newest state with a right checksum; its time is the robot's, mapped to ours
-        (TickClock).
+        """Return the newest state with a right checksum.
+
+        Its time is the robot's, mapped to ours (TickClock).
         """
         assert self._state is not None
         assert self._states is not None
@@ -420,8 +421,9 @@ class UnitreeDriver:
         self._bus = self._states = self._writer = None
 
     def publishers(self) -> dict[str, list[str]]:
-        """Return the other publishers on the bus: topic → programs; the robot's topics are always
-        included.
+        """Return the other publishers on the bus: topic → programs.
+
+        The robot's topics are always included.
         """
         assert self._bus is not None
         publishers = self._bus.publishers()

@@ -118,8 +118,9 @@ class Transport(Protocol):
         """Return the messages since the last call, oldest first, at most some dozens."""
 
     def senders(self) -> set[Hashable]:
-        """Return the senders that are connected now; empty where a transport knows them by their
-        messages alone.
+        """Return the senders that are connected now.
+
+        Empty where a transport knows them by their messages alone.
         """
 
     def publish(self, to: Hashable, state: dict[str, Any]) -> None:
@@ -213,8 +214,9 @@ class LiveTargets:
         self._rejection = ""
 
     def __call__(self, k: int, state: State) -> Array | Fault | None:
-        """Return the position on the way to the target, (n) rad; it begins at the first target, at
-        rest.
+        """Return the position on the way to the target, (n) rad.
+
+        It begins at the first target, at rest.
 
         None: the sender has ended the motion and its last target is reached. Fault: no target was
         accepted for long.
@@ -294,8 +296,9 @@ class LiveTargets:
         return message
 
     def _receive(self, now: float, state: State) -> None:
-        """Accept the newest valid target; each is compared with the one in force before this
-        call.
+        """Accept the newest valid target.
+
+        Each is compared with the one in force before this call.
         """
         before = self._target
         since = now - self._accepted_time
@@ -355,8 +358,9 @@ class LiveTargets:
     def _full_target(
         self, message: Message, before: Array | None, since: float, state: State
     ) -> tuple[Array | None, str, str]:
-        """Return the target of all joints (n) rad, None for a greeting; or kind and reason of its
-        rejection.
+        """Return the target of all joints (n) rad, None for a greeting.
+
+        Or kind and reason of its rejection.
         """
         if not message.target:
             return None, "", ""

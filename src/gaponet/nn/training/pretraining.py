@@ -254,8 +254,9 @@ class Pretraining:
         return net.fit(self.pool_x[0], self.pool_labels[0], self.seed)
 
     def _fit(self, tick: Callable[[], object]) -> Array:
-        """Fit the network to the pool; return the mean squared label error of each gradient step,
-        rad².
+        """Fit the network to the pool.
+
+        Return the mean squared label error of each gradient step, rad².
         """
         config = self.config
         net = self.net

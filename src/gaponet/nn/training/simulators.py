@@ -67,8 +67,9 @@ def pieces(sequence: Sequence) -> list[Sequence]:
 def in_validation_simulators(
     sequences: ListOf[Sequence], robot: RobotSpec, config: TrainConfig
 ) -> list[Sequence]:
-    """Return about VALIDATION_SIMULATORS validation recordings in as many simulators; a recording
-    can be in several.
+    """Return about VALIDATION_SIMULATORS validation recordings in as many simulators.
+
+    A recording can be in several.
 
     No training recording has these simulators, but for the first one, the robot's own.
     """

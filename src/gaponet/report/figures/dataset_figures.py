@@ -50,8 +50,9 @@ class _NoDataError(Exception):
 def write_figures(
     dataset: Dataset, robot: RobotSpec, out: Path, progress: Progress = no_progress
 ) -> tuple[list[Path], dict[str, str]]:
-    """Write every figure for which the dataset has data; return the files, and {figure: reason for
-    its absence}.
+    """Write every figure for which the dataset has data.
+
+    Return the files, and {figure: reason for its absence}.
     """
     dataset.require_robot(robot)
     dataset.require_sequences()
@@ -105,8 +106,9 @@ def joint_ranges(dataset: Dataset, robot: RobotSpec) -> Figure:
 def draw_joint_ranges(
     positions: dict[str, Array], limits: dict[str, tuple[float, float]], title: str
 ) -> Figure:
-    """Draw a raincloud of each joint: density, quartiles with 1 % and 99 %, single rows; grey: the
-    joint's range.
+    """Draw a raincloud of each joint: density, quartiles with 1 % and 99 %, single rows.
+
+    grey: the joint's range.
 
     Args:
         positions: {joint: (k,) rad}.

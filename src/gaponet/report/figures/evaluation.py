@@ -139,8 +139,9 @@ def trajectories(
 def _trajectory(
     arrays: dict[str, Array], row: int, joints: tuple[str, ...], methods: list[str], dt: float
 ) -> Figure:
-    """Draw the three joints with the largest nominal error, a column each; moving joints come
-    first.
+    """Draw the three joints with the largest nominal error, a column each.
+
+    Moving joints come first.
 
     From top to bottom: positions, positions around the largest turn of the command, errors, and
     corrections.

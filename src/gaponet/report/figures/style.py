@@ -102,8 +102,9 @@ def _shortened(text: str, limit: int) -> str:
 
 
 def legend(fig: Figure, title: str = "") -> None:
-    """Add one legend for all axes above the figure, in as many columns as fit; title is that of
-    the figure.
+    """Add one legend for all axes above the figure, in as many columns as fit.
+
+    title is that of the figure.
     """
     handles: dict[str, Any] = {}
     for ax in fig.axes:
@@ -175,8 +176,9 @@ def draw_bars(ax: Axes, groups: ListOf[str], methods: Bars, size: float | None =
 
 
 def joint_label(joint: str, wrapped: bool = True) -> str:
-    """Return left_shoulder_pitch_joint as left shoulder pitch; wrapped: one word per line, for
-    neighbouring ticks.
+    """Return left_shoulder_pitch_joint as left shoulder pitch.
+
+    wrapped: one word per line, for neighbouring ticks.
     """
     words = joint.removesuffix("_joint").replace("_", " ")
     return words.replace(" ", "\n") if wrapped else words

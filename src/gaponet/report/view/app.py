@@ -419,8 +419,9 @@ class App:
         self._draw_recording()
 
     def _go_on(self, living: Job | None, every: list[Job]) -> None:
-        """After an identification compare it with the nominal robot; before the first recording
-        show the robot.
+        """After an identification compare it with the nominal robot.
+
+        Before the first recording show the robot.
         """
         last = self.jobs.result("identify")
         fitted = last is not None and last.number == every[-1].number and living is None
@@ -517,8 +518,9 @@ class App:
 
 
 def _make_places(folder: Path) -> None:
-    """Make the folders that the page writes into; a link, which could lead elsewhere, is
-    refused.
+    """Make the folders that the page writes into.
+
+    A link, which could lead elsewhere, is refused.
     """
     for name in (*PLACES, "jobs", "incoming"):
         if (folder / name).is_symlink():
@@ -587,8 +589,9 @@ def _report(job: Job) -> str:
 
 
 def _report_line(line: str) -> list[str]:
-    """Return a line that a command printed as lines of Markdown; a table of rich becomes one of
-    Markdown.
+    """Return a line that a command printed as lines of Markdown.
+
+    A table of rich becomes one of Markdown.
     """
     text = re.sub("[┃│]", "|", escape_markdown(line.strip()))
     if line.startswith("┡"):

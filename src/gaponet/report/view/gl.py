@@ -45,8 +45,9 @@ def _has_display() -> bool:
 
 
 def prepare() -> None:
-    """Choose the backend before anything imports mujoco; without one, only pictures are missing
-    later.
+    """Choose the backend before anything imports mujoco.
+
+    Without one, only pictures are missing later.
     """
     with suppress(UsageError):
         choose_gl()

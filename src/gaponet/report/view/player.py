@@ -162,8 +162,9 @@ def _page_colour(rgb: Array) -> Array:
 
 
 def draw_curves(gui: Any, time: Array, curves: Mapping[str, tuple[Array, str]], title: str) -> Any:
-    """Return a new chart over time (T), s, above a button that saves it; curves: name → values (T)
-    and colour.
+    """Return a new chart over time (T), s, above a button that saves it.
+
+    curves: name → values (T) and colour.
     """
     from viser.uplot import Scale, Series
 

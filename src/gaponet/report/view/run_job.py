@@ -70,8 +70,9 @@ def _lock_job(path: Path) -> int:
 
 
 def _take_standard_input() -> int:
-    """Return a descriptor of the server's pipe; the command itself finds an empty standard
-    input.
+    """Return a descriptor of the server's pipe.
+
+    The command itself finds an empty standard input.
     """
     pipe = os.dup(0)
     empty = os.open(os.devnull, os.O_RDONLY)

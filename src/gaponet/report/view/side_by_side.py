@@ -68,8 +68,9 @@ class SideBySide:
         return replace(self, motions=tuple(have[name] for name in dict.fromkeys(wanted)))
 
     def magnified(self, factor: float) -> SideBySide:
-        """Return the motions with their differences from the recording times a factor; errors are
-        unchanged.
+        """Return the motions with their differences from the recording times a factor.
+
+        Errors are unchanged.
         """
         if not factor > 0:
             raise UsageError(f"--magnify is {factor}; give a positive factor, 1 for the truth")
