@@ -26,11 +26,8 @@ def dense(
     """Return linear layers with ELU between them. With zero_output, the initial output is 0."""
     layers: list[nn.Module] = []
     for width in hidden:
-        # In place: half the memory traffic.
-        layers += [
-            nn.Linear(inputs, width),
-            nn.ELU(inplace=True),
-        ]
+        layers.append(nn.Linear(inputs, width))
+        layers.append(nn.ELU(inplace=True))  # in place: half the memory traffic
         inputs = width
     head = nn.Linear(inputs, outputs)
     if zero_output:
@@ -89,10 +86,10 @@ class Features(nn.Module):
         # Features that a shift of each joint changes.
         moved = self.layout.shifted(np.eye(n))[:, self.layout.query]
         moved[:, self.layout.q] = 0.0
-        self.register_buffer("position_column", torch.from_numpy(moved.argmax(0)), persistent=False)
-        self.register_buffer(
-            "is_position", torch.from_numpy(moved.max(0)).float(), persistent=False
-        )
+        column = torch.from_numpy(moved.argmax(0))
+        is_position = torch.from_numpy(moved.max(0)).float()
+        self.register_buffer("position_column", column, persistent=False)
+        self.register_buffer("is_position", is_position, persistent=False)
 
     def relative(self, x: Tensor) -> Tensor:
         """(B, dim of x) → (B, dim): subtract q_t from past positions, past targets and a_t."""
@@ -103,7 +100,9 @@ class Features(nn.Module):
         to 50 σ.
         """
         z = self.standardise(self.relative(x)).clamp(-MAX_FEATURE, MAX_FEATURE)
-        return z + self.noise_std * torch.randn_like(z) if self.noise_std else z
+        if self.noise_std:
+            z = z + self.noise_std * torch.randn_like(z)
+        return z
 
 
 class BoundedOutput(nn.Module):
@@ -127,7 +126,9 @@ class BoundedOutput(nn.Module):
     def forward(self, y: Tensor) -> Tensor:
         if self.hard:
             delta = self.gain * self.scale * y
-            return delta if self.training else delta.clamp(-self.delta_max, self.delta_max)
+            if self.training:
+                return delta
+            return delta.clamp(-self.delta_max, self.delta_max)
         return self.delta_max * torch.tanh(self.gain * self.scale / self.delta_max * y)
 
 

@@ -42,9 +42,8 @@ class OperatorNet(DeltaNet):
             inputs = config.observation_dim(n)
             self.predictor = SensorPredictor(inputs, config.sensor_hidden, config.sensor_dim(n))
         branch, trunk = self.joint_columns(config, n)
-        self.register_buffer(
-            "columns", torch.from_numpy(np.hstack([branch, trunk]).ravel()), persistent=False
-        )
+        columns = torch.from_numpy(np.hstack([branch, trunk]).ravel())
+        self.register_buffer("columns", columns, persistent=False)
         self.branch_inputs = branch.shape[1]
         self.trunk_inputs = trunk.shape[1]
         branch_hidden = config.branch_hidden
@@ -124,9 +123,8 @@ class OperatorNet(DeltaNet):
         if self.config.sensors != "off":
             z = torch.cat([z, self.sensors(z)], dim=1)
         z = pad(pad(z, (0, 1)), (0, 1), value=1.0)
-        return z.index_select(1, self.columns).reshape(
-            -1, self.n, self.branch_inputs + self.trunk_inputs
-        )
+        inputs = self.branch_inputs + self.trunk_inputs  # of a joint
+        return z.index_select(1, self.columns).reshape(-1, self.n, inputs)
 
     def correct(self, prepared: Tensor) -> Tensor:
         """⟨branch, trunk⟩ + c → Δa, (B, n) rad."""
@@ -151,9 +149,9 @@ class DeltaMLP(DeltaNet):
     def __init__(self, config: ModelConfig, n: int, hidden: Sequence[int] | None = None) -> None:
         """hidden: Widths of the hidden layers; default config.mlp_hidden."""
         super().__init__(config, n)
-        self.net = dense(
-            self.features.dim, config.mlp_hidden if hidden is None else hidden, n, zero_output=True
-        )
+        if hidden is None:
+            hidden = config.mlp_hidden
+        self.net = dense(self.features.dim, hidden, n, zero_output=True)
 
     def correct(self, prepared: Tensor) -> Tensor:
         return self.bounded(self.net(prepared))
@@ -179,7 +177,10 @@ class DeltaMLP(DeltaNet):
             high = 2 * high
         while high - low > 1:
             middle = (low + high) // 2
-            low, high = (middle, high) if excess(middle) < 0 else (low, middle)
+            if excess(middle) < 0:
+                low = middle
+            else:
+                high = middle
         return scaled(min((low, high), key=lambda width: abs(excess(width))))
 
 

@@ -1,13 +1,15 @@
 """Observation of the networks: the same code for training, aligned simulators and robots.
 
-o_t = [ q_t | q̇_t | h_{t-1} | … | h_{t-H} | (P / P_max) ],  h_s = [ q_s | q̇_s | u_s ],  u_s the
-target applied over [s, s+1), correction included. n operated joints; 2n + 3nH (+1) numbers. With a
-stride k, the frames are t-1, t-1-k, ….
+    o_t = [ q_t | q̇_t | h_{t-1} | … | h_{t-H} | (P / P_max) ]
+    h_s = [ q_s | q̇_s | u_s ]
+
+u_s is the target applied over [s, s+1), correction included. With n operated joints, o_t has
+2n + 3nH (+1) numbers. With a stride k, the frames are t-1, t-1-k, ….
 
 x = [ o_t | a_t ] is the input of a network. The paper's network (nn/paper.py) can have more
-columns: with fixed probes S_t, then, if it observes the recorded state, [ q_real − q | q̇_real − q̇
-| 1 ], all zero where that state is hidden. A network for many simulators has the context of
-sim/context.py as last columns.
+columns: with fixed probes S_t, then, if it observes the recorded state,
+[ q_real − q | q̇_real − q̇ | 1 ], all zero where that state is hidden. A network for many simulators
+has the context of sim/context.py as last columns.
 """
 
 from __future__ import annotations

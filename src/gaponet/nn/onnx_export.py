@@ -24,10 +24,10 @@ from gaponet.nn.networks import build_network
 from gaponet.nn.onnx_network import CARD_FACTS, TRUSTED, OnnxNetwork
 
 MAX_DIFFERENCE_RAD = 1e-5  # between ONNX and torch
-# Of matrices that `with_small_matrices` changes.
-MIN_SPARSE_ELEMENTS = 2048  # smaller ones are not worth an index
-MAX_DENSITY = 0.1  # share of elements that are not zero, for storage as a sparse matrix
-# the small first layers matter most for the output and little for the size
+MIN_SPARSE_ELEMENTS = 2048  # of a matrix that is stored sparsely; smaller ones need no index
+MAX_SPARSE_DENSITY = 0.1  # share of its elements that are not zero
+# Of a matrix that is stored as int16: the small first layers matter most for the output and little
+# for the size.
 MIN_INT16_ELEMENTS = 32_768
 
 
@@ -95,9 +95,8 @@ def onnx_content(net: DeltaNet) -> bytes:
     float32.
     """
     config = net.config
-    linear = (
-        config.kind not in ("paper", "trees") and config.sensors == "off" and not config.context
-    )
+    has_linear_features = config.kind not in ("paper", "trees")
+    linear = has_linear_features and config.sensors == "off" and not config.context
     content = io.BytesIO()
     x = torch.zeros(2, net.config.input_dim(net.n))
     exported: Any = _FusedFeatures(net) if linear else net
@@ -149,7 +148,7 @@ def with_small_matrices(content: bytes, *, int16: bool) -> bytes:
         matrix = onnx.numpy_helper.to_array(tensor)
         if matrix.ndim != 2:
             continue
-        few = np.count_nonzero(matrix) <= MAX_DENSITY * matrix.size
+        few = np.count_nonzero(matrix) <= MAX_SPARSE_DENSITY * matrix.size
         if few and matrix.size >= MIN_SPARSE_ELEMENTS:
             graph.sparse_initializer.append(_sparse(tensor.name, matrix))
         elif int16 and matrix.size >= MIN_INT16_ELEMENTS:
@@ -228,11 +227,7 @@ def sample_inputs(net: DeltaNet, count: int = 256, seed: int = 0) -> Array:
     z = torch.randn(count, features.dim, generator=generator)
     relative = features.standardise.mean + features.standardise.std * z
     # relative(x) is linear in x.
-    x = torch.linalg.solve(
-        features.relative(torch.eye(features.dim)).T.double(), relative.double().T
-    ).T
-    return (
-        torch.nn.functional.pad(x.float(), (0, net.config.input_dim(net.n) - features.dim))
-        .contiguous()
-        .numpy()
-    )
+    matrix = features.relative(torch.eye(features.dim)).T.double()
+    x = torch.linalg.solve(matrix, relative.double().T).T.float()
+    further = net.config.input_dim(net.n) - features.dim
+    return torch.nn.functional.pad(x, (0, further)).contiguous().numpy()

@@ -1,9 +1,12 @@
 """Networks of the package by name, as load_robot has robots by name.
 
-PACKAGE_FOLDER/NAME/model.onnx           the network               card.json         what it is, and
-                    how good it is split.json           hashes of its recordings  delay_offset.json
-                    the delay and offset baseline packaged_robot.json  its simulator: a robot of the
-                    package and the factor on its gains
+PACKAGE_FOLDER/NAME has these files:
+
+    model.onnx           the network
+    card.json            what it is, and how good it is
+    split.json           hashes of its recordings
+    delay_offset.json    the delay and offset baseline
+    packaged_robot.json  its simulator: a robot of the package and the factor on its gains
 
 `benchmarks/ship_networks.py` makes such a folder from a run. Nothing writes into it afterwards.
 """

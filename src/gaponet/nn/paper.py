@@ -1,10 +1,14 @@
 """The network of the GAPONet paper in its literal form: `gaponet train … --model paper`.
 
-    (μ, log σ²) = f(A, Q, V, P, J, Q_real, V_real),  S ~ N(μ, σ²)   (1)  sensor predictor, 128-128
-    b = Branch(S)                                                   (2)  branch, 256-256-256-16n,
-    ELU after each layer y = Trunk(A) or Trunk(P, A)                                     (3)  trunk,
-    128-128-128-16n, linear output Δa_j = Σ_i b_ij y_ij,  i = 1 … p = 16
-    (4)  no bias
+    (μ, log σ²) = f(A, Q, V, P, J, Q_real, V_real),  S ~ N(μ, σ²)   (1)
+    b = Branch(S)                                                   (2)
+    y = Trunk(A) or Trunk(P, A)                                     (3)
+    Δa_j = Σ_i b_ij y_ij,  i = 1 … p = 16                           (4)
+
+    (1) sensor predictor, hidden layers 128-128
+    (2) branch, 256-256-256-16n, ELU after each layer
+    (3) trunk, 128-128-128-16n, linear output
+    (4) no bias
 
 A is the target, Q and V are positions and velocities, P is the payload, J is the joint index.
 Q_real and V_real are the recorded state.
@@ -16,9 +20,9 @@ and export.
 
 `predictor_inputs` says what the predictor of (1) sees:
 
-    observation   Q, V, P, and the H past frames of Q, V, A: 20 + 30 H numbers for n = 10, one more
-                  with P. J is the place in the output: one pass gives the sensor values of all
-                  joints.
+    observation   Q, V, P, and the H past frames of Q, V, A: 20 + 30 H numbers for n = 10, one
+                  more with P. J is the place in the output: one pass gives the sensor values of
+                  all joints.
     equation_1    Also the present A, J, Q_real − Q, V_real − V, and 1 where the recorded state is
                   visible. One network is shared by the joints: with the input J, it gives the 2m
                   sensor values of joint J.
@@ -32,11 +36,10 @@ information.
 `sensor_source` says where S comes from. The probe targets are q + e_k, k = 1 … m:
 
     predicted   e_k are fixed; one predictor gives the answers to all.
-    fixed       e_k are fixed; the simulator itself gives S, which is the limit of a perfect
-    predictor. learned     e_k are parameters that PPO trains, within ±probe_limit. The predictor
-    takes one e_k beside the state
-                and gives its 2n answers. It is fitted to random e_k, then frozen; gradients pass
-                through it.
+    fixed       e_k are fixed; the simulator itself gives S, the limit of a perfect predictor.
+    learned     e_k are parameters that PPO trains, within ±probe_limit. The predictor takes one
+                e_k beside the state and gives its 2n answers. It is fitted to random e_k, then
+                frozen; gradients pass through it.
     none        There is no S. The branch sees the observation, as the predictor would see it.
                 Compare with `predicted` to learn what the predictor costs and brings.
 

@@ -1,11 +1,15 @@
 """Recordings and files of one training run.
 
-RUN/config.json        all that is needed to repeat it      RUN/progress.jsonl   training curve, one
-line per validation RUN/split.json         content hashes of each split         RUN/checkpoint.pt
-newest state, for --resume RUN/delay_offset.json  the delay and offset baseline        RUN/model/
-the artifact: model.onnx, card.json RUN/candidates.json    validation errors of --model auto
-RUN/candidates/      the run of each of its networks RUN/robot/             the simulator that is
-corrected      RUN/tensorboard/     the same curve, with --log tensorboard
+RUN/config.json        all that is needed to repeat it
+RUN/split.json         content hashes of each split
+RUN/delay_offset.json  the delay and offset baseline
+RUN/robot/             the simulator that is corrected
+RUN/progress.jsonl     training curve, one line per validation
+RUN/checkpoint.pt      newest state, for --resume
+RUN/model/             the artifact: model.onnx, card.json
+RUN/tensorboard/       the training curve, with --log tensorboard
+RUN/candidates.json    validation errors of --model auto
+RUN/candidates/        the run of each of its networks
 """
 
 from __future__ import annotations

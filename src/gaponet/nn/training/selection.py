@@ -48,19 +48,11 @@ def train_best(out: Path, resume: bool, train: Train) -> GapModel:
         )
     if not resume and (begun or present):
         raise UsageError(f"{out}: holds a run already; add --resume, or choose another --out")
-    errors = candidate_errors(out)
     kinds = [kind for kind in CANDIDATES if kind != "trees" or trees_available()]
-    for i, kind in enumerate(kinds):
-        if kind in errors:
-            continue
-        run = out / FOLDER / kind
-        again = (run / CHECKPOINT).is_file()
-        model = train(kind, run, SHARE, i * SHARE, again)
-        if model.card["interrupted"]:
-            _copy(out, _best(errors) if errors else kind)
-            return GapModel.load(out)
-        errors[kind] = _validation_error(model)
-        write_json(out / ERRORS, errors)
+    errors, interrupted = _train_candidates(out, kinds, train)
+    if interrupted:
+        _copy(out, _best(errors) if errors else interrupted)
+        return GapModel.load(out)
     best = _best(errors)
     if _kind(out) != best:
         _copy(out, best)
@@ -72,6 +64,28 @@ def train_best(out: Path, resume: bool, train: Train) -> GapModel:
     if _validation_error(model) < errors["trees"]:
         _copy(out, best_network)
     return GapModel.load(out)
+
+
+def _train_candidates(
+    out: Path, kinds: list[ModelKind], train: Train
+) -> tuple[dict[ModelKind, float], ModelKind | None]:
+    """Train the candidates that have no validation error yet.
+
+    Returns:
+        Validation errors, rad, and the kind whose training was interrupted, or None.
+    """
+    errors = candidate_errors(out)
+    for i, kind in enumerate(kinds):
+        if kind in errors:
+            continue
+        run = out / FOLDER / kind
+        again = (run / CHECKPOINT).is_file()
+        model = train(kind, run, SHARE, i * SHARE, again)
+        if model.card["interrupted"]:
+            return errors, kind
+        errors[kind] = _validation_error(model)
+        write_json(out / ERRORS, errors)
+    return errors, None
 
 
 def _best(errors: dict[ModelKind, float]) -> ModelKind:
