@@ -134,13 +134,10 @@ class Reader:
             DriverError: DDS fails.
         """
         try:
-            return [
-                sample
-                for sample in self._reader.take(N=self._queue_length)
-                if hasattr(sample, "data")
-            ]
+            taken = self._reader.take(N=self._queue_length)
         except DDSException as error:
             raise DriverError(f"DDS does not give messages: {error}") from None
+        return [sample for sample in taken if hasattr(sample, "data")]
 
     def receive(self) -> list[Array]:
         """Return the messages since the last call, oldest first, as arrays of bytes."""
@@ -277,9 +274,9 @@ def _programs(participant: DomainParticipant) -> dict[Any, str]:
 def _program(qos: Qos) -> str:
     """Return name, process and machine of a participant, as far as it tells them."""
     properties = {policy.key: policy.value for policy in qos if isinstance(policy, Policy.Property)}
-    name, pid, host = (
-        properties.get(f"__{key}", "?") for key in ("ProcessName", "Pid", "Hostname")
-    )
+    name = properties.get("__ProcessName", "?")
+    pid = properties.get("__Pid", "?")
+    host = properties.get("__Hostname", "?")
     return f"{name} (process {pid} on {host})"
 
 

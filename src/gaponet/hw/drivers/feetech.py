@@ -155,12 +155,10 @@ class ServoBus:
 
     def sync_write(self, register: Register, values: dict[int, int]) -> None:
         """Write one register of several servos; they do not acknowledge it."""
-        parameters = b"".join(
-            bytes([servo]) + register.encode(value) for servo, value in values.items()
-        )
-        self._send(
-            packet(BROADCAST, SYNC_WRITE, bytes([register.address, register.size]) + parameters)
-        )
+        parameters = bytes([register.address, register.size])
+        for servo, value in values.items():
+            parameters += bytes([servo]) + register.encode(value)
+        self._send(packet(BROADCAST, SYNC_WRITE, parameters))
 
     def broadcast(self, register: Register, value: int) -> None:
         """Write one register of all servos on the bus; they do not acknowledge it."""

@@ -32,9 +32,8 @@ def supported_options(name: str, options: Mapping[str, Any]) -> dict[str, Any]:
     Raises:
         UsageError: There is no such driver, or its package is broken.
     """
-    parameters = inspect.signature(
-        plugins.require(plugins.DRIVERS, name, DRIVERS, "driver")
-    ).parameters
+    make_driver = plugins.require(plugins.DRIVERS, name, DRIVERS, "driver")
+    parameters = inspect.signature(make_driver).parameters
     return {option: value for option, value in options.items() if option in parameters}
 
 
@@ -59,11 +58,10 @@ def open_driver(
     if limits_from is not None:
         spec = hardware_robot(spec, reference_robot(kind, limits_from))
     driver: Driver = plugins.require(plugins.DRIVERS, kind, DRIVERS, "driver")(spec, **options)
-    members = [
-        *Driver.__annotations__,
-        *(name for name in vars(Driver) if not name.startswith("_")),
-    ]
-    if missing := [name for name in members if not hasattr(driver, name)]:
+    members = list(Driver.__annotations__)
+    members += [name for name in vars(Driver) if not name.startswith("_")]
+    missing = [name for name in members if not hasattr(driver, name)]
+    if missing:
         raise UsageError(
             f"driver '{kind}' lacks {', '.join(missing)} (gaponet.hw.control.driver.Driver says "
             "what they do)"

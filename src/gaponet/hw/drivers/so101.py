@@ -45,7 +45,8 @@ try:
     import termios
 except ImportError:  # Windows, where only one program can open a port
     PORT_ERRORS: tuple[type[Exception], ...] = (OSError,)
-    EXCLUSIVE = SHARED = 0
+    EXCLUSIVE = 0
+    SHARED = 0
 else:
     # Pyserial's own errors are OSErrors; a removed port also raises the other.
     PORT_ERRORS = (
@@ -150,7 +151,8 @@ class SO101Driver:
         self.timeout = timeout
         self.silent = silent
         self.address = port
-        self.joint_names = self.commanded = robot.joint_names
+        self.joint_names = robot.joint_names
+        self.commanded = robot.joint_names
         self.file_calibration = read_calibration(calibration, robot) if calibration else None
         self.arm = self.file_calibration or uncalibrated(robot)
         self._nominal = robot.before_identification
@@ -349,12 +351,12 @@ class SO101Driver:
         for name, register in READINGS.items():
             values = [register.value_in(reg.RUNNING, blocks[servo]) for servo in servos]
             raw[name] = np.array(values, float)
-        self._disobedience = (
-            self._disobedience
-            or self._check_source(bus, blocks, now)
-            or self._check_running(blocks)
-            or self._check_next_settings(bus, now)
-        )
+        if self._disobedience is None:
+            self._disobedience = (
+                self._check_source(bus, blocks, now)
+                or self._check_running(blocks)
+                or self._check_next_settings(bus, now)
+            )
         sign = self.arm.sign
         share = np.abs(raw["current"]) / STALL_CURRENT_STEPS * np.sign(raw["load"])
         self._state = State(

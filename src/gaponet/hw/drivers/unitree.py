@@ -223,11 +223,9 @@ class UnitreeDriver:
                     arrivals.append(now)
                     messages.append(data)
             if now - start > CONNECT_TIMEOUT_S and not arrivals:
-                wrong = (
-                    f"; {self._refused} messages came, all damaged or of another type"
-                    if self._refused
-                    else ""
-                )
+                wrong = ""
+                if self._refused:
+                    wrong = f"; {self._refused} messages came, all damaged or of another type"
                 raise DriverError(
                     f"nobody speaks on rt/lowstate, domain {self.domain}, interface "
                     f"{self.interface}, within {CONNECT_TIMEOUT_S:g} s{wrong}. Is the robot on, "
@@ -247,18 +245,17 @@ class UnitreeDriver:
         slots are not all 0.
         """
         self._machine = int(hg.LowState.view(messages[-1], "mode_machine")[0])
-        fields = [hg.LowState.motors(data, name) for data in messages for name in MOTOR_FIELDS]
-        values = np.concatenate([field.reshape(hg.MOTORS, -1) for field in fields], axis=1)
-        used = np.abs(values).max(axis=1) != 0
+        used = np.zeros(hg.MOTORS, bool)  # slots in which anything is not 0
+        for data in messages:
+            for name in MOTOR_FIELDS:
+                used |= (hg.LowState.motors(data, name).reshape(hg.MOTORS, -1) != 0).any(axis=1)
         strange = np.flatnonzero(used[len(MOTOR_NAMES) :])
         missing = np.flatnonzero(~used[: len(MOTOR_NAMES)])
         if self._machine in G1_MACHINES:
             reason = f"its mode_machine is {self._machine}, a G1's"
         elif len(strange):
-            reason = (
-                "there are motors in slots "
-                f"{', '.join(str(len(MOTOR_NAMES) + i) for i in strange)}, a G1's"
-            )
+            slots = ", ".join(str(len(MOTOR_NAMES) + i) for i in strange)
+            reason = f"there are motors in slots {slots}, a G1's"
         elif len(missing):
             reason = f"no motor in slot {missing[0]}, {MOTOR_NAMES[missing[0]]}"
         else:
@@ -320,11 +317,11 @@ class UnitreeDriver:
         at = self._motor
         measured = clock.time(int(message.view(data, "tick")[0]), now)
         self.virtual = int(message.view(data, "reserve")[0]) == VIRTUAL_MARK
-        q, dq, tau = (
-            message.motors(data, name)[at].astype(float) for name in ("q", "dq", "tau_est")
-        )
-        # Case and winding.
-        temperature = message.motors(data, "temperature")[at].max(axis=1).astype(float)
+        q = message.motors(data, "q")[at].astype(float)
+        dq = message.motors(data, "dq")[at].astype(float)
+        tau = message.motors(data, "tau_est")[at].astype(float)
+        case_and_winding = message.motors(data, "temperature")[at]
+        temperature = case_and_winding.max(axis=1).astype(float)
         quaternion = message.view(data, "imu_state.quaternion").astype(float)
         _, x, y, _ = quaternion
         # The vertical's component along the trunk; an invalid quaternion gives NaN, which counts as
@@ -405,7 +402,8 @@ class UnitreeDriver:
     def confirm(self) -> str:
         """Check that the robot still sends states; it reports nothing else of its damping."""
         state = self.read()
-        if (age := time.monotonic() - state.time) > MAX_SILENCE_S:
+        age = time.monotonic() - state.time
+        if age > MAX_SILENCE_S:
             raise DriverError(f"nothing was heard of the robot for {age:.1f} s")
         return "damped and let go"
 
@@ -418,7 +416,9 @@ class UnitreeDriver:
         with contextlib.suppress(DriverError):
             if not hold:
                 self.damp(0.0)
-        self._bus = self._states = self._writer = None
+        self._bus = None
+        self._states = None
+        self._writer = None
 
     def publishers(self) -> dict[str, list[str]]:
         """Return the other publishers on the bus: topic → programs.
@@ -427,10 +427,8 @@ class UnitreeDriver:
         """
         assert self._bus is not None
         publishers = self._bus.publishers()
-        return {
-            topic: publishers[topic]
-            for topic in (STATES_TOPIC, "rt/arm_sdk", "rt/lowcmd", *sorted(publishers))
-        }
+        topics = (STATES_TOPIC, "rt/arm_sdk", "rt/lowcmd", *sorted(publishers))
+        return {topic: publishers[topic] for topic in topics}
 
     def watchdog(self) -> dict[str, object] | None:
         """Return the options of a second participant: connected from the start, and silent until

@@ -95,10 +95,9 @@ class RemoteRobot:
         self._context.destroy()
 
     def _send(self, message: dict[str, object]) -> None:
+        data = json.dumps({"time": time.monotonic()} | message).encode()
         with contextlib.suppress(zmq.Again):  # nobody reads; the next target is newer
-            self._socket.send(
-                json.dumps({"time": time.monotonic()} | message).encode(), zmq.NOBLOCK
-            )
+            self._socket.send(data, zmq.NOBLOCK)
 
     def _newest(self) -> State | None:
         if not self._socket.poll(round(1e3 * self.patience)):
@@ -117,5 +116,7 @@ class RemoteRobot:
         if "nominal_qpos" in message:
             self.nominal_qpos = np.array(message["nominal_qpos"], float)
             self.nominal_qvel = np.array(message["nominal_qvel"], float)
-        qpos, qvel, tau = (np.array(message[name], float) for name in ("qpos", "qvel", "tau"))
+        qpos = np.array(message["qpos"], float)
+        qvel = np.array(message["qvel"], float)
+        tau = np.array(message["tau"], float)
         return State(message["time"], qpos, qvel, tau, np.full_like(qpos, np.nan))

@@ -33,7 +33,8 @@ class PipeTransport:
         self.address = "stdin"
         self._descriptor = sys.stdin.fileno() if descriptor is None else descriptor
         self._partial_line = b""
-        self._skipping = self._closed = False
+        self._skipping = False  # the rest of a line that was too long
+        self._closed = False
 
     def receive(self) -> list[Message]:
         """Return the messages of all whole lines since the last call."""

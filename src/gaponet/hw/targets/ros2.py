@@ -105,7 +105,9 @@ class ROS2Transport:
 
     def close(self, reason: str) -> None:
         """Leave the bus."""
-        self._bus = self._reader = self._writer = None  # type: ignore[assignment]
+        self._bus = None  # type: ignore[assignment]
+        self._reader = None  # type: ignore[assignment]
+        self._writer = None  # type: ignore[assignment]
 
 
 def to_message(sender: Hashable, data: bytes) -> Message:
