@@ -485,10 +485,7 @@ class StateMonitor:
         last = self._last
         if last is None or state.time <= last.time or not self.config.frozen:
             return None
-        same_motion = np.array_equal(state.qpos, last.qpos) and np.array_equal(
-            state.qvel, last.qvel
-        )
-        if not (same_motion and np.array_equal(state.tau, last.tau)):
+        if not _reads_the_same(state, last):
             self._equal_states = 0
             self._travel[:] = 0.0
             return None
@@ -582,3 +579,9 @@ class StateMonitor:
                 f"{count} messages with a wrong checksum within a second; check cable and firmware",
             )
         return None
+
+
+def _reads_the_same(state: State, last: State) -> bool:
+    """Return True if positions, velocities and torques of two states are equal to the last bit."""
+    names = ("qpos", "qvel", "tau")
+    return all(np.array_equal(getattr(state, name), getattr(last, name)) for name in names)
