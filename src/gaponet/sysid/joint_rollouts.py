@@ -57,62 +57,25 @@ class JointRollouts:
             robot: Its stops, zeros, limits and inertias hold.
             contact_height: Height under which a tip may touch something, m.
         """
-        self.parts, self.robot, self.op = parts, robot, robot.operated_index
+        self.parts = parts
+        self.robot = robot
+        self.op = robot.operated_index
         self.nthread = nthread or os.cpu_count() or 1
         self.periods = np.array([p.dt for p in parts])  # (windows,) s
         self.dt = float(self.periods.max())
-        self.count = robot.steps_per(
-            self.dt
-        )  # physics steps of every period, so that windows step side by side
+        # Physics steps of every period, so that windows step side by side.
+        self.count = robot.steps_per(self.dt)
         self.thin = max(1, round(ROW_PERIOD_S / self.dt))
         # Rows of each window from one that is compared to the next, (windows,): multiples of `thin`.
-        thins = self.thin * np.maximum(1, np.round(ROW_PERIOD_S / self.periods / self.thin)).astype(
-            int
-        )
-        self._thins, rows = thins, max(map(len, parts))
-        payloads = [(p.meta.payload_mass, p.meta.payload_side) for p in parts]
-        models = {
-            x: build_model(robot, *x, self.dt, physics_only=True) for x in dict.fromkeys(payloads)
-        }
-        loads = [
-            _loads_along(p, models[x], self.op, k)
-            for p, x, k in zip(parts, payloads, thins, strict=True)
-        ]
-        low, high = robot.qpos_range[self.op].T
-
-        def stacked(
-            xs: list[Array],
-        ) -> Array:  # (n, windows, rows), so that a rollout reads contiguous memory
-            return np.stack([_extended(x, rows) for x in xs]).transpose(2, 0, 1).astype(np.float32)
-
-        def at_middle(x: Array) -> Array:
-            return 0.5 * (x + np.concatenate([x[..., 1:], x[..., -1:]], axis=-1))
-
-        self.qpos = stacked([p.qpos[:, self.op] for p in parts])
-        self.ctrl = stacked([np.clip(p.ctrl[:, self.op], low, high) for p in parts])
-        if (speed := robot.target_speed[self.op]).any():
-            most = np.where(speed > 0, speed, np.inf)[:, None]
-            limited = speed_limited(
-                np.moveaxis(self.ctrl, -1, 0), self.qpos[..., 0], most, self.periods
-            )
-            self.ctrl = np.ascontiguousarray(np.moveaxis(limited, 0, -1))
-        self.qvel = stacked([p.qvel[:, self.op] for p in parts])
-        # In the middle of each period: inertia, gravity's torque at an angle of zero, the others' torque, its slope.
-        inertia, weight, pull, slope = (
-            at_middle(stacked([load[i] for load in loads])) for i in range(4)
-        )
-        self.tables = np.stack([inertia, weight - slope * at_middle(self.qpos), pull, slope])
-        # A rollout stops at the ends of the range or of the recording, so that none diverges.
-        reached = self.qpos.min(axis=(1, 2)), self.qpos.max(axis=(1, 2))
-        self.stops = np.stack([
-            np.minimum(np.where(np.isfinite(low), low, -UNLIMITED_STOP_RAD), reached[0]),
-            np.maximum(np.where(np.isfinite(high), high, UNLIMITED_STOP_RAD), reached[1]),
-        ], axis=1).astype(np.float32)  # fmt: skip
-        heights = tips_of(robot) or (lambda qpos: np.full(len(qpos), np.inf))
-        self.touch = (
-            np.stack([_extended(heights(p.qpos), rows) for p in parts]) < contact_height
-        )  # (windows, rows)
+        thins = np.round(ROW_PERIOD_S / self.periods / self.thin)
+        self._thins = self.thin * np.maximum(1, thins).astype(int)
         self.lengths = np.array([len(p) for p in parts])
+        self.qpos = self._stacked([p.qpos[:, self.op] for p in parts])
+        self.qvel = self._stacked([p.qvel[:, self.op] for p in parts])
+        self.ctrl = self._commands()
+        self.tables = self._loads()
+        self.stops = self._stops()
+        self.touch = self._touch(contact_height)  # (windows, rows)
         # Joints that a window does not hold have no error, (n, windows).
         self.recorded = np.array(
             [[j not in p.meta.unrecorded for p in parts] for j in robot.operated]
@@ -123,6 +86,60 @@ class JointRollouts:
         self.kp_ratio = np.array([(r.kp / robot.kp)[self.op] for r in acting])
         self.kd = np.array([r.kd[self.op] for r in acting])
         self.temperature = recorded_temperatures(parts, self.op).T  # (n, windows) °C
+
+    def _stacked(self, windows: list[Array]) -> Array:
+        """Return arrays (rows, n) of each window as (n, windows, rows); the last row of a shorter one is repeated."""
+        rows = int(self.lengths.max())
+        extended = np.stack([_extended(x, rows) for x in windows])
+        return extended.transpose(2, 0, 1).astype(np.float32)
+
+    def _commands(self) -> Array:
+        """Return the commands inside the joints' ranges, as servos with a speed limit ramp them, (n, windows, rows)."""
+        low, high = self.robot.qpos_range[self.op].T
+        ctrl = self._stacked([np.clip(p.ctrl[:, self.op], low, high) for p in self.parts])
+        speed = self.robot.target_speed[self.op]
+        if not speed.any():
+            return ctrl
+        limit = np.where(speed > 0, speed, np.inf)[:, None]
+        limited = speed_limited(np.moveaxis(ctrl, -1, 0), self.qpos[..., 0], limit, self.periods)
+        return np.ascontiguousarray(np.moveaxis(limited, 0, -1))
+
+    def _loads(self) -> Array:
+        """Return the loads along the recordings in the middle of each period, as `Windows.loads`."""
+        payloads = [(p.meta.payload_mass, p.meta.payload_side) for p in self.parts]
+        models = {
+            x: build_model(self.robot, *x, self.dt, physics_only=True)
+            for x in dict.fromkeys(payloads)
+        }
+        along = [
+            _loads_along(part, models[payload], self.op, thin)
+            for part, payload, thin in zip(self.parts, payloads, self._thins, strict=True)
+        ]
+        inertia, weight, pull, slope = (
+            _at_middle(self._stacked([loads[i] for loads in along])) for i in range(4)
+        )
+        # Gravity's torque is that at an angle of zero.
+        return np.stack([inertia, weight - slope * _at_middle(self.qpos), pull, slope])
+
+    def _stops(self) -> Array:
+        """Return the ends of each joint's range, or of the recordings, so that no rollout diverges, (n, 2) rad."""
+        low, high = self.robot.qpos_range[self.op].T
+        lowest = np.where(np.isfinite(low), low, -UNLIMITED_STOP_RAD)
+        highest = np.where(np.isfinite(high), high, UNLIMITED_STOP_RAD)
+        ends = (
+            np.minimum(lowest, self.qpos.min(axis=(1, 2))),
+            np.maximum(highest, self.qpos.max(axis=(1, 2))),
+        )
+        return np.stack(ends, axis=1).astype(np.float32)
+
+    def _touch(self, contact_height: float) -> Array:
+        """Return the rows in which a tip is below a height, m, (windows, rows)."""
+        rows = int(self.lengths.max())
+        heights = tips_of(self.robot)
+        if heights is None:
+            return np.zeros((len(self.parts), rows), bool)
+        each = np.stack([_extended(heights(p.qpos), rows) for p in self.parts])
+        return np.asarray(each < contact_height)
 
     def _counted(self) -> Array:
         """Return the rows that count, (windows, rows): after the start has settled, away from contacts."""
@@ -306,6 +323,11 @@ def _loads_along(part: Sequence, model: mujoco.MjModel, op: Array, thin: int) ->
         if thin == 1
         else np.apply_along_axis(lambda y: np.interp(rows, at, y), 1, loads)
     )
+
+
+def _at_middle(x: Array) -> Array:
+    """Return values (…, rows) in the middle between each row and the next."""
+    return np.asarray(0.5 * (x + np.concatenate([x[..., 1:], x[..., -1:]], axis=-1)))
 
 
 def _extended(x: Array, rows: int) -> Array:

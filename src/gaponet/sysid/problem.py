@@ -49,6 +49,11 @@ MAX_GAIN_RATIO = (
 STATED_KP_LOG_STD = 0.1  # of a kp that recordings state
 RELATIVE_GAP_STD = 0.06  # of backlash, by the physics step and by what else crosses the gap (benchmarks/backlash.py)
 UNIFORM_STD = 0.29  # of what is uniformly distributed over one step
+MIN_SLOPE = (
+    3e-5  # of all rows together over a parameter, errors a large change; less counts as none
+)
+UNKNOWN_STD = 1e3  # large changes, of a parameter that no row depends on
+DERIVATIVE_STEP = 1e-3  # large changes, of the delta method
 MAX_RELATIVE_STD = 0.15  # of a value and of its scale; beyond it the parameter is not determined
 
 
@@ -312,52 +317,71 @@ class StandardErrors:
 
 
 def standard_errors(problem: FitProblem, values: Values) -> StandardErrors:
-    """Estimate the standard errors of values (n,).
+    """Estimate the standard errors of values (n,): on the axes by `_covariance`, then in SI units."""
+    names = fitted_fields(values)
+    joints = problem.robot.operated
+    axes = Axes(problem.bounds, names, values)
+    x = axes.normalize(values)  # (n, P)
+    covariance, lost = _covariance(problem, axes, x)
+    std = _std_in_si(axes, x, values, covariance, lost)
+    for field, error in _discretisation_std(problem, values).items():
+        std[field] = np.hypot(std[field], error)
+    if "no_load_speed" in std:  # a joint without a line: on its axis zero, but infinite in SI units
+        std["no_load_speed"] *= values["no_load_speed"] > 0
+    width = np.sqrt(np.einsum("...ii->...i", covariance))
+    width = width + np.where(lost & (axes.low < axes.high), UNKNOWN_STD, 0)
+    unknown = _undetermined(problem, values, axes, std, width)
+    unit = axes.unit[..., None]
+    unseen = UNKNOWN_STD * np.eye(len(names)) * lost[..., None, :]
+    in_axis_units = unit * (covariance + unseen) * np.swapaxes(unit, -1, -2)
+    return StandardErrors(
+        std={j: {f: float(std[f][i]) for f in names} for i, j in enumerate(joints)},
+        covariance={j: (names, in_axis_units[i]) for i, j in enumerate(joints)},
+        undetermined={j: fields for j, (fields, _) in unknown.items()},
+        sentences=tuple(text for _, text in unknown.values()),
+    )
 
-    They come from derivatives, from the spread of the gradients over windows, from the width of the prior where it
-    holds a value, and from the length of a further step.
+
+def _covariance(problem: FitProblem, axes: Axes, x: Array) -> tuple[Array, Array]:
+    """Return the covariance of values x (n, P) in large changes, (n, P, P), and which no row depends on, (n, P).
+
+    This is the sandwich estimator with windows as clusters (Huber 1967; Liang and Zeger 1986): errors within a window
+    are not independent, so the spread of the windows' gradients stands between two inverse curvatures. C clusters of P
+    parameters are few, so the spread is multiplied by (C / (C − P))², the jackknife's correction at average leverage
+    (MacKinnon and White 1985). The prior adds its own width where it holds a value. The square of a further
+    Gauss-Newton step is added, since a search may end before the minimum.
     """
-    bounds, prior = problem.bounds, problem.prior
-    names, joints = fitted_fields(values), problem.robot.operated
-    axes = Axes(bounds, names, values)
-    x = axes.normalize(values)
-    here, jac = (y[0] for y in agreed_slopes(x[None], axes.low, axes.high, problem.of_axes(axes)))
-    weight = 1 / np.sqrt(1 + here**2)
-    gradient = jac * (weight * here)[..., None]  # (n, rows + PRIORS, P)
+    starts = agreed_slopes(x[None], axes.low, axes.high, problem.of_axes(axes))
+    here = starts[0][0]  # errors, (n, rows + PRIORS)
+    slopes = starts[1][0]  # (n, rows + PRIORS, P)
+    weight = 1 / np.sqrt(1 + here**2)  # of soft L1
+    gradient = slopes * (weight * here)[..., None]
     each, _ = cluster_sums(gradient[:, :-PRIORS], problem.rollouts.window)
     each -= each.mean(axis=1, keepdims=True)
     clusters = each.shape[1]
-    prior_jac = jac[:, -PRIORS:] * prior.error_std()[:, None, None]
-    normal = (np.swapaxes(jac, -1, -2) @ (weight[..., None] * jac)).astype(float)
-    few = clusters / max(
-        clusters - len(names), 1
-    )  # squared, as a jackknife of so few clusters has it
+    few = clusters / max(clusters - len(axes.names), 1)
     scatter = np.swapaxes(each, -1, -2) @ each * few**2
-    scatter += np.swapaxes(prior_jac, -1, -2) @ prior_jac
-    # A parameter that no row depends on is as unknown as before.
-    size = np.sqrt(np.einsum("...ii->...i", normal))
-    lost = size < 3e-5
-    inverse = _inverse(normal, np.where(lost | (axes.low == axes.high), np.inf, size))
+    prior_slopes = slopes[:, -PRIORS:] * problem.prior.error_std()[:, None, None]
+    scatter += np.swapaxes(prior_slopes, -1, -2) @ prior_slopes
+    curvature = (np.swapaxes(slopes, -1, -2) @ (weight[..., None] * slopes)).astype(float)
+    size = np.sqrt(np.einsum("...ii->...i", curvature))
+    lost = size < MIN_SLOPE
+    inverse = _inverse(curvature, np.where(lost | (axes.low == axes.high), np.inf, size))
     step = np.clip((inverse @ gradient.sum(axis=1)[..., None])[..., 0], -1, 1)
-    cov = inverse @ scatter @ inverse + step[..., :, None] * step[..., None, :]
-    width = np.sqrt(np.einsum("...ii->...i", cov)) + np.where(lost & (axes.low < axes.high), 1e3, 0)
-    ahead = [axes.values(x + 1e-3 * row) for row in np.eye(len(names))]
-    by = {f: np.stack([(a[f] - values[f]) / 1e-3 for a in ahead], axis=-1) for f in names}
-    std = {
-        f: np.sqrt(np.einsum("np,npq,nq->n", g, cov, g)) + (np.abs(g) * lost).max(axis=1)
-        for f, g in by.items()
-    }
-    std |= {f: np.hypot(std[f], error) for f, error in _discretisation_std(problem, values).items()}
-    if "no_load_speed" in std:  # a joint without a line: on its axis zero, but infinite in SI units
-        std["no_load_speed"] *= values["no_load_speed"] > 0
-    unit = axes.unit[..., None]
-    wide = unit * (cov + 1e3 * np.eye(len(names)) * lost[..., None, :]) * np.swapaxes(unit, -1, -2)
-    unknown = _undetermined(problem, values, axes, std, width)
-    return StandardErrors(
-        {j: {f: float(std[f][i]) for f in names} for i, j in enumerate(joints)},
-        {j: (names, wide[i]) for i, j in enumerate(joints)},
-        {j: fields for j, (fields, _) in unknown.items()}, tuple(text for _, text in unknown.values()),
-    )  # fmt: skip
+    return inverse @ scatter @ inverse + step[..., :, None] * step[..., None, :], lost
+
+
+def _std_in_si(axes: Axes, x: Array, values: Values, covariance: Array, lost: Array) -> Values:
+    """Return the standard errors of fields in SI units, (n,), by the delta method; arguments as of `_covariance`."""
+    ahead = [axes.values(x + DERIVATIVE_STEP * row) for row in np.eye(len(axes.names))]
+    std = {}
+    for field in axes.names:
+        moved = [(one[field] - values[field]) / DERIVATIVE_STEP for one in ahead]
+        slope = np.stack(moved, axis=-1)  # (n, P)
+        known = np.sqrt(np.einsum("np,npq,nq->n", slope, covariance, slope))
+        # A parameter that no row depends on is as unknown as before.
+        std[field] = known + (np.abs(slope) * lost).max(axis=1)
+    return std
 
 
 def contradicted_gains(bounds: Bounds, values: Values, std: Std) -> list[str]:
