@@ -41,7 +41,7 @@ from gaponet.data.split import SPLITS
 from gaponet.data.store import Dataset
 from gaponet.evaluation.candidate import read_origin
 from gaponet.experiments.real.cards import Card, prepare, read_cards
-from gaponet.export.plain_servos import CACHE, fit_plain_servos, read_recordings
+from gaponet.export.plain_servos import CACHE, fit_plain_servos, read_recordings, rollout_error
 from gaponet.robot.by_name import CARD, identified_catalogue
 from gaponet.robot.card import (
     ROBOT_HEADINGS,
@@ -133,7 +133,9 @@ def write_robot(folder: Path, made: Path, dataset: Dataset, card: Card, limits: 
     write_json_line(made / PROVENANCE_FILE, dict(origin) | {"dataset": card.name, "parts": parts})
     uncertainty = json.loads((folder / UNCERTAINTY_FILE).read_text(encoding="utf-8"))
     write_json_line(made / UNCERTAINTY_FILE, uncertainty)
-    write_plain_servos(robot, made, dataset)
+    plain = write_plain_servos(robot, made, dataset)
+    tests = set(origin["parts"]["test"].values())
+    test_recordings = dataset.sequences([entry for entry in dataset.entries if entry.hash in tests])
     table = tomllib.loads((made / "robot.toml").read_text(encoding="utf-8"))
     entries = dataset.entries
     facts = RobotFacts(
@@ -143,6 +145,7 @@ def write_robot(folder: Path, made: Path, dataset: Dataset, card: Card, limits: 
         rates_hz=tuple(sorted({round(1 / entry.dt, 1) for entry in entries})),
         units=tuple(sorted({entry.meta.unit_id for entry in entries})),
         gaponet=gaponet.__version__,
+        plain_mrad=round(1e3 * rollout_error(test_recordings, plain), 3),
         published=Published(
             licence=LICENCE,
             date=today(),
@@ -156,14 +159,18 @@ def write_robot(folder: Path, made: Path, dataset: Dataset, card: Card, limits: 
     RobotCard.read(made)
 
 
-def write_plain_servos(robot: RobotSpec, made: Path, dataset: Dataset) -> None:
-    """Fit the nearest servos without a servo model to the recordings, and copy them; there may be no need for any."""
+def write_plain_servos(robot: RobotSpec, made: Path, dataset: Dataset) -> RobotSpec:
+    """Fit the nearest servos without a servo model to the recordings, and copy them; return the robot with them.
+
+    A robot without a servo model is returned as it is.
+    """
     recordings = read_recordings(robot.folder, str(dataset.path), robot)
     if recordings is None:
         raise UsageError(f"{dataset.path}: no position was commanded")
-    fit_plain_servos(robot, recordings[0])
+    plain = fit_plain_servos(robot, recordings[0])
     if (robot.folder / CACHE).is_file():
         shutil.copyfile(robot.folder / CACHE, made / CACHE)
+    return plain
 
 
 if __name__ == "__main__":

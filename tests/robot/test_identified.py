@@ -101,6 +101,7 @@ def test_an_export_needs_no_recordings(place):
     facts = json.loads((made.path / "facts.json").read_text())
     robot = gp.load_robot(NAME)
     assert [facts["joints"][j]["delay"] for j in robot.joint_names] == pytest.approx(robot.delay)
+    assert "recordings that were not fitted" in made.notes[-1]
 
 
 def test_a_report_is_not_written_into_the_package(place, capsys):

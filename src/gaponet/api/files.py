@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -15,6 +16,8 @@ from gaponet.nn.packaged_networks import (
     named_folder,
     require_run_folder,
 )
+from gaponet.robot.by_name import identified_catalogue
+from gaponet.robot.card import RobotCard
 from gaponet.robot.folder import STORED_ROBOT, has_stored_robot
 from gaponet.robot.spec import load_robot
 
@@ -70,6 +73,9 @@ def export_robot(
         Path(out) if out else holder / to,
     )
     made = files.export_robot(spec, to, folder, recordings, source, prefix, payload_mass, progress)
+    if recordings is None and identified_catalogue().holds(holder):
+        card = RobotCard.read(holder)
+        made = replace(made, notes=(*made.notes, f"{card.name}, {card.errors()}"))
     return _exported(made, folder, to, spec.name)
 
 

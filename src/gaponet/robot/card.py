@@ -95,6 +95,7 @@ class RobotFacts:
         rates_hz: Their control rates, Hz.
         units: Their units.
         gaponet: Version that identified the robot.
+        plain_mrad: Error on the test motions of its nearest PD servos, which have no servo model, mrad.
         published: Licence, data, errors and limits of use.
     """
 
@@ -104,6 +105,7 @@ class RobotFacts:
     rates_hz: tuple[float, ...]
     units: tuple[str, ...]
     gaponet: Text
+    plain_mrad: float
     published: Published
 
 
@@ -135,13 +137,22 @@ class RobotCard:
             facts.published.date,
         ]
 
+    def errors(self) -> str:
+        """Return its errors on the test motions as a sentence, for an export without recordings."""
+        test = self.facts.published.test
+        return (
+            f"on {test.recordings} recordings that were not fitted: nominal {test.nominal_mrad:.2f} mrad, identified "
+            f"{test.model_mrad:.2f}, without the servo model {self.facts.plain_mrad:.2f}"
+        )
+
     def details(self) -> str:
         """Return a line below the table: licences, version, data, units and limits of use."""
         facts = self.facts
         published = facts.published
         return (
             f"licence {published.licence}, model {facts.model}, gaponet {facts.gaponet}; data: "
-            f"{published.data.address}, units {', '.join(facts.units)}. {published.limits_of_use}"
+            f"{published.data.address}, units {', '.join(facts.units)}; without the servo model {facts.plain_mrad:.2f} "
+            f"mrad. {published.limits_of_use}"
         )
 
 
