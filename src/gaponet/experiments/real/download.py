@@ -142,6 +142,6 @@ def _read(url: str, size: int) -> bytes:
     except NETWORK_ERRORS as error:
         reason = getattr(error, "reason", None) or error or type(error).__name__
         raise RemoteError(
-            f"{url}: cannot be read ({reason}); with a network the same command goes on; without one, name a folder "
+            f"{url}: not read ({reason}); the same command goes on where it stopped. Without a network, name a folder "
             f"that has these recordings with {DATA_VARIABLE}"
         ) from None
