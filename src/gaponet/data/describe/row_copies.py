@@ -18,6 +18,16 @@ FINE_STEPS = 10  # steps of the readings that a joint passes from row to row, fr
 # Share of the changes that a copy repeats. Rows may be missing. A stiff servo with a coarse encoder repeats most of a
 # slow motion.
 FINE_SHARE, COARSE_SHARE = 0.7, 0.99
+# Steps of rounded readings, coarse first: decimals of rad and deg, and turns divided by powers of two.
+USUAL_STEPS_RAD = sorted(
+    [
+        *(10.0**-k for k in range(1, 7)),
+        *(np.radians(10.0**-k) for k in range(6)),
+        *(2 * np.pi / 2**k for k in range(8, 21)),
+    ],
+    reverse=True,
+)
+MAX_OFF_STEP = 0.02  # of a step, by which rounded readings lie beside its multiples
 NO_DIGIT_RAD = 1.01e-6  # closer readings are the same one, in another precision
 
 
@@ -70,7 +80,7 @@ def _nearest(time: Array, at: Array) -> Array:
 
 def _shift(distance: Array, shifts: Array, told: Array, reading: Array) -> float:
     """Return the shift of one joint's copy; NaN if it is none. distance: (changes, shifts) rad."""
-    steps = [encoder_step([told]), encoder_step([reading])]
+    steps = [_step(told), _step(reading)]
     coarse = max(steps)
     tolerance = NO_DIGIT_RAD
     if min(steps) < 0.9 * coarse:  # one of them was rounded
@@ -86,3 +96,13 @@ def _shift(distance: Array, shifts: Array, told: Array, reading: Array) -> float
     if tolerance > NO_DIGIT_RAD or share.max() < COARSE_SHARE:
         return np.nan
     return float(shifts[share.argmax()])
+
+
+def _step(values: Array) -> float:
+    """Return the step to which readings (k,) were rounded, rad; 0 where they are continuous."""
+    from_first = values - values[0]
+    for step in USUAL_STEPS_RAD:
+        multiples = from_first / step
+        if np.abs(multiples - np.round(multiples)).max() < MAX_OFF_STEP:
+            return float(step)
+    return encoder_step([values])
