@@ -111,3 +111,56 @@ def test_a_bag_cut_short_is_one_clear_error(tmp_path, arm):
         file.write_bytes(whole[:size])
         with pytest.raises(LogError, match=r"not a readable bag \(.*\); it is cut short"):
             only(file, arm)
+
+
+def write_joint_states(bag, messages):
+    """A bag of JointStates, messages (topic, time s, names, position, effort), with stamps."""
+    from rosbags.rosbag2 import StoragePlugin, Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    kind = "sensor_msgs/msg/JointState"
+    make = lambda told, **fields: store.types[told](**fields)  # noqa: E731
+    with Writer(bag, version=8, storage_plugin=StoragePlugin.MCAP) as writer:
+        topics = {
+            topic: writer.add_connection(topic, kind, typestore=store)
+            for topic in sorted({message[0] for message in messages})
+        }
+        for topic, t, names, position, effort in messages:
+            stamp = make("builtin_interfaces/msg/Time", sec=int(t), nanosec=round(t % 1 * 1e9))
+            header = make("std_msgs/msg/Header", stamp=stamp, frame_id="")
+            message = make(
+                kind, header=header, name=names, position=np.array(position), velocity=np.array([]),
+                effort=np.array(effort),
+            )  # fmt: skip
+            writer.write(topics[topic], round(t * 1e9), store.serialize_cdr(message, kind))
+    return bag
+
+
+@pytest.mark.parametrize("together", [True, False])
+def test_publishers_of_some_joints_each_are_joined_by_name(tmp_path, arm, together):
+    ctrl, qpos = motion()
+    messages = []
+    for i, time in enumerate(10 + 0.02 * np.arange(40)):
+        later = time if together else time + 0.006
+        messages += [
+            ("/joint_states", time, ["shoulder"], qpos[i, :1], [np.nan]),
+            ("/joint_states", later, ["elbow", "wheel"], [qpos[i, 1], 3.0], [np.nan, np.nan]),
+            ("/joint_command", time + 0.001, ["elbow", "shoulder"], ctrl[i, ::-1], []),
+        ]
+    write_joint_states(tmp_path / "wave", messages)
+    (tmp_path / "logs.toml").write_text('ignore = ["wheel"]\n')
+    log = only(tmp_path, arm)
+    assert "tau" not in log.channels
+    assert np.array_equal(log.channels["ctrl"].values, ctrl)
+    states = log.channels["qpos"]
+    elbow = states.values[:, log.joint_names.index("elbow")]
+    shoulder = states.values[:, log.joint_names.index("shoulder")]
+    start = states.time[0] - (0.0 if together else 0.006)
+    apart = 0.0 if together else 0.006
+    assert np.allclose(
+        elbow, np.interp(states.time - start, 0.02 * np.arange(40) + apart, qpos[:, 1]), atol=1e-6
+    )
+    assert np.allclose(
+        shoulder, np.interp(states.time - start, 0.02 * np.arange(40), qpos[:, 0]), atol=1e-6
+    )

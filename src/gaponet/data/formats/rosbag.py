@@ -56,6 +56,10 @@ CONTROLLER = (
     f"std_msgs/Header header\nstring[] joint_names\n{POINT} reference\n{POINT} feedback\n"
     f"{POINT} error\n{POINT} output"
 )
+INTERFACES = {
+    "InterfaceValue": "string[] interface_names\nfloat64[] values",
+    "DynamicJointState": "std_msgs/Header header\nstring[] joint_names\ncontrol_msgs/InterfaceValue[] interface_values",
+}
 Fields = dict[str, tuple[tuple[str, ...], Any]]  # field → (names of its columns, its numbers)
 
 
@@ -110,13 +114,39 @@ def _usual(signals: dict[str, tuple[str, ...]]) -> LogsFile:
             )
             if name in signals:
                 specified[channel] = name  # type: ignore[literal-required]
-    if len(commands) == 1:
+    command = _best_command(signals, commands, states)
+    if command:
+        commands = [command]
         specified["ctrl"] = commands[0]
         gain = commands[0].rpartition(".")[0]
         if f"{gain}.kp" in signals:
             specified["kp"], specified["kd"] = f"{gain}.kp", f"{gain}.kd"
             specified |= {"feedforward_torque": f"{gain}.tau"} if f"{gain}.tau" in signals else {}
     return specified
+
+
+def _best_command(
+    signals: dict[str, tuple[str, ...]], commands: list[str], states: list[str]
+) -> str | None:
+    """Return the command signal, where one can be told: it names the state's joints, and a controller's reference says
+    more than the goals that it was sent."""
+    if len(states) == 1:
+        joints = set(signals[states[0]])
+        fitting = [
+            c for c in commands if joints & set(signals[c]) or len(signals[c]) == len(joints)
+        ]
+        commands = fitting or commands
+    for endings in (
+        (".reference.position", ".desired.position"),
+        (".q",),
+        (".position",),
+        (".point",),
+        (".data",),
+    ):
+        alike = [c for c in commands if c.endswith(endings)]
+        if alike:
+            return alike[0] if len(alike) == 1 else None
+    return None
 
 
 @contextmanager
@@ -131,6 +161,8 @@ def _opened(bag: Path) -> Iterator[Any]:
     store.register(
         get_types_from_msg(CONTROLLER, "control_msgs/msg/JointTrajectoryControllerState")
     )
+    for name, text in INTERFACES.items():
+        store.register(get_types_from_msg(text, f"control_msgs/msg/{name}"))
     with reading(bag, "bag"), AnyReader([bag], default_typestore=store) as reader:
         yield reader
 
@@ -171,17 +203,24 @@ def _peeked(bag: Path) -> dict[str, dict[str, tuple[str, ...]]]:
 
 
 def _peek(bag: Path, reader: Any) -> dict[str, dict[str, tuple[str, ...]]]:
-    """topic → field → names of its columns; a second publisher's joints on one topic are TOPIC#2."""
+    """topic → field → names of its columns, of all messages together: several publishers may tell of some joints each.
+
+    Arrays without names that have another length are a field of TOPIC#2.
+    """
     topics: dict[str, dict[str, tuple[str, ...]]] = {}
     for connection in _known(reader):
         sets: dict[str, list[tuple[str, ...]]] = {}  # of a field
         for i, (_, _, fields, _) in enumerate(_messages(reader, [connection])):
             for field, (labels, _) in fields.items():
                 mine = sets.setdefault(field, [])
-                at = next((k for k, s in enumerate(mine) if set(s) == set(labels)), len(mine))
-                mine += [labels] * (at == len(mine))
+                alike = [k for k, known in enumerate(mine) if _joined(known, labels)]
+                at = alike[0] if alike else len(mine)
+                if alike:
+                    mine[at] = tuple(dict.fromkeys((*mine[at], *labels)))
+                else:
+                    mine.append(labels)
                 topic = f"{connection.topic}#{at + 1}" if at else connection.topic
-                topics.setdefault(topic, {}).setdefault(field, labels)
+                topics.setdefault(topic, {})[field] = mine[at]
             if i == PEEK:
                 break
     if not topics:
@@ -194,6 +233,12 @@ def _peek(bag: Path, reader: Any) -> dict[str, dict[str, tuple[str, ...]]]:
         )
         raise LogError(f"{bag}: none of its topics is about joints; it has {types}{why}")
     return topics
+
+
+def _joined(known: tuple[str, ...], labels: tuple[str, ...]) -> bool:
+    """Return True if both name columns of one array: the same numbers, or names of joints."""
+    numbered = [all(label.isdigit() for label in names) for names in (known, labels)]
+    return known == labels if any(numbered) else True
 
 
 def _load(bag: Path, meta: dict[str, Any], names: list[str]) -> dict[str, Signal]:
@@ -214,21 +259,21 @@ def _read(bag: Path, names: list[str]) -> tuple[dict[str, Signal], dict[str, Any
         wanted = {topic: fields for topic, fields in wanted.items() if fields}
         rows: dict[str, list[Any]] = {topic: [] for topic in wanted}
         used = {topic.split("#")[0] for topic in wanted}
+        partial = set[str]()  # topics whose messages tell of some of their joints each
         for connection, time, fields, stamp in _messages(
             reader, [c for c in _known(reader) if c.topic in used]
         ):
             for topic, known in wanted.items():
-                if topic.split("#")[0] == connection.topic and all(
-                    f in fields and set(fields[f][0]) == set(labels) for f, labels in known.items()
-                ):
-                    values = []
-                    for f, labels in known.items():
-                        own, numbers = fields[f]
-                        values.append(
-                            list(numbers)
-                            if own == labels
-                            else [numbers[own.index(name)] for name in labels]
-                        )
+                if topic.split("#")[0] != connection.topic:
+                    continue
+                told = {f: fields[f] for f in known if f in fields}
+                told = {f: (own, x) for f, (own, x) in told.items() if set(own) <= set(known[f])}
+                if told:
+                    if len(told) < len(known) or any(
+                        set(known[f]) - set(own) for f, (own, _) in told.items()
+                    ):
+                        partial.add(topic)
+                    values = [_in_order(told.get(f), labels) for f, labels in known.items()]
                     rows[topic].append(
                         (time, time if stamp is None else stamp, stamp is not None, values)
                     )
@@ -243,6 +288,8 @@ def _read(bag: Path, names: list[str]) -> tuple[dict[str, Signal], dict[str, Any
     loaded: dict[str, Signal] = {}
     for topic, known in wanted.items():
         columns = [np.array([r[3][i] for r in rows[topic]], float) for i in range(len(known))]
+        if topic in partial:
+            times[topic], columns = _together(times[topic], columns)
         fresh = _fresh(times[topic], columns)
         if not fresh.all():
             notes["repeated"] = notes.get("repeated", 0) + int((~fresh).sum())
@@ -251,6 +298,34 @@ def _read(bag: Path, names: list[str]) -> tuple[dict[str, Signal], dict[str, Any
             for f, v in zip(known, columns, strict=True)
         }
     return {name: loaded[name] for name in names}, notes
+
+
+def _in_order(told: tuple[tuple[str, ...], Any] | None, labels: tuple[str, ...]) -> list[float]:
+    """Return the numbers of a message in the order of labels; NaN for joints of which it tells nothing."""
+    if told is None:
+        return [np.nan] * len(labels)
+    own, numbers = told
+    if own == labels:
+        return list(numbers)
+    by_name = dict(zip(own, numbers, strict=True))
+    return [by_name.get(name, np.nan) for name in labels]
+
+
+def _together(time: Array, columns: list[Array]) -> tuple[Array, list[Array]]:
+    """Return rows in the order of time; messages of one instant that tell of some joints each are one row."""
+    order = np.argsort(time, kind="stable")
+    time = time[order]
+    columns = [values[order] for values in columns]
+    first = np.r_[True, np.diff(time) > 0]
+    group = np.cumsum(first) - 1
+    joined = []
+    for values in columns:
+        row = np.full((group[-1] + 1, values.shape[1]), np.nan)
+        known = np.isfinite(values)
+        where = np.nonzero(known)
+        row[group[where[0]], where[1]] = values[known]
+        joined.append(row)
+    return time[first], joined
 
 
 def _fresh(time: Array, values: list[Array]) -> Array:
@@ -334,6 +409,15 @@ def _controller(topic: str, m: Any) -> Fields:
     return messages
 
 
+def _dynamic(topic: str, m: Any) -> Fields:
+    """Interfaces of DynamicJointState, such as position and effort, each with the joints that have it."""
+    found: dict[str, dict[str, float]] = {}
+    for joint, part in zip(m.joint_names, m.interface_values, strict=True):
+        for interface, value in zip(part.interface_names, part.values, strict=True):
+            found.setdefault(interface.rpartition("/")[2], {})[joint] = value
+    return {name: (tuple(joints), list(joints.values())) for name, joints in found.items()}
+
+
 def _trajectory(topic: str, m: Any) -> Fields:
     if len(m.points) > 1:
         raise LogError(
@@ -359,6 +443,7 @@ STATE, COMMAND = (
 KINDS: dict[str, Callable[[str, Any], Fields]] = {
     "trajectory_msgs/msg/JointTrajectory": _trajectory,
     "control_msgs/msg/JointTrajectoryControllerState": _controller,
+    "control_msgs/msg/DynamicJointState": _dynamic,
     "unitree_hg/msg/LowState": STATE, "unitree_go/msg/LowState": STATE,
     "unitree_hg/msg/LowCmd": COMMAND, "unitree_go/msg/LowCmd": COMMAND,
 }  # fmt: skip
