@@ -1,6 +1,6 @@
 """The network that gaponet train chooses on top of identification, as a method of the benchmark.
 
-    gaponet experiment real --method benchmarks/chosen_network.py:network
+    python benchmarks/compare_methods.py --method benchmarks/chosen_network.py:network
 
 Each candidate of `--model auto` gets two short rounds of supervised pre-training and no PPO. Seed 0.
 """
@@ -10,10 +10,11 @@ from __future__ import annotations
 import json
 import shutil
 
+from real_robots.methods import FittedSim, identified
+from real_robots.questions import Question, train_val
+
 import gaponet as gp
 from gaponet.data.store import Dataset
-from gaponet.experiments.real.methods import FittedSim, identified
-from gaponet.experiments.real.questions import Question, train_val
 from gaponet.nn.artifact import GapModel
 from gaponet.nn.training.config import PretrainingConfig, TrainConfig
 

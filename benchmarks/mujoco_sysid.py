@@ -1,7 +1,7 @@
 """mujoco.sysid as a rival of gaponet identify, on the windows, start and bounds of plain_fit.py.
 
     pip install "mujoco[sysid]"
-    gaponet experiment real --method benchmarks/mujoco_sysid.py:mujoco_sysid
+    python benchmarks/compare_methods.py --method benchmarks/mujoco_sysid.py:mujoco_sysid
 
 Parameters, changes of the model, rollouts and the optimizer are those of mujoco.sysid. Some defaults are replaced:
 
@@ -23,9 +23,9 @@ from typing import Any
 import mujoco
 import numpy as np
 from mujoco import sysid
+from real_robots.methods import FittedSim
+from real_robots.questions import Question
 
-from gaponet.experiments.real.methods import FittedSim
-from gaponet.experiments.real.questions import Question
 from gaponet.sim.model import stiffen_friction
 
 sys.path.insert(0, str(Path(__file__).parent))

@@ -5,7 +5,7 @@
 It fits kp, total damping, dry friction, armature, delay and offset of each joint, by finite differences over windows of
 the training motions, starting from the robot's file. The error is that of whole validation motions.
 
-    gaponet experiment real --method benchmarks/plain_fit.py:equal_windows
+    python benchmarks/compare_methods.py --method benchmarks/plain_fit.py:equal_windows
 
 is the same with the windows and bounds of gaponet identify, fitted to all recordings that a question gives to methods.
 """
@@ -19,12 +19,12 @@ from pathlib import Path
 import mujoco
 import numpy as np
 from mujoco.rollout import Rollout
+from real_robots.methods import FittedSim
+from real_robots.questions import Question
 from scipy.optimize import least_squares
 
 from gaponet.data.sequence import Sequence
 from gaponet.data.split import split_entries
-from gaponet.experiments.real.methods import FittedSim
-from gaponet.experiments.real.questions import Question
 from gaponet.robot.folder import save_robot
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.dataset_robot import open_dataset

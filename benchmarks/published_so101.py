@@ -1,6 +1,6 @@
 """Published servo parameters of the SO-101 as rivals of an identification.
 
-    gaponet experiment real --sets so101 so101_another_day --method benchmarks/published_so101.py:nvidia \
+    python benchmarks/compare_methods.py --sets so101 so101_another_day --method benchmarks/published_so101.py:nvidia \
         --method benchmarks/published_so101.py:community
     python benchmarks/published_so101.py DATASET        # error of each joint on the test motions
 
@@ -14,10 +14,10 @@ import sys
 from math import isnan, nan
 
 import numpy as np
+from real_robots.methods import FittedSim
+from real_robots.questions import Question
 
 from gaponet.data.split import split_entries
-from gaponet.experiments.real.methods import FittedSim
-from gaponet.experiments.real.questions import Question
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.dataset_robot import open_dataset
 from gaponet.sim.replay import replay

@@ -26,7 +26,7 @@ from typing import Any
 import page_charts
 import page_numbers
 
-from gaponet.experiments.real.page import write_page
+from real_robots.page import write_page
 
 ROOT = Path(__file__).parents[1]
 PAGES = ROOT / "docs" / "results"
@@ -48,7 +48,7 @@ STEPS_HEAD = """# Steps of `make results`
 Commands of `benchmarks/results.toml`, and when `make results` last ran each. DATA is the folder of the public
 recordings (`GAPONET_DATA`), WORK is `results_work`. `make results STEPS="backlash hinge"` runs two steps. A step with
 an answer in WORK/answers is skipped; delete the answer to repeat it. A killed step starts again. Commands that store
-each robot or set, such as `gaponet experiment real`, then continue. Below the table is what steps printed.
+each robot or set, such as `python benchmarks/compare_methods.py`, then continue. Below the table is what steps printed.
 """
 
 

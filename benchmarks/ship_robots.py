@@ -2,7 +2,7 @@
 
     python benchmarks/ship_robots.py one SET FOLDER DATASET [--limits SENTENCE]
 
-SET is a data set of the benchmark (src/gaponet/experiments/real/cards.toml), which has its source and licence; FOLDER
+SET is a data set of the benchmark (benchmarks/real_robots/cards.toml), which has its source and licence; FOLDER
 is what `gaponet identify DATASET --out FOLDER` wrote. Copied are the robot, its uncertainty, the hashes of its
 recordings, and its nearest PD servos, so that an export needs no recordings. The errors of the card are measured here,
 with the robot as it is shipped, on the test motions of DATASET. Nothing is shipped if a check fails. The table goes
@@ -40,7 +40,7 @@ from gaponet.base.errors import UsageError
 from gaponet.data.split import SPLITS
 from gaponet.data.store import Dataset
 from gaponet.evaluation.candidate import read_origin
-from gaponet.experiments.real.cards import Card, prepare, read_cards
+from real_robots.cards import Card, prepare, read_cards
 from gaponet.export.plain_servos import CACHE, fit_plain_servos, read_recordings, rollout_error
 from gaponet.robot.by_name import CARD, identified_catalogue
 from gaponet.robot.card import (

@@ -24,7 +24,7 @@ INNER = {
     "nn": ("training",),
     "sysid": ("steps", "evidence"),
     "report": ("figures", "view"),
-    "experiments": ("paper", "real"),
+    "experiments": ("paper",),
 }
 BESIDE = {"report": {"report"}, "sysid": {"identify"}}  # modules above the folders beside them
 HEAVY = (

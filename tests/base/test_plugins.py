@@ -21,7 +21,6 @@ from gaponet.cli.main import main
 from gaponet.data.formats import FORMATS, detect, formats
 from gaponet.data.importer import import_logs
 from gaponet.data.store import Dataset
-from gaponet.experiments.real.bench import load_method
 from gaponet.hw.drivers.open import open_driver
 
 
@@ -88,14 +87,12 @@ def test_a_built_in_name_is_not_replaced_and_one_line_says_so(installed, caplog)
     ]
 
 
-def test_an_extension_adds_a_format_a_driver_and_a_method(installed, tmp_path, capsys, caplog):
+def test_an_extension_adds_a_format_and_a_driver(installed, tmp_path, capsys, caplog):
     installed(
-        "[gaponet.formats]\nwav = HERE_wav\n[gaponet.drivers]\ntoy = HERE_toy:Toy\n"
-        "[gaponet.methods]\nhalf = HERE_toy:half\n",
-        wav='"""Sound."""\nEXTRA = ""\ndef detects(path): return path.is_file() and b"acme" in '
-        "path.read_bytes()",
+        "[gaponet.formats]\nwav = HERE_wav\n[gaponet.drivers]\ntoy = HERE_toy:Toy\n",
+        wav='"""Sound."""\nEXTRA = ""\ndef detects(path): return path.is_file() and b"acme" in path.read_bytes()',
         toy="class Toy:\n    def __init__(self, robot, port): self.robot, self.port = robot, port\n"
-        "    def __getattr__(self, name): return None\n\ndef half(q): return q",
+        "    def __getattr__(self, name): return None",
     )
     assert main(["import", "--formats"]) == 0
     assert "Sound" in capsys.readouterr().out
@@ -108,8 +105,6 @@ def test_an_extension_adds_a_format_a_driver_and_a_method(installed, tmp_path, c
         assert detect(tmp_path / name) == fmt
     driver = open_driver("toy", "so101", port="x")
     assert (driver.robot.name, driver.port) == ("so101", "x")
-    name, method = load_method("half")
-    assert (name, method(3)) == ("half", 3)
     assert caplog.records == []
 
 

@@ -6,7 +6,7 @@ import pytest
 from conftest import SHARED
 
 from gaponet import api
-from gaponet.experiments.real.cards import prepare, read_cards
+from real_robots.cards import prepare, read_cards
 
 CARDS = {card.name: card for card in read_cards().set}
 

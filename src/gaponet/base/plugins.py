@@ -1,13 +1,10 @@
-"""Extensions by other packages: log formats, drivers and methods.
+"""Extensions by other packages: log formats and drivers.
 
-A package names them in its metadata, as entry points of one of three groups:
+A package names them in its metadata, as entry points of one of two groups:
 
     gaponet.formats   a module that reads logs (gaponet.data.formats says what it has)
-    gaponet.drivers   a function (robot, **options) that returns a Driver
-                      (gaponet.hw.control.driver). `gaponet run` gives it those options of --help
-                      that are its parameters, such as port
-    gaponet.methods   a function that `gaponet experiment real --method NAME` compares
-    (docs/benchmark.md)
+    gaponet.drivers   a function (robot, **options) that returns a Driver (gaponet.hw.control.driver). `gaponet run`
+                      gives it those options of --help that are its parameters, such as port
 
 A built-in name cannot be replaced. A failure of an extension is logged once as a warning, and
 gaponet continues without the extension.
@@ -27,8 +24,7 @@ from gaponet.base.text import escape
 
 FORMATS = "gaponet.formats"
 DRIVERS = "gaponet.drivers"
-METHODS = "gaponet.methods"
-GROUPS = (FORMATS, DRIVERS, METHODS)
+GROUPS = (FORMATS, DRIVERS)
 Result = TypeVar("Result")
 _WARNED: set[str] = set()
 

@@ -1,4 +1,4 @@
-"""gaponet data: card, split, figures, export, remove, labels."""
+"""gaponet data: card, split, figures, export, remove."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any, Literal
 import tyro
 
 from gaponet.base.progress import progress_bar
-from gaponet.cli.options import Data, Json, Logs, Robot, actions
+from gaponet.cli.options import Data, Json, Robot, actions
 from gaponet.cli.out import Out
 from gaponet.data.store import Dataset
 from gaponet.robot.finding import abbreviate
@@ -148,52 +148,7 @@ def _remove(dataset: Data, ids: tyro.conf.Positional[tuple[str, ...]], json: Jso
     out.result({"removed": [e.id for e in gone], "sequences": len(data)})
 
 
-def _labels(
-    logs: Logs, robot: str, out: Path, payloads: tuple[float, ...], units: int = 1, rate: float | None = None,
-    json: Json = False,
-) -> None:  # fmt: skip
-    """Estimate which payload each recording of one moving joint carried and which unit made it, by held torque.
-
-    Args:
-        logs: File or folder of logs.
-        robot: Robot name or folder.
-        out: Folder for logs.toml and labels.csv, which gaponet import LOGS --logs OUT/logs.toml takes.
-        payloads: Masses that may have been carried, kg.
-        units: Number of robots.
-        rate: Hz, of logs without a clock.
-    """
-    from gaponet.data.formats import read_logs
-    from gaponet.robot.spec import load_robot
-    from gaponet.sysid.labels import estimate, write
-
-    screen, spec = Out(json), load_robot(robot)
-    gain = dict(zip(spec.joint_names, spec.kp.tolist(), strict=True))
-    labels = estimate(read_logs(logs, spec, rate=rate), payloads, units, gain)
-    write(labels, out, rate)
-    columns = [
-        "joint",
-        "to, rad",
-        "recordings",
-        "N·m a kg",
-        "bands apart",
-        "units, N·m",
-        "payload determined",
-    ]
-    screen.table("Held torque at equal commands", columns, [
-        [c.joint, f"{c.command:+.2f}", str(c.count), f"{c.slope:+.2f}", f"{c.band_distance:.1f}",
-         ", ".join(f"{u:+.2f}" for u in c.units), "yes" if c.determined else "no"]
-        for c in labels.groups
-    ])  # fmt: skip
-    for line in labels.remarks:
-        screen.say(line)
-    screen.say(f"written: {out / 'labels.csv'!s}")
-    screen.next(f"gaponet import {logs} --robot {robot} --logs {out / 'logs.toml'}")
-    screen.result(
-        {"cells": labels.groups, "agreement": labels.agreement, "recordings": labels.recordings}
-    )
-
-
-@actions(card=_card, split=_split, figures=_figures, export=_export, remove=_remove, labels=_labels)
+@actions(card=_card, split=_split, figures=_figures, export=_export, remove=_remove)
 def data(action: None) -> None:
     """A dataset's card, splits, pictures, export and removal."""
 

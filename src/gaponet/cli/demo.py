@@ -54,7 +54,7 @@ def identify_real_arm(screen: Out, out: Path) -> dict[str, object]:
     """Identify the SO-101 of the public recordings; return errors and places for --json."""
     from gaponet.data.split import split_entries
     from gaponet.data.store import Dataset
-    from gaponet.experiments.real.download import PublicFiles
+    from gaponet.share.public_recordings import PublicFiles
 
     began = time.monotonic()
     public = PublicFiles.read()

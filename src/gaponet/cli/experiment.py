@@ -1,4 +1,4 @@
-"""gaponet experiment: the paper's experiment, and methods compared on real recordings."""
+"""gaponet experiment: the paper's experiment."""
 
 from __future__ import annotations
 
@@ -92,40 +92,6 @@ def share_bar(title: str) -> Iterator[Callable[[float], None]]:
         yield lambda share: update(share, 1.0, "")
 
 
-def real(
-    data: Path | None = None, out: Path = Path("bench_real"), sets: tuple[str, ...] = (),
-    questions: tuple[str, ...] = (), method: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = (),
-    networks: int = 0, json: Json = False,
-) -> None:  # fmt: skip
-    """Compare methods on public recordings of real robots.
-
-    Args:
-        data: Folder of the public recordings; default GAPONET_DATA, else ../shared/data.
-        out: Folder for datasets, table and figure.
-        sets: Only these data sets.
-        questions: Only these questions, such as "3 kg left out".
-        method: A method of your own, FILE.py:FUNCTION; may be repeated.
-        networks: Train networks too, for so many control steps each; 0 for none.
-    """
-    from gaponet.experiments.real.bench import Bench, load_method
-    from gaponet.experiments.real.cards import data_folder, read_cards
-    from gaponet.experiments.real.methods import METHODS, network_methods
-    from gaponet.experiments.real.page import result_table, write_page
-
-    screen = Out(json)
-    methods = METHODS | {name: (name, function) for name, function in map(load_method, method)}
-    methods |= network_methods(networks) if networks else {}
-    result = Bench(read_cards(), data_folder(data), out, methods, screen.say).run(sets, questions)
-    screen.show(
-        "Real robots, recordings that no method was fitted to", result_table(result["rows"])
-    )
-    for name, remarks in result["labels"].items():
-        screen.say(f" of {name}: {'; '.join(remarks)}", "labels")
-    for path in write_page(result, out):
-        screen.say(f"written: {path!s}")
-    screen.result(result)
-
-
-@actions(paper=paper, real=real)
+@actions(paper=paper)
 def experiment(action: None) -> None:
-    """Run an experiment: the paper's, or methods on real recordings."""
+    """Run the paper's experiment."""

@@ -7,19 +7,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 from logs import repeated_motions
+from real_robots import methods as module
+from real_robots.bench import Bench, load_method
+from real_robots.cards import CARDS, ROBOTS, read_cards
+from real_robots.methods import LEFT_OUT, METHODS
+from real_robots.page import result_table
+from real_robots.questions import questions, repeatability
 
 from gaponet.base.errors import UsageError
 from gaponet.data.store import Dataset
-from gaponet.experiments.real import methods as module
-from gaponet.experiments.real.bench import Bench, load_method
-from gaponet.experiments.real.cards import CARDS, ROBOTS, read_cards
-from gaponet.experiments.real.methods import LEFT_OUT, METHODS
-from gaponet.experiments.real.page import result_table
-from gaponet.experiments.real.questions import questions, repeatability
 from gaponet.robot.folder import save_robot
 from gaponet.robot.spec import load_robot, packaged_robots
 
-DOCS = Path(__file__).parents[3] / "docs"
+DOCS = Path(__file__).parents[2] / "docs"
 
 
 @pytest.fixture

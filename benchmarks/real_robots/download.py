@@ -25,7 +25,7 @@ from gaponet.base.files import atomic_write, lock_folder
 from gaponet.base.network import RemoteError
 from gaponet.base.progress import Progress, no_progress
 from gaponet.base.structure import read_toml
-from gaponet.experiments.real.cards import DATA_VARIABLE
+from real_robots.cards import DATA_VARIABLE
 from gaponet.share.remote import FileRecord
 
 SO101_FILES = Path(__file__).with_name("so101_files.toml")

@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
+from estimate_labels import estimate
 
 from gaponet.base.errors import LogError
 from gaponet.data.log import Channel, Log
-from gaponet.sysid.labels import estimate
 
 MASSES, UNITS = (0.0, 1.0, 2.0), 2
 

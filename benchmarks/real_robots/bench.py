@@ -14,14 +14,13 @@ from typing import Any
 
 import numpy as np
 
-from gaponet.base import plugins
 from gaponet.base.errors import GAPONetError, UsageError
 from gaponet.base.files import json_compatible, write_text
-from gaponet.experiments.real.cards import Card, Cards, prepare
-from gaponet.experiments.real.methods import Method, identified
-from gaponet.experiments.real.questions import Question, questions, recorded_joints, repeatability
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.metrics import standard_error
+from real_robots.cards import Card, Cards, prepare
+from real_robots.methods import Method, identified
+from real_robots.questions import Question, questions, recorded_joints, repeatability
 
 Row = dict[str, Any]  # errors of one method on one question (Bench.evaluate)
 
@@ -196,13 +195,11 @@ def _lacks_data(method: str, question: Question) -> bool:
 
 
 def load_method(where: str) -> tuple[str, Method]:
-    """Load a method, given as FILE.py:FUNCTION or as the name of a plug-in. Return its name and function.
+    """Load a method, given as FILE.py:FUNCTION. Return its name and function.
 
     Raises:
         UsageError: No such file or function.
     """
-    if where in plugins.registry(plugins.METHODS, {}):
-        return where, plugins.require(plugins.METHODS, where, {}, "method")
     file, _, name = where.rpartition(":")
     spec = (
         importlib.util.spec_from_file_location(Path(file).stem, file)

@@ -11,9 +11,9 @@ import numpy as np
 from gaponet.base.files import write_text
 from gaponet.base.result_table import ResultTable
 from gaponet.evaluation.methods import colour, shade
-from gaponet.experiments.real.methods import LEFT_OUT, METHODS
 from gaponet.report.figures.style import figure, legend, save, styled
 from gaponet.sim.metrics import standard_error
+from real_robots.methods import LEFT_OUT, METHODS
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -34,7 +34,7 @@ COLUMNS = ("set", "question", "method", "mrad", "of nominal", "less than nominal
 STEM = "real"
 HEADING = """# Real robots
 
-This table is what `gaponet experiment real` writes ([compare your method](../benchmark.md)): errors in mrad on public
+This table is what `benchmarks/compare_methods.py` writes ([compare your method](../benchmark.md)): errors in mrad on public
 recordings of real robots, of motions that no method was fitted to. Each simulation starts at the recorded state and
 then receives only commands.
 

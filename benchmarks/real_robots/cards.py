@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from annotated_types import Len
+from estimate_labels import Labels, estimate, write
 
 from gaponet.base.errors import UsageError
 from gaponet.base.files import write_text
@@ -17,7 +18,6 @@ from gaponet.data.formats import read_logs
 from gaponet.data.importer import import_logs
 from gaponet.data.store import Dataset
 from gaponet.robot.spec import RobotSpec, load_robot
-from gaponet.sysid.labels import Labels, estimate, write
 
 CARDS = Path(__file__).with_name("cards.toml")
 ROBOTS = Path(__file__).with_name(

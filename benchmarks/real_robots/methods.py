@@ -16,7 +16,6 @@ from gaponet.base.files import write_text
 from gaponet.data.sequence import Sequence
 from gaponet.data.store import Dataset
 from gaponet.evaluation.verdict import NetworkGain
-from gaponet.experiments.real.questions import Question, recorded_joints, train_val
 from gaponet.nn.artifact import GapModel
 from gaponet.nn.config import ModelConfig
 from gaponet.nn.delay_offset import DelayOffset
@@ -28,6 +27,7 @@ from gaponet.sim.replay import Corrector, replay
 from gaponet.sysid.adapt import adapt
 from gaponet.sysid.identify import identify
 from gaponet.sysid.robot_rollouts import WINDOW_S
+from real_robots.questions import Question, recorded_joints, train_val
 
 LEFT_OUT = "left out"  # starts the note of a network that validation rejected
 ADAPTATION_S = 30.0  # of the test's session

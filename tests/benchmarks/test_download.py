@@ -10,7 +10,7 @@ import pytest
 from gaponet.base.errors import UsageError
 from gaponet.base.network import RemoteError
 from gaponet.cli.main import main
-from gaponet.experiments.real.download import PublicFiles
+from gaponet.share.public_recordings import PublicFiles
 from gaponet.share.remote import FileRecord
 
 CONTENT = {f"arm/motion-{i}/control.csv": f"recording {i}\n".encode() * 100 for i in range(5)}

@@ -1,5 +1,7 @@
 """Estimation of missing labels: the payload of each recording, and the unit (one physical robot) that made it.
 
+    python benchmarks/estimate_labels.py LOGS --robot h1_2 --rate 50 --payloads 0 1 2 3 --units 3 --out labels
+
 Recordings in which one joint moves repeat the same commands with several payloads and units. The held torque at equal
 commands is a + b·m: m is one of the given payloads, b is common, a is the unit's. Each joint and command is fitted by
 itself, by expectation maximisation over all pairs of unit and payload. Consecutive recordings with equal torque are
@@ -19,12 +21,15 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+import tyro
 
 from gaponet.base.arrays import Array
 from gaponet.base.errors import LogError
 from gaponet.base.files import write_text
 from gaponet.base.text import format_uncertainty
+from gaponet.data.formats import read_logs
 from gaponet.data.log import Log
+from gaponet.robot.spec import load_robot
 from gaponet.sysid.torque import Gains, servo_gains
 
 MIN_MOVE_RAD = 0.05  # of a command that moves a joint
@@ -355,8 +360,49 @@ def write(labels: Labels, folder: Path, rate: float | None = None) -> None:
                         "yes" if r.copy_of else "no"])  # fmt: skip
     write_text(folder / "labels.csv", text.getvalue())
     lines = [
-        "# gaponet data labels: units and payloads are estimated from held torque",
+        "# benchmarks/estimate_labels.py: units and payloads are estimated from held torque",
         'manifest = "labels.csv"',
     ]
     lines += [f"rate = {rate:g}"] if rate else []
     write_text(folder / "logs.toml", "\n".join(lines) + "\n")
+
+
+def main(
+    logs: tyro.conf.Positional[Path],
+    robot: str,
+    out: Path,
+    payloads: tuple[float, ...],
+    units: int = 1,
+    rate: float | None = None,
+) -> None:
+    """Estimate which payload each recording of one moving joint carried and which unit made it, by held torque.
+
+    Args:
+        logs: File or folder of logs.
+        robot: Robot name or folder.
+        out: Folder for logs.toml and labels.csv, which gaponet import LOGS --logs OUT/logs.toml takes.
+        payloads: Masses that may have been carried, kg.
+        units: Number of robots.
+        rate: Hz, of logs without a clock.
+    """
+    spec = load_robot(robot)
+    gain = dict(zip(spec.joint_names, spec.kp.tolist(), strict=True))
+    labels = estimate(read_logs(logs, spec, rate=rate), payloads, units, gain)
+    write(labels, out, rate)
+    print("held torque at equal commands:")
+    for group in labels.groups:
+        zeros = ", ".join(f"{torque:+.2f}" for torque in group.units)
+        determined = "" if group.determined else "not "
+        print(
+            f"  {group.joint} to {group.command:+.2f} rad: {group.count} recordings, "
+            f"{group.slope:+.2f} N·m a kg, bands {group.band_distance:.1f} apart, units {zeros} N·m, "
+            f"payload {determined}determined"
+        )
+    for line in labels.remarks:
+        print(line)
+    print(f"written: {out / 'labels.csv'}")
+    print(f"Next: gaponet import {logs} --robot {robot} --logs {out / 'logs.toml'}")
+
+
+if __name__ == "__main__":
+    tyro.cli(main)
