@@ -16,7 +16,7 @@ if a content differs, a file remains, an exit code is wrong, or a traceback was 
 
 Not among the cases: run and record, which play a motion again and store it under a new name; demo, which consists of
 commands that are; view --render and replay --out, which write one file as
-`robot show --out` does; data labels, which writes two such files.
+`robot show --out` does.
 """
 
 from __future__ import annotations
@@ -302,7 +302,7 @@ def prepare(given: Path) -> None:
         ["train", str(given / "data"), "--out", str(given / "run"), "--budget", "2000", *TRAIN],
         ["robot", "new", str(given / "arm.xml"), "--out", nominal, *GAINS],
         ["collect", "--robot", nominal, *few, "--fleet", "easy", "--out", arm_data],
-        ["data", "export", arm_data, "--to", "lerobot", "--out", str(given / "arm_logs")],
+        ["data", "export", arm_data, "--out", str(given / "arm_logs")],
         ["identify", arm_data, "--out", str(given / "identified"), *QUICK_FIT],
     ):
         if wait(start(argv, given / "prepare.txt")):

@@ -85,7 +85,7 @@ def main(work: tyro.conf.Positional[Path]) -> None:
         if not (run / "model" / "card.json").is_file():
             call("train", data, "--robot", arm, "--out", run, "--budget", "10m")
         if not out.is_dir():
-            call("data", "export", data, "--out", out, "--to", "lerobot")
+            call("data", "export", data, "--out", out)
         errors = {}
         for motion in MOTIONS:
             for how, given in WAYS.items():

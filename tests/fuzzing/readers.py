@@ -170,7 +170,7 @@ def _export(folder: Path) -> None:
                 )
             )
         data.set_provenance(licence="CC0-1.0")
-        export(data, arm(), folder / "set", "lerobot")
+        export(data, folder / "set")
 
 
 def _motions(folder: Path) -> None:

@@ -106,29 +106,25 @@ def _figures(dataset: Data, out: Path, robot: Robot = None, json: Json = False) 
     screen.result({"figures": [str(path) for path in written], "left_out": left_out})
 
 
-def _export(
-    dataset: Data, out: Path, to: str = "lerobot", robot: Robot = None, json: Json = False
-) -> None:
-    """Write a dataset in another format; gaponet import reads it back as far as the format can hold it.
+def _export(dataset: Data, out: Path, json: Json = False) -> None:
+    """Write a dataset as LeRobotDataset v3.0, one set for each rate; gaponet import reads it back.
 
     Args:
         out: New folder.
-        to: lerobot (v3.0, one set for each rate), sage, npz (NumPy), asap (motion with action), mcap (ROS 2 bags).
     """
     from gaponet.data.writers import export
 
     screen = Out(json)
-    data, spec = open_dataset(dataset, robot)
+    data = Dataset(dataset)
     with progress_bar("exporting") as update:
-        sets = export(data, spec, out, to, update)
+        sets = export(data, out, update)
     shown = sets[:20]
-    screen.table(f"{out!s}: {to}", ["set", "episodes", "frames", "fps"], [
+    screen.table(str(out), ["set", "episodes", "frames", "fps"], [
         [str(s.path), f"{s.episodes:,}", f"{s.frames:,}", f"{s.fps:g}"] for s in shown
     ])  # fmt: skip
     if len(shown) < len(sets):
         screen.say(f"… and {len(sets) - len(shown)} more")
-    pickled = " --allow-pickle" if to == "asap" else ""
-    screen.say(f"Back: gaponet import {out!s} --robot {data.robot_name}{pickled} --out NEW")
+    screen.say(f"Back: gaponet import {out!s} --robot {data.robot_name} --out NEW")
     screen.result(
         {"sets": [{"path": str(s.path), "episodes": s.episodes, "frames": s.frames} for s in sets]}
     )

@@ -19,7 +19,7 @@ from gaponet.data.writers import lerobot as lerobot_export
 
 
 def export_lerobot(dataset, out, progress=no_progress):
-    return export(dataset, None, out, "lerobot", progress)  # the robot is not asked
+    return export(dataset, out, progress)
 
 
 @pytest.fixture

@@ -6,7 +6,7 @@ import re
 import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,14 +14,12 @@ import numpy as np
 
 from gaponet.base.arrays import Array
 from gaponet.base.errors import LogError, UsageError
-from gaponet.base.structure import validated
 from gaponet.data.describe.clocks import clock_periods, require_one_rate
 from gaponet.data.describe.joints import ignored, resolve_all
 from gaponet.data.describe.logs_file import HINT, LogsFile
 from gaponet.data.describe.plausibility import to_radians
 from gaponet.data.describe.slow_channels import sampled_channels
 from gaponet.data.log import CHANNELS, COMMANDS, DERIVED, FEEDFORWARD, REQUIRED, Channel, Log
-from gaponet.data.sequence import SequenceMeta
 from gaponet.robot.spec import LOG_UNITS, RobotSpec
 
 WIDEST = 500  # columns of an array that may be joints
@@ -196,14 +194,6 @@ class RawRecording:
         for clock in sorted(filter(None, chosen)):
             where = self.where or self.source
             require_one_rate(periods, clock, used, specified.get("ignore", ()), where)
-
-
-def restated(specified: Any, where: str) -> dict[str, Any]:
-    """Return the checked fields of SequenceMeta that an export of this package states."""
-    fields = specified if isinstance(specified, dict) else {}
-    again = "export it again"
-    meta = asdict(validated(SequenceMeta, fields | {"robot": "?"}, where, LogError, again))
-    return {name: meta[name] for name in fields if name != "robot"}
 
 
 GIT_LFS_POINTER = b"version https://git-lfs"  # how such a file begins

@@ -1,8 +1,8 @@
 """ASAP's motion pickle (.pkl): {motion: {dof, action, fps, …}}; opened with --allow-pickle only.
 
-`action` is the policy's: the target is default position + action_scale · action, 0.25 in ASAP's configuration. A file
-of ours says scale and default positions itself; for others logs.toml says action_scale, and home in robot.toml is the
-default position. Joints have no names in it: logs.toml lists them. Opened as formats.pickles says: nothing runs.
+`action` is the policy's: the target is default position + action_scale · action, 0.25 in ASAP's configuration.
+logs.toml says action_scale, and home in robot.toml is the default position. Joints have no names in it: logs.toml
+lists them. Opened as formats.pickles says: nothing runs.
 """
 
 from __future__ import annotations
@@ -15,11 +15,10 @@ import numpy as np
 
 from gaponet.base.errors import LogError
 from gaponet.base.sandbox import sandboxed
-from gaponet.base.structure import MAX_ARRAYS_BYTES, parse_json, read_limited
+from gaponet.base.structure import MAX_ARRAYS_BYTES, read_limited
 from gaponet.data.describe.logs_file import LogsFile
-from gaponet.data.describe.raw_recording import RawRecording, restated
+from gaponet.data.describe.raw_recording import RawRecording
 from gaponet.data.formats import files_under, pickles
-from gaponet.data.sequence import OPTIONAL
 
 SUFFIXES = (".pkl",)
 PICKLED = True
@@ -30,7 +29,6 @@ DEFAULT: LogsFile = {
     "position_unit": "rad",
     "time_unit": "s",
 }
-TARGETS = "target"  # signal made of action, where the file says how
 
 
 def recordings(path: Path, specified: LogsFile) -> Iterator[RawRecording]:
@@ -69,23 +67,6 @@ def _recording(file: Path, name: str, motion: dict[str, Any]) -> RawRecording:
     rows = min(len(arrays["action"]), len(arrays["dof"]))
     arrays = {k: v[:rows] for k, v in arrays.items() if len(v) >= rows}
     default = LogsFile(rate=float(fps))
-    scale, home = motion.get("action_scale"), motion.get("default_dof_pos")
-    if (
-        isinstance(scale, (int, float))
-        and isinstance(home, np.ndarray)
-        and home.shape == arrays["action"].shape[1:]
-    ):
-        arrays[TARGETS] = np.asarray(home, float) + scale * arrays["action"]
-        default["ctrl"] = TARGETS
     names = motion.get("joint_names")
     labels = tuple(map(str, names)) if isinstance(names, (list, np.ndarray)) else ()
-    meta: dict[str, Any] = {}
-    if isinstance(motion.get("stated"), str):  # a file of ours
-        meta["stated"] = restated(
-            parse_json(dict[str, Any], motion["stated"], where, LogError), where
-        )
-        default |= {c: c for c in ("ctrl", *OPTIONAL) if c in arrays}  # type: ignore[typeddict-item]
-    motion_name = str(meta["stated"]["motion"]) if meta else name
-    return RawRecording.of_arrays(
-        file, arrays, labels, motion_name, part=name, meta=meta, default=default
-    )
+    return RawRecording.of_arrays(file, arrays, labels, name, part=name, default=default)

@@ -1,6 +1,6 @@
-"""NumPy .npz, or a folder of them: ours, GAPONet's motion files, ASAP's, or any with arrays of one row per sample.
+"""NumPy .npz, or a folder of them: GAPONet's motion files, ASAP's, or any with arrays of one row per sample.
 
-What gaponet data export wrote says everything itself. GAPONet's files hold many motions in one: real_dof_positions_cmd,
+GAPONet's files hold many motions in one: real_dof_positions_cmd,
 real_dof_positions, real_dof_velocities, real_dof_torques (motions, rows, joints), padded with zero rows, or one array
 per motion; joint_sequence; payloads; or windows in which one joint moves, (windows, rows), with that joint's name in
 joint_sequence, (windows,). They have no clock: logs.toml says rate = 50.0, or --rate 50 does. In plain files logs.toml
@@ -18,11 +18,9 @@ import numpy as np
 
 from gaponet.base.errors import LogError
 from gaponet.base.sandbox import sandboxed
-from gaponet.base.structure import parse_json
 from gaponet.data.describe.logs_file import LogsFile
-from gaponet.data.describe.raw_recording import RawRecording, restated
+from gaponet.data.describe.raw_recording import RawRecording
 from gaponet.data.formats import files_under, pickles
-from gaponet.data.log import CHANNELS, DERIVED
 
 SUFFIXES = (".npz",)
 DEFAULT: LogsFile = {"time": "time"}
@@ -31,7 +29,6 @@ GAPONET: LogsFile = {
     "tau": "real_dof_torques", "position_unit": "rad", "time_unit": "s",
 }  # fmt: skip
 NAMES = ("joint_names", "joint_sequence", "dof_names")
-OURS = "gaponet"  # array with JSON in a file of ours
 
 
 def recordings(path: Path, specified: LogsFile) -> Iterator[RawRecording]:
@@ -39,28 +36,10 @@ def recordings(path: Path, specified: LogsFile) -> Iterator[RawRecording]:
     for file in files_under(path, SUFFIXES):
         arrays = _read(file)
         names = next((tuple(map(str, arrays[n].ravel())) for n in NAMES if n in arrays), ())
-        if OURS in arrays:
-            yield _ours(file, arrays, names)
-        elif all(k in arrays for k in ("real_dof_positions", "real_dof_positions_cmd")):
+        if all(k in arrays for k in ("real_dof_positions", "real_dof_positions_cmd")):
             yield from _motions(file, arrays, names)
         else:
             yield RawRecording.of_arrays(file, arrays, names)
-
-
-def _ours(file: Path, arrays: dict[str, Any], names: tuple[str, ...]) -> RawRecording:
-    """Read a file that data.writers.npz wrote, in SI units, with all its metadata."""
-    specified = parse_json(
-        dict[str, Any], str(arrays[OURS].ravel()[0]), f"{file}: {OURS}", LogError, "export it again"
-    )
-    stated = restated(specified.get("stated"), f"{file}: {OURS}")
-    default = LogsFile(time_unit="s", position_unit="rad")
-    default |= {c: c for c in (*CHANNELS, *DERIVED) if c in arrays}  # type: ignore[typeddict-item]
-    meta = {"stated": stated} | (
-        {"dt": specified["dt"]} if isinstance(specified.get("dt"), float) else {}
-    )
-    return RawRecording.of_arrays(
-        file, arrays, names, str(stated["motion"]), meta=meta, default=default
-    )
 
 
 def _motions(file: Path, arrays: dict[str, Any], names: tuple[str, ...]) -> Iterator[RawRecording]:

@@ -17,7 +17,7 @@ A reader that knows none of these finds an ordinary set. Simulated replays are n
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -32,12 +32,12 @@ from gaponet.data.log import UNITS
 from gaponet.data.sequence import Sequence
 from gaponet.data.statistics import Statistics, pool, statistics
 from gaponet.data.store import Dataset, Entry, dataset_hash
-from gaponet.data.writers import Tell, Written
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
 Group = tuple[float, tuple[str, ...]]  # dt, channels
+Tell = Callable[[str], None]  # called with the motion of each recording
 FeatureStatistics = dict[str, Statistics]  # feature → of its samples
 
 FILE_MB, CHUNK_FILES = 100, 1000  # LeRobot's own defaults, at most
@@ -60,6 +60,16 @@ class _Placed:
     first: int
     task: int
     file: int
+
+
+@dataclass(frozen=True)
+class Written:
+    """One set of an export."""
+
+    path: Path
+    episodes: int
+    frames: int
+    fps: float
 
 
 def write(dataset: Dataset, folder: Path, tell: Tell) -> list[Written]:
