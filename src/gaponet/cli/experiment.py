@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from gaponet.base.errors import ModelError
+from gaponet.base.errors import ModelError, UsageError
 from gaponet.base.progress import progress_bar, progress_bars
-from gaponet.cli.options import Data, Json, actions
+from gaponet.cli.options import Data, Json
 from gaponet.cli.out import Out, writes
 from gaponet.experiments.paper.options import PaperOptions
 
@@ -37,7 +37,8 @@ TITLES = {  # of tables on the terminal; the page numbers them too
 
 
 @writes("experiments")
-def paper(
+def experiment(
+    name: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="paper")],
     dataset: Data,
     out: Path,
     options: Annotated[PaperOptions, tyro.conf.arg(name="")] = PaperOptions(),  # noqa: B008
@@ -50,9 +51,12 @@ def paper(
     cores, with one about two hours.
 
     Args:
+        name: "paper", the only experiment.
         out: Folder of the results; OUT/paper.html is the page.
         options: Size of the experiment, and where it runs.
     """
+    if name != "paper":
+        raise UsageError(f"{name}: no such experiment; there is: paper")
     import gaponet.report.page  # noqa: F401  # needs an extra; without it nothing is trained
     from gaponet.api.paper import paper_experiment
 
@@ -90,8 +94,3 @@ def share_bar(title: str) -> Iterator[Callable[[float], None]]:
     """Open a progress bar that is told the share done."""
     with progress_bar(title) as update:
         yield lambda share: update(share, 1.0, "")
-
-
-@actions(paper=paper)
-def experiment(action: None) -> None:
-    """Run the paper's experiment."""
