@@ -44,7 +44,7 @@ def experiment(
     options: Annotated[PaperOptions, tyro.conf.arg(name="")] = PaperOptions(),  # noqa: B008
     json: Json = False,
 ) -> None:
-    """Run the paper's experiment: its claims, Figures 2 and 3, Tables 1 and 2, beside its numbers.
+    """Run the paper's experiment; show its numbers beside the paper's.
 
     Every network has the same recordings, inputs, training and seeds, and is measured on motions and on a unit that no
     network has seen. The same command continues an interrupted experiment. With three seeds it takes a night on two
