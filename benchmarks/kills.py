@@ -192,12 +192,11 @@ def cases(given: Path) -> dict[str, Case]:
 def further_cases(given: Path) -> dict[str, Case]:
     """Return commands that are only killed and repeated.
 
-    `given` holds, of an arm with two joints, a model file, a nominal and an identified robot, a fleet of one, data and
+    `given` holds, of an arm with two joints, a model file, a nominal and an identified robot, data and
     logs; and an empty folder.
     """
-    data, logs, nominal, identified, fleet, trained_on = (
-        str(given / name)
-        for name in ("arm_data", "arm_logs", "nominal", "identified", "fleet", "data")
+    data, logs, nominal, identified, trained_on = (
+        str(given / name) for name in ("arm_data", "arm_logs", "nominal", "identified", "data")
     )
 
     def killed(
@@ -217,24 +216,9 @@ def further_cases(given: Path) -> dict[str, Case]:
     def new_robot(out: Path) -> list[str]:
         return ["robot", "new", str(given / "arm.xml"), "--out", str(out), *GAINS]
 
-    def check_fleet(out: Path) -> list[str]:
-        return [
-            "check",
-            fleet,
-            data,
-            "--fleet",
-            "--out",
-            str(out),
-            "--night",
-            "n",
-            "--workers",
-            "1",
-        ]
-
     def start(out: Path) -> list[str]:
         return ["start", nominal, logs, "--out", str(out), "--unit-id", "virtual-1"]
 
-    timed = without("fleet.html", "virtual-1.json")
     return {
         "robot new": killed(new_robot),
         "identify": killed(identify, without("identified.json")),  # the path of the dataset
@@ -273,7 +257,6 @@ def further_cases(given: Path) -> dict[str, Case]:
             lambda out: ["robot", "show", identified, "--out", str(out / "known.png")],
             begin="empty",
         ),
-        "check a fleet": killed(check_fleet, timed, done=(0, 1)),
         "start": killed(start, without("*.html", "*.json", "*.npz")),
     }
 
@@ -308,7 +291,6 @@ def prepare(given: Path) -> None:
         if wait(start(argv, given / "prepare.txt")):
             raise SystemExit(f"{argv[0]} failed; see {given / 'prepare.txt'}")
     shutil.copytree(given / "data", given / "bare", ignore=shutil.ignore_patterns("replays"))
-    shutil.copytree(given / "identified", given / "fleet" / "virtual-1")
     (given / "empty").mkdir()
 
 

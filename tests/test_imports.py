@@ -16,7 +16,7 @@ PACKAGE = Path(gaponet.__file__).parent
 # Sub-packages and modules of gaponet. Each may import from itself and from those before it, also inside functions.
 RANKS = (
     "base", "robot", "data", "sim", "motion", "sysid", "nn", "deploy", "evaluation", "hw", "virtual",
-    "report", "share", "export", "experiments", "api", "fleet", "cli", "__main__",
+    "report", "share", "export", "experiments", "api", "cli", "__main__",
 )  # fmt: skip
 # The same within sub-packages: these folders may be imported by those after them, never by what lies beside them.
 INNER = {

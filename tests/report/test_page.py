@@ -9,15 +9,16 @@ SHOWN = "&lt;script&gt;alert(&#39;x&#39;)&lt;/script&gt; &amp; &#34;q&#34; \\x1b
 
 def test_text_is_escaped_once_wherever_it_stands():
     page = render(
-        "fleet.html.j2",
+        "paper.html.j2",
         title=HOSTILE,
-        summary=HOSTILE,
-        changed=[[HOSTILE] * 6],
-        legend=HOSTILE,
-        moved=[],
-        unchanged="",
+        virtual=False,
+        provenance=HOSTILE,
+        failures=[HOSTILE],
+        diagram="",
+        sections=[],
+        facts=[[HOSTILE] * 2],
     )
-    assert page.count(SHOWN) == 2 + 1 + 6 + 1
+    assert page.count(SHOWN) == 2 + 1 + 1 + 2
     assert "<script" not in page
     assert "&amp;lt;" not in page
 
