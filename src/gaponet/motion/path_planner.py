@@ -1,4 +1,4 @@
-"""Collision-free paths from one posture to another: straight, by way of home, or by random trees."""
+"""Collision-free paths from one posture to another: straight or by way of home."""
 
 from __future__ import annotations
 
@@ -15,11 +15,7 @@ from gaponet.robot.collision import POSTURE_STEP_RAD
 Free = Callable[[Array], bool]  # whether all postures (T, n) rad are
 _T = TypeVar("_T")
 Search = Generator[None, None, _T]  # works in steps of about a millisecond, one per next()
-_Straight = Callable[[Array, Array], Search[bool]]
 
-TREE_STEP_RAD = 0.5  # growth of a tree in one step
-MAX_GROWTHS = 250  # of both trees
-SHORTCUT_ATTEMPTS = 60  # at corners of the path
 MIN_LEG_S = 0.5  # of one leg of several
 ROWS_PER_STEP = 16  # postures that one step of a search checks
 
@@ -73,17 +69,13 @@ def finish_search(search: Search[_T]) -> _T:
             return end.value
 
 
-def find_points(
-    free: Free, start: Array, goal: Array, low: Array, high: Array, home: Array, seed: int = 0
-) -> Search[Array | None]:
-    """Return points (k, n) rad of a free path from start to goal, or None if none was found.
+def find_points(free: Free, start: Array, goal: Array, home: Array) -> Search[Array | None]:
+    """Return points (k, n) rad of a free path from start to goal, straight if possible, else by way of home.
 
-    It is straight if possible, else by way of home, else by two random trees that grow towards each other (RRT-Connect,
-    Kuffner & LaValle 2000), with shortcuts.
+    None if neither is free. Nothing else is tried: a person decides how a robot gets out of a place.
 
     Args:
         start, goal, home: (n,) rad.
-        low, high: Where to search, (n,) rad; a joint with equal bounds is not moved.
     """
 
     def straight(a: Array, b: Array) -> Search[bool]:
@@ -98,69 +90,4 @@ def find_points(
         return np.stack([start, goal])
     if (yield from straight(start, home)) and (yield from straight(home, goal)):
         return np.stack([start, home, goal])
-    rng = np.random.default_rng(seed)
-    points = yield from _connect(straight, start, goal, low, high, rng)
-    return None if points is None else (yield from _cut(straight, points, rng))
-
-
-def _connect(
-    straight: _Straight,
-    start: Array,
-    goal: Array,
-    low: Array,
-    high: Array,
-    rng: np.random.Generator,
-) -> Search[list[Array] | None]:
-    trees = [([start], [-1]), ([goal], [-1])]  # postures, and from which each was reached
-    for growth in range(MAX_GROWTHS):
-        (here, came), (there, _) = trees
-        reached = yield from _grow(
-            straight, here, came, rng.uniform(low, high), once=growth % 8 > 0
-        )
-        if reached is not None:
-            met = yield from _grow(straight, there, trees[1][1], here[reached], once=False)
-            if met is not None and np.abs(there[met] - here[reached]).max() < 1e-9:
-                halves = [_back(*tree, at) for tree, at in zip(trees, (reached, met), strict=True)]
-                if growth % 2:
-                    halves.reverse()
-                return [*halves[0][::-1], *halves[1][1:]]
-        trees.reverse()
     return None
-
-
-def _grow(
-    straight: _Straight, tree: list[Array], came: list[int], aim: Array, once: bool
-) -> Search[int | None]:
-    """Grow a tree towards `aim`, by one step or as far as possible; return the index of the last node, or None."""
-    at = int(np.argmin(np.abs(np.array(tree) - aim).max(axis=1)))
-    reached = None
-    while (far := float(np.abs(aim - tree[at]).max())) > 1e-9:
-        step = tree[at] + min(1.0, TREE_STEP_RAD / far) * (aim - tree[at])
-        if not (yield from straight(tree[at], step)):
-            break
-        tree.append(step)
-        came.append(at)
-        reached = at = len(tree) - 1
-        if once:
-            break
-    return reached
-
-
-def _back(tree: list[Array], came: list[int], at: int) -> list[Array]:
-    """Return the nodes from one to the root."""
-    nodes = []
-    while at >= 0:
-        nodes.append(tree[at])
-        at = came[at]
-    return nodes
-
-
-def _cut(straight: _Straight, points: list[Array], rng: np.random.Generator) -> Search[Array]:
-    """Return the path with shortcuts."""
-    for _ in range(SHORTCUT_ATTEMPTS):
-        if len(points) == 2:
-            break
-        i, k = sorted(rng.choice(len(points), 2, replace=False))
-        if k - i > 1 and (yield from straight(points[i], points[k])):
-            points = [*points[: i + 1], *points[k:]]
-    return np.array(points)

@@ -309,12 +309,13 @@ class Planner:
             some = rows[::4]
             return all((np.abs(static_torque(model, some)) <= most).all() for model in models)
 
-        points = yield from find_points(free, start, goal, low, high, home)
+        points = yield from find_points(free, start, goal, home)
         if points is None:
             straight = self.collision.along(np.linspace(start, goal, 200))
             raise UsageError(
-                f"no clear way was found {label}: the straight one brings "
-                f"{self._describe(straight)}"
+                f"no clear way {label}: straight it brings {self._describe(straight)}, and the way "
+                "through the home posture is not clear either. Bring the robot by hand near its "
+                "home posture, or to a posture from where the straight way is clear"
             )
         return Trajectory.minimum_jerk(
             points, self.config.blend_speed, self.safety.acceleration, self.config.blend
