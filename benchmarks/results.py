@@ -25,7 +25,6 @@ from typing import Any
 
 import page_charts
 import page_numbers
-
 from real_robots.page import write_page
 
 ROOT = Path(__file__).parents[1]

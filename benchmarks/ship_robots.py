@@ -24,6 +24,7 @@ from pathlib import Path
 from typing import Annotated
 
 import tyro
+from real_robots.cards import Card, prepare, read_cards
 from shipping import (
     measure_error,
     put_into_package,
@@ -40,7 +41,6 @@ from gaponet.base.errors import UsageError
 from gaponet.data.split import SPLITS
 from gaponet.data.store import Dataset
 from gaponet.evaluation.candidate import read_origin
-from real_robots.cards import Card, prepare, read_cards
 from gaponet.export.plain_servos import CACHE, fit_plain_servos, read_recordings, rollout_error
 from gaponet.robot.by_name import CARD, identified_catalogue
 from gaponet.robot.card import (

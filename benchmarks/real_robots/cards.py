@@ -18,12 +18,12 @@ from gaponet.data.formats import read_logs
 from gaponet.data.importer import import_logs
 from gaponet.data.store import Dataset
 from gaponet.robot.spec import RobotSpec, load_robot
+from gaponet.share.public_recordings import DATA_VARIABLE
 
 CARDS = Path(__file__).with_name("cards.toml")
 ROBOTS = Path(__file__).with_name(
     "robots"
 )  # robots of the data sets that the package does not have
-DATA_VARIABLE = "GAPONET_DATA"  # environment variable: folder of the data sets
 
 
 @dataclass(frozen=True)

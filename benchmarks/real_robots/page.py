@@ -34,9 +34,9 @@ COLUMNS = ("set", "question", "method", "mrad", "of nominal", "less than nominal
 STEM = "real"
 HEADING = """# Real robots
 
-This table is what `benchmarks/compare_methods.py` writes ([compare your method](../benchmark.md)): errors in mrad on public
-recordings of real robots, of motions that no method was fitted to. Each simulation starts at the recorded state and
-then receives only commands.
+This table is what `benchmarks/compare_methods.py` writes ([compare your method](../benchmark.md)): errors in mrad on
+public recordings of real robots, of motions that no method was fitted to. Each simulation starts at the recorded state
+and then receives only commands.
 
 ± is the standard error over independent motions; differences are paired, motion by motion. "Floor" is the difference
 between two recordings of one command. "Identified elsewhere" means on another session or unit."""

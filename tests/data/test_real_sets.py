@@ -4,9 +4,9 @@ import shutil
 
 import pytest
 from conftest import SHARED
+from real_robots.cards import prepare, read_cards
 
 from gaponet import api
-from real_robots.cards import prepare, read_cards
 
 CARDS = {card.name: card for card in read_cards().set}
 

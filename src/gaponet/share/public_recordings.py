@@ -1,7 +1,7 @@
 """Public recordings over HTTPS: the files of a pinned commit, each checked by its size and SHA-256.
 
-They come into the cache, in the folders that the data folder of the benchmark has. A file gets its name when it is
-complete and right, so that an interrupted download goes on with the files that are missing.
+They come into the cache, in the folders that the data folder of benchmarks/real_robots has. A file gets its name when
+it is complete and right, so that an interrupted download goes on with the files that are missing.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ from gaponet.base.files import atomic_write, lock_folder
 from gaponet.base.network import RemoteError
 from gaponet.base.progress import Progress, no_progress
 from gaponet.base.structure import read_toml
-from real_robots.cards import DATA_VARIABLE
 from gaponet.share.remote import FileRecord
 
+DATA_VARIABLE = "GAPONET_DATA"  # environment variable: folder of the data sets
 SO101_FILES = Path(__file__).with_name("so101_files.toml")
 FOLDER_KIND = "download"
 PARALLEL_DOWNLOADS = 8  # GitHub serves small files slowly, one after the other
