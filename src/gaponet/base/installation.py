@@ -1,7 +1,8 @@
 """How this gaponet was installed, and the commands that add an optional package to it.
 
-The distribution's name stands in pyproject.toml alone. Here it is read from the metadata of the distribution that
-brings the command `gaponet`, because another distribution on the package index may have the package's name.
+The distribution's name stands in pyproject.toml alone. Here it is read from the metadata of the
+distribution that brings the command `gaponet`, because another distribution on the package index
+may have the package's name.
 """
 
 from __future__ import annotations
@@ -17,19 +18,42 @@ SOURCE_TREE = Path(__file__).parents[3]  # with pyproject.toml, if nothing was i
 UVX_FOLDERS = ("archive-v0", "environments-v2")  # of uv's cache, which holds environments of uvx
 # Modules of optional dependencies → the extra that brings them.
 EXTRAS = {
-    "torch": "train", "onnx": "train", "sklearn": "train", "onnxruntime": "deploy", "cyclonedds": "dds",
-    "serial": "so101", "gymnasium": "gym", "imageio_ffmpeg": "film", "rosbags": "ros", "h5py": "hdf5",
-    "huggingface_hub": "hub", "zmq": "zmq", "warp": "warp", "mujoco_warp": "warp",
-}  # fmt: skip
-# Modules of packages that gaponet itself needs, and of packages that people choose by themselves → what to install.
+    "torch": "train",
+    "onnx": "train",
+    "sklearn": "train",
+    "onnxruntime": "deploy",
+    "cyclonedds": "dds",
+    "serial": "so101",
+    "gymnasium": "gym",
+    "imageio_ffmpeg": "film",
+    "rosbags": "ros",
+    "h5py": "hdf5",
+    "huggingface_hub": "hub",
+    "zmq": "zmq",
+    "warp": "warp",
+    "mujoco_warp": "warp",
+}
+# Modules of packages that gaponet itself needs, and of packages that people choose by themselves →
+# what to install.
 PACKAGES = {
-    "numba": "numba", "matplotlib": "matplotlib", "jinja2": "jinja2", "markupsafe": "jinja2", "PIL": "pillow",
-    "viser": "viser", "trimesh": "trimesh", "tensorboard": "tensorboard", "wandb": "wandb", "ray": "ray",
-}  # fmt: skip
+    "numba": "numba",
+    "matplotlib": "matplotlib",
+    "jinja2": "jinja2",
+    "markupsafe": "jinja2",
+    "PIL": "pillow",
+    "viser": "viser",
+    "trimesh": "trimesh",
+    "tensorboard": "tensorboard",
+    "wandb": "wandb",
+    "ray": "ray",
+}
 
 
 def missing_package(error: ModuleNotFoundError) -> str | None:
-    """Return a sentence with the command that installs a missing dependency; None for any other module."""
+    """Return a sentence with the command that installs a missing dependency.
+
+    None for any other module.
+    """
     module = (error.name or "").split(".")[0]
     if module in EXTRAS:
         return f"{module} is not installed; run: {install_command(EXTRAS[module])}"
@@ -39,7 +63,9 @@ def missing_package(error: ModuleNotFoundError) -> str | None:
 
 
 def install_command(*extras: str) -> str:
-    """Return the command for a shell that adds extras to the gaponet at hand, from where that came from."""
+    """Return the command for a shell that adds extras to the gaponet at hand, from where that came
+    from.
+    """
     return _command(_distribution(), extras)
 
 
@@ -53,7 +79,10 @@ def pip() -> str:
 
 
 def _distribution() -> Distribution | None:
-    """Return the distribution that brings the command `gaponet` of this package; None if it was not installed."""
+    """Return the distribution that brings the command `gaponet` of this package.
+
+    None if it was not installed.
+    """
     name, target = SCRIPT
     for point in entry_points(group="console_scripts", name=name):
         if point.value == target:
@@ -74,7 +103,8 @@ def _command(distribution: Distribution | None, extras: tuple[str, ...]) -> str:
 def _requirement(distribution: Distribution, suffix: str) -> tuple[str, str]:
     """Return the requirement with extras for an installed distribution, and the option before it.
 
-    PEP 610: direct_url.json says from where a distribution came, and is absent if that was an index.
+    PEP 610: direct_url.json says from where a distribution came, and is absent if that was an
+    index.
     """
     name = distribution.name
     text = distribution.read_text("direct_url.json")

@@ -9,12 +9,17 @@ from contextlib import contextmanager
 
 from gaponet.base.errors import GAPONetError
 
-# Modules of the network libraries → base classes of their errors that are neither OSError nor ValueError.
+# Modules of the network libraries → base classes of their errors that are neither OSError nor
+# ValueError.
 LIBRARY_ERRORS = {
     "huggingface_hub.errors": (
-        "HTTPError", "EntryNotFoundError", "CorruptedCacheException", "RevisionResolutionError", "XetDownloadError",
+        "HTTPError",
+        "EntryNotFoundError",
+        "CorruptedCacheException",
+        "RevisionResolutionError",
+        "XetDownloadError",
     ),
-}  # fmt: skip
+}
 
 
 class RemoteError(GAPONetError):
@@ -22,7 +27,10 @@ class RemoteError(GAPONetError):
 
 
 def _network_error_types() -> tuple[type[Exception], ...]:
-    """Return the errors that network libraries raise; a library that was not imported cannot have raised one."""
+    """Return the errors that network libraries raise.
+
+    A library that was not imported cannot have raised one.
+    """
     loaded = (
         (sys.modules[module], names)
         for module, names in LIBRARY_ERRORS.items()
@@ -36,7 +44,9 @@ def _network_error_types() -> tuple[type[Exception], ...]:
 
 @contextmanager
 def network_errors(address: str) -> Iterator[None]:
-    """Turn errors of the network libraries into a RemoteError with the address and without secrets."""
+    """Turn errors of the network libraries into a RemoteError with the address and without
+    secrets.
+    """
     try:
         yield
     except _network_error_types() as error:

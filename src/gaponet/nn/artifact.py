@@ -352,8 +352,9 @@ class GapModel:
         return self.contexts_of(robot, [Condition(0.0, "both", dt)])[0]
 
     def contexts_of(self, robot: RobotSpec, conditions: list[Condition]) -> Array:
-        """Measure answers to fixed probes, (conditions, 8n) rad: with empty hands, or loaded if the network is not
-        told the payload."""
+        """Measure answers to fixed probes, (conditions, 8n) rad: with empty hands, or loaded if
+        the network is not told the payload.
+        """
         from gaponet.sim.context import contexts
 
         return contexts(robot, conditions, loaded=self.config.context_is_loaded)

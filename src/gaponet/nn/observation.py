@@ -8,8 +8,8 @@ u_s is the target applied over [s, s+1), correction included. With n operated jo
 
 x = [ o_t | a_t ] is the input of a network. The paper's network (nn/paper.py) can have more
 columns: with fixed probes S_t, then, if it observes the recorded state,
-[ q_real − q | q̇_real − q̇ | 1 ], all zero where that state is hidden. A network for many simulators
-has the context of sim/context.py as last columns.
+[ q_real − q | q̇_real − q̇ | 1 ], all zero where that state is hidden. A network for many
+simulators has the context of sim/context.py as last columns.
 """
 
 from __future__ import annotations

@@ -34,7 +34,8 @@ def packaged_networks() -> tuple[str, ...]:
 
 
 def named_folder(name_or_path: str | Path) -> Path:
-    """Return the folder of a network or an identified robot of the package or of the Hub, or the path itself.
+    """Return the folder of a network or an identified robot of the package or of the Hub, or the
+    path itself.
 
     Args:
         name_or_path: Name, path, or address hf://USER/NAME.
@@ -92,6 +93,6 @@ def _unknown(name: str) -> str:
         return f"{name}: no such folder, and the package has no names; give a robot or run folder"
     nearest = difflib.get_close_matches(name, names, n=1, cutoff=0.0)[0]
     return (
-        f"{name}: no such folder, and no name of the package, which has {', '.join(names)}; nearest: {nearest}; or "
-        "give a robot or run folder"
+        f"{name}: no such folder, and no name of the package, which has {', '.join(names)}; "
+        f"nearest: {nearest}; or give a robot or run folder"
     )

@@ -125,8 +125,8 @@ def write_report(
     run = named_folder(run)
     if is_packaged(run):
         raise UsageError(
-            f"a report lies beside what it describes, and '{run.name}' lies in the package; gaponet eval {run.name} "
-            "DATASET prints its errors, gaponet gap their causes"
+            f"a report lies beside what it describes, and '{run.name}' lies in the package; "
+            f"gaponet eval {run.name} DATASET prints its errors, gaponet gap their causes"
         )
     model = None if is_robot(run) else GapModel.load(run)
     given = None

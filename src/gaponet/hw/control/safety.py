@@ -28,7 +28,8 @@ from gaponet.base.errors import UsageError
 from gaponet.hw.control.driver import Fault, State
 from gaponet.robot.spec import RobotSpec
 
-# Share of a bound that is kept free, so that rounding does not exceed a limit that is computed back.
+# Share of a bound that is kept free, so that rounding does not exceed a limit that is computed
+# back.
 RELATIVE_ROUNDING = 1e-9
 # New states in which one joint must read the same; at a turn two may by chance.
 MIN_STILL_STATES = 4

@@ -25,25 +25,51 @@ MOTORS = 35  # slots in a message; H1-2 uses 27
 HEADER = b"\x00\x01\x00\x00"  # plain CDR, little endian
 
 IMU: Fields = [
-    ("quaternion", "<f4", 4), ("gyroscope", "<f4", 3), ("accelerometer", "<f4", 3), ("rpy", "<f4", 3),
+    ("quaternion", "<f4", 4),
+    ("gyroscope", "<f4", 3),
+    ("accelerometer", "<f4", 3),
+    ("rpy", "<f4", 3),
     ("temperature", "<i2", 1),
-]  # fmt: skip
+]
 MOTOR_STATE: Fields = [
-    ("mode", "u1", 1), ("q", "<f4", 1), ("dq", "<f4", 1), ("ddq", "<f4", 1), ("tau_est", "<f4", 1),
-    ("temperature", "<i2", 2), ("vol", "<f4", 1), ("sensor", "<u4", 2), ("motorstate", "<u4", 1), ("reserve", "<u4", 4),
-]  # fmt: skip
+    ("mode", "u1", 1),
+    ("q", "<f4", 1),
+    ("dq", "<f4", 1),
+    ("ddq", "<f4", 1),
+    ("tau_est", "<f4", 1),
+    ("temperature", "<i2", 2),
+    ("vol", "<f4", 1),
+    ("sensor", "<u4", 2),
+    ("motorstate", "<u4", 1),
+    ("reserve", "<u4", 4),
+]
 MOTOR_CMD: Fields = [
-    ("mode", "u1", 1), ("q", "<f4", 1), ("dq", "<f4", 1), ("tau", "<f4", 1), ("kp", "<f4", 1), ("kd", "<f4", 1),
+    ("mode", "u1", 1),
+    ("q", "<f4", 1),
+    ("dq", "<f4", 1),
+    ("tau", "<f4", 1),
+    ("kp", "<f4", 1),
+    ("kd", "<f4", 1),
     ("reserve", "<u4", 1),
-]  # fmt: skip
+]
 LOW_STATE: Fields = [
-    ("version", "<u4", 2), ("mode_pr", "u1", 1), ("mode_machine", "u1", 1), ("tick", "<u4", 1), ("imu_state", IMU, 1),
-    ("motor_state", MOTOR_STATE, MOTORS), ("wireless_remote", "u1", 40), ("reserve", "<u4", 4), ("crc", "<u4", 1),
-]  # fmt: skip
-LOW_CMD: Fields = [
-    ("mode_pr", "u1", 1), ("mode_machine", "u1", 1), ("motor_cmd", MOTOR_CMD, MOTORS), ("reserve", "<u4", 4),
+    ("version", "<u4", 2),
+    ("mode_pr", "u1", 1),
+    ("mode_machine", "u1", 1),
+    ("tick", "<u4", 1),
+    ("imu_state", IMU, 1),
+    ("motor_state", MOTOR_STATE, MOTORS),
+    ("wireless_remote", "u1", 40),
+    ("reserve", "<u4", 4),
     ("crc", "<u4", 1),
-]  # fmt: skip
+]
+LOW_CMD: Fields = [
+    ("mode_pr", "u1", 1),
+    ("mode_machine", "u1", 1),
+    ("motor_cmd", MOTOR_CMD, MOTORS),
+    ("reserve", "<u4", 4),
+    ("crc", "<u4", 1),
+]
 
 
 def flatten(

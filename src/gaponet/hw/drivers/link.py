@@ -32,7 +32,9 @@ def measure_link(driver: Driver, seconds: float) -> dict[str, Any]:
             measured.append(state.time)
             arrived.append(time.monotonic())
         time.sleep(POLL_S)
-    count = len(measured) if received is None else driver.received - received + 1  # type: ignore[attr-defined]
+    count = len(measured)
+    if received is not None:
+        count = driver.received - received + 1  # type: ignore[attr-defined]
     span = max(measured[-1] - measured[0], 1e-9)
     steps = np.diff(measured) if len(measured) > 1 else np.array([np.inf])
     due = 1 + round(span / float(np.median(steps)))

@@ -30,7 +30,8 @@ class RemoteRobot:
         joint_names: All joints of the robot, in the order of every array; set with the first state.
         commanded: Those that targets may name.
         ended: Why the run is over; empty before.
-        nominal_qpos, nominal_qvel: What a policy is to see with --follow nominal, rad and rad/s; None without it.
+        nominal_qpos, nominal_qvel: What a policy is to see with --follow nominal, rad and rad/s;
+            None without it.
     """
 
     def __init__(self, address: str = ADDRESS, patience: float = 10.0) -> None:

@@ -166,8 +166,9 @@ class LiveTargets:
         counts: accepted (`taken`) and rejected (`refused`, by kind) messages; periods in which a
             target was `held`; the `sender`.
         remarks: Sentences for the recording; the controller takes them out.
-        observe: Returns positions and velocities, (n) rad and rad/s, that a policy is to see instead of the measured
-            position, which it is given; None, or returning None: there are none.
+        observe: Returns positions and velocities, (n) rad and rad/s, that a policy is to see
+            instead of the measured position, which it is given; None, or returning None: there are
+            none.
     """
 
     def __init__(

@@ -63,8 +63,9 @@ class ZeroMQTransport:
         """Send a JSON object to the sender; it is dropped if the sender does not read."""
         self._sender = to
         if to is not None:
+            message: list[Any] = [to, json.dumps(state).encode()]
             with contextlib.suppress(zmq.ZMQError):  # the sender is gone
-                self._socket.send_multipart([to, json.dumps(state).encode()], zmq.NOBLOCK)  # type: ignore[list-item]
+                self._socket.send_multipart(message, zmq.NOBLOCK)
 
     def close(self, reason: str) -> None:
         """Send the sender the reason, and close the socket."""

@@ -182,8 +182,9 @@ class TrainConfig:
     """Threads of the simulator and of torch, which take turns; 0 means all cores, and
     OMP_NUM_THREADS for torch."""
     device: Literal["cpu", "cuda", "warp-cpu"] = "cpu"
-    """cuda: simulations and networks on a GPU (extra `warp`), by default 4,096 simulations. warp-cpu:
-    the same on the CPU, slowly, for tests. Validation, identification and robots use C MuJoCo."""
+    """cuda: simulations and networks on a GPU (extra `warp`), by default 4,096 simulations.
+    warp-cpu: the same on the CPU, slowly, for tests. Validation, identification and robots use C
+    MuJoCo."""
 
     def network_device(self) -> str:
         """Return torch's device for the networks.
