@@ -5,6 +5,7 @@ runs.
 from __future__ import annotations
 
 import os
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -108,7 +109,7 @@ class VirtualDriver:
             payload: kg per hand, and side.
             period: Time between two states, s.
         """
-        robot = robot.nominal or robot  # the hidden physics replaces what was identified
+        robot = robot.before_identification  # the hidden physics replaces what was identified
         self.kp = robot.kp
         self.kd = robot.kd
         self.facts: dict[str, Any] = {}
@@ -116,7 +117,9 @@ class VirtualDriver:
         self.joint_names = robot.joint_names
         self.clock = clock
         self.period = period
-        self._given = (robot, physics, payload, seed, period)
+        self._new_unit = partial(LiveUnit, robot, physics, payload, seed, period)
+        self._live: LiveUnit | None = None  # from the connection on
+        self._state: State | None = None  # the newest one, from the connection on
         self._begun = 0.0  # clock's time at the connection, s
         self._skipped = 0  # state periods that were not simulated, before the first command
         self._commanded = False
@@ -125,7 +128,7 @@ class VirtualDriver:
         self._at = robot.index(self.commanded)
 
     def connect(self) -> None:
-        self.live = LiveUnit(*self._given)
+        self._live = self._new_unit()
         self._begun = self.clock.now()
         self._skipped = 0
         self._commanded = False
@@ -138,6 +141,7 @@ class VirtualDriver:
             DriverError: The simulation of a commanded robot is more than MAX_LAG_S behind the
                 clock.
         """
+        assert self._state is not None, "connect first"
         due = self._periods_due()
         if due <= 0:
             return self._state
@@ -153,6 +157,12 @@ class VirtualDriver:
             self.live.step()
         self._state = self._measure()
         return self._state
+
+    @property
+    def live(self) -> LiveUnit:
+        """The simulated unit; it exists once the driver is connected."""
+        assert self._live is not None, "connect first"
+        return self._live
 
     def _periods_due(self) -> int:
         """Return how many state periods the simulation is behind the clock."""
