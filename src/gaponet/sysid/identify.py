@@ -139,7 +139,7 @@ def _fit_positions(
     fits = _fits(recordings, robot, given, options, progress, contact)
     classic = fit_classic(fits, joints_alone=options.joints_alone)
     steps = _steps(fits, options)
-    state, comparisons, untried = _with_steps(steps, fits, classic)
+    state, comparisons, untried = with_steps(steps, fits, classic)
     errors = _standard_errors(state)
     robots = _robots(fits, state)
     without_table = robots[-1] if state.chosen != "given" else robot
@@ -218,7 +218,7 @@ def _steps(fits: Fits, options: IdentifyOptions) -> list[Step]:
     return steps
 
 
-def _with_steps(
+def with_steps(
     steps: ListOf[Step], fits: Fits, state: FitState
 ) -> tuple[FitState, tuple[Comparison, ...], list[str]]:
     """Return the state with the steps that the judge accepts, its comparisons, and names of steps without time."""
