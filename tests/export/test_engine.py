@@ -425,11 +425,7 @@ def test_the_command_writes_a_folder_that_needs_no_gaponet(place, capsys):
         "facts.json",
         "robot.xml",
         "gaponet_action.py",
-        "servo_law.py",
-        "mujoco_servos.py",
-        "scene_facts.py",
     }
-    shared |= {"unit_events.py"}
     assert files == shared | {".gaponet", "delta.pt2", "robot_without_servos.xml"}
     assert not [
         f

@@ -124,7 +124,7 @@ def test_a_users_file_moves_as_gaponet_does_and_keeps_all_that_is_the_users(
     made = export_robot(lawful, "mjcf", tmp_path / "out", source=mine)
     assert made.virtual
     assert made.errors["in gaponet"] == pytest.approx(0.0, abs=1e-9)
-    assert made.errors["scene.xml with servo_law.py"] < 2e-5
+    assert made.errors["scene.xml with mujoco_servos.py"] < 2e-5
     assert made.errors["scene.xml alone"] == pytest.approx(
         made.errors["in gaponet, without the servo model"], rel=0.02
     )
@@ -195,7 +195,7 @@ def test_a_servo_whose_gains_and_commands_are_in_degrees_takes_radians_from_now_
     assert servo.biasprm[:2].tolist() == [0.0, -24.0]
     assert servo.ctrlrange.tolist() == pytest.approx([-90 * 0.42 / 24, 90 * 0.42 / 24])
     assert "targets of elbow were not in rad before (degrees?)" in made.notes[-1]
-    assert made.errors["scene.xml with servo_law.py"] < 2e-5
+    assert made.errors["scene.xml with mujoco_servos.py"] < 2e-5
     assert (
         f'-    <general name="second" joint="elbow" {degrees}/>'
         in (tmp_path / "out/changes.diff").read_text()
@@ -208,7 +208,7 @@ def test_a_joint_that_turns_without_end_leaves_beside_one_that_does_not(tmp_path
     )
     endless = write_arm(tmp_path / "arm", xml=xml).with_servos(LAWS)
     made = export_robot(endless, "mjcf", tmp_path / "out")
-    assert made.errors["robot.xml with servo_law.py"] < 2e-5
+    assert made.errors["robot.xml with mujoco_servos.py"] < 2e-5
 
 
 def test_two_robots_in_one_scene_are_told_apart_by_what_stands_before_their_names(
@@ -263,7 +263,7 @@ def test_an_engine_with_another_order_of_joints_is_told_by_name(lawful, tmp_path
     model = mujoco.MjModel.from_xml_path(str(made.file))
     assert [model.actuator(i).name for i in range(3)] == ["a", "z", "b"]
     assert model.actuator_gainprm[:, 0].tolist() == [24.0, 7.0, 16.0]
-    assert made.errors["scene.xml with servo_law.py"] < 2e-5
+    assert made.errors["scene.xml with mujoco_servos.py"] < 2e-5
 
 
 def test_a_joint_with_two_servos_is_refused(robot, mine, tmp_path):

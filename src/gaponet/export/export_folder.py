@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import inspect
 import json
 import re
-from collections.abc import Callable
 from collections.abc import Sequence as ListOf
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,12 +12,18 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from gaponet.base.arrays import array_module
 from gaponet.base.errors import UsageError
 from gaponet.base.files import atomic_write, lock_folder, write_text
 from gaponet.base.progress import Progress, no_progress
 from gaponet.data.sequence import Sequence
 from gaponet.export.engine_configs import TEMPLATES, engine_config
+from gaponet.export.helper_file import (
+    MUJOCO_HELPER,
+    SHIPPED,
+    TORCH_HELPER,
+    helper_text,
+    without_gaponet,
+)
 from gaponet.export.mjcf_edit import MUJOCO_HAS_RAMPS, edit_mjcf
 from gaponet.export.plain_servos import (
     check_motions,
@@ -33,50 +37,30 @@ from gaponet.export.shipped import mujoco_servos
 from gaponet.export.simulator_facts import control_period, mjcf_text, simulator_facts
 from gaponet.export.urdf_edit import MISSING_FIELDS, edit_urdf, with_urdf_fields
 from gaponet.nn.artifact import GapModel
-from gaponet.robot.servo_fields import SERVO_TERMS
 from gaponet.robot.spec import RobotSpec
-from gaponet.sim import servo
 
 FOLDER_KIND = "engine"
 FACTS, ROBOT, CHECK = "facts.json", "robot.xml", "check.npz"
-SHIPPED = Path(__file__).parent / "shipped"
-ACTION_TERM = {name: name for name in ("scene_facts.py", "unit_events.py", "gaponet_action.py")}
-# Engine → name in the export folder → file in SHIPPED; beside mujoco_servos.py and servo_law.py.
+# Engine → name in the export folder → file in SHIPPED; beside the helper file.
 CHECK_FILES: dict[str, dict[str, str]] = {
     "mjcf": {"check.py": "check_mjcf.py", "check_mjx.py": "check_mjx.py"},
     "urdf": {},
-    "mjlab": ACTION_TERM | {"check.py": "check_mjlab.py"},
-    "isaaclab": ACTION_TERM | {"check.py": "check_isaaclab.py"},
+    "mjlab": {"check.py": "check_mjlab.py"},
+    "isaaclab": {"check.py": "check_isaaclab.py"},
     "newton": {"check.py": "check_newton.py"},
     "drake": {"check.py": "check_drake.py"},
     "json": {},
-    "torch": ACTION_TERM,
-    "actuator-net": ACTION_TERM
-    | {
+    "torch": {},
+    "actuator-net": {
         "check.py": "check_mjlab.py",
         "check_newton.py": "check_newton.py",
         "actuators.py": "actuators.py",
     },
 }
-SERVO_MODEL_HEAD = '''"""Servo model beyond PD: encoder steps, torque limits and friction; numpy or torch."""
-
-from __future__ import annotations
-
-from importlib import import_module
-from typing import Any
-
-import numpy as np
-
-ServoTerms = dict[str, Any]  # name of a term → values that broadcast to the joints
-'''
-SERVO_MODEL: tuple[Callable[..., Any], ...] = (
-    array_module, servo.present, servo.exp, servo.torque_range, servo.passing_friction, servo.resting_friction,
-    servo.friction_limit, servo.servo_torque, servo.servo_bias, servo.crossed, servo.Play,
-)  # fmt: skip
+WITH_TORCH = ("mjlab", "isaaclab", "torch", "actuator-net")  # engines whose helper file needs torch
 ENGINE_TERMS = {
     "isaaclab": ("no_load_speed",)
 }  # terms of the servo model that an engine's own servos have
-OWN_IMPORTS = re.compile(r"from gaponet\S*\.(servo|mujoco_servos|scene_facts|unit_events) import")
 ACTUATORS = re.compile(r"\s*<actuator>.*?</actuator>", re.DOTALL)
 DELAY_NOTES = {
     "newton": "Newton has no delays: check.py has a buffer of five lines",
@@ -151,7 +135,7 @@ def export_robot(
     with lock_folder(out, FOLDER_KIND):
         if to == "mjcf":
             file, not_rad = edit_mjcf(source or robot.mjcf, out, plain, facts, payload_mass)
-            for form, what in (("joints", "with servo_law.py"), ("plain", "alone")):
+            for form, what in (("joints", "with mujoco_servos.py"), ("plain", "alone")):
                 if form == "plain" or robot.has_servo_model:
                     errors[f"{file.name} {what}"] = _error_in_mujoco(
                         file, facts, validation, robot, form
@@ -322,17 +306,12 @@ def _write_motions(file: Path, motions: ListOf[Sequence]) -> None:
 
 
 def _write_shipped(folder: Path, to: str, facts: dict[str, Any]) -> None:
-    """Write facts.json and the files of SHIPPED for an engine, with imports that need no gaponet."""
-    constants = (
-        f"SERVO_TERMS = {SERVO_TERMS}\n"
-        f"SLOWEST, FINEST = {servo.SLOWEST}, {servo.FINEST}  # rad/s of stribeck_speed, rad of encoder_step\n"
-        f"DEADBAND_STEPS, OPENED = {servo.DEADBAND_STEPS}, {servo.OPENED}\n"
-    )
-    functions = [inspect.getsource(f) for f in SERVO_MODEL]
-    write_text(folder / "servo_law.py", "\n\n".join([SERVO_MODEL_HEAD + constants, *functions]))
-    for name, file in ({"mujoco_servos.py": "mujoco_servos.py"} | CHECK_FILES[to]).items():
-        text = OWN_IMPORTS.sub(r"from \1 import", (SHIPPED / file).read_text(encoding="utf-8"))
-        write_text(folder / name, text.replace("from servo import", "from servo_law import"))
+    """Write facts.json, the helper file and the check of an engine; none of them needs gaponet."""
+    helper = TORCH_HELPER if to in WITH_TORCH else MUJOCO_HELPER
+    write_text(folder / f"{helper}.py", helper_text(helper))
+    for name, file in CHECK_FILES[to].items():
+        text = (SHIPPED / file).read_text(encoding="utf-8")
+        write_text(folder / name, without_gaponet(text, helper))
     write_text(folder / FACTS, json.dumps(facts, indent=1, ensure_ascii=False) + "\n")
 
 

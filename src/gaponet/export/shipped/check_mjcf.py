@@ -9,7 +9,7 @@ from gaponet.export.shipped.mujoco_servos import Check, play
 HERE = Path(__file__).parent
 check = Check(HERE)
 file = str(HERE / check.facts["file"])
-for form, what in (("plain", "the MJCF alone"), ("joints", "the MJCF with servo_law.py")):
+for form, what in (("plain", "the MJCF alone"), ("joints", "the MJCF with mujoco_servos.py")):
     models = [mujoco.MjModel.from_xml_path(file) for _ in check.motions]
     paths = [
         play(m, check.facts, x, check.facts["prefix"], form)

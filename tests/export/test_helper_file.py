@@ -1,0 +1,31 @@
+"""The helper file of an export: one file, which needs no gaponet and defines every name once."""
+
+import subprocess
+import sys
+
+import pytest
+
+from gaponet.export.helper_file import MODULES, defined_names, helper_text
+
+
+@pytest.mark.parametrize("helper", MODULES)
+def test_a_helper_defines_every_name_once(helper):
+    names = defined_names(helper_text(helper))
+    assert len(names) > 20
+    assert sorted(names) == sorted(set(names))
+
+
+@pytest.mark.parametrize("helper", MODULES)
+def test_a_helper_imports_where_there_is_no_gaponet(helper, tmp_path):
+    if helper == "gaponet_action":
+        pytest.importorskip("torch")
+    (tmp_path / f"{helper}.py").write_text(helper_text(helper), encoding="utf-8")
+    forbid = "import sys; sys.modules['gaponet'] = None; "
+    names = "Servos, Check, fill_delays, friction_limit, servo_bias"
+    code = f"{forbid}from {helper} import {names}; print(Servos.__module__)"
+
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True
+    )
+
+    assert done.stdout.strip() == helper
