@@ -69,7 +69,7 @@ def test_the_correction_is_clipped_and_has_a_gain():
 def test_without_scikit_learn_there_is_one_sentence(monkeypatch):
     monkeypatch.setattr(trees, "find_spec", lambda name: None)
     net = build_network(ModelConfig("trees"), 1)
-    with pytest.raises(UsageError, match=r"gaponet\[trees\]"):
+    with pytest.raises(UsageError, match="scikit-learn"):
         net.fit(torch.zeros(100, net.config.input_dim(1)), torch.zeros(100, 1), 0)
 
 
