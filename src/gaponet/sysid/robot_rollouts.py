@@ -52,94 +52,123 @@ class RobotRollouts:
     """
 
     def __init__(
-        self, parts: list[Sequence], robot: RobotSpec, nthread: int = 0, corrector: Corrector | None = None,
+        self,
+        parts: list[Sequence],
+        robot: RobotSpec,
+        nthread: int = 0,
+        corrector: Corrector | None = None,
         touch: Array | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         """Take windows of recordings, and a robot whose own values hold where candidates give none.
 
         Rollouts go on from the recording in the rows of `touch`, (windows, rows), in which a tip may touch something.
         """
-        self.parts, self.robot, self.nthread, self.corrector = parts, robot, nthread, corrector
-        self.locked, self.op, self.n = (
-            idle_limbs(parts, robot),
-            robot.operated_index,
-            len(robot.operated),
-        )
-        free = [j for j in robot.joint_names if j not in self.locked]
+        self.parts = parts
+        self.robot = robot
+        self.nthread = nthread
+        self.corrector = corrector
+        self.locked = idle_limbs(parts, robot)
+        self.op = robot.operated_index
+        self.n = len(robot.operated)
         rows = max(map(len, parts))
         self.real = np.zeros((rows, len(parts), self.n))
-        for i, s in enumerate(parts):
-            self.real[: len(s), i] = s.qpos[:, self.op]
-        thin = [max(1, round(ROW_PERIOD_S / s.dt)) for s in parts]
-        self.touch = np.zeros((rows, len(parts)), bool) if touch is None else touch.T[:rows]
-        after = max(1, round(SETTLE_S / max(s.dt for s in parts)))
-        near = np.array([self.touch[max(0, t - after) : t + 1].any(axis=0) for t in range(rows)])
-        self.counted = ~near[1:] & np.array([
-            [t >= SETTLE_S / s.dt and t < len(s) and t % k == 0 for s, k in zip(parts, thin, strict=True)]
-            for t in range(1, rows)
-        ])  # fmt: skip
+        for i, part in enumerate(parts):
+            self.real[: len(part), i] = part.qpos[:, self.op]
+        self.touch = np.zeros((rows, len(parts)), bool)
+        if touch is not None:
+            self.touch = touch.T[:rows]
+        self.counted = self._counted()  # (rows − 1, windows): of the state after each step
         self.window = np.broadcast_to(np.arange(len(parts)), self.counted.shape)[self.counted]
-        # Joints that a window does not hold stand where it says.
-        self.recorded = np.array(
-            [[j not in p.meta.unrecorded for p in parts] for j in robot.operated]
-        )[:, self.window]
-        self.standing = [
-            (w, i)
-            for w, p in enumerate(parts)
-            for i, j in enumerate(free)
-            if j in p.meta.unrecorded
-        ]
+        held = [[j not in p.meta.unrecorded for p in parts] for j in robot.operated]
+        self.recorded = np.array(held)[:, self.window]
         self.rows = self.recorded.sum(axis=1)
+        self._standing = self._standing_joints()
+
+    def _counted(self) -> Array:
+        """Return the rows that count: after the start has settled, every ROW_PERIOD_S, away from contacts."""
+        rows = len(self.touch)
+        after = max(1, round(SETTLE_S / max(p.dt for p in self.parts)))
+        near = np.array([self.touch[max(0, t - after) : t + 1].any(axis=0) for t in range(rows)])
+        time = np.arange(rows)
+        counted = []
+        for part in self.parts:
+            thin = max(1, round(ROW_PERIOD_S / part.dt))
+            settled = time >= SETTLE_S / part.dt
+            counted.append(settled & (time < len(part)) & (time % thin == 0))
+        return np.asarray(np.array(counted).T[1:] & ~near[1:])
+
+    def _standing_joints(self) -> list[tuple[int, int]]:
+        """Return window and number of each joint that a window does not hold: it stands where the window says."""
+        free = [joint for joint in self.robot.joint_names if joint not in self.locked]
+        standing = []
+        for window, part in enumerate(self.parts):
+            standing += [(window, i) for i, j in enumerate(free) if j in part.meta.unrecorded]
+        return standing
 
     def flat_errors(self, values: dict[str, Array], links: ListOf[dict[str, Link]] = ()) -> Array:
         """Return q_sim − q_real in the rows that count, (k, n, rows) rad; values (k, n), `links` (k,)."""
-        k, m = len(values["kp"]), len(self.parts)
+        sim, conditions = self._simulations(values)
+        sim.set_servos(self.robot.operated, self._beside_windows(values))
+        self._hold_standing_joints(sim)
+        if links:
+            self._set_links(sim, conditions, links)
+        return self.simulated_errors(sim)
+
+    def _simulations(self, values: dict[str, Array]) -> tuple[BatchSim, list[Condition]]:
+        """Return simulations of all windows for each candidate, and the windows' conditions."""
         delay = np.array(self.robot.delay)
         delay[self.op] = max(float(values["delay"].max()), self.robot.dt / self.robot.decimation)
-        terms = any(values[f].any() for f in SERVO_TERMS if f in values)
-        plain: dict[str, Any] = {} if terms else dict.fromkeys(SERVO_TERMS, np.array(0.0))
-        acting = replace(self.robot, delay=delay, **plain)
+        acting = replace(self.robot, delay=delay)
+        has_terms = any(values[f].any() for f in SERVO_TERMS if f in values)
+        if not has_terms:
+            plain: dict[str, Any] = dict.fromkeys(SERVO_TERMS, np.array(0.0))
+            acting = replace(acting, **plain)
         conditions = [Condition.of(s, self.robot)._replace(temperature=None) for s in self.parts]
-        sim = BatchSim(acting, conditions * k, self.nthread, self.locked, servo_model=terms)
-        each = {f: np.repeat(x, m, axis=0) for f, x in values.items()}
-        warm = warm_values(values, recorded_temperatures(self.parts, self.op).T)
-        each |= {
-            f: x.swapaxes(1, 2).reshape(-1, self.n)
-            for f, x in zip(("damping", "frictionloss"), warm, strict=True)
-        }
-        sim.set_servos(self.robot.operated, each)
-        for (
-            w,
-            i,
-        ) in (
-            self.standing
-        ):  # n joints of a robot that is not locked have as many degrees of freedom
-            sim.batch.expand("dof_armature")[w::m, i] = IMMOVABLE_ARMATURE
+        every = conditions * len(values["kp"])
+        sim = BatchSim(acting, every, self.nthread, self.locked, servo_model=has_terms)
+        return sim, conditions
+
+    def _beside_windows(self, values: dict[str, Array]) -> dict[str, Array]:
+        """Return values (k, n) for each window, at its temperature, (k · windows, n)."""
+        each = {f: np.repeat(x, len(self.parts), axis=0) for f, x in values.items()}
+        temperature = recorded_temperatures(self.parts, self.op).T
+        damping, frictionloss = warm_values(values, temperature)  # (k, n, windows)
+        each["damping"] = damping.swapaxes(1, 2).reshape(-1, self.n)
+        each["frictionloss"] = frictionloss.swapaxes(1, 2).reshape(-1, self.n)
+        return each
+
+    def _hold_standing_joints(self, sim: BatchSim) -> None:
+        """Let joints that a window does not hold stand."""
+        windows = len(self.parts)
+        # A robot with all joints free has as many degrees of freedom as joints.
+        for window, joint in self._standing:
+            sim.batch.expand("dof_armature")[window::windows, joint] = IMMOVABLE_ARMATURE
             if sim.servo_model is not None:
-                sim.servo_model.armature[w::m, i], sim.servo_model.values["backlash"][w::m, i] = (
-                    IMMOVABLE_ARMATURE,
-                    0.0,
-                )
-        if links:
-            robots = [replace(self.robot, links=one) for one in links]
-            models = [
-                {c: with_links(model, robot) for c, model in sim.models.items()} for robot in robots
-            ]
-            for name in LINK_FIELDS:
-                rows = np.array([getattr(each[c], name) for each in models for c in conditions])
-                if rows.size:
-                    sim.batch.expand(name)[:] = rows
-        return self.simulated_errors(sim)
+                sim.servo_model.armature[window::windows, joint] = IMMOVABLE_ARMATURE
+                sim.servo_model.values["backlash"][window::windows, joint] = 0.0
+
+    def _set_links(
+        self, sim: BatchSim, conditions: list[Condition], links: ListOf[dict[str, Link]]
+    ) -> None:
+        """Give each candidate's simulations its links."""
+        models = []
+        for one in links:
+            robot = replace(self.robot, links=one)
+            own = {c: with_links(model, robot) for c, model in sim.models.items()}
+            models += [own[c] for c in conditions]
+        for name in LINK_FIELDS:
+            rows = np.array([getattr(model, name) for model in models])
+            if rows.size:
+                sim.batch.expand(name)[:] = rows
 
     def simulated_errors(self, sim: BatchSim) -> Array:
         """Return q_sim − q_real in the rows that count, (k, n, rows) rad, of simulations of k times the windows."""
-        k, m = sim.num_envs // len(self.parts), len(self.parts)
-        qpos = rollout(sim, self.parts * k, self.corrector, touch=np.tile(self.touch, k))[0, 1:][
-            ..., self.op
-        ]
-        error = (qpos.reshape(len(qpos), k, m, self.n) - self.real[1:, None]).astype(np.float32)
+        windows = len(self.parts)
+        k = sim.num_envs // windows
+        channels = rollout(sim, self.parts * k, self.corrector, touch=np.tile(self.touch, k))
+        qpos = channels[0, 1:][..., self.op]
+        each = qpos.reshape(len(qpos), k, windows, self.n)
+        error = (each - self.real[1:, None]).astype(np.float32)
         errors = error.transpose(1, 3, 0, 2)[:, :, self.counted]
-        return (
-            np.clip(np.nan_to_num(errors, nan=MAX_ERROR_RAD), -MAX_ERROR_RAD, MAX_ERROR_RAD)
-            * self.recorded
-        )
+        errors = np.nan_to_num(errors, nan=MAX_ERROR_RAD).clip(-MAX_ERROR_RAD, MAX_ERROR_RAD)
+        return np.asarray(errors * self.recorded)
