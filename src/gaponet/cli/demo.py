@@ -17,7 +17,7 @@ from gaponet.cli.experiment import share_bar, show_paper_result
 from gaponet.cli.gap import show_steps
 from gaponet.cli.options import Flag, Json
 from gaponet.cli.out import Out, writes
-from gaponet.evaluation.tables import by_group, mrad
+from gaponet.evaluation.tables import mrad
 from gaponet.robot.spec import robot_argument
 
 FLEET = "firm"
@@ -75,12 +75,14 @@ def identify_real_arm(screen: Out, out: Path) -> dict[str, object]:
     test_motions = tuple(sorted({entry.meta.motion for entry in split_entries(dataset)["test"]}))
     screen.say(
         f": the simulator gets the commands alone, on {len(test_motions)} motions that stay out of the fit  "
-        f"(gaponet gap {data})",
+        f"(gaponet gap {data}, which takes all 40)",
         "2 Measure the gap",
     )
     with progress_bar("gap") as update:
         nominal = api.gap(dataset, motions=test_motions, progress=update)
-    screen.show("Nominal simulator, real robot", by_group(nominal.methods, "joint"))
+    by_joint = nominal.methods["nominal"]["by_joint"]
+    rows = [[joint, mrad(errors["mpjae"])] for joint, errors in by_joint.items()]
+    screen.table("Nominal simulator beside the real robot", ["joint", "mean |error|, mrad"], rows)
     screen.say(f"  (gaponet identify {data} --out {robot})", "3 Identify")
     with progress_bar("identifying") as update:
         api.identify(dataset, out=robot, progress=update)
@@ -93,10 +95,11 @@ def identify_real_arm(screen: Out, out: Path) -> dict[str, object]:
     with progress_bar("exporting") as update:
         exported = api.export_robot(robot, to="mjcf", progress=update)
     screen.say(
-        f"{mean_error(after, 'nominal')} mrad before, {mean_error(after, 'identified')} mrad after, on motions that "
-        f"the fit never saw; {time.monotonic() - began:.0f} s in all. For MuJoCo: {exported.path}"
+        f"{mean_error(after, 'nominal')} → {mean_error(after, 'identified')} mrad on motions that the fit never saw "
+        f"({time.monotonic() - began:.0f} s in all); the robot for MuJoCo: {exported.path}",
+        "Result: ",
     )
-    screen.next(f"gaponet start MODEL LOGS: the same for your robot; gaponet robot show {robot}")
+    screen.next(f"gaponet robot show {robot}; for your robot gaponet start MODEL LOGS")
     return {
         "origin": public.origin,
         "nominal_rad": after.methods["nominal"]["mpjae"],
