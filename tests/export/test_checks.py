@@ -24,9 +24,7 @@ pytestmark = pytest.mark.peers
 ENGINES = {  # name → what is exported, what is run, Python, what is installed
     "mujoco": ("mjcf", "check.py", "3.11", ("mujoco>=3.5",)),
     "mjlab-1.6": ("mjlab", "check.py", "3.11", (f"torch=={torch.__version__}", "mjlab==1.6.*")),
-    "mjx": ("mjcf", "check_mjx.py", "3.11", ("mujoco-mjx",)),
     "isaaclab-3": ("isaaclab", "check.py", "3.12", ("isaaclab==3.*", "mujoco-usd-converter")),
-    "drake": ("drake", "check.py", "3.12", ("drake",)),
     "newton": ("newton", "check.py", "3.11", ("newton[sim,onnx]",)),
 }
 

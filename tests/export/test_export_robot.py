@@ -377,7 +377,7 @@ def test_a_robot_folder_leaves_by_the_command_and_without_torch(robot, tmp_path,
     )
     words = ["export", str(robot.folder), "--to", "mjcf", "--out", str(tmp_path / "alone")]
     subprocess.run([sys.executable, "-c", alone, *words], check=True)
-    for to in ("mjcf", "newton", "drake", "json", "mjlab", "isaaclab"):
+    for to in ("mjcf", "newton", "json", "mjlab", "isaaclab"):
         assert (
             main(["export", str(robot.folder), "--to", to, "--out", str(tmp_path / to), "--json"])
             == 0
@@ -388,8 +388,7 @@ def test_a_robot_folder_leaves_by_the_command_and_without_torch(robot, tmp_path,
         assert facts["plain"]["elbow"]["kp"] == 20.0
     assert mujoco.MjModel.from_xml_path(str(tmp_path / "newton/robot.xml")).nu == 0
     assert mujoco.MjModel.from_xml_path(str(tmp_path / "mjlab/robot.xml")).nu == 2
-    for to in ("newton", "drake"):
-        compile((tmp_path / to / "robot_cfg.py").read_text(), to, "exec")
+    compile((tmp_path / "newton" / "robot_cfg.py").read_text(), "newton", "exec")
     assert main(["export", str(robot.folder), "--to", "torch"]) == 2
     assert "is a robot, which has no network" in capsys.readouterr().err
 

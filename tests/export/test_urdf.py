@@ -1,14 +1,11 @@
 """A user's URDF takes along what its tags hold, and is told what they do not."""
 
-import json
-import subprocess
 import xml.etree.ElementTree as ET
 from dataclasses import replace
 
 import mujoco
 import pytest
 from arm import write_arm
-from environments import environment
 
 from gaponet.base.errors import RobotError, UsageError
 from gaponet.cli.main import main
@@ -100,24 +97,3 @@ def test_a_file_that_is_none_or_has_other_joints_is_refused(robot, tmp_path, cap
         export_robot(robot, "urdf", tmp_path / "c", source=file)
     assert main(["export", str(robot.folder), "--to", "urdf", "--into", str(file)]) == 2
     assert "no joint 'shoulder'" in capsys.readouterr().err
-
-
-DRAKE = """
-import json, sys
-from pydrake.multibody.parsing import Parser
-from pydrake.multibody.plant import MultibodyPlant
-plant = MultibodyPlant(0.001)
-Parser(plant).AddModels(sys.argv[1])
-print(json.dumps({name: plant.GetJointByName(name).default_damping() for name in ("shoulder", "elbow")}))
-"""
-
-
-@pytest.mark.peers
-def test_drakes_parser_reads_the_damping(robot, tmp_path):
-    (tmp_path / "mine.urdf").write_text(URDF)
-    made = export_robot(robot, "urdf", tmp_path / "out", source=tmp_path / "mine.urdf")
-    python = environment("drake", "3.12", ("drake",))
-    done = subprocess.run(
-        [python, "-c", DRAKE, made.file], capture_output=True, text=True, check=True
-    )
-    assert json.loads(done.stdout) == {"shoulder": 0.8, "elbow": 0.6}

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from gaponet.export.export_folder import ExportedFolder
     from gaponet.export.randomization import Engine, Randomization, Scope
 
-RobotTarget = Literal["mjcf", "urdf", "mjlab", "isaaclab", "newton", "drake", "json"]
+RobotTarget = Literal["mjcf", "urdf", "mjlab", "isaaclab", "newton", "json"]
 NetworkTarget = Literal["onnx", "torch", "actuator-net"]
 
 
@@ -44,7 +44,7 @@ def export_robot(
 
     Args:
         robot: Robot folder, name of an identified robot of the package (give `out`), or run folder of `train`.
-        to: mjcf (plain MuJoCo), mjlab, isaaclab, newton and drake, each with a check.py that needs no gaponet; urdf
+        to: mjcf (plain MuJoCo), mjlab, isaaclab and newton, each with a check.py that needs no gaponet; urdf
             (damping, friction, effort limits); json (the numbers).
         out: Folder; default one with that name in the robot or run.
         data: Dataset on which a servo model's nearest plain servos are fitted, and every form is measured; default the

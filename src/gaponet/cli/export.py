@@ -44,7 +44,7 @@ def export(
     """Write an identified robot or a network for another program.
 
     Args:
-        to: Simulator of a robot or a run: mjcf (plain MuJoCo), mjlab, isaaclab, newton and drake, each with a check.py
+        to: Simulator of a robot or a run: mjcf (plain MuJoCo), mjlab, isaaclab and newton, each with a check.py
             that needs no gaponet; urdf (damping, friction, effort limits); json (the numbers). Network of a
             run: onnx (model.onnx and card.json), torch (delta.pt2 with simulator and action term for mjlab and Isaac
             Lab), actuator-net (one network per joint; its inputs are past target − position and speed, its output is
@@ -83,7 +83,7 @@ def export(
         return
     if to == "onnx" or to == "torch" or to == "actuator-net":
         if (robot / "robot.toml").is_file():
-            engines = "mjcf, mjlab, isaaclab, newton, drake or json"
+            engines = "mjcf, mjlab, isaaclab, newton or json"
             raise UsageError(f"{robot}: is a robot, which has no network; --to {engines}")
         made = api.export_network(robot, to=to, out=out, data=data, payload_mass=payload_mass)
     else:

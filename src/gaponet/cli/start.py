@@ -80,7 +80,7 @@ def start(
     position_unit: Literal["rad", "deg", "fraction", "ticks", "signed_percent"] | None = None,
     time_unit: Literal["s", "ms", "us", "ns"] | None = None, rate: float | None = None, cut: float | None = None,
     skip_bad: Flag = False, allow_pickle: Flag = False,
-    to: Literal["mjcf", "mjlab", "isaaclab", "newton", "drake", "json"] = "mjcf", budget: str | None = None,
+    to: Literal["mjcf", "mjlab", "isaaclab", "newton", "json"] = "mjcf", budget: str | None = None,
     dry_run: Flag = False, despite_errors: Flag = False, json: Json = False,
 ) -> None:  # fmt: skip
     """All steps in one command: from model file and logs to a report.

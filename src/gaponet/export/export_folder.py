@@ -16,7 +16,6 @@ from gaponet.base.errors import UsageError
 from gaponet.base.files import atomic_write, lock_folder, write_text
 from gaponet.base.progress import Progress, no_progress
 from gaponet.data.sequence import Sequence
-from gaponet.export.engine_configs import TEMPLATES, engine_config
 from gaponet.export.helper_file import (
     MUJOCO_HELPER,
     SHIPPED,
@@ -25,6 +24,7 @@ from gaponet.export.helper_file import (
     without_gaponet,
 )
 from gaponet.export.mjcf_edit import MUJOCO_HAS_RAMPS, edit_mjcf
+from gaponet.export.newton_config import newton_config
 from gaponet.export.plain_servos import (
     check_motions,
     comparable,
@@ -43,12 +43,11 @@ FOLDER_KIND = "engine"
 FACTS, ROBOT, CHECK = "facts.json", "robot.xml", "check.npz"
 # Engine → name in the export folder → file in SHIPPED; beside the helper file.
 CHECK_FILES: dict[str, dict[str, str]] = {
-    "mjcf": {"check.py": "check_mjcf.py", "check_mjx.py": "check_mjx.py"},
+    "mjcf": {"check.py": "check_mjcf.py"},
     "urdf": {},
     "mjlab": {"check.py": "check_mjlab.py"},
     "isaaclab": {"check.py": "check_isaaclab.py"},
     "newton": {"check.py": "check_newton.py"},
-    "drake": {"check.py": "check_drake.py"},
     "json": {},
     "torch": {},
     "actuator-net": {
@@ -64,9 +63,8 @@ ENGINE_TERMS = {
 ACTUATORS = re.compile(r"\s*<actuator>.*?</actuator>", re.DOTALL)
 DELAY_NOTES = {
     "newton": "Newton has no delays: check.py has a buffer of five lines",
-    "drake": "Drake has no delays: check.py has a buffer of five lines; robot_cfg.py has the friction",
-    "mjcf": "delays need MuJoCo 3.5, and after each reset fill_delays of mujoco_servos.py; MJX and Newton ignore them "
-    "without a message: check_mjx.py has a buffer",
+    "mjcf": "delays need MuJoCo 3.5, and after each reset fill_delays of mujoco_servos.py; MJX ignores them without a "
+    "message",
 }
 
 
@@ -95,7 +93,7 @@ def export_robot(
 
     Args:
         robot: Identified, or nominal.
-        to: mjcf, urdf, mjlab, isaaclab, newton, drake or json.
+        to: mjcf, urdf, mjlab, isaaclab, newton or json.
         out: Folder.
         recordings: Training and validation motions; default: simulated motions of the robot itself.
         source: For mjcf and urdf, a file of the user's of which an edited copy is written; for mjcf by default the
@@ -161,8 +159,8 @@ def export_robot(
             _write_scene(
                 robot if to == "mjlab" else plain, file, payload_mass, servos=to == "mjlab"
             )
-            if to in TEMPLATES:
-                write_text(out / "robot_cfg.py", engine_config(to, robot.name, facts))
+            if to == "newton":
+                write_text(out / "robot_cfg.py", newton_config(robot.name, facts))
         facts["file"] = str(file.relative_to(out)) if file else ROBOT
         _write_motions(out / CHECK, motions)
         _write_shipped(out, to, facts)
@@ -204,7 +202,7 @@ def _notes(robot: RobotSpec, facts: dict[str, Any], to: str) -> list[str]:
             f"the file has no place for {missing}: they are in facts.json (plain), kp and kd for your controller; "
             "files that it names stay where they were"
         )
-    if law and to in ("isaaclab", "newton", "drake", "urdf"):
+    if law and to in ("isaaclab", "newton", "urdf"):
         notes.append(f"the servo model ({law}) is not in {to}: the numbers were fitted without it")
     if to == "mjlab" and robot.backlash.any():
         notes.append("mjlab simulates no backlash: use the form for MuJoCo, or identify without it")

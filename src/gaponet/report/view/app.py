@@ -45,7 +45,7 @@ from gaponet.sim.dataset_robot import dataset_robot
 
 MODEL_SUFFIXES = (".xml", ".mjcf", ".urdf")
 POSITION_UNITS = ("as the logs state", "rad", "deg", "fraction", "ticks", "signed_percent")
-TARGETS = ("mjcf", "urdf", "mjlab", "isaaclab", "newton", "drake", "json")
+TARGETS = ("mjcf", "urdf", "mjlab", "isaaclab", "newton", "json")
 NETWORK_TARGETS = ("onnx", "torch")  # of a trained network
 # Target → engine that applies parameter sets; others read a file.
 ENGINES = {"mjcf": "mujoco", "mjlab": "mjlab", "isaaclab": "isaaclab"}
