@@ -140,6 +140,9 @@ class GaponetSO101Config(RobotConfig):
     # Calibration file, compared with the servos; default that of --robot.id, without an id the servos' counts.
     calibration: Path | None = None
     known: Path | None = None  # robot folder of gaponet identify, for compensation
+    # Move as the nominal simulator does, for a policy that was trained there; needs known, and takes no model. The
+    # policy then observes the nominal simulator's positions.
+    follow: bool = False
     # run of gaponet train, in addition; without both, targets are not corrected
     model: Path | None = None
     # control rate, Hz, equal to LeRobot's; default that of the model, else 30
@@ -211,6 +214,8 @@ class GaponetSO101(Robot):
     def connect(self, calibrate: bool = True) -> None:
         from gaponet.hw.control.consent import require_consent
 
+        if self.config.follow and (self.config.known is None or self.config.model is not None):
+            raise ValueError("gaponet_so101: follow needs known, and takes no model")
         if not self.config.yes:
             require_consent(
                 f"The SO-101 at {self.config.port} will move as LeRobot commands.",
@@ -236,7 +241,9 @@ class GaponetSO101(Robot):
             "--yes",
         ]
         words += ["--targets", "zmq", "--live.address", address]
-        words += ["--robot", str(config.known.absolute()), "--compensate"] if config.known else []
+        if config.known:
+            words += ["--robot", str(config.known.absolute())]
+            words += ["--follow", "nominal"] if config.follow else ["--compensate"]
         words += ["--model", str(config.model)] if config.model else []
         calibration = self._calibration()
         words += ["--calibration", str(calibration)] if calibration else []
@@ -250,7 +257,10 @@ class GaponetSO101(Robot):
                 f"{self} is not connected, or was stopped: {' '.join(end)}"
             )
         set_observation(self.units.named(state.qpos))
-        return self.units.named(state.qpos) | {name: read() for name, _, read in self._pictures()}
+        seen = state.qpos
+        if self.config.follow:
+            seen = self._controller.remote.nominal_qpos
+        return self.units.named(seen) | {name: read() for name, _, read in self._pictures()}
 
     def send_action(self, action: dict[str, Any]) -> dict[str, Any]:
         if self._controller is None:
@@ -389,6 +399,9 @@ class GaponetCorrect(ProcessorStep):
     known: str = ""  # instead of a model, a robot folder of gaponet identify
     payload_mass: float = 0.0
     dynamics: bool = False  # feed forward accelerations: only for planned, smooth targets
+    # Move as the nominal simulator of `known` does. The policy sees the measured state, whose delay a policy with a
+    # high gain may not bear (docs/deploy.md): gaponet_so101 gives it the nominal simulator's instead.
+    follow: bool = False
 
     def __post_init__(self) -> None:
         from gaponet.deploy.compensator import Compensator, CompensatorConfig
@@ -399,6 +412,8 @@ class GaponetCorrect(ProcessorStep):
             raise ValueError(
                 "gaponet_correct: give either model, a run, or known, a robot folder of gaponet identify"
             )
+        if self.follow and self.model:
+            raise ValueError("gaponet_correct: follow needs known, and takes no model")
         network = GapModel.load(self.model) if self.model else None
         self.spec = load_robot(Path(self.known)) if network is None else network.simulator()
         self.units, self.dt = (
@@ -406,7 +421,11 @@ class GaponetCorrect(ProcessorStep):
             self.spec.dt if network is None else network.card["dt"][0],
         )
         self.compensator = Compensator(
-            self.spec, network, CompensatorConfig(dynamics=self.dynamics), self.dt
+            self.spec,
+            network,
+            CompensatorConfig(dynamics=self.dynamics),
+            self.dt,
+            follow="nominal" if self.follow else None,
         )
         self.limits = Limits.from_robot(self.spec, self.spec.joint_names, SafetyConfig())
         self._bounded = limit_delta
@@ -478,6 +497,7 @@ class GaponetCorrect(ProcessorStep):
             "known": self.known,
             "payload_mass": self.payload_mass,
             "dynamics": self.dynamics,
+            "follow": self.follow,
         }
 
     def transform_features(self, features: dict[Any, dict[str, Any]]) -> dict[Any, dict[str, Any]]:

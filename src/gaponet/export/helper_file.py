@@ -73,12 +73,10 @@ def defined_names(text: str) -> ListOf[str]:
         if isinstance(node, ast.FunctionDef | ast.ClassDef):
             names.append(node.name)
         if isinstance(node, ast.Assign):
-            names += [name.id for name in ast.walk(node) if _is_bound(name)]
+            for part in ast.walk(node):
+                if isinstance(part, ast.Name) and isinstance(part.ctx, ast.Store):
+                    names.append(part.id)
     return names
-
-
-def _is_bound(node: ast.AST) -> bool:
-    return isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store)
 
 
 def _is_own(node: ast.ImportFrom) -> bool:

@@ -11,7 +11,9 @@ import numpy as np
 import pytest
 from contacts import Contacts
 
+import gaponet as gp
 from gaponet.base.errors import UsageError
+from gaponet.robot.folder import save_robot
 
 PLUGIN = (
     Path(__file__).parents[3] / "plugins" / "lerobot_robot_gaponet" / "lerobot_robot_gaponet.py"
@@ -145,3 +147,49 @@ def test_a_motion_that_goes_into_the_table_is_refused_before_a_row_is_said(plugi
     plugin.set_observation(seen(gripper=10.0))
     with pytest.raises(UsageError, match=r"'shove' begins with .* and the plane at 0 m"):
         motion.get_action()
+
+
+def test_an_arm_that_follows_shows_the_policy_the_nominal_simulator(plugin, so101):
+    measured = so101.qpos_home
+    nominal = measured + 0.1
+    robot = plugin.GaponetSO101.__new__(plugin.GaponetSO101)
+    robot.units = plugin.Units(so101)
+    robot.cameras = {}
+    robot.config = plugin.GaponetSO101Config(known=Path("known"), follow=True)
+    remote = SimpleNamespace(nominal_qpos=nominal)
+    states = iter([SimpleNamespace(qpos=measured)])
+    robot._controller = SimpleNamespace(states=states, remote=remote)
+
+    seen = robot.units.rad(robot.get_observation())
+
+    np.testing.assert_allclose(seen, nominal)
+
+
+def test_following_without_an_identified_robot_is_refused_before_anything_moves(plugin):
+    robot = plugin.GaponetSO101.__new__(plugin.GaponetSO101)
+    robot.config = plugin.GaponetSO101Config(yes=True, follow=True)
+    with pytest.raises(ValueError, match="known"):
+        robot.connect()
+
+
+def test_the_processor_commands_an_arm_as_its_nominal_simulator_moves(plugin, so101, tmp_path):
+    servo = {"kp": 14.0, "offset": 0.05}
+    soft = so101.with_servos(dict.fromkeys(so101.operated, servo))
+    save_robot(soft, tmp_path / "soft")
+    target = so101.qpos_home + 0.1
+    sent = {}
+    for follow in (False, True):
+        step = plugin.GaponetCorrect(known=str(tmp_path / "soft"), follow=follow)
+        for _ in range(100):
+            sent[follow] = step._corrected(target, None)
+
+    nominal = gp.AlignedSim(so101)
+    robot = gp.AlignedSim(soft)
+    reached = gp.AlignedSim(soft)
+    for _ in range(200):
+        nominal.step(target)
+        robot.step(sent[True])
+        reached.step(sent[False])
+    moved = so101.operated_index
+    assert np.abs(robot.qpos - nominal.qpos)[moved].max() < 0.005
+    assert np.abs(reached.qpos - target)[moved].max() < 0.02
