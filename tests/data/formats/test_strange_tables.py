@@ -9,7 +9,7 @@ from logs import arm_columns, table_text
 
 from gaponet.base.errors import LogError
 from gaponet.data.describe.guess import guess_logs
-from gaponet.data.formats import look, read_logs
+from gaponet.data.formats import files_under, look, read_logs
 
 SI = {"position_unit": "rad", "time_unit": "s"}
 ROWS = 200
@@ -173,3 +173,42 @@ def test_files_that_belong_together_are_proposed_and_then_read_as_one_recording(
     assert np.array_equal(logs["run1"].channels["ctrl"].values, command)
     assert np.array_equal(logs["run1"].channels["qpos"].values, state)
     assert np.allclose(logs["run1"].channels["qpos"].time, columns["time"])
+
+
+@pytest.mark.parametrize("named", [True, False])
+def test_a_table_with_a_row_per_signal_is_called_transposed(tmp_path, arm, named):
+    columns = arm_columns(ROWS)
+    lines = [
+        ",".join([*[name] * named, *map(repr, values.tolist())]) for name, values in columns.items()
+    ]
+    (tmp_path / "m.csv").write_text("\n".join(lines) + "\n")
+    with pytest.raises(LogError, match="transposed"):
+        only(tmp_path / "m.csv", arm, **SI)
+
+
+@pytest.mark.parametrize("clock", [True, False])
+def test_arrays_with_a_column_per_sample_are_turned(tmp_path, arm, clock):
+    columns = arm_columns(ROWS)
+    arrays = {
+        name: np.stack([columns[f"{name}.{joint}"] for joint in JOINTS])
+        for name in ("ctrl", "qpos")
+    }
+    if clock:
+        arrays["time"] = columns["time"][None]
+    np.savez(tmp_path / "m.npz", **arrays)
+    (tmp_path / "logs.toml").write_text(
+        'ctrl = "ctrl"\nqpos = "qpos"\nposition_unit = "rad"\njoints = ["shoulder", "elbow"]\n'
+        + ('time = "time"\ntime_unit = "s"\n' if clock else "rate = 50.0\n")
+    )
+    log = only(tmp_path, arm)
+    assert np.array_equal(log.channels["qpos"].values, arrays["qpos"].T)
+    assert log.meta["notes"]["transposed"] == ["ctrl", "qpos"]
+
+
+def test_logs_behind_a_link_are_found_once_also_where_links_go_in_a_circle(tmp_path):
+    (tmp_path / "disk" / "day").mkdir(parents=True)
+    (tmp_path / "disk" / "day" / "m.npz").write_bytes(b"")
+    (tmp_path / "disk" / "day" / "back").symlink_to(tmp_path / "disk")
+    (tmp_path / "logs").mkdir()
+    (tmp_path / "logs" / "linked").symlink_to(tmp_path / "disk")
+    assert files_under(tmp_path / "logs", (".npz",)) == [tmp_path / "logs/linked/day/m.npz"]

@@ -14,7 +14,7 @@ import numpy as np
 
 from gaponet.base.arrays import Array
 from gaponet.base.errors import LogError, UsageError
-from gaponet.data.describe.clocks import clock_periods, require_one_rate
+from gaponet.data.describe.clocks import clock_periods, named_like_a_clock, require_one_rate
 from gaponet.data.describe.joints import ignored, resolve_all
 from gaponet.data.describe.logs_file import HINT, LogsFile
 from gaponet.data.describe.plausibility import to_radians
@@ -23,6 +23,7 @@ from gaponet.data.log import CHANNELS, COMMANDS, DERIVED, FEEDFORWARD, REQUIRED,
 from gaponet.robot.spec import LOG_UNITS, RobotSpec
 
 WIDEST = 500  # columns of an array that may be joints
+MIN_WIDTHS = 10  # by which an array with a column per sample is wider than high
 SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 SAY_UNITS = "--position-unit rad --time-unit s (or position_unit and time_unit in logs.toml)"
 COMMAND = "command:"  # before the names of signals that lie in a command_file
@@ -102,6 +103,10 @@ class RawRecording:
             part: Which of several in the file.
             more: meta, default.
         """
+        arrays, turned = rows_first(arrays)
+        if turned:
+            notes = more.get("meta", {}).get("notes", {}) | {"transposed": turned}
+            more["meta"] = more.get("meta", {}) | {"notes": notes}
         numeric = {
             n: a
             for n, a in arrays.items()
@@ -194,6 +199,27 @@ class RawRecording:
         for clock in sorted(filter(None, chosen)):
             where = self.where or self.source
             require_one_rate(periods, clock, used, specified.get("ignore", ()), where)
+
+
+def rows_first(arrays: dict[str, Any]) -> tuple[dict[str, Any], list[str]]:
+    """Return arrays with a row per sample, and the names of those that had a column per sample.
+
+    The clock tells the number of samples. Without one, arrays that are all far wider than high are taken as transposed.
+    """
+    tables = {n: a for n, a in arrays.items() if isinstance(a, np.ndarray) and a.ndim == 2}
+    flat = {n: a for n, a in tables.items() if 1 in a.shape and named_like_a_clock(n)}
+    arrays = arrays | {n: a.ravel() for n, a in flat.items()}
+    single = [len(a) for a in arrays.values() if isinstance(a, np.ndarray) and a.ndim == 1]
+    wide = [a.shape[0] * MIN_WIDTHS <= a.shape[1] for a in tables.values()]
+    samples = max(single, default=0)
+    if samples < 2:
+        samples = max((a.shape[1] for a in tables.values()), default=0) if wide and all(wide) else 0
+    turned = [
+        n
+        for n, a in tables.items()
+        if n not in flat and a.shape[1] == samples and a.shape[0] != samples and samples > 1
+    ]
+    return arrays | {n: tables[n].T for n in turned}, turned
 
 
 GIT_LFS_POINTER = b"version https://git-lfs"  # how such a file begins

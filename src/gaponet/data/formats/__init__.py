@@ -23,6 +23,7 @@ format detects is no `table`. The shortest readers to copy are pace.py (`recordi
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from functools import partial
@@ -88,10 +89,23 @@ def files_under(path: Path, suffixes: Iterable[str]) -> list[Path]:
     """The file, or those with these suffixes in a folder and below it; hidden ones are left alone."""
     if path.is_file():
         return [path] if path.suffix.lower() in suffixes else []
-    matches = (f for f in path.rglob("*") if f.suffix.lower() in suffixes and f.is_file())
-    return sorted(
-        f for f in matches if not any(part.startswith(".") for part in f.relative_to(path).parts)
-    )
+    return sorted(f for f in files_below(path) if f.suffix.lower() in suffixes)
+
+
+def files_below(folder: Path) -> Iterator[Path]:
+    """The files in a folder and below it, also behind links; hidden ones are left alone."""
+    seen = set[str]()  # folders: a link may lead back to one
+    for place, folders, files in os.walk(folder, followlinks=True):
+        real = os.path.realpath(place)
+        if real in seen:
+            folders.clear()
+            continue
+        seen.add(real)
+        folders[:] = sorted(name for name in folders if not name.startswith("."))
+        for name in sorted(files):
+            file = Path(place) / name
+            if not name.startswith(".") and file.is_file():
+                yield file
 
 
 def detect(path: Path) -> str:

@@ -21,6 +21,7 @@ from typing_extensions import TypedDict
 
 from gaponet.base.errors import LogError
 from gaponet.base.structure import read_json
+from gaponet.data.formats import files_below
 from gaponet.data.log import Channel, Log
 from gaponet.robot.spec import RobotSpec
 
@@ -71,7 +72,9 @@ def _is_bam(file: Path) -> bool:
 
 def find(path: Path) -> list[Path]:
     """The recordings at or below a path."""
-    return [path] if path.is_file() else sorted(f for f in path.rglob("*.json") if _is_bam(f))
+    if path.is_file():
+        return [path]
+    return sorted(f for f in files_below(path) if f.suffix == ".json" and _is_bam(f))
 
 
 def read(

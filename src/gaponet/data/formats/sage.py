@@ -21,6 +21,7 @@ from gaponet.base.errors import LogError
 from gaponet.base.structure import MAX_ARRAYS_BYTES, read_limited
 from gaponet.data.describe.joints import resolve_all
 from gaponet.data.describe.plausibility import to_radians
+from gaponet.data.formats import files_below
 from gaponet.data.log import Channel, Log
 from gaponet.robot.spec import RobotSpec
 
@@ -32,12 +33,12 @@ NUMBER = r" *(?:[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?|[-+]?nan|[-+]?inf) *"
 
 def detects(path: Path) -> bool:
     """A folder with motion folders at or below it."""
-    return path.is_dir() and any(next(path.rglob(name), None) for name in FILES)
+    return path.is_dir() and any(f.name in FILES for f in files_below(path))
 
 
 def find(path: Path) -> list[Path]:
     """Real motion folders under path; simulated ones are skipped."""
-    folders = sorted({f.parent for name in FILES for f in path.rglob(name)})
+    folders = sorted({f.parent for f in files_below(path) if f.name in FILES})
     return [f for f in folders if f.relative_to(path).parts[:1] != ("sim",)]
 
 

@@ -33,6 +33,9 @@ SUFFIXES = (".csv", ".tsv", ".txt", ".dat", ".parquet")
 NOT_OURS = ("control.csv", "state_motor.csv", "event.csv", "joint_list.txt")  # of SAGE folders
 # metadata of a table that is no data, and why (hw/control/recording.py)
 NOT_OBEYED = "gaponet.not_obeyed"
+MIN_TRANSPOSED_CELLS = (
+    20  # of the first row of a table that can be transposed; times the rows, where nothing is named
+)
 DECIMAL_SAMPLE_BYTES = 20_000  # of the first rows, by which decimal commas are told
 EMPTY = ("", "nan", "NaN", "NA", "N/A", "null", "None")  # cells without a number
 DEFAULT: LogsFile = {"time": "time"} | {c: c + ".{joint}" for c in CHANNELS}  # type: ignore[assignment]
@@ -156,6 +159,7 @@ def _csv_header(file: Path, given: list[str] | None) -> tuple[list[str], int]:
     header = line.split() if _delimiter(line) == " " else header
     if not any(header):
         raise LogError(f"{file}: empty; a table needs a header line and rows")
+    _refuse_transposed(file, header)
     if not _numeric(header):
         return [name.strip() for name in header], 1
     if given is None:
@@ -165,6 +169,22 @@ def _csv_header(file: Path, given: list[str] | None) -> tuple[list[str], int]:
             f"{file}:1: {len(header)} cells, header in logs.toml names {len(given)}; name each"
         )
     return given, 0
+
+
+def _refuse_transposed(file: Path, first: list[str]) -> None:
+    """Refuse a table with a row per signal, whose first row has these cells."""
+    if len(first) < MIN_TRANSPOSED_CELLS or not _numeric(first[1:]):
+        return
+    named = not _numeric(first[:1])
+    with file.open("rb") as lines:
+        rows = sum(1 for _ in lines)
+    if named or rows * MIN_TRANSPOSED_CELLS < len(first):
+        raise LogError(
+            f"{file}:1: the table is transposed: {rows} rows with a signal each, and {len(first)} columns with an "
+            'instant each. A row must be an instant. Turn it: python -c "import pandas; pandas.read_csv('
+            f"'{file.name}', header=None, index_col={0 if named else None}).T.to_csv('{file.name}', index=False"
+            f'{"" if named else ", header=False"})"'
+        )
 
 
 def _read_csv(file: Path, names: list[str], first: int, wanted: list[str]) -> dict[str, Signal]:
