@@ -42,7 +42,8 @@ def gap(
         if (folder / "gap.png").is_file():
             out.say(f"figure: {folder / 'gap.png'}")
     baselines = result.table["baselines"]
-    show_baselines(out, baselines)
+    count = len(result.methods["nominal"]["by_independent_motion"])
+    show_baselines(out, baselines, count)
     own = folder if result.by_cause else None
     show_verdict(out, result.methods, str(dataset), own, baselines)
     out.result(result.to_dict())

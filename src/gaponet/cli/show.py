@@ -37,11 +37,10 @@ def baseline_rows(baselines: Mapping[str, float]) -> list[list[str]]:
     ]
 
 
-def show_baselines(out: Out, baselines: Mapping[str, float]) -> None:
-    """Print the errors of predictions that need no identified simulator."""
-    title = (
-        "Without an identified simulator; delay and offset of each joint fitted to other motions"
-    )
+def show_baselines(out: Out, baselines: Mapping[str, float], motions: int) -> None:
+    """Print the errors of predictions that need no identified simulator, measured on so many motions."""
+    fitted_to = "other motions" if motions > 1 else "the same motion"
+    title = f"Without an identified simulator; delay and offset of each joint fitted to {fitted_to}"
     out.table(title, ["prediction", "error, mrad"], baseline_rows(baselines))
 
 
