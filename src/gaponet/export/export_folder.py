@@ -61,6 +61,7 @@ ENGINE_TERMS = {
     "isaaclab": ("no_load_speed",)
 }  # terms of the servo model that an engine's own servos have
 ACTUATORS = re.compile(r"\s*<actuator>.*?</actuator>", re.DOTALL)
+WITHOUT_SERVO_MODEL = ("isaaclab", "newton", "urdf")
 DELAY_NOTES = {
     "newton": "Newton has no delays: check.py has a buffer of five lines",
     "mjcf": "delays need MuJoCo 3.5, and after each reset fill_delays of mujoco_servos.py; MJX ignores them without a "
@@ -169,44 +170,67 @@ def export_robot(
 
 def _notes(robot: RobotSpec, facts: dict[str, Any], to: str) -> list[str]:
     """Return effects that an engine's form of a robot lacks."""
-    notes, servos = [], facts["plain"].values()
-    law = ", ".join(term for term in facts["law"] if term not in ENGINE_TERMS.get(to, ()))
+    notes = []
+    servos = facts["plain"].values()
     if to == "mjcf":
-        for name, *stops in zip(robot.joint_names, robot.stop_low, robot.stop_high, strict=True):
-            if at := " and ".join(f"{x:.2f}" for x in stops if np.isfinite(x)):
-                notes.append(
-                    f"{name} met something at {at} rad in the recordings; the file keeps its range: was that a stop?"
-                )
+        notes += _stop_notes(robot)
     if robot.target_speed.any():
-        ramps = ", ".join(
-            f"{n} {v:.3g}" for n, v in zip(robot.joint_names, robot.target_speed, strict=True) if v
-        )
-        if to == "mjcf" and MUJOCO_HAS_RAMPS:
-            notes.append(
-                f"servos' own ramps ({ramps} rad/s) are <pid slewmax> of MuJoCo 4: call fill_delays of "
-                "mujoco_servos.py after each reset; MJX and older versions do not have them"
-            )
-        else:
-            notes.append(
-                f"servos' own ramps ({ramps} rad/s) are not in this file: limit targets so, as in "
-                "check.npz. MuJoCo 4 has them (--to mjcf)"
-            )
+        notes.append(_ramp_note(robot, to))
     if robot.friction_per_kelvin.any():
         warm = ", ".join(f"{t:.0f}" for t in robot.friction_temperature[robot.operated_index])
         notes.append(f"friction and damping are those at {warm} °C: no engine has a temperature")
-    if to in DELAY_NOTES and any(s["delay"] for s in servos):
+    is_late = any(servo["delay"] for servo in servos)
+    if is_late and to in DELAY_NOTES:
         notes.append(DELAY_NOTES[to])
     if to == "urdf":
-        missing = ", ".join(f for f in MISSING_FIELDS if any(s[f] for s in servos))
+        notes.append(_urdf_note(facts))
+    law = [term for term in facts["law"] if term not in ENGINE_TERMS.get(to, ())]
+    if law and to in WITHOUT_SERVO_MODEL:
+        terms = ", ".join(law)
         notes.append(
-            f"the file has no place for {missing}: they are in facts.json (plain), kp and kd for your controller; "
-            "files that it names stay where they were"
+            f"the servo model ({terms}) is not in {to}: the numbers were fitted without it"
         )
-    if law and to in ("isaaclab", "newton", "urdf"):
-        notes.append(f"the servo model ({law}) is not in {to}: the numbers were fitted without it")
     if to == "mjlab" and robot.backlash.any():
         notes.append("mjlab simulates no backlash: use the form for MuJoCo, or identify without it")
     return notes
+
+
+def _stop_notes(robot: RobotSpec) -> list[str]:
+    """Return a question for each joint with identified stops, which an MJCF of the user's does not get."""
+    notes = []
+    for name, low, high in zip(robot.joint_names, robot.stop_low, robot.stop_high, strict=True):
+        stops = " and ".join(f"{x:.2f}" for x in (low, high) if np.isfinite(x))
+        if stops:
+            notes.append(
+                f"{name} met something at {stops} rad in the recordings; the file keeps its range: "
+                "was that a stop?"
+            )
+    return notes
+
+
+def _ramp_note(robot: RobotSpec, to: str) -> str:
+    """Return where the servos' own limits of the speed of targets are."""
+    named = zip(robot.joint_names, robot.target_speed, strict=True)
+    ramps = ", ".join(f"{name} {speed:.3g}" for name, speed in named if speed)
+    if to == "mjcf" and MUJOCO_HAS_RAMPS:
+        return (
+            f"servos' own ramps ({ramps} rad/s) are <pid slewmax> of MuJoCo 4: call fill_delays of "
+            "mujoco_servos.py after each reset; MJX and older versions do not have them"
+        )
+    return (
+        f"servos' own ramps ({ramps} rad/s) are not in this file: limit targets so, as in "
+        "check.npz. MuJoCo 4 has them (--to mjcf)"
+    )
+
+
+def _urdf_note(facts: dict[str, Any]) -> str:
+    """Return what a URDF has no place for."""
+    servos = facts["plain"].values()
+    missing = ", ".join(f for f in MISSING_FIELDS if any(servo[f] for servo in servos))
+    return (
+        f"the file has no place for {missing}: they are in facts.json (plain), kp and kd for your "
+        "controller; files that it names stay where they were"
+    )
 
 
 def export_model(model: GapModel, run: Path, folder: Path, payload_mass: float = 0.0) -> float:
