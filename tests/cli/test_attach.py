@@ -100,7 +100,8 @@ def test_a_policy_is_corrected_by_what_was_attached_last_and_by_nothing_after_of
     *before, step = json.loads(file.read_text())["steps"]
     assert before == POLICY["steps"]
     assert (step["registry_name"], step["config"]["payload_mass"]) == ("gaponet_correct", 0.2)
-    assert plugin.GaponetCorrect(**step["config"]).get_config() == {"model": ""} | step["config"]
+    loaded = plugin.GaponetCorrect(**step["config"]).get_config()
+    assert loaded == {"model": "", "follow": False} | step["config"]
     assert main(["export", str(known), "--to", "lerobot", "--into", str(policy), "--remove"]) == 0
     assert json.loads(file.read_text()) == POLICY
     for into, holder, said in (

@@ -122,7 +122,7 @@ def _fitted() -> Files:
 
 
 def _evaluation(folder: Path) -> None:
-    from report.test_run_files import METRICS
+    from evaluation.test_run_files import METRICS
 
     parts = {"left": {"nominal": 0.02, "gaponet": 0.01}, "floor": {"both": 0.001}}
     gap = parts | {

@@ -318,7 +318,7 @@ def literals(file: Path) -> Iterator[str]:
             yield node.value
 
 
-FOREIGN = {"--repo-type": "hf", "--index-url": "pip", "--version": "gaponet itself",
+FOREIGN = {"--repo-type": "hf", "--index-url": "pip", "--python": "uv", "--version": "gaponet itself",
            "--tyro": "gaponet itself"}  # fmt: skip
 
 
