@@ -82,7 +82,7 @@ def open_server(label: str, port: int, script: str = "") -> tuple[Any, str]:
     transport.serve = guarded_serve
     try:
         with contextlib.redirect_stdout(io.StringIO()):  # viser prints an address without the token
-            server = viser.ViserServer(HOST, port, label=label, verbose=False)
+            server: Any = viser.ViserServer(HOST, port, label=label, verbose=False)
     finally:
         transport.serve = serve
     if not guarded:
