@@ -135,6 +135,10 @@ class Job:
 def run_jobs(jobs: list[Job], show: Show) -> list[str]:
     """Do the jobs that have no result yet. Return a sentence for each that failed.
 
+    Args:
+        jobs: All jobs of the experiment.
+        show: Shows the running trainings and how many of all jobs are done, those of earlier runs included.
+
     Raises:
         KeyboardInterrupt: After every running training has stored a checkpoint.
     """
@@ -145,6 +149,7 @@ def run_jobs(jobs: list[Job], show: Show) -> list[str]:
     stop = study.out / STOP_FILE
     stop.unlink(missing_ok=True)
     failures: list[str] = []
+    done_before = len(jobs) - len(todo)
     ended: set[str] = set()
 
     def request_stop(job: Job) -> bool:
@@ -156,14 +161,14 @@ def run_jobs(jobs: list[Job], show: Show) -> list[str]:
         for job in todo:
             if job.name not in ended and job.training and job.run_folder.is_dir():
                 running[job.name] = (job.progress(), "")
-        show(running, len(ended))
+        show(running, done_before + len(ended))
 
     with open_pool(study.options.executor, study.options.workers, threads=1) as pool:
         for outcome in pool.run(do_job, todo, poll, request_stop):
             ended.add(outcome.job.name)
             if outcome.error is not None:
                 failures.append(f"{outcome.job.name} failed: {outcome.error}")
-            show({}, len(ended))
+            show({}, done_before + len(ended))
     return failures
 
 
