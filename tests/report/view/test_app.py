@@ -12,9 +12,14 @@ from arm import recordings, write_arm
 from gaponet.base.errors import UsageError
 from gaponet.data.store import Dataset
 from gaponet.report.view import app
-from gaponet.report.view.app import TARGETS, App, _ending, _report
+from gaponet.report.view.app import App
+from gaponet.report.view.controls import Controls
+from gaponet.report.view.job_text import ending, report
 from gaponet.report.view.jobs import OUT, Jobs
 from gaponet.report.view.player import draw_curves
+from gaponet.report.view.scene import Scene
+from gaponet.report.view.side_by_side import Clip, side_by_side
+from gaponet.report.view.steps import TARGETS, helping_network
 
 
 def finish(jobs, step, result, words=("x",)):
@@ -92,21 +97,21 @@ def test_a_page_opens_after_its_import_was_deleted_and_shows_all_after_an_error(
     assert jobs.result("import") is None
     page = App(tmp_path, 0)
     try:
-        assert "Not done" not in page.status.content
+        assert "Not done" not in page.controls.status.content
         (tmp_path / "import1").mkdir()  # no dataset
         finish(jobs, "robot", {}, ("robot", "check", "so101"))
         finish(jobs, "import", {}, ("import", "logs", "--out", "import4"))
         (tmp_path / "import4").mkdir()
         for _ in range(2):
-            page.status.content = ""
+            page.controls.status.content = ""
             page.tick(1.0)
-            assert "Not done" in page.status.content
+            assert "Not done" in page.controls.status.content
         (tmp_path / "import4").rmdir()
         page.tick(1.0)
-        assert "has ended" in page.status.content
+        assert "has ended" in page.controls.status.content
         page.player.advance = {}.pop
         page.tick(0.1)
-        assert "Unexpected KeyError" in page.status.content
+        assert "Unexpected KeyError" in page.controls.status.content
     finally:
         page.server.stop()
 
@@ -123,16 +128,42 @@ def page(tmp_path):
 
 def test_nothing_starts_before_what_it_needs_and_the_page_says_what(page):
     for act, hint in (
-        (page._read, "Choose a robot"),
-        (page._show, "Choose the robot"),
-        (lambda _: page._fit(), "Check the rec"),
+        (page.logs.read, "Choose a robot"),
+        (page.gap.show_recording, "Choose a robot"),
+        (page.identify.words, "Choose a robot"),
     ):
-        page._attempt(act, None)
-        assert hint in page.status.content
-    page._attempt(page._fit)
-    assert "Check the rec" in page.status.content
-    assert page.fit.disabled
+        page.controls.attempt(act)
+        assert hint in page.controls.status.content
+    assert page.identify.button.disabled
     assert page.jobs.all == []
+
+
+def test_a_hint_names_the_next_thing_to_do(page):
+    hint = page.controls.places["identify"].text
+    for step, said in (
+        ("robot", "Read the logs"),
+        ("import", "Check the recordings"),
+        ("doctor", "Identify the robot"),
+    ):
+        finish(page.jobs, step, {}, ("robot", "check", "so101"))
+        page.identify.show()
+        assert said in hint.content
+
+
+def test_the_next_step_is_offered_once_a_step_is_done(page):
+    assert page.onwards["robot"].disabled
+    finish(page.jobs, "robot", {}, ("robot", "check", "so101"))
+    page.refresh()
+    assert not page.onwards["robot"].disabled
+    assert page.onwards["import"].disabled
+
+
+def test_a_quick_identification_is_bounded_in_rollouts_and_terms(page):
+    for step in ("robot", "import"):
+        finish(page.jobs, step, {}, ("robot", "check", "so101"))
+    finish(page.jobs, "doctor", {"findings": []})
+    page.identify.effort.value = "quick: gains, friction and delay alone"
+    assert page.identify.words()[4:] == ["--windows", "12", "--terms"]
 
 
 def test_identification_is_locked_while_the_check_finds_an_error(page):
@@ -140,11 +171,11 @@ def test_identification_is_locked_while_the_check_finds_an_error(page):
         finish(page.jobs, step, {}, ("robot", "check", "so101"))
     finding = {"level": "error", "check": "sign", "message": "elbow moves against its command"}
     finish(page.jobs, "doctor", {"findings": [finding]})
-    assert "Locked: the check finds an error (sign)" in page._locked()
-    page._attempt(page._fit)
-    assert "Locked" in page.status.content
+    assert "Locked: the check finds an error (sign)" in page.identify.locked()
+    page.controls.attempt(page.identify.words)
+    assert "Locked" in page.controls.status.content
     finish(page.jobs, "doctor", {"findings": [finding | {"level": "warning"}]})
-    assert page._locked() == ""
+    assert page.identify.locked() == ""
 
 
 def test_what_a_command_prints_is_shown_as_a_table_and_names_stay_text(page):
@@ -162,7 +193,7 @@ def test_what_a_command_prints_is_shown_as_a_table_and_names_stay_text(page):
             "![x](https://evil.example)",
         ],
     )
-    text = _report(job)
+    text = report(job)
     assert "| joint | MPJAE, mrad |\n| --- | ---: |\n| \\<b\\>x\\</b\\> | 3.1 |" in text
     assert r"!\[x\](https://evil.example)" in text
     assert "note" not in text
@@ -173,24 +204,24 @@ def test_what_a_command_prints_is_shown_as_a_table_and_names_stay_text(page):
 def test_a_name_in_the_form_is_no_option_of_the_command(page):
     finish(page.jobs, "robot", {}, ("robot", "check", "so101"))
     (page.folder / "logs" / "logs.toml").write_text("mine")
-    page.unit.value = "--allow-pickle"
-    page.cut.value = 8.0
-    page._attempt(page._read, None)
+    page.logs.unit.value = "--allow-pickle"
+    page.logs.cut.value = 8.0
+    page.controls.attempt(page.logs.read)
     assert {"--unit-id=--allow-pickle", "--cut=8"} < set(page.jobs.all[-1].words)
-    page._attempt(page._set_aside, None)
-    assert "is running" in page.status.content
+    page.controls.attempt(page.logs.set_aside)
+    assert "is running" in page.controls.status.content
     page.jobs.cancel()
     assert (page.folder / "logs" / "logs.toml").read_text() == "mine"
     (page.folder / "logs_aside2").mkdir()
-    page._set_aside(None)
+    page.logs.set_aside()
     assert (page.folder / "logs_aside1" / "logs.toml").read_text() == "mine"
     assert list((page.folder / "logs").iterdir()) == []
     (page.folder / "model" / "arm.xml").write_text("<mujoco/>")
     page.refresh()
-    page.model.value = "model/arm.xml"
-    page.options["kp"].value = "--contacts"
-    page._attempt(page._use_robot, None)
-    assert "without a dash" in page.status.content
+    page.robot.model.value = "model/arm.xml"
+    page.robot.options["kp"].value = "--contacts"
+    page.controls.attempt(page.robot.use)
+    assert "without a dash" in page.controls.status.content
 
 
 def test_a_command_that_is_being_started_is_not_called_cancelled(page):
@@ -199,7 +230,7 @@ def test_a_command_that_is_being_started_is_not_called_cancelled(page):
         watching = threading.Thread(target=page.refresh)
         watching.start()
         watching.join(0.3)
-        assert "no result" not in page.status.content
+        assert "no result" not in page.controls.status.content
         page.jobs.started = page.jobs.all[-1]
         page.jobs.process = SimpleNamespace(poll=lambda: None)
     watching.join()
@@ -209,9 +240,9 @@ def test_a_command_that_is_being_started_is_not_called_cancelled(page):
 
 def test_a_guess_does_not_replace_the_logs_toml_of_the_folder(page):
     (page.folder / "logs" / "logs.toml").write_text('unit = "deg"\n')
-    page._attempt(page._guess, None)
-    assert "a guess would replace it" in page.status.content
-    assert not page.described.value
+    page.controls.attempt(page.logs.guess)
+    assert "a guess would replace it" in page.controls.status.content
+    assert not page.logs.described.value
 
 
 def test_a_proposal_is_added_to_the_logs_toml_of_the_folder(page):
@@ -219,9 +250,9 @@ def test_a_proposal_is_added_to_the_logs_toml_of_the_folder(page):
         finish(page.jobs, step, {}, ("robot", "check", "so101"))
     finish(page.jobs, "doctor", {"findings": []})
     (page.folder / "logs" / "logs.toml").write_text('unit = "deg"\n')
-    page._attempt(page._propose, None)
-    assert page.described.value.startswith('unit = "deg"\n')
-    assert "nothing to mend" in page.described.value
+    page.controls.attempt(page.check.propose)
+    assert page.logs.described.value.startswith('unit = "deg"\n')
+    assert "nothing to mend" in page.logs.described.value
 
 
 @pytest.fixture
@@ -229,13 +260,13 @@ def clicked(monkeypatch):
     """Buttons of the next page by label, and the commands that they start."""
     acts = {}
     words = []
-    add = App._button
+    add = Controls.add_button
 
     def noted(self, label, act):
         acts[label] = act
         return add(self, label, act)
 
-    monkeypatch.setattr(App, "_button", noted)
+    monkeypatch.setattr(Controls, "add_button", noted)
     monkeypatch.setattr(Jobs, "start", lambda self, step, *command: words.append(command))
     return acts, words
 
@@ -246,19 +277,19 @@ def test_step_use_exports_the_calibrated_robot_and_a_network_only_if_it_helps(cl
         finish(page.jobs, step, {}, (step, "x", "y", "--out", step))
         (page.folder / step).mkdir(exist_ok=True)
         if step == "identify":
-            acts["Export"](None)
+            acts["Export"]()
             finish(page.jobs, "train", {"val_mpjae": {"added": 1e-4, "error": 2e-4, "start": 0.01}})
             page.seen = ()
-            page._attempt(page.refresh)
-            assert page.target.options == TARGETS
+            page.controls.attempt(page.refresh)
+            assert page.use.target.options == TARGETS
             finish(page.jobs, "train", {"val_mpjae": {"added": 2e-3, "error": 2e-4, "start": 0.01}})
         if step == "new":
-            acts["Check whether the robot changed"](None)
-            acts["Calibrate with the new logs"](None)
-    page.target.value = "mjlab"
+            acts["Check whether the robot changed"]()
+            acts["Calibrate with the new logs"]()
+    page.use.target.value = "mjlab"
     for label in ("Export", "Parameter sets for training", "Train a network"):
-        acts[label](None)
-    assert page._network() is not None
+        acts[label]()
+    assert helping_network(page.jobs) is not None
     assert [" ".join(w).replace(OUT, "OUT") for w in words] == [
         "export ./identify --to mjcf --out OUT",
         "check ./identify ./new",
@@ -278,7 +309,7 @@ def test_view_shows_a_dataset_in_the_page_at_step_gap_and_leaves_no_folder(
     pages = []
     for sequence in recordings(arm, 2, rows=60):
         data.append(sequence)
-    shown = app.side_by_side(data, data.entries[1], arm)
+    shown = side_by_side(data, data.entries[1], arm)
 
     def once(server, tick):
         tick(1.0)
@@ -287,12 +318,10 @@ def test_view_shows_a_dataset_in_the_page_at_step_gap_and_leaves_no_folder(
 
     monkeypatch.setattr(app, "run_until_interrupt", once)
     monkeypatch.setattr(app.signal, "signal", lambda *_: None)
-    app.serve_dataset(
-        data, app.Scene(shown), app.Clip.from_start(shown, 0.0, 1.0), 0, 2.0, said.append
-    )
+    app.serve_dataset(data, Scene(shown), Clip.from_start(shown, 0.0, 1.0), 0, 2.0, said.append)
     (page,) = pages
     assert said == [f"open {page.address}?step=4 in a browser; Ctrl-C ends"]
-    assert page.recording.options == tuple(e.id for e in data.entries)
+    assert page.logs.recording.options == tuple(e.id for e in data.entries)
     assert "differences drawn 2×" in page.player.title.content
     assert not page.folder.exists()
 
@@ -301,10 +330,12 @@ def test_curves_are_saved_as_the_page_shows_them(page):
     pytest.importorskip("matplotlib")
     sent = {}
     client = SimpleNamespace(send_file_download=lambda name, content: sent.update({name: content}))
-    chart = draw_curves(page.gui, np.arange(3.0), {"<b>x</b>": (np.zeros(3), "#00838f")}, "rad")
+    chart = draw_curves(
+        page.server.gui, np.arange(3.0), {"<b>x</b>": (np.zeros(3), "#00838f")}, "rad"
+    )
     save = next(
         h
-        for h in page.gui._gui_input_handle_from_uuid.values()
+        for h in page.server.gui._gui_input_handle_from_uuid.values()
         if getattr(h, "label", "").startswith("Save")
     )
     assert chart.title == "rad"
@@ -317,10 +348,10 @@ def test_curves_are_saved_as_the_page_shows_them(page):
 def test_the_page_says_what_is_wrong_with_logs_and_what_to_do(page):
     write_arm(page.folder / "arm")
     finish(page.jobs, "robot", {}, ("robot", "new", "x", "--out", "arm"))
-    page.described.value = (
+    page.logs.described.value = (
         'time = "t"\ntime_unit = "s"\nctrl = "{joint}_des"\nqpos = "{joint}_pos"\n'
     )
-    page.position.value = "rad"
+    page.logs.position.value = "rad"
     time_s = np.arange(300) * 0.02
     for joints, scale, why in (
         ((), 1.0, "no log of"),
@@ -339,10 +370,10 @@ def test_the_page_says_what_is_wrong_with_logs_and_what_to_do(page):
                 header=",".join(columns),
                 comments="",
             )
-        page._attempt(page._read, None)
+        page.controls.attempt(page.logs.read)
         wait_for(page.jobs)
-        assert why in _ending(page.jobs.all[-1])
-    assert "elbow: missing in some recordings" in _report(page.jobs.all[-1])
+        assert why in ending(page.jobs.all[-1])
+    assert "elbow: missing in some recordings" in report(page.jobs.all[-1])
 
 
 @pytest.mark.slow
@@ -352,9 +383,11 @@ def test_a_calibration_and_a_training_end_in_step_use_with_their_result(tmp_path
     """
     pytest.importorskip("viser")
     acts = {}
-    add = App._button
+    add = Controls.add_button
     monkeypatch.setattr(
-        App, "_button", lambda self, label, act: acts.update({label: act}) or add(self, label, act)
+        Controls,
+        "add_button",
+        lambda self, label, act: acts.update({label: act}) or add(self, label, act),
     )
     robot = write_arm(tmp_path / "robot")
     for place, kp in (("data", 0.7), ("new", 0.6)):
@@ -366,14 +399,17 @@ def test_a_calibration_and_a_training_end_in_step_use_with_their_result(tmp_path
         finish(Jobs(tmp_path), step, {"findings": []}, (step, "x", "--out", out))
     page = App(tmp_path, 0)
     try:
-        page.budget.value = "40000"
+        page.use.budget.value = "40000"
         for label, step in (("Calibrate with the new logs", "adapt"), ("Train a network", "train")):
-            page._attempt(acts[label], None)
+            page.controls.attempt(acts[label])
             wait_for(page.jobs)
-            page._attempt(page.refresh)
-            assert page.status.content == f"**gaponet {step}** has ended."
-        assert "recording(s) of unit a; robot folder adapt" in page.texts["adapt"][0].content
-        assert "best on validation" in page.texts["train"][0].content
+            page.controls.attempt(page.refresh)
+            assert page.controls.status.content == f"**gaponet {step}** has ended."
+        assert (
+            "recording(s) of unit a; robot folder adapt"
+            in page.controls.places["adapt"].text.content
+        )
+        assert "best on validation" in page.controls.places["train"].text.content
     finally:
         page.jobs.cancel()
         page.server.stop()

@@ -8,10 +8,13 @@ import sys
 import time
 
 import pytest
+from arm import recordings, write_arm
 
 from gaponet.base.errors import UsageError
 from gaponet.base.files import lock_file
-from gaponet.report.view.app import App, _ending, _make_places, _picture, _report
+from gaponet.data.store import Dataset
+from gaponet.report.view.app import App, make_places
+from gaponet.report.view.job_text import ending, picture, report
 from gaponet.report.view.jobs import Jobs
 
 HURT = '<img src=x onerror="alert(1)">'
@@ -113,7 +116,7 @@ def test_a_folder_of_the_page_that_is_a_link_is_refused(tmp_path):
     folder.mkdir()
     (folder / "logs").symlink_to(tmp_path)
     with pytest.raises(UsageError, match="link"):
-        _make_places(folder)
+        make_places(folder)
 
 
 def test_a_picture_that_is_a_link_out_of_the_folder_is_not_shown(tmp_path):
@@ -121,14 +124,14 @@ def test_a_picture_that_is_a_link_out_of_the_folder_is_not_shown(tmp_path):
     folder.mkdir()
     (tmp_path / "secret.svg").write_text("secret")
     (folder / "x.svg").symlink_to(tmp_path / "secret.svg")
-    assert "data:" not in _picture(folder, "x.svg")
-    assert "a link leads out" in _picture(folder, "x.svg")
+    assert "data:" not in picture(folder, "x.svg")
+    assert "a link leads out" in picture(folder, "x.svg")
 
 
 def test_the_name_of_a_picture_ends_no_attribute(tmp_path):
     name = f'a"{HURT}.svg'.replace("/", "")
     (tmp_path / name).write_text("<svg/>")
-    shown = _picture(tmp_path, name)
+    shown = picture(tmp_path, name)
     assert shown.count("<") == 3  # img, a, /a
     assert "&quot;&lt;img" in shown
 
@@ -136,8 +139,8 @@ def test_the_name_of_a_picture_ends_no_attribute(tmp_path):
 def test_what_a_job_says_of_itself_stays_text(tmp_path):
     store(tmp_path, 1, "gap", [f"gap{HURT}", "x"], result="", log=f"Usage: {HURT}\n")
     (job,) = Jobs(tmp_path).all
-    assert "<img" not in _ending(job).replace(r"\<img", "")
-    assert "<img" not in _report(job).replace(r"\<img", "")
+    assert "<img" not in ending(job).replace(r"\<img", "")
+    assert "<img" not in report(job).replace(r"\<img", "")
 
 
 def test_a_finding_of_a_stranger_stays_text_in_the_page(tmp_path):
@@ -149,7 +152,7 @@ def test_a_finding_of_a_stranger_stays_text_in_the_page(tmp_path):
     store(tmp_path, 3, "doctor", ["doctor", "./import2"], json.dumps({"findings": [finding]}))
     page = App(tmp_path, 0)
     try:
-        text = page.texts["identify"][0].content
+        text = page.controls.places["identify"].text.content
         assert "finds an error" in text
         assert "<img" not in text.replace(r"\<img", "")
     finally:
@@ -163,11 +166,14 @@ def test_a_stored_command_is_never_run_again(tmp_path, monkeypatch):
     store(tmp_path, 1, "robot", ["robot", "check", "so101"])
     for number, step in ((2, "import"), (3, "identify")):
         store(tmp_path, number, step, [step, "x", "--out", f"{step}{number}"])
-        (tmp_path / f"{step}{number}").mkdir()
+    arm = write_arm(tmp_path / "arm")
+    Dataset.create(tmp_path / "import2", arm).append(recordings(arm, 1, rows=60)[0])
+    (tmp_path / "identify3").mkdir()
     page = App(tmp_path, 0)
     try:
         assert page.jobs.result("identify").number == 3
-        page._go_on(None, page.jobs.all)
+        page.seen = None
+        page.refresh()
         assert started == []
     finally:
         page.server.stop()
@@ -262,7 +268,7 @@ def test_a_command_and_its_children_end_with_the_server_of_the_page(tmp_path, se
     wait_until_ended(server.pid, command, grandchild)
     (job,) = Jobs(tmp_path).all
     assert not job.lives
-    assert "it ended with the server of the page" in _ending(job)
+    assert "it ended with the server of the page" in ending(job)
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
@@ -272,7 +278,7 @@ def test_a_command_that_is_killed_is_not_called_cancelled(tmp_path, serving):
     os.kill(grandchild, signal.SIGKILL)
     wait_until_ended(command)
     (tmp_path / "jobs" / "001-gap" / "result.json").write_text("")
-    assert "it was killed" in _ending(Jobs(tmp_path).all[0])
+    assert "it was killed" in ending(Jobs(tmp_path).all[0])
 
 
 def test_while_a_command_of_an_earlier_page_lives_no_other_starts(tmp_path):
@@ -292,10 +298,10 @@ def test_a_command_without_a_result_says_why(tmp_path):
     job = store(
         tmp_path, 1, "gap", ["gap", "./x"], result="", log="gap: 50 %, 3 s\nUsage: no data\n"
     )
-    assert "Usage: no data" in _ending(Jobs(tmp_path).all[0])
+    assert "Usage: no data" in ending(Jobs(tmp_path).all[0])
     (job / "log.txt").write_text("")
     for how, why in (("cancelled", "was cancelled"), ("exit", "exit code 3"), ("server", "server")):
         (job / "ended.json").write_text(json.dumps({"how": how, "code": 3}))
-        assert why in _ending(Jobs(tmp_path).all[0])
+        assert why in ending(Jobs(tmp_path).all[0])
     (job / "ended.json").write_text('{"how": "<b>", "code": 3}')
-    assert "it was killed" in _ending(Jobs(tmp_path).all[0])
+    assert "it was killed" in ending(Jobs(tmp_path).all[0])

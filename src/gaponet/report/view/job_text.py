@@ -1,0 +1,86 @@
+"""What the page says of a command: how it ended, what it printed, and its pictures.
+
+Texts of commands and of files come from strangers: Markdown and HTML hold them only escaped.
+"""
+
+from __future__ import annotations
+
+import base64
+import html
+import re
+from pathlib import Path
+
+from gaponet.base.errors import UsageError
+from gaponet.base.text import escape_markdown
+from gaponet.report.view.inside import read_inside
+from gaponet.report.view.jobs import PROGRESS_LINE, Job
+from gaponet.report.view.run_job import BY_ITSELF, CANCELLED, WITH_SERVER
+
+UNCHANGED = "what was there before is unchanged."
+
+
+def ending(job: Job) -> str:
+    """Return how a command ended, in Markdown."""
+    command = f"**gaponet {escape_markdown(job.words[0])}**"
+    if job.result is not None:
+        return f"{command} has ended."
+    return f"{command} gave no result: {escape_markdown(_reason(job))}"
+
+
+def _reason(job: Job) -> str:
+    """Return why a command gave no result."""
+    ended = job.ending
+    how = "" if ended is None else ended["how"]
+    if how == CANCELLED:
+        return f"it was cancelled; {UNCHANGED}"
+    if how == WITH_SERVER:
+        return f"it ended with the server of the page; {UNCHANGED}"
+    said = [line for line in job.lines if line.strip() and not PROGRESS_LINE.match(line)]
+    if said:
+        return said[-1]
+    if ended is not None and how == BY_ITSELF:
+        return f"it ended with exit code {ended['code']} and said nothing."
+    return f"it was killed, or the computer went off; {UNCHANGED}"
+
+
+def report(job: Job) -> str:
+    """Return what a command printed, in Markdown, and the command."""
+    lines = list[str]()
+    for line in job.lines:
+        lines += _report_line(line)
+    repeat = f"To repeat it in the folder of this page: {escape_markdown(job.command)}"
+    return "\n".join([*lines, "", repeat])
+
+
+def _report_line(line: str) -> list[str]:
+    """Return a line that a command printed as lines of Markdown.
+
+    A table of rich becomes one of Markdown.
+    """
+    text = re.sub("[┃│]", "|", escape_markdown(line.strip()))
+    if line.startswith("┡"):
+        return [f"| --- |{' ---: |' * line.count('╇')}"]
+    if line.startswith(("┃", "│")):
+        return [text]
+    if not text or line.startswith(("┏", "└", "     ok ")) or PROGRESS_LINE.match(line):
+        return []
+    if text.startswith(("error ", "warning ")):
+        return ["", f"**{text}**"]
+    return ["", text]
+
+
+def picture(folder: Path, name: str) -> str:
+    """Return a picture of the page's folder as HTML with a link that saves it, or why it is not
+    shown.
+    """
+    try:
+        data = base64.b64encode(read_inside(folder, name)).decode()
+    except UsageError as error:
+        return f"<p>Not shown: {html.escape(str(error))}</p>"
+    kind = Path(name).suffix[1:]
+    address = f"data:image/{kind.replace('svg', 'svg+xml')};base64,{data}"
+    saved = html.escape(Path(name).name)
+    text = f'<a download="{saved}" href="{address}">save {kind.upper()}</a> '
+    if kind == "svg":
+        text = f'<img alt="{saved}" style="width:100%;background:white" src="{address}">{text}'
+    return text
