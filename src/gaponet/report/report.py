@@ -33,9 +33,11 @@ from gaponet.nn.artifact import GapModel
 from gaponet.nn.packaged_networks import is_packaged, named_folder
 from gaponet.report.page import inline_image, page_figure, render
 from gaponet.robot.folder import load_stored_robot
+from gaponet.robot.servo_fields import SERVO_FIELDS
 from gaponet.robot.spec import RobotSpec, load_robot
 from gaponet.sim.dataset_robot import dataset_robot
 from gaponet.sim.model import require_stored_robot
+from gaponet.sysid.uncertainty import ParameterUncertainty, summarize, table_rows
 
 Picture = Callable[[RobotSpec, SequenceMeta, float, dict[str, Array]], bytes]
 OPEN_TRAJECTORIES = 3  # motions shown without a click
@@ -208,6 +210,7 @@ def _values(e: _Evaluated, picture: Picture | None) -> dict[str, Any]:
         "open_trajectories": OPEN_TRAJECTORIES,
         "by_motion": by_group(methods, "motion", mrad_and_degrees),
         "waterfall": None,
+        "parameters": _parameters(e.robot),
         **_photo(e, next(iter(drawn), None), picture),
     }
     if e.gap is not None:
@@ -225,6 +228,22 @@ def _values(e: _Evaluated, picture: Picture | None) -> dict[str, Any]:
             "versions": ", ".join(f"{k} {v}" for k, v in e.card["versions"].items()),
         }
     return values
+
+
+def _parameters(robot: RobotSpec) -> tuple[list[str], list[list[str]]] | None:
+    """Return columns and rows of the identified values with their standard errors; None if the robot
+    keeps none.
+    """
+    known = ParameterUncertainty.load(robot)
+    if known is None:
+        return None
+    summaries = [summarize(known, joint) for joint in known.joints]
+    fields = []
+    for field in known.fields:
+        if any(summary.values[field] for summary in summaries):
+            fields.append(field)
+    columns = ["joint", *(SERVO_FIELDS[field].heading for field in fields)]
+    return columns, table_rows(known, tuple(fields))
 
 
 def _by_joint(e: _Evaluated) -> tuple[list[str], list[list[str]]]:

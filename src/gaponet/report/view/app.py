@@ -152,13 +152,13 @@ class App:
         state = (len(every), living.folder.name if living else "")
         if self.seen == state:
             return
+        self._show_results()
         if living is not None:
             self.controls.say("")
         elif every:
             self.controls.say(ending(every[-1]))
         else:
             self.controls.say("Six steps, from left to right.")
-        self._show_results()
         if living is None and every:
             self._compare(every[-1])
         self.seen = state  # last: after an error all is shown again

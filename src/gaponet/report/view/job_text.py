@@ -16,6 +16,8 @@ from gaponet.report.view.inside import read_inside
 from gaponet.report.view.jobs import PROGRESS_LINE, Job
 from gaponet.report.view.run_job import BY_ITSELF, CANCELLED, WITH_SERVER
 
+# How commands print what they find: the level, two spaces, the name of the check, a sentence.
+FINDING_LINE = re.compile(r" *(error|warning)  \S")
 UNCHANGED = "what was there before is unchanged."
 
 
@@ -64,7 +66,7 @@ def _report_line(line: str) -> list[str]:
         return [text]
     if not text or line.startswith(("┏", "└", "     ok ")) or PROGRESS_LINE.match(line):
         return []
-    if text.startswith(("error ", "warning ")):
+    if FINDING_LINE.match(line):
         return ["", f"**{text}**"]
     return ["", text]
 

@@ -144,7 +144,7 @@ class Player:
     def _aim(self) -> None:
         # One robot may point at the camera.
         across, up = self.scene.view.axes
-        far = 2.2 + 1.2 / len(self.scene.base)
+        far = 2.6 + 0.8 / len(self.scene.base)
         self.server.initial_camera.fov = np.radians(45)
         for camera in (
             self.server.initial_camera,
