@@ -98,9 +98,9 @@ def test_causes_lead_from_the_nominal_simulator_to_the_identified_one(tmp_path):
         {"elbow": {"kp": 15.0, "frictionloss": 0.1, "stribeck": 0.05, "stribeck_speed": 0.1}}
     )
     steps = cause_steps(found)
-    assert [name for name, _ in steps] == ["gain", "friction", "creep", "stribeck"]
-    assert model_hash(steps[-1][1]) == model_hash(found)
-    assert steps[0][1].frictionloss[1] != 0.1
+    assert [step.name for step in steps] == ["gain", "friction", "creep", "stribeck"]
+    assert model_hash(steps[-1].simulator) == model_hash(found)
+    assert steps[0].simulator.frictionloss[1] != 0.1
     assert cause_steps(robot) == []
 
 
@@ -109,7 +109,7 @@ def test_a_servo_with_less_damping_than_its_files_kd_is_the_last_step_too(tmp_pa
     robot = replace(robot, kd=np.full_like(robot.kd, 0.5))
     found = robot.with_servos({"elbow": {"damping": -0.3}})
     assert found.kd[1] == pytest.approx(0.2)
-    assert model_hash(cause_steps(found)[-1][1]) == model_hash(found)
+    assert model_hash(cause_steps(found)[-1].simulator) == model_hash(found)
 
 
 def test_the_reduction_by_a_step_has_a_standard_error_over_motions(tmp_path):

@@ -25,9 +25,12 @@ DATA_HINT = "data of the robot that the run was trained for"
 
 
 class Origin(TypedDict):
-    """Data that a robot was identified from: dataset (path from the folder), recordings and motions by
-    split, the error on validation motions, rad, what was learned about backlash and links, and what the doctor found in
-    the recordings (checks/gate.py)."""
+    """Data that a robot was identified from.
+
+    dataset is a path from the folder; parts and motions are recordings and motions by split;
+    val_mpjae is the error on validation motions, rad; findings say what was learned about backlash
+    and links, doctor what was found in the recordings (checks/gate.py).
+    """
 
     dataset: str
     parts: SplitHashes
@@ -106,22 +109,28 @@ def select_entries(
     Raises:
         DatasetError: Every recording was used in training.
     """
-    data = [FittedData.of_folder(folder) for folder in folders]
-    if None in data:
-        return dataset.select(motions, units), False
-    fitted = [d for d in data if d is not None]
-    candidates = dataset.select(units=units)
-    unused = [e for e in candidates if not any(e in d for d in fitted)]
+    fitted = []
+    for folder in folders:
+        data = FittedData.of_folder(folder)
+        if data is None:
+            return dataset.select(motions, units), False
+        fitted.append(data)
+    available = dataset.select(units=units)
+    unused = [entry for entry in available if not any(entry in data for data in fitted)]
     if motions:
         entries = dataset.select(motions, units)
     else:
-        entries = [e for e in unused if e.hash in fitted[0].test] or unused
-        entries = entries or [e for e in candidates if not any(e.hash in s.hashes for s in fitted)]
+        entries = [entry for entry in unused if entry.hash in fitted[0].test] or [*unused]
+    if not entries and not motions:  # all motions were used, perhaps not all recordings of them
+        for entry in available:
+            if not any(entry.hash in data.hashes for data in fitted):
+                entries.append(entry)
     if not entries:
         raise DatasetError(
-            f"{dataset.path}: every sequence was used in training; give logs the runs never saw, or --motions"
+            f"{dataset.path}: every sequence was used in training; give logs the runs never saw, "
+            "or --motions"
         )
-    return entries, {e.hash for e in entries} <= {e.hash for e in unused}
+    return entries, {entry.hash for entry in entries} <= {entry.hash for entry in unused}
 
 
 @dataclass(frozen=True)
@@ -143,27 +152,31 @@ class FittedData:
             origin = read_origin(folder)
             return None if origin is None else cls._of(origin["parts"], origin["motions"])
         model = GapModel.load(folder)
-        logs = {h for c in Adaptation.load(folder, model.weights_hash()).values() for h in c.logs}
+        logs = set[str]()
+        for adaptation in Adaptation.load(folder, model.weights_hash()).values():
+            logs.update(adaptation.logs)
         origin = read_origin(folder / STORED_ROBOT)  # of the robot under the model
-        logs |= (
-            set()
-            if origin is None
-            else {h for part in ("train", "val") for h in origin["parts"][part].values()}
-        )
+        if origin is not None:
+            logs |= _fitted_hashes(origin["parts"])
         return cls._of(split_of_run(folder), model.card.get("motions", {}), logs)
 
     @classmethod
     def _of(
         cls, split: Any, motions: Mapping[str, Any], more: set[str] | None = None
     ) -> FittedData:
-        hashes = {h for part in ("train", "val") for h in split[part].values()} | (more or set())
-        used = {m for part in ("train", "val") for m in motions.get(part, ())}
+        hashes = _fitted_hashes(split) | (more or set())
+        used = {*motions.get("train", ()), *motions.get("val", ())}
         return cls(frozenset(hashes), frozenset(used), frozenset(split["test"].values()) - hashes)
 
     def __contains__(self, entry: Entry) -> bool:
-        return entry.hash in self.hashes or (
-            entry.hash not in self.test and entry.meta.motion in self.motions
-        )
+        if entry.hash in self.hashes:
+            return True
+        return entry.hash not in self.test and entry.meta.motion in self.motions
+
+
+def _fitted_hashes(split: Any) -> set[str]:
+    """Return the content hashes of the recordings for training and validation."""
+    return {*split["train"].values(), *split["val"].values()}
 
 
 def split_of_run(run: Path) -> dict[str, dict[str, str]]:
@@ -181,20 +194,19 @@ def read_origin(folder: Path) -> Origin | None:
     file = folder / PROVENANCE_FILE
     if not file.is_file():
         return None
-    return read_json(
-        Origin,
-        file,
-        RobotError,
-        "identify again, or remove it: all recordings then count as seen",
-        allow_extra=True,
-    )
+    hint = "identify again, or remove it: all recordings then count as seen"
+    return read_json(Origin, file, RobotError, hint, allow_extra=True)
 
 
 def robot_label(entries: list[Entry]) -> str:
     """Return the robot's name; "VIRTUAL h1_2" or "partly VIRTUAL h1_2" where recordings are virtual."""
-    virtual = sum(e.meta.virtual for e in entries)
-    kind = "" if not virtual else "VIRTUAL " if virtual == len(entries) else "partly VIRTUAL "
-    return kind + entries[0].meta.robot
+    name = entries[0].meta.robot
+    virtual = sum(entry.meta.virtual for entry in entries)
+    if not virtual:
+        return name
+    if virtual == len(entries):
+        return f"VIRTUAL {name}"
+    return f"partly VIRTUAL {name}"
 
 
 def describe_provenance(dataset: Dataset) -> str:
@@ -202,8 +214,9 @@ def describe_provenance(dataset: Dataset) -> str:
     label = robot_label(dataset.entries)
     if label == dataset.robot_name:
         return f"Recordings of a real {label}."
-    fleets = sorted(
-        {e.meta.source for e in dataset.entries if e.meta.virtual and "fleet" in e.meta.source}
-    )
-    names = f" ({', '.join(fleets)})" if fleets else ""
+    fleets = set[str]()
+    for entry in dataset.entries:
+        if entry.meta.virtual and "fleet" in entry.meta.source:
+            fleets.add(entry.meta.source)
+    names = f" ({', '.join(sorted(fleets))})" if fleets else ""
     return f"{label[0].upper()}{label[1:]}{names}: these numbers say nothing about real hardware."

@@ -1,12 +1,13 @@
-"""Sources of the gap: the error after each step from the nominal to the identified simulator and to a model on top of
-it, and the error floor."""
+"""Sources of the gap: the error after each step from the nominal to the identified simulator and to a
+model on top of it, and the error floor.
+"""
 
 from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterable
 from collections.abc import Sequence as ListOf
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
 
@@ -15,9 +16,9 @@ import numpy as np
 from gaponet.base.arrays import Array
 from gaponet.base.progress import Progress, no_progress, with_note
 from gaponet.data.repeatability import Repetitions, repetition_difference
-from gaponet.data.sequence import Sequence
+from gaponet.data.sequence import Sequence, SequenceMeta
 from gaponet.data.signals import encoder_step
-from gaponet.data.store import Dataset
+from gaponet.data.store import Dataset, Entry
 from gaponet.evaluation.baselines import baseline_errors, command_run
 from gaponet.evaluation.candidate import Candidate, select_entries
 from gaponet.nn.delay_offset import DelayOffset
@@ -31,91 +32,173 @@ from gaponet.sim.replay import Corrector, kept_replays, replay
 MAX_COMPARED = 60  # recordings that are searched for equal commands
 
 
+@dataclass(frozen=True)
+class GapStep:
+    """A simulator on the way from the nominal one to the model.
+
+    Attributes:
+        name: Of the step, a key of evaluation.methods.METHODS.
+        simulator: Robot that is simulated.
+        corrector: Corrects its targets; None if nothing does.
+    """
+
+    name: str
+    simulator: RobotSpec
+    corrector: Corrector | None = None
+
+
 def gap_by_step(
     candidate: Candidate,
     dataset: Dataset,
     motions: tuple[str, ...] = (),
     progress: Progress = no_progress,
 ) -> dict[str, Any]:
-    """Mean |error| after each step, in open-loop rollouts of motions that the candidate was not fitted to.
+    """Mean |error| after each step, in open-loop rollouts of motions that the candidate was not
+    fitted to.
 
-    Steps: nominal; of a run, delay (fitted on the training motions) and offset (delay and offset); of an identified
-    simulator its CAUSES, one after the other, and static friction that holds ("creep": with the step "friction" alone,
-    friction creeps as MuJoCo's does); of a run, its model. Standard errors are over independent motions, of paired
-    reductions. The reduction by a cause depends on the order of causes. "unexplained" is the error above the floor.
+    Steps: nominal; of a run, delay (fitted on the training motions) and offset (delay and offset);
+    of an identified simulator its CAUSES, one after the other, and static friction that holds
+    ("creep": with the step "friction" alone, friction creeps as MuJoCo's does); of a run, its
+    model. Standard errors are over independent motions, of paired reductions. The reduction by a
+    cause depends on the order of causes. "unexplained" is the error above the floor.
 
     Args:
-        candidate: An identified robot, or a run; its recordings, baseline, simulator and model are used.
+        candidate: An identified robot, or a run; its recordings, baseline, simulator and model are
+            used.
+        dataset: The recordings.
+        motions: Only these; default: those that the candidate was not fitted to.
+        progress: Called while recordings are simulated.
 
     Returns:
-        {"methods": {nominal, identified, …: metrics.summary}, "baselines": {delay_offset, command: rad}, "left": {step:
-        rad}, "removed": {step: [rad, standard error]}, "unexplained": rad, "by_joint": {joint: the same and "floor"},
-        "by_payload": {kg: {step: rad}}, "floor": {"encoder": rad, "repeatability": rad, "both": rad}, …}; an unknown
-        floor is None, and so is the error above it.
+        {"methods": {nominal, identified, …: metrics.summary}, "baselines": {delay_offset, command:
+        rad}, "left": {step: rad}, "removed": {step: [rad, standard error]}, "unexplained": rad,
+        "by_joint": {joint: the same and "floor"}, "by_payload": {kg: {step: rad}}, "floor":
+        {"encoder", "repeatability", "both": rad}, …}; an unknown floor is None, and so is the error
+        above it.
     """
     robot = candidate.robot
     dataset.require_robot(robot)
     nominal = robot.before_identification
     entries, unseen = select_entries([candidate.folder], dataset, motions)
     sequences = dataset.sequences(entries)
-    causes, done = cause_steps(robot), {}
-    for name, physics, corrector in _steps(candidate, causes):
-        report = with_note(progress, name)
-        if corrector is None:
-            replays = kept_replays(dataset, entries, physics, report, creeps=name == "friction")
-        else:
-            replays = replay(sequences, physics, corrector, lock_idle=True, progress=report)
-        done[name] = runs(sequences, [t.qpos for t in replays], robot)
-    units = {s.meta.unit_id for s in sequences}
-    others = (dataset.sequences([e])[0] for e in dataset.entries if e.meta.unit_id in units)
-    floors = error_floor(sequences if any(s.meta.repetition for s in sequences) else others, robot)
-    floors["all"] = {
-        k: _mean([f[k] for f in floors.values()]) for k in ("encoder", "repeatability", "both")
-    }
-    last = list(done)[-1]
-    methods = {"nominal": "nominal"} | ({"delay_offset": "offset"} if "offset" in done else {})
-    methods |= {"identified": causes[-1][0]} if causes else {}
-    methods |= {candidate.method: last} if candidate.model is not None else {}
+    causes = cause_steps(robot)
+    done = _simulate(_steps(candidate, causes), dataset, entries, sequences, robot, progress)
+    floors = _floors(sequences, dataset, robot)
+    simulators = {"nominal": model_hash(nominal)}
+    if causes:
+        simulators["identified"] = model_hash(robot)
+    commands = [command_run(sequence, robot) for sequence in sequences]
     return {
-        "methods": {name: errors_of(done[step], robot) for name, step in methods.items()},
-        "baselines": baseline_errors(done["nominal"], [command_run(s, robot) for s in sequences]),
+        "methods": _methods(candidate, causes, done),
+        "baselines": baseline_errors(done["nominal"], commands),
         **_sources(done, floors["all"]),
-        "by_joint": {
-            j: _sources(done, floors[j], [i]) for i, j in enumerate(robot.operated) if metrics(done[last], [i])
-        },
-        "by_payload": {
-            f"{p:g}": {n: metrics([r for r in part if r.meta.payload_mass == p])["mpjae"] for n, part in done.items()}
-            for p in sorted({s.meta.payload_mass for s in sequences})
-        },
-        "virtual": any(s.meta.virtual for s in sequences),
+        "by_joint": _by_joint(done, floors, robot),
+        "by_payload": _by_payload(done, sequences),
+        "virtual": any(sequence.meta.virtual for sequence in sequences),
         "unseen": unseen,
         "sequences": len(sequences),
-        "hours": sum(e.rows * e.dt for e in entries) / 3600,
-        "simulator_hash": model_hash(nominal),
-        "simulators": {"nominal": model_hash(nominal)} | ({"identified": model_hash(robot)} if causes else {}),
+        "hours": sum(entry.rows * entry.dt for entry in entries) / 3600,
+        "simulator_hash": simulators["nominal"],
+        "simulators": simulators,
         "dataset": dataset.path.name,
         "robot": robot.name,
-    }  # fmt: skip
+    }
 
 
-def _steps(
-    candidate: Candidate, causes: list[tuple[str, RobotSpec]]
-) -> list[tuple[str, RobotSpec, Corrector | None]]:
-    """Return name, simulator and corrector of each step, from the nominal simulator over the causes to the model."""
+def _simulate(
+    steps: ListOf[GapStep],
+    dataset: Dataset,
+    entries: list[Entry],
+    sequences: list[Sequence],
+    robot: RobotSpec,
+    progress: Progress,
+) -> dict[str, list[Run]]:
+    """Return the runs of all recordings after each step."""
+    done = {}
+    for step in steps:
+        report = with_note(progress, step.name)
+        if step.corrector is None:
+            creeps = step.name == "friction"
+            replays = kept_replays(dataset, entries, step.simulator, report, creeps=creeps)
+        else:
+            replays = replay(
+                sequences, step.simulator, step.corrector, lock_idle=True, progress=report
+            )
+        done[step.name] = runs(sequences, [one.qpos for one in replays], robot)
+    return done
+
+
+def _methods(
+    candidate: Candidate, causes: ListOf[GapStep], done: dict[str, list[Run]]
+) -> dict[str, Any]:
+    """Return the errors of the methods that some steps are: nominal, identified, …"""
+    step_of = {"nominal": "nominal"}
+    if "offset" in done:
+        step_of["delay_offset"] = "offset"
+    if causes:
+        step_of["identified"] = causes[-1].name
+    if candidate.model is not None:
+        step_of[candidate.method] = list(done)[-1]
+    return {name: errors_of(done[step], candidate.robot) for name, step in step_of.items()}
+
+
+def _floors(
+    sequences: list[Sequence], dataset: Dataset, robot: RobotSpec
+) -> dict[str, dict[str, float | None]]:
+    """Return the floor of each joint, and under "all" that of their mean, rad.
+
+    Without repetitions among the recordings, all recordings of their units are searched for some.
+    """
+    searched: Iterable[Sequence] = sequences
+    if not any(sequence.meta.repetition for sequence in sequences):
+        units = {sequence.meta.unit_id for sequence in sequences}
+        entries = [entry for entry in dataset.entries if entry.meta.unit_id in units]
+        searched = (dataset.sequences([entry])[0] for entry in entries)
+    floors = error_floor(searched, robot)
+    of_all = {}
+    for kind in ("encoder", "repeatability", "both"):
+        of_all[kind] = _mean([floor[kind] for floor in floors.values()])
+    return floors | {"all": of_all}
+
+
+def _by_joint(
+    done: dict[str, list[Run]], floors: dict[str, dict[str, float | None]], robot: RobotSpec
+) -> dict[str, Any]:
+    """Return the sources of the gap of each joint that was recorded."""
+    last = list(done)[-1]
+    sources = {}
+    for column, joint in enumerate(robot.operated):
+        if metrics(done[last], [column]):
+            sources[joint] = _sources(done, floors[joint], [column])
+    return sources
+
+
+def _by_payload(
+    done: dict[str, list[Run]], sequences: list[Sequence]
+) -> dict[str, dict[str, float]]:
+    """Return payload, kg → step → error, rad."""
+    errors: dict[str, dict[str, float]] = {}
+    for payload in sorted({sequence.meta.payload_mass for sequence in sequences}):
+        left = {}
+        for name, part in done.items():
+            same = [run for run in part if run.meta.payload_mass == payload]
+            left[name] = metrics(same)["mpjae"]
+        errors[f"{payload:g}"] = left
+    return errors
+
+
+def _steps(candidate: Candidate, causes: list[GapStep]) -> list[GapStep]:
+    """Return the steps from the nominal simulator over the causes to the model."""
     nominal = candidate.robot.before_identification
-    start: list[tuple[str, RobotSpec, Corrector | None]] = [("nominal", nominal, None)]
-    middle: list[tuple[str, RobotSpec, Corrector | None]] = [
-        (cause, physics, None) for cause, physics in causes
-    ]
+    start = [GapStep("nominal", nominal)]
     if candidate.model is None:
-        return start + middle
+        return start + causes
     fitted = DelayOffset.read(candidate.folder)
     only_delay = DelayOffset(fitted.delay, dict.fromkeys(fitted.offset, 0.0))
-    start += [
-        ("delay", nominal, only_delay.corrector(nominal)),
-        ("offset", nominal, fitted.corrector(nominal)),
-    ]
-    return [*start, *middle, (candidate.method, candidate.robot, candidate.corrector())]
+    start.append(GapStep("delay", nominal, only_delay.corrector(nominal)))
+    start.append(GapStep("offset", nominal, fitted.corrector(nominal)))
+    corrected = GapStep(candidate.method, candidate.robot, candidate.corrector())
+    return [*start, *causes, corrected]
 
 
 def _sources(
@@ -123,8 +206,11 @@ def _sources(
 ) -> dict[str, Any]:
     """Return the error after each step, its reductions, the floor, and the error above it, rad."""
     left = {name: metrics(part, columns)["mpjae"] for name, part in done.items()}
-    least, last = floor["both"], list(left.values())[-1]
-    unexplained = None if least is None else max(last - least, 0.0)
+    least = floor["both"]
+    unexplained = None
+    if least is not None:
+        last = list(left.values())[-1]
+        unexplained = max(last - least, 0.0)
     return {
         "left": left,
         "removed": reductions(done, columns),
@@ -133,89 +219,120 @@ def _sources(
     }
 
 
+def _fields_by_cause() -> dict[str, list[str]]:
+    """Return cause → fields of servos; none for causes that are no servo's."""
+    fields: dict[str, list[str]] = {}
+    for field in SERVO_FIELDS.values():
+        fields.setdefault(field.cause, []).append(field.name)
+    return fields | {"hand": [], "links": []}
+
+
 # Fields in which an identified simulator differs from the nominal one, in the order of the steps.
-CAUSES = {cause: [f.name for f in SERVO_FIELDS.values() if f.cause == cause]
-          for cause in (*(f.cause for f in SERVO_FIELDS.values()), "hand", "links")}  # fmt: skip
+CAUSES = _fields_by_cause()
+# Cause → what else of the robot it changes.
+BESIDE_SERVOS = {"contact": "table", "hand": "payload_mounts", "links": "links"}
 
 
-def cause_steps(simulator: RobotSpec) -> list[tuple[str, RobotSpec]]:
+def cause_steps(simulator: RobotSpec) -> list[GapStep]:
     """Return the simulators from the first cause on; the last one is the identified simulator."""
     if simulator.nominal is None:
         return []
-    robot, steps = simulator.before_identification, []
+    robot = simulator.before_identification
+    steps = []
     for cause, fields in CAUSES.items():
-        servos = {
-            joint: {
-                f: float(getattr(simulator, f)[i])
-                for f in fields
-                if np.isfinite(getattr(simulator, f)[i])
-            }
-            for i, joint in enumerate(simulator.joint_names)
-        }
-        changed = robot.with_servos(servos)
-        more = {"contact": "table", "hand": "payload_mounts", "links": "links"}.get(cause)
-        changed = replace(changed, **{more: getattr(simulator, more)}) if more else changed
+        changed = _with_cause(robot, simulator, cause, fields)
         if model_hash(changed) != model_hash(robot):
-            steps += (
-                [(cause, changed)]
-                if cause != "friction"
-                else [(cause, changed), ("creep", changed)]
-            )
+            steps.append(GapStep(cause, changed))
+            if cause == "friction":
+                steps.append(GapStep("creep", changed))
         robot = changed
     return steps
+
+
+def _with_cause(
+    robot: RobotSpec, identified: RobotSpec, cause: str, fields: list[str]
+) -> RobotSpec:
+    """Return a robot that takes what a cause changes from the identified one."""
+    servos: dict[str, dict[str, float]] = {}
+    for row, joint in enumerate(identified.joint_names):
+        servos[joint] = {}
+        for field in fields:
+            value = float(getattr(identified, field)[row])
+            if np.isfinite(value):
+                servos[joint][field] = value
+    changed = robot.with_servos(servos)
+    if cause not in BESIDE_SERVOS:
+        return changed
+    other = BESIDE_SERVOS[cause]
+    return replace(changed, **{other: getattr(identified, other)})
 
 
 def reductions(
     done: dict[str, list[Run]], columns: list[int] | None = None
 ) -> dict[str, list[float]]:
-    """Return the reduction of the error by each step and its standard error over independent motions, rad."""
-    held = {name: [r for r in part if r.holds(columns)] for name, part in done.items()}
-    errors = {name: np.array([r.mean_error(columns) for r in part]) for name, part in held.items()}
-    metas = [r.meta for r in next(iter(held.values()))]
-    pairs = pairwise(errors)
-    return {
-        after: list(mean_reduction(metas, errors[before], errors[after])) for before, after in pairs
-    }
+    """Return the reduction of the error by each step and its standard error over independent
+    motions, rad.
+    """
+    errors = {}
+    metas: list[SequenceMeta] = []
+    for name, part in done.items():
+        held = [run for run in part if run.holds(columns)]
+        errors[name] = np.array([run.mean_error(columns) for run in held])
+        metas = metas or [run.meta for run in held]
+    removed = {}
+    for before, after in pairwise(errors):
+        removed[after] = list(mean_reduction(metas, errors[before], errors[after]))
+    return removed
 
 
 def error_floor(
     sequences: Iterable[Sequence], robot: RobotSpec
 ) -> dict[str, dict[str, float | None]]:
-    """Mean |error| that no simulator can remove, by joint: {"encoder", "repeatability", "both"}, rad; None if unknown.
+    """Mean |error| that no simulator can remove, by joint: {"encoder", "repeatability", "both"},
+    rad; None if unknown.
 
-    An encoder of step s reads wrong by s/4 on average. A robot that differs from itself by σ from one repetition, or
-    from one period of a motion, to the next differs from its own mean by √(2/π)·σ on average, encoder included.
+    An encoder of step s reads wrong by s/4 on average. A robot that differs from itself by σ from
+    one repetition, or from one period of a motion, to the next differs from its own mean by
+    √(2/π)·σ on average, encoder included.
     """
     groups: dict[Any, Repetitions] = defaultdict(Repetitions)
     angles: list[Array] = []
-    some: list[Sequence] = []
-    for s in sequences:
-        some += [s] * (len(some) < MAX_COMPARED)
-        angles.append(s.qpos[:, robot.operated_index])
-        same = (*s.meta.repetition_key, round(s.dt * 1e6))
-        groups[same].add(s)
-        for period in Repetitions.periods(s):
+    compared: list[Sequence] = []
+    for sequence in sequences:
+        if len(compared) < MAX_COMPARED:
+            compared.append(sequence)
+        angles.append(sequence.qpos[:, robot.operated_index])
+        same = (*sequence.meta.repetition_key, round(sequence.dt * 1e6))
+        groups[same].add(sequence)
+        for period in Repetitions.periods(sequence):
             groups[*same, "period"].add(period)
-    repeated = [g.result() for g in groups.values() if g.count > 1]
-    std = (
-        Repetitions.summary(repeated, robot.joint_names)["channels"]["qpos"]["joints"]
-        if repeated
-        else {}
-    )
+    std = _std_of_repetitions(groups.values(), robot)
     if not std:  # recordings of one command under several names
-        differences = zip(
-            robot.operated, repetition_difference(some, robot.operated).tolist(), strict=True
-        )
-        std = {joint: difference / np.sqrt(2) for joint, difference in differences if difference}
+        differences = repetition_difference(compared, robot.operated).tolist()
+        for joint, difference in zip(robot.operated, differences, strict=True):
+            if difference:
+                std[joint] = difference / np.sqrt(2)
     floors: dict[str, dict[str, float | None]] = {}
-    for i, joint in enumerate(robot.operated):
-        encoder = encoder_step([a[:, i] for a in angles]) / 4 or None
+    for column, joint in enumerate(robot.operated):
+        encoder = encoder_step([angle[:, column] for angle in angles]) / 4 or None
         repeatability = std[joint] * np.sqrt(2 / np.pi) if joint in std else None
         both = max(encoder or 0.0, repeatability or 0.0) or None
         floors[joint] = {"encoder": encoder, "repeatability": repeatability, "both": both}
     return floors
 
 
+def _std_of_repetitions(groups: Iterable[Repetitions], robot: RobotSpec) -> dict[str, float]:
+    """Return joint → standard deviation among repetitions, rad; empty if nothing was repeated."""
+    repeated = [group.result() for group in groups if group.count > 1]
+    if not repeated:
+        return {}
+    summary = Repetitions.summary(repeated, robot.joint_names)
+    return dict(summary["channels"]["qpos"]["joints"])
+
+
 def _mean(values: ListOf[float | None]) -> float | None:
-    numbers = [v for v in values if v is not None]
-    return float(np.mean(numbers)) if len(numbers) == len(values) else None
+    """Return the mean of numbers; None if one is unknown."""
+    numbers = [value for value in values if value is not None]
+    if len(numbers) < len(values):
+        return None
+    return float(np.mean(numbers))

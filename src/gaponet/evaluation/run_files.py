@@ -166,16 +166,14 @@ def read_progress(run: Path) -> list[dict[str, Any]]:
     file = run / "progress.jsonl"
     if not file.is_file():
         return []
-    lines = file.read_bytes().split(b"\n")[:-1]
-    return [
-        {
-            **parse_json(
-                _Validation, line, f"{file}:{number}", ModelError, REPAIR_HINT, allow_extra=True
-            )
-        }
-        for number, line in enumerate(lines, 1)
-        if line.strip()
-    ]
+    complete = file.read_bytes().split(b"\n")[:-1]
+    validations = []
+    for number, line in enumerate(complete, 1):
+        if line.strip():
+            where = f"{file}:{number}"
+            read = parse_json(_Validation, line, where, ModelError, REPAIR_HINT, allow_extra=True)
+            validations.append(dict(read))
+    return validations
 
 
 class _Floor(TypedDict):
@@ -197,7 +195,8 @@ class _Gap(_Panel):
 
 def read_gap(run: Path) -> dict[str, Any] | None:
     """Read gap.json of a run; None if there is none."""
-    file, again = run / "gap.json", "make it again with gaponet gap DATASET --run RUN"
+    file = run / "gap.json"
+    again = "make it again with gaponet gap DATASET --run RUN"
     if not file.is_file():
         return None
     gap = read_json(_Gap, file, ModelError, again, allow_extra=True)

@@ -12,20 +12,21 @@ from gaponet.evaluation.methods import title
 
 
 def mrad(value: float | None) -> str:
-    """Format an angle in rad as milliradian; a dash if there is none, such as the standard error over one motion."""
-    return (
-        "–" if value is None or value != value else f"{round(value * 1e3, 2) + 0.0:.2f}"
-    )  # no −0.00
+    """Format an angle in rad as milliradian.
+
+    A dash stands for none, such as the standard error over one motion.
+    """
+    if value is None or np.isnan(value):
+        return "–"
+    no_minus_zero = round(value * 1e3, 2) + 0.0
+    return f"{no_minus_zero:.2f}"
 
 
 def mrad_with_error(value: float, standard_error: float) -> str:
-    """Format an angle in rad with its standard error over independent motions, which is NaN if there is one."""
-    one = standard_error != standard_error
-    return (
-        f"{mrad(value)} mrad (one motion)"
-        if one
-        else f"{mrad(value)} ± {mrad(standard_error)} mrad"
-    )
+    """Format an angle in rad with its standard error over independent motions, NaN if there is one."""
+    if np.isnan(standard_error):
+        return f"{mrad(value)} mrad (one motion)"
+    return f"{mrad(value)} ± {mrad(standard_error)} mrad"
 
 
 def mrad_and_degrees(value: float) -> str:
@@ -45,21 +46,47 @@ def totals(
         angle: Formats the MPJAE.
         simulators: Method → hash of its simulator, for a last column.
     """
-    base = methods["nominal"]["mpjae"]
-    columns = ("method", "mean |error|, mrad", "of nominal", "RMSE, mrad", "static, mrad", "dynamic, mrad",
-               "Q_dis, rad·s", "≥ 0.05 rad", "≥ 0.1 rad", "correlation", *["simulator"] * bool(simulators))  # fmt: skip
-    return ResultTable("totals", columns, tuple(
-        (title(name), angle(m["mpjae"]), m["mpjae"] / base if base else "–", mrad(m["rmse"]), mrad(m["static"]),
-         mrad(m["dynamic"]), f"{m['q_dis']:.3f}", f"{m['large_0.05'] * 100:.1f} %", f"{m['large_0.1'] * 100:.2f} %",
-         f"{m['correlation']:.4f}", *([simulators[name]] if simulators else []))
-        for name, m in methods.items()
-    ))  # fmt: skip
+    columns = [
+        "method",
+        "mean |error|, mrad",
+        "of nominal",
+        "RMSE, mrad",
+        "static, mrad",
+        "dynamic, mrad",
+        "Q_dis, rad·s",
+        "≥ 0.05 rad",
+        "≥ 0.1 rad",
+        "correlation",
+    ]
+    if simulators:
+        columns.append("simulator")
+    nominal = methods["nominal"]["mpjae"]
+    rows = []
+    for name, errors in methods.items():
+        row: list[Any] = [
+            title(name),
+            angle(errors["mpjae"]),
+            errors["mpjae"] / nominal if nominal else "–",
+            mrad(errors["rmse"]),
+            mrad(errors["static"]),
+            mrad(errors["dynamic"]),
+            f"{errors['q_dis']:.3f}",
+            f"{100 * errors['large_0.05']:.1f} %",
+            f"{100 * errors['large_0.1']:.2f} %",
+            f"{errors['correlation']:.4f}",
+        ]
+        if simulators:
+            row.append(simulators[name])
+        rows.append(tuple(row))
+    return ResultTable("totals", tuple(columns), tuple(rows))
 
 
 def by_group(
     methods: dict[str, Any], group: str, angle: Callable[[float], str] = mrad
 ) -> ResultTable:
     """Return the MPJAE by joint, payload, unit, horizon or motion: a row for each, a column per method."""
-    parts = [m[f"by_{group}"] for m in methods.values()]
-    rows = tuple((key, *(angle(part[key]["mpjae"]) for part in parts)) for key in parts[0])
-    return ResultTable(group, ("mean |error|, mrad", *map(title, methods)), rows)
+    parts = [errors[f"by_{group}"] for errors in methods.values()]
+    rows = []
+    for key in parts[0]:
+        rows.append((key, *(angle(part[key]["mpjae"]) for part in parts)))
+    return ResultTable(group, ("mean |error|, mrad", *map(title, methods)), tuple(rows))

@@ -46,62 +46,76 @@ class NetworkGain(NamedTuple):
 
 def network_gain(methods: Scores, own: str) -> NetworkGain:
     """Return the gain of the network of method `own`."""
-    base = "identified" if own.startswith(IDENTIFIED) else min(
-        (name for name in WITHOUT_NETWORK if name in methods), key=lambda name: methods[name]["mpjae"]
-    )  # fmt: skip
-    before, after = (methods[name] for name in (base, own))
-    paired = [m["mpjae"] - after["by_independent_motion"][name]["mpjae"]
-              for name, m in before["by_independent_motion"].items()]  # fmt: skip
-    return NetworkGain(
-        base, before["mpjae"] - after["mpjae"], standard_error(paired), before["mpjae"]
-    )
+    base = "identified"
+    if not own.startswith(IDENTIFIED):
+        available = [name for name in WITHOUT_NETWORK if name in methods]
+        base = min(available, key=lambda name: methods[name]["mpjae"])
+    before = methods[base]
+    after = methods[own]
+    paired = []
+    for motion, errors in before["by_independent_motion"].items():
+        paired.append(errors["mpjae"] - after["by_independent_motion"][motion]["mpjae"])
+    reduction = before["mpjae"] - after["mpjae"]
+    return NetworkGain(base, reduction, standard_error(paired), before["mpjae"])
 
 
 def verdict(methods: Scores, baselines: Mapping[str, float] | None = None) -> list[str]:
-    """Return sentences: the nominal error, the error after identification, and the gain of each network.
+    """Return sentences: the nominal error, the error after identification, and the gain of each
+    network.
 
     Args:
         methods: Method → its metrics.
-        baselines: As of `evaluation.baselines.baseline_errors`; without them nothing is said of the command itself.
+        baselines: As of `evaluation.baselines.baseline_errors`; without them nothing is said of the
+            command itself.
     """
-    nominal = methods["nominal"]["mpjae"]
-    by_joint = methods["nominal"]["by_joint"]
-    worst = max(by_joint, key=lambda joint: by_joint[joint]["mpjae"])
-    sentences = [
-        f"The nominal simulator is {mrad(nominal)} mrad ({np.degrees(nominal):.2f}°) from the robot, most at {worst} "
-        f"({mrad(by_joint[worst]['mpjae'])})."
-    ]
+    sentences = [_about_nominal(methods["nominal"])]
     if "identified" in methods:
-        error = methods["identified"]["mpjae"]
-        change = f"{100 * abs(1 - error / nominal):.0f} % {'less' if error <= nominal else 'MORE'}"
-        end = "." if error < nominal else ": identify again, on logs like these."
-        motions = len(methods["identified"]["by_independent_motion"])
-        count = f"{motions} independent motion{'s' * (motions != 1)}"
-        sentences.append(
-            f"After identification the error is {mrad(error)} mrad, {change}, on {count}{end}"
-        )
-    sentences += [
-        _about_network(methods, own) for own in methods if own.removeprefix(IDENTIFIED) in LEARNED
-    ]
+        sentences.append(_about_identified(methods))
+    sentences += [_about_network(methods, own) for own in _networks(methods)]
     best = min(scores["mpjae"] for scores in methods.values())
     if baselines is not None and baselines["command"] <= best:
         sentences.append(
-            f"The command itself, delayed and offset, is {mrad(baselines['command'])} mrad from the robot. "
-            f"No simulator here is closer ({mrad(best)}), so for motions like these a simulator adds nothing."
+            f"The command itself, delayed and offset, is {mrad(baselines['command'])} mrad from the "
+            f"robot. No simulator here is closer ({mrad(best)}), so for motions like these a "
+            "simulator adds nothing."
         )
     return sentences
 
 
-def _about_network(methods: Scores, own: str) -> str:
-    gain, error = network_gain(methods, own), methods[own]["mpjae"]
-    end = (
-        f", {100 * gain.reduction / gain.base_error:.0f} %."
-        if gain.helps
-        else ": leave the network out."
-    )
+def _networks(methods: Scores) -> list[str]:
+    """Return the methods that are networks."""
+    return [own for own in methods if own.removeprefix(IDENTIFIED) in LEARNED]
+
+
+def _about_nominal(nominal: Scores) -> str:
+    error = nominal["mpjae"]
+    by_joint = {joint: errors["mpjae"] for joint, errors in nominal["by_joint"].items()}
+    worst = max(by_joint, key=lambda joint: by_joint[joint])
     return (
-        f"With {title(own)} the error is {mrad(error)} mrad: the correction reduces the error of {title(gain.base)} by "
-        f"{gain.text}{end}"
+        f"The nominal simulator is {mrad(error)} mrad ({np.degrees(error):.2f}°) from the robot, "
+        f"most at {worst} ({mrad(by_joint[worst])})."
+    )
+
+
+def _about_identified(methods: Scores) -> str:
+    nominal = methods["nominal"]["mpjae"]
+    error = methods["identified"]["mpjae"]
+    percent = f"{100 * abs(1 - error / nominal):.0f} %"
+    change = f"{percent} less" if error <= nominal else f"{percent} MORE"
+    motions = len(methods["identified"]["by_independent_motion"])
+    count = "1 independent motion" if motions == 1 else f"{motions} independent motions"
+    end = "." if error < nominal else ": identify again, on logs like these."
+    return f"After identification the error is {mrad(error)} mrad, {change}, on {count}{end}"
+
+
+def _about_network(methods: Scores, own: str) -> str:
+    gain = network_gain(methods, own)
+    end = ": leave the network out."
+    if gain.helps:
+        end = f", {100 * gain.reduction / gain.base_error:.0f} %."
+    return (
+        f"With {title(own)} the error is {mrad(methods[own]['mpjae'])} mrad: the correction reduces "
+        f"the error of {title(gain.base)} by {gain.text}{end}"
     )
 
 
@@ -111,29 +125,24 @@ def next_step(
     """Return the next command: identify, or export without a useful network, else report.
 
     Args:
-        folder: Folder of the identified robot or of the run, or a network of the package by name or folder.
+        methods: Method → its metrics.
+        dataset: Dataset, as the command line names it.
+        folder: Folder of the identified robot or of the run, or a network of the package by name or
+            folder.
         reported: The report exists; a run's model is exported.
     """
-    networks = [own for own in methods if own.removeprefix(IDENTIFIED) in LEARNED]
+    identify = shlex.join(["gaponet", "identify", dataset, "--out", "my_robot"])
+    networks = _networks(methods)
     helps = any(network_gain(methods, own).helps for own in networks)
     if folder is not None and is_packaged(named_folder(folder)):
-        if helps:
-            name = folder.name
-            return f"gaponet export {name} --to torch --out {name}-torch"
-        return shlex.join(["gaponet", "identify", dataset, "--out", "my_robot"])
+        if not helps:
+            return identify
+        return f"gaponet export {folder.name} --to torch --out {folder.name}-torch"
+    if helps and reported:
+        return shlex.join(["gaponet", "export", str(folder), "--to", "torch"])
     if helps:
-        return shlex.join(
-            [
-                "gaponet",
-                *(
-                    ["export", str(folder), "--to", "torch"]
-                    if reported
-                    else ["report", str(folder)]
-                ),
-            ]
-        )
+        return shlex.join(["gaponet", "report", str(folder)])
     if "identified" not in methods or folder is None:
-        return shlex.join(["gaponet", "identify", dataset, "--out", "my_robot"])
-    return shlex.join(
-        ["gaponet", "export", str(folder / STORED_ROBOT if networks else folder), "--to", "mjcf"]
-    )
+        return identify
+    robot = folder / STORED_ROBOT if networks else folder
+    return shlex.join(["gaponet", "export", str(robot), "--to", "mjcf"])
