@@ -1,18 +1,20 @@
-"""Coordinated motions: arms and torso with a load in the hands, legs in the air, and tours of the joint space.
+"""Coordinated motions: arms and torso with a load in the hands, legs in the air, and tours of the
+joint space.
 
-Each function takes a Kit, the sides that act (motions of arms) and a seeded generator, and returns targets (T, n) rad
-on the motion grid. World frame: x forward, y left, z up; the H1-2 shoulder is at z = 1.45 m and a hand reaches 0.6 m
-from it. Sideways numbers are given for the left arm and mirrored for the right one. The base is fixed.
+Each function takes a Kit, the sides that act (motions of arms) and a seeded generator, and returns
+targets (T, n) rad on the motion grid. World frame: x forward, y left, z up; the H1-2 shoulder is at
+z = 1.45 m and a hand reaches 0.6 m from it. Sideways numbers are given for the left arm and mirrored
+for the right one. The base is fixed.
 
-An arm is found by joint names, `<side>_shoulder_pitch…`, `…shoulder_roll…`, `…shoulder_yaw…`, `…elbow…` and
-`…wrist_roll…`, with a payload mount of the same side as its hand. Robots without such names have no arm motions.
+An arm is found by joint names, `<side>_shoulder_pitch…`, `…shoulder_roll…`, `…shoulder_yaw…`,
+`…elbow…` and `…wrist_roll…`, with a payload mount of the same side as its hand. Robots without such
+names have no arm motions.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from itertools import accumulate
 
 import mujoco
 import numpy as np
@@ -24,8 +26,10 @@ from gaponet.robot.spec import RobotSpec
 
 Sides = tuple[str, ...]
 MAX_IK_ITERATIONS = 80
+MAX_IK_STEP_RAD = 0.3  # of a joint in one iteration
+IK_TOLERANCE_M = 1e-4
 DURATION_S = 8.0  # of most whole-body motions
-# between postures on a path of the hands that are computed; a spline goes through them
+# Rows between postures that are computed on a path of the hands; a spline goes through them.
 KNOT_ROWS = 10
 ROLES = ("shoulder_pitch", "shoulder_roll", "shoulder_yaw", "elbow", "wrist_roll")
 
@@ -44,25 +48,38 @@ def arms(robot: RobotSpec) -> dict[str, Arm]:
     """The robot's arms by side; empty for a robot that is not built like that."""
     by_side = {}
     for mount in robot.payload_mounts:
-        names = [
-            [n for n in robot.joint_names if n.startswith(f"{mount.side}_{role}")] for role in ROLES
-        ]
-        if all(len(n) == 1 for n in names):
+        joints = _joints_of_arm(robot, mount.side)
+        if joints is not None:
             sign = -1.0 if mount.side == "right" else 1.0
-            columns = robot.index([n[0] for n in names])
+            columns = robot.index(joints)
             by_side[mount.side] = Arm(mount.side, sign, columns, f"payload_{mount.side}")
     return by_side
 
 
+def _joints_of_arm(robot: RobotSpec, side: str) -> list[str] | None:
+    """Return the joints of an arm in the order of ROLES; None if one is missing or not unique."""
+    joints = []
+    for role in ROLES:
+        named = [name for name in robot.joint_names if name.startswith(f"{side}_{role}")]
+        if len(named) != 1:
+            return None
+        joints += named
+    return joints
+
+
 class HandIK:
-    """Inverse kinematics of one arm by damped least squares; the null space is pulled towards the start."""
+    """Inverse kinematics of one arm by damped least squares.
+
+    The null space is pulled towards the start.
+    """
 
     def __init__(self, limits: Feasibility, arm: Arm) -> None:
         self.model = limits.models[0]
         self.data = mujoco.MjData(self.model)
         self.arm = arm
         self.body = self.model.body(arm.hand).id
-        self.low, self.high = limits.low[arm.columns], limits.high[arm.columns]
+        self.low = limits.low[arm.columns]
+        self.high = limits.high[arm.columns]
 
     def position(self, qpos: Array) -> Array:
         """Palm centre in the world at a posture (n,), (3,) m."""
@@ -71,31 +88,40 @@ class HandIK:
         return self.data.xpos[self.body].copy()
 
     def solve(self, qpos: Array, target: Array) -> Array:
-        """Joint positions (n,) that bring the palm as near to target (3,) m as limits allow, starting from qpos."""
+        """Joint positions (n,) that bring the palm as near to target (3,) m as limits allow.
+
+        Args:
+            qpos: Posture from which the search starts, (n,) rad.
+            target: Of the palm, (3,) m in the world.
+        """
         q = np.array(qpos, float)
-        rest = q[self.arm.columns].copy()
-        jac = np.zeros((3, self.model.nv))
+        columns = self.arm.columns
+        rest = q[columns].copy()
+        jacobian = np.zeros((3, self.model.nv))
         for _ in range(MAX_IK_ITERATIONS):
             error = target - self.position(q)
-            if np.linalg.norm(error) < 1e-4:
+            if np.linalg.norm(error) < IK_TOLERANCE_M:
                 break
             mujoco.mj_comPos(self.model, self.data)
-            mujoco.mj_jacBody(self.model, self.data, jac, None, self.body)
-            J = jac[:, self.arm.columns]
+            mujoco.mj_jacBody(self.model, self.data, jacobian, None, self.body)
+            J = jacobian[:, columns]
             inverse = J.T @ np.linalg.inv(J @ J.T + 1e-3 * np.eye(3))
-            pull = (np.eye(len(rest)) - inverse @ J) @ (rest - q[self.arm.columns])
-            step = inverse @ error + 0.1 * pull
-            q[self.arm.columns] = np.clip(
-                q[self.arm.columns] + np.clip(step, -0.3, 0.3), self.low, self.high
-            )
+            pull = (np.eye(len(rest)) - inverse @ J) @ (rest - q[columns])
+            step = np.clip(inverse @ error + 0.1 * pull, -MAX_IK_STEP_RAD, MAX_IK_STEP_RAD)
+            q[columns] = np.clip(q[columns] + step, self.low, self.high)
         return q
 
     def path(self, qpos: Array, targets: Array) -> Array:
         """One posture per target (k, 3), each from the one before: (k, n)."""
-        return np.array(list(accumulate(targets, self.solve, initial=qpos))[1:])
+        postures = []
+        for target in targets:
+            qpos = self.solve(qpos, target)
+            postures.append(qpos)
+        return np.array(postures)
 
 
-# Elbows bent, hands in front of the belly: the posture from which people start; (ROLES), rad, left arm.
+# Elbows bent, hands in front of the belly: the posture from which people start; (ROLES), rad, left
+# arm.
 READY = np.array([0.15, 0.25, 0.0, 0.35, 0.0])
 MIRROR = np.array([1.0, -1.0, -1.0, 1.0, -1.0])  # roll, yaw and wrist roll change sign on the right
 
@@ -110,23 +136,37 @@ class Kit:
         self.ik = {side: HandIK(limits, arm) for side, arm in self.arms.items()}
         self.ready = limits.robot.qpos_home.copy()
         for arm in self.arms.values():
-            self.ready[arm.columns] = READY * (MIRROR if arm.sign < 0 else 1.0)
+            self.ready[arm.columns] = mirrored(READY, arm)
 
     def posture(self, **values: Array | list[float]) -> Array:
-        """The ready posture with some arms at left-arm angles (ROLES), mirrored where needed; (n,) rad."""
+        """The ready posture with some arms at left-arm angles (ROLES), mirrored where needed;
+        (n,) rad.
+        """
         q = self.ready.copy()
         for side, angles in values.items():
-            q[self.arms[side].columns] = np.asarray(angles) * (
-                MIRROR if self.arms[side].sign < 0 else 1.0
-            )
+            arm = self.arms[side]
+            q[arm.columns] = mirrored(np.asarray(angles), arm)
         return np.clip(q, self.limits.low, self.limits.high)
 
     def at(self, q: Array, sides: Sides, point: Array | list[float], roll: float = 0.0) -> Array:
-        """Posture q with these hands at a point given for the left arm, (3,) m, and wrists rolled by so many rad."""
-        for arm in (self.arms[side] for side in sides):
-            q = self.ik[arm.side].solve(q, np.asarray(point) * [1.0, arm.sign, 1.0])
+        """Posture q with these hands at a point, and their wrists rolled.
+
+        Args:
+            q: (n,) rad.
+            sides: Arms that move.
+            point: Of the left hand, (3,) m; the right one mirrors it.
+            roll: Of the left wrist, rad.
+        """
+        for side in sides:
+            arm = self.arms[side]
+            q = self.ik[side].solve(q, np.asarray(point) * [1.0, arm.sign, 1.0])
             q[arm.columns[4]] = arm.sign * roll
         return q
+
+
+def mirrored(angles: Array, arm: Arm) -> Array:
+    """Return left-arm angles (ROLES) for an arm."""
+    return angles * MIRROR if arm.sign < 0 else angles
 
 
 def reach(kit: Kit, sides: Sides, rng: np.random.Generator) -> Array:
@@ -135,12 +175,9 @@ def reach(kit: Kit, sides: Sides, rng: np.random.Generator) -> Array:
     for _ in range(4):
         q = kit.ready
         for side in sides:
-            q = kit.at(
-                q,
-                (side,),
-                rng.uniform([0.25, 0.08, 0.95], [0.5, 0.45, 1.45]),
-                rng.uniform(-1.2, 1.2),
-            )
+            point = rng.uniform([0.25, 0.08, 0.95], [0.5, 0.45, 1.45])
+            roll = rng.uniform(-1.2, 1.2)
+            q = kit.at(q, (side,), point, roll)
         stops.append(q)
     return _stops(stops, rng.uniform(0.8, 1.4), 0.4)
 
@@ -150,24 +187,27 @@ def pick_and_place(kit: Kit, sides: Sides, rng: np.random.Generator) -> Array:
     height = rng.uniform(0.92, 1.05)
     stops = [kit.ready]
     for _ in range(2):
-        start, stop = (rng.uniform([0.3, 0.1], [0.45, 0.4]) for _ in range(2))
+        start = rng.uniform([0.3, 0.1], [0.45, 0.4])
+        stop = rng.uniform([0.3, 0.1], [0.45, 0.4])
         roll = rng.uniform(-1.0, 1.0)
-        for xy, z in (
+        way = (
             (start, 0.15),
             (start, 0.0),
             (start, 0.18),
             (stop, 0.18),
             (stop, 0.0),
             (stop, 0.15),
-        ):
-            stops.append(kit.at(stops[-1], sides, [*xy, height + z], roll))
+        )
+        for xy, above_table in way:
+            stops.append(kit.at(stops[-1], sides, [*xy, height + above_table], roll))
     return _stops(stops, 0.7, 0.15)
 
 
 def lift(kit: Kit, sides: Sides, rng: np.random.Generator) -> Array:
     """Lift from the waist to the shoulder and down again, twice, to random heights."""
     stops = [kit.ready]
-    x, y = rng.uniform(0.3, 0.4), rng.uniform(0.15, 0.3)
+    x = rng.uniform(0.3, 0.4)
+    y = rng.uniform(0.15, 0.3)
     for z in rng.uniform([0.9, 1.3, 0.9, 1.35], [1.0, 1.5, 1.05, 1.55]):
         stops.append(kit.at(stops[-1], sides, [x, y, z]))
     return _stops([*stops, kit.ready], 1.4, 0.5)
@@ -175,26 +215,32 @@ def lift(kit: Kit, sides: Sides, rng: np.random.Generator) -> Array:
 
 def punch(kit: Kit, sides: Sides, rng: np.random.Generator) -> Array:
     """Four quick stretches forward from a guard, sides in turn."""
-    guard = kit.posture(**{s: [-0.5, 0.25, 0.1, -0.4, 0.0] for s in sides})
+    guard = kit.posture(**{side: [-0.5, 0.25, 0.1, -0.4, 0.0] for side in sides})
     stops = [kit.ready, guard]
     for i in range(4):
         side = sides[i % len(sides)]
-        stops += [kit.at(guard, (side,), rng.uniform([0.48, 0.1, 1.25], [0.56, 0.25, 1.45])), guard]
+        point = rng.uniform([0.48, 0.1, 1.25], [0.56, 0.25, 1.45])
+        stops += [kit.at(guard, (side,), point), guard]
     return _stops(stops, 0.5, 0.25)
 
 
 def wave(kit: Kit, sides: Sides, rng: np.random.Generator) -> Array:
     """Upper arm out and up, then forearm from side to side."""
-    raised = kit.posture(
-        **{s: [rng.uniform(-0.6, -0.2), rng.uniform(1.0, 1.4), 0.0, -0.5, 0.0] for s in sides}
-    )
+    angles = {}
+    for side in sides:
+        pitch = rng.uniform(-0.6, -0.2)
+        roll = rng.uniform(1.0, 1.4)
+        angles[side] = [pitch, roll, 0.0, -0.5, 0.0]
+    raised = kit.posture(**angles)
     ctrl = _stops([kit.ready, raised], 1.6, 0.4)
     steps = round(rng.uniform(4.0, 5.0) / GRID)
     phase = 2 * np.pi * rng.uniform(0.5, 0.9) * np.arange(steps) * GRID
     swing = np.repeat(raised[None], steps, axis=0)
-    for c in (kit.arms[s].columns for s in sides):
-        swing[:, c[2]] += 0.4 * np.sin(phase) * fade(steps, GRID, 1.0)
-        swing[:, c[3]] += 0.25 * np.sin(phase + 1.0) * fade(steps, GRID, 1.0)
+    window = fade(steps, GRID, 1.0)
+    for side in sides:
+        columns = kit.arms[side].columns
+        swing[:, columns[2]] += 0.4 * np.sin(phase) * window
+        swing[:, columns[3]] += 0.25 * np.sin(phase + 1.0) * window
     return np.concatenate([ctrl, swing, _stops([raised, kit.ready], 1.6, 0.4)])
 
 
@@ -204,9 +250,8 @@ def stir(kit: Kit, sides: Sides, rng: np.random.Generator) -> Array:
     centre = rng.uniform([0.32, 0.15, 1.0], [0.4, 0.3, 1.15])
     phase = 2 * np.pi * rng.uniform(0.4, 0.7) * np.arange(steps) * GRID
     radius = rng.uniform(0.07, 0.11) * fade(steps, GRID, 1.5)
-    circle = centre + radius[:, None] * np.stack(
-        [np.cos(phase), np.sin(phase), 0.2 * np.sin(phase / 2)], axis=1
-    )
+    around = np.stack([np.cos(phase), np.sin(phase), 0.2 * np.sin(phase / 2)], axis=1)
+    circle = centre + radius[:, None] * around
     return _along(kit, dict.fromkeys(sides, circle))
 
 
@@ -219,10 +264,9 @@ def mirror(kit: Kit, sides: Sides, rng: np.random.Generator) -> Array:
     lag = rng.choice([0.0, np.pi])
     paths = {}
     for i, side in enumerate(sides):
-        p = phase + i * lag
-        paths[side] = centre + size[:, None] * np.stack(
-            [0.5 * np.cos(p), 0.6 * np.sin(p), np.cos(p)], axis=1
-        )
+        own = phase + i * lag
+        oval = np.stack([0.5 * np.cos(own), 0.6 * np.sin(own), np.cos(own)], axis=1)
+        paths[side] = centre + size[:, None] * oval
     return _along(kit, paths)
 
 
@@ -242,13 +286,16 @@ def carry(kit: Kit, sides: Sides, rng: np.random.Generator) -> Array:
         columns = kit.arms[side].columns
         ctrl[:, columns[0]] += bounce
         ctrl[:, columns[3]] -= 0.7 * bounce
-    return np.concatenate(
-        [_stops([kit.ready, held], 1.2, 0.3), ctrl, _stops([held, kit.ready], 1.2, 0.3)]
-    )
+    before = _stops([kit.ready, held], 1.2, 0.3)
+    after = _stops([held, kit.ready], 1.2, 0.3)
+    return np.concatenate([before, ctrl, after])
 
 
 def wander(kit: Kit, sides: Sides, rng: np.random.Generator) -> Array:
-    """Move all joints of the arms at once, on slow sines with random phases: states that no task passes through."""
+    """Move all joints of the arms at once, on slow sines with random phases.
+
+    These are states that no task passes through.
+    """
     steps = round(8.0 / GRID)
     time = np.arange(steps) * GRID
     ctrl = np.repeat(kit.ready[None], steps, axis=0)
@@ -267,9 +314,9 @@ BUILDERS: dict[str, Callable[[Kit, Sides, np.random.Generator], Array]] = {
 def _sines(time: Array, most: float, rng: np.random.Generator) -> Array:
     """Mean of three sines of random phases and frequencies from 0.1 to `most` Hz, (T,)."""
     frequency = rng.uniform(0.1, most, 3)
-    return np.asarray(
-        np.sin(2 * np.pi * np.outer(time, frequency) + rng.uniform(0, 2 * np.pi, 3)).mean(axis=1)
-    )
+    phase = rng.uniform(0, 2 * np.pi, 3)
+    waves = np.sin(2 * np.pi * np.outer(time, frequency) + phase)
+    return np.asarray(waves.mean(axis=1))
 
 
 def _stops(stops: list[Array], move: float, hold: float) -> Array:
@@ -286,14 +333,14 @@ def _along(kit: Kit, paths: dict[str, Array]) -> Array:
     knots = np.unique(np.append(np.arange(0, rows, KNOT_ROWS), rows - 1))
     q = np.repeat(kit.ready[None], len(knots), axis=0)
     for side, path in paths.items():
-        arm: Arm = kit.arms[side]
-        q[:, arm.columns] = kit.ik[side].path(kit.ready, path[knots] * [1.0, arm.sign, 1.0])[
-            :, arm.columns
-        ]
+        arm = kit.arms[side]
+        targets = path[knots] * [1.0, arm.sign, 1.0]
+        postures = kit.ik[side].path(kit.ready, targets)
+        q[:, arm.columns] = postures[:, arm.columns]
+    before = _stops([kit.ready, q[0]], 1.2, 0.3)
     middle = CubicSpline(knots, q)(np.arange(rows))
-    return np.concatenate(
-        [_stops([kit.ready, q[0]], 1.2, 0.3), middle, _stops([q[-1], kit.ready], 1.2, 0.3)]
-    )
+    after = _stops([q[-1], kit.ready], 1.2, 0.3)
+    return np.concatenate([before, middle, after])
 
 
 def squat(kit: Kit, rng: np.random.Generator) -> Array:
@@ -331,7 +378,8 @@ def sway(kit: Kit, rng: np.random.Generator) -> Array:
     """Sway from side to side with hip and ankle roll while the torso turns and the arms open."""
     time, ctrl, window = _start(kit)
     phase = 2 * np.pi * rng.uniform(0.25, 0.4) * time
-    wave, opening = np.sin(phase) * window, 0.5 * (1 - np.cos(2 * phase)) * window
+    wave = np.sin(phase) * window
+    opening = 0.5 * (1 - np.cos(2 * phase)) * window
     for side in ("left", "right"):
         _add(ctrl, kit, f"{side}_hip_roll", 0.15 * wave)
         _add(ctrl, kit, f"{side}_ankle_roll", -0.12 * wave)
@@ -343,7 +391,9 @@ def sway(kit: Kit, rng: np.random.Generator) -> Array:
 
 
 def tour(kit: Kit, rng: np.random.Generator) -> Array:
-    """Move all joints at once from one random posture to the next, a third of the range around the ready posture."""
+    """Move all joints at once from one random posture to the next, a third of the range around the
+    ready posture.
+    """
     low, high = _box(kit, 0.3)
     stops = np.array([kit.ready, *rng.uniform(low, high, (4, len(low))), kit.ready])
     return through(stops, rng.uniform(1.0, 1.4, 5), np.full(6, 0.3), GRID)
@@ -355,13 +405,13 @@ def limber(kit: Kit, rng: np.random.Generator) -> Array:
     low, high = _box(kit, 0.3)
     for j in range(ctrl.shape[1]):
         wave = _sines(time, 0.5, rng)
-        ctrl[:, j] += (
-            (low[j] + high[j]) / 2 - kit.ready[j] + wave * (high[j] - low[j]) / 2
-        ) * window
+        away = (low[j] + high[j]) / 2 - kit.ready[j] + wave * (high[j] - low[j]) / 2
+        ctrl[:, j] += away * window
     return ctrl
 
 
-LEGGED, ANY = (squat, march, sway), (tour, limber)
+LEGGED = (squat, march, sway)
+ANY = (tour, limber)
 _LEG = ("hip_pitch", "hip_roll", "hip_yaw", "knee", "ankle_pitch", "ankle_roll")
 WHOLE_BODY: dict[str, Callable[[Kit, np.random.Generator], Array]] = {
     f.__name__: f for f in LEGGED + ANY
@@ -370,32 +420,42 @@ WHOLE_BODY: dict[str, Callable[[Kit, np.random.Generator], Array]] = {
 
 def available(kit: Kit) -> list[str]:
     """Names of the whole-body motions that this robot can play."""
-    legs = all(
-        any(n.startswith(f"{s}_{j}") for n in kit.robot.joint_names)
-        for s in ("left", "right")
-        for j in _LEG
-    )
-    return [f.__name__ for f in (LEGGED if legs else ()) + ANY]
+    names = [builder.__name__ for builder in ANY]
+    if _has_legs(kit.robot):
+        return [*(builder.__name__ for builder in LEGGED), *names]
+    return names
+
+
+def _has_legs(robot: RobotSpec) -> bool:
+    for side in ("left", "right"):
+        for joint in _LEG:
+            if not any(name.startswith(f"{side}_{joint}") for name in robot.joint_names):
+                return False
+    return True
 
 
 def _add(ctrl: Array, kit: Kit, start: str, values: Array | float) -> None:
-    """Add values (T,) or one number to the joint whose name starts so; a robot without it is left as it is."""
+    """Add values (T,) or one number to the joint whose name starts so.
+
+    A robot without it is left as it is.
+    """
     for i, name in enumerate(kit.robot.joint_names):
         if name.startswith(start):
             ctrl[..., i] += values
 
 
 def _start(kit: Kit) -> tuple[Array, Array, Array]:
+    """Return time (T,) s, the ready posture at each (T, n) rad, and a window (T,)."""
     steps = round(DURATION_S / GRID)
-    return (
-        np.arange(steps) * GRID,
-        np.repeat(kit.ready[None], steps, axis=0),
-        fade(steps, GRID, 1.5),
-    )
+    time = np.arange(steps) * GRID
+    ctrl = np.repeat(kit.ready[None], steps, axis=0)
+    return time, ctrl, fade(steps, GRID, 1.5)
 
 
 def _box(kit: Kit, share: float) -> tuple[Array, Array]:
     """A share of every joint's range around the ready posture, at most 0.8 rad to either side."""
-    low, high = kit.limits.low, kit.limits.high
-    half = np.minimum(share * np.where(np.isfinite(high - low), high - low, 2.0), 0.8)
+    low = kit.limits.low
+    high = kit.limits.high
+    width = np.where(np.isfinite(high - low), high - low, 2.0)
+    half = np.minimum(share * width, 0.8)
     return np.maximum(kit.ready - half, low), np.minimum(kit.ready + half, high)

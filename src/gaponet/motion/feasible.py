@@ -1,8 +1,9 @@
 """Feasibility of commands, and the nearest feasible one.
 
-Four limits: joint range, joint speed, free space between limbs and above floor or table, and torque by inverse dynamics
-of the nominal model at every payload. For a given motion the torque is an affine function of the payload mass (up to
-the payload ball's own radius), so the lightest and the heaviest payload bound all between.
+Four limits: joint range, joint speed, free space between limbs and above floor or table, and torque
+by inverse dynamics of the nominal model at every payload. For a given motion the torque is an affine
+function of the payload mass (up to the payload ball's own radius), so the lightest and the heaviest
+payload bound all between.
 """
 
 from __future__ import annotations
@@ -21,11 +22,13 @@ from gaponet.sim.dynamics import inverse_dynamics, static_torque
 from gaponet.sim.model import build_model
 
 MAX_PAYLOAD = 3.0  # kg per hand: the heaviest of the SimLifter recipe, and the default
-MAX_SPEED = 4.0  # rad/s: under half of the 9 of the slowest H1-2 arm joint (unitreerobotics/unitree_ros, h1_2.urdf)
+# rad/s: under half of the 9 of the slowest H1-2 arm joint (unitreerobotics/unitree_ros, h1_2.urdf)
+MAX_SPEED = 4.0
 MAX_CHANGES = 40  # of a motion until it fits
+NEARER = 0.93  # of the distance to a posture that is fine, after one change
 RANGE_MARGIN = 0.02  # rad kept from a hard stop
 MAX_STATIC_SHARE = 0.95  # of the usable torque, to hold a posture: slower motion does not reduce it
-TORQUE_SHARE = 0.85  # of the effort limit, for commands; the rest is for feedback and heavier links
+TORQUE_SHARE = 0.85  # of the effort limit, for commands; the rest is for feedback, heavier links
 
 
 @dataclass(frozen=True)
@@ -57,45 +60,47 @@ class Feasibility:
         height: float | None = None,
         unchecked: bool = False,
     ) -> None:
-        """Take the floor's or table's height, m, instead of collision.toml's; `unchecked` ignores all shapes."""
+        """Take a robot's limits.
+
+        Args:
+            robot: Its ranges, effort limits and shapes count.
+            max_payload: Heaviest payload in each hand, kg.
+            height: Of the floor or table, m, instead of collision.toml's.
+            unchecked: Ignore all shapes.
+        """
         self.robot = robot
-        self.low, self.high = (
-            robot.qpos_range[:, 0] + RANGE_MARGIN,
-            robot.qpos_range[:, 1] - RANGE_MARGIN,
-        )
+        self.low = robot.qpos_range[:, 0] + RANGE_MARGIN
+        self.high = robot.qpos_range[:, 1] - RANGE_MARGIN
         self.max_payload = max_payload if robot.payload_mounts else 0.0
-        self.models: list[mujoco.MjModel] = [
-            build_model(robot, p, dt=GRID) for p in sorted({0.0, self.max_payload})
-        ]
+        self.models: list[mujoco.MjModel] = []
+        for payload in sorted({0.0, self.max_payload}):
+            self.models.append(build_model(robot, payload, dt=GRID))
         self.limit = TORQUE_SHARE * robot.effort_limit
         self.collision = Collision(robot, self.models[0], height, unchecked)
 
     def demand(
         self, ctrl: Array, dt: float, named: Array | slice = slice(None), need: Array | None = None
     ) -> Demand:
-        """Return the demand of a command (T, n) rad at period dt.
+        """Return the demand of a command.
 
-        Joints `named` must be within their ranges; `need` is the free space to keep, (pairs + shells,) m, if it is not
-        the clearance.
+        Args:
+            ctrl: Command, (T, n) rad.
+            dt: Its period, s.
+            named: Columns of joints that must be within their ranges.
+            need: Free space to keep, (pairs + shells,) m; default: the clearance.
         """
         qvel = np.gradient(ctrl, dt, axis=0)
         qacc = np.gradient(qvel, dt, axis=0)
         zero = np.zeros_like(ctrl)
-        share = (
-            np.max([np.abs(inverse_dynamics(m, ctrl, qvel, qacc)) for m in self.models], axis=0)
-            / self.limit
-        )
-        still = (
-            np.max([np.abs(inverse_dynamics(m, ctrl, zero, zero)) for m in self.models], axis=0)
-            / self.limit
-        )
+        share = self._torque_share(ctrl, qvel, qacc)
+        still = self._torque_share(ctrl, zero, zero)
         free = self.collision.along(ctrl)
         least = float(free.min(initial=np.inf))
-        centre, half = (self.low + self.high) / 2, (self.high - self.low) / 2
-        with np.errstate(invalid="ignore"):
-            position = np.nan_to_num(
-                np.abs(ctrl - centre) / half, nan=0.0
-            )  # unlimited joints: inf / inf
+        centre = (self.low + self.high) / 2
+        half = (self.high - self.low) / 2
+        with np.errstate(invalid="ignore"):  # joints without a limit: inf / inf
+            position = np.nan_to_num(np.abs(ctrl - centre) / half, nan=0.0)
+        required = self.collision.clearance if need is None else need
         return Demand(
             position=float(position[:, named].max()),
             speed=float(np.abs(qvel).max() / MAX_SPEED),
@@ -104,21 +109,31 @@ class Feasibility:
             worst_joint=self.robot.joint_names[int(share.max(axis=0).argmax())],
             clearance=least,
             nearest=self.collision.nearest(free) if len(free) else "",
-            clear=bool((free >= (self.collision.clearance if need is None else need)).all()),
+            clear=bool((free >= required).all()),
         )
+
+    def _torque_share(self, qpos: Array, qvel: Array, qacc: Array) -> Array:
+        """Return the largest |torque| over payloads as a share of the usable one, (T, n)."""
+        torques = [np.abs(inverse_dynamics(model, qpos, qvel, qacc)) for model in self.models]
+        share: Array = np.max(torques, axis=0) / self.limit
+        return share
 
     def fit(self, motion: Motion, need: Array | None = None) -> Motion:
         """Slow the motion down, or bring it nearer to a posture that is fine, until it fits.
 
-        It is slowed where speed or acceleration demand too much, and brought nearer where even standing still does or
-        where limbs meet: to its own start if that is fine, else to the robot's home. Joints that it does not name stay.
+        It is slowed where speed or acceleration demand too much, and brought nearer where even
+        standing still does or where limbs meet: to its own start if that is fine, else to the
+        robot's home. Joints that it does not name stay.
 
         Raises:
-            UsageError: It does not fit after MAX_CHANGES changes; the message says what exceeds a limit.
+            UsageError: It does not fit after MAX_CHANGES changes; the message says what exceeds a
+                limit.
         """
         named = self.robot.index(motion.named(self.robot))
-        low, high = np.full_like(self.low, -np.inf), np.full_like(self.high, np.inf)
-        low[named], high[named] = self.low[named], self.high[named]
+        low = np.full_like(self.low, -np.inf)
+        low[named] = self.low[named]
+        high = np.full_like(self.high, np.inf)
+        high[named] = self.high[named]
         ctrl = np.clip(motion.ctrl, low, high)
         anchor = ctrl[0].copy()
         if not self.can_hold(anchor, need):  # of all joints, those that are only held too
@@ -128,20 +143,25 @@ class Feasibility:
             if demand.met:
                 return replace(motion, ctrl=ctrl)
             if demand.gravity > MAX_STATIC_SHARE or not demand.clear:
-                ctrl = anchor + 0.93 * (ctrl - anchor)
+                ctrl = anchor + NEARER * (ctrl - anchor)
             else:
-                ctrl = stretch(ctrl, min(max(demand.speed, demand.torque**0.5, 1.03), 1.5))
+                slower = max(demand.speed, demand.torque**0.5, 1.03)
+                ctrl = stretch(ctrl, min(slower, 1.5))
             ctrl = np.clip(ctrl, low, high)
         raise UsageError(
-            f"motion '{motion.name}' does not fit {self.robot.name} after {MAX_CHANGES} changes: {demand.worst_joint} "
-            f"needs {demand.torque:.2f} of its usable torque at {self.max_payload:g} kg, speed is {demand.speed:.2f} "
-            f"of {MAX_SPEED:g} rad/s, {demand.nearest or 'limbs'} come as near as {demand.clearance * 100:.1f} cm (at "
-            f"least {self.collision.clearance * 100:g}). Start it from a posture that is easier to hold, or collect "
-            "with a lighter payload"
+            f"motion '{motion.name}' does not fit {self.robot.name} after {MAX_CHANGES} changes: "
+            f"{demand.worst_joint} needs {demand.torque:.2f} of its usable torque at "
+            f"{self.max_payload:g} kg, speed is {demand.speed:.2f} of {MAX_SPEED:g} rad/s, "
+            f"{demand.nearest or 'limbs'} come as near as {demand.clearance * 100:.1f} cm (at "
+            f"least {self.collision.clearance * 100:g}). Start it from a posture that is easier to "
+            "hold, or collect with a lighter payload"
         )
 
     def can_hold(self, posture: Array, need: Array | None = None) -> bool:
-        """Return True if a posture (n,) rad can be held at every payload, clear of the body; need as in `demand`."""
+        """Return True if a posture (n,) rad can be held at every payload, clear of the body.
+
+        `need` is as in `demand`.
+        """
         demand = self.demand(np.repeat(posture[None], 2, axis=0), GRID, need=need)
         return demand.gravity <= MAX_STATIC_SHARE and demand.clear
 
@@ -151,12 +171,13 @@ def stretch(ctrl: Array, factor: float) -> Array:
     from scipy.interpolate import CubicSpline
 
     rows = round((len(ctrl) - 1) * factor) + 1
-    return CubicSpline(np.arange(len(ctrl)), ctrl)(np.linspace(0, len(ctrl) - 1, rows))
+    path = CubicSpline(np.arange(len(ctrl)), ctrl)
+    return path(np.linspace(0, len(ctrl) - 1, rows))
 
 
 GRID_POINTS = 41  # across the range
 MAX_POSTURES = 400
-# of the joint's range: stop looking; the margins to the stops take 1 or 2 %
+# Of the joint's range; then the search ends. The margins to the stops take 1 or 2 %.
 ENOUGH_RANGE_SHARE = 0.91
 GRAVITY_SHARE = 0.9  # of the usable torque: leaves some to accelerate
 
@@ -172,26 +193,29 @@ class ExcitationRange:
 
 
 def find_excitation_range(limits: Feasibility, joint: str, seed: int = 0) -> ExcitationRange:
-    """Return a posture near home from which `joint` reaches most of its range, clear of the body, at every payload.
+    """Return a posture near home from which `joint` reaches most of its range, clear of the body, at
+    every payload.
 
-    Home is tried first; then the other operated joints of the limb are varied at random, more and more.
+    Home is tried first; then the other operated joints of the limb are varied at random, more and
+    more.
     """
     robot = limits.robot
     j = robot.index([joint])[0]
     limb = _limb(limits.models[0], robot.operated, joint)
     columns = robot.index([name for name in limb if name != joint])
     rng = np.random.default_rng([seed, j])
-    low, high = limits.low, limits.high
+    low = limits.low
+    high = limits.high
     home = np.clip(robot.qpos_home, low, high)
     best = _span(limits, home, int(j))
     for i in range(MAX_POSTURES):
         if best.share >= ENOUGH_RANGE_SHARE:
             break
         posture = home.copy()
-        reach = min(1.0, 1.5 * i / MAX_POSTURES) * rng.uniform(
-            0, 1, len(columns)
-        )  # near home first
-        posture[columns] += reach * (rng.uniform(low[columns], high[columns]) - home[columns])
+        near_home_first = min(1.0, 1.5 * i / MAX_POSTURES)
+        reach = near_home_first * rng.uniform(0, 1, len(columns))
+        anywhere = rng.uniform(low[columns], high[columns])
+        posture[columns] += reach * (anywhere - home[columns])
         stage = _span(limits, posture, int(j))
         if stage.share > best.share:
             best = stage
@@ -207,12 +231,14 @@ def _span(limits: Feasibility, posture: Array, j: int) -> ExcitationRange:
     fits = limits.collision.distance(rows) >= limits.collision.clearance
     if np.diff(_longest_run(fits))[0] < GRID_POINTS // 2:
         return empty
-    share = np.max([np.abs(static_torque(m, rows)) for m in limits.models], axis=0) / limits.limit
+    torques = [np.abs(static_torque(model, rows)) for model in limits.models]
+    share = np.max(torques, axis=0) / limits.limit
     fits &= (share <= GRAVITY_SHARE).all(axis=1)
     start, stop = _longest_run(fits)
     if stop == start:
         return empty
-    low, high = float(grid[start]), float(grid[stop - 1])
+    low = float(grid[start])
+    high = float(grid[stop - 1])
     full = np.diff(limits.robot.qpos_range[j])[0]
     return ExcitationRange(posture, low, high, (high - low) / float(full))
 
@@ -228,12 +254,16 @@ def _longest_run(mask: Array) -> tuple[int, int]:
 
 
 def _limb(model: mujoco.MjModel, operated: tuple[str, ...], joint: str) -> list[str]:
-    """Return the operated joints on the chain of `joint`: those that it carries and those that carry it."""
+    """Return the operated joints on the chain of `joint`: those that it carries and those that carry
+    it.
+    """
     body = {name: int(model.joint(name).bodyid[0]) for name in operated}
     mine = body[joint]
-    return [
-        name for name, b in body.items() if b in carriers(model, mine) or mine in carriers(model, b)
-    ]
+    limb = []
+    for name, other in body.items():
+        if other in carriers(model, mine) or mine in carriers(model, other):
+            limb.append(name)
+    return limb
 
 
 def carriers(model: mujoco.MjModel, body: int) -> set[int]:

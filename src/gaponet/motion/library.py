@@ -20,13 +20,14 @@ from gaponet.motion.feasible import (
 from gaponet.motion.motion import GRID, Motion, fade, move_time, through
 from gaponet.robot.spec import RobotSpec
 
-Signal = Callable[
-    [float, float, np.random.Generator, float], Array
-]  # (low, high, rng, dt) → (T,) rad
+# (low rad, high rad, generator, period s) → (T,) rad
+Signal = Callable[[float, float, np.random.Generator, float], Array]
 
 
 def sweep(low: float, high: float, rng: np.random.Generator, dt: float) -> Array:
-    """Up and down the whole interval: shows gravity over the range, and friction as the distance of the two ways."""
+    """Up and down the whole interval: shows gravity over the range, and friction as the distance of
+    the two ways.
+    """
     time = max((high - low) / 0.8, 2.5)
     return _line([low, high, low], [time, time], [0.5, 0.5, 0.5], dt)
 
@@ -34,13 +35,17 @@ def sweep(low: float, high: float, rng: np.random.Generator, dt: float) -> Array
 def creep(low: float, high: float, rng: np.random.Generator, dt: float) -> Array:
     """A few tenths of a radian at 0.1 rad/s, there and back: shows sticking, backlash and the Stribeck dip."""
     half = min(0.15, (high - low) / 2)
-    mid = rng.uniform(low + half, high - half) if high - low > 2 * half else (low + high) / 2
+    mid = (low + high) / 2
+    if high - low > 2 * half:
+        mid = rng.uniform(low + half, high - half)
     levels = [mid - half, mid + half, mid - half]
     return _ramps(levels, [0.1, 0.1], dt)
 
 
 def steps(low: float, high: float, rng: np.random.Generator, dt: float) -> Array:
-    """Quick moves of a quarter radian with rests between: shows delay, overshoot and where the joint comes to rest."""
+    """Quick moves of a quarter radian with rests between: shows delay, overshoot and where the joint
+    comes to rest.
+    """
     size = min(0.3, (high - low) / 3)
     levels = [float(rng.uniform(low + size, high - size))]
     while len(levels) < 7:
@@ -56,24 +61,30 @@ def trapezoids(low: float, high: float, rng: np.random.Generator, dt: float) -> 
 
 def chirp(low: float, high: float, rng: np.random.Generator, dt: float) -> Array:
     """0.15 → 2 Hz with falling amplitude: shows inertia, payload and resonance."""
-    duration, f0, f1 = 7.5, 0.15, 2.0
+    duration = 7.5  # s
+    first = 0.15  # Hz
+    last = 2.0  # Hz
+    peak_speed = 0.9  # rad/s
     time = np.arange(round(duration / dt)) * dt
-    growth = np.log(f1 / f0) / duration
-    frequency = f0 * np.exp(growth * time)
-    phase = 2 * np.pi * (frequency - f0) / growth
-    amplitude = np.minimum(min(0.35, (high - low) / 2), 0.9 / (2 * np.pi * frequency))  # 0.9 rad/s
+    growth = np.log(last / first) / duration
+    frequency = first * np.exp(growth * time)
+    phase = 2 * np.pi * (frequency - first) / growth
+    widest = min(0.35, (high - low) / 2)
+    amplitude = np.minimum(widest, peak_speed / (2 * np.pi * frequency))
     return _about(low, high, amplitude * np.sin(phase), rng, dt)
 
 
 def multisine(low: float, high: float, rng: np.random.Generator, dt: float) -> Array:
-    """Seven incommensurate sines from 0.1 to 1.6 Hz with random phases: many speeds at many positions."""
+    """Seven incommensurate sines from 0.1 to 1.6 Hz with random phases: many speeds at many
+    positions.
+    """
     time = np.arange(round(8.0 / dt)) * dt
     frequency = 0.1 * 1.59 ** np.arange(7) * rng.uniform(0.95, 1.05, 7)
     phase = rng.uniform(0, 2 * np.pi, 7)
-    wave = (np.sin(2 * np.pi * np.outer(time, frequency) + phase) / (1 + frequency / 0.2)).sum(
-        axis=1
-    )
-    return _about(low, high, wave * min(0.45, (high - low) / 2) / np.abs(wave).max(), rng, dt)
+    sines = np.sin(2 * np.pi * np.outer(time, frequency) + phase)
+    wave = (sines / (1 + frequency / 0.2)).sum(axis=1)
+    widest = min(0.45, (high - low) / 2)
+    return _about(low, high, wave * widest / np.abs(wave).max(), rng, dt)
 
 
 def holds(low: float, high: float, rng: np.random.Generator, dt: float) -> Array:
@@ -99,10 +110,10 @@ def _ramps(levels: Array | list[float], speeds: Array | list[float], dt: float) 
     kernel = np.hanning(max(3, round(0.3 / dt)))
     out = [np.full(round(0.5 / dt), levels[0])]
     for a, b, speed in zip(levels[:-1], levels[1:], speeds, strict=True):
+        before = np.full(len(kernel), a)
         line = np.linspace(a, b, max(2, round(abs(b - a) / speed / dt)))
-        ramp = np.concatenate(
-            [np.full(len(kernel), a), line, np.full(len(kernel) + round(0.2 / dt), b)]
-        )
+        after = np.full(len(kernel) + round(0.2 / dt), b)
+        ramp = np.concatenate([before, line, after])
         out.append(np.convolve(ramp, kernel / kernel.sum(), "valid"))
     return np.concatenate(out)
 
@@ -110,11 +121,9 @@ def _ramps(levels: Array | list[float], speeds: Array | list[float], dt: float) 
 def _about(low: float, high: float, wave: Array, rng: np.random.Generator, dt: float) -> Array:
     """The wave, faded in and out, about a random centre that keeps it inside the interval."""
     wave = wave * fade(len(wave), dt, 1.0)
-    centre = (
-        rng.uniform(low - wave.min(), high - wave.max())
-        if high - low > np.ptp(wave)
-        else (low + high) / 2
-    )
+    centre = (low + high) / 2
+    if high - low > np.ptp(wave):
+        centre = rng.uniform(low - wave.min(), high - wave.max())
     rest = np.zeros(round(0.5 / dt))
     return centre + np.concatenate([rest, wave, rest])
 
@@ -123,11 +132,16 @@ class Library:
     """Motions of one robot by name; joints' excitation ranges are cached."""
 
     def __init__(
-        self, robot: RobotSpec, seed: int = 0, max_payload: float = MAX_PAYLOAD, height: float | None = None,
+        self,
+        robot: RobotSpec,
+        seed: int = 0,
+        max_payload: float = MAX_PAYLOAD,
+        height: float | None = None,
         unchecked: bool = False,
-    ) -> None:  # fmt: skip
-        """Make the motions of a seed; height and unchecked as of Feasibility."""
-        self.robot, self.seed = robot, seed
+    ) -> None:
+        """Make the motions of a seed; the other arguments are those of Feasibility."""
+        self.robot = robot
+        self.seed = seed
         self.limits = Feasibility(robot, max_payload, height, unchecked)
         self.kit = Kit(self.limits)
         self._ranges: dict[str, ExcitationRange] = {}
@@ -142,12 +156,21 @@ class Library:
         self._given[motion.name] = self.limits.fit(motion)
 
     def names(self, variants: int = 1) -> list[str]:
-        """Return all names: <signal>-<joint>, <kind>-<side>-<variant> and <kind>-all-<variant>, and what was added."""
-        joint = [f"{signal}-{short(j)}" for j in self.robot.operated for signal in SIGNALS]
-        sides = [*self.kit.arms, "both"] if len(self.kit.arms) == 2 else list(self.kit.arms)
-        upper = [f"{b}-{side}-{v}" for v in range(variants) for b in BUILDERS for side in sides]
-        whole = [f"{kind}-all-{v}" for v in range(variants) for kind in available(self.kit)]
-        return joint + upper + whole + list(self._given)
+        """Return all names: <signal>-<joint>, <kind>-<side>-<variant>, <kind>-all-<variant>, and what
+        was added.
+        """
+        sides = list(self.kit.arms)
+        if len(sides) == 2:
+            sides.append("both")
+        names = []
+        for joint in self.robot.operated:
+            names += [f"{signal}-{short(joint)}" for signal in SIGNALS]
+        for variant in range(variants):
+            for kind in BUILDERS:
+                names += [f"{kind}-{side}-{variant}" for side in sides]
+        for variant in range(variants):
+            names += [f"{kind}-all-{variant}" for kind in available(self.kit)]
+        return names + list(self._given)
 
     def make(self, name: str) -> Motion:
         """Return the motion of that name.
@@ -157,27 +180,30 @@ class Library:
         """
         if name in self._given:
             return self._given[name]
-        parts = name.split("-")
-        rng = np.random.default_rng(
-            [self.seed, int(hashlib.sha256(name.encode()).hexdigest()[:8], 16)]
-        )
-        if parts[0] in SIGNALS and len(parts) == 2:
-            return self._joint(name, parts[0], parts[1], rng)
-        if (
-            parts[0] in BUILDERS
-            and len(parts) == 3
-            and (parts[1] in self.kit.arms or parts[1] == "both")
-        ):
-            sides = tuple(self.kit.arms) if parts[1] == "both" else (parts[1],)
-            return self._fitted(name, "upper_body", BUILDERS[parts[0]](self.kit, sides, rng))
-        if parts[0] in available(self.kit) and len(parts) == 3 and parts[1] == "all":
-            return self._fitted(name, "whole_body", WHOLE_BODY[parts[0]](self.kit, rng))
-        raise UsageError(
-            f"{self.robot.name} has no motion '{name}'; names are <signal>-<joint> with a signal of "
-            f"{', '.join(SIGNALS)} and a joint of {', '.join(short(j) for j in self.robot.operated)}, or "
-            f"<kind>-<side>-<variant> with a kind of {', '.join(BUILDERS)} and a side of "
-            f"{', '.join([*self.kit.arms, 'both']) if self.kit.arms else 'none (this robot has no arms by name)'}, "
-            f"or <kind>-all-<variant> with a kind of {', '.join(available(self.kit))}"
+        rng = np.random.default_rng([self.seed, _number(name)])
+        match name.split("-"):
+            case [signal, joint] if signal in SIGNALS:
+                return self._joint(name, signal, joint, rng)
+            case [kind, "both", _] if kind in BUILDERS:
+                ctrl = BUILDERS[kind](self.kit, tuple(self.kit.arms), rng)
+                return self._fitted(name, "upper_body", ctrl)
+            case [kind, side, _] if kind in BUILDERS and side in self.kit.arms:
+                ctrl = BUILDERS[kind](self.kit, (side,), rng)
+                return self._fitted(name, "upper_body", ctrl)
+            case [kind, "all", _] if kind in available(self.kit):
+                return self._fitted(name, "whole_body", WHOLE_BODY[kind](self.kit, rng))
+        raise UsageError(f"{self.robot.name} has no motion '{name}'; {self._forms()}")
+
+    def _forms(self) -> str:
+        """Say how motions are named."""
+        joints = ", ".join(short(joint) for joint in self.robot.operated)
+        sides = "none (this robot has no arms by name)"
+        if self.kit.arms:
+            sides = ", ".join([*self.kit.arms, "both"])
+        return (
+            f"names are <signal>-<joint> with a signal of {', '.join(SIGNALS)} and a joint of "
+            f"{joints}, or <kind>-<side>-<variant> with a kind of {', '.join(BUILDERS)} and a side "
+            f"of {sides}, or <kind>-all-<variant> with a kind of {', '.join(available(self.kit))}"
         )
 
     def excitation_range(self, joint: str) -> ExcitationRange:
@@ -201,11 +227,14 @@ class Library:
 
     def _fitted(self, name: str, level: str, ctrl: Array) -> Motion:
         """Make commands feasible; the motion names the operated joints and those that move."""
-        fitted, robot = self.limits.fit(Motion(name, level, GRID, ctrl)), self.robot
-        moved = fitted.moved(robot)
-        return replace(
-            fitted, joints=tuple(n for n in robot.joint_names if n in robot.operated or n in moved)
-        )
+        fitted = self.limits.fit(Motion(name, level, GRID, ctrl))
+        about = {*self.robot.operated, *fitted.moved(self.robot)}
+        return replace(fitted, joints=tuple(n for n in self.robot.joint_names if n in about))
+
+
+def _number(name: str) -> int:
+    """Return a number that a name stands for, the same on every machine."""
+    return int(hashlib.sha256(name.encode()).hexdigest()[:8], 16)
 
 
 def short(joint: str) -> str:

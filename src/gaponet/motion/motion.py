@@ -23,7 +23,8 @@ class Motion:
         level: joint, upper_body or whole_body.
         dt: Grid period of ctrl, s.
         ctrl: Targets of all joints in the robot's order, (T, n), rad.
-        joints: Names of those that it is about; on a robot the others stay where they are found. None: all.
+        joints: Names of those that it is about; on a robot the others stay where they are found.
+            None: all.
     """
 
     name: str
@@ -36,7 +37,8 @@ class Motion:
         ctrl = np.ascontiguousarray(self.ctrl, float)
         if ctrl.ndim != 2 or len(ctrl) < 2 or not np.isfinite(ctrl).all():
             raise UsageError(
-                f"motion '{self.name}': ctrl must be (T ≥ 2, n) finite numbers, got shape {ctrl.shape}"
+                f"motion '{self.name}': ctrl must be (T ≥ 2, n) finite numbers, got shape "
+                f"{ctrl.shape}"
             )
         if self.level not in LEVELS:
             raise UsageError(
@@ -51,7 +53,9 @@ class Motion:
         return len(self.ctrl) * self.dt
 
     def sample(self, dt: float) -> Array:
-        """Targets at a control period, (T', n): every k-th row where dt is k grid periods, else linear between rows."""
+        """Targets at a control period, (T', n): every k-th row where dt is k grid periods, else linear
+        between rows.
+        """
         stride = dt / self.dt
         if abs(stride - round(stride)) < 1e-9:
             return self.ctrl[:: round(stride)].copy()
@@ -65,7 +69,8 @@ class Motion:
 
     def held_at(self, qpos: Array, robot: RobotSpec) -> Motion:
         """The same with the joints that it does not name where they are in a posture (n,) rad."""
-        ctrl, named = np.repeat(qpos[None], len(self.ctrl), axis=0), robot.index(self.named(robot))
+        named = robot.index(self.named(robot))
+        ctrl = np.repeat(qpos[None], len(self.ctrl), axis=0)
         ctrl[:, named] = self.ctrl[:, named]
         return replace(self, ctrl=ctrl)
 
@@ -112,6 +117,8 @@ def move_time(distance: Array, speed: float, least: float = 0.5) -> Array:
 
 
 def fade(steps: int, dt: float, ramp: float) -> Array:
-    """A window (steps,) that rises from 0 to 1 within `ramp` s, stays, and falls back: oscillations start at rest."""
+    """A window (steps,) that rises from 0 to 1 within `ramp` s, stays, and falls back: oscillations
+    start at rest.
+    """
     time = np.arange(steps) * dt
     return blend(time / ramp) * blend((time[-1] - time) / ramp)

@@ -31,7 +31,14 @@ class Trajectory:
     def minimum_jerk(
         cls, points: Array, speed: float, acceleration: float, least: float
     ) -> Trajectory:
-        """Return the fastest trajectory within peak speed (rad/s) and acceleration (rad/s²), of at least `least` s."""
+        """Return the fastest trajectory within limits.
+
+        Args:
+            points: (k, n) rad.
+            speed: Peak speed, rad/s.
+            acceleration: Peak acceleration, rad/s².
+            least: Least duration, s.
+        """
         far = np.abs(np.diff(points, axis=0)).max(axis=1)
         legs = move_time(far, speed, least if len(points) == 2 else MIN_LEG_S)
         legs = np.maximum(legs, np.sqrt(PEAK_ACCELERATION * far / acceleration))
@@ -46,8 +53,10 @@ class Trajectory:
     def at(self, time: float) -> Array:
         """Return the posture at a time, (n,) rad."""
         leg = min(max(int(np.searchsorted(self.times, time)) - 1, 0), len(self.times) - 2)
-        (a, b), (since, until) = self.points[leg : leg + 2], self.times[leg : leg + 2]
-        return a + float(blend(np.array((time - since) / (until - since)))) * (b - a)
+        a, b = self.points[leg : leg + 2]
+        since, until = self.times[leg : leg + 2]
+        share = np.array((time - since) / (until - since))
+        return a + float(blend(share)) * (b - a)
 
     def rows(self, dt: float) -> Array:
         """Return postures at a period of dt s, both ends included, (T, n) rad."""
@@ -57,7 +66,8 @@ class Trajectory:
 
 def line(a: Array, b: Array) -> Array:
     """Return postures from a to b (n,) rad, at most POSTURE_STEP_RAD apart, both included, (T, n)."""
-    return np.linspace(a, b, max(2, int(np.ceil(np.abs(b - a).max() / POSTURE_STEP_RAD)) + 1))
+    steps = int(np.ceil(np.abs(b - a).max() / POSTURE_STEP_RAD))
+    return np.linspace(a, b, max(1, steps) + 1)
 
 
 def finish_search(search: Search[_T]) -> _T:
@@ -70,7 +80,8 @@ def finish_search(search: Search[_T]) -> _T:
 
 
 def find_points(free: Free, start: Array, goal: Array, home: Array) -> Search[Array | None]:
-    """Return points (k, n) rad of a free path from start to goal, straight if possible, else by way of home.
+    """Return points (k, n) rad of a free path from start to goal, straight if possible, else by way
+    of home.
 
     None if neither is free. Nothing else is tried: a person decides how a robot gets out of a place.
 
