@@ -23,6 +23,7 @@ import numpy as np
 from by_seed import Row, measure_seeds, plus_minus, print_table
 
 from gaponet.data.sequence import Sequence, SequenceMeta
+from gaponet.robot.servo_fields import Term
 from gaponet.robot.spec import RobotSpec, load_robot
 from gaponet.sim.batch import Batch
 from gaponet.sim.model import STIFF_MOBILITY, STIFF_SOLIMP, STIFF_SOLREF, build_model
@@ -180,7 +181,7 @@ class PlayRobot:
         return Sequence(meta, names, DT, ctrl, qpos, np.gradient(qpos, DT, axis=0))
 
 
-def result(robot: PlayRobot, terms: tuple[str, ...] | None = None) -> dict[str, object]:
+def result(robot: PlayRobot, terms: tuple[Term, ...] | None = None) -> dict[str, object]:
     """Identify a robot from its logs; return widths, standard errors, the verdict and errors of new motions."""
     ctrl = np.stack([robot.commands(k) for k in range(MOTIONS)])
     logs, spec = robot.record(ctrl, [f"m{k:02}" for k in range(MOTIONS)]), robot.spec()

@@ -508,7 +508,9 @@ def main() -> int:
     )
     parser.add_argument("--seed", type=int, default=0, help="of the moments")
     args = parser.parse_args()
-    work, found, wrong = args.work.resolve(), {}, 0
+    work = args.work.resolve()
+    found: dict[str, Any] = {}
+    wrong = 0
     wanted = args.trials.split(",")
     if not (work / "input").is_dir():
         prepare(work / "input")

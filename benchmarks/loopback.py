@@ -12,6 +12,7 @@ import json
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -75,7 +76,9 @@ def main(
     print(json.dumps({k: v for k, v in result.items() if k not in ("kp", "kd")}, indent=1))
 
 
-def swing(home: np.ndarray, seconds: float, rate: float):
+def swing(
+    home: np.ndarray, seconds: float, rate: float
+) -> Callable[[int, object], np.ndarray | None]:
     """Return a policy that moves elbows and shoulder pitch at 0.25 Hz."""
 
     def policy(k: int, state: object) -> np.ndarray | None:

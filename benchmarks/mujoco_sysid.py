@@ -42,7 +42,9 @@ def mujoco_sysid(question: Question) -> FittedSim:
 
 def fit(problem: Problem, links: tuple[str, ...] = ()) -> tuple[sysid.ParameterDict, Any]:
     """Fit servos, and the pseudo-inertia of links; return parameters and the optimizer's result."""
-    robot, windows, window_of = problem.robot, [], {}
+    robot = problem.robot
+    windows = []
+    window_of: dict[int, int] = {}  # identity of an object of a window → its number
     for w, (spec, state) in enumerate(zip(problem.specs, problem.states, strict=True)):
         commands = problem.controls(np.zeros(len(problem.op)), w)
         times = np.arange(len(commands) + 1) * spec.option.timestep
@@ -95,9 +97,10 @@ def fit(problem: Problem, links: tuple[str, ...] = ()) -> tuple[sysid.ParameterD
         models_sequences=windows, build_model=build, custom_rollout=rollout, modify_residual=residual,
         resample_true=False,
     )  # fmt: skip
-    params, bounds = sysid.ParameterDict(), (problem.start, problem.low, problem.high)
+    params = sysid.ParameterDict()
+    limits = (problem.start, problem.low, problem.high)
     for field, start, low, high in zip(
-        FIELDS, *(np.split(x, len(FIELDS)) for x in bounds), strict=True
+        FIELDS, *(np.split(x, len(FIELDS)) for x in limits), strict=True
     ):
         params.add(sysid.Parameter(field, start, low, high))
     for name in links:

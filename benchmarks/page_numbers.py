@@ -11,6 +11,7 @@ import json
 import re
 import sys
 import tomllib
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -39,10 +40,14 @@ def value(source: str) -> str:
         LookupError: The file has no such number.
     """
     kind, *words = [word.strip() for word in source.split(";")]
-    read = {"real": _real, "paper": _paper, "step": _step, "commit": _commit, "seconds": _seconds}[
-        kind
-    ]
-    return read(*words).replace("-", "−")
+    readers: dict[str, Callable[..., str]] = {
+        "real": _real,
+        "paper": _paper,
+        "step": _step,
+        "commit": _commit,
+        "seconds": _seconds,
+    }
+    return readers[kind](*words).replace("-", "−")
 
 
 def _real(question: str, method: str, field: str, form: str) -> str:

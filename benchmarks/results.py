@@ -116,8 +116,9 @@ def write(answers: dict[str, dict[str, Any]], work: Path) -> None:
     page = [STEPS_HEAD]
     page.append("| step | command | seeds | measured | minutes |\n| --- | --- | --- | --- | ---: |")
     for name, (command, seeds) in STEPS.items():
-        a = kept.get(name)
-        done = f"{measured(a)} | {a['seconds'] / 60:.1f}" if a else "– | –"
+        done = "– | –"
+        if name in kept:
+            done = f"{measured(kept[name])} | {kept[name]['seconds'] / 60:.1f}"
         page.append(
             f"| {name} | `{filled(command, Path('WORK'), Path('DATA'))}` | {seeds} | {done} |"
         )

@@ -38,7 +38,6 @@ from shipping import (
 import gaponet
 from gaponet import api
 from gaponet.base.errors import UsageError
-from gaponet.data.split import SPLITS
 from gaponet.data.store import Dataset
 from gaponet.evaluation.candidate import read_origin
 from gaponet.export.plain_servos import CACHE, fit_plain_servos, read_recordings, rollout_error
@@ -129,7 +128,11 @@ def write_robot(folder: Path, made: Path, dataset: Dataset, card: Card, limits: 
     origin = read_origin(folder)
     if origin is None or robot.nominal is None:
         raise UsageError(f"{folder}: was not written by gaponet identify")
-    parts = {part: without_names(origin["parts"][part]) for part in SPLITS}
+    parts = {
+        "train": without_names(origin["parts"]["train"]),
+        "val": without_names(origin["parts"]["val"]),
+        "test": without_names(origin["parts"]["test"]),
+    }
     write_json_line(made / PROVENANCE_FILE, dict(origin) | {"dataset": card.name, "parts": parts})
     uncertainty = json.loads((folder / UNCERTAINTY_FILE).read_text(encoding="utf-8"))
     write_json_line(made / UNCERTAINTY_FILE, uncertainty)

@@ -110,7 +110,8 @@ def _correction(model: GapModel, states: Array) -> Turn:
     def step() -> Array:
         nonlocal k
         k = (k + 1) % len(states)
-        return loop.delta(*states[k], 1.0)
+        qpos, qvel, ctrl = states[k]
+        return loop.delta(qpos, qvel, ctrl, 1.0)
 
     return step
 

@@ -20,6 +20,7 @@ import numpy as np
 from by_seed import Row, measure_seeds, plus_minus, print_table
 
 from gaponet.data.sequence import Sequence, SequenceMeta
+from gaponet.robot.servo_fields import Term
 from gaponet.robot.spec import RobotSpec, load_robot
 from gaponet.sim.replay import motion_errors
 from gaponet.sysid.identify import identify
@@ -29,7 +30,7 @@ from gaponet.virtual.virtual_robot import VirtualRobot
 
 DT, ROWS, FITTED, VALIDATED, MOTIONS = 0.02, 200, 6, 10, 16
 NORMAL_90, KT_PER_KELVIN, DERATING_PER_KELVIN, COUNT_RAD = 1.645, 0.001, 0.005, 2 * np.pi / 4096
-OTHER_TERMS = ("stribeck", "load", "backlash")
+OTHER_TERMS: tuple[Term, ...] = ("stribeck", "load", "backlash")
 XML = """<mujoco><compiler angle="radian" autolimits="true"/><option integrator="implicitfast"/>
 <default><joint axis="0 1 0" range="-2.5 2.5"/><geom type="capsule" size="0.02" contype="0" conaffinity="0"/></default>
 <worldbody>{}</worldbody></mujoco>"""

@@ -70,7 +70,7 @@ def call(*words: object) -> str:
         try:
             code = gaponet(list(map(str, words)))
         except SystemExit as end:  # the command line was not understood
-            code = end.code
+            code = end.code if isinstance(end.code, int) else 1
     if code:
         told = (out.getvalue() + said.getvalue()).strip().splitlines()
         raise RefusedError(f"{words[0]} ended with {code}: {' '.join(told[-3:])}")
@@ -270,7 +270,8 @@ def losers(rows: list[Row]) -> list[str]:
             mrad = [
                 f"{1e3 * r[k]:.2f}" if k in r else "–" for k in ("nominal", "identified", "plain")
             ]
-            why = r.get("refused", r.get("plain_refused", ""))[:160].replace("|", "/")
+            refused = str(r.get("refused") or r.get("plain_refused") or "")
+            why = refused[:160].replace("|", "/")
             effects = ", ".join(r["effects"]) or "of the form"
             robot = f"{r['seed']} | {r['body']} | {r['joints']} | {r['rate']:g}"
             said.append(f"| {robot} | {effects} | {' | '.join(mrad)} | {why} |")

@@ -174,7 +174,7 @@ def _evaluated(
         "frictionloss": 0.05 + unit.friction, "delay": unit.delay + 0 * op, "armature": 0.02 + 0.0 * op,
         "offset": 0.0 * op,
     }  # fmt: skip
-    z = {kind: {f: [] for f in truth} for kind in KINDS}
+    z: dict[str, dict[str, list[float]]] = {kind: {f: [] for f in truth} for kind in KINDS}
     for i, joint in enumerate(robot.operated):
         at, cov = mine.si(joint)
         for f, v in truth.items():

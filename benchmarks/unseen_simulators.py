@@ -27,6 +27,7 @@ from __future__ import annotations
 import argparse
 import json
 from collections.abc import Callable
+from collections.abc import Sequence as ListOf
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -40,6 +41,7 @@ from gaponet.data.sequence import Sequence
 from gaponet.data.store import Dataset
 from gaponet.deploy.transfer import TransferCorrector
 from gaponet.nn.artifact import GapModel
+from gaponet.nn.config import ModelKind
 from gaponet.nn.loop import DeltaCorrector
 from gaponet.nn.onnx_export import trained_network
 from gaponet.nn.onnx_network import Network
@@ -80,7 +82,7 @@ class Row:
         payload: The network is told the payload.
     """
 
-    kind: str
+    kind: ModelKind
     simulators: int
     context: bool = False
     payload: bool = True
@@ -158,7 +160,8 @@ def test(arguments: argparse.Namespace) -> None:
     dataset, robot = open_dataset(arguments.dataset)
     robot = robot.before_identification
     by_payload = test_recordings(dataset, arguments)
-    groups = {"nominal": [None], **test_simulators(len(robot.joint_names))}
+    groups: dict[str, ListOf[SimulatorChange | None]] = {"nominal": [None]}
+    groups.update(test_simulators(len(robot.joint_names)))
     methods = all_methods(arguments, robot)
     found: dict[str, dict[str, list[list[float]]]] = {name: {} for name in methods}
     for group, simulators in groups.items():
@@ -181,12 +184,12 @@ def test(arguments: argparse.Namespace) -> None:
 def test_recordings(dataset: Dataset, arguments: argparse.Namespace) -> dict[float, list[Sequence]]:
     """Return payload, kg → pieces of the test recordings, at most MAX_RECORDINGS of each."""
     split = json.loads(next(arguments.out.glob("*/model/card.json")).read_text())["motions"]
-    chosen = [e for e in dataset.entries if e.motion in split["test"] or arguments.all]
+    chosen = [e for e in dataset.entries if e.meta.motion in split["test"] or arguments.all]
     if arguments.rates:
         chosen = [e for e in chosen if round(1 / e.dt) in arguments.rates]
     by_payload: dict[float, list[Sequence]] = {}
-    for kg in sorted({e.payload_mass for e in chosen}):
-        same = [e for e in chosen if e.payload_mass == kg]
+    for kg in sorted({e.meta.payload_mass for e in chosen}):
+        same = [e for e in chosen if e.meta.payload_mass == kg]
         steps = np.linspace(0, len(same) - 1, min(MAX_RECORDINGS, len(same)))
         cut = []
         for whole in dataset.sequences([same[round(i)] for i in steps]):
@@ -206,20 +209,25 @@ def all_methods(arguments: argparse.Namespace, robot: RobotSpec) -> dict[str, li
         folders = [run_folder(arguments.out, name, seed) for seed in range(arguments.seeds)]
         models[name] = [GapModel.load(f) for f in folders if (f / "model" / "card.json").is_file()]
 
-    def corrected(make: Callable[[], Corrector]) -> Errors:
-        return lambda placed: float(rollout_errors(placed, robot, 1, make()).mean())
+    def corrected(make: Callable[[GapModel], Corrector], model: GapModel) -> Errors:
+        return lambda placed: float(rollout_errors(placed, robot, 1, make(model)).mean())
+
+    def plain(model: GapModel) -> Corrector:
+        return DeltaCorrector(model.infer, model.config, robot)
+
+    def told_another(model: GapModel) -> Corrector:
+        return OtherContext(model, robot)
+
+    def transferred(model: GapModel) -> Corrector:
+        return TransferCorrector(model, robot, extrapolate=True)
 
     for name, loaded in models.items():
-        methods[name] = [
-            corrected(lambda m=m: DeltaCorrector(m.infer, m.config, robot)) for m in loaded
-        ]
-    told = models["GAPONet + context"]
+        methods[name] = [corrected(plain, model) for model in loaded]
     methods["GAPONet + context of another simulator"] = [
-        corrected(lambda m=m: OtherContext(m, robot)) for m in told
+        corrected(told_another, model) for model in models["GAPONet + context"]
     ]
     methods["GAPONet, one simulator, transferred"] = [
-        corrected(lambda m=m: TransferCorrector(m, robot, extrapolate=True))
-        for m in models["GAPONet, one simulator"]
+        corrected(transferred, model) for model in models["GAPONet, one simulator"]
     ]
     if arguments.literal:
         refits = literal_refits(arguments, robot, models[LITERAL])
@@ -241,7 +249,7 @@ def literal_refits(
     """Return the literal networks with the pieces of recordings at which their predictor is fitted again."""
     dataset, _ = open_dataset(arguments.trained_on or arguments.dataset)
     motions = models[0].card["motions"]["train"]
-    entries = [e for e in dataset.entries if e.motion in motions]
+    entries = [e for e in dataset.entries if e.meta.motion in motions]
     if arguments.rates:
         entries = [e for e in entries if round(1 / e.dt) in arguments.rates]
     steps = np.linspace(0, len(entries) - 1, min(MAX_RECORDINGS, len(entries)))
@@ -315,7 +323,7 @@ class OtherContext(DeltaCorrector):
         super().__init__(model.infer, model.config, robot)
         self.other = SimulatorRanges().draw(len(robot.joint_names), 1, TEST_SEED + 3)[0]
 
-    def reset(self, start: list[Sequence]) -> None:
+    def reset(self, start: ListOf[Sequence]) -> None:
         super().reset(start)
         assert self.loop is not None
         conditions = [Condition.of(replace(s, simulator=self.other), self.robot) for s in start]
@@ -337,7 +345,8 @@ def table(found: dict[str, dict[str, list[list[float]]]]) -> ResultTable:
             cells.append(f"{text} ({seeds})")
         lines.append(cells)
     heads = ["error over uncorrected", *next(iter(found.values()))]
-    return ResultTable("unseen_simulators", heads, lines)
+    rows = tuple(tuple(cells) for cells in lines)
+    return ResultTable("unseen_simulators", tuple(heads), rows)
 
 
 def main() -> None:

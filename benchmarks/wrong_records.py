@@ -43,7 +43,7 @@ class Truth:
     """A drawn robot and what it did: times (k,), commands, positions, velocities and torques (k, n), SI."""
 
     robot: RobotSpec
-    motions: list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]]
+    motions: list[tuple[np.ndarray, ...]]
 
 
 @dataclass
@@ -126,13 +126,13 @@ def rounded(values: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     return np.round(values / step) * step
 
 
-def good(motion, rng: np.random.Generator) -> Record:
+def good(motion: tuple[np.ndarray, ...], rng: np.random.Generator) -> Record:
     """What a careful logger writes."""
     time, ctrl, qpos, _, tau = sampled(motion, rng)
     return Record(time, rounded(ctrl, rng), rounded(qpos, rng), tau if rng.random() < 0.5 else None)
 
 
-def copied(motion, rng: np.random.Generator) -> Record:
+def copied(motion: tuple[np.ndarray, ...], rng: np.random.Generator) -> Record:
     """The command is the position of a row before or after."""
     time, _, qpos, _, tau = sampled(motion, rng)
     qpos = rounded(qpos, rng)
@@ -147,7 +147,7 @@ def copied(motion, rng: np.random.Generator) -> Record:
     )
 
 
-def not_measured(motion, rng: np.random.Generator) -> Record:
+def not_measured(motion: tuple[np.ndarray, ...], rng: np.random.Generator) -> Record:
     """The position is the command of a row before, rounded otherwise."""
     time, ctrl, _, _, _ = sampled(motion, rng)
     shift = int(rng.integers(1, 4))
@@ -155,14 +155,14 @@ def not_measured(motion, rng: np.random.Generator) -> Record:
     return Record(time[3:], ctrl[3:], np.round(np.roll(ctrl, shift, axis=0)[3:], digits))
 
 
-def by_torque(motion, rng: np.random.Generator) -> Record:
+def by_torque(motion: tuple[np.ndarray, ...], rng: np.random.Generator) -> Record:
     """Torque or current was the command; the position's column stands for the command."""
     time, _, qpos, _, tau = sampled(motion, rng)
     qpos = rounded(qpos, rng)
     return Record(time, qpos, qpos, tau / rng.uniform(0.05, 2.0))
 
 
-def two_clocks(motion, rng: np.random.Generator) -> Record:
+def two_clocks(motion: tuple[np.ndarray, ...], rng: np.random.Generator) -> Record:
     """A second column runs like a clock at another rate."""
     record = good(motion, rng)
     ratio = float(rng.choice([rng.uniform(0.2, 0.9), rng.uniform(1.1, 6)]))
@@ -176,7 +176,7 @@ def two_clocks(motion, rng: np.random.Generator) -> Record:
     return record
 
 
-def velocity(motion, rng: np.random.Generator) -> Record:
+def velocity(motion: tuple[np.ndarray, ...], rng: np.random.Generator) -> Record:
     """A velocity stands where command or position is expected."""
     time, ctrl, qpos, qvel, _ = sampled(motion, rng)
     told = np.gradient(ctrl, time, axis=0)
@@ -185,7 +185,7 @@ def velocity(motion, rng: np.random.Generator) -> Record:
     return Record(time, rounded(ctrl, rng), rounded(qvel, rng))
 
 
-def exchanged(motion, rng: np.random.Generator) -> Record:
+def exchanged(motion: tuple[np.ndarray, ...], rng: np.random.Generator) -> Record:
     """Positions of joints stand under each other's names."""
     record = good(motion, rng)
     n = record.qpos.shape[1]
@@ -276,7 +276,7 @@ def main() -> int:
     parser.add_argument("--keep", action="store_true", help="keep logs that pass in silence")
     args = parser.parse_args()
     rng = np.random.default_rng(args.seed)
-    truths = []
+    truths = list[Truth]()
     for k in range(ROBOTS):
         robot = draw_robot(args.work / f"robot{args.seed}_{k}", rng)
         truths.append(Truth(robot, [play(robot, rng) for _ in range(MOTIONS)]))
