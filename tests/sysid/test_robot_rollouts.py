@@ -8,6 +8,8 @@ from arm import recordings, write_arm
 
 from gaponet.sim.replay import replay
 from gaponet.sysid.axes import CLASSIC, Bounds
+from gaponet.sysid.joint_rollouts import JointRollouts
+from gaponet.sysid.problem import JointFit
 from gaponet.sysid.robot_rollouts import RobotRollouts, cut
 
 
@@ -77,3 +79,21 @@ def test_damping_below_zero_is_taken_from_the_servo(robot, parts):
     written = less.with_servos({"elbow": {"damping": -0.3}})
     assert written.kd.tolist() == pytest.approx([0.4, 0.1])
     assert (written.damping[1], written.nominal.kd[1]) == (0.0, 0.4)
+
+
+def test_a_search_goes_on_with_the_better_of_its_starts(robot, parts):
+    fit = JointFit(JointRollouts(parts, robot), robot, Bounds(robot, parts)).robot_fit(1)
+    file = fit.bounds.start
+    real = file | {"kp": 0.6 * file["kp"]}
+    search = fit.search(CLASSIC, file, (file, real))
+    errors = []
+    for _ in range(2):
+        search.iterate(1)
+        search.keep_better_starts()
+        errors.append(np.abs(fit.rollouts.flat_errors(alone(search.values))).mean())
+    assert errors[1] <= errors[0]
+    np.testing.assert_allclose(search.values["kp"], real["kp"], rtol=0.1)
+
+
+def alone(values):
+    return {f: x[None] for f, x in values.items()}

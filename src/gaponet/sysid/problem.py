@@ -208,28 +208,9 @@ class RobotFit(FitProblem):
 
     rollouts: RobotRollouts
 
-    def descend(
-        self, fields: ListOf[str], rest: Values, starts: ListOf[Values], iterations: ListOf[int], *,
-        report: Progress = lambda cost: None,
-    ) -> Values:  # fmt: skip
-        """Fit fields from starts (n,), the better of which go on after each number of iterations; return values (n,).
-
-        A joint's parameters are judged by the joint's own error. Fields of `rest` that are not fitted stay.
-        """
-        axes = Axes(self.bounds, fields, rest)
-        x, cost = (
-            np.stack([axes.normalize(v) for v in starts]),
-            np.zeros((len(starts), self.bounds.n)),
-        )
-        for i, count in enumerate(iterations):
-            errors = self.of_axes(axes)
-            x, cost = descend(x, axes.low, axes.high, errors, count, report, MIN_COST_DECREASE)
-            self.prior.update_residual(cost.min(axis=0), self.rollouts.rows)
-            if i < len(iterations) - 1:
-                # The better start of every joint; and the start that is better in the sum over joints.
-                x = np.concatenate([better_half(x, cost)[:1], x[[cost.sum(axis=1).argmin()]]])
-                x = x[:1] if np.array_equal(x[0], x[1]) else x
-        return {f: v[0].copy() for f, v in axes.values(x[[cost.sum(axis=1).argmin()]]).items()}
+    def search(self, fields: ListOf[str], rest: Values, starts: ListOf[Values]) -> RobotSearch:
+        """Return a search for fields from starts (n,); fields of `rest` that are not fitted stay."""
+        return RobotSearch(self, Axes(self.bounds, fields, rest), starts)
 
     def descend_chains(
         self, values: Values, report: Callable[[tuple[str, ...], Array], Progress]
@@ -255,6 +236,49 @@ class RobotFit(FitProblem):
             x, low, high, errors, iterations, report(names, rows), MIN_CHAIN_COST_DECREASE
         )
         return {f: v[0].copy() for f, v in axes.values(chains.unpack(x)).items()}
+
+
+class RobotSearch:
+    """A search for parameters of all joints together, which may stop after any iterations and go on later.
+
+    A joint's parameters are judged by the joint's own error.
+    """
+
+    def __init__(self, fit: RobotFit, axes: Axes, starts: ListOf[Values]) -> None:
+        """Begin at starts (n,)."""
+        self._fit = fit
+        self._axes = axes
+        self._x = np.stack([axes.normalize(v) for v in starts])  # (starts, n, P)
+        self._cost = np.zeros((len(starts), fit.bounds.n))
+
+    def iterate(self, count: int, report: Progress = lambda cost: None) -> None:
+        """Go on for at most `count` iterations."""
+        errors = self._fit.of_axes(self._axes)
+        low = self._axes.low
+        high = self._axes.high
+        self._x, self._cost = descend(self._x, low, high, errors, count, report, MIN_COST_DECREASE)
+        self._fit.prior.update_residual(self._cost.min(axis=0), self._fit.rollouts.rows)
+
+    def keep_better_starts(self) -> None:
+        """Keep the better start of every joint, and the start that is better in the sum over joints if it differs."""
+        x = better_half(self._x, self._cost)[:1]
+        cost = self._cost.min(axis=0)[None]
+        of_robot = self._least()
+        if not np.array_equal(x, self._x[of_robot]):
+            x = np.concatenate([x, self._x[of_robot]])
+            cost = np.concatenate([cost, self._cost[of_robot]])
+        self._x = x
+        self._cost = cost
+
+    @property
+    def values(self) -> Values:
+        """Values (n,) of the best start."""
+        best = self._x[self._least()]
+        return {f: v[0].copy() for f, v in self._axes.values(best).items()}
+
+    def _least(self) -> list[int]:
+        """Return the number of the start with the least cost in the sum over joints, alone in a list."""
+        return [int(self._cost.sum(axis=1).argmin())]
 
 
 class KinematicChains:

@@ -12,7 +12,8 @@ from gaponet.base.progress import Progress
 from gaponet.sysid.joint_rollouts import ERROR_SCALE_RAD
 from gaponet.sysid.problem import CHAIN_ITERATIONS, SEARCH_ITERATIONS
 
-ROBOT_ITERATIONS = (2, 3)  # of the whole robot: from both starts, from the better one
+FIRST_ROBOT_ITERATIONS = 2  # of the whole robot, from both starts
+ROBOT_ITERATIONS = 3  # of the whole robot afterwards, from the better one
 POLISH_ITERATIONS = 2  # of the whole robot with a term of the servo model
 JOINTS_TIME_SHARE = 0.3  # of a time budget
 ROBOT_TIME_SHARE = 0.4
@@ -34,7 +35,7 @@ class SearchProgress:
             progress: Called with iterations done, in all, and what is fitted with its error.
         """
         joints = sum(SEARCH_ITERATIONS)
-        robot = sum(ROBOT_ITERATIONS) + CHAIN_ITERATIONS
+        robot = FIRST_ROBOT_ITERATIONS + ROBOT_ITERATIONS + CHAIN_ITERATIONS
         iterations = [joints] * fits
         iterations += [robot * fits]
         iterations += [joints + POLISH_ITERATIONS] * (fits * steps)

@@ -7,8 +7,12 @@ import time
 from gaponet.sysid.acceptance import MIN_JUDGES
 from gaponet.sysid.axes import CLASSIC, Values
 from gaponet.sysid.least_squares import DAMPING_FACTORS
-from gaponet.sysid.problem import JointFit, RobotFit
-from gaponet.sysid.search_progress import ROBOT_ITERATIONS, SearchProgress
+from gaponet.sysid.problem import JointFit, RobotFit, RobotSearch
+from gaponet.sysid.search_progress import (
+    FIRST_ROBOT_ITERATIONS,
+    ROBOT_ITERATIONS,
+    SearchProgress,
+)
 from gaponet.sysid.steps.step import Fits, FitState
 
 MAX_LOSS_OF_FIRST_ITERATIONS = 0.05  # share of the error; see `robot_candidates`
@@ -65,12 +69,18 @@ def robot_candidates(
     judge = fits.judge
     if not _has_time_for_iterations(fits, robots, alone):
         return {}
+    starts = zip(robots, alone, strict=True)
+    searches = [r.search(CLASSIC, r.bounds.start, (own, r.bounds.start)) for r, own in starts]
+    _iterate(fits, robots, searches, FIRST_ROBOT_ITERATIONS)
     if len(set(judge.names.tolist())) >= MIN_JUDGES:
-        first = _fit_together(fits, robots, alone, ROBOT_ITERATIONS[:1])
+        first = [search.values for search in searches]
         largest = (1 + MAX_LOSS_OF_FIRST_ITERATIONS) * judge.errors(alone).mean()
         if judge.errors(first).mean() > largest:
             return {}
-    whole_robot = _fit_together(fits, robots, alone, ROBOT_ITERATIONS)
+    for search in searches:
+        search.keep_better_starts()
+    _iterate(fits, robots, searches, ROBOT_ITERATIONS)
+    whole_robot = [search.values for search in searches]
     if fits.progress.search_is_over():
         return {"whole": whole_robot, "limbs": whole_robot}
     chains = []
@@ -97,16 +107,13 @@ def _has_time_for_iterations(fits: Fits, robots: list[RobotFit], alone: list[Val
     starts = 2
     candidates = starts * (len(CLASSIC) + 1 + len(DAMPING_FACTORS))
     rows = sum(len(part) for robot in robots for part in robot.rollouts.parts)
-    return fits.progress.has_time_for(seconds_per_row * rows * candidates * ROBOT_ITERATIONS[0])
+    return fits.progress.has_time_for(seconds_per_row * rows * candidates * FIRST_ROBOT_ITERATIONS)
 
 
-def _fit_together(
-    fits: Fits, robots: list[RobotFit], alone: list[Values], iterations: tuple[int, ...]
-) -> list[Values]:
-    """Return the fits of all joints together, from values of single joints and from the robot's file."""
-    fitted = []
-    for robot, own in zip(robots, alone, strict=True):
+def _iterate(
+    fits: Fits, robots: list[RobotFit], searches: list[RobotSearch], iterations: int
+) -> None:
+    """Go on with the searches for all joints together."""
+    for robot, search in zip(robots, searches, strict=True):
         report = fits.progress.reporter("whole robot", robot.robot.operated, robot.rollouts.rows)
-        file = robot.bounds.start
-        fitted.append(robot.descend(CLASSIC, file, (own, file), iterations, report=report))
-    return fitted
+        search.iterate(iterations, report)

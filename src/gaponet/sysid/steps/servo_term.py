@@ -67,8 +67,9 @@ class ServoTerm:
         report = self._fits.progress.reporter(
             f"{self.name}, whole robot", robot.robot.operated, robot.rollouts.rows
         )
-        fields = robot_fields(values)
-        return robot.descend(fields, values, (values,), (POLISH_ITERATIONS,), report=report)
+        search = robot.search(robot_fields(values), values, (values,))
+        search.iterate(POLISH_ITERATIONS, report)
+        return search.values
 
 
 class Backlash(ServoTerm):
