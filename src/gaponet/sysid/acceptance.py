@@ -63,28 +63,33 @@ def cross_validation(
     Motions of one set of joints are dealt out to the folds. A set with a single motion is fitted in every fold.
     """
     every = [*sequences, *validation]
-    judges, motions = (
-        {joints: hash_order(s.meta.independent_motion for s in part if s.meta.unrecorded == joints)
-         for joints in {s.meta.unrecorded for s in part}} for part in (validation, every)
-    )  # fmt: skip
-    enough = min(
-        (len(judges.get(joints, ())) for joints, names in motions.items() if len(names) > 1),
-        default=0,
-    )
+    motions = _motions(every)
+    judges = _motions(validation)
+    several = [joints for joints, names in motions.items() if len(names) > 1]
+    enough = min((len(judges.get(joints, ())) for joints in several), default=0)
     count = min(folds, max(map(len, motions.values())))
     few = len({s.meta.independent_motion for s in every}) < MIN_CROSS_VALIDATED
     if not validation or enough >= MIN_JUDGES or count < 2 or few:
         return [(list(sequences), list(validation))]
-    fold = {
-        (joints, name): i % count
-        for joints, names in motions.items()
-        if len(names) > 1
-        for i, name in enumerate(names)
-    }
-    pairs = [(s, fold.get((s.meta.unrecorded, s.meta.independent_motion))) for s in every]
-    return [
-        ([s for s, k in pairs if k != i], [s for s, k in pairs if k == i]) for i in range(count)
-    ]
+    fold = {}
+    for joints in several:
+        for i, name in enumerate(motions[joints]):
+            fold[joints, name] = i % count
+    fold_of = [fold.get((s.meta.unrecorded, s.meta.independent_motion)) for s in every]
+    splits = []
+    for i in range(count):
+        fitted = [s for s, k in zip(every, fold_of, strict=True) if k != i]
+        held_out = [s for s, k in zip(every, fold_of, strict=True) if k == i]
+        splits.append((fitted, held_out))
+    return splits
+
+
+def _motions(sequences: ListOf[Sequence]) -> dict[tuple[str, ...], list[str]]:
+    """Return joints that recordings do not hold → names of their independent motions, in the order of their hashes."""
+    names: dict[tuple[str, ...], list[str]] = {}
+    for s in sequences:
+        names.setdefault(s.meta.unrecorded, []).append(s.meta.independent_motion)
+    return {joints: hash_order(motions) for joints, motions in names.items()}
 
 
 @dataclass(frozen=True)

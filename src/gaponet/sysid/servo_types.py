@@ -6,7 +6,7 @@ import json
 import re
 from collections.abc import Sequence as ListOf
 from dataclasses import fields, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.stats import norm
@@ -34,37 +34,46 @@ def servos_like(robot: RobotSpec, like: RobotSpec) -> tuple[RobotSpec, dict[str,
     Raises:
         UsageError: No joint corresponds.
     """
-    before, changed = like.before_identification, identified_joints(like)
-    sources: dict[str, str] = {}
-    for i, joint in zip(robot.operated_index, robot.operated, strict=True):
-        servo, types = robot.servos[i], dict(zip(like.joint_names, like.servos, strict=True))
-        same_type = [
-            j for j, other in types.items() if servo and other and other.name == servo.name
-        ]
-        source = next((j for j in (joint, mirrored(joint), *same_type) if j in changed), None)
-        if source:
-            sources[joint] = source
+    sources = _sources(robot, like)
     if not sources:
         raise UsageError(
             f"{like.folder}: no identified joint of it has the name, the mirrored name or the type of servo of a joint "
             f"of {robot.name}"
         )
-    taken = [
-        f.name
-        for f in SERVO_FIELDS.values()
-        if (f.shared or f.name == "delay") and f.name != "effort_limit"
-    ]
+    before = like.before_identification
+    taken = [f.name for f in SERVO_FIELDS.values() if f.shared or f.name == "delay"]
+    taken.remove("effort_limit")
     servos: dict[str, dict[str, float]] = {}
     for joint, source in sources.items():
-        i, k = robot.joint_names.index(joint), like.joint_names.index(source)
+        i = robot.joint_names.index(joint)
+        k = like.joint_names.index(source)
         servos[joint] = {f: float(getattr(like, f)[k]) for f in taken}
         for gain in ("kp", "kd"):
-            own, theirs = (float(getattr(r, gain)[at]) for r, at in ((robot, i), (before, k)))
-            servos[joint][gain] *= own / theirs if own > 0 and theirs > 0 else 1.0
+            own = float(getattr(robot, gain)[i])
+            theirs = float(getattr(before, gain)[k])
+            if own > 0 and theirs > 0:
+                servos[joint][gain] *= own / theirs
     same = like if like.name == robot.name else robot
-    return replace(
+    taken_over = replace(
         robot.with_servos(servos), payload_mounts=same.payload_mounts, links=same.links
-    ), sources
+    )
+    return taken_over, sources
+
+
+def _sources(robot: RobotSpec, like: RobotSpec) -> dict[str, str]:
+    """Return joint of `robot` → identified joint of `like` that its values come from."""
+    identified = identified_joints(like)
+    types = dict(zip(like.joint_names, like.servos, strict=True))
+    sources: dict[str, str] = {}
+    for i, joint in zip(robot.operated_index, robot.operated, strict=True):
+        candidates = [joint, mirrored(joint)]
+        servo = robot.servos[i]
+        if servo is not None:
+            candidates += [j for j, other in types.items() if other and other.name == servo.name]
+        found = [j for j in candidates if j in identified]
+        if found:
+            sources[joint] = found[0]
+    return sources
 
 
 def mirrored(joint: str) -> str:
@@ -103,48 +112,56 @@ def measured_types(robots: ListOf[RobotSpec], source: str, licence: str) -> list
     Raises:
         UsageError: No identified joint names a servo type.
     """
-    joints: list[
-        tuple[ServoType, set[tuple[int, str]], dict[str, tuple[float, float]]]
-    ] = []  # type, robots, values
+    joints: list[_MeasuredServo] = []
     for number, robot in enumerate(robots):
-        nominal, known, op = (
-            robot.before_identification,
-            ParameterUncertainty.load(robot),
-            robot.operated_index,
-        )
-        now, then, changed = first_values(robot), first_values(nominal), identified_joints(robot)
-        now["damping"] = now["damping"] + robot.kd[op] - nominal.kd[op]
-        units = {
-            (number, u)
-            for s in (known.sources if known else ({"unit": ""},))
-            for u in s["unit"].split(", ")
-        }
-        for k, joint in enumerate(robot.operated):
-            servo = robot.servos[op[k]]
-            errors = summarize(known, joint).errors if known else {}
-            moved = [
-                f
-                for f in MEASURED_FIELDS
-                if abs(now[f][k] - then[f][k]) >= MIN_CHANGE * abs(then[f][k])
-            ]
-            if servo is not None and joint in changed:
-                joints.append(
-                    (servo, units, {f: (float(now[f][k]), errors.get(f, 0.0)) for f in moved})
-                )
+        joints += _measured_servos(number, robot)
     if not joints:
         raise UsageError(
             "no identified joint names a servo type; write servo = into the [[joint]] of its robot.toml"
         )
     types = []
-    for servo in {servo.name: servo for servo, *_ in joints}.values():
-        same = [joint for joint in joints if joint[0].name == servo.name]
-        estimates = {f: [values[f] for *_, values in same if f in values] for f in MEASURED_FIELDS}
-        new: dict[str, Any] = {f: _spread(f, values) for f, values in estimates.items()}
-        new |= {"source": source, "licence": licence, "gaponet": __version__, "joints": len(same)}
-        types.append(
-            replace(servo, **new, robots=len(set().union(*(units for _, units, _ in same))))
-        )
+    for servo in {joint.servo.name: joint.servo for joint in joints}.values():
+        same = [joint for joint in joints if joint.servo.name == servo.name]
+        units = set[tuple[int, str]]().union(*(joint.units for joint in same))
+        measured: dict[str, Any] = {}
+        for f in MEASURED_FIELDS:
+            measured[f] = _spread(f, [joint.estimates[f] for joint in same if f in joint.estimates])
+        measured |= {"source": source, "licence": licence, "gaponet": __version__}
+        types.append(replace(servo, **measured, joints=len(same), robots=len(units)))
     return types
+
+
+class _MeasuredServo(NamedTuple):
+    """The servo of an identified joint: its type, the units recorded, and field → value and its standard error."""
+
+    servo: ServoType
+    units: set[tuple[int, str]]
+    estimates: dict[str, tuple[float, float]]
+
+
+def _measured_servos(number: int, robot: RobotSpec) -> list[_MeasuredServo]:
+    """Return the servos of a robot's identified joints whose type is known; `number` tells robots apart."""
+    nominal = robot.before_identification
+    known = ParameterUncertainty.load(robot)
+    op = robot.operated_index
+    now = first_values(robot)
+    then = first_values(nominal)
+    now["damping"] = now["damping"] + robot.kd[op] - nominal.kd[op]
+    sources = known.sources if known else ({"unit": ""},)
+    units = {(number, unit) for source in sources for unit in source["unit"].split(", ")}
+    identified = identified_joints(robot)
+    servos = []
+    for k, joint in enumerate(robot.operated):
+        servo = robot.servos[op[k]]
+        if servo is None or joint not in identified:
+            continue
+        errors = summarize(known, joint).errors if known else {}
+        estimates = {}
+        for f in MEASURED_FIELDS:
+            if abs(now[f][k] - then[f][k]) >= MIN_CHANGE * abs(then[f][k]):
+                estimates[f] = (float(now[f][k]), errors.get(f, 0.0))
+        servos.append(_MeasuredServo(servo, units, estimates))
+    return servos
 
 
 def _spread(field: str, estimates: list[tuple[float, float]]) -> Spread | None:

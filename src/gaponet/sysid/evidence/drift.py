@@ -127,75 +127,144 @@ def drift(
         raise UsageError(
             "no recording moves an operated joint away from what it may touch; record gaponet excite's"
         )
-    fields, joints = (*uncertainty.fields, PLAY), robot.operated
+    joints = robot.operated
     held = {j for j, rows in zip(joints, own.rows, strict=True) if rows}
     if not held & identified_joints(robot):
         raise UsageError(
             f"{robot.folder}: these recordings hold only joints that were never identified: {', '.join(sorted(held))}. "
             "Identify these joints first"
         )
-    repeatability = {
-        j: uncertainty.joints[j].repeatability
-        or float(today)  # today's may itself have become worse
-        for j, today in zip(joints, repetition_difference(sequences, joints), strict=True)
-    }
-    times = {
-        j: float(np.median(e)) / max(uncertainty.joints[j].residual_rms, repeatability[j], 1e-9)
-        for j, e in zip(joints, own.window_rms, strict=True)
-    }
-    far = {j: by for j, by in times.items() if by > FAR_RATIO}
+    repeatability = _repeatability(uncertainty, sequences, joints)
+    far = _far_joints(uncertainty, own, joints, repeatability)
     overdispersion = np.stack(
         [np.maximum(uncertainty.array(j, "overdispersion"), 1.0) for j in joints]
     )
-    against, rest = (
-        list[Contradiction](),
-        own.by_recording(),
-    )  # the farthest first; each is left out of the others
-    while len(rest.names) > 1 and (
-        worst := _farthest(rest, overdispersion, uncertainty, joints, fields)
-    ):
-        against.append(worst)
-        rest = rest.without({worst.recording})
+    against = _contradictions(own, overdispersion, uncertainty, joints)
     aside = {a.recording for a in against}
     contradictory = len(aside) > MAX_SET_ASIDE * len(own.names)
-    own = own if contradictory else own.without(aside)
-    grouped = own.by_recording() if len(own.names) > 1 else own
-    clusters, trusted = grouped.gradients.shape[1], min(uncertainty.clusters, MAX_PRIOR_CLUSTERS)
-    tests = len(joints) * len(fields) + len(COMMON_FIELDS)
-    threshold = float(student.isf(FALSE_ALARM_RATE / tests / 2, trusted + clusters - 1))
-    information, freedom = grouped.information.sum(axis=1), trusted + clusters - 1
-    scatter = trusted * widened(information, overdispersion) + (clusters - 1) * gradient_covariance(
-        grouped.gradients
+    if not contradictory:
+        own = own.without(aside)
+    each, threshold = _gradients_to_explain(own, overdispersion, uncertainty, joints, repeatability)
+    moved, largest = _changes(each, threshold)
+    verdict: Verdict = "same"
+    if contradictory:
+        verdict = "contradictory"
+    elif moved or far:
+        verdict = "drifted"
+    return Drift(
+        verdict=verdict,
+        moved=tuple(moved),
+        largest=largest,
+        min_effect={one.name: one.min_effect for one in each},
+        against=tuple(against),
+        advice=_advice(verdict, moved, against, joints, far),
+        threshold=threshold,
+        seconds=float(sum(s.duration for s in sequences)),
+        far=far,
     )
-    gradients, rows = grouped.gradients.sum(axis=1), own.rows.astype(int).tolist()
-    each = [
-        _Joint(
-            j,
-            uncertainty,
-            information[i],
-            gradients[i],
-            scatter[i] / freedom,
-            rows[i],
-            repeatability[j],
+
+
+def _repeatability(
+    uncertainty: ParameterUncertainty, sequences: ListOf[Sequence], joints: ListOf[str]
+) -> dict[str, float]:
+    """Return joint → RMS difference between two recordings of one command, rad: that of the identification.
+
+    Where that had no repetitions, these recordings' own difference counts, which may itself have become worse.
+    """
+    today = repetition_difference(sequences, joints)
+    differences = {}
+    for joint, difference in zip(joints, today, strict=True):
+        differences[joint] = uncertainty.joints[joint].repeatability or float(difference)
+    return differences
+
+
+def _far_joints(
+    uncertainty: ParameterUncertainty,
+    own: Evidence,
+    joints: ListOf[str],
+    repeatability: Mapping[str, float],
+) -> dict[str, float]:
+    """Return joint → error over the identification's residual, where it exceeds FAR_RATIO."""
+    far = {}
+    for joint, errors in zip(joints, own.window_rms, strict=True):
+        usual = max(uncertainty.joints[joint].residual_rms, repeatability[joint], 1e-9)
+        times = float(np.median(errors)) / usual
+        if times > FAR_RATIO:
+            far[joint] = times
+    return far
+
+
+def _contradictions(
+    own: Evidence, overdispersion: Array, uncertainty: ParameterUncertainty, joints: ListOf[str]
+) -> list[Contradiction]:
+    """Return the recordings that contradict the others, the farthest first; each is left out of the others."""
+    against: list[Contradiction] = []
+    rest = own.by_recording()
+    fields = (*uncertainty.fields, PLAY)
+    while len(rest.names) > 1:
+        worst = _farthest(rest, overdispersion, uncertainty, joints, fields)
+        if worst is None:
+            break
+        against.append(worst)
+        rest = rest.without({worst.recording})
+    return against
+
+
+def _gradients_to_explain(
+    own: Evidence,
+    overdispersion: Array,
+    uncertainty: ParameterUncertainty,
+    joints: ListOf[str],
+    repeatability: Mapping[str, float],
+) -> tuple[list[_Joint], float]:
+    """Return the gradients of the joints, and the number of standard errors from which a change is significant.
+
+    The identification's overdispersion counts as that of MAX_PRIOR_CLUSTERS clusters at most, beside those of these
+    recordings; Student's t has their degrees of freedom, and all parameters together raise FALSE_ALARM_RATE.
+    """
+    grouped = own.by_recording() if len(own.names) > 1 else own
+    clusters = grouped.gradients.shape[1]
+    trusted = min(uncertainty.clusters, MAX_PRIOR_CLUSTERS)
+    freedom = trusted + clusters - 1
+    tests = len(joints) * (len(uncertainty.fields) + 1) + len(COMMON_FIELDS)
+    threshold = float(student.isf(FALSE_ALARM_RATE / tests / 2, freedom))
+    information = grouped.information.sum(axis=1)
+    expected = trusted * widened(information, overdispersion)
+    scatter = expected + (clusters - 1) * gradient_covariance(grouped.gradients)
+    gradients = grouped.gradients.sum(axis=1)
+    each = []
+    for i, joint in enumerate(joints):
+        each.append(
+            _Joint(
+                joint,
+                uncertainty,
+                information[i],
+                gradients[i],
+                scatter[i] / freedom,
+                int(own.rows[i]),
+                repeatability[joint],
+            )
         )
-        for i, j in enumerate(joints)
-    ]
-    moved = [
-        m
-        for f in COMMON_FIELDS
-        if len(joints) > 1 and (m := _together(each, fields.index(f), threshold))
-    ]
-    largest: dict[str, ParameterChange] = {m.joint: m for m in moved}
+    return each, threshold
+
+
+def _changes(
+    each: ListOf[_Joint], threshold: float
+) -> tuple[list[ParameterChange], dict[str, ParameterChange]]:
+    """Return the significant changes, and joint → its largest change: first those that all joints share."""
+    moved: list[ParameterChange] = []
+    fields = each[0].fields
+    for field in COMMON_FIELDS if len(each) > 1 else ():
+        together = _together(each, fields.index(field), threshold)
+        if together is not None:
+            moved.append(together)
+    largest = {change.joint: change for change in moved}
     for one in each:
         changes, first = one.explained(threshold)
         moved += changes
-        largest |= {one.name: first} if first else {}
-    verdict: Verdict = "contradictory" if contradictory else "drifted" if moved or far else "same"
-    seconds = float(sum(s.duration for s in sequences))
-    return Drift(
-        verdict, tuple(moved), largest, {one.name: one.min_effect for one in each}, tuple(against),
-        _advice(verdict, moved, against, joints, far), threshold, seconds, far,
-    )  # fmt: skip
+        if first is not None:
+            largest[one.name] = first
+    return moved, largest
 
 
 class _Joint:
@@ -343,8 +412,7 @@ def _advice(
             f"no number explains how far these logs are from the model ({times} the residual): another robot, payload "
             "or controller, or a part that gives way; look at it, then identify again"
         )
-    by = {j: [m for m in moved if m.joint == j] for j in joints}
-    odd = [j for j, ms in by.items() if len(ms) > 1 or any(m.field == "kp" for m in ms)]
+    odd = [j for j in joints if _is_odd([m for m in moved if m.joint == j])]
     if len(odd) > MAX_CHANGED_JOINTS * len(joints) and len(odd) > 1:
         return (
             f"{len(odd)} of {len(joints)} joints have another stiffness or several other numbers: is this the same "
@@ -353,9 +421,23 @@ def _advice(
     play = sorted({m.joint for m in moved if m.field == PLAY and m.by > 0})
     if play:
         return f"look at the gearbox and the screws of {', '.join(play)}: play that was not there; then identify again"
+    return _friction_advice(moved, joints) or (
+        "adapt with these logs: gaponet adapt ROBOT LOGS --out ROBOT_TODAY"
+    )
+
+
+def _is_odd(changes: ListOf[ParameterChange]) -> bool:
+    """Return whether a joint's changes are rather another robot's: several, or one of its stiffness."""
+    return len(changes) > 1 or any(m.field == "kp" for m in changes)
+
+
+def _friction_advice(moved: ListOf[ParameterChange], joints: ListOf[str]) -> str:
+    """Return what to do if most joints turn more easily, or harder; else nothing."""
     eased = [m for m in moved if m.field in FRICTION_FIELDS]
     ways = {np.sign(m.by) for m in eased}
-    if len({m.joint for m in eased}) > len(joints) / 2 and len(ways) == 1:
-        how = "more easily: warmer" if ways == {-1.0} else "harder: colder, or dry"
-        return f"most joints turn {how}? Check again as warm as when it was identified, or adapt for now"
-    return "adapt with these logs: gaponet adapt ROBOT LOGS --out ROBOT_TODAY"
+    if len({m.joint for m in eased}) <= len(joints) / 2 or len(ways) != 1:
+        return ""
+    how = "more easily: warmer" if ways == {-1.0} else "harder: colder, or dry"
+    return (
+        f"most joints turn {how}? Check again as warm as when it was identified, or adapt for now"
+    )

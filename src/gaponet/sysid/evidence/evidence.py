@@ -156,75 +156,112 @@ def estimate_uncertainty(
         held_out: Recordings and the robots that were fitted without them, instead of `judges`, if `robot` was fitted to
             them as well.
     """
-    first = first_values(robot)
-    fitted_fields = (
-        *CLASSIC,
-        *(f for f in SERVO_TERMS if SERVO_FIELDS[f].prior_std and first[f].any()),
-    )
-    fields = before.fields if before else fitted_fields
-    own, values = evidence(robot, sequences, fields, nthread=nthread), to_axes(robot, fields)
-    grouped = own.by_recording() if len(own.names) >= MIN_CLUSTERS // 4 else own
-    clusters, independent = grouped.gradients.shape[1], np.einsum("nckk->nk", grouped.information)
-    scatter = np.einsum("nkk->nk", gradient_covariance(grouped.gradients))
-    overdispersion = np.divide(
-        scatter, independent, out=np.zeros_like(independent), where=independent > 0
-    )
-    if before:
-        old = np.stack([before.array(j, "overdispersion") for j in robot.operated])
-        overdispersion = (before.clusters * old + clusters * overdispersion) / (
-            before.clusters + clusters
-        )
+    if before is None:
+        first = first_values(robot)
+        present = [f for f in SERVO_TERMS if SERVO_FIELDS[f].prior_std and first[f].any()]
+        fields: tuple[str, ...] = (*CLASSIC, *present)
+    else:
+        fields = before.fields
+    own = evidence(robot, sequences, fields, nthread=nthread)
+    values = to_axes(robot, fields)
+    clusters, overdispersion = _overdispersion(own, before, robot.operated)
     information = own.information.sum(axis=1)
     inverse = inverted(information)
     step = -(inverse @ own.gradients.sum(axis=1)[..., None])[..., 0]
     step_covariance = inverse @ widened(information, np.maximum(overdispersion, 1.0)) @ inverse
     repeatability = repetition_difference(sequences, robot.operated)
-    errors, joints = (
-        _errors_by_joint(held_out or [HeldOut(list(judges or sequences), robot)], nthread),
-        {},
-    )
+    errors = _errors_by_joint(held_out or [HeldOut(list(judges or sequences), robot)], nthread)
+    joints = {}
     for i, joint in enumerate(robot.operated):
-        covariance = step_covariance[i, :-1, :-1]
-        if before:
-            was, at = before.array(joint, "covariance"), before.array(joint, "values")
-            moved = np.square(values[joint] - at) - np.diag(covariance) - np.diag(was)
-            covariance = inverted(
-                inverted(was + np.diag(np.maximum(moved, 0.0))) + inverted(covariance)
-            )
-        if joint in covariances:
-            names, whole = covariances[joint]
-            at = np.array([names.index(f) for f in fields])
-            covariance = whole[np.ix_(at, at)]
-        if not before:
-            covariance = inverted(
-                inverted(covariance) + np.diag(prior_std(fields, values[joint]) ** -2)
-            )
+        covariance = _covariance(
+            joint, fields, values[joint], step_covariance[i, :-1, :-1], covariances, before
+        )
         variance = max(np.trace(covariance @ information[i, :-1, :-1]), 0.0) / max(own.rows[i], 1)
+        old = before.joints[joint] if before else None
         rms = float(np.sqrt(np.mean(np.concatenate(errors[joint]) ** 2)))
-        old_joint = before.joints[joint] if before and not (judges or held_out) else None
+        bound = _error_bound(errors[joint])
+        difference = float(repeatability[i])
+        if old is not None:
+            difference = max(difference, old.repeatability)
+        if old is not None and not (judges or held_out):
+            rms = max(rms, old.residual_rms)
+            bound = max(bound, old.residual_p90)
         joints[joint] = JointUncertainty(
-            values=_nested(values[joint]), covariance=_nested(covariance), gauss_newton_step=_nested(step[i]),
-            gauss_newton_covariance=_nested(step_covariance[i]), overdispersion=_nested(overdispersion[i]),
+            values=_nested(values[joint]),
+            covariance=_nested(covariance),
+            gauss_newton_step=_nested(step[i]),
+            gauss_newton_covariance=_nested(step_covariance[i]),
+            overdispersion=_nested(overdispersion[i]),
             parameter_rms=ERROR_SCALE_RAD * float(np.sqrt(variance)),
-            residual_rms=max(rms, old_joint.residual_rms if old_joint else 0.0),
-            residual_p90=max(_error_bound(errors[joint]), old_joint.residual_p90 if old_joint else 0.0),
-            repeatability=max(float(repeatability[i]), before.joints[joint].repeatability if before else 0.0),
-        )  # fmt: skip
+            residual_rms=rms,
+            residual_p90=bound,
+            repeatability=difference,
+        )
     source: Provenance = {
         "made_by": "identify" if judges or covariances else "adapt",
         "days": tuple(sorted({s.meta.recorded_at[:10] for s in sequences} - {""})),
         "unit": ", ".join(sorted({s.meta.unit_id for s in sequences})),
-        "logs": {f"{s.meta.motion} {s.meta.repetition}".removesuffix(" 0"): s.content_hash() for s in sequences},
+        "logs": {_log_name(s): s.content_hash() for s in sequences},
         "seconds": float(sum(s.duration for s in sequences)),
-        "values": {j: joints[j].values for j in joints}, "covariance": {j: joints[j].covariance for j in joints},
-    }  # fmt: skip
-    return ParameterUncertainty(
-        fields,
-        joints,
-        (*(before.sources if before else ()), source),
-        clusters,
-        bool(judges or held_out),
-    )
+        "values": {j: joints[j].values for j in joints},
+        "covariance": {j: joints[j].covariance for j in joints},
+    }
+    sources = (*before.sources, source) if before else (source,)
+    return ParameterUncertainty(fields, joints, sources, clusters, bool(judges or held_out))
+
+
+def _overdispersion(
+    own: Evidence, before: ParameterUncertainty | None, joints: ListOf[str]
+) -> tuple[int, Array]:
+    """Return the number of clusters, and the variance of their gradients over that of independent rows, (n, Q).
+
+    It is averaged with that of `before`, in proportion to the clusters of both.
+    """
+    grouped = own.by_recording() if len(own.names) >= MIN_CLUSTERS // 4 else own
+    clusters = grouped.gradients.shape[1]
+    independent = np.einsum("nckk->nk", grouped.information)
+    scatter = np.einsum("nkk->nk", gradient_covariance(grouped.gradients))
+    seen = np.divide(scatter, independent, out=np.zeros_like(independent), where=independent > 0)
+    if before is None:
+        return clusters, seen
+    old = np.stack([before.array(j, "overdispersion") for j in joints])
+    return clusters, (before.clusters * old + clusters * seen) / (before.clusters + clusters)
+
+
+def _covariance(
+    joint: str,
+    fields: tuple[str, ...],
+    values: Array,
+    from_rows: Array,
+    fitted: Mapping[str, tuple[list[str], Array]],
+    before: ParameterUncertainty | None,
+) -> Array:
+    """Return the covariance of a joint's values (P,) on the axes, (P, P).
+
+    Args:
+        from_rows: What the recordings' rows say alone, (P, P).
+        fitted, before: As `covariances` and `before` of `estimate_uncertainty`.
+    """
+    covariance = from_rows
+    if before:
+        was = before.array(joint, "covariance")
+        at = before.array(joint, "values")
+        moved = np.square(values - at) - np.diag(covariance) - np.diag(was)
+        wider = was + np.diag(np.maximum(moved, 0.0))
+        covariance = inverted(inverted(wider) + inverted(covariance))
+    if joint in fitted:
+        names, whole = fitted[joint]
+        order = np.array([names.index(f) for f in fields])
+        covariance = whole[np.ix_(order, order)]
+    if not before:
+        prior = np.diag(prior_std(fields, values) ** -2)
+        covariance = inverted(inverted(covariance) + prior)
+    return covariance
+
+
+def _log_name(sequence: Sequence) -> str:
+    """Return motion and repetition of a recording; the first repetition has no number."""
+    return f"{sequence.meta.motion} {sequence.meta.repetition}".removesuffix(" 0")
 
 
 def _errors_by_joint(folds: ListOf[HeldOut], nthread: int) -> dict[str, list[Array]]:
