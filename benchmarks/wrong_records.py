@@ -1,11 +1,11 @@
-"""Logs that pass in silence where nobody looks: six faults, put into recordings of drawn VIRTUAL robots.
+"""Logs that pass in silence where nobody looks: seven faults, put into recordings of drawn VIRTUAL robots.
 
     python benchmarks/wrong_records.py WORK --mutations 200 --seed 0
 
 Robot, rate, clock, digits, names of columns and units are drawn for each mutation. Each log is imported and examined as
 a user would do it. Counted are, by fault: "named", the import or the doctor names it; "stopped", another error or
-refusal; "silent", neither. Good logs of the same draws count as "false" where an error is found in them. The exit code
-is 1 where one is silent or false.
+refusal; "untold", the doctor says that gravity and inertia do not tell it; "silent", none of these. Good logs of the
+same draws count as "false" where an error is found in them. The exit code is 1 where one is silent or false.
 """
 
 from __future__ import annotations
@@ -196,6 +196,21 @@ def exchanged(motion: tuple[np.ndarray, ...], rng: np.random.Generator) -> Recor
     return record
 
 
+def exchanged_in_both(motion, rng: np.random.Generator) -> Record:
+    """Commands, positions and torques of joints stand under each other's names."""
+    record = good(motion, rng)
+    n = record.qpos.shape[1]
+    order = np.arange(n)
+    while (order == np.arange(n)).all():
+        order = rng.permutation(n)
+    record.ctrl = record.ctrl[:, order]
+    record.qpos = record.qpos[:, order]
+    if record.tau is not None:
+        record.tau = record.tau[:, order]
+    return record
+
+
+UNTOLD = "do not tell whether"
 FAULTS: dict[str, tuple[Callable[..., Record], tuple[str, ...]]] = {
     "command is the position of another row": (copied, ("copied",)),
     "position is a rounded command": (not_measured, ("copied",)),
@@ -203,6 +218,7 @@ FAULTS: dict[str, tuple[Callable[..., Record], tuple[str, ...]]] = {
     "two clocks": (two_clocks, ("run like clocks",)),
     "velocity for a position": (velocity, ("command", "velocit", "degrees")),
     "joints exchanged": (exchanged, ("order", "range")),
+    "joints exchanged in command and state": (exchanged_in_both, ("place", "order of joints")),
     "good": (good, ()),
 }
 
@@ -262,6 +278,8 @@ def outcome(place: Path, truth: Truth, fault: str, rng: np.random.Generator) -> 
         return ("false" if errors else "good"), said
     if any(word in f"{f.check}: {f.message}" for word in words for f in bad):
         return "named", said
+    if any(UNTOLD in f.message for f in findings):
+        return "untold", said
     return ("stopped" if errors else "silent"), said
 
 

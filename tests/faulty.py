@@ -14,7 +14,7 @@ from gaponet.base.errors import GAPONetError
 from gaponet.data.doctor import DoctorResult
 from gaponet.data.importer import import_logs
 from gaponet.robot.spec import RobotSpec
-from gaponet.sim.dynamics import gravity_of
+from gaponet.sim.dynamics import dynamics_of, gravity_of
 from gaponet.sim.model import build_model
 
 SECONDS, DELAY = 24.0, 2  # of a motion; periods until a command arrives
@@ -114,7 +114,8 @@ def examine(robot: RobotSpec, logs: list[Recording], folder: Path, damage: Calla
                 )
             )
             report = import_logs(folder / f"{mass:g}", robot, "a", mass, folder / "data", kp=kp)
-        return DoctorResult.of(report.dataset, robot, gravity_model=gravity_of(robot))
+        models = {"gravity_model": gravity_of(robot), "dynamics_model": dynamics_of(robot)}
+        return DoctorResult.of(report.dataset, robot, **models)
     except GAPONetError as error:
         return error
 

@@ -28,7 +28,7 @@ NAMED = {
     "two robots in one": ("unit_id", "warning", "m2 rests +10"),
     "wrong gains": ("gains", "warning", "times as far as the stated kp says"),
     "wrong payload label": ("payload", "warning", "m2 rests as with 0"),
-    "joint order": ("gravity", "warning", "the order of joints one place back"),
+    "joint order": ("order", "warning", "the order of joints one place back"),
     "zero of command and state": (
         "gravity",
         "warning",

@@ -119,11 +119,16 @@ def doctor(
         DatasetError: The folder is no dataset, or damaged.
     """
     from gaponet.data.doctor import DoctorResult
-    from gaponet.sim.dynamics import gravity_of
+    from gaponet.sim.dynamics import dynamics_of, gravity_of
 
     data, spec = as_dataset(dataset, robot)
     return DoctorResult.of(
-        data, spec, gravity_model=gravity_of(spec), progress=progress, executor=executor
+        data,
+        spec,
+        gravity_model=gravity_of(spec),
+        dynamics_model=dynamics_of(spec),
+        progress=progress,
+        executor=executor,
     )
 
 

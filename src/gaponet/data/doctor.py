@@ -12,12 +12,13 @@ import numpy as np
 from gaponet.base.executor import LOCAL
 from gaponet.base.progress import Progress, no_progress
 from gaponet.data.checks import CHECKS, run_checks
+from gaponet.data.checks.arrangement import arrangement
 from gaponet.data.checks.gravity import gravity
 from gaponet.data.checks.motor import fast_lags, lag_values, static_errors
 from gaponet.data.checks.static_checks import feedforward, static_checks
 from gaponet.data.checks.survey import Survey, survey_all
 from gaponet.data.checks.wiring import driven_by_torque
-from gaponet.data.offsets import Gravity
+from gaponet.data.offsets import Dynamics, Gravity
 from gaponet.data.store import Dataset
 from gaponet.robot.finding import LEVELS, Finding
 from gaponet.robot.spec import RobotSpec
@@ -60,13 +61,15 @@ class DoctorResult:
     @classmethod
     def of(
         cls, dataset: Dataset, robot: RobotSpec, *, gravity_model: Gravity | None = None,
-        progress: Progress = no_progress, executor: str | Executor = LOCAL,
+        dynamics_model: Dynamics | None = None, progress: Progress = no_progress,
+        executor: str | Executor = LOCAL,
     ) -> DoctorResult:  # fmt: skip
         """Examine every sequence, and judge them together.
 
         Args:
             gravity_model: Gravity of the nominal model, which shows wrong zeros, signs, gains and payload labels; these
                 are not examined without it.
+            dynamics_model: Inverse dynamics of the nominal model, which show joints under each other's names; likewise.
 
         Raises:
             DatasetError: The dataset is empty, damaged or another robot's.
@@ -76,7 +79,7 @@ class DoctorResult:
         surveys = survey_all(dataset, robot, progress, executor)
         findings = run_checks(CHECKS, surveys, robot)
         if gravity_model is not None:
-            findings += _examine_loads(findings, surveys, robot, gravity_model)
+            findings += _examine_loads(findings, surveys, robot, gravity_model, dynamics_model)
         findings.sort(key=lambda f: -LEVELS.index(f.level))
         rows = tuple(_sequence_row(s, robot) for s in surveys)
         return DoctorResult(tuple(findings), rows, tuple(_joint_rows(surveys, robot)))
@@ -96,14 +99,23 @@ class DoctorResult:
 
 
 def _examine_loads(
-    findings: list[Finding], surveys: list[Survey], robot: RobotSpec, model: Gravity
+    findings: list[Finding],
+    surveys: list[Survey],
+    robot: RobotSpec,
+    model: Gravity,
+    dynamics: Dynamics | None,
 ) -> list[Finding]:
     """Compare torques and static poses with gravity, unless another error would cause these findings too."""
-    errors = [f.check for f in findings if f.level == "error" or "slope" in f.values]
+    errors = [f.check for f in findings if f.level == "error"]
+    result = list[Finding]()
+    if dynamics is not None and not errors:
+        result += arrangement(surveys, robot, dynamics)
+    if any(f.level == "warning" for f in result):  # wrong names would cause findings of the others
+        return result
+    errors += [f.check for f in findings if "slope" in f.values]
     if errors:
         text = f"zeros, offsets, gains and payloads are judged by gravity once this is mended: {', '.join(set(errors))}"
-        return [Finding("ok", "gravity", text)]
-    result = list[Finding]()
+        return [*result, Finding("ok", "gravity", text)]
     by_commands = () if driven_by_torque(surveys) else (feedforward, static_checks)
     for check in (gravity, *by_commands):
         result += check(surveys, robot, model)

@@ -20,7 +20,7 @@ from gaponet.base.files import lock_folder
 from gaponet.base.progress import Progress, no_progress
 from gaponet.data.formats import find_logs, read_logs
 from gaponet.data.journal import Findings
-from gaponet.data.log import Log, skip_bad_rows
+from gaponet.data.log import Log, skip_bad_rows, skipped_rows
 from gaponet.data.offsets import Gravity, JointOffset, read_offsets, record_offsets, unit_offsets
 from gaponet.data.sequence import ARRAYS, Sequence, SequenceMeta, to_sequence
 from gaponet.data.signals import FAST_COMMAND_RAD_S, estimate_delay, fast_speed
@@ -178,7 +178,12 @@ class _Source:
                 self.held.append(sequence)
             progress(len(self.hashes), max(total, len(self.hashes)), sequence.meta.motion)
         if not self.hashes:
-            raise LogError("no recording found")
+            left_out = skipped_rows()
+            if left_out:
+                raise LogError(
+                    f"no recording is left of {len(left_out)}; the first was {left_out[0]}"
+                )
+            raise LogError(f"{self.src}: no recording found")
         if duplicates:
             raise DatasetError(
                 f"{len(duplicates)} of {len(self.hashes)} recordings are there twice (same samples, unit and "

@@ -53,6 +53,10 @@ class Channel(NamedTuple):
     values: Array
 
 
+RESTART_PERIODS = 3  # by which clocks of recordings in one file may begin apart
+MIN_PIECE_ROWS = 20  # of each of them
+
+
 @dataclass(frozen=True)
 class Log:
     """One recording.
@@ -77,7 +81,7 @@ class Log:
                     "position's name for ctrl too, and see gaponet identify"
                 )
         bad = _bad.get()
-        if bad is not None:
+        if bad is not None and not any(_starts_again(c.time) for c in self.channels.values()):
             self._cut_bad_rows(bad)
         for name, (time, values) in self.channels.items():
             self._check(name, np.asarray(time), np.asarray(values))
@@ -128,6 +132,11 @@ class Log:
                 f"{self.row(name, row)}: {what} is empty or not finite; repair or cut the row (--skip-bad does)"
             )
         back = np.flatnonzero(np.diff(time) <= 0)
+        if back.size and _starts_again(time):
+            raise LogError(
+                f"{self.row(name, int(back[0]) + 1)}: the clock starts again at {time[back[0] + 1]:.6g} s: several "
+                "recordings in one file; write each into a file of its own, or number them in a column episode_index"
+            )
         if back.size:
             raise LogError(
                 f"{self.row(name, int(back[0]) + 1)}: time does not increase in channel {name} "
@@ -139,3 +148,17 @@ class Log:
         """File and line of a row of a channel, as the reader noted them."""
         file = self.meta.get("files", {}).get(name, self.source)
         return f"{file}:{index + int(self.meta.get('first_line', 1))}"
+
+
+def _starts_again(time: Array) -> bool:
+    """Return True if a clock goes back to where it began, and on as before, as where recordings follow each other."""
+    time = np.asarray(time, float)
+    steps = np.diff(time)
+    back = np.flatnonzero(steps < 0)
+    if not back.size or not np.isfinite(time).all():
+        return False
+    period = float(np.median(steps))
+    restarts = time[back + 1]
+    near = np.abs(restarts - time[0]) < RESTART_PERIODS * max(period, 0.0)
+    pieces = np.diff(np.concatenate([[0], back + 1, [len(time)]]))
+    return bool(near.all() and pieces.min() >= MIN_PIECE_ROWS)

@@ -26,6 +26,8 @@ from gaponet.robot.spec import RobotSpec
 FILE = "offsets.json"
 # qpos (k, n) rad, payload_mass kg, payload_side → torques that hold the robot, (k, n) N·m
 Gravity = Callable[[Array, float, str], Array]
+# qpos, qvel, qacc (k, n) rad, rad/s, rad/s², payload_mass kg, payload_side → torques of that motion, (k, n) N·m
+Dynamics = Callable[[Array, Array, Array, float, str], Array]
 
 
 @dataclass(frozen=True)

@@ -47,20 +47,37 @@ def static_torque(model: mujoco.MjModel, qpos: Array) -> Array:
 
 def gravity_of(robot: RobotSpec) -> Callable[[Array, float, str], Array]:
     """Return the static torque by postures, payload mass and side (data/offsets.py); it can be pickled."""
-    return partial(_gravity, robot, {})
+    return partial(_gravity, dynamics_of(robot))
+
+
+def dynamics_of(robot: RobotSpec) -> Callable[[Array, Array, Array, float, str], Array]:
+    """Return the torque by motion, payload mass and side (data/offsets.py); it can be pickled."""
+    return partial(_dynamics, robot, {})
 
 
 def _gravity(
+    dynamics: Callable[[Array, Array, Array, float, str], Array],
+    qpos: Array,
+    payload_mass: float,
+    payload_side: str,
+) -> Array:
+    zero = np.zeros_like(qpos)
+    return dynamics(qpos, zero, zero, payload_mass, payload_side)
+
+
+def _dynamics(
     robot: RobotSpec,
     models: dict[tuple[float, str], mujoco.MjModel],
     qpos: Array,
+    qvel: Array,
+    qacc: Array,
     payload_mass: float,
     payload_side: str,
 ) -> Array:
     key = (payload_mass, payload_side)
     if key not in models:
         models[key] = build_model(robot, *key)
-    return static_torque(models[key], qpos)
+    return inverse_dynamics(models[key], qpos, qvel, qacc)
 
 
 def tips_of(robot: RobotSpec) -> Callable[[Array], Array] | None:

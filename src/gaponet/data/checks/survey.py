@@ -46,6 +46,9 @@ GRAVITY_SAMPLES, SLOW_RAD_S = (
     60,
     0.5,
 )  # rows in which torque is compared with gravity, and the highest speed there
+MOTION_HZ = 4.0  # above it, noise and a servo's resonance outweigh the weight of the links
+MOTION_ROWS, MIN_MOTION_ROWS = 60, 10  # of a recording in which motion is compared with the model
+MOTION_MARGIN_S = 0.2  # at both ends, where smoothing is poor
 HOLD_S, HELD_COMMAND_RAD = 0.4, 2e-3  # time and range of a command that stands still
 TORQUE_TOLERANCE = 0.05  # share of the torque limit by which a reading may exceed it
 JUMP_RAD, JUMP_RAD_S2 = (
@@ -126,6 +129,11 @@ class Survey:
     gravity_samples: (
         Array | None
     )  # positions and torques in slow rows, (2, k, n); None if no torque was recorded
+    movement: (
+        Array | None
+    )  # rows of smoothed motion: position, velocity, acceleration, torque (NaN if none was
+    # recorded), command − position (its lag taken off), and the command's velocity and acceleration, (7, k, n) in SI;
+    # None if the recording is too short
     holds: (
         Array | None
     )  # of single joints that rest under a constant command: joint, command − position (rad), torque,
@@ -201,6 +209,7 @@ class Survey:
             spectra=np.stack([_spectrum(ctrl, dt), _spectrum(qpos, dt)]).astype(np.float32),
             **_kind_of_command(sequence),
             gravity_samples=_gravity_samples(sequence),
+            movement=_movement(sequence, delay),
             holds=_holds(sequence),
         )
 
@@ -376,6 +385,31 @@ def _gravity_samples(sequence: Sequence) -> Array | None:
     slow = np.flatnonzero((np.abs(sequence.qvel) < SLOW_RAD_S).all(axis=1))
     rows = slow[:: max(1, len(slow) // GRAVITY_SAMPLES)]
     return np.stack([sequence.qpos[rows], sequence.tau[rows]])
+
+
+def _movement(sequence: Sequence, delay: Array) -> Array | None:
+    """Return rows of smoothed motion (Survey.movement). delay: of the state, (n) s; NaN where it is not known."""
+    dt = sequence.dt
+    margin = max(2, round(MOTION_MARGIN_S / dt))
+    rows = np.arange(margin, len(sequence) - margin)
+    if len(rows) < MIN_MOTION_ROWS:
+        return None
+    known = delay[np.isfinite(delay)]
+    usual = min(float(np.median(known)), MAX_LAG_S) if len(known) else 0.0
+    lag = round(usual / dt)
+    ctrl = np.concatenate([np.repeat(sequence.ctrl[:1], lag, axis=0), sequence.ctrl])
+    target = lowpass(ctrl[: len(sequence)], dt, MOTION_HZ)
+    target_speed = differentiate(target, dt)
+    qpos = lowpass(sequence.qpos, dt, MOTION_HZ)
+    qvel = differentiate(qpos, dt)
+    qacc = differentiate(qvel, dt)
+    torque = np.full_like(qpos, np.nan)
+    if sequence.tau is not None:
+        torque = lowpass(sequence.tau, dt, MOTION_HZ)
+    chosen = rows[:: max(1, len(rows) // MOTION_ROWS)]
+    target_acceleration = differentiate(target_speed, dt)
+    channels = (qpos, qvel, qacc, torque, target - qpos, target_speed, target_acceleration)
+    return np.stack([channel[chosen] for channel in channels]).astype(np.float32)
 
 
 def _holds(sequence: Sequence) -> Array | None:

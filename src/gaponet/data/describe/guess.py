@@ -14,7 +14,7 @@ import numpy as np
 from gaponet.base.arrays import Array
 from gaponet.base.errors import JointMismatchError, LogError
 from gaponet.data.describe.clocks import MAX_RATE_DIFFERENCE, clock_periods, rate_ratio
-from gaponet.data.describe.plausibility import look_like_ticks
+from gaponet.data.describe.plausibility import look_like_percent, look_like_ticks
 from gaponet.data.describe.raw_recording import SECONDS, RawRecording
 from gaponet.data.log import FEEDFORWARD
 from gaponet.robot.spec import RobotSpec
@@ -330,8 +330,11 @@ def _positions(recording: RawRecording, channels: dict[str, str]) -> list[str]:
         return ['position_unit = "rad"  # ?']
     span = float(np.nanmax(np.abs(values)))
     unit = "rad" if span <= 7 else "deg"
-    if look_like_ticks(values[np.isfinite(values)]):
+    finite = values[np.isfinite(values)]
+    if look_like_ticks(finite):
         unit = "ticks"
+    elif look_like_percent(finite):
+        unit = "signed_percent"
     return [f'position_unit = "{unit}"  # ? values up to {span:.3g}']
 
 

@@ -51,7 +51,13 @@ class LogsFile(TypedDict, total=False):
     time: Text  # column of the clock
     rate: Annotated[float, Interval(ge=1, le=10_000)]  # Hz, where the log has no clock
     time_unit: Text  # s, ms, us, ns
-    position_unit: Text  # rad, deg, fraction (0..1 of the joint's range), ticks (4096 a turn); velocities: per s
+    position_unit: (
+        Text  # rad, deg, ticks (4096 a turn); fraction (0..1), percent (0..100) or signed_percent
+    )
+    # (−100..100) of the joint's range; velocities: per s
+    calibration: (
+        Text  # LeRobot's calibration file of the arm, beside logs.toml: what ticks and percent mean
+    )
     ctrl: Text  # columns of commanded positions, as "{joint}_des", or the name of an array
     qpos: Text
     qvel: Text
@@ -90,7 +96,10 @@ def read_logs_file(src: Path, given: str | Path | None = None) -> tuple[LogsFile
     file = Path(given) if given is not None else beside if beside.is_file() else None
     if file is None:
         return LogsFile(), None
-    return read_toml(LogsFile, file, UsageError, f"docs/logs.md lists the fields; {HINT}"), file
+    specified = read_toml(LogsFile, file, UsageError, f"docs/logs.md lists the fields; {HINT}")
+    if "calibration" in specified:
+        specified["calibration"] = str(file.parent / specified["calibration"])
+    return specified, file
 
 
 class Naming:

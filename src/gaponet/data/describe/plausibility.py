@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
 
@@ -10,6 +10,7 @@ import numpy as np
 
 from gaponet.base.arrays import Array
 from gaponet.base.errors import LogError
+from gaponet.data.describe.encoders import Encoder
 from gaponet.data.log import FEEDFORWARD, UNITS, Channel, Log
 from gaponet.robot.spec import RobotSpec
 
@@ -19,11 +20,22 @@ FASTER = 50.0  # rad/s beyond ten times as fast as the positions ever move
 MOSTLY = 0.2  # of a joint's rows: more nonsense than this, and nothing of the channel is believed
 UNASKED = 1.0  # rad that no joint moves of itself while all are told to stand still
 TICKS_PER_TURN = 4096  # of the encoders of Feetech and Dynamixel servos
+FRACTIONS = {
+    "fraction": (0.0, 1.0),
+    "percent": (0.0, 100.0),
+    "signed_percent": (-100.0, 200.0),
+}  # start, span
+FULL_PERCENT = 100.0
 LARGEST_DEG = 360.0  # larger positions of a limb are no degrees
 
 
 def to_radians(
-    name: str, values: Array, joint_names: tuple[str, ...], units: list[str], robot: RobotSpec
+    name: str,
+    values: Array,
+    joint_names: tuple[str, ...],
+    units: list[str],
+    robot: RobotSpec,
+    encoders: Mapping[str, Encoder] | None = None,
 ) -> Array:
     """Positions or velocities in the unit of the log → rad or rad/s.
 
@@ -31,23 +43,41 @@ def to_radians(
         name: Channel: an offset applies to positions (ctrl, qpos) only; torques and temperatures pass untouched.
         values: (k, n), columns in the order of joint_names.
         joint_names: The robot's own names, (n).
-        units: Unit of each joint, (n): rad, deg, fraction (0..1 of the robot's joint range), or ticks (4096 a turn,
-            2048 at zero, as Feetech and Dynamixel servos count).
+        units: Unit of each joint, (n), one of LOG_UNITS.
         robot: The robot whose joint ranges give a fraction its meaning.
+        encoders: The arm's calibration, which gives ticks and percent their meaning. Without it, ticks are 4096 a turn
+            and 2048 at zero, as Feetech and Dynamixel servos count, and percent are of the robot's joint range.
     """
     if name not in ("ctrl", "qpos", "qvel") or set(units) == {"rad"}:
         return values
     out = np.array(values, float)
     for column, (joint, unit) in enumerate(zip(joint_names, units, strict=True)):
-        if unit == "deg":
-            out[:, column] *= np.pi / 180
-        if unit == "ticks":
-            zero = 0.0 if name == "qvel" else TICKS_PER_TURN / 2
-            out[:, column] = (out[:, column] - zero) * 2 * np.pi / TICKS_PER_TURN
-        if unit == "fraction":
-            low, high = robot.qpos_range[robot.joint_names.index(joint)]
-            out[:, column] = out[:, column] * (high - low) + (0.0 if name == "qvel" else low)
+        encoder = (encoders or {}).get(joint)
+        out[:, column] = _angles(out[:, column], joint, unit, robot, encoder, name == "qvel")
     return out
+
+
+def _angles(
+    values: Array, joint: str, unit: str, robot: RobotSpec, encoder: Encoder | None, speed: bool
+) -> Array:
+    """Return one joint's values (k,) in rad or, if they are speeds, in rad/s."""
+    if unit == "rad":
+        return values
+    if unit == "deg":
+        return np.radians(values)
+    in_range = robot.log_units[robot.joint_names.index(joint)] == "fraction"  # a gripper
+    if encoder is not None and unit == "ticks" and in_range:
+        values = encoder.fractions(values, speed)
+        unit = "fraction"
+    if encoder is not None and unit in ("ticks", "signed_percent"):
+        return encoder.angles(values, unit, speed)
+    if unit == "ticks":
+        zero = 0.0 if speed else TICKS_PER_TURN / 2
+        return (values - zero) * 2 * np.pi / TICKS_PER_TURN
+    low, high = robot.qpos_range[robot.joint_names.index(joint)]
+    start, span = FRACTIONS[unit]
+    shares = values / span if speed else (values - start) / span
+    return shares * (high - low) + (0.0 if speed else low)
 
 
 def require_plausible(log: Log, robot: RobotSpec, strict: bool = False) -> Log:
@@ -150,6 +180,11 @@ def require_radians(
                     "ticks of an encoder, whole numbers from 0 to 4095; logs state them with "
                     "--position-unit ticks"
                 )
+            elif look_like_percent(values[:, column]):
+                look_like = (
+                    "degrees, or LeRobot's −100..100 of the range; logs state them with --position-unit deg or "
+                    "signed_percent"
+                )
             raise LogError(
                 f"{where(row)} of {joint} is {value:.3f}, outside its range [{low:.2f}, {high:.2f}] rad; positions "
                 f"must be in radians: these look like {look_like}, or for one joint with [joint_units]"
@@ -160,3 +195,8 @@ def look_like_ticks(values: Array) -> bool:
     """Return True if positions can only be ticks of an encoder with TICKS_PER_TURN a turn."""
     whole = np.array_equal(values, np.round(values))
     return bool(whole and values.min() >= 0 and LARGEST_DEG < values.max() < TICKS_PER_TURN)
+
+
+def look_like_percent(values: Array) -> bool:
+    """Return True if positions end at exactly ±100, as LeRobot's normalised ones do."""
+    return float(np.abs(values).max()) == FULL_PERCENT

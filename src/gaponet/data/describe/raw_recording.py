@@ -15,6 +15,7 @@ import numpy as np
 from gaponet.base.arrays import Array
 from gaponet.base.errors import LogError, UsageError
 from gaponet.data.describe.clocks import clock_periods, named_like_a_clock, require_one_rate
+from gaponet.data.describe.encoders import read_encoders
 from gaponet.data.describe.joints import ignored, resolve_all
 from gaponet.data.describe.logs_file import HINT, LogsFile
 from gaponet.data.describe.plausibility import to_radians
@@ -158,13 +159,16 @@ class RawRecording:
         }
         joints = tuple(name for name in robot.joint_names if name in chosen["ctrl"])
         in_units = [units[j] for j in joints]
+        encoders = None
+        if "calibration" in specified:
+            encoders = read_encoders(Path(specified["calibration"]), robot, joint_map)
         channels = {}
         for channel, columns in chosen.items():
             values = np.stack([_column(loaded, *columns[j]) for j in joints], axis=1).astype(float)
             if channel == "ctrl" and "action_scale" in specified:
                 values = robot.qpos_home[robot.index(joints)] + specified["action_scale"] * values
             channels[channel] = Channel(
-                times[channel], to_radians(channel, values, joints, in_units, robot)
+                times[channel], to_radians(channel, values, joints, in_units, robot, encoders)
             )
         channels, empty = sampled_channels(channels, joints, self.where or self.source)
         start = min((float(c.time[0]) for c in channels.values() if len(c.time)), default=0.0)

@@ -12,7 +12,8 @@ Of v2.1, one data file an episode and meta/episodes.jsonl, the episodes whose fi
 Stock sets hold positions alone: action is the command, observation.state the joints (row t as in data.sequence). Their
 unit is not written in them: SO-101 sets are degrees, older ones −100..100 of the calibrated range; --position-unit says
 which. A joint that the robot's log_unit calls a fraction (a gripper) is 0..100 in both. What gaponet.data exported says
-its units, periods and metadata itself. Images and videos are left alone.
+its units, periods and metadata itself. Images and videos are left alone. Actions that are poses of the hand, steps or
+speeds are refused by the names of their values; logs.toml may name other features that hold joint targets.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from __future__ import annotations
 import logging
 import re
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -28,8 +30,11 @@ import numpy as np
 
 from gaponet.base.arrays import Array
 from gaponet.base.errors import JointMismatchError, LogError, UsageError
+from gaponet.base.structure import validated
+from gaponet.data.describe.actions import NO_TARGETS, what_it_holds
+from gaponet.data.describe.encoders import Encoder, read_encoders
 from gaponet.data.describe.joints import ignored, resolve_all
-from gaponet.data.describe.plausibility import to_radians
+from gaponet.data.describe.plausibility import FULL_PERCENT, to_radians
 from gaponet.data.formats.lerobot_set import (
     AGAIN,
     FEATURES,
@@ -43,8 +48,11 @@ from gaponet.data.formats.lerobot_set import (
 from gaponet.data.log import Channel, Log
 from gaponet.robot.spec import RobotSpec
 
-OPTIONS = ("position_unit", "joints", "ignore")
-POSITION_UNITS = ("rad", "deg", "fraction", "signed_percent")
+OPTIONS = ("position_unit", "joints", "ignore", "calibration", "ctrl", "qpos")
+POSITION_UNITS = ("rad", "deg", "fraction", "signed_percent", "ticks")
+NO_SI = ("deg", "signed_percent", "ticks")  # units beside which a gripper is 0..100
+MAX_PERCENT = 101.0  # beyond it, values are no percent
+MIN_AT_END = 5  # rows of one joint at exactly ±100
 INDEX = ("timestamp", "frame_index", "episode_index")  # columns of data files
 
 
@@ -60,24 +68,51 @@ def find(path: Path) -> list[Path]:
     return [s.data_file(e) for s in sets_under(path) for e in s.episodes]
 
 
+@dataclass(frozen=True)
+class _Options:
+    """What is said of a set.
+
+    Attributes:
+        robot: Whose joints its values are.
+        joint_map: The set's name of a joint → the robot's.
+        unit: Of positions, one of POSITION_UNITS.
+        joints: Names of the values, for a set that does not name them.
+        ignore: Patterns of names that are no joints of this robot.
+        encoders: The arm's calibration.
+        features: Channel → feature, for channels that are not in the usual one.
+    """
+
+    robot: RobotSpec
+    joint_map: dict[str, str] | None
+    unit: str
+    joints: list[str] | None = None
+    ignore: tuple[str, ...] = ()
+    encoders: dict[str, Encoder] | None = None
+    features: dict[str, str] = field(default_factory=dict)
+
+
 def read(
-    path: Path,
-    robot: RobotSpec,
-    joint_map: dict[str, str] | None = None,
-    position_unit: str | None = None,
-    joints: list[str] | None = None,
-    ignore: list[str] | None = None,
+    path: Path, robot: RobotSpec, joint_map: dict[str, str] | None = None, **said: Any
 ) -> Iterator[tuple[str, Callable[[], Log]]]:
     """Yield (motion name, what reads its Log) for every episode.
 
     Args:
         joint_map: The set's name of a joint → the robot's.
-        joints: Names of the values, for a set that does not name them.
-        ignore: Patterns of names that are no joints of this robot.
-        position_unit: One of POSITION_UNITS; not for what gaponet exported, which says rad itself.
+        said: OPTIONS that logs.toml states. position_unit is not for what gaponet exported, which says rad itself.
     """
+    encoders = None
+    if "calibration" in said:
+        encoders = read_encoders(Path(said["calibration"]), robot, joint_map)
     for part in sets_under(path):
-        unit = _unit(part, position_unit)
+        options = _Options(
+            robot,
+            joint_map,
+            _unit(part, said.get("position_unit")),
+            said.get("joints"),
+            tuple(said.get("ignore", ())),
+            encoders,
+            {channel: said[channel] for channel in ("ctrl", "qpos") if channel in said},
+        )
         if part.absent:
             logging.getLogger("gaponet").warning(
                 "%s: %d episodes that meta/episodes lists are missing", part.path, part.absent
@@ -87,10 +122,8 @@ def read(
         for episode in part.episodes:
             file = part.data_file(episode)
             if file != open_file:
-                open_file, table = (
-                    file,
-                    _Frames(part, file, robot, joint_map, unit, joints, tuple(ignore or ())),
-                )
+                open_file = file
+                table = _Frames(part, file, options)
             assert table is not None
             yield _motion(episode, tasks), partial(table.episode, episode)
 
@@ -101,7 +134,7 @@ def read_episodes(part: Set, episodes: list[dict[str, Any]], robot: RobotSpec) -
     for episode in episodes:
         file = part.data_file(episode)
         if frames is None or frames.file != file:
-            frames = _Frames(part, file, robot, None, _unit(part, None), None, ())
+            frames = _Frames(part, file, _Options(robot, None, _unit(part, None)))
         yield frames.episode(episode)
 
 
@@ -131,68 +164,127 @@ def _unit(part: Set, given: str | None) -> str:
 class _Frames:
     """Reads a data file once and cuts it into episodes."""
 
-    def __init__(
-        self, part: Set, file: Path, robot: RobotSpec, joint_map: dict[str, str] | None, unit: str,
-        joints: list[str] | None, ignore: tuple[str, ...],
-    ) -> None:  # fmt: skip
-        self.part, self.file, self.robot, self.given, self.ignore = (
-            part,
-            file,
-            robot,
-            joints,
-            ignore,
-        )
-        features = part.features
-        present = {ours: theirs for ours, theirs in FEATURES.items() if theirs in features}
-        for need in ("ctrl", "qpos"):
-            if need not in present:
-                raise LogError(
-                    f"{part.path}/meta/info.json: no feature '{FEATURES[need]}'; it has "
-                    f"{', '.join(part.info['features'])}"
-                )
-        names = {c: self._joints(f, features[f], joint_map) for c, f in present.items()}
+    def __init__(self, part: Set, file: Path, options: _Options) -> None:
+        self.part = part
+        self.file = file
+        self.options = options
+        robot = options.robot
+        features = self._features()
+        names = {c: self._joints(c, name, features[name]) for c, name in self.features.items()}
         self.joints = tuple(j for j in robot.joint_names if j in names["ctrl"])
         for channel, theirs in names.items():
             odd = sorted(set(theirs) - {""} ^ set(self.joints))
             if odd:
                 raise JointMismatchError(
-                    f"{part.path}/meta/info.json: joint '{odd[0]}' is not in both action and {FEATURES[channel]}"
+                    f"{part.path}/meta/info.json: joint '{odd[0]}' is not in both {self.features['ctrl']} and "
+                    f"{self.features[channel]}"
                 )
-        # A gripper is 0..100 of its range wherever the other joints are not SI.
-        shares = {
-            j for j, u in zip(robot.joint_names, robot.log_units, strict=True) if u == "fraction"
-        }
-        scaled = shares if unit in ("deg", "signed_percent") else ()
-        self.units = ["percent" if j in scaled else unit for j in self.joints]
-        table = read_table(file, (*present.values(), *INDEX))
+        self.units = [self._unit_of(joint) for joint in self.joints]
+        table = read_table(file, (*self.features.values(), *INDEX))
         self.columns = {
             c: _matrix(file, table, f, len(names[c]))[:, [names[c].index(j) for j in self.joints]]
-            for c, f in present.items()
+            for c, f in self.features.items()
         }
+        self._require_unit()
         self.timestamp, self.frame, self.episodes = (
             _matrix(file, table, name, 1)[:, 0] for name in INDEX
         )
 
-    def _joints(self, feature: str, spec: Feature, joint_map: dict[str, str] | None) -> list[str]:
+    def _features(self) -> dict[str, Feature]:
+        """Choose the feature of each channel, and return what info.json says of them."""
+        part, known = self.part, dict(self.part.features)
+        self.features = {ours: theirs for ours, theirs in FEATURES.items() if theirs in known}
+        info = f"{part.path}/meta/info.json"
+        for channel, name in self.options.features.items():
+            if name not in part.info["features"]:
+                raise LogError(
+                    f"{info}: no feature '{name}' (for {channel}); it has "
+                    f"{', '.join(part.info['features'])}"
+                )
+            spec = part.info["features"][name]
+            where = f"{info}: features.{name}"
+            known[name] = validated(Feature, spec, where, LogError, AGAIN, allow_extra=True)
+            self.features[channel] = name
+        for need in ("ctrl", "qpos"):
+            if need not in self.features:
+                raise LogError(
+                    f"{info}: no feature '{FEATURES[need]}'; it has {', '.join(part.info['features'])}. Say "
+                    f'{need} = "…" in logs.toml if another one holds it'
+                )
+        return known
+
+    def _unit_of(self, joint: str) -> str:
+        """The unit of a joint: a gripper is 0..100 of its range wherever the other joints are not SI."""
+        robot, unit = self.options.robot, self.options.unit
+        in_range = robot.log_units[robot.joint_names.index(joint)] == "fraction"
+        raw = unit == "ticks" and self.options.encoders is not None
+        return "percent" if in_range and unit in NO_SI and not raw else unit
+
+    def _require_unit(self) -> None:
+        """Refuse degrees that are called percent, and percent that are called degrees."""
+        for column, joint in enumerate(self.joints):
+            if self.units[column] not in ("deg", "signed_percent"):
+                continue
+            size = np.abs(np.concatenate([self.columns[c][:, column] for c in ("ctrl", "qpos")]))
+            where = f"{self.file}: {joint}"
+            if self.units[column] == "signed_percent" and size.max() > MAX_PERCENT:
+                raise LogError(
+                    f"{where} is up to {size.max():.4g}, beyond −100..100 of a range: these are degrees or ticks; say "
+                    "--position-unit deg (or ticks)"
+                )
+            at_end = int((size == FULL_PERCENT).sum())
+            if self.units[column] == "deg" and at_end >= MIN_AT_END and size.max() == FULL_PERCENT:
+                raise LogError(
+                    f"{where} ends at exactly 100 in {at_end} values: these are LeRobot's −100..100 of the calibrated "
+                    "range, not degrees; say --position-unit signed_percent, and calibration in logs.toml"
+                )
+
+    def _joints(self, channel: str, feature: str, spec: Feature) -> list[str]:
         """The robot's own joint of each column, "" where it is said to be none."""
+        options = self.options
         names, where = spec["names"], f"{self.part.path}/meta/info.json: {feature}"
         if isinstance(names, dict):
             names = next((v for v in names.values() if isinstance(v, list)), None)
         if names and isinstance(names[0], list):
             names = names[0]
-        names = names or self.given
+        names = names or options.joints
         if not names or len(names) != int(np.prod(spec["shape"])):
             raise LogError(
                 f"{where} does not name its {spec['shape']} values; write joints = [their names, in order] into "
                 "logs.toml beside the set"
             )
         short = [str(name).removesuffix(".pos") for name in names]
-        ours = iter(
-            resolve_all(
-                [n for n in short if not ignored(n, self.ignore)], self.robot, where, joint_map
+        kept = [name for name in short if not ignored(name, options.ignore)]
+        if channel in ("ctrl", "qpos"):
+            self._require_joints(kept, where)
+        ours = iter(resolve_all(kept, options.robot, where, options.joint_map))
+        return ["" if ignored(n, options.ignore) else next(ours) for n in short]
+
+    def _require_joints(self, names: list[str], where: str) -> None:
+        """Refuse poses of the hand, steps and speeds, where no value is a joint; joints among them are told."""
+        joints, strange = [], []
+        for name in names:
+            try:
+                joints.append(self.options.robot.resolve(name, where, self.options.joint_map))
+            except JointMismatchError:
+                strange.append(name)
+        held = what_it_holds(strange)
+        if held is None:
+            return
+        shown = ", ".join(strange[:4]) + (", …" if len(strange) > 4 else "")
+        if len(joints) > 1:
+            patterns = ", ".join(f'"{name}"' for name in strange)
+            raise LogError(
+                f"{where} holds joint positions ({', '.join(joints)}), and {held} ({shown}); leave these out: "
+                f"ignore = [{patterns}] in logs.toml"
             )
-        )
-        return ["" if ignored(n, self.ignore) else next(ours) for n in short]
+        others = [
+            name
+            for name in self.part.info["features"]
+            if re.search(r"joint|qpos", name) and name not in where
+        ]
+        hint = f" Features that may hold them: {', '.join(others)}." if others else ""
+        raise LogError(f"{where} holds {held} ({shown}), not joint positions. {NO_TARGETS}.{hint}")
 
     def episode(self, row: dict[str, Any]) -> Log:
         """The frames of an episode as a Log, in SI."""
@@ -221,7 +313,7 @@ class _Frames:
                 "stated": row["stated"],
                 "dataset": {k: v for k, v in explanation.items() if k in Stated.__annotations__},
             }
-        return Log(self.robot.name, self.joints, channels, f"{self.file}#{index}", meta)
+        return Log(self.options.robot.name, self.joints, channels, f"{self.file}#{index}", meta)
 
     def _time(self, where: Array) -> Array:
         """Frames are a period apart; their timestamps, float32, lose digits and are believed only where they differ."""
@@ -234,14 +326,11 @@ class _Frames:
         )
 
     def _si(self, channel: str, values: Array) -> Array:
-        """Percentages to fractions, then as for every format."""
-        values, units = values.copy(), list(self.units)
-        for column, unit in enumerate(self.units):
-            if unit in ("percent", "signed_percent") and channel in ("ctrl", "qpos", "qvel"):
-                low, span = (0.0, 100.0) if unit == "percent" else (-100.0, 200.0)
-                values[:, column] = (values[:, column] - (0.0 if channel == "qvel" else low)) / span
-                units[column] = "fraction"
-        return to_radians(channel, values, self.joints, units, self.robot)
+        """Return values in SI."""
+        options = self.options
+        return to_radians(
+            channel, values.copy(), self.joints, self.units, options.robot, options.encoders
+        )
 
 
 def _motion(episode: dict[str, Any], tasks: dict[int, str]) -> str:

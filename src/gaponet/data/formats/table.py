@@ -2,7 +2,8 @@
 
 Columns are called `time`, `ctrl.<joint>`, `qpos.<joint>` and, where the robot says more, `qvel.<joint>`, `tau.<joint>`,
 `temperature.<joint>`; others are left alone. A logs.toml (data.describe.logs_file) says other names, the units, and the
-names of the columns where the file has none. Torques are N·m and temperatures °C. Units have no default: a wrong guess
+names of the columns where the file has none. A column with the number of the episode (formats.episodes) makes several
+recordings of a file. Torques are N·m and temperatures °C. Units have no default: a wrong guess
 looks like a sim-to-real gap. A table with a column `joint` has a row per joint and time (formats.joint_rows).
 """
 
@@ -24,6 +25,7 @@ from gaponet.data.describe.logs_file import LogsFile
 from gaponet.data.describe.raw_recording import RawRecording, Signal, require_content
 from gaponet.data.formats import files_under, joint_rows, parquet
 from gaponet.data.formats.dates import is_date, to_seconds
+from gaponet.data.formats.episodes import episodes
 from gaponet.data.log import CHANNELS, skipped_rows
 
 if TYPE_CHECKING:
@@ -82,7 +84,7 @@ def recordings(path: Path, specified: LogsFile) -> Iterator[RawRecording]:
         if joint := joint_rows.joint_column(names, specified):
             yield joint_rows.recording(file, names, joint, specified)
             continue
-        yield RawRecording(
+        whole = RawRecording(
             file.stem,
             str(file),
             dict.fromkeys(names, ()) | signals,
@@ -91,6 +93,7 @@ def recordings(path: Path, specified: LogsFile) -> Iterator[RawRecording]:
             (str(file),),
             line,
         )
+        yield from episodes(whole)
 
 
 def _refuse_twice(file: Path, names: list[str], wanted: list[str]) -> None:
