@@ -196,7 +196,7 @@ def exchanged(motion: tuple[np.ndarray, ...], rng: np.random.Generator) -> Recor
     return record
 
 
-def exchanged_in_both(motion, rng: np.random.Generator) -> Record:
+def exchanged_in_both(motion: tuple[np.ndarray, ...], rng: np.random.Generator) -> Record:
     """Commands, positions and torques of joints stand under each other's names."""
     record = good(motion, rng)
     n = record.qpos.shape[1]

@@ -1,1 +1,3 @@
-"""Evaluation of simulators on recordings they never saw: errors, gap by cause, candidates, verdicts, their tables."""
+"""Evaluation of simulators on recordings they never saw: errors, gap by cause, candidates,
+verdicts, their tables.
+"""

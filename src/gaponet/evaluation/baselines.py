@@ -1,7 +1,9 @@
-"""Two predictions that need no identified simulator: the command itself, and the nominal simulation, later and shifted.
+"""Two predictions that need no identified simulator: the command itself, and the nominal
+simulation, later and shifted.
 
-Each joint's path gets a delay and an offset. They are fitted to half of the motions and measured on the other half, and
-the other way round, so no motion is measured with numbers that were fitted to it. A single motion is fitted to itself.
+Each joint's path gets a delay and an offset. They are fitted to half of the motions and measured on
+the other half, and the other way round, so no motion is measured with numbers that were fitted to
+it. A single motion is fitted to itself.
 """
 
 from __future__ import annotations
@@ -28,7 +30,9 @@ def command_run(sequence: Sequence, robot: RobotSpec) -> Run:
 
 
 def baseline_errors(nominal: ListOf[Run], commands: ListOf[Run]) -> dict[str, float]:
-    """Return the mean |error| of delay + offset and of the command itself, rad, for recordings in one order."""
+    """Return the mean |error| of delay + offset and of the command itself, rad, for recordings in
+    one order.
+    """
     return {
         "delay_offset": _error(_later_and_shifted(nominal)),
         "command": _error(_later_and_shifted(commands)),

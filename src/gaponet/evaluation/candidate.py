@@ -1,4 +1,6 @@
-"""Candidates of an evaluation: an identified robot folder, or a run, whose model corrects a simulator."""
+"""Candidates of an evaluation: an identified robot folder, or a run, whose model corrects a
+simulator.
+"""
 
 from __future__ import annotations
 
@@ -66,7 +68,8 @@ class Candidate:
         )
         if own.nominal is None:
             raise UsageError(
-                f"{folder}: nothing was identified of this robot; gaponet identify DATASET --out FOLDER does"
+                f"{folder}: nothing was identified of this robot; gaponet identify DATASET --out "
+                "FOLDER does"
             )
         return cls(folder, own, None)
 
@@ -86,10 +89,12 @@ def is_robot(folder: Path) -> bool:
 
 
 def corrected_robot(run: Path, robot: RobotSpec) -> RobotSpec:
-    """Return the simulator that a run's model corrects, as the run stores it: nominal or identified.
+    """Return the simulator that a run's model corrects, as the run stores it: nominal or
+    identified.
 
     Raises:
-        ModelError: The robots differ before identification, so that errors would have another baseline.
+        ModelError: The robots differ before identification, so that errors would have another
+            baseline.
     """
     return require_stored_robot(run, robot, ModelError, DATA_HINT)
 
@@ -100,11 +105,14 @@ def select_entries(
     motions: tuple[str, ...] = (),
     units: tuple[str, ...] = (),
 ) -> tuple[list[Entry], bool]:
-    """Select recordings for an evaluation. Return them, and True if no candidate was fitted to any of them.
+    """Select recordings for an evaluation.
 
-    The default is the test set of the first candidate, or else all recordings, each time without recordings that any
-    candidate was fitted to. If all motions were used, the default is recordings that were not used. A robot folder
-    without an origin counts as fitted to everything and is evaluated on everything.
+    Return them, and True if no candidate was fitted to any of them.
+
+    The default is the test set of the first candidate, or else all recordings, each time without
+    recordings that any candidate was fitted to. If all motions were used, the default is recordings
+    that were not used. A robot folder without an origin counts as fitted to everything and is
+    evaluated on everything.
 
     Raises:
         DatasetError: Every recording was used in training.
@@ -137,8 +145,8 @@ def select_entries(
 class FittedData:
     """Recordings and motions that a folder was trained, identified, validated or adapted on.
 
-    A recording of the test set is not among them, whatever the split: a split by unit or payload tests motions that
-    were trained on.
+    A recording of the test set is not among them, whatever the split: a split by unit or payload
+    tests motions that were trained on.
     """
 
     hashes: frozenset[str]  # of the recordings' contents
@@ -199,7 +207,9 @@ def read_origin(folder: Path) -> Origin | None:
 
 
 def robot_label(entries: list[Entry]) -> str:
-    """Return the robot's name; "VIRTUAL h1_2" or "partly VIRTUAL h1_2" where recordings are virtual."""
+    """Return the robot's name; "VIRTUAL h1_2" or "partly VIRTUAL h1_2" where recordings are
+    virtual.
+    """
     name = entries[0].meta.robot
     virtual = sum(entry.meta.virtual for entry in entries)
     if not virtual:

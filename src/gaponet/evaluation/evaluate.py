@@ -1,4 +1,6 @@
-"""Evaluation of nominal, identified and learned simulators: open-loop rollouts with the exported artifact (ONNX)."""
+"""Evaluation of nominal, identified and learned simulators: open-loop rollouts with the exported
+artifact (ONNX).
+"""
 
 from __future__ import annotations
 
@@ -53,8 +55,8 @@ ORDER = (
 class Evaluation:
     """Rollouts by method, their metrics, and the corrections applied by each learned model.
 
-    `result` holds methods → method → metrics (mpjae rad, q_dis rad·s, …; by_joint, by_motion, … the same); unseen is
-    true if no recording was used in training. All lists have an item per sequence.
+    `result` holds methods → method → metrics (mpjae rad, q_dis rad·s, …; by_joint, by_motion, … the
+    same); unseen is true if no recording was used in training. All lists have an item per sequence.
     """
 
     result: dict[str, Any]
@@ -63,7 +65,9 @@ class Evaluation:
     deltas: dict[str, list[Array]]  # method → corrections applied, (T, n operated) rad
 
     def save(self, folder: Path) -> None:
-        """Write metrics.json and trajectories.npz, which the report reads, into a run or robot folder."""
+        """Write metrics.json and trajectories.npz, which the report reads, into a run or robot
+        folder.
+        """
         reals = self.runs["nominal"]
         picked = evenly_spaced(list(range(len(reals))), STORED_TRAJECTORIES)
         shown = [
@@ -106,11 +110,12 @@ def evaluate(
     """Roll out every method from the first recorded state under the recorded commands.
 
     Args:
-        folders: Identified robots and training runs. Recordings that any of them was fitted to are not selected by
-            default and not called unseen. The test motions and the delay + offset baseline are those of the first.
+        folders: Identified robots and training runs. Recordings that any of them was fitted to are
+            not selected by default and not called unseen. The test motions and the delay + offset
+            baseline are those of the first.
         robot: The dataset's robot; the folders' robots must equal it before identification.
-        motions: Only these; default: the test motions of the dataset trained on; of another dataset, all motions that
-            were never trained on.
+        motions: Only these; default: the test motions of the dataset trained on; of another
+            dataset, all motions that were never trained on.
         target: Another simulator, evaluated as it is and with the first folder transferred into it.
         units: Only recordings of these units.
 
@@ -201,7 +206,10 @@ class _Rollouts:
         corrector: Corrector | None,
         progress: Callable[[int, int], None],
     ) -> None:
-        """Roll out a method. A transfer that is refused is a note if the network could be told its simulator."""
+        """Roll out a method.
+
+        A transfer that is refused is a note if the network could be told its simulator.
+        """
         try:
             if corrector is None:
                 replays = kept_replays(self._dataset, self._entries, simulator, progress)
@@ -286,7 +294,9 @@ class _Rollouts:
 
 
 def _distance_note(model: GapModel, simulator: RobotSpec, dt: float) -> str:
-    """Return whether a simulator's answers to fixed probes lie within those of a network's training."""
+    """Return whether a simulator's answers to fixed probes lie within those of a network's
+    training.
+    """
     known = model.known_simulators
     assert known is not None
     context = model.context_of(simulator, dt)
@@ -350,7 +360,10 @@ def _methods(
 def _methods_in(
     target: RobotSpec, first: Candidate, nominal: RobotSpec
 ) -> Iterator[tuple[str, RobotSpec, Corrector | None]]:
-    """Yield the methods in another simulator. Gains of a log change it by as much as they change the nominal one."""
+    """Yield the methods in another simulator.
+
+    Gains of a log change it by as much as they change the nominal one.
+    """
     simulator = replace(target, nominal=target.nominal or nominal)
     if model_hash(target) != model_hash(nominal):
         yield "uncorrected", simulator, None
@@ -378,7 +391,9 @@ def _by_unit(
 
 
 def _delta_summary(parts: list[Array], sequences: list[Sequence], limit: float) -> dict[str, float]:
-    """Return mean and largest |Δa|, rad, their mean rate, rad/s, and the share at the limit Δ_max (rad)."""
+    """Return mean and largest |Δa|, rad, their mean rate, rad/s, and the share at the limit Δ_max
+    (rad).
+    """
     dt = float(np.median([s.dt for s in sequences]))
     return {
         "mean": float(np.mean([np.abs(d).mean() for d in parts])),

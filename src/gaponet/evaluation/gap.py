@@ -1,5 +1,5 @@
-"""Sources of the gap: the error after each step from the nominal to the identified simulator and to a
-model on top of it, and the error floor.
+"""Sources of the gap: the error after each step from the nominal to the identified simulator and
+to a model on top of it, and the error floor.
 """
 
 from __future__ import annotations

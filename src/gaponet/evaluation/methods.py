@@ -1,6 +1,7 @@
 """One title and one colour per method, in every figure, table and scene.
 
-A method is a key of METHODS, with identified+ in front where a network corrects an identified simulator.
+A method is a key of METHODS, with identified+ in front where a network corrects an identified
+simulator.
 """
 
 from __future__ import annotations
@@ -42,7 +43,9 @@ OTHER_COLOUR = "#777777"
 
 
 def method(kind: str, simulator: RobotSpec) -> str:
-    """Return the method of a model: its kind, with identified+ in front where it corrects an identified simulator."""
+    """Return the method of a model: its kind, with identified+ in front where it corrects an
+    identified simulator.
+    """
     return (IDENTIFIED if simulator.nominal is not None else "") + kind
 
 
@@ -54,13 +57,17 @@ def title(method: str) -> str:
 
 
 def colour(method: str) -> str:
-    """Return the colour of the method, #rrggbb, darker where it corrects an identified simulator."""
+    """Return the colour of the method, #rrggbb, darker where it corrects an identified
+    simulator.
+    """
     base = METHODS.get(method.removeprefix(IDENTIFIED), ("", OTHER_COLOUR))[1]
     return shade(base, -0.4) if method.startswith(IDENTIFIED) else base
 
 
 def shade(base: str, share: float) -> str:
-    """Return a colour, #rrggbb, mixed with white by a share, or with black where the share is negative."""
+    """Return a colour, #rrggbb, mixed with white by a share, or with black where the share is
+    negative.
+    """
     end = 255 if share > 0 else 0
     parts = (int(base[i : i + 2], 16) for i in (1, 3, 5))
     return "#" + "".join(f"{round(p + (end - p) * abs(share)):02x}" for p in parts)

@@ -42,12 +42,21 @@ Horizons = dict[Annotated[str, Predicate(lambda time: time == "whole" or _is_num
 Scores = TypedDict(  # metrics of one method, in total and by group
     "Scores",
     {
-        "mpjae": Number, "rmse": Number, "q_dis": Number, "static": Number, "dynamic": Number, "large_0.05": Number,
-        "large_0.1": Number, "correlation": Number, "by_joint": Joints, "by_payload": Payloads,
-        "by_horizon": Annotated[Horizons, Len(1)], "by_motion": Motions,
+        "mpjae": Number,
+        "rmse": Number,
+        "q_dis": Number,
+        "static": Number,
+        "dynamic": Number,
+        "large_0.05": Number,
+        "large_0.1": Number,
+        "correlation": Number,
+        "by_joint": Joints,
+        "by_payload": Payloads,
+        "by_horizon": Annotated[Horizons, Len(1)],
+        "by_motion": Motions,
         "by_independent_motion": Motions,
     },
-)  # fmt: skip
+)
 
 
 class _Shown(TypedDict):
@@ -117,13 +126,17 @@ def read_config(run: Path) -> dict[str, Any]:
     """Read config.json of a run.
 
     Raises:
-        ModelError: The file is missing or damaged; the message names file and field. All functions here raise it.
+        ModelError: The file is missing or damaged; the message names file and field. All functions
+            here raise it.
     """
     return dict(read_json(_Config, run / "config.json", ModelError, REPAIR_HINT, allow_extra=True))
 
 
 def read_metrics(run: Path) -> dict[str, Any]:
-    """Read metrics.json of a run. Every method has the groups of the nominal one; absent numbers are NaN."""
+    """Read metrics.json of a run.
+
+    Every method has the groups of the nominal one; absent numbers are NaN.
+    """
     file = run / "metrics.json"
     metrics: dict[str, Any] = {
         **read_json(_Metrics, file, ModelError, REPAIR_HINT, allow_extra=True)
@@ -154,7 +167,8 @@ def read_trajectories(run: Path, metrics: dict[str, Any], joints: int) -> dict[s
         shape = max(shapes, key=len)
         if len(shapes) != 1 or len(shape) != 2 or shape[0] < 2 or shape[1] != joints:
             raise ModelError(
-                f"{file}: sequence {row} has arrays of {joints} joints missing or of other sizes; {REPAIR_HINT}"
+                f"{file}: sequence {row} has arrays of {joints} joints missing or of other sizes; "
+                f"{REPAIR_HINT}"
             )
     if not all(a.dtype == np.float32 and np.isfinite(a).all() for a in arrays.values()):
         raise ModelError(f"{file}: holds NaN or other types than float32; {REPAIR_HINT}")

@@ -23,7 +23,9 @@ def mrad(value: float | None) -> str:
 
 
 def mrad_with_error(value: float, standard_error: float) -> str:
-    """Format an angle in rad with its standard error over independent motions, NaN if there is one."""
+    """Format an angle in rad with its standard error over independent motions, NaN if there is
+    one.
+    """
     if np.isnan(standard_error):
         return f"{mrad(value)} mrad (one motion)"
     return f"{mrad(value)} ± {mrad(standard_error)} mrad"
@@ -84,7 +86,9 @@ def totals(
 def by_group(
     methods: dict[str, Any], group: str, angle: Callable[[float], str] = mrad
 ) -> ResultTable:
-    """Return the MPJAE by joint, payload, unit, horizon or motion: a row for each, a column per method."""
+    """Return the MPJAE by joint, payload, unit, horizon or motion: a row for each, a column per
+    method.
+    """
     parts = [errors[f"by_{group}"] for errors in methods.values()]
     rows = []
     for key in parts[0]:

@@ -1,4 +1,6 @@
-"""Conclusions from the errors of methods: the remaining error, the gain of a network, the next command."""
+"""Conclusions from the errors of methods: the remaining error, the gain of a network, the next
+command.
+"""
 
 from __future__ import annotations
 
@@ -75,8 +77,8 @@ def verdict(methods: Scores, baselines: Mapping[str, float] | None = None) -> li
     best = min(scores["mpjae"] for scores in methods.values())
     if baselines is not None and baselines["command"] <= best:
         sentences.append(
-            f"The command itself, delayed and offset, is {mrad(baselines['command'])} mrad from the "
-            f"robot. No simulator here is closer ({mrad(best)}), so for motions like these a "
+            f"The command itself, delayed and offset, is {mrad(baselines['command'])} mrad from "
+            f"the robot. No simulator here is closer ({mrad(best)}), so for motions like these a "
             "simulator adds nothing."
         )
     return sentences
@@ -114,8 +116,8 @@ def _about_network(methods: Scores, own: str) -> str:
     if gain.helps:
         end = f", {100 * gain.reduction / gain.base_error:.0f} %."
     return (
-        f"With {title(own)} the error is {mrad(methods[own]['mpjae'])} mrad: the correction reduces "
-        f"the error of {title(gain.base)} by {gain.text}{end}"
+        f"With {title(own)} the error is {mrad(methods[own]['mpjae'])} mrad: the correction "
+        f"reduces the error of {title(gain.base)} by {gain.text}{end}"
     )
 
 

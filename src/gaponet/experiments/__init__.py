@@ -1,1 +1,3 @@
-"""Experiments: trainings and measurements that become tables, figures and sentences in one folder."""
+"""Experiments: trainings and measurements that become tables, figures and sentences in one
+folder.
+"""

@@ -1,1 +1,3 @@
-"""Commands worth playing: excitation per joint, coordinated upper body, whole body, motion files."""
+"""Commands worth playing: excitation per joint, coordinated upper body, whole body, motion
+files.
+"""

@@ -3,8 +3,8 @@ joint space.
 
 Each function takes a Kit, the sides that act (motions of arms) and a seeded generator, and returns
 targets (T, n) rad on the motion grid. World frame: x forward, y left, z up; the H1-2 shoulder is at
-z = 1.45 m and a hand reaches 0.6 m from it. Sideways numbers are given for the left arm and mirrored
-for the right one. The base is fixed.
+z = 1.45 m and a hand reaches 0.6 m from it. Sideways numbers are given for the left arm and
+mirrored for the right one. The base is fixed.
 
 An arm is found by joint names, `<side>_shoulder_pitch…`, `…shoulder_roll…`, `…shoulder_yaw…`,
 `…elbow…` and `…wrist_roll…`, with a payload mount of the same side as its hand. Robots without such

@@ -1,9 +1,9 @@
 """Feasibility of commands, and the nearest feasible one.
 
 Four limits: joint range, joint speed, free space between limbs and above floor or table, and torque
-by inverse dynamics of the nominal model at every payload. For a given motion the torque is an affine
-function of the payload mass (up to the payload ball's own radius), so the lightest and the heaviest
-payload bound all between.
+by inverse dynamics of the nominal model at every payload. For a given motion the torque is an
+affine function of the payload mass (up to the payload ball's own radius), so the lightest and the
+heaviest payload bound all between.
 """
 
 from __future__ import annotations
@@ -184,7 +184,9 @@ GRAVITY_SHARE = 0.9  # of the usable torque: leaves some to accelerate
 
 @dataclass(frozen=True)
 class ExcitationRange:
-    """A posture (n,) rad and the interval of one joint that can be held from there at every payload."""
+    """A posture (n,) rad and the interval of one joint that can be held from there at every
+    payload.
+    """
 
     posture: Array
     low: float
@@ -193,8 +195,8 @@ class ExcitationRange:
 
 
 def find_excitation_range(limits: Feasibility, joint: str, seed: int = 0) -> ExcitationRange:
-    """Return a posture near home from which `joint` reaches most of its range, clear of the body, at
-    every payload.
+    """Return a posture near home from which `joint` reaches most of its range, clear of the body,
+    at every payload.
 
     Home is tried first; then the other operated joints of the limb are varied at random, more and
     more.
@@ -254,8 +256,8 @@ def _longest_run(mask: Array) -> tuple[int, int]:
 
 
 def _limb(model: mujoco.MjModel, operated: tuple[str, ...], joint: str) -> list[str]:
-    """Return the operated joints on the chain of `joint`: those that it carries and those that carry
-    it.
+    """Return the operated joints on the chain of `joint`: those that it carries and those that
+    carry it.
     """
     body = {name: int(model.joint(name).bodyid[0]) for name in operated}
     mine = body[joint]

@@ -1,7 +1,8 @@
 """Motion files: SAGE motion txt, csv and npz, read into a Motion, or written from one.
 
-SAGE txt: a line of joint names (comma separated, each a name or a path /robot/link/joint), then one row per sample in
-rad at 50 Hz. csv: the same with a `time` column (s) that sets the period. npz: joint_names, ctrl (T, k) rad and dt s.
+SAGE txt: a line of joint names (comma separated, each a name or a path /robot/link/joint), then one
+row per sample in rad at 50 Hz. csv: the same with a `time` column (s) that sets the period. npz:
+joint_names, ctrl (T, k) rad and dt s.
 """
 
 from __future__ import annotations
@@ -25,7 +26,8 @@ SUFFIXES = (".txt", ".csv", ".npz")
 
 
 def read_motion(path: str | Path, robot: RobotSpec) -> Motion:
-    """A motion from a file; joints that the file does not name are at home, and stay where they are found on a robot.
+    """A motion from a file; joints that the file does not name are at home, and stay where they
+    are found on a robot.
 
     Raises:
         LogError: Unreadable; with file, line and what is wrong.
@@ -57,7 +59,8 @@ def write_motion(path: Path, motion: Motion, robot: RobotSpec, rate: float) -> N
     """The joints that a motion names, at a control rate, Hz, as a file that read_motion reads.
 
     Raises:
-        UsageError: No robot has this rate; or a .txt, which has no time column, at another than 50 Hz.
+        UsageError: No robot has this rate; or a .txt, which has no time column, at another than 50
+            Hz.
     """
     if not 1 / MAX_PERIOD_S <= rate <= 1 / MIN_PERIOD_S:
         raise UsageError(
@@ -74,13 +77,16 @@ def write_motion(path: Path, motion: Motion, robot: RobotSpec, rate: float) -> N
             f"{path}: SAGE motion files are at {1 / SAGE_DT:g} Hz; write csv or npz at {rate:g} Hz"
         )
     if path.suffix == ".csv":
-        rows, names = np.column_stack([np.arange(len(rows)) / rate, rows]), ["time", *names]
+        rows = np.column_stack([np.arange(len(rows)) / rate, rows])
+        names = ["time", *names]
     text = "\n".join([", ".join(names), *(", ".join(f"{x:.6f}" for x in row) for row in rows)])
     write_text(path, text + "\n")
 
 
 def _level_of(ctrl: Array, robot: RobotSpec) -> str:
-    """joint when one joint moves, upper_body when only operated joints and torso move, else whole_body."""
+    """joint when one joint moves, upper_body when only operated joints and torso move, else
+    whole_body.
+    """
     moved = [
         name
         for name, span in zip(robot.joint_names, np.ptp(ctrl, axis=0), strict=True)
@@ -150,9 +156,11 @@ def _npz(path: Path) -> tuple[list[str], Array, float]:
         if arrays[name].dtype.kind not in kind or arrays[name].ndim != dimensions:
             what = "text" if kind == "U" else "numbers"
             raise LogError(
-                f"{path}: array '{name}' must hold {what} in {dimensions} dimensions; write it again"
+                f"{path}: array '{name}' must hold {what} in {dimensions} dimensions; write it "
+                "again"
             )
-    names, rows = arrays["joint_names"].tolist(), arrays["ctrl"].astype(float)
+    names = arrays["joint_names"].tolist()
+    rows = arrays["ctrl"].astype(float)
     if rows.shape[1] != len(names) or len(rows) < 2 or not np.isfinite(rows).all():
         raise LogError(
             f"{path}: ctrl has shape {rows.shape} or holds NaN; {len(names)} joint names"

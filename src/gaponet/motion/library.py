@@ -33,7 +33,9 @@ def sweep(low: float, high: float, rng: np.random.Generator, dt: float) -> Array
 
 
 def creep(low: float, high: float, rng: np.random.Generator, dt: float) -> Array:
-    """A few tenths of a radian at 0.1 rad/s, there and back: shows sticking, backlash and the Stribeck dip."""
+    """A few tenths of a radian at 0.1 rad/s, there and back: shows sticking, backlash and the
+    Stribeck dip.
+    """
     half = min(0.15, (high - low) / 2)
     mid = (low + high) / 2
     if high - low > 2 * half:
@@ -43,8 +45,8 @@ def creep(low: float, high: float, rng: np.random.Generator, dt: float) -> Array
 
 
 def steps(low: float, high: float, rng: np.random.Generator, dt: float) -> Array:
-    """Quick moves of a quarter radian with rests between: shows delay, overshoot and where the joint
-    comes to rest.
+    """Quick moves of a quarter radian with rests between: shows delay, overshoot and where the
+    joint comes to rest.
     """
     size = min(0.3, (high - low) / 3)
     levels = [float(rng.uniform(low + size, high - size))]
@@ -88,7 +90,9 @@ def multisine(low: float, high: float, rng: np.random.Generator, dt: float) -> A
 
 
 def holds(low: float, high: float, rng: np.random.Generator, dt: float) -> Array:
-    """A staircase through the interval with rests, from both sides: shows sag and the dead band around it."""
+    """A staircase through the interval with rests, from both sides: shows sag and the dead band
+    around it.
+    """
     up = np.linspace(low, high, 4) + rng.uniform(-0.05, 0.05, 4) * (high - low)
     levels = np.clip(np.concatenate([up, up[-2::-1]]), low, high)
     return _line(levels, move_time(np.diff(levels), 2.0), [0.6] * len(levels), dt)
@@ -156,8 +160,8 @@ class Library:
         self._given[motion.name] = self.limits.fit(motion)
 
     def names(self, variants: int = 1) -> list[str]:
-        """Return all names: <signal>-<joint>, <kind>-<side>-<variant>, <kind>-all-<variant>, and what
-        was added.
+        """Return all names: <signal>-<joint>, <kind>-<side>-<variant>, <kind>-all-<variant>, and
+        what was added.
         """
         sides = list(self.kit.arms)
         if len(sides) == 2:

@@ -53,8 +53,8 @@ class Motion:
         return len(self.ctrl) * self.dt
 
     def sample(self, dt: float) -> Array:
-        """Targets at a control period, (T', n): every k-th row where dt is k grid periods, else linear
-        between rows.
+        """Targets at a control period, (T', n): every k-th row where dt is k grid periods, else
+        linear between rows.
         """
         stride = dt / self.dt
         if abs(stride - round(stride)) < 1e-9:

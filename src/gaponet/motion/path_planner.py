@@ -65,7 +65,9 @@ class Trajectory:
 
 
 def line(a: Array, b: Array) -> Array:
-    """Return postures from a to b (n,) rad, at most POSTURE_STEP_RAD apart, both included, (T, n)."""
+    """Return postures from a to b (n,) rad, at most POSTURE_STEP_RAD apart, both included, (T,
+    n).
+    """
     steps = int(np.ceil(np.abs(b - a).max() / POSTURE_STEP_RAD))
     return np.linspace(a, b, max(1, steps) + 1)
 
@@ -83,7 +85,8 @@ def find_points(free: Free, start: Array, goal: Array, home: Array) -> Search[Ar
     """Return points (k, n) rad of a free path from start to goal, straight if possible, else by way
     of home.
 
-    None if neither is free. Nothing else is tried: a person decides how a robot gets out of a place.
+    None if neither is free. Nothing else is tried: a person decides how a robot gets out of a
+    place.
 
     Args:
         start, goal, home: (n,) rad.

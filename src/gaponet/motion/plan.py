@@ -14,6 +14,7 @@ from gaponet.motion.library import Library, short
 from gaponet.motion.motion import Motion
 from gaponet.robot.spec import RobotSpec
 
+# most informative first
 SIGNAL_ORDER = (
     "multisine",
     "steps",
@@ -22,9 +23,10 @@ SIGNAL_ORDER = (
     "sweep",
     "trapezoids",
     "creep",
-)  # most informative first
+)
 MAX_ROUNDS = 50
-RECOMMENDED_MINUTES, MIN_TRAINING_MINUTES = 41.0, 9.0
+RECOMMENDED_MINUTES = 41.0
+MIN_TRAINING_MINUTES = 9.0
 
 
 @dataclass(frozen=True)
@@ -50,21 +52,25 @@ class Plan:
 
 
 def make_plan(robot: RobotSpec, minutes: float, payloads: tuple[float, ...], seed: int = 0) -> Plan:
-    """Return motions for so many minutes: every joint alone, signal by signal, with motions of many joints between.
+    """Return motions for so many minutes: every joint alone, signal by signal, with motions of
+    many joints between.
 
     Raises:
-        UsageError: Too little time for one motion of each joint at each payload, or a payload that cannot be carried.
+        UsageError: Too little time for one motion of each joint at each payload, or a payload that
+            cannot be carried.
     """
     if not payloads or min(payloads) < 0 or (max(payloads) > 0 and not robot.payload_mounts):
         raise UsageError(
-            f"--payloads {payloads}: give kg ≥ 0; {robot.name} has {len(robot.payload_mounts)} mounts"
+            f"--payloads {payloads}: give kg ≥ 0; {robot.name} has {len(robot.payload_mounts)} "
+            "mounts"
         )
     library = Library(robot, seed, max(payloads))
     first = [library.make(f"{SIGNAL_ORDER[0]}-{short(joint)}") for joint in robot.operated]
     least = len(payloads) * sum(m.duration for m in first) / 60
     if least > minutes:
         raise UsageError(
-            f"--minutes {minutes:g} is too short for {robot.name} at these payloads: give {math.ceil(least)}"
+            f"--minutes {minutes:g} is too short for {robot.name} at these payloads: give "
+            f"{math.ceil(least)}"
         )
     chosen = list(first)
     for name in _names(robot, library):
@@ -75,8 +81,11 @@ def make_plan(robot: RobotSpec, minutes: float, payloads: tuple[float, ...], see
 
 
 def _standing(library: Library, name: str) -> Motion:
-    """Return the motion with joints that are not operated at home, so that a humanoid stays on its legs."""
-    made, robot = library.make(name), library.robot
+    """Return the motion with joints that are not operated at home, so that a humanoid stays on its
+    legs.
+    """
+    made = library.make(name)
+    robot = library.robot
     if set(made.moved(robot)) <= set(robot.operated):
         return made
     ctrl = np.tile(robot.qpos_home, (len(made.ctrl), 1))
@@ -85,7 +94,9 @@ def _standing(library: Library, name: str) -> Motion:
 
 
 def _names(robot: RobotSpec, library: Library) -> Iterator[str]:
-    """Yield names of motions of many joints, and after some of them another signal on every joint."""
+    """Yield names of motions of many joints, and after some of them another signal on every
+    joint.
+    """
     kinds = ["tour-all", "limber-all", *(f"wander-{side}" for side in library.kit.arms)]
     for k in range(MAX_ROUNDS):
         yield from (f"{kind}-{v}" for kind in kinds for v in (2 * k, 2 * k + 1))
@@ -109,8 +120,8 @@ def sheet(
     )
     masses = ", ".join(f"{p:g}" for p in plan.payloads)
     size = (
-        f"On virtual H1-2 robots {MIN_TRAINING_MINUTES:g} minutes left a third of the simulator's error, "
-        f"{RECOMMENDED_MINUTES:g} came within a tenth of the best."
+        f"On virtual H1-2 robots {MIN_TRAINING_MINUTES:g} minutes left a third of the simulator's "
+        f"error, {RECOMMENDED_MINUTES:g} came within a tenth of the best."
     )
     size += " Enough to identify gains, friction and delay; little to train on." * (
         plan.minutes < MIN_TRAINING_MINUTES
@@ -118,17 +129,22 @@ def sheet(
     lines = [
         f"# Recording sheet: {robot.name}",
         "",
-        f"{plan.minutes:.{1 if known else 0}f} minutes of motion: {len(plan.motions)} motions at {masses} kg, "
-        f"commands at {rate:g} Hz. {'Chosen for what they tell of this robot beside its logs.' if known else size}",
+        f"{plan.minutes:.{1 if known else 0}f} minutes of motion: {len(plan.motions)} motions at "
+        f"{masses} kg, commands at {rate:g} Hz. "
+        f"{'Chosen for what they tell of this robot beside its logs.' if known else size}",
         "",
         "Robot: ____________  unit: ____________  date: ____________  by: ____________",
         "",
         "1. Warm up for ten minutes with any of these motions: cold joints rub more.",
-        "2. Note kp and kd of the controller and leave them: one setting for all motions, or a folder for each.",
+        "2. Note kp and kd of the controller and leave them: one setting for all motions, or a "
+        "folder for each.",
         f"   The simulator has (N·m/rad, N·m·s/rad): {gains}.",
-        "3. Log the command as it is sent, the measured position and, if there are, velocity and signed torque: with",
-        "   one clock, at the commands' rate or above, with all digits, from before the motion to a second after it.",
-        "4. Nothing may touch the robot. Play each motion slowly first, a hand on the stop. Play a motion again that",
+        "3. Log the command as it is sent, the measured position and, if there are, velocity and "
+        "signed torque: with",
+        "   one clock, at the commands' rate or above, with all digits, from before the motion to "
+        "a second after it.",
+        "4. Nothing may touch the robot. Play each motion slowly first, a hand on the stop. Play "
+        "a motion again that",
         "   was stopped.",
         "5. Weigh payloads to 10 g and mount them where robot.toml says.",
         "",
@@ -141,7 +157,8 @@ def sheet(
         )
     lines += ["", "Then, for each payload:", ""]
     lines += [
-        f"    gaponet import LOGS/{p:g}kg --robot ROBOT --unit-id UNIT --payload-mass {p:g} --out data"
+        f"    gaponet import LOGS/{p:g}kg --robot ROBOT --unit-id UNIT --payload-mass {p:g} --out "
+        "data"
         for p in plan.payloads
     ]
     then = (

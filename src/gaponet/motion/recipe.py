@@ -1,4 +1,6 @@
-"""Recipe: which motions are played with which payloads, on which units, at which rates, how often."""
+"""Recipe: which motions are played with which payloads, on which units, at which rates, how
+often.
+"""
 
 from __future__ import annotations
 
@@ -31,7 +33,8 @@ class Recipe:
         motions: Names of motion.library, or patterns of them (`*-left_*`).
         files: Motion files (motion.files) to play too; in a recipe file relative to it.
         rates: Control rates, Hz.
-        repetitions: How often all is played; repetitions differ in temperature, noise and exact start, as on a robot.
+        repetitions: How often all is played; repetitions differ in temperature, noise and exact
+            start, as on a robot.
         variants: How many of each kind of coordinated motion patterns choose among.
         payload_side: both, or one hand.
     """
@@ -72,7 +75,8 @@ def load_recipe(name_or_path: str | Path) -> Recipe:
     """A recipe of the package by name, or a TOML file with the fields of Recipe.
 
     Raises:
-        UsageError: No such recipe, or a field is unknown, missing or empty; with the file and what to write.
+        UsageError: No such recipe, or a field is unknown, missing or empty; with the file and what
+            to write.
     """
     path, table = load_toml("recipe", RECIPES, name_or_path)
     hint = f"fields are {', '.join(Recipe.__dataclass_fields__)}"

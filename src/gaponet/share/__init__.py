@@ -1,1 +1,3 @@
-"""Push datasets and runs to the Hugging Face Hub, and pull them, checked by the hash of every file."""
+"""Push datasets and runs to the Hugging Face Hub, and pull them, checked by the hash of every
+file.
+"""

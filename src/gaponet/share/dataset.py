@@ -1,8 +1,8 @@
 """Conversion between a dataset and the files that are pushed.
 
-The files are a LeRobot set (gaponet.data.writers.lerobot), which LeRobot and the Hub's viewer read. The folder
-gaponet/ beside it holds what such a set has no place for: the nominal robot, splits, recipe, offsets, and the hashes
-of the files that the push was made from.
+The files are a LeRobot set (gaponet.data.writers.lerobot), which LeRobot and the Hub's viewer read.
+The folder gaponet/ beside it holds what such a set has no place for: the nominal robot, splits,
+recipe, offsets, and the hashes of the files that the push was made from.
 """
 
 from __future__ import annotations
@@ -49,7 +49,8 @@ def write_files(path: Path, folder: Path, address: str) -> tuple[str, ...]:
     Raises:
         DatasetError: The dataset is empty, or a recording is damaged.
     """
-    dataset, source = Dataset(path), _source_text(path, address)
+    dataset = Dataset(path)
+    source = _source_text(path, address)
     robot = load_stored_robot(dataset.path, dataset.robot_name)
     contents = tuple(sorted(entry.hash for entry in dataset.select()))
     with progress_bar("reading") as update:
@@ -78,7 +79,8 @@ def is_pushed(path: Path, address: str, index: Index) -> bool:
 
 
 def _source_text(path: Path, address: str) -> str:
-    """Return what the pushed files depend on, as JSON: version, address, and hashes of the dataset's small files.
+    """Return what the pushed files depend on, as JSON: version, address, and hashes of the
+    dataset's small files.
 
     The journal lists the content hash of every recording, so that no recording is read.
     """
@@ -125,7 +127,8 @@ def missing_files(files: Path, index: Index, present: Dataset | None) -> list[st
 
 
 def add_missing(files: Path, robot: RobotSpec, out: Path, new: bool) -> None:
-    """Copy the sequences that a dataset lacks from pushed files; each is compared with its content hash.
+    """Copy the sequences that a dataset lacks from pushed files; each is compared with its content
+    hash.
 
     Args:
         files: Folder with the small files of the push and with those of missing_files.

@@ -1,6 +1,8 @@
-"""Repositories of the Hugging Face Hub: datasets as dataset repositories, runs and robots as model repositories.
+"""Repositories of the Hugging Face Hub: datasets as dataset repositories, runs and robots as model
+repositories.
 
-A push is one commit. huggingface_hub uploads only files that the Hub does not have; it retries and resumes transfers.
+A push is one commit. huggingface_hub uploads only files that the Hub does not have; it retries and
+resumes transfers.
 """
 
 from __future__ import annotations
@@ -36,7 +38,8 @@ class Hub:
     def __init__(self, address: str) -> None:
         """
         Args:
-            address: USER/NAME, with @REVISION behind it for another branch, tag or commit than main.
+            address: USER/NAME, with @REVISION behind it for another branch, tag or commit than
+                main.
 
         Raises:
             RemoteError: It is the address of something else.
@@ -46,20 +49,23 @@ class Hub:
         scheme, separator, _ = address.partition("://")
         if separator and scheme != "hf":
             raise RemoteError(
-                f"{address}: not on the Hub; a dataset is a folder, which the tools of other places "
-                "copy as it is, such as aws s3 sync"
+                f"{address}: not on the Hub; a dataset is a folder, which the tools of other "
+                "places copy as it is, such as aws s3 sync"
             )
 
         self.address = address
         self.repo, _, revision = (
             address.removeprefix("hf://").removeprefix("datasets/").partition("@")
         )
-        self.api, self.revision = HfApi(os.environ.get("HF_ENDPOINT")), revision or "main"
+        self.api = HfApi(os.environ.get("HF_ENDPOINT"))
+        self.revision = revision or "main"
         self.type = self.commit = ""
         self._sizes: dict[str, int | None] = {}
 
     def index(self, kind: Kind | None = None) -> bytes | None:
-        """Return the content of gaponet.json, None if nothing was pushed; kind: look for this one only."""
+        """Return the content of gaponet.json, None if nothing was pushed; kind: look for this one
+        only.
+        """
         from huggingface_hub.errors import RepositoryNotFoundError
 
         types = dict.fromkeys(REPOSITORY_TYPES.values())
@@ -68,7 +74,8 @@ class Hub:
                 info = self.api.repo_info(
                     self.repo, repo_type=wanted, revision=self.revision, files_metadata=True
                 )
-                self.type, self.commit = wanted, str(info.sha)
+                self.type = wanted
+                self.commit = str(info.sha)
                 self._sizes = {
                     file.rfilename: file.size for file in getattr(info, "siblings", None) or ()
                 }
@@ -83,12 +90,14 @@ class Hub:
                     return Path(file).read_bytes()
                 if self._sizes.keys() - INITIAL_FILES:
                     raise RemoteError(
-                        f"{self.address}: the {wanted} repository holds files but no {INDEX}: gaponet did not push it; "
-                        "a LeRobot set is fetched with: hf download --repo-type dataset, and read by gaponet import"
+                        f"{self.address}: the {wanted} repository holds files but no {INDEX}: "
+                        "gaponet did not push it; a LeRobot set is fetched with: hf download "
+                        "--repo-type dataset, and read by gaponet import"
                     )
         if kind is None and not self.type:
             raise RemoteError(
-                f"{self.address}: no dataset, run or robot there that may be read; see hf auth login"
+                f"{self.address}: no dataset, run or robot there that may be read; see hf auth "
+                "login"
             )
         return None
 
@@ -97,7 +106,8 @@ class Hub:
         return any(self._sizes.get(path) != file.size for path, file in index.files.items())
 
     def download(self, paths: list[str], index: Index, folder: Path) -> None:
-        """Download files of the index into a folder; those that an earlier download left there are kept.
+        """Download files of the index into a folder; those that an earlier download left there are
+        kept.
 
         Raises:
             RemoteError: A file is missing or differs, or the disk is too small.
@@ -128,7 +138,8 @@ class Hub:
         from huggingface_hub import CommitOperationAdd, CommitOperationDelete
         from huggingface_hub.errors import HfHubHTTPError, RevisionNotFoundError
 
-        repo_type, files = REPOSITORY_TYPES[index.kind], {*index.files, INDEX}
+        repo_type = REPOSITORY_TYPES[index.kind]
+        files = {*index.files, INDEX}
         with network_errors(self.address):
             if not self.type:
                 self.api.create_repo(
@@ -138,7 +149,8 @@ class Hub:
                     raise lost_race(self.address)
             removed = sorted(self._sizes.keys() - files - INITIAL_FILES)
             try:
-                self.api.create_commit(  # upload_folder and upload_large_folder show readers a part of the new state
+                # upload_folder and upload_large_folder show readers a part of the new state
+                self.api.create_commit(
                     self.repo,
                     [CommitOperationAdd(path, str(folder / path)) for path in sorted(files)]
                     + [CommitOperationDelete(path) for path in removed],

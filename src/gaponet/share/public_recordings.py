@@ -1,7 +1,8 @@
 """Public recordings over HTTPS: the files of a pinned commit, each checked by its size and SHA-256.
 
-They come into the cache, in the folders that the data folder of benchmarks/real_robots has. A file gets its name when
-it is complete and right, so that an interrupted download goes on with the files that are missing.
+They come into the cache, in the folders that the data folder of benchmarks/real_robots has. A file
+gets its name when it is complete and right, so that an interrupted download goes on with the files
+that are missing.
 """
 
 from __future__ import annotations
@@ -66,7 +67,8 @@ class PublicFiles:
         return missing
 
     def provide(self, progress: Progress = no_progress) -> Path:
-        """Return the folder of the recordings: below GAPONET_DATA, or else in the cache after a download.
+        """Return the folder of the recordings: below GAPONET_DATA, or else in the cache after a
+        download.
 
         Args:
             progress: Called with the bytes done, all bytes, and the name of a file.
@@ -87,8 +89,8 @@ class PublicFiles:
         missing = self.missing_in(folder)
         if missing:
             raise UsageError(
-                f"{folder}: {len(missing)} of {len(self.files)} files are missing or have another content, such as "
-                f"{missing[0]}; unset {DATA_VARIABLE}, and they are downloaded"
+                f"{folder}: {len(missing)} of {len(self.files)} files are missing or have another "
+                f"content, such as {missing[0]}; unset {DATA_VARIABLE}, and they are downloaded"
             )
         return folder
 
@@ -113,14 +115,16 @@ class PublicFiles:
             temporary.write_bytes(_read(url, record.size))
             if FileRecord.of(temporary) != record:
                 raise RemoteError(
-                    f"{url}: is not the file that this gaponet knows, by its size or SHA-256, and was not kept; "
-                    "give the same command again, and if it persists update gaponet"
+                    f"{url}: is not the file that this gaponet knows, by its size or SHA-256, and "
+                    "was not kept; give the same command again, and if it persists update gaponet"
                 )
         return path
 
 
 def cache_folder() -> Path:
-    """Return the folder for downloaded files: gaponet in XDG_CACHE_HOME, which is by default ~/.cache."""
+    """Return the folder for downloaded files: gaponet in XDG_CACHE_HOME, which is by default
+    ~/.cache.
+    """
     given = os.environ.get("XDG_CACHE_HOME")
     return (Path(given) if given else Path.home() / ".cache") / "gaponet"
 
@@ -142,6 +146,6 @@ def _read(url: str, size: int) -> bytes:
     except NETWORK_ERRORS as error:
         reason = getattr(error, "reason", None) or error or type(error).__name__
         raise RemoteError(
-            f"{url}: not read ({reason}); the same command goes on where it stopped. Without a network, name a folder "
-            f"that has these recordings with {DATA_VARIABLE}"
+            f"{url}: not read ({reason}); the same command goes on where it stopped. Without a "
+            f"network, name a folder that has these recordings with {DATA_VARIABLE}"
         ) from None

@@ -1,7 +1,7 @@
 """Push and pull of datasets, runs and robots.
 
-Both work in a hidden folder beside what is pushed or pulled, which gets its name when it is complete. The next push or
-pull does not transfer again what a killed one has transferred.
+Both work in a hidden folder beside what is pushed or pulled, which gets its name when it is
+complete. The next push or pull does not transfer again what a killed one has transferred.
 """
 
 from __future__ import annotations
@@ -56,8 +56,8 @@ def push(
     licence: str = "",
     trained_on: str = "",
 ) -> TransferResult:
-    """Put a dataset, a run or an identified robot where others can pull it, with a card; what is there already is
-    brought up to date.
+    """Put a dataset, a run or an identified robot where others can pull it, with a card; what is
+    there already is brought up to date.
 
     Args:
         path: Dataset, run or robot folder.
@@ -110,7 +110,8 @@ def push(
 
 
 def pull(address: str, out: str | Path) -> TransferResult:
-    """Fetch what was pushed, checked by the hash of each file and each sequence; a pull that was killed goes on.
+    """Fetch what was pushed, checked by the hash of each file and each sequence; a pull that was
+    killed goes on.
 
     A dataset that is there already gets the sequences that it lacks, and keeps all else as it is.
 
@@ -119,7 +120,8 @@ def pull(address: str, out: str | Path) -> TransferResult:
         out: New or empty folder, or a dataset of that robot.
 
     Raises:
-        RemoteError: Nothing is there, a file has another hash, or the content is no dataset, run or robot.
+        RemoteError: Nothing is there, a file has another hash, or the content is no dataset, run or
+            robot.
         UsageError: The folder holds something.
     """
     out = Path(out)
@@ -154,7 +156,9 @@ def pull(address: str, out: str | Path) -> TransferResult:
 def _pull_dataset(
     hub: Hub, index: Index, work: Path, present: Dataset | None
 ) -> tuple[list[str], Path]:
-    """Download what a dataset lacks, and add it to the dataset or to a new one; return the files and the dataset."""
+    """Download what a dataset lacks, and add it to the dataset or to a new one; return the files
+    and the dataset.
+    """
     files = work / "files"
     files.mkdir(exist_ok=True)
     small = sorted(path for path in index.files if not datasets.is_recording_file(path))
@@ -208,10 +212,11 @@ def _require_newer(
 
 @contextmanager
 def _work_folder(path: Path, purpose: str) -> Iterator[Path]:
-    """Hidden folder beside a path, for one process at a time; it is removed at the end if the block does not fail."""
-    parent = (
-        path.parent if os.access(path.parent, os.W_OK) else Path(gettempdir())
-    )  # a disk that is only read
+    """Hidden folder beside a path, for one process at a time; it is removed at the end if the
+    block does not fail.
+    """
+    # a disk that is only read
+    parent = path.parent if os.access(path.parent, os.W_OK) else Path(gettempdir())
     folder = parent / f"{FOLDER_MARKER}-{purpose}-{path.name}"
     with lock_folder(folder, purpose):
         yield folder

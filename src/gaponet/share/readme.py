@@ -1,4 +1,6 @@
-"""README.md of a push: the header for the Hub, the data card or model card, and the command that pulls it."""
+"""README.md of a push: the header for the Hub, the data card or model card, and the command that
+pulls it.
+"""
 
 from __future__ import annotations
 
@@ -13,6 +15,7 @@ from gaponet.evaluation.tables import mrad, totals
 from gaponet.nn.artifact import GapModel
 from gaponet.robot.spec import RobotSpec
 
+# the Hub's
 LICENCES = (
     "apache-2.0",
     "mit",
@@ -21,11 +24,12 @@ LICENCES = (
     "cc-by-4.0",
     "cc-by-sa-4.0",
     "cc-by-nc-4.0",
-)  # the Hub's
+)
 
 
 def dataset_readme(card: dict[str, Any], text: str, address: str, sets: list[str]) -> str:
-    """Return a dataset card: the header with which the Hub shows LeRobot sets, and the text of the card.
+    """Return a dataset card: the header with which the Hub shows LeRobot sets, and the text of the
+    card.
 
     Args:
         sets: Folders of the sets, below the repository.
@@ -96,7 +100,8 @@ def robot_readme(robot: RobotSpec, origin: Origin | None, address: str, facts: M
         ]
     lines += [
         "",
-        "These are the values of one robot at one time. Identify or adapt yours before you rely on them.",
+        "These are the values of one robot at one time. Identify or adapt yours before you rely "
+        "on them.",
     ]
     short = address.removeprefix("hf://")
     use = [
@@ -113,18 +118,18 @@ def robot_readme(robot: RobotSpec, origin: Origin | None, address: str, facts: M
 
 def run_readme(found: dict[str, Any], address: str, facts: ModelFacts) -> str:
     """Return a model card: corrected joints, training data, and errors on the test motions."""
-    card, metrics = found["card"], found["metrics"]
-    virtual, rates = (
-        ", trained on VIRTUAL robots",
-        ", ".join(f"{1 / dt:.2f}" for dt in card.get("dt", [])),
-    )
+    card = found["card"]
+    metrics = found["metrics"]
+    virtual = ", trained on VIRTUAL robots"
+    rates = ", ".join(f"{1 / dt:.2f}" for dt in card.get("dt", []))
     lines = [
-        f"# {escape_markdown(card['robot'])}: a model of its motor gap{virtual * bool(card.get('virtual'))}",
+        f"# {escape_markdown(card['robot'])}: a model of its motor "
+        f"gap{virtual * bool(card.get('virtual'))}",
         "",
         f"- corrects the targets of {len(card['joint_names'])} joints: "
         f"{escape_markdown(', '.join(card['joint_names']))}",
-        f"- trained {escape_markdown(GapModel.how_trained(card))}, on {card.get('hours', 0):.2f} h of dataset "
-        f"{escape_markdown(str(card.get('dataset_hash', '')))}",
+        f"- trained {escape_markdown(GapModel.how_trained(card))}, on {card.get('hours', 0):.2f} "
+        f"h of dataset {escape_markdown(str(card.get('dataset_hash', '')))}",
         f"- at {rates} Hz, in simulator {escape_markdown(card['simulator'])}",
         f"- weights {found['weights']}",
     ]
@@ -143,6 +148,9 @@ def _tags(card: dict[str, Any], *more: str) -> list[str]:
 
 
 def _page(header: dict[str, Any], lines: list[str], use: list[str]) -> str:
-    """Return YAML between two rules and then the page. Each value is written as JSON, which is valid YAML."""
+    """Return YAML between two rules and then the page.
+
+    Each value is written as JSON, which is valid YAML.
+    """
     fields = [f"{name}: {json.dumps(value, ensure_ascii=False)}" for name, value in header.items()]
     return "\n".join(["---", *fields, "---", "", *lines, "", "## Use", "", *use, ""])

@@ -130,7 +130,9 @@ def require_pushed_files(address: str, index: Index, paths: list[str], folder: P
 
 @contextmanager
 def file_errors(address: str, folder: Path) -> Iterator[None]:
-    """Turn errors about downloaded files into a RemoteError that names the address instead of the folder."""
+    """Turn errors about downloaded files into a RemoteError that names the address instead of the
+    folder.
+    """
     try:
         yield
     except GAPONetError as error:

@@ -1,4 +1,6 @@
-"""The files of a robot folder that are pushed: those that load it and say how sure its values are, and no HTML."""
+"""The files of a robot folder that are pushed: those that load it and say how sure its values are,
+and no HTML.
+"""
 
 from __future__ import annotations
 

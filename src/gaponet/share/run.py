@@ -31,7 +31,9 @@ FILES = re.compile(
 
 
 def write_files(run: Path, folder: Path, address: str, facts: ModelFacts) -> tuple[str, ...]:
-    """Copy the files of a run, with a README, into an empty folder; return the hash of its network."""
+    """Copy the files of a run, with a README, into an empty folder; return the hash of its
+    network.
+    """
     if not (run / "model" / CARD).is_file():
         raise ModelError(f"{run}: no model yet; train it first")
     write_text(folder / README, run_readme(_facts(run), address, facts))
@@ -65,10 +67,13 @@ def require_pushed(folder: Path, index: Index) -> None:
 
 
 def _facts(run: Path) -> dict[str, Any]:
-    """Read and check the files of a run; return model card, configuration, newest metrics and hash of the weights."""
+    """Read and check the files of a run; return model card, configuration, newest metrics and hash
+    of the weights.
+    """
     if has_stored_robot(run):
         require_self_contained(run / STORED_ROBOT)
-    config, model = read_config(run), GapModel.load(run)
+    config = read_config(run)
+    model = GapModel.load(run)
     load_stored_robot(run, config["robot"])
     metrics = read_metrics(run) if (run / "metrics.json").is_file() else None
     return {

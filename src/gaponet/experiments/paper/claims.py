@@ -1,7 +1,7 @@
 """The paper's claims, and what each method reaches here.
 
-A network is credited with what it adds: to the nominal simulator, to targets as they are, or to the feed-forward. So an
-untrained network, whose correction is zero, has 0 % in every row.
+A network is credited with what it adds: to the nominal simulator, to targets as they are, or to the
+feed-forward. So an untrained network, whose correction is zero, has 0 % in every row.
 """
 
 from __future__ import annotations
@@ -116,7 +116,9 @@ WITHOUT_NETWORK = {
 
 
 def _delivery_claims(results: Results, block: Block) -> list[Claim]:
-    """Offsets at the heaviest payload, against the MLP as the paper has it, and against what needs no network."""
+    """Offsets at the heaviest payload, against the MLP as the paper has it, and against what needs
+    no network.
+    """
     found = []
     heaviest = f"{results.masses[-1]:g} kg"
     for way in ("delta", "both"):
@@ -129,7 +131,10 @@ def _delivery_claims(results: Results, block: Block) -> list[Claim]:
             reductions = {
                 name: _offset_reduction(seeds, plain, axis) for name, seeds in offsets.items()
             }
-            text = f"hand to goal along {letter}, {WAY_TITLES[way]}, {heaviest}: less than {WITHOUT_NETWORK[reference]}"
+            text = (
+                f"hand to goal along {letter}, {WAY_TITLES[way]}, {heaviest}: less than "
+                f"{WITHOUT_NETWORK[reference]}"
+            )
             found.append(Claim(block, text, None, reductions))
         if "MLP" not in offsets:
             continue
@@ -186,8 +191,9 @@ def claim_table(found: list[Claim], block: Block) -> ResultTable:
     if seeds == 1:
         over = "over motions or goals; of one seed the spread over seeds is not known"
     caption = (
-        f"Trained by {BLOCK_TITLES[block]}. Per cent less, ± the standard error {over} (paired, jackknife). "
-        "The verdict is on GAPONet: reached or not by two standard errors. An untrained network has 0 in every row."
+        f"Trained by {BLOCK_TITLES[block]}. Per cent less, ± the standard error {over} (paired, "
+        "jackknife). The verdict is on GAPONet: reached or not by two standard errors. An "
+        "untrained network has 0 in every row."
     )
     columns = ("claim", "the paper", *methods, "verdict")
     return ResultTable(f"claims_{block}", columns, tuple(rows), caption, 0)

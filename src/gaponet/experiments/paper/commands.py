@@ -1,14 +1,15 @@
-"""Commands on a VIRTUAL robot, many motions side by side: targets as they are, or through a compensator.
+"""Commands on a VIRTUAL robot, many motions side by side: targets as they are, or through a
+compensator.
 
 Way            command for a target a
 raw            a
-delta          a − Δa: the robot moves like the nominal simulator, which includes its sag and its lag
-feedforward    a + τ / kp, τ being the nominal simulator's torque for holding and moving
-both           feed-forward, and a − Δa on top of it
-integral       both, and the slow integral of the measured error
+delta          a − Δa: the robot moves like the nominal simulator, which includes its sag and its
+lag feedforward    a + τ / kp, τ being the nominal simulator's torque for holding and moving both
+feed-forward, and a − Δa on top of it integral       both, and the slow integral of the measured
+error
 
-A network that corrects nothing leaves `delta` at raw and `both` at feed-forward. So the gain of a network is measured
-against raw, feed-forward, and feed-forward with the integral.
+A network that corrects nothing leaves `delta` at raw and `both` at feed-forward. So the gain of a
+network is measured against raw, feed-forward, and feed-forward with the integral.
 """
 
 from __future__ import annotations
@@ -31,7 +32,8 @@ DELTA = CompensatorConfig(aim="simulator", feedback=0.0)
 FEEDFORWARD = CompensatorConfig(dynamics=True, feedback=0.0)
 INTEGRAL = CompensatorConfig(dynamics=True)
 
-# Way → settings of the compensator, for a network and without one. None: targets are sent as they are.
+# Way → settings of the compensator, for a network and without one. None: targets are sent as they
+# are.
 NETWORK_WAYS = {"delta": DELTA, "both": FEEDFORWARD, "integral": INTEGRAL}
 PLAIN_WAYS = {"raw": None, "feedforward": FEEDFORWARD, "integral": INTEGRAL}
 # Way of a network → way without one that it is measured against.
@@ -75,9 +77,11 @@ def play(
     compensator: Compensator | None = None,
     progress: ShareDone = lambda share: None,
 ) -> Playback:
-    """Play motions on a VIRTUAL unit, each from rest under its first target; one that has ended stands still.
+    """Play motions on a VIRTUAL unit, each from rest under its first target; one that has ended
+    stands still.
 
-    The noise and the exact start of a motion depend on its place in the list alone, so all ways meet the same robot.
+    The noise and the exact start of a motion depend on its place in the list alone, so all ways
+    meet the same robot.
 
     Args:
         robot: The nominal robot; the unit's hidden physics acts on it.
@@ -89,7 +93,8 @@ def play(
     count = len(targets)
     lengths = np.array([len(target) for target in targets])
     padded = np.stack([_padded(target, lengths[0]) for target in targets], axis=1)  # (T, N, n) rad
-    # Limbs without an operated joint stay at home: with a fixed base they share no dynamics with the others.
+    # Limbs without an operated joint stay at home: with a fixed base they share no dynamics with
+    # the others.
     robots = VirtualRobot(
         robot,
         [unit] * count,

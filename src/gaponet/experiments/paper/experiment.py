@@ -1,9 +1,10 @@
 """The paper's experiment from top to bottom.
 
 1. Motions that are in no recording, played by a unit that no network sees.
-2. Identification of the nominal robot, and every network: equal recordings, inputs, training and seeds.
-3. Each is measured on these motions: the simulator with Δa against the robot (equation 5), commands on the robot, and
-   delivery of payloads.
+2. Identification of the nominal robot, and every network: equal recordings, inputs, training and
+seeds.
+3. Each is measured on these motions: the simulator with Δa against the robot (equation 5), commands
+   on the robot, and delivery of payloads.
 4. The paper's claims, Figures 2 and 3, Tables 1 and 2, on one page.
 """
 
@@ -85,7 +86,8 @@ def run_paper_experiment(
         open_bars: Opens the bars of the trainings, title and number → show(running, done).
 
     Raises:
-        UsageError: The dataset or the folder does not fit, or a motion of the experiment was recorded.
+        UsageError: The dataset or the folder does not fit, or a motion of the experiment was
+            recorded.
         ModelError: Every training failed.
     """
     with lock_folder(out, KIND):
@@ -139,7 +141,9 @@ def prepare(
 
 
 def record_unseen(study: Study, rate: float, progress: ShareDone) -> None:
-    """Store the recordings of the unit that no network sees in OUT/unseen, unless they are there."""
+    """Store the recordings of the unit that no network sees in OUT/unseen, unless they are
+    there.
+    """
     unseen = Dataset.create(study.out / "unseen", study.robot)
     unit = study.virtual_unit(1.0 / rate)
     present = [entry for entry in unseen.entries if round(1 / entry.dt) == rate]
@@ -200,8 +204,8 @@ def _figure_3(results: Results) -> list[Section]:
             Section(
                 "Figure 3",
                 f"Simulator against robot, by joint and payload ({BLOCK_TITLES[block]})",
-                "Q_dis is the area between the positions of the simulator, under a + Δa, and of the robot, under a. "
-                "No network has seen these motions.",
+                "Q_dis is the area between the positions of the simulator, under a + Δa, and of "
+                "the robot, under a. No network has seen these motions.",
                 {f"figure3_{block}": draw_figure_3(results, block)},
                 [figure_3_table(results, block)],
             )

@@ -28,7 +28,8 @@ COLUMNS = 4  # panels side by side
 def draw_figure_3(results: Results, block: Block) -> Figure:
     """Draw a panel for each joint without wrists: Q_dis over the payload, raw, MLP and GAPONet.
 
-    Bars are the standard error over motions. A robot with one payload has its joints on the x-axis instead.
+    Bars are the standard error over motions. A robot with one payload has its joints on the x-axis
+    instead.
     """
     curves = _curves(results, block)
     if len(results.masses) == 1:
@@ -120,8 +121,8 @@ def figure_3_table(results: Results, block: Block) -> ResultTable:
             cells.append(MeanStd.from_values([float(seed) for seed in seeds]))
         rows.append((f"{mass:g} kg", *cells))
     caption = (
-        "Q_dis between simulator and robot, mean over joints without wrists and over motions; ± is the standard "
-        "deviation over training seeds."
+        "Q_dis between simulator and robot, mean over joints without wrists and over motions; ± "
+        "is the standard deviation over training seeds."
     )
     columns = ("Q_dis, rad·s", "nominal (raw)", "identification", *methods)
     return ResultTable(f"figure3_{block}", columns, tuple(rows), caption, digits=4)

@@ -1,4 +1,6 @@
-"""Goals of the hands, spread evenly over the space in which they can hold a payload, and trajectories to them."""
+"""Goals of the hands, spread evenly over the space in which they can hold a payload, and
+trajectories to them.
+"""
 
 from __future__ import annotations
 
@@ -32,7 +34,8 @@ class Plan:
     Attributes:
         ctrl: Joint targets at the robot's control period, (T, n) rad.
         goals: Goals of each hand, (G, hands, 3) m in the frame of the robot's base.
-        start, arrive, leave: Rows at which the move to a goal begins, the move ends, and its hold ends, (G,).
+        start, arrive, leave: Rows at which the move to a goal begins, the move ends, and its hold
+            ends, (G,).
     """
 
     ctrl: Array
@@ -64,7 +67,8 @@ class HandPositions:
     """Forward kinematics of the hands."""
 
     def __init__(self, model: mujoco.MjModel, arms: list[Arm]) -> None:
-        self.model, self.data = model, mujoco.MjData(model)
+        self.model = model
+        self.data = mujoco.MjData(model)
         self.bodies = np.array([model.body(arm.hand).id for arm in arms])
 
     def __call__(self, qpos: Array) -> Array:
@@ -87,7 +91,8 @@ class GoalPlanner:
             max_payload: Payload that can be held at every goal, kg per hand.
             hold: Time at each goal, s.
         """
-        self.robot, self.hold = robot, hold
+        self.robot = robot
+        self.hold = hold
         self.limits = Feasibility(robot, max_payload)
         self.rng = np.random.default_rng([seed, 7])
         self.model = self.limits.models[0]
@@ -111,12 +116,14 @@ class GoalPlanner:
             if len(plans) == count:
                 return plans
         raise UsageError(
-            f"{self.robot.name}: {len(plans)} of {count} trajectories can be held with {self.limits.max_payload:g} kg; "
-            "give a lighter payload"
+            f"{self.robot.name}: {len(plans)} of {count} trajectories can be held with "
+            f"{self.limits.max_payload:g} kg; give a lighter payload"
         )
 
     def _reachable(self, hand: int) -> Array:
-        """Return positions of one hand, (k, 3) m, one for each voxel that a sampled posture reaches."""
+        """Return positions of one hand, (k, 3) m, one for each voxel that a sampled posture
+        reaches.
+        """
         columns = self.arms[hand].columns
         q = np.repeat(self.ready[None], SAMPLED_POSTURES, axis=0)
         q[:, columns] = self.rng.uniform(
@@ -132,8 +139,11 @@ class GoalPlanner:
         return positions[chosen]
 
     def _plan(self) -> Plan | None:
-        """Return a random trajectory; None if a goal is too near, cannot be held, or the move to it meets the body."""
-        postures, goals = [self.ready], []
+        """Return a random trajectory; None if a goal is too near, cannot be held, or the move to
+        it meets the body.
+        """
+        postures = [self.ready]
+        goals = []
         for _ in range(GOALS_PER_TRAJECTORY):
             goal = np.array([places[self.rng.integers(len(places))] for places in self.reachable])
             q = postures[-1]

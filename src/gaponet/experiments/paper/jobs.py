@@ -1,6 +1,8 @@
-"""Jobs of the experiment, each in a process of its own: identification and baselines, and every training.
+"""Jobs of the experiment, each in a process of its own: identification and baselines, and every
+training.
 
-Every job writes one result file. A job whose file exists is done; an interrupted training continues at its checkpoint.
+Every job writes one result file. A job whose file exists is done; an interrupted training continues
+at its checkpoint.
 """
 
 from __future__ import annotations
@@ -93,7 +95,9 @@ def shared_inputs(study: Study, training: Training) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Job:
-    """One job; without a training it identifies the robot and measures all that needs no network."""
+    """One job; without a training it identifies the robot and measures all that needs no
+    network.
+    """
 
     study: Study
     training: Training | None = None
@@ -137,7 +141,8 @@ def run_jobs(jobs: list[Job], show: Show) -> list[str]:
 
     Args:
         jobs: All jobs of the experiment.
-        show: Shows the running trainings and how many of all jobs are done, those of earlier runs included.
+        show: Shows the running trainings and how many of all jobs are done, those of earlier runs
+            included.
 
     Raises:
         KeyboardInterrupt: After every running training has stored a checkpoint.

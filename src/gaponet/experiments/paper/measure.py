@@ -1,7 +1,7 @@
 """What a method is measured on, and the measurement: the same for every method.
 
-On a VIRTUAL fleet: ten motions that no network has seen, on a unit that no network has seen, with every payload. Of a
-real robot: the test motions of the dataset; nothing can be commanded there.
+On a VIRTUAL fleet: ten motions that no network has seen, on a unit that no network has seen, with
+every payload. Of a real robot: the test motions of the dataset; nothing can be commanded there.
 """
 
 from __future__ import annotations
@@ -121,7 +121,8 @@ def record_unit(unit: VirtualUnit, progress: ShareDone = lambda share: None) -> 
 def measure_alignment(
     recorded: Recorded, simulator: RobotSpec, model: GapModel | None
 ) -> dict[str, Any]:
-    """Equation 5: roll the simulator out under a + Δa from the recorded start, and compare it with the recordings.
+    """Equation 5: roll the simulator out under a + Δa from the recorded start, and compare it with
+    the recordings.
 
     Returns:
         q_dis: Q_dis = Σ |error| Δt of each recording and operated joint, (recordings, n) rad·s.
@@ -182,7 +183,9 @@ class Delivery:
 
     @classmethod
     def plan(cls, unit: VirtualUnit) -> Delivery:
-        """Plan trajectories over the space that the hands reach and can hold the heaviest payload in."""
+        """Plan trajectories over the space that the hands reach and can hold the heaviest payload
+        in.
+        """
         planner = GoalPlanner(unit.robot, max(unit.payloads), GOAL_SEED, HOLD_S)
         goals_per_plan = GOALS_PER_TRAJECTORY * len(planner.arms)
         plans = planner.plans(-(-unit.goal_count // goals_per_plan))
@@ -195,7 +198,8 @@ def measure_delivery(
     """Send the hands to their goals in every way.
 
     Returns:
-        Way → offset: mean |hand − goal| in the last second of each hold, (payloads, goals, 3) m along X, Y, Z;
+        Way → offset: mean |hand − goal| in the last second of each hold, (payloads, goals, 3) m
+        along X, Y, Z;
         near: share of the goals at which the hand stays within SUCCESS_RADIUS_M then, (payloads,).
     """
     ways = PLAIN_WAYS if model is None else NETWORK_WAYS
@@ -241,7 +245,9 @@ def held_offsets(hands: Array, plan: Plan, dt: float) -> list[Array]:
 
 
 def measure_latency(model: GapModel) -> dict[str, float]:
-    """Return the time of one correction of one robot in its control loop, µs: median and 99 % quantile."""
+    """Return the time of one correction of one robot in its control loop, µs: median and 99 %
+    quantile.
+    """
     loop = model.loop(1)
     rng = np.random.default_rng(0)
     positions = 0.1 * rng.standard_normal((LATENCY_CALLS, len(model.card["joint_names"])))

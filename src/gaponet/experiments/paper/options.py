@@ -25,11 +25,11 @@ class PaperOptions:
     steps: Annotated[int, Interval(ge=1_000, le=10**10)] = 600_000
     """Length of each training, control steps."""
     methods: tuple[Method, ...] = ("MLP", "shared MLP", "literal", "GAPONet")
-    """Networks. MLP: ASAP's form, the paper's baseline. shared MLP: the inputs and the number of weights of GAPONet.
-    literal: the paper's network in its own form."""
+    """Networks. MLP: ASAP's form, the paper's baseline. shared MLP: the inputs and the number of
+    weights of GAPONet. literal: the paper's network in its own form."""
     blocks: tuple[Block, ...] = ("labels", "ppo", "table2")
-    """Comparisons. labels: supervised pre-training, then PPO. ppo: PPO alone, the paper's recipe. table2: one setting
-    of the literal network at a time."""
+    """Comparisons. labels: supervised pre-training, then PPO. ppo: PPO alone, the paper's recipe.
+    table2: one setting of the literal network at a time."""
     motions: Count = 10
     """Motions of Figure 3, made for the experiment."""
     goals: Count = 50

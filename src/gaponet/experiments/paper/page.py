@@ -1,4 +1,6 @@
-"""The page of the experiment: figures and tables numbered as in the paper, with its numbers beside ours."""
+"""The page of the experiment: figures and tables numbered as in the paper, with its numbers beside
+ours.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Numbers that the paper "SimLifter and GAPONet" prints, to stand beside ours. Its robots are real."""
+"""Numbers that the paper "SimLifter and GAPONet" prints, to stand beside ours.
+
+Its robots are real.
+"""
 
 from __future__ import annotations
 

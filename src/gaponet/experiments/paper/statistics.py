@@ -17,7 +17,8 @@ class Reduction:
 
     Attributes:
         mean: Over all seeds and motions: 100 (1 − Σ error / Σ error of the baseline).
-        seed_error: Standard error over training seeds; 0 for one seed or none, because nothing is known of it.
+        seed_error: Standard error over training seeds; 0 for one seed or none, because nothing is
+            known of it.
         motion_error: Standard error over motions.
         seeds, motions: Their numbers.
     """
@@ -49,8 +50,8 @@ class Reduction:
 def reduction(errors: ListOf[Array], baseline: Array, motions: ListOf[str]) -> Reduction:
     """Return the reduction of an error.
 
-    The standard error over motions is that of a delete-one-motion jackknife (Efron & Stein 1981): the reduction is a
-    ratio of sums, whose terms are paired by motion.
+    The standard error over motions is that of a delete-one-motion jackknife (Efron & Stein 1981):
+    the reduction is a ratio of sums, whose terms are paired by motion.
 
     Args:
         errors: Error of each recording, (recordings,), one array for each training seed.

@@ -1,11 +1,13 @@
-"""Inputs of the experiment that every worker needs: dataset, simulator, the robot that no network sees, results folder.
+"""Inputs of the experiment that every worker needs: dataset, simulator, the robot that no network
+sees, results folder.
 
 OUT/experiment.json    what the results belong to: another dataset or unit needs another OUT
 OUT/unseen/            recordings of the unit that no network sees, a dataset
 OUT/identified/        the robot as `gaponet identify` finds it on the training recordings
 OUT/trainings/NAME/    run folder of a training, and its result.json
 OUT/baselines.json     what is measured without a network
-OUT/paper.html         all figures and tables; paper.json and the folders figures/ and tables/ have the numbers
+OUT/paper.html         all figures and tables; paper.json and the folders figures/ and tables/ have
+the numbers
 """
 
 from __future__ import annotations
@@ -91,8 +93,8 @@ class Study:
         fleet = load_fleet(self.fleet, self.robot)
         if fleet.gain_scale not in (None, self.robot.gain_scale):
             raise UsageError(
-                f"fleet '{fleet.name}' is driven with gain_scale {fleet.gain_scale:g}, the robot of "
-                f"the dataset with {self.robot.gain_scale:g}; give the fleet that was recorded"
+                f"fleet '{fleet.name}' is driven with gain_scale {fleet.gain_scale:g}, the robot "
+                f"of the dataset with {self.robot.gain_scale:g}; give the fleet that was recorded"
             )
         name = self.options.unit or list(fleet.units)[-1]
         fleet.unit(name)  # refuses a name that is not in the fleet
@@ -136,7 +138,9 @@ class Study:
         )
 
     def recorded(self, rate: float | None = None) -> Recorded:
-        """Return the recordings that simulators are compared with, at a rate in Hz; default the slowest."""
+        """Return the recordings that simulators are compared with, at a rate in Hz; default the
+        slowest.
+        """
         rate = rate or self.rates[0]
         if not self.virtual:
             entries = [entry for entry in self.splits()["test"] if round(1 / entry.dt) == rate]
@@ -191,7 +195,9 @@ def quick_dataset(data: Dataset, robot: RobotSpec, out: Path, unit: str) -> Data
 
 
 def _quick_entries(data: Dataset, unseen_unit: str) -> list[Entry]:
-    """Return recordings of the shortest motions, with the least and the largest payload, on few units."""
+    """Return recordings of the shortest motions, with the least and the largest payload, on few
+    units.
+    """
     rows: dict[str, int] = {}
     for entry in data.entries:
         rows[entry.meta.motion] = max(rows.get(entry.meta.motion, 0), entry.rows)

@@ -1,4 +1,6 @@
-"""Tables 1 and 2 of the paper, and the tables that answer its questions: commands, large gaps, sensors, latency."""
+"""Tables 1 and 2 of the paper, and the tables that answer its questions: commands, large gaps,
+sensors, latency.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +24,8 @@ from gaponet.experiments.paper.results import Results
 from gaponet.experiments.paper.trainings import BLOCK_TITLES, TABLE_2_CHANGES
 
 CONVERGED_SHARE = 0.5  # of the nominal error; above it a row of Table 2 is not converged
-# Row of Table 2 here → row of the paper. The paper does not say what is held for an action duration.
+# Row of Table 2 here → row of the paper. The paper does not say what is held for an action
+# duration.
 PRINTED_ROW = {
     "payload out": "payload out",
     "payload in": "payload in",
@@ -40,7 +43,9 @@ OWN_LABEL = "the paper's own: payload out, 50 Hz, history 4, S(t+1) − S(t)"
 
 
 def table_1(results: Results, block: Block) -> ResultTable:
-    """Table 1: offsets of the hands from their goals, all payloads, axes and methods, beside the paper's."""
+    """Table 1: offsets of the hands from their goals, all payloads, axes and methods, beside the
+    paper's.
+    """
     rows: list[tuple[Any, ...]] = []
     for index, mass in enumerate(results.masses):
         label = f"{mass:g} kg"
@@ -61,16 +66,19 @@ def table_1(results: Results, block: Block) -> ResultTable:
             if mass in printed:
                 rows.append((f"{label}, the paper's {method}", *printed[mass]))
     caption = (
-        f"Mean |hand − goal| in the last second of a hold, cm, of a unit that no network has seen; networks trained by "
-        f"{BLOCK_TITLES[block]}; ± is the standard deviation over training seeds. X is forward, Y left, Z up. The "
-        "paper's robot is a real H1-2 with other goals; its third method sends the simulator's output as it is."
+        "Mean |hand − goal| in the last second of a hold, cm, of a unit that no network has "
+        f"seen; networks trained by {BLOCK_TITLES[block]}; ± is the standard deviation over "
+        "training seeds. X is forward, Y left, Z up. The paper's robot is a real H1-2 with other "
+        "goals; its third method sends the simulator's output as it is."
     )
     columns = ("payload in each hand, method", *(f"{axis}, cm" for axis in AXES))
     return ResultTable(f"table1_{block}", columns, tuple(rows), caption)
 
 
 def commands_table(results: Results, block: Block) -> ResultTable:
-    """Return the error of the robot by way of commanding it, and the gain over the same way without a network."""
+    """Return the error of the robot by way of commanding it, and the gain over the same way
+    without a network.
+    """
     raw = results.mean_over_joints(results.plain_command_q_dis("raw"))
     rows: list[tuple[Any, ...]] = []
 
@@ -97,9 +105,10 @@ def commands_table(results: Results, block: Block) -> ResultTable:
             )
             rows.append(row)
     caption = (
-        "Q_dis between target and robot, mean over joints without wrists, motions and payloads; ± is the standard "
-        "deviation over training seeds. The gain is over the same way without a network: over targets as they are for "
-        "target − Δa, over the feed-forward for both, over feed-forward and integral with the integral."
+        "Q_dis between target and robot, mean over joints without wrists, motions and payloads; ± "
+        "is the standard deviation over training seeds. The gain is over the same way without a "
+        "network: over targets as they are for target − Δa, over the feed-forward for both, over "
+        "feed-forward and integral with the integral."
     )
     columns = (
         "command",
@@ -116,7 +125,9 @@ def _less(error: float, reference: float) -> float:
 
 
 def large_gaps_table(results: Results, block: Block) -> ResultTable:
-    """Return the share of rows and joints with a large gap, by payload: a later metric of the authors."""
+    """Return the share of rows and joints with a large gap, by payload: a later metric of the
+    authors.
+    """
     methods = results.networks(block)
     rows = []
     for threshold in LARGE_GAPS_RAD:
@@ -150,10 +161,11 @@ def table_2(results: Results) -> ResultTable:
         if name == "100 Hz":
             baseline = "nominal_fastest"
         nominal = results.over_joints(results.baseline_q_dis(baseline)) / results.durations
+        # (recordings,) rad each: MPJAE is Q_dis by the duration
         errors = [
             results.over_joints(q_dis) / results.durations
             for q_dis in results.q_dis("table2", name)
-        ]  # (recordings,) rad each: MPJAE is Q_dis by the duration
+        ]
         cells = []
         for mass in results.masses:
             kept = results.payloads == mass
@@ -165,9 +177,10 @@ def table_2(results: Results) -> ResultTable:
         rows.append((label, runs[0]["obs_dim"], *cells, ratio, note, printed))
     masses = [f"{mass:g} kg" for mass in results.masses]
     caption = (
-        "The literal network, joints without wrists, MPJAE in mrad on the motions and the unit of Figure 3; ± is the "
-        "standard deviation over training seeds. A row above half of the nominal error is not converged, and its place "
-        "in an order means nothing. The paper: Obs Dim, then mrad at 0, 1, 2 and 3 kg."
+        "The literal network, joints without wrists, MPJAE in mrad on the motions and the unit of "
+        "Figure 3; ± is the standard deviation over training seeds. A row above half of the "
+        "nominal error is not converged, and its place in an order means nothing. The paper: Obs "
+        "Dim, then mrad at 0, 1, 2 and 3 kg."
     )
     columns = ("setting", "Obs Dim", *masses, "of nominal", "", "the paper")
     return ResultTable("table2", columns, tuple(rows), caption)
@@ -181,7 +194,9 @@ def _printed(row: str | None) -> str:
 
 
 def sensor_table(results: Results) -> ResultTable:
-    """Return what the Sensor Predictor costs and saves: one training each, everything else equal."""
+    """Return what the Sensor Predictor costs and saves: one training each, everything else
+    equal.
+    """
     rows = []
     for label, name in (
         ("predicted sensors (the paper's)", "payload out"),
@@ -201,8 +216,9 @@ def sensor_table(results: Results) -> ResultTable:
             )
         )
     caption = (
-        "Processor seconds of one thread for one whole training of the literal network, validation included, labels "
-        "aside, and control steps per such second; of trainings that were not interrupted."
+        "Processor seconds of one thread for one whole training of the literal network, "
+        "validation included, labels aside, and control steps per such second; of trainings that "
+        "were not interrupted."
     )
     columns = ("sensors", "steps per s", "processor seconds", "validation error, mrad")
     return ResultTable("sensors", columns, tuple(rows), caption, digits=1)
@@ -231,8 +247,9 @@ def method_table(results: Results) -> ResultTable:
                 )
             )
     caption = (
-        "Equal recordings, payload input, labels, pre-training, control steps, selection and seeds. Latency is that of "
-        "one correction for one robot, history and normalisation included."
+        "Equal recordings, payload input, labels, pre-training, control steps, selection and "
+        "seeds. Latency is that of one correction for one robot, history and normalisation "
+        "included."
     )
     columns = (
         "method",

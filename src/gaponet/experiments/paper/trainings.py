@@ -1,7 +1,8 @@
 """What is trained: a plain list. All networks of a block have equal data, inputs and training.
 
-Block "labels": supervised pre-training on labels, then PPO. Block "ppo": PPO from an untrained network, the paper's
-recipe. Block "table2": the paper's network in its own form, one setting changed in each row.
+Block "labels": supervised pre-training on labels, then PPO. Block "ppo": PPO from an untrained
+network, the paper's recipe. Block "table2": the paper's network in its own form, one setting
+changed in each row.
 """
 
 from __future__ import annotations
@@ -85,10 +86,12 @@ class Training:
 def all_trainings(
     options: PaperOptions, rates: tuple[float, ...], payloads: tuple[float, ...]
 ) -> list[Training]:
-    """Return all trainings, the most important first, so that an interrupted night has every method.
+    """Return all trainings, the most important first, so that an interrupted night has every
+    method.
 
     Args:
-        rates: Control rates of the dataset, Hz, ascending. The first one is used wherever the rate is not the question.
+        rates: Control rates of the dataset, Hz, ascending. The first one is used wherever the rate
+            is not the question.
         payloads: Payloads of the dataset, kg.
     """
     trainings: list[Training] = []

@@ -1,4 +1,6 @@
-"""The motions of Figure 3: made for the experiment, and checked against every recorded motion before any training."""
+"""The motions of Figure 3: made for the experiment, and checked against every recorded motion
+before any training.
+"""
 
 from __future__ import annotations
 
@@ -37,7 +39,8 @@ class UnseenMotion:
 def make_unseen_motions(
     robot: RobotSpec, count: int, max_payload: float, dt: float
 ) -> list[UnseenMotion]:
-    """Make coordinated motions of all kinds, both hands first; of all joints for a robot without hands.
+    """Make coordinated motions of all kinds, both hands first; of all joints for a robot without
+    hands.
 
     Args:
         count: Number of motions.
@@ -62,7 +65,9 @@ def make_unseen_motions(
 
 
 def unseen_names(library: Library) -> list[str]:
-    """Return names of motions that no recipe has: of the hands, both first; else of all joints together."""
+    """Return names of motions that no recipe has: of the hands, both first; else of all joints
+    together.
+    """
     sides = list(library.kit.arms)
     if len(sides) == 2:
         sides = ["both", *sides]
@@ -75,9 +80,11 @@ def unseen_names(library: Library) -> list[str]:
 def require_unseen(
     motions: ListOf[UnseenMotion], dataset: Dataset, robot: RobotSpec, dt: float
 ) -> None:
-    """Refuse motions that the dataset holds, by name or by their targets, at a control period of dt s.
+    """Refuse motions that the dataset holds, by name or by their targets, at a control period of
+    dt s.
 
-    Motions are compared over the whole length of the longer one: punches that begin alike are different motions.
+    Motions are compared over the whole length of the longer one: punches that begin alike are
+    different motions.
 
     Raises:
         UsageError: A motion is in the dataset.
@@ -95,13 +102,15 @@ def require_unseen(
             if name == motion.name or difference < MIN_RMS_DIFFERENCE_RAD:
                 raise UsageError(
                     f"motion '{motion.name}' of the experiment is '{name}' of the dataset "
-                    f"({1e3 * difference:.1f} mrad RMS apart); the experiment needs motions that no "
-                    f"network has seen: gaponet data remove {dataset.path} '{name}'"
+                    f"({1e3 * difference:.1f} mrad RMS apart); the experiment needs motions that "
+                    f"no network has seen: gaponet data remove {dataset.path} '{name}'"
                 )
 
 
 def rms_difference(first: Array, second: Array) -> float:
-    """Return the RMS difference of two motions, (T, n) rad each; the shorter one stands at its end meanwhile."""
+    """Return the RMS difference of two motions, (T, n) rad each; the shorter one stands at its end
+    meanwhile.
+    """
     rows = max(len(first), len(second))
     difference = _extended(first, rows) - _extended(second, rows)
     return float(np.sqrt(np.mean(difference**2)))
