@@ -40,7 +40,7 @@ from gaponet import api
 from gaponet.base.errors import UsageError
 from gaponet.data.store import Dataset
 from gaponet.evaluation.candidate import read_origin
-from gaponet.export.plain_servos import CACHE, fit_plain_servos, read_recordings, rollout_error
+from gaponet.export.plain_servos import CACHE, fit_plain_servos, read_recordings
 from gaponet.robot.by_name import CARD, identified_catalogue
 from gaponet.robot.card import (
     ROBOT_HEADINGS,
@@ -53,6 +53,7 @@ from gaponet.robot.card import (
 )
 from gaponet.robot.folder import PROVENANCE_FILE, UNCERTAINTY_FILE, save_robot
 from gaponet.robot.spec import RobotSpec, load_robot
+from gaponet.sim.replay import rollout_errors
 
 PAGE = Path(__file__).parents[1] / "docs" / "robots.md"
 MAX_TOTAL_BYTES = 1_000_000  # of all robots together, so that the wheel stays small
@@ -148,7 +149,7 @@ def write_robot(folder: Path, made: Path, dataset: Dataset, card: Card, limits: 
         rates_hz=tuple(sorted({round(1 / entry.dt, 1) for entry in entries})),
         units=tuple(sorted({entry.meta.unit_id for entry in entries})),
         gaponet=gaponet.__version__,
-        plain_mrad=round(1e3 * rollout_error(test_recordings, plain), 3),
+        plain_mrad=round(1e3 * float(rollout_errors(test_recordings, plain).mean()), 3),
         published=Published(
             licence=LICENCE,
             date=today(),
