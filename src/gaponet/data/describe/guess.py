@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections import Counter, defaultdict
+from collections import defaultdict
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,12 @@ import numpy as np
 
 from gaponet.base.arrays import Array
 from gaponet.base.errors import JointMismatchError, LogError
-from gaponet.data.describe.clocks import MAX_RATE_DIFFERENCE, clock_periods, rate_ratio
+from gaponet.data.describe.clocks import (
+    MAX_RATE_DIFFERENCE,
+    clock_periods,
+    named_like_a_clock,
+    rate_ratio,
+)
 from gaponet.data.describe.plausibility import look_like_percent, look_like_ticks
 from gaponet.data.describe.raw_recording import SECONDS, RawRecording
 from gaponet.data.log import FEEDFORWARD
@@ -22,12 +27,13 @@ from gaponet.robot.spec import RobotSpec
 # Words by which the world calls them; a name with a word of an earlier line is not looked for in a later one.
 WORDS = {
     FEEDFORWARD: ("ff", "feedforward", "ffwd"),
-    "ctrl": ("ctrl", "cmd", "command", "commanded", "des", "desired", "target", "goal", "ref", "reference", "action",
-             "setpoint", "sp"),
+    "ctrl": ("ctrl", "cmd", "command", "commands", "commanded", "des", "desired", "d", "target", "targets", "goal",
+             "goals", "ref", "reference", "action", "actions", "qaction", "setpoint", "sp"),
     "qvel": ("qvel", "vel", "velocity", "velocities", "dq", "qd", "speed", "dof_vel"),
     "tau": ("tau", "torque", "torques", "effort", "trq", "tau_est", "current"),
     "temperature": ("temperature", "temp"),
-    "qpos": ("qpos", "pos", "position", "positions", "q", "meas", "measured", "actual", "act", "state", "angle", "enc"),
+    "qpos": ("qpos", "pos", "position", "positions", "q", "meas", "measured", "actual", "act", "state",
+             "states", "present", "angle", "enc"),
 }  # fmt: skip
 CLOCKS = (
     "time",
@@ -60,6 +66,9 @@ def guess_logs(
     family = _family([Path(r.source).name for r in recordings])
     if family:
         return _guess_family(recordings, robot, fmt, family)
+    topics = _state_and_command(recordings)
+    if topics:
+        return _guess_two_files(*topics, robot, fmt, known)
     first = recordings[0]
     specified = dict(known) | {k: v for k, v in first.default.items() if k not in known}
     lines = [f"# {fmt}; the first recording: {first.where or first.source}",
@@ -69,15 +78,16 @@ def guess_logs(
         for c in WORDS
         if c in specified and _values(first, specified[c]) is not None
     }
-    channels = _channels(first) | stated
+    channels = _channels(first, robot) | stated
     joints = _joints(first, channels)
     lines += _clock(first, specified)
     lines += _positions(first, channels)
-    lines += [f"{channel} = {_text(name)}" for channel, name in channels.items()]
+    lines += [_channel_line(channel, name, lines) for channel, name in channels.items()]
     for need in ("ctrl", "qpos"):
         if need not in channels:
             lines.append(f'# {need} = "…"          ? none of the names looks like it')
     lines += _names(channels, joints, robot)
+    lines += _names_of_commands(_joints(first, channels, "ctrl"), joints, robot)
     repeated = _repeated(recordings, channels.get("ctrl", ""))
     lines += ["", "# What the names of the recordings say, or a sheet (file, motion, payload, unit, rep):",
               f"# names here: {', '.join(r.name for r in recordings[:5])}{', …' if len(recordings) > 5 else ''}",
@@ -153,6 +163,60 @@ def _guess_family(
     return "\n".join(lines) + "\n"
 
 
+def _channel_line(channel: str, name: str, lines: list[str]) -> str:
+    """The line of a channel; velocities and currents in units of a servo are left out."""
+    line = f"{channel} = {_text(name)}"
+    if channel == "tau" and "current" in name.lower():
+        return f"# {line}  # ? a current is no torque: only for gaponet identify --current"
+    if channel == "qvel" and any(text.startswith('position_unit = "ticks"') for text in lines):
+        return f"# {line}  # ? its unit is not known; velocities are computed without it"
+    return line
+
+
+def _state_and_command(recordings: list[RawRecording]) -> tuple[RawRecording, RawRecording] | None:
+    """Return state and command where there are two files, called like joint_states.csv and command.csv."""
+    by_kind = {_kind(Path(r.source).stem): r for r in recordings}
+    if len(recordings) != 2 or by_kind.keys() != {"qpos", "ctrl"}:
+        return None
+    return by_kind["qpos"], by_kind["ctrl"]
+
+
+def _guess_two_files(
+    state: RawRecording, command: RawRecording, robot: RobotSpec, fmt: str, known: dict[str, Any]
+) -> str:
+    """The text of a logs.toml for one recording whose commands lie in a file of their own."""
+    channels = _channels(state, robot)
+    channels.pop("ctrl", None)
+    commands = _channels(command, robot)
+    told = commands.get("ctrl") or commands.get("qpos") or _numbered(command)
+    lines = [
+        f"# {fmt}; one recording in two files",
+        f"# columns of the state: {state.shown(20)}",
+        f"# columns of the command: {command.shown(20)}",
+        "# Lines with a ? are guesses: look at them.",
+        "",
+        f"state_file = {_text(Path(state.source).name)}",
+        f"command_file = {_text(Path(command.source).name)}",
+    ]
+    lines += _clock(state, dict(known))
+    lines += _positions(state, channels)
+    lines += [_channel_line(channel, name, lines) for channel, name in channels.items()]
+    lines.append(f"ctrl = {_text(told)}  # ? of the command's file")
+    joints = _joints(state, channels)
+    lines += _names(channels, joints, robot)
+    return "\n".join(lines) + "\n"
+
+
+def _numbered(recording: RawRecording) -> str:
+    """The pattern of most numbered columns: field.data0, field.data1 → field.data{joint}."""
+    counts: dict[str, int] = defaultdict(int)
+    for name in recording.signals:
+        if not named_like_a_clock(name):
+            counts[re.sub(r"\d+(?=\D*$)", "{joint}", name)] += 1
+    numbered = {pattern: count for pattern, count in counts.items() if "{joint}" in pattern}
+    return max(numbered, key=lambda pattern: numbered[pattern], default="…")
+
+
 def _fits(file: str, pattern: str) -> bool:
     before, _, after = pattern.partition("{name}")
     return file.startswith(before) and file.endswith(after)
@@ -176,6 +240,7 @@ def _text(value: str) -> str:
 def _kind(name: str) -> str | None:
     """Which channel a name speaks of; of a command's, positions only."""
     parts = re.split(r"[^a-z0-9]+", re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name).lower())
+    parts += [part.rstrip("0123456789") for part in parts]  # q1, cmd2
     matches = [channel for channel, words in WORDS.items() if any(part in words for part in parts)]
     excluded = {"ctrl": NOT_POSITIONS, FEEDFORWARD: ("qpos", "qvel", "temperature")}.get(
         matches[0] if matches else ""
@@ -185,7 +250,7 @@ def _kind(name: str) -> str | None:
     return matches[0] if matches else None
 
 
-def _channels(recording: RawRecording) -> dict[str, str]:
+def _channels(recording: RawRecording, robot: RobotSpec) -> dict[str, str]:
     """channel → array, or pattern of columns with {joint}."""
     matches: dict[str, str] = {}
     arrays = [n for n, labels in recording.signals.items() if labels]
@@ -195,16 +260,48 @@ def _channels(recording: RawRecording) -> dict[str, str]:
     singles = [
         n for n, labels in recording.signals.items() if not labels and n.lower() not in CLOCKS
     ]
-    shapes = defaultdict[str, Counter[str]](Counter)
+    shapes: dict[str, dict[str, set[str]]] = defaultdict(dict)  # channel → pattern → joints
     for name in singles:
         if kind := _kind(name):
-            shapes[kind].update(_patterns(name))
-    best = {kind: max(counts, key=lambda p: (counts[p], len(p))) for kind, counts in shapes.items()}
-    return matches | {kind: pattern for kind, pattern in best.items() if kind not in matches}
+            for pattern, joint in _patterns(name):
+                shapes[kind].setdefault(pattern, set()).add(joint)
+    joints: set[str] = set()
+    for kind in sorted(shapes, key=lambda k: k != "qpos"):  # the others have the joints of qpos
+        pattern = _best_pattern(shapes[kind], joints, robot)
+        joints = joints or shapes[kind][pattern]
+        matches.setdefault(kind, pattern)
+    return matches
 
 
-def _patterns(name: str) -> list[str]:
-    """Each way to read a name as joint and words: shoulder_pan_des → {joint}_des; q_des_1 → q_des_{joint}."""
+def _best_pattern(joints_of: dict[str, set[str]], joints: set[str], robot: RobotSpec) -> str:
+    """Return the pattern with these joints, with most joints, with those of the robot, and that says most.
+
+    Args:
+        joints_of: Pattern → joints of the columns that fit.
+        joints: Of the positions; empty if they are not known.
+    """
+
+    def score(pattern: str) -> tuple[bool, int, int, int]:
+        found = joints_of[pattern]
+        known = sum(_is_joint(joint, robot) for joint in found)
+        return found == joints, len(found), known, len(pattern)
+
+    return max(joints_of, key=score)
+
+
+def _is_joint(name: str, robot: RobotSpec) -> bool:
+    try:
+        robot.resolve(name, "")
+    except JointMismatchError:
+        return False
+    return True
+
+
+def _patterns(name: str) -> list[tuple[str, str]]:
+    """Each way to read a name as joint and words, with the joint.
+
+    shoulder_pan_des → {joint}_des; q_des_1 → q_des_{joint}; tau_J[0] → tau_J[{joint}]; q1_ref → q{joint}_ref.
+    """
     words = list(re.finditer(r"[A-Za-z0-9]+", name))
     matches = []
     for known, run in groupby(
@@ -212,21 +309,28 @@ def _patterns(name: str) -> list[str]:
     ):
         first, *_, last = *(together := list(run)), together[-1]
         if known and last.end() < len(name):
-            matches.append(name[: last.end() + 1] + "{joint}")
+            start = last.end() + 1
+            joint, closing = re.fullmatch(r"(.*?)([^A-Za-z0-9]*)", name[start:]).groups()  # type: ignore[union-attr]
+            if joint:
+                matches.append((name[:start] + "{joint}" + closing, joint))
         if known and first.start():
-            matches.append("{joint}" + name[first.start() - 1 :])
-    return matches or [name]
+            matches.append(("{joint}" + name[first.start() - 1 :], name[: first.start() - 1]))
+    numbers = list(re.finditer(r"\d+", name))
+    if numbers:
+        place = numbers[-1]
+        matches.append((name[: place.start()] + "{joint}" + name[place.end() :], place[0]))
+    return matches or [(name, "0")]
 
 
-def _joints(recording: RawRecording, channels: dict[str, str]) -> list[str]:
-    """Names of the joints as the log has them, in its order; digits where it has none."""
-    pattern = channels.get("qpos") or channels.get("ctrl")
+def _joints(recording: RawRecording, channels: dict[str, str], channel: str = "qpos") -> list[str]:
+    """Names of the joints as a channel has them, in its order; digits where it has none."""
+    pattern = channels.get(channel) or channels.get("ctrl")
     if pattern is None:
         return []
     if "{joint}" not in pattern:
         return list(recording.signals.get(pattern) or ("0",))
     before, after = map(re.escape, pattern.split("{joint}"))
-    kind = "qpos" if "qpos" in channels else "ctrl"
+    kind = channel if channel in channels else "ctrl"
     return [
         m[1]
         for c in recording.columns
@@ -249,12 +353,7 @@ def _names(channels: dict[str, str], joints: list[str], robot: RobotSpec) -> lis
             else "which joints are these?"
         )
         return [f"joints = {json.dumps(own)}  # ? {question}"]
-    strange = []
-    for joint in joints:
-        try:
-            robot.resolve(joint, "")
-        except JointMismatchError:
-            strange.append(joint)
+    strange = [joint for joint in joints if not _is_joint(joint, robot)]
     if not strange:
         return []
     left = [j for j in robot.joint_names if j not in joints]
@@ -266,6 +365,18 @@ def _names(channels: dict[str, str], joints: list[str], robot: RobotSpec) -> lis
     for i, joint in enumerate(strange):
         lines.append(f"{_text(joint)} = {_text(left[i] if in_order else '…')}")
     return lines
+
+
+def _names_of_commands(told: list[str], joints: list[str], robot: RobotSpec) -> list[str]:
+    """Lines of [names] for commands that call their joints otherwise than the positions do."""
+    strange = [name for name in told if name not in joints and not _is_joint(name, robot)]
+    if not strange or "0" in joints:
+        return []
+    own = [name for name in robot.joint_names if len(strange) == len(robot.joint_names)]
+    ours = own or ["…"] * len(strange)
+    lines = [] if any(not _is_joint(joint, robot) for joint in joints) else ["", "[names]"]
+    lines.append("# of the commands  ? in the robot's order: is it theirs?")
+    return lines + [f"{_text(a)} = {_text(b)}" for a, b in zip(strange, ours, strict=True)]
 
 
 def _clock(recording: RawRecording, specified: dict[str, Any]) -> list[str]:

@@ -131,9 +131,20 @@ def detect(path: Path) -> str:
                 f"{path}: is a dataset of gaponet, not logs; go on with gaponet doctor {path}"
             )
         raise LogError(
-            f"{path}: no log of {', '.join(formats())} (gaponet import --formats explains them)"
+            f"{path}: no log of {', '.join(formats())} (gaponet import --formats explains them){_json_hint(path)}"
         )
     return matches[0]
+
+
+def _json_hint(path: Path) -> str:
+    """How JSON files become a table; "" where there are none."""
+    files = files_under(path, (".json", ".jsonl", ".ndjson"))
+    if not files:
+        return ""
+    return (
+        f'. {files[0].name} is JSON: make a table of it: python -c "import pandas; pandas.read_json('
+        f"'{files[0].name}', lines={files[0].suffix != '.json'}).to_parquet('{files[0].stem}.parquet')\""
+    )
 
 
 def _detects(fmt: str, path: Path) -> bool:
