@@ -1,6 +1,6 @@
 """Fine-tune a policy in the aligned simulator, then test it on an unseen robot: ASAP's use of a gap model.
 
-    pip install "rsl-rl-lib>=5.5,<6"
+    pip install "rsl-rl-lib>=5.4.2,<6"
     python examples/finetune_policy.py RUN        # RUN: gaponet train (or demo) on virtual H1-2 units 1 to 3
 
 PPO trains a small network in the nominal simulator to follow arm motions with 0 to 3 kg in each hand. Training then
