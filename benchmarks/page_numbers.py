@@ -2,7 +2,8 @@
 
 page_numbers.toml lists sentences and rows of the pages, with a name in braces for each number, and where this number
 is. `make results` runs this at its end. tests/test_docs.py compares, so that no page keeps a number that was measured
-anew. The files are docs/results/real.json, docs/results/paper_*.json and benchmarks/steps.json.
+anew. The files are docs/results/real.json, docs/results/paper_*.json, docs/results/unseen_*.json and
+benchmarks/steps.json.
 """
 
 from __future__ import annotations
@@ -14,6 +15,8 @@ import tomllib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "docs" / "results"
@@ -43,6 +46,7 @@ def value(source: str) -> str:
     readers: dict[str, Callable[..., str]] = {
         "real": _real,
         "paper": _paper,
+        "unseen": _unseen,
         "step": _step,
         "commit": _commit,
         "seconds": _seconds,
@@ -66,6 +70,16 @@ def _paper(name: str, table: str, begin: str, column: str) -> str:
         if row[0].startswith(begin):
             return str(row[found["columns"].index(column)])
     raise LookupError(f"paper_{name}.json: {table} has no row {begin}")
+
+
+def _unseen(name: str, method: str, column: str) -> str:
+    """Return the mean over simulators, ± its standard error over simulators of the mean over seeds."""
+    found = json.loads((RESULTS / f"unseen_{name}.json").read_text(encoding="utf-8"))
+    by_simulator = np.array(found[method][column]).mean(axis=1)
+    text = f"{by_simulator.mean():.2f}"
+    if len(by_simulator) > 1:
+        text += f" ± {by_simulator.std(ddof=1) / np.sqrt(len(by_simulator)):.2f}"
+    return text
 
 
 def _answer(step: str) -> dict[str, Any]:

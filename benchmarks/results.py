@@ -136,6 +136,8 @@ def write(answers: dict[str, dict[str, Any]], work: Path) -> None:
     (ROOT / "README.md").write_text(table.sub(lambda m: m[1] + text, readme), encoding="utf-8")
     for paper in sorted(work.glob("paper_*/paper.json")):
         store_paper(paper)
+    for unseen in sorted(work.glob("unseen_*/unseen_simulators.json")):
+        shutil.copyfile(unseen, PAGES / f"{unseen.parent.name}.json")
     page_numbers.main()
     page_charts.main()
 
