@@ -4,6 +4,7 @@ import importlib
 import json
 import re
 import tomllib
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -54,6 +55,14 @@ def widths(layers: tuple[int, ...]) -> str:
 )  # fmt: skip
 def test_a_default_that_a_page_states_is_that_of_the_code(page, said):
     assert said in text(f"docs/{page}")
+
+
+def test_the_sizes_of_networks_that_a_page_states_are_those_of_the_code():
+    networks = importlib.import_module("gaponet.nn.networks")  # loads torch
+    for kind in ("gaponet", "shared_mlp", "mlp", "paper"):
+        network = networks.build_network(replace(MODEL, kind=kind), n=10)
+        assert f"`{kind}`" in text("docs/network.md")
+        assert f" {networks.num_parameters(network):,}" in text("docs/network.md")
 
 
 def test_words_for_fractions_are_the_code_s_too():
