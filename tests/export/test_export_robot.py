@@ -16,7 +16,7 @@ from gaponet.base.errors import RobotError
 from gaponet.cli.main import main
 from gaponet.export import export_folder as exporting
 from gaponet.export import plain_servos
-from gaponet.export.export_folder import export_robot
+from gaponet.export.export_folder import Source, export_robot
 from gaponet.export.plain_servos import (
     fit_plain_servos,
     keep_plain_servos,
@@ -121,7 +121,7 @@ def quick(monkeypatch, robot):
 def test_a_users_file_moves_as_gaponet_does_and_keeps_all_that_is_the_users(
     lawful, mine, tmp_path, quick
 ):
-    made = export_robot(lawful, "mjcf", tmp_path / "out", source=mine)
+    made = export_robot(lawful, "mjcf", tmp_path / "out", source=Source(mine))
     assert made.virtual
     assert made.errors["in gaponet"] == pytest.approx(0.0, abs=1e-9)
     assert made.errors["scene.xml with mujoco_servos.py"] < 2e-5
@@ -161,7 +161,7 @@ def test_a_users_file_moves_as_gaponet_does_and_keeps_all_that_is_the_users(
 
 
 def test_the_check_travels(robot, mine, tmp_path):
-    made = export_robot(robot, "mjcf", tmp_path / "out", source=mine)
+    made = export_robot(robot, "mjcf", tmp_path / "out", source=Source(mine))
     assert not [f for f in (tmp_path / "out").glob("*.py") if "from gaponet" in f.read_text()]
     said = subprocess.run(
         [sys.executable, "check.py"],
@@ -176,7 +176,7 @@ def test_the_check_travels(robot, mine, tmp_path):
 
 def test_an_engine_that_steps_twice_as_long_keeps_delays_and_tells_its_price(robot, mine, tmp_path):
     mine.write_text(MAIN.format(step=0.01))
-    made = export_robot(robot, "mjcf", tmp_path / "out", source=mine)
+    made = export_robot(robot, "mjcf", tmp_path / "out", source=Source(mine))
     model = mujoco.MjModel.from_xml_path(str(made.file))
     assert model.opt.timestep == 0.01
     assert model.actuator_delay.tolist() == [0.013, 0.0, 0.006]
@@ -189,7 +189,7 @@ def test_a_servo_whose_gains_and_commands_are_in_degrees_takes_radians_from_now_
     degrees = 'gainprm="0.42" biasprm="0 -24 -0.5" biastype="affine" gear="1" ctrlrange="-90 90"'
     plain = '<general name="second" joint="elbow"/>'
     mine.write_text(mine.read_text().replace(plain, f"{plain[:-2]} {degrees}/>"))
-    made = export_robot(lawful, "mjcf", tmp_path / "out", source=mine)
+    made = export_robot(lawful, "mjcf", tmp_path / "out", source=Source(mine))
     servo = mujoco.MjModel.from_xml_path(str(made.file)).actuator("second")
     assert servo.gainprm[0] == 24.0
     assert servo.biasprm[:2].tolist() == [0.0, -24.0]
@@ -220,8 +220,8 @@ def test_two_robots_in_one_scene_are_told_apart_by_what_stands_before_their_name
     scene.write_text(
         f"<mujoco><worldbody>{body.format('left_')}{body.format('right_')}</worldbody></mujoco>"
     )
-    first = export_robot(robot, "mjcf", tmp_path / "one", source=scene, prefix="left_")
-    both = export_robot(lawful, "mjcf", tmp_path / "two", source=first.file, prefix="right_")
+    first = export_robot(robot, "mjcf", tmp_path / "one", source=Source(scene, "left_"))
+    both = export_robot(lawful, "mjcf", tmp_path / "two", source=Source(first.file, "right_"))
     model = mujoco.MjModel.from_xml_path(str(both.file))
     assert [model.actuator(i).name for i in range(4)] == [
         "left_shoulder",
@@ -231,14 +231,14 @@ def test_two_robots_in_one_scene_are_told_apart_by_what_stands_before_their_name
     ]
     assert model.actuator_gainprm[:, 0].tolist() == [16.0, 24.0, 16.0, 24.0]
     with pytest.raises(RobotError, match=r"no joint 'shoulder' in its text \(--prefix"):
-        export_robot(robot, "mjcf", tmp_path / "none", source=scene)
+        export_robot(robot, "mjcf", tmp_path / "none", source=Source(scene))
 
 
 def test_a_file_in_one_line_takes_a_payload_right_before_a_joint(robot, tmp_path):
     text = re.sub(r">\s+<", "><", robot.mjcf.read_text().strip())
     scene = tmp_path / "scene.xml"
     scene.write_text(text.replace("<option ", '<option timestep="0.005" '))
-    made = export_robot(robot, "mjcf", tmp_path / "out", source=scene, payload_mass=0.2)
+    made = export_robot(robot, "mjcf", tmp_path / "out", source=Source(scene), payload_mass=0.2)
     assert '"/></body><joint' in made.file.read_text().replace("\n", "")
     model, own = mujoco.MjModel.from_xml_path(str(made.file)), build_model(robot, 0.2)
     assert model.body_mass.sum() == pytest.approx(own.body_mass.sum())
@@ -259,7 +259,7 @@ def test_an_engine_with_another_order_of_joints_is_told_by_name(lawful, tmp_path
     )
     scene = tmp_path / "scene.xml"
     scene.write_text(text)
-    made = export_robot(lawful, "mjcf", tmp_path / "out", source=scene)
+    made = export_robot(lawful, "mjcf", tmp_path / "out", source=Source(scene))
     model = mujoco.MjModel.from_xml_path(str(made.file))
     assert [model.actuator(i).name for i in range(3)] == ["a", "z", "b"]
     assert model.actuator_gainprm[:, 0].tolist() == [24.0, 7.0, 16.0]
@@ -272,7 +272,7 @@ def test_a_joint_with_two_servos_is_refused(robot, mine, tmp_path):
     )
     mine.write_text(text)
     with pytest.raises(RobotError, match="has 2 servos of 'elbow'; one is needed"):
-        export_robot(robot, "mjcf", tmp_path / "out", source=mine)
+        export_robot(robot, "mjcf", tmp_path / "out", source=Source(mine))
 
 
 def test_a_delay_buffer_of_five_lines_is_mujocos_own_delay(robot, tmp_path):

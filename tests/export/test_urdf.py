@@ -9,7 +9,7 @@ from arm import write_arm
 
 from gaponet.base.errors import RobotError, UsageError
 from gaponet.cli.main import main
-from gaponet.export.export_folder import export_robot
+from gaponet.export.export_folder import Source, export_robot
 from gaponet.robot.spec import Link
 
 FOUND = {
@@ -41,7 +41,7 @@ def robot(tmp_path_factory):
 def test_a_urdf_keeps_all_but_its_dynamics_and_efforts_and_the_loss_has_its_price(robot, tmp_path):
     file = tmp_path / "mine.urdf"
     file.write_text(URDF)
-    made = export_robot(robot, "urdf", tmp_path / "out", source=file)
+    made = export_robot(robot, "urdf", tmp_path / "out", source=Source(file))
     root = ET.parse(made.file).getroot()
     told = {j.attrib["name"]: j.find("dynamics").attrib for j in root.findall("joint")}
     assert {j: (float(d["damping"]), float(d["friction"])) for j, d in told.items()} == {
@@ -66,7 +66,10 @@ def test_links_are_written_where_the_file_has_the_mass_that_was_corrected(robot,
     )
     file.write_text(URDF)
     made = export_robot(
-        replace(robot, links={"upper": link, "fore": link}), "urdf", tmp_path / "out", source=file
+        replace(robot, links={"upper": link, "fore": link}),
+        "urdf",
+        tmp_path / "out",
+        source=Source(file),
     )
     model = mujoco.MjModel.from_xml_path(str(made.file))
     assert model.body("upper").mass == pytest.approx(0.4)
@@ -88,12 +91,12 @@ def test_a_file_that_is_none_or_has_other_joints_is_refused(robot, tmp_path, cap
     with pytest.raises(UsageError, match="--into FILE"):
         export_robot(robot, "urdf", tmp_path / "a")
     with pytest.raises(RobotError, match="begins with <mujoco>"):
-        export_robot(robot, "urdf", tmp_path / "b", source=robot.mjcf)
+        export_robot(robot, "urdf", tmp_path / "b", source=Source(robot.mjcf))
     file = tmp_path / "other.urdf"
     file.write_text(URDF.replace('"shoulder"', '"left_shoulder"'))
     with pytest.raises(
         RobotError, match=r"no joint 'shoulder' \(--prefix\); it has left_shoulder, elbow"
     ):
-        export_robot(robot, "urdf", tmp_path / "c", source=file)
+        export_robot(robot, "urdf", tmp_path / "c", source=Source(file))
     assert main(["export", str(robot.folder), "--to", "urdf", "--into", str(file)]) == 2
     assert "no joint 'shoulder'" in capsys.readouterr().err

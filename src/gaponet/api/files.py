@@ -67,12 +67,13 @@ def export_robot(
         "its simulator is a robot of the package, with the gain_scale that gaponet robot networks shows: export that",
     )
     require_out(holder, out)
-    spec, source = load_robot(simulator_folder(holder)), None if into is None else Path(into)
-    recordings, folder = (
-        read_recordings(simulator_folder(holder), data, spec),
-        Path(out) if out else holder / to,
-    )
-    made = files.export_robot(spec, to, folder, recordings, source, prefix, payload_mass, progress)
+    if prefix and into is None:
+        raise UsageError(f"prefix '{prefix}' is of joints in a file of yours: give it with into")
+    spec = load_robot(simulator_folder(holder))
+    source = None if into is None else files.Source(Path(into), prefix)
+    recordings = read_recordings(simulator_folder(holder), data, spec)
+    folder = Path(out) if out else holder / to
+    made = files.export_robot(spec, to, folder, recordings, source, payload_mass, progress)
     if recordings is None and identified_catalogue().holds(holder):
         card = RobotCard.read(holder)
         made = replace(made, notes=(*made.notes, f"{card.name}, {card.errors()}"))

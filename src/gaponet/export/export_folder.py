@@ -16,6 +16,7 @@ from gaponet.base.errors import UsageError
 from gaponet.base.files import atomic_write, lock_folder, write_text
 from gaponet.base.progress import Progress, no_progress
 from gaponet.data.sequence import Sequence
+from gaponet.export import isaaclab_config
 from gaponet.export.helper_file import (
     MUJOCO_HELPER,
     SHIPPED,
@@ -41,12 +42,13 @@ from gaponet.robot.spec import RobotSpec
 
 FOLDER_KIND = "engine"
 FACTS, ROBOT, CHECK = "facts.json", "robot.xml", "check.npz"
+CONFIG = "robot_cfg.py"  # servos in the classes of Isaac Lab or Newton
 # Engine → name in the export folder → file in SHIPPED; beside the helper file.
 CHECK_FILES: dict[str, dict[str, str]] = {
     "mjcf": {"check.py": "check_mjcf.py"},
     "urdf": {},
     "mjlab": {"check.py": "check_mjlab.py"},
-    "isaaclab": {"check.py": "check_isaaclab.py"},
+    "isaaclab": {"check.py": "check_isaaclab.py", "make_usd.py": "make_usd.py"},
     "newton": {"check.py": "check_newton.py"},
     "json": {},
     "torch": {},
@@ -80,13 +82,113 @@ class ExportedFolder:
     notes: tuple[str, ...] = ()  # effects that the form lacks, and decisions for the user
 
 
+@dataclass(frozen=True)
+class Source:
+    """A file of the user's of which an edited copy is written."""
+
+    file: Path
+    prefix: str = ""  # text before each joint's name in it
+
+
+@dataclass
+class _RobotExport:
+    """An export of a robot while it is written.
+
+    Attributes:
+        robot: Identified, or nominal.
+        plain: The robot as fitted without a servo model.
+        to: Engine.
+        out: Folder.
+        validation: Validation motions that can be compared.
+        checked: Those of check.npz.
+        facts: Content of facts.json.
+        errors, notes: As in `ExportedFolder`.
+    """
+
+    robot: RobotSpec
+    plain: RobotSpec
+    to: str
+    out: Path
+    validation: ListOf[Sequence]
+    checked: ListOf[Sequence]
+    facts: dict[str, Any]
+    errors: dict[str, float]
+    notes: list[str]
+
+    @property
+    def payload_mass(self) -> float:
+        """In each hand, kg."""
+        return float(self.facts["payload_mass"])
+
+    @property
+    def step(self) -> float:
+        """Physics step, s."""
+        return float(self.facts["options"]["timestep"])
+
+    def write_mjcf(self, source: Path) -> Path:
+        """Write an edited copy of an MJCF, and measure it in plain MuJoCo."""
+        file, not_rad = edit_mjcf(source, self.out, self.plain, self.facts, self.payload_mass)
+        forms = {"plain": "alone"}
+        if self.robot.has_servo_model:
+            forms = {"joints": "with mujoco_servos.py", **forms}
+        for form, what in forms.items():
+            error = _error_in_mujoco(file, self.facts, self.validation, self.robot, form)
+            self.errors[f"{file.name} {what}"] = error
+        if not_rad:
+            text = f"targets of {', '.join(not_rad)} were not in rad before (degrees?)"
+            self.notes.append(f"{text}: now they are; ctrl of keyframes not")
+        return file
+
+    def write_urdf(self, source: Path) -> Path:
+        """Write an edited copy of a URDF; the error is that of its fields in gaponet."""
+        file, other = edit_urdf(source, self.out, self.facts, self.robot)
+        plain = self.plain
+        if other:
+            self.notes.append(
+                f"inertias of {', '.join(other)} were not written: their masses in the file are others"
+            )
+            links = {name: link for name, link in plain.links.items() if name not in other}
+            plain = replace(plain, links=links)
+        error = rollout_error(self.validation, with_urdf_fields(plain))
+        self.errors[f"{file.name} alone, all else as before"] = error
+        return file
+
+    def write_scene(self) -> Path:
+        """Write robot.xml, for mjlab with its servos, and the configuration of Isaac Lab or Newton."""
+        file = self.out / ROBOT
+        has_servos = self.to == "mjlab"
+        robot = self.robot if has_servos else self.plain
+        _write_scene(robot, file, self.payload_mass, servos=has_servos)
+        if self.to == "newton":
+            write_text(self.out / CONFIG, newton_config(self.robot.name, self.facts))
+        if self.to == "isaaclab":
+            self._write_native_form()
+        return file
+
+    def _write_native_form(self) -> None:
+        """Write the servos in Isaac Lab's own classes, and which form is which."""
+        name = self.robot.name
+        form = isaaclab_config.native_form(self.robot, self.plain, self.step, self.validation)
+        servos = form.servos(self.payload_mass, self.facts["dt"])
+        config = isaaclab_config.robot_config(name, servos, self.step, form.lines())
+        write_text(self.out / CONFIG, config)
+        self.facts["native"] = servos
+        self.facts["error_mrad"]["native"] = 1e3 * rollout_error(self.checked, form.robot)
+        readme = isaaclab_config.readme(name, form, self.facts["error_mrad"])
+        write_text(self.out / "README.md", readme)
+        *_, last = form.losses.values()
+        self.errors["in Isaac Lab's own classes"] = last
+        self.notes.append(
+            "README.md says what is lost in Isaac Lab's own classes, effect by effect"
+        )
+
+
 def export_robot(
     robot: RobotSpec,
     to: str,
     out: Path,
     recordings: tuple[ListOf[Sequence], ListOf[Sequence]] | None = None,
-    source: Path | None = None,
-    prefix: str = "",
+    source: Source | None = None,
     payload_mass: float = 0.0,
     progress: Progress = no_progress,
 ) -> ExportedFolder:
@@ -97,9 +199,7 @@ def export_robot(
         to: mjcf, urdf, mjlab, isaaclab, newton or json.
         out: Folder.
         recordings: Training and validation motions; default: simulated motions of the robot itself.
-        source: For mjcf and urdf, a file of the user's of which an edited copy is written; for mjcf by default the
-            robot's.
-        prefix: Text before each joint's name in that file.
+        source: For mjcf and urdf, a file of the user's; for mjcf by default the robot's.
         payload_mass: In each hand, kg.
         progress: Progress of the fit without the servo model, as of `identify`.
 
@@ -118,54 +218,34 @@ def export_robot(
             f"no validation motion was made with {payload_mass:g} kg and the robot's own gains"
         )
     plain = fit_plain_servos(robot, train, progress, ENGINE_TERMS.get(to, ()))
-    facts = simulator_facts(
-        robot, control_period(robot, (s.dt for s in validation)), payload_mass, plain
-    )
+    dt = control_period(robot, (s.dt for s in validation))
+    facts = simulator_facts(robot, dt, payload_mass, plain)
     has_ramps = to == "mjcf" and MUJOCO_HAS_RAMPS
-    motions = check_motions(validation, robot, ramped=not has_ramps)
-    facts |= {"file": ROBOT, "prefix": prefix, "virtual": validation[0].meta.virtual}
+    checked = check_motions(validation, robot, ramped=not has_ramps)
+    is_virtual = validation[0].meta.virtual
+    prefix = source.prefix if source else ""
+    facts |= {"file": ROBOT, "prefix": prefix, "virtual": is_virtual}
     facts["error_mrad"] = {
-        form: 1e3 * rollout_error(motions, r) for form, r in (("joints", robot), ("plain", plain))
+        form: 1e3 * rollout_error(checked, r) for form, r in (("joints", robot), ("plain", plain))
     }
     errors = {"in gaponet": rollout_error(validation, robot)}
     if robot.has_servo_model:
         errors["in gaponet, without the servo model"] = rollout_error(validation, plain)
-    file, notes = None, _notes(robot, facts, to)
+    notes = _notes(robot, facts, to)
+    export = _RobotExport(robot, plain, to, out, validation, checked, facts, errors, notes)
+    file = None
     with lock_folder(out, FOLDER_KIND):
         if to == "mjcf":
-            file, not_rad = edit_mjcf(source or robot.mjcf, out, plain, facts, payload_mass)
-            for form, what in (("joints", "with mujoco_servos.py"), ("plain", "alone")):
-                if form == "plain" or robot.has_servo_model:
-                    errors[f"{file.name} {what}"] = _error_in_mujoco(
-                        file, facts, validation, robot, form
-                    )
-            if not_rad:
-                text = f"targets of {', '.join(not_rad)} were not in rad before (degrees?)"
-                notes.append(f"{text}: now they are; ctrl of keyframes not")
+            file = export.write_mjcf(source.file if source else robot.mjcf)
         elif to == "urdf":
             assert source is not None
-            file, other = edit_urdf(source, out, facts, robot)
-            if other:
-                notes.append(
-                    f"inertias of {', '.join(other)} were not written: their masses in the file are others"
-                )
-                plain = replace(
-                    plain, links={n: link for n, link in plain.links.items() if n not in other}
-                )
-            errors[f"{file.name} alone, all else as before"] = rollout_error(
-                validation, with_urdf_fields(plain)
-            )
+            file = export.write_urdf(source.file)
         elif to != "json":
-            file = out / ROBOT
-            _write_scene(
-                robot if to == "mjlab" else plain, file, payload_mass, servos=to == "mjlab"
-            )
-            if to == "newton":
-                write_text(out / "robot_cfg.py", newton_config(robot.name, facts))
+            file = export.write_scene()
         facts["file"] = str(file.relative_to(out)) if file else ROBOT
-        _write_motions(out / CHECK, motions)
+        _write_motions(out / CHECK, checked)
         _write_shipped(out, to, facts)
-    return ExportedFolder(file, errors, len(validation), validation[0].meta.virtual, tuple(notes))
+    return ExportedFolder(file, errors, len(validation), is_virtual, tuple(notes))
 
 
 def _notes(robot: RobotSpec, facts: dict[str, Any], to: str) -> list[str]:

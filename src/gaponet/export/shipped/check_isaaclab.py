@@ -1,7 +1,9 @@
 """Play the motions of check.npz in Isaac Lab 3 on Newton's MuJoCo-Warp, in a few worlds, and print the error beside
-gaponet's: python check.py. The USD is made by mujoco-usd-converter.
+gaponet's. The USD is made by mujoco-usd-converter.
 
-python check.py randomization.json ROW     # the same with a unit of gaponet export ROBOT --to randomization
+python check.py                            # robot_cfg.py: Isaac Lab's own classes, its native actuators
+python check.py action                     # the action term of gaponet_action.py; its native actuators are off
+python check.py randomization.json ROW     # the action term, with a unit of gaponet export ROBOT --to randomization
 """
 
 import sys
@@ -9,7 +11,8 @@ from pathlib import Path
 
 import gaponet_action as gaponet
 import isaaclab.sim as sim_utils
-import mujoco_usd_converter
+import make_usd
+import robot_cfg
 from isaaclab.assets import ArticulationCfg
 from isaaclab.envs import ManagerBasedEnv, ManagerBasedEnvCfg, mdp
 from isaaclab.managers import EventTermCfg, ObservationGroupCfg, ObservationTermCfg, SceneEntityCfg
@@ -24,18 +27,23 @@ HERE = Path(__file__).parent
 check = Check(HERE)
 player = gaponet.CheckPlayer(check)
 reset = player.reset_event()
-usd = mujoco_usd_converter.Converter().convert(str(HERE / "robot.xml"), str(HERE / "usd"))
+usd = make_usd.convert(HERE / "usd")
+is_native = not sys.argv[1:]
+form = "native" if is_native else "plain"
+actuators = robot_cfg.ACTUATORS if is_native else gaponet.isaaclab_actuators(HERE)
+of_all = {"asset_name": "robot", "joint_names": [".*"]}
+own_action = mdp.JointPositionActionCfg(
+    **of_all, offset=robot_cfg.OFFSETS, use_default_offset=False
+)
 
 
 @configclass
 class Scene(InteractiveSceneCfg):
     robot: ArticulationCfg = ArticulationCfg(
         prim_path="{ENV_REGEX_NS}/Robot",
-        spawn=sim_utils.UsdFileCfg(usd_path=usd.path),
-        init_state=ArticulationCfg.InitialStateCfg(
-            joint_pos={n: j["home"] for n, j in check.facts["plain"].items()}
-        ),
-        actuators=gaponet.isaaclab_actuators(HERE),
+        spawn=sim_utils.UsdFileCfg(usd_path=usd),
+        init_state=ArticulationCfg.InitialStateCfg(joint_pos=robot_cfg.HOME),
+        actuators=actuators,
     )
 
 
@@ -50,7 +58,7 @@ class Observations:
 
 @configclass
 class Actions:
-    joint_pos = gaponet.isaaclab_action(HERE, asset_name="robot", joint_names=[".*"])
+    joint_pos = own_action if is_native else gaponet.isaaclab_action(HERE, **of_all)
 
 
 @configclass
@@ -60,7 +68,7 @@ class Events:
 
 
 events = Events()
-if sys.argv[1:]:
+if sys.argv[2:]:
     unit = {
         "file": sys.argv[1],
         "rows": [int(sys.argv[2])] * check.worlds,
@@ -74,9 +82,11 @@ solver = MJWarpSolverCfg(
 cfg = ManagerBasedEnvCfg(
     decimation=check.facts["decimation"], scene=Scene(num_envs=check.worlds, env_spacing=2.0),
     sim=sim_utils.SimulationCfg(
-        dt=check.step, use_newton_actuators=False, device="cpu", physics=NewtonCfg(solver_cfg=solver)
+        dt=check.step, use_newton_actuators=is_native, device="cpu", physics=NewtonCfg(solver_cfg=solver)
     ),
     observations=Observations(), actions=Actions(), events=events,
 )  # fmt: skip
 env = ManagerBasedEnv(cfg)
-check.report("Isaac Lab", player.run(env, env.action_manager.get_term("joint_pos")._joint_names))
+path = player.run(env, env.action_manager.get_term("joint_pos")._joint_names)
+what = "'s own classes" if is_native else ", action term"
+check.report(f"Isaac Lab{what}", path, form)
