@@ -1,23 +1,16 @@
 """gaponet export --to lerobot, and the LeRobot plug-in on stand-ins for LeRobot 0.6; its own run is make lerobot."""
 
-import importlib.util
 import json
-import sys
-from dataclasses import dataclass
-from pathlib import Path
-from types import ModuleType, SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 from arm import write_arm
+from lerobot_plugin import plugin as plugin
 
 from gaponet.cli.main import main
 from gaponet.robot.folder import save_robot
 
-PLUGIN = (
-    Path(__file__).parents[2] / "plugins" / "lerobot_robot_gaponet" / "lerobot_robot_gaponet.py"
-)
 POLICY = {
     "name": "policy_postprocessor",
     "steps": [
@@ -34,44 +27,6 @@ def known(tmp_path):
     )
     save_robot(robot, tmp_path / "known")
     return tmp_path / "known"
-
-
-@pytest.fixture
-def plugin(monkeypatch):
-    """The plug-in on stand-ins for what it takes from LeRobot."""
-
-    class Config:
-        register_subclass = staticmethod(lambda name: lambda cls: cls)
-
-    @dataclass
-    class RobotConfig(Config):
-        id: str | None = None
-        calibration_dir: Path | None = None
-
-    class Robot:
-        def __init__(self, config):
-            self.calibration_fpath = config.calibration_dir / self.name / f"{config.id}.json"
-
-    keys = SimpleNamespace(ACTION="action", OBSERVATION="observation")
-    registry = SimpleNamespace(register=lambda name: lambda cls: cls)
-    modules = {
-        "lerobot": {}, "lerobot.utils": {},
-        "lerobot.cameras": {"CameraConfig": object, "make_cameras_from_configs": lambda configs: {}},
-        "lerobot.lerobot_types": {"EnvTransition": dict, "TransitionKey": keys},
-        "lerobot.processor": {"ProcessorStep": object, "ProcessorStepRegistry": registry},
-        "lerobot.robots": {"Robot": Robot, "RobotConfig": RobotConfig},
-        "lerobot.teleoperators": {"Teleoperator": object, "TeleoperatorConfig": Config},
-        "lerobot.utils.errors": {"DeviceNotConnectedError": ConnectionError},
-    }  # fmt: skip
-    for name, content in modules.items():
-        module = ModuleType(name)
-        vars(module).update(content)
-        monkeypatch.setitem(sys.modules, name, module)
-    spec = importlib.util.spec_from_file_location("lerobot_robot_gaponet", PLUGIN)
-    module = importlib.util.module_from_spec(spec)
-    monkeypatch.setitem(sys.modules, "lerobot_robot_gaponet", module)
-    spec.loader.exec_module(module)
-    return module
 
 
 def test_a_policy_is_corrected_by_what_was_attached_last_and_by_nothing_after_off(

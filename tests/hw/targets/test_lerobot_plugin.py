@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-import importlib.util
 import sys
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from contacts import Contacts
+from lerobot_plugin import plugin as plugin
 
 import gaponet as gp
 from gaponet.base.errors import UsageError
 from gaponet.robot.folder import save_robot
 
-PLUGIN = (
-    Path(__file__).parents[3] / "plugins" / "lerobot_robot_gaponet" / "lerobot_robot_gaponet.py"
-)
 FOUND = {
     "shoulder_pan": 11.5,
     "shoulder_lift": -68.8,
@@ -25,49 +22,6 @@ FOUND = {
     "wrist_flex": 80.2,
     "wrist_roll": 22.9,
 }
-
-
-class Base:
-    """Robot, Teleoperator and their configurations."""
-
-    def __init__(self, config: object = None) -> None:
-        self.config = config
-
-    @classmethod
-    def register_subclass(cls, name: str):
-        return lambda made: made
-
-    register = register_subclass
-
-
-@pytest.fixture
-def plugin(monkeypatch):
-    pytest.importorskip("torch")
-    parts = {
-        "lerobot": {},
-        "lerobot.cameras": {"CameraConfig": Base, "make_cameras_from_configs": dict},
-        "lerobot.lerobot_types": {"EnvTransition": dict, "TransitionKey": SimpleNamespace()},
-        "lerobot.processor": {"ProcessorStep": Base, "ProcessorStepRegistry": Base},
-        "lerobot.robots": {
-            "Robot": Base,
-            "RobotConfig": type("RobotConfig", (Base,), {"__init__": object.__init__}),
-        },
-        "lerobot.teleoperators": {
-            "Teleoperator": Base,
-            "TeleoperatorConfig": type("Config", (Base,), {"__init__": object.__init__}),
-        },
-        "lerobot.utils": {},
-        "lerobot.utils.errors": {"DeviceNotConnectedError": ConnectionError},
-    }
-    for name, holds in parts.items():
-        module = ModuleType(name)
-        vars(module).update(holds)
-        monkeypatch.setitem(sys.modules, name, module)
-    spec = importlib.util.spec_from_file_location("lerobot_robot_gaponet", PLUGIN)
-    module = importlib.util.module_from_spec(spec)
-    monkeypatch.setitem(sys.modules, spec.name, module)
-    spec.loader.exec_module(module)
-    return module
 
 
 def seen(gripper: float) -> dict[str, float]:
@@ -105,7 +59,7 @@ def test_a_controller_that_ends_at_its_start_is_an_error_with_its_messages(plugi
     pytest.importorskip("zmq")
     command = [sys.executable, "-c", "raise SystemExit('no arm at the port')"]
     with pytest.raises(ConnectionError, match="port"):
-        plugin._Controller.start(lambda address: command)
+        plugin.so101._Controller.start(lambda address: command)
 
 
 def test_its_motions_are_one_plan_from_where_the_arm_is_and_the_gripper_keeps_what_it_holds(
@@ -181,7 +135,7 @@ def test_the_processor_commands_an_arm_as_its_nominal_simulator_moves(plugin, so
     for follow in (False, True):
         step = plugin.GaponetCorrect(known=str(tmp_path / "soft"), follow=follow)
         for _ in range(100):
-            sent[follow] = step._corrected(target, None)
+            sent[follow] = step.corrector(target)
 
     nominal = gp.AlignedSim(so101)
     robot = gp.AlignedSim(soft)
