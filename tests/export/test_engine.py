@@ -19,13 +19,12 @@ from gaponet.export.shipped import gaponet_action
 from gaponet.export.shipped.gaponet_action import (
     AlignedAction,
     Aligner,
-    DelayBuffers,
     DelayedAction,
-    ServoModel,
     hold_friction,
     isaaclab_actuators,
     read_facts,
 )
+from gaponet.export.shipped.mjlab_servos import Addresses, WorldServos
 from gaponet.export.shipped.scene_facts import require_scene
 from gaponet.export.simulator_facts import mjcf_text, simulator_facts
 from gaponet.export.torch_program import delta_step, program
@@ -33,7 +32,6 @@ from gaponet.nn.config import ModelConfig
 from gaponet.robot.fingerprint import model_fingerprint
 from gaponet.robot.servo_fields import SERVO_TERMS
 from gaponet.robot.spec import load_robot
-from gaponet.sim.batch import BatchSim, Condition
 from gaponet.sim.model import build_model, model_hash
 from gaponet.sim.servo import friction_limit, servo_torque
 
@@ -213,23 +211,51 @@ def test_a_scene_that_is_not_the_simulator_of_training_is_refused_with_the_field
         require_scene(scene, "", place / "torch")
 
 
-def test_late_servos_of_a_world_that_begins_stay_where_it_begins(place, model):
-    robot = model.simulator()
-    own = BatchSim(robot, [Condition(0.1, "both", 0.02)] * 3)
-    late = torch.full((3, own.batch.bind("history").shape[1]), 7.0)
-    named = re.sub('="(shoulder|elbow)"', r'="robot/\1"', (place / "torch/robot.xml").read_text())
+def mjlab_servos_of(robot, worlds):
+    """Return the servos of a robot in mjlab's scene of that many worlds, with mjlab's model and data."""
+    named = re.sub('="(shoulder|elbow)"', r'="robot/\1"', mjcf_text(robot, robot.dt))
     scene = mujoco.MjModel.from_xml_string(named)
-    sim = SimpleNamespace(
-        mj_model=scene, device="cpu", data=SimpleNamespace(history=late, time=torch.zeros(3))
+    addresses = Addresses.of_servos(scene, torch.arange(2))
+    facts = simulator_facts(robot, robot.dt)
+    servos = WorldServos(facts, ["shoulder", "elbow"], addresses, worlds, scene.opt.timestep)
+    model = SimpleNamespace(
+        dof_frictionloss=torch.zeros(worlds, 2), actuator_biasprm=torch.zeros(worlds, 2, 10)
     )
-    q = np.array([[0.1, 0.2], [0.3, 0.4], [0.5, 0.6]])
-    own.reset(slice(None), q, 0 * q, past=q[:, None])
-    fresh = torch.tensor([True, False, True])
-    DelayBuffers(sim, "robot", ["elbow", "shoulder"]).restart(
-        fresh, torch.tensor(q[:, ::-1].copy())
-    )
-    np.testing.assert_allclose(late[[0, 2]], own.batch.bind("history")[[0, 2]], atol=1e-7)
-    assert (late[1] == 7.0).all()
+    model.actuator_forcerange = torch.tensor([[-5.0, 5.0]]).repeat(worlds, 2, 1)
+    data = SimpleNamespace(qpos=torch.zeros(worlds, 2), qvel=torch.zeros(worlds, 2))
+    data.actuator_force = torch.zeros(worlds, 2)
+    data.qfrc_bias = torch.zeros(worlds, 2)
+    return servos, model, data
+
+
+def test_late_servos_of_a_world_that_begins_stay_where_it_begins(model):
+    servos, scene, data = mjlab_servos_of(model.simulator(), worlds=3)
+    asked = torch.full((3, 2), 0.4)
+    for _ in range(4):
+        servos.before_step(scene, data, asked)
+        servos.after_step(data)
+    data.qpos = torch.tensor([[0.1, 0.2], [0.3, 0.4], [0.5, 0.6]])
+
+    servos.restart(torch.tensor([True, False, True]))
+    sent = servos.before_step(scene, data, asked)
+
+    torch.testing.assert_close(sent[[0, 2]], data.qpos[[0, 2]])
+    torch.testing.assert_close(sent[1], asked[1])
+
+
+def test_only_physics_steps_move_the_delays_of_servos_on(model):
+    """mjlab asks for a step's targets once more whenever a world begins anew."""
+    servos, scene, data = mjlab_servos_of(model.simulator(), worlds=1)
+    asked = torch.full((1, 2), 0.4)
+    sent = []
+    for step in range(4):
+        for _ in range(1 + step % 2):
+            again = servos.before_step(scene, data, asked)
+        servos.after_step(data)
+        sent.append(again[0].tolist())
+    # late by 7 and 13 ms, in steps of 5 ms
+    expected = [[0.0, 0.0], [0.24, 0.0], [0.4, 0.16], [0.4, 0.4]]
+    np.testing.assert_allclose(sent, expected, atol=1e-6)
 
 
 class Wrapped:
@@ -283,23 +309,12 @@ def test_a_servos_law_in_torch_is_the_simulators(tmp_path):
     robot = write_arm(tmp_path / "arm").with_servos(
         {"elbow": law | {"offset": 0.1}, "shoulder": {"kp": 11.0}}
     )
-    scene = mujoco.MjModel.from_xml_string(
-        re.sub('="(shoulder|elbow)"', r'="robot/\1"', mjcf_text(robot, robot.dt))
-    )
     q, v, torque, load, ctrl = rng.uniform(-0.2, 0.2, (5, 20, 2))
     seen = {"qpos": q, "qvel": v, "actuator_force": torque, "qfrc_bias": load}
-    model = SimpleNamespace(
-        dof_frictionloss=torch.zeros(20, 2), actuator_biasprm=torch.zeros(20, 2, 10)
-    )
-    model.actuator_forcerange = torch.tensor([[-5.0, 5.0]]).repeat(20, 2, 1)
-    data = SimpleNamespace(**{name: torch.tensor(x).float() for name, x in seen.items()})
-    sim = SimpleNamespace(mj_model=scene, model=model, data=data, device="cpu", num_envs=20)
-    sim.expand_model_fields, entity = lambda fields: None, SimpleNamespace(update=lambda dt: None)
-    found = ServoModel(
-        sim, entity, "robot", ["shoulder", "elbow"], simulator_facts(robot, robot.dt)
-    )
-    entity.update(0.005)
-    found.before(torch.tensor(ctrl).float())
+    found, model, data = mjlab_servos_of(robot, worlds=20)
+    vars(data).update({name: torch.tensor(x).float() for name, x in seen.items()})
+    found.after_step(data)
+    found.before_step(model, data, torch.tensor(ctrl).float())
     terms, kp = {name: getattr(robot, name) for name in SERVO_TERMS}, robot.kp
     friction = friction_limit(terms, np.full(2, 0.05), v, torque, load)
     np.testing.assert_allclose(model.dof_frictionloss, friction, atol=1e-6)
@@ -307,10 +322,20 @@ def test_a_servos_law_in_torch_is_the_simulators(tmp_path):
     np.testing.assert_allclose(model.actuator_biasprm[:, :, 0], asked - kp * (ctrl - q), atol=1e-5)
     limits = np.stack([np.full(20, 5.0), 5.0 * np.minimum(1 - v[:, 1] / 3.0, 1)], axis=1)
     np.testing.assert_allclose(model.actuator_forcerange[:, :, 1], limits, atol=1e-5)
-    found.restart(torch.ones(20, dtype=torch.bool), torch.full((20, 2), 0.01))
+    found.restart()
+    found.starts_under_command = True
+    found.before_step(model, data, data.qpos + 0.01)
     np.testing.assert_allclose(
         found.torque, np.tile(kp * (robot.offset + 0.01), (20, 1)), atol=1e-6
     )
+
+
+def test_worlds_that_share_one_friction_are_refused(place):
+    robot = write_arm(place / "arm_with_law").with_servos({"elbow": {"friction_motor": 0.1}})
+    servos, model, data = mjlab_servos_of(robot, worlds=2)
+    model.dof_frictionloss = torch.zeros(1, 2).expand(2, 2)
+    with pytest.raises(ValueError, match="mjlab_events"):
+        servos.before_step(model, data, torch.zeros(2, 2))
 
 
 def isaac_lab(monkeypatch):
@@ -401,20 +426,12 @@ def test_targets_under_way_in_the_term_are_late_by_parts_of_a_step_and_begin_at_
     assert (term._processed_actions == 1.0).all()
 
 
-def test_friction_is_made_to_hold_in_every_world_of_a_model_that_they_share(place):
+def test_friction_is_made_to_hold_in_every_world(place):
     scene = mujoco.MjModel.from_xml_string(
         re.sub('="(shoulder|elbow)"', r'="robot/\1"', (place / "torch/robot.xml").read_text())
     )
-    shared = torch.tensor(scene.dof_invweight0)[None].expand(
-        3, -1
-    )  # as mjlab has it: one row for all
-
-    def expand(fields):
-        sim.model.dof_invweight0 = shared.clone()
-
-    sim = SimpleNamespace(
-        mj_model=scene, model=SimpleNamespace(dof_invweight0=shared), expand_model_fields=expand
-    )
+    shared = torch.tensor(scene.dof_invweight0)[None].repeat(3, 1)
+    sim = SimpleNamespace(mj_model=scene, model=SimpleNamespace(dof_invweight0=shared.clone()))
     hold_friction(sim, "robot", place / "torch")
     np.testing.assert_allclose(sim.model.dof_invweight0, 0.1 * shared)
 

@@ -316,6 +316,7 @@ def test_mjlab_s_own_position_servos_get_units_without_the_servo_model_by_joint_
     worlds = {f: x.expand(WORLDS, *x.shape).clone() for f, x in fields.items()}
     env = environment(None, SimpleNamespace(cfg=SimpleNamespace(entity_name="robot")))
     env.sim = SimpleNamespace(mj_model=scene, model=SimpleNamespace(**worlds))
+    env.scene = {"robot": SimpleNamespace(actuators=[SimpleNamespace()])}
     event(env, torch.tensor([1, 3]))
     kp = stored(file, "shoulder")["kp"]
     torch.testing.assert_close(

@@ -19,7 +19,13 @@ TORCH_HELPER = "gaponet_action"
 # Helper → modules of SHIPPED that it consists of, beside the servo model; the last one gives its docstring.
 MODULES: dict[str, tuple[str, ...]] = {
     MUJOCO_HELPER: ("mujoco_servos",),
-    TORCH_HELPER: ("mujoco_servos", "scene_facts", "unit_events", "gaponet_action"),
+    TORCH_HELPER: (
+        "mujoco_servos",
+        "scene_facts",
+        "unit_events",
+        "mjlab_servos",
+        "gaponet_action",
+    ),
 }
 SERVO_MODEL: tuple[Callable[..., Any], ...] = (
     array_module,

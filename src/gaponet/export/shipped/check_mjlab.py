@@ -29,13 +29,14 @@ if networks:
     entity = gaponet.mjlab_entity(
         HERE, articulation=EntityArticulationInfoCfg(actuators=mjlab_actuators(HERE))
     )
-    action = JointPositionActionCfg(**joints, use_default_offset=False)
 else:
-    entity, action = gaponet.mjlab_entity(HERE), gaponet.mjlab_action(HERE, check=False, **joints)
+    entity = gaponet.mjlab_entity(HERE)
+action = JointPositionActionCfg(**joints, use_default_offset=False)
 options, decimation = gaponet.mjlab_options(HERE)
 step = check.facts["actuator_net"]["step"] if networks else check.step
 player = gaponet.CheckPlayer(check)
-events = {"start": EventTermCfg(func=player.reset_event(), mode="reset")}
+events = gaponet.mjlab_events(HERE)
+events["start"] = EventTermCfg(func=player.reset_event(), mode="reset")
 if sys.argv[1:]:
     unit = gaponet.mjlab_units(sys.argv[1], rows=[int(sys.argv[2])] * check.worlds)
     events = {"unit": EventTermCfg(func=unit, mode="reset")} | events
@@ -47,8 +48,6 @@ cfg = ManagerBasedRlEnvCfg(
     sim=SimulationCfg(mujoco=dataclasses.replace(options, timestep=step)),
 )
 env = ManagerBasedRlEnv(cfg, device="cpu")
-if networks:
-    gaponet.hold_friction(env.sim, "robot", HERE)
 path = player.run(env, env.action_manager.get_term("joint_pos").target_names)
 form, what = ("actuator networks", "'s learned actuators") if networks else ("joints", "")
 check.report(f"mjlab{what}", path, form)

@@ -1,4 +1,4 @@
-"""Action terms for mjlab and Isaac Lab that align the simulation with the robot.
+"""Servos and action terms for mjlab and Isaac Lab that align the simulation with the robot.
 
 This file is copied into exports; it needs torch, not gaponet.
 
@@ -7,12 +7,14 @@ gaponet export ROBOT --to mjlab --out FOLDER   # the identified servos without a
 
 mjlab:      cfg.scene.entities["robot"] = mjlab_entity(FOLDER)
             cfg.sim.mujoco, cfg.decimation = mjlab_options(FOLDER)
+            cfg.events |= mjlab_events(FOLDER)
+            and of a run, for its network:
             cfg.actions["joint_pos"] = mjlab_action(FOLDER, entity_name="robot", actuator_names=(".*",))
 Isaac Lab:  cfg.scene.robot.actuators = isaaclab_actuators(FOLDER)
             cfg.actions.joint_pos = isaaclab_action(FOLDER, asset_name="robot", joint_names=[".*"])
 
-Both call process_actions once per control period. It replaces the targets of the policy by targets that make the
-simulator move like the robot. Options are those of JointPositionActionCfg.
+Both action terms call process_actions once per control period. It replaces the targets of the policy by targets that
+make the simulator move like the robot. Options are those of JointPositionActionCfg.
 """
 
 from __future__ import annotations
@@ -25,11 +27,15 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from gaponet.export.shipped.mjlab_servos import (
+    FRICTION_FIELDS,
+    SERVO_FIELDS,
+    mjlab_servos,
+)
 from gaponet.export.shipped.mujoco_servos import Check, read
 from gaponet.export.shipped.scene_facts import require_scene
-from gaponet.export.shipped.unit_events import columns_of, write_model
+from gaponet.export.shipped.unit_events import columns_of
 from gaponet.export.shipped.unit_events import mjlab_units as mjlab_units
-from gaponet.sim.servo import SERVO_TERMS, friction_limit, present, servo_bias, torque_range
 
 PROGRAM, FACTS, ROBOT = "delta.pt2", "facts.json", "robot.xml"
 
@@ -220,6 +226,9 @@ class CheckPlayer:
         """Play all motions with action term "joint_pos"; return positions, (T, worlds, n) rad."""
         robot, term = env.scene["robot"], env.action_manager.get_term("joint_pos")
         columns = [self.check.names.index(name) for name in action_joints]
+        for actuator in robot.actuators:
+            if hasattr(actuator, "servos"):  # of mjlab
+                actuator.servos.starts_under_command = True
         order = [list(robot.joint_names).index(name) for name in self.check.names]
 
         def start(motions: dict[int, Any], ctrl: Any) -> None:
@@ -243,32 +252,21 @@ class CheckPlayer:
 def mjlab_action(
     folder: str | Path, payload_mass: float | None = None, check: bool = True, **options: Any
 ) -> Any:
-    """Return a JointPositionActionCfg that aligns; `check` refuses a scene that is not the simulator of training."""
+    """Return a JointPositionActionCfg whose targets the network of a run corrects.
+
+    `check` refuses a scene that is not the simulator of training. Without a network, mjlab's own class does.
+    """
     from mjlab.envs.mdp.actions import JointPositionAction, JointPositionActionCfg
 
     class Term(AlignedAction, JointPositionAction):
         def __init__(self, cfg: Any, env: Any) -> None:
             super().__init__(cfg, env)
-            self.folder, self.payload_mass = Path(folder), payload_mass
+            self.folder = Path(folder)
+            self.payload_mass = payload_mass
             self.align(self._entity, self._target_ids, self._target_names)
             if check:
-                require_scene(env.sim.mj_model, f"{cfg.entity_name}/", self.folder)
-            names = list(self._target_names)
-            self.delays = DelayBuffers(env.sim, cfg.entity_name, names)
-            self.terms = ServoModel(
-                env.sim, self._entity, cfg.entity_name, names, read_facts(self.folder)
-            )
-            hold_friction(env.sim, cfg.entity_name, self.folder)
-
-        def restart(self, qpos: Tensor, command: Tensor) -> None:
-            self.delays.restart(self.aligner.past.fresh, command)
-            self.terms.restart(self.aligner.past.fresh, command - qpos)
-
-        def apply_actions(self) -> None:
-            super().apply_actions()
-            self.terms.before(
-                self._processed_actions - self._entity.data.encoder_bias[:, self._target_ids]
-            )
+                delays = ("actuator_delay", "actuator_history")  # are computed in IdentifiedServo
+                require_scene(env.sim.mj_model, f"{cfg.entity_name}/", self.folder, delays)
 
     class Cfg(JointPositionActionCfg):
         def build(self, env: Any) -> Any:
@@ -280,18 +278,25 @@ def mjlab_action(
 def mjlab_entity(folder: str | Path, **options: Any) -> Any:
     """Return the robot with its servos, at its home position; options are those of EntityCfg."""
     import mujoco
-    from mjlab.actuator import XmlActuatorCfg
     from mjlab.entity import EntityArticulationInfoCfg, EntityCfg
 
     home = {name: joint["home"] for name, joint in read_facts(folder)["joints"].items()}
-    servos = EntityArticulationInfoCfg(
-        actuators=(XmlActuatorCfg(target_names_expr=(".*",), command_field="position"),)
-    )
     own = {
-        "articulation": servos,
+        "articulation": EntityArticulationInfoCfg(actuators=(mjlab_servos(folder),)),
         "init_state": EntityCfg.InitialStateCfg(joint_pos=home),
     } | options
     return EntityCfg(spec_fn=lambda: mujoco.MjSpec.from_file(str(Path(folder) / ROBOT)), **own)
+
+
+def mjlab_events(folder: str | Path, entity: str = "robot") -> dict[str, Any]:
+    """Return the event by which each world has friction of its own, as stiff as in training."""
+    from mjlab.managers.event_manager import EventTermCfg, requires_model_fields
+
+    @requires_model_fields(*FRICTION_FIELDS, *SERVO_FIELDS)
+    def stiffen(env: Any, env_ids: Any) -> None:
+        hold_friction(env.sim, entity, folder)
+
+    return {f"{entity}_servos": EventTermCfg(func=stiffen, mode="startup")}
 
 
 def mjlab_options(folder: str | Path) -> tuple[Any, int]:
@@ -304,9 +309,8 @@ def mjlab_options(folder: str | Path) -> tuple[Any, int]:
 
     facts = read_facts(folder)
     fields = {field.name for field in dataclasses.fields(MujocoCfg)}
-    return MujocoCfg(**{k: v for k, v in facts["options"].items() if k in fields}), facts[
-        "decimation"
-    ]
+    options = {name: value for name, value in facts["options"].items() if name in fields}
+    return MujocoCfg(**options), facts["decimation"]
 
 
 def hold_friction(sim: Any, entity: str, folder: str | Path) -> None:
@@ -315,134 +319,10 @@ def hold_friction(sim: Any, entity: str, folder: str | Path) -> None:
     Call it again after events that recompute the constants of the model.
     """
     facts = read_facts(folder)
-    sim.expand_model_fields(("dof_invweight0",))  # one per world; before, all worlds share one
     for name in facts["joints"]:
         dof = sim.mj_model.joint(f"{entity}/{name}").dofadr[0]
-        sim.model.dof_invweight0[:, dof] = (
-            float(sim.mj_model.dof_invweight0[dof]) * facts["dof_invweight0_factor"]
-        )
-
-
-class DelayBuffers:
-    """MuJoCo's buffers of delayed commands, which mjlab's reset does not clear."""
-
-    def __init__(self, sim: Any, entity: str, names: list[str]) -> None:
-        self.sim, model = sim, sim.mj_model
-        size = model.nhistory
-        self.mask, self.times, self.values = (torch.zeros(size, dtype=torch.bool) for _ in range(3))
-        self.base, self.source = torch.zeros(size), torch.zeros(size, dtype=torch.long)
-        for column, name in enumerate(names):
-            servo = model.actuator(f"{entity}/{name}").id
-            start, count = (
-                int(model.actuator_historyadr[servo]),
-                int(model.actuator_history[servo, 0]),
-            )
-            if start < 0 or not count:
-                continue
-            times, values = (
-                slice(start + 2, start + 2 + count),
-                slice(start + 2 + count, start + 2 + 2 * count),
-            )
-            self.mask[start : values.stop] = self.times[times] = self.values[values] = True
-            self.base[start + 1] = count - 1  # index of the newest sample; user data come before it
-            self.base[times] = -model.opt.timestep * torch.arange(count, 0, -1)
-            self.source[values] = column
-        self.any = bool(self.mask.any())
-        vars(self).update(
-            {k: x.to(sim.device) for k, x in vars(self).items() if isinstance(x, Tensor)}
-        )
-
-    def restart(self, fresh: Tensor, command: Tensor) -> None:
-        """Fill the buffers of fresh worlds with a command, (num_envs, names) rad."""
-        if self.any:
-            history, time = self.sim.data.history, self.sim.data.time
-            filled = self.base + self.times * time[:, None] + self.values * command[:, self.source]
-            history[:] = torch.where(fresh[:, None] & self.mask, filled, history[:])
-
-
-class ServoModel:
-    """Servo model beyond PD, applied before every physics step of mjlab."""
-
-    def __init__(
-        self, sim: Any, entity: Any, name: str, joints: list[str], facts: dict[str, Any]
-    ) -> None:
-        column = {f: torch.tensor([facts["joints"][j].get(f, 0.0) for j in joints], device=sim.device)
-                  for f in ("kp", "offset", "frictionloss", "effort_limit", *SERVO_TERMS)}  # fmt: skip
-        self.sim, self.terms, model = (
-            sim,
-            present({f: column[f] for f in SERVO_TERMS}),
-            sim.mj_model,
-        )
-        self.joints, self.effort = joints, column["effort_limit"]
-        self.dof = torch.tensor(
-            [model.joint(f"{name}/{j}").dofadr[0] for j in joints], device=sim.device
-        )
-        self.at = torch.tensor(
-            [model.joint(f"{name}/{j}").qposadr[0] for j in joints], device=sim.device
-        )
-        self.servo = torch.tensor(
-            [model.actuator(f"{name}/{j}").id for j in joints], device=sim.device
-        )
-        self.kp, self.frictionloss, self.bias = (
-            column["kp"],
-            column["frictionloss"],
-            column["kp"] * column["offset"],
-        )
-        if not self.terms:
-            return
-        sim.expand_model_fields(("dof_frictionloss", "actuator_biasprm", "actuator_forcerange"))
-        self.torque = torch.zeros(sim.num_envs, len(joints), device=sim.device)
-        self.load, update = torch.zeros_like(self.torque), entity.update
-
-        def updated(
-            dt: float,
-        ) -> None:  # after each physics step, before forward() overwrites these
-            update(dt)
-            self.torque, self.load = (
-                sim.data.actuator_force[:, self.servo],
-                sim.data.qfrc_bias[:, self.dof],
-            )
-
-        entity.update = updated
-
-    def set_units(self, env_ids: Tensor, joints: list[str], units: dict[str, Tensor]) -> None:
-        """Give worlds the numbers of units: field → (len(env_ids), joints). Delays stay as exported."""
-        columns = torch.tensor(
-            columns_of(joints, self.joints, "the action term"), device=env_ids.device
-        )
-        write_model(self.sim.model, env_ids, self.dof[columns], self.servo[columns], units)
-        at = env_ids[:, None]
-
-        def of_worlds(column: Tensor, values: Tensor) -> Tensor:
-            column = column.expand(self.sim.num_envs, -1).clone()
-            column[at, columns] = values.to(column.dtype)
-            return column
-
-        self.kp = of_worlds(self.kp, units["kp"])
-        self.bias = of_worlds(self.bias, units["kp"] * units["offset"])
-        self.frictionloss = of_worlds(self.frictionloss, units["frictionloss"])
-        self.effort = of_worlds(self.effort, units["effort_limit"])
-        self.terms = {name: of_worlds(column, units[name]) for name, column in self.terms.items()}
-
-    def restart(self, fresh: Tensor, error: Tensor) -> None:
-        """Restart fresh worlds with a distance from position to command, (num_envs, joints) rad."""
-        if self.terms:
-            self.torque = torch.where(fresh[:, None], self.bias + self.kp * error, self.torque)
-            self.load = torch.where(fresh[:, None], self.sim.data.qfrc_bias[:, self.dof], self.load)
-
-    def before(self, ctrl: Tensor) -> None:
-        """Set friction, torque limits and bias for the next physics step, under targets (num_envs, joints) rad."""
-        if not self.terms:
-            return
-        q, v = self.sim.data.qpos[:, self.at], self.sim.data.qvel[:, self.dof]
-        limit = friction_limit(self.terms, self.frictionloss, v, self.torque, self.load)
-        self.sim.model.dof_frictionloss[:, self.dof] = limit
-        if "no_load_speed" in self.terms:
-            speed = self.terms["no_load_speed"]
-            limits = torque_range(self.effort, torch.where(speed > 0, v / speed, 0.0))
-            self.sim.model.actuator_forcerange[:, self.servo] = torch.stack(limits, dim=-1)
-        bias = servo_bias(self.terms, self.kp, self.bias, ctrl, q)
-        self.sim.model.actuator_biasprm[:, self.servo, 0] = bias
+        stiff = float(sim.mj_model.dof_invweight0[dof]) * facts["dof_invweight0_factor"]
+        sim.model.dof_invweight0[:, dof] = stiff
 
 
 # ---- Isaac Lab
@@ -590,9 +470,13 @@ def isaaclab_actuators(folder: str | Path) -> dict[str, Any]:
 
 def __getattr__(name: str) -> Any:
     """Make the classes for Isaac Lab on first use; hydra finds them here by name."""
-    makers = {"IsaacLabTerm": _isaaclab_term, "IsaacLabActionCfg": _isaaclab_cfg}
+    makers = {
+        "IsaacLabTerm": _isaaclab_term,
+        "IsaacLabActionCfg": _isaaclab_cfg,
+    }
     if name not in makers:
         raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
     new = globals()[name] = makers[name]()
-    new.__module__, new.__qualname__ = __name__, name
+    new.__module__ = __name__
+    new.__qualname__ = name
     return new

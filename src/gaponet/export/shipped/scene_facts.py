@@ -24,12 +24,15 @@ OPTIONS = (
 )  # fmt: skip
 
 
-def require_scene(model: Any, prefix: str, folder: str | Path) -> None:
+def require_scene(
+    model: Any, prefix: str, folder: str | Path, skipped: tuple[str, ...] = ()
+) -> None:
     """Refuse a compiled MjModel in which the robot's joints and servos are not those of training.
 
     Args:
         prefix: Text before each joint's name in the model.
         folder: Export.
+        skipped: Fields of joints and servos that may differ.
 
     Raises:
         ValueError: The message names the fields that differ.
@@ -37,6 +40,8 @@ def require_scene(model: Any, prefix: str, folder: str | Path) -> None:
     facts, wrong = read(Path(folder) / "facts.json"), []
     for name, joint in facts["joints"].items():
         for field, value in joint_fields(model, prefix + name).items():
+            if field in skipped:
+                continue
             wrong += _differs(f"{field} of {name}", value, joint["mujoco"][field])
     here = solver_options(model)
     for field, value in facts["options"].items():

@@ -72,7 +72,7 @@ def columns_of(joints: Iterable[str], names: Iterable[str], what: str) -> list[i
 def mjlab_units(file: str | Path, term: str = "joint_pos", rows: Any = None) -> Any:
     """Return the function of an event term for mjlab. Delays stay as they are.
 
-    With the action of `mjlab_action`, units have the servo model. With another action on position servos they have not.
+    With the servos of `mjlab_entity`, units have the servo model. With other position servos they have not.
 
     Args:
         term: Action term of the robot.
@@ -85,19 +85,16 @@ def mjlab_units(file: str | Path, term: str = "joint_pos", rows: Any = None) -> 
     @requires_model_fields(*MODEL_FIELDS, *BODY_FIELDS * bool(bodies))
     def use_units(env: Any, env_ids: Any) -> None:
         action = env.action_manager.get_term(term)
-        servos = getattr(action, "terms", None)
-        ids, joints, units = draw_units(
-            file, "units" if servos else "plain_units", env, env_ids, rows
-        )
+        robot = env.scene[action.cfg.entity_name]
+        identified = [a.servos for a in robot.actuators if hasattr(a, "servos")]
+        form = "units" if identified else "plain_units"
+        ids, joints, units = draw_units(file, form, env, env_ids, rows)
         if bodies:
-            write_links(
-                env.sim,
-                ids,
-                [f"{action.cfg.entity_name}/{name}" for name in bodies],
-                units["links"],
-            )
-        if servos:
-            return servos.set_units(ids, joints, units)
+            names = [f"{action.cfg.entity_name}/{name}" for name in bodies]
+            write_links(env.sim, ids, names, units["links"])
+        if identified:
+            identified[0].set_units(env.sim.model, ids, joints, units)
+            return
         model, joints = env.sim.mj_model, [f"{action.cfg.entity_name}/{name}" for name in joints]
         driven = {model.joint(joint).name: servo for servo, joint in enumerate(model.actuator_trnid[:, 0])
                   if (model.actuator_trntype[servo], model.actuator_biastype[servo]) == (0, 1)}  # fmt: skip

@@ -1,0 +1,223 @@
+"""Identified servos as an actuator of mjlab. This file is copied into exports; it needs torch, not gaponet.
+
+EntityArticulationInfoCfg(actuators=(mjlab_servos(FOLDER),)), and mjlab_events(FOLDER) of gaponet_action.py
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gaponet.export.shipped.mujoco_servos import delay_weights, read
+from gaponet.export.shipped.unit_events import columns_of, write_model
+from gaponet.sim.servo import SERVO_TERMS, friction_limit, present, servo_bias, torque_range
+
+# Fields of the model that each world needs for itself.
+SERVO_FIELDS = ("dof_frictionloss", "actuator_biasprm", "actuator_forcerange")
+FRICTION_FIELDS = ("dof_invweight0",)
+
+
+@dataclass(frozen=True)
+class Addresses:
+    """Places of joints in mjlab's model and data, (n) each."""
+
+    dof: Tensor
+    qpos: Tensor
+    servo: Tensor
+
+    @classmethod
+    def of_servos(cls, mj_model: Any, servos: Tensor) -> Addresses:
+        """Return the places of the joints that actuators move."""
+        joints = mj_model.actuator_trnid[servos.cpu().numpy(), 0]
+        dof = torch.as_tensor(mj_model.jnt_dofadr[joints], device=servos.device).long()
+        qpos = torch.as_tensor(mj_model.jnt_qposadr[joints], device=servos.device).long()
+        return cls(dof, qpos, servos)
+
+
+class WorldServos:
+    """Delays and the servo model beyond PD of some joints, in all worlds.
+
+    mjlab's own delay fields count how often a target is written, and it writes once more whenever a world begins anew;
+    these delays count physics steps, and may be parts of one.
+
+    Attributes:
+        starts_under_command: How a world begins: as if its first target had been in force for long; False: as if its
+            first position had been.
+    """
+
+    def __init__(
+        self,
+        facts: dict[str, Any],
+        joints: list[str],
+        addresses: Addresses,
+        num_envs: int,
+        step: float,
+    ) -> None:
+        """
+        Args:
+            facts: facts.json.
+            step: Physics step, s.
+        """
+        device = addresses.servo.device
+
+        def column(field: str) -> Tensor:
+            values = [facts["joints"][joint].get(field, 0.0) for joint in joints]
+            return torch.tensor(values, device=device)
+
+        self.joints = joints
+        self.addresses = addresses
+        self.num_envs = num_envs
+        self.kp = column("kp")
+        self.bias = self.kp * column("offset")
+        self.frictionloss = column("frictionloss")
+        self.effort = column("effort_limit")
+        self.terms = present({name: column(name) for name in SERVO_TERMS})
+        weights = delay_weights(column("delay").cpu().numpy(), step)
+        self.weights = torch.tensor(weights, dtype=torch.float, device=device)[:, None]
+        self.targets = torch.zeros(len(weights), num_envs, len(joints), device=device)
+        self.torque = torch.zeros(num_envs, len(joints), device=device)
+        self.load = torch.zeros_like(self.torque)
+        self.fresh = torch.ones(num_envs, dtype=torch.bool, device=device)
+        self.starts_under_command = False
+
+    def restart(self, env_ids: Any = None) -> None:
+        """Let worlds (indices, a mask, a slice; None for all) begin anew at the next physics step."""
+        self.fresh = self.fresh.clone()
+        self.fresh[slice(None) if env_ids is None else env_ids] = True
+
+    def before_step(self, model: Any, data: Any, target: Tensor) -> Tensor:
+        """Write the servo model into mjlab's model for the next physics step, and return ctrl, (num_envs, n) rad.
+
+        mjlab calls it once a step, and again when a world begins anew: only `after_step` moves the delays on.
+        """
+        qpos = data.qpos[:, self.addresses.qpos]
+        qvel = data.qvel[:, self.addresses.dof]
+        if self.fresh.any():
+            self._start(data, qpos, target)
+        self.targets[0] = target
+        if self.terms:
+            self._write_servo_model(model, qpos, qvel, target)
+        return (self.weights * self.targets).sum(0)
+
+    def after_step(self, data: Any) -> None:
+        """Note torque and load of the physics step, and move the delays on."""
+        self.torque = data.actuator_force[:, self.addresses.servo]
+        self.load = data.qfrc_bias[:, self.addresses.dof]
+        self.targets = torch.cat([self.targets[:1], self.targets[:-1]])
+        self.fresh = torch.zeros_like(self.fresh)
+
+    def _start(self, data: Any, qpos: Tensor, target: Tensor) -> None:
+        """Put fresh worlds under a target that has been in force for long."""
+        fresh = self.fresh[:, None]
+        held = target if self.starts_under_command else qpos
+        self.targets = torch.where(fresh, held, self.targets)
+        self.torque = torch.where(fresh, self.bias + self.kp * (held - qpos), self.torque)
+        self.load = torch.where(fresh, data.qfrc_bias[:, self.addresses.dof], self.load)
+
+    def _write_servo_model(self, model: Any, qpos: Tensor, qvel: Tensor, target: Tensor) -> None:
+        """Write friction, torque limits and bias."""
+        if self.num_envs > 1 and model.dof_frictionloss.stride(0) == 0:
+            raise ValueError(
+                "all worlds share one friction: cfg.events.update(mjlab_events(FOLDER)) gives each its own"
+            )
+        dof, servo = self.addresses.dof, self.addresses.servo
+        friction = friction_limit(self.terms, self.frictionloss, qvel, self.torque, self.load)
+        model.dof_frictionloss[:, dof] = friction
+        if "no_load_speed" in self.terms:
+            speed = self.terms["no_load_speed"]
+            limits = torque_range(self.effort, torch.where(speed > 0, qvel / speed, 0.0))
+            model.actuator_forcerange[:, servo] = torch.stack(limits, dim=-1)
+        bias = servo_bias(self.terms, self.kp, self.bias, target, qpos)
+        model.actuator_biasprm[:, servo, 0] = bias
+
+    def set_units(
+        self, model: Any, env_ids: Tensor, joints: list[str], units: dict[str, Tensor]
+    ) -> None:
+        """Give worlds the numbers of units: field → (len(env_ids), joints). Delays stay as exported."""
+        columns = torch.tensor(
+            columns_of(joints, self.joints, "the actuators"), device=env_ids.device
+        )
+        dof, servo = self.addresses.dof[columns], self.addresses.servo[columns]
+        write_model(model, env_ids, dof, servo, units)
+        rows = env_ids[:, None]
+
+        def of_worlds(column: Tensor, values: Tensor) -> Tensor:
+            column = column.expand(self.num_envs, -1).clone()
+            column[rows, columns] = values.to(column.dtype)
+            return column
+
+        self.kp = of_worlds(self.kp, units["kp"])
+        self.bias = of_worlds(self.bias, units["kp"] * units["offset"])
+        self.frictionloss = of_worlds(self.frictionloss, units["frictionloss"])
+        self.effort = of_worlds(self.effort, units["effort_limit"])
+        self.terms = {name: of_worlds(column, units[name]) for name, column in self.terms.items()}
+
+
+def mjlab_servos(folder: str | Path, **options: Any) -> Any:
+    """Return the ActuatorCfg of the servos in robot.xml, for EntityArticulationInfoCfg; options are its fields."""
+    own = {"target_names_expr": (".*",), "command_field": "position", "folder": str(folder)}
+    return _servo_cfg_class()(**own | options)
+
+
+@cache
+def _servo_cfg_class() -> Any:
+    """Return the configuration class; it needs mjlab."""
+    from mjlab.actuator import XmlActuatorCfg
+
+    @dataclass(kw_only=True)
+    class IdentifiedServoCfg(XmlActuatorCfg):
+        """Servos of robot.xml with their identified delays and servo model."""
+
+        folder: str
+        """Export of gaponet, with facts.json."""
+
+        def build(self, entity: Any, target_ids: list[int], target_names: list[str]) -> Any:
+            return _servo_class()(self, entity, target_ids, target_names)
+
+    return IdentifiedServoCfg
+
+
+@cache
+def _servo_class() -> Any:
+    """Return the actuator class; it needs mjlab."""
+    from mjlab.actuator.xml_actuator import XmlActuator
+
+    class IdentifiedServo(XmlActuator):
+        """Actuator of mjlab: `servos` computes its delays and its servo model."""
+
+        servos: WorldServos
+
+        def edit_spec(self, spec: Any, target_names: list[str]) -> None:
+            super().edit_spec(spec, target_names)
+            for (
+                servo
+            ) in self._mjs_actuators:  # `servos` has the delays; mjlab's reset keeps MuJoCo's
+                servo.nsample = 0
+                servo.delay = 0.0
+
+        def initialize(self, mj_model: Any, model: Any, data: Any, device: str) -> None:
+            super().initialize(mj_model, model, data, device)
+            self.model = model
+            self.data = data
+            facts = read(Path(self.cfg.folder) / "facts.json")
+            addresses = Addresses.of_servos(mj_model, self.global_ctrl_ids)
+            step = float(mj_model.opt.timestep)
+            self.servos = WorldServos(facts, list(self.target_names), addresses, data.nworld, step)
+
+        def reset(self, env_ids: Any = None) -> None:
+            super().reset(env_ids)
+            self.servos.restart(env_ids)
+
+        def compute(self, cmd: Any) -> Tensor:
+            return self.servos.before_step(self.model, self.data, cmd.position_target)
+
+        def update(self, dt: float) -> None:
+            super().update(dt)
+            self.servos.after_step(self.data)
+
+    return IdentifiedServo
