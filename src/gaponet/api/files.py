@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from gaponet.export.export_folder import ExportedFolder
     from gaponet.export.randomization import Engine, Randomization, Scope
 
-RobotTarget = Literal["mjcf", "urdf", "mjlab", "isaaclab", "newton", "json"]
+RobotTarget = Literal["mjcf", "envhub", "urdf", "mjlab", "isaaclab", "newton", "json"]
 NetworkTarget = Literal["onnx", "torch", "actuator-net"]
 
 
@@ -44,12 +44,13 @@ def export_robot(
 
     Args:
         robot: Robot folder, name of an identified robot of the package (give `out`), or run folder of `train`.
-        to: mjcf (plain MuJoCo), mjlab, isaaclab and newton, each with a check.py that needs no gaponet; urdf
-            (damping, friction, effort limits); json (the numbers).
+        to: mjcf (plain MuJoCo), envhub (an environment of LeRobot's EnvHub in MuJoCo), mjlab, isaaclab and newton, each
+            with a check.py that needs no gaponet; urdf (damping, friction, effort limits); json (the numbers).
         out: Folder; default one with that name in the robot or run.
         data: Dataset on which a servo model's nearest plain servos are fitted, and every form is measured; default the
             one that the robot was identified from, and without any the robot's own simulated motions.
-        into: For mjcf and urdf: a file of the user's own; an edited copy is written (mjcf: default the robot's).
+        into: For mjcf, envhub and urdf: a file of the user's own; an edited copy is written (but for urdf, default the
+            robot's).
         prefix: Prefix of joint names in that file.
         payload_mass: kg in each hand.
 

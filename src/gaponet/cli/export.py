@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from gaponet.export.randomization import Engine, Scope
 
 POLICY_FILE, POLICY_STEP = "policy_postprocessor.json", "gaponet_correct"  # of a LeRobot policy
-CHECKED_IN = {"mjcf": "MuJoCo", "actuator-net": "mjlab"}
+CHECKED_IN = {"mjcf": "MuJoCo", "envhub": "MuJoCo", "actuator-net": "mjlab"}
 Holder = Annotated[
     Folder,
     tyro.conf.arg(
@@ -44,14 +44,15 @@ def export(
     """Write an identified robot or a network for another program.
 
     Args:
-        to: Simulator of a robot or a run: mjcf (plain MuJoCo), mjlab, isaaclab and newton, each with a check.py
-            that needs no gaponet; urdf (damping, friction, effort limits); json (the numbers). Network of a
-            run: onnx (model.onnx and card.json), torch (delta.pt2 with simulator and action term for mjlab and Isaac
-            Lab), actuator-net (one network per joint; its inputs are past target − position and speed, its output is
-            the torque). randomization: sets of a robot's parameters ("units") for training. lerobot: add the correction
-            to the LeRobot policy in --into; LeRobot finds it through the plug-in lerobot_robot_gaponet.
-        into: For mjcf and urdf: a file of your own; an edited copy is written (mjcf: default the robot's). For lerobot:
-            folder of a policy (pretrained_model) that holds policy_postprocessor.json.
+        to: Simulator of a robot or a run: mjcf (plain MuJoCo), envhub (an environment of LeRobot's EnvHub in MuJoCo),
+            mjlab, isaaclab and newton, each with a check.py that needs no gaponet; urdf (damping, friction, effort
+            limits); json (the numbers). Network of a run: onnx (model.onnx and card.json), torch (delta.pt2 with
+            simulator and action term for mjlab and Isaac Lab), actuator-net (one network per joint; its inputs are past
+            target − position and speed, its output is the torque). randomization: sets of a robot's parameters
+            ("units") for training. lerobot: add the correction to the LeRobot policy in --into; LeRobot finds it
+            through the plug-in lerobot_robot_gaponet.
+        into: For mjcf, envhub and urdf: a file of your own; an edited copy is written (but for urdf, default the
+            robot's). For lerobot: folder of a policy (pretrained_model) that holds policy_postprocessor.json.
         engine: For randomization: engine for which a file is written that applies units of randomization.json.
         scope: today: this robot as last fitted. any-day: sessions on several days. any-robot: all robots of its type.
         units: For any-robot: robot folders of the type.
@@ -67,7 +68,10 @@ def export(
         ),
         ("--payload-mass", to == "randomization" and payload_mass),
         ("--out", to == "lerobot" and out),
-        ("--into and --prefix", to not in ("mjcf", "urdf", "lerobot") and (into or prefix)),
+        (
+            "--into and --prefix",
+            to not in ("mjcf", "envhub", "urdf", "lerobot") and (into or prefix),
+        ),
         ("--data", to in ("onnx", "torch", "lerobot") and data),
     ):
         if unused:

@@ -1,0 +1,92 @@
+"""What an environment of LeRobot's EnvHub has beside the MJCF: units to draw, units of joints, and a model card."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence as ListOf
+from pathlib import Path
+
+from gaponet.base.files import write_text
+from gaponet.base.progress import Progress
+from gaponet.data.sequence import Sequence
+from gaponet.export.randomization import judge_units, sample_units, write_randomization
+from gaponet.robot.spec import RobotSpec
+from gaponet.sysid.uncertainty import ParameterUncertainty
+
+SAMPLED_UNITS = 128
+README = """---
+license: apache-2.0
+library_name: lerobot
+tags: [lerobot, robotics, simulation, mujoco]
+---
+
+# {robot} with identified servos, in MuJoCo
+
+An environment of LeRobot's EnvHub. The servos move as those of the real robot did: friction, delay, offset and gains
+were identified from its logs by gaponet. Mean |error| of the joints on the motions of `check.npz`: {error:.2f} mrad.
+
+```console
+hf upload USER/NAME . --repo-type model     # in this folder
+```
+
+```python
+from lerobot.envs.factory import make_env
+
+envs = make_env("USER/NAME", n_envs=4, trust_remote_code=True)
+```
+
+| what | value |
+| --- | --- |
+| action, `agent_pos` | joint targets and positions in LeRobot's values: degrees, 0..100 for {percent} |
+| `environment_state` | the goal, in the same values |
+| rate | {rate:.4g} Hz |
+| success | every operated joint within 0.05 rad of the goal for 10 control periods |
+| servos | identified; {drawn} |
+
+`env.py` needs gymnasium, MuJoCo 3.5 or newer and numpy; it fetches the other files of this repository.
+`python check.py` plays recorded motions and prints the error.
+"""
+
+
+def lerobot_units(robot: RobotSpec) -> dict[str, str]:
+    """Return the unit of each joint in LeRobot: deg, or percent of its range."""
+    named = zip(robot.joint_names, robot.log_units, strict=True)
+    return {name: "percent" if unit == "fraction" else "deg" for name, unit in named}
+
+
+def write_units(
+    robot: RobotSpec,
+    folder: Path,
+    recordings: tuple[ListOf[Sequence], ListOf[Sequence]] | None,
+    progress: Progress,
+) -> bool:
+    """Write units drawn from the robot's uncertainty; return False if none is known.
+
+    Args:
+        recordings: Training and validation motions that choose the units; None: they are taken as drawn.
+    """
+    if ParameterUncertainty.load(robot) is None:
+        return False
+    drawn = sample_units(robot, samples=SAMPLED_UNITS)
+    made = judge_units(drawn, robot, recordings, progress)
+    write_randomization(made, "mujoco", folder)
+    return True
+
+
+def write_readme(robot: RobotSpec, dt: float, error: float, has_units: bool, folder: Path) -> None:
+    """Write the model card.
+
+    Args:
+        dt: Control period, s.
+        error: Of the form with the servo model, mrad.
+    """
+    units = lerobot_units(robot)
+    percent = [name for name in robot.joint_names if units[name] == "percent"]
+    drawn = 'drawn from their uncertainty with `make_env(..., servos="drawn")`, or `cfg.task`'
+    text = README.format(
+        robot=robot.name,
+        error=error,
+        percent=", ".join(percent) or "no joint",
+        rate=1 / dt,
+        drawn=drawn if has_units else "their uncertainty is not known, so none are drawn",
+    )
+    write_text(folder / "README.md", text)

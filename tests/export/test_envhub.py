@@ -1,0 +1,123 @@
+"""An environment of LeRobot's EnvHub, in a folder that needs no gaponet."""
+
+import json
+import subprocess
+import sys
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from gaponet.export.export_folder import export_robot
+from gaponet.export.plain_servos import own_motions
+from gaponet.robot.spec import load_robot
+
+pytest.importorskip("gymnasium")
+NAME = "so101@sage"
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """The export of an identified SO-101."""
+    folder = tmp_path_factory.mktemp("envhub") / "out"
+    robot = load_robot(NAME)
+    motions = [s.rows(slice(0, 40)) for s in own_motions(robot, count=2)]
+    with pytest.MonkeyPatch.context() as patch:
+        # judging by recordings takes minutes; tests/export/test_ranges.py does it
+        patch.setattr("gaponet.export.envhub.judge_units", lambda drawn, *_: drawn)
+        export_robot(robot, "envhub", folder, (motions, motions))
+    return folder
+
+
+def loaded(folder):
+    """Import env.py as LeRobot does: by its path, under a name of its own."""
+    import importlib.util
+
+    spec = importlib.util.spec_from_file_location("hub_env_user_name", folder / "env.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture
+def hub(folder, monkeypatch):
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    yield loaded(folder)
+    for name in ("mujoco_servos", "mujoco_randomization"):
+        sys.modules.pop(name, None)
+
+
+def test_robots_are_stepped_by_targets_in_degrees_and_come_near(hub):
+    (envs,) = hub.make_env(n_envs=2)["so101"].values()
+    seen, _ = envs.reset(seed=1)
+    first = np.abs(seen["agent_pos"] - seen["environment_state"])[:, :5].max(axis=1)
+
+    for _ in range(60):
+        seen, reward, terminated, _, info = envs.step(seen["environment_state"])
+
+    now = np.abs(seen["agent_pos"] - seen["environment_state"])[:, :5].max(axis=1)
+    assert (now < first / 3).all()
+    assert reward.shape == (2,)
+    assert not terminated.any() or "final_info" in info
+    envs.close()
+
+
+def test_an_episode_ends_in_success_at_the_goal_and_without_it_after_its_time(hub):
+    env = hub.RobotEnv()
+    env.reset(seed=3)
+    env._goal = env._home.copy()
+    outcomes = [env.step(env._shown(env._home)) for _ in range(hub.HELD_PERIODS)]
+    assert [terminated for _, _, terminated, _, _ in outcomes].count(True) == 1
+    assert outcomes[-1][-1]["is_success"]
+
+    env.reset(seed=3)
+    away = env._shown(env._low)
+    ends = [env.step(away)[3] for _ in range(env._max_episode_steps)]
+    assert ends.index(True) == len(ends) - 1
+
+
+def test_drawn_servos_differ_between_episodes_and_identified_ones_do_not(hub):
+    gains = {}
+    for servos in hub.SERVOS:
+        env = hub.RobotEnv(servos)
+        found = []
+        for seed in range(2):
+            env.reset(seed=seed)
+            found.append(env.servos.kp.tolist())
+        gains[servos] = found
+    assert gains["identified"][0] == gains["identified"][1]
+    assert gains["drawn"][0] != gains["drawn"][1]
+
+
+def test_the_task_of_lerobots_configuration_chooses_drawn_servos(hub):
+    (envs,) = hub.make_env(cfg=SimpleNamespace(task="drawn"))["so101"].values()
+    assert envs.envs[0]._units is not None
+    envs.close()
+
+
+def test_the_gripper_has_0_to_100_and_other_joints_have_degrees(hub, folder):
+    env = hub.RobotEnv()
+    gripper = env.names.index("gripper")
+    assert env.action_space.low[gripper] == pytest.approx(0.0, abs=1e-4)
+    assert env.action_space.high[gripper] == pytest.approx(100.0, abs=1e-3)
+    pan = json.loads((folder / "facts.json").read_text())["joints"]["shoulder_pan"]["range"]
+    assert np.radians(env.action_space.high[0]) == pytest.approx(pan[1], rel=1e-5)
+
+
+def test_the_folder_needs_no_gaponet(folder):
+    blocked = (
+        "import sys; sys.modules['gaponet'] = None; sys.path.insert(0, '.'); import env; "
+        "envs = env.make_env(1)['so101'][0]; envs.reset(seed=0); envs.step(envs.action_space.sample())"
+    )
+    subprocess.run([sys.executable, "-c", blocked], cwd=folder, check=True)
+
+
+def test_a_robot_without_uncertainty_has_no_drawn_servos(folder, tmp_path, monkeypatch):
+    robot = load_robot("so101")
+    motions = [s.rows(slice(0, 20)) for s in own_motions(robot, count=1)]
+    export_robot(robot, "envhub", tmp_path / "out", (motions, motions))
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    module = loaded(tmp_path / "out")
+    with pytest.raises(ValueError, match="uncertainty"):
+        module.RobotEnv("drawn")
+    assert not (tmp_path / "out" / "randomization.json").exists()
