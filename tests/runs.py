@@ -10,13 +10,15 @@ import numpy as np
 import torch
 
 from gaponet.data.store import Dataset
-from gaponet.nn.artifact import GapModel, make_card
+from gaponet.nn.artifact import GapModel, KnownSimulators, make_card
 from gaponet.nn.config import ModelConfig
 from gaponet.nn.networks import build_network
 from gaponet.nn.onnx_export import export, sample_inputs
 from gaponet.nn.training.config import PPOConfig, PretrainingConfig, TrainConfig
 from gaponet.robot.folder import save_robot
 from gaponet.robot.spec import RobotSpec
+from gaponet.sim.batch import Condition
+from gaponet.sim.context import contexts
 
 TINY_TRAINING = TrainConfig(
     model=ModelConfig(
@@ -111,6 +113,10 @@ def random_run(
             p.add_(0.1 * torch.randn_like(p))
     net.features.standardise.std.fill_(0.3)
     card = make_card(net.config, robot, dt=[robot.dt], payload_seen=list(payload_seen))
+    if net.config.context:
+        loads = [Condition(mass, "both", robot.dt) for mass in payload_seen]
+        answers = contexts(robot, loads, loaded=net.config.context_is_loaded)
+        card["context"] = KnownSimulators.of(answers[0], answers).to_card()
     export(
         net,
         folder / "model",

@@ -11,7 +11,7 @@ import numpy as np
 
 from gaponet.base.arrays import Array
 from gaponet.base.errors import ModelError, UsageError
-from gaponet.deploy.transfer import Reference, Transfer, control_periods_of
+from gaponet.deploy.transfer import Reference, Transfer, control_periods_of, own_context
 from gaponet.nn.artifact import GapModel
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.batch import BatchSim, Condition
@@ -87,7 +87,7 @@ class AlignedSim:
             and trained.is_trained_in(robot)
             and control_periods_of(trained, self.dt) == 1
         ):
-            self.loop = trained.loop(self.num_envs)
+            self.loop = trained.loop(self.num_envs, own_context(trained, robot, conditions))
         elif model is not None:
             inverse = AnalyticInverse.of(BatchSim(robot, own, nthread, locked))
             try:

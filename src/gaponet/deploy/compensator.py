@@ -34,6 +34,7 @@ from gaponet.data.describe.plausibility import require_radians
 from gaponet.deploy.feedforward import Feedforward
 from gaponet.deploy.follow import Follower
 from gaponet.deploy.payload import PayloadEstimate
+from gaponet.deploy.transfer import own_context
 from gaponet.nn.adaptation import Adaptation
 from gaponet.nn.artifact import GAIN_TOLERANCE, GapModel
 from gaponet.robot.spec import RobotSpec
@@ -160,6 +161,8 @@ class Compensator:
         self.kp, self.zero_offset = robot.kp[self.op], robot.offset[self.op]
         self.bias: Array = self.shadow.batch.bind("qfrc_bias")
         self.loop = None if model is None else model.loop(num)
+        loads = [Condition(float(mass), payload_side, self.dt) for mass in self.masses]
+        self._contexts = None if model is None else own_context(model, robot, loads)
         self.feedforward = Feedforward(
             self.shadow, self.operated, robot, self.dt, config.acceleration_time
         )
@@ -268,6 +271,8 @@ class Compensator:
                 field[: self.num_envs] = field[self.num_envs + nearest]
             if self.follower is not None:
                 self.follower.carry(self.ids, nearest)
+            if self.loop is not None and self._contexts is not None:
+                self.loop.set_context(self._contexts[nearest])
             self._carried = nearest
 
     def step(

@@ -9,7 +9,7 @@ import numpy as np
 
 from gaponet.base.arrays import Array
 from gaponet.base.errors import ModelError
-from gaponet.deploy.transfer import Reference, Transfer, control_periods_of
+from gaponet.deploy.transfer import Reference, Transfer, control_periods_of, own_context
 from gaponet.nn.artifact import GapModel
 from gaponet.nn.loop import DeltaLoop
 from gaponet.robot.spec import RobotSpec
@@ -80,7 +80,8 @@ class MujocoAligner:
         self.transfer: Transfer | None = None
         equal = unchanged and inverse.agrees_with(AnalyticInverse.of(reference), reference.range)
         if equal and isinstance(model, GapModel):
-            self.loop, joints = model.loop(), robot.operated
+            self.loop = model.loop(context=own_context(model, robot, [condition]))
+            joints = robot.operated
         elif not equal:
             try:
                 self.transfer = Transfer(model, inverse, [condition], locked, 1, extrapolate)

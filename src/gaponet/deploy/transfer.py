@@ -77,7 +77,9 @@ class Transfer:
             if model is None
             else max(control_periods_of(model, c.dt) for c in dict.fromkeys(conditions))
         )
-        self.loop = None if model is None else model.loop(self.num_envs)
+        self.loop = None
+        if model is not None:
+            self.loop = model.loop(self.num_envs, own_context(model, robot, conditions))
         self.payload_mass = np.array([c.payload_mass for c in conditions])
         self._delta = np.zeros((self.num_envs, len(self.op)))
         self._elapsed = 0  # control periods since the start
@@ -223,6 +225,20 @@ def _require_between(what: str, values: Array, bounds: tuple[float, float]) -> N
         f"{what} is {values[outside][0]:.3g}; transfer was measured from {low:g} to {high:g}. "
         "Train in this simulator, or extrapolate (extrapolate=True, --extrapolate)"
     )
+
+
+def own_context(model: GapModel, robot: RobotSpec, conditions: list[Condition]) -> Array | None:
+    """Return the context of a network in its simulator, (conditions, 8n) rad.
+
+    None for most networks: the context that is stored with them holds for every payload. A network that is not told the
+    payload reads it from the simulator's answers with the payload in hand.
+
+    Args:
+        robot: Simulator of training.
+    """
+    if not model.config.context_is_loaded:
+        return None
+    return model.contexts_of(robot, conditions)
 
 
 def control_periods_of(model: GapModel, dt: float) -> int:

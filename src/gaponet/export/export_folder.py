@@ -16,7 +16,7 @@ from gaponet.base.errors import UsageError
 from gaponet.base.files import atomic_write, lock_folder, write_text
 from gaponet.base.progress import Progress, no_progress
 from gaponet.data.sequence import Sequence
-from gaponet.export import isaaclab_config
+from gaponet.export import envhub, isaaclab_config
 from gaponet.export.helper_file import (
     MUJOCO_HELPER,
     SHIPPED,
@@ -46,6 +46,7 @@ CONFIG = "robot_cfg.py"  # servos in the classes of Isaac Lab or Newton
 # Engine → name in the export folder → file in SHIPPED; beside the helper file.
 CHECK_FILES: dict[str, dict[str, str]] = {
     "mjcf": {"check.py": "check_mjcf.py"},
+    "envhub": {"check.py": "check_mjcf.py", "env.py": "env.py"},
     "urdf": {},
     "mjlab": {"check.py": "check_mjlab.py"},
     "isaaclab": {"check.py": "check_isaaclab.py", "make_usd.py": "make_usd.py"},
@@ -58,11 +59,13 @@ CHECK_FILES: dict[str, dict[str, str]] = {
         "actuators.py": "actuators.py",
     },
 }
+MJCF_TARGETS = ("mjcf", "envhub")  # an edited copy of a MuJoCo file
 WITH_TORCH = ("mjlab", "isaaclab", "torch", "actuator-net")  # engines whose helper file needs torch
 ENGINE_TERMS = {
     "isaaclab": ("no_load_speed",)
 }  # terms of the servo model that an engine's own servos have
 ACTUATORS = re.compile(r"\s*<actuator>.*?</actuator>", re.DOTALL)
+WITHOUT_TABLE = ("isaaclab", "newton")  # engines in whose scenes robot.xml's table is not
 WITHOUT_SERVO_MODEL = ("isaaclab", "newton", "urdf")
 DELAY_NOTES = {
     "newton": "Newton has no delays: check.py has a buffer of five lines",
@@ -196,10 +199,10 @@ def export_robot(
 
     Args:
         robot: Identified, or nominal.
-        to: mjcf, urdf, mjlab, isaaclab, newton or json.
+        to: mjcf, envhub, urdf, mjlab, isaaclab, newton or json.
         out: Folder.
         recordings: Training and validation motions; default: simulated motions of the robot itself.
-        source: For mjcf and urdf, a file of the user's; for mjcf by default the robot's.
+        source: For mjcf, envhub and urdf, a file of the user's; by default, except for urdf, the robot's.
         payload_mass: In each hand, kg.
         progress: Progress of the fit without the servo model, as of `identify`.
 
@@ -209,10 +212,11 @@ def export_robot(
     """
     if to == "urdf" and source is None:
         raise UsageError("--to urdf edits a copy of your own file: --into FILE.urdf")
-    if recordings is None:
+    played = recordings
+    if played is None:
         motions = own_motions(robot, payload_mass, 24 if robot.has_servo_model else 2)
-        recordings = motions[::2], motions[1::2] or motions
-    train, validation = recordings[0], comparable(recordings[1], robot, payload_mass)
+        played = motions[::2], motions[1::2] or motions
+    train, validation = played[0], comparable(played[1], robot, payload_mass)
     if not validation:
         raise UsageError(
             f"no validation motion was made with {payload_mass:g} kg and the robot's own gains"
@@ -220,13 +224,17 @@ def export_robot(
     plain = fit_plain_servos(robot, train, progress, ENGINE_TERMS.get(to, ()))
     dt = control_period(robot, (s.dt for s in validation))
     facts = simulator_facts(robot, dt, payload_mass, plain)
-    has_ramps = to == "mjcf" and MUJOCO_HAS_RAMPS
+    has_ramps = to in MJCF_TARGETS and MUJOCO_HAS_RAMPS
     checked = check_motions(validation, robot, ramped=not has_ramps)
     is_virtual = validation[0].meta.virtual
     prefix = source.prefix if source else ""
     facts |= {"file": ROBOT, "prefix": prefix, "virtual": is_virtual}
+    if to == "envhub":
+        facts["lerobot_units"] = envhub.lerobot_units(robot)
+    played_there = replace(plain, table=None) if to in WITHOUT_TABLE else plain
     facts["error_mrad"] = {
-        form: 1e3 * rollout_error(checked, r) for form, r in (("joints", robot), ("plain", plain))
+        "joints": 1e3 * rollout_error(checked, robot),
+        "plain": 1e3 * rollout_error(checked, played_there),
     }
     errors = {"in gaponet": rollout_error(validation, robot)}
     if robot.has_servo_model:
@@ -235,7 +243,7 @@ def export_robot(
     export = _RobotExport(robot, plain, to, out, validation, checked, facts, errors, notes)
     file = None
     with lock_folder(out, FOLDER_KIND):
-        if to == "mjcf":
+        if to in MJCF_TARGETS:
             file = export.write_mjcf(source.file if source else robot.mjcf)
         elif to == "urdf":
             assert source is not None
@@ -245,6 +253,9 @@ def export_robot(
         facts["file"] = str(file.relative_to(out)) if file else ROBOT
         _write_motions(out / CHECK, checked)
         _write_shipped(out, to, facts)
+    if to == "envhub":
+        has_units = envhub.write_units(robot, out, recordings, progress)
+        envhub.write_readme(robot, facts["dt"], facts["error_mrad"]["joints"], has_units, out)
     return ExportedFolder(file, errors, len(validation), is_virtual, tuple(notes))
 
 
@@ -252,7 +263,7 @@ def _notes(robot: RobotSpec, facts: dict[str, Any], to: str) -> list[str]:
     """Return effects that an engine's form of a robot lacks."""
     notes = []
     servos = facts["plain"].values()
-    if to == "mjcf":
+    if to in MJCF_TARGETS:
         notes += _stop_notes(robot)
     if robot.target_speed.any():
         notes.append(_ramp_note(robot, to))
@@ -292,7 +303,7 @@ def _ramp_note(robot: RobotSpec, to: str) -> str:
     """Return where the servos' own limits of the speed of targets are."""
     named = zip(robot.joint_names, robot.target_speed, strict=True)
     ramps = ", ".join(f"{name} {speed:.3g}" for name, speed in named if speed)
-    if to == "mjcf" and MUJOCO_HAS_RAMPS:
+    if to in MJCF_TARGETS and MUJOCO_HAS_RAMPS:
         return (
             f"servos' own ramps ({ramps} rad/s) are <pid slewmax> of MuJoCo 4: call fill_delays of "
             "mujoco_servos.py after each reset; MJX and older versions do not have them"
@@ -329,7 +340,7 @@ def export_model(model: GapModel, run: Path, folder: Path, payload_mass: float =
     robot = model.simulator()
     dt = control_period(robot, model.card.get("dt") or [robot.dt])
     with lock_folder(folder, FOLDER_KIND):
-        difference = export_program(model, run, folder)
+        difference = export_program(model, run, folder, payload_mass)
         past = {
             "depth": (model.config.history - 1) * model.config.stride + 1,
             "parity_rad": difference,

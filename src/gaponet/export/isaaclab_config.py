@@ -42,7 +42,8 @@ OFFSETS = {offsets}
 '''
 README = """# {robot} for Isaac Lab 3
 
-The same servos in two forms. The errors are means over the joints on the motions of `check.npz`, in gaponet.
+The same servos in two forms. The errors are means over the joints on the motions of `check.npz`, in gaponet, without a
+table.
 
 | form | files | mrad |
 | --- | --- | --: |
@@ -143,11 +144,17 @@ def robot_config(robot: str, servos: dict[str, dict[str, Any]], step: float, err
         robot=robot,
         errors=errors,
         step=step,
-        home={name: servo["home"] for name, servo in servos.items()},
-        offsets={name: servo["offset"] for name, servo in servos.items()},
+        home=_column(servos, "home"),
+        offsets=_column(servos, "offset"),
     )
     actuators = [_actuator(name, servo) for name, servo in servos.items()]
     return head + "ACTUATORS = {\n" + "".join(actuators) + "}\n"
+
+
+def _column(servos: dict[str, dict[str, Any]], field: str) -> str:
+    """Return one number of each servo, as the text of a dict."""
+    lines = [f'    "{name}": {servo[field]!r},\n' for name, servo in servos.items()]
+    return "{\n" + "".join(lines) + "}"
 
 
 def _actuator(joint: str, servo: dict[str, Any]) -> str:

@@ -17,11 +17,13 @@ from torch import Tensor, nn
 
 from gaponet.base.errors import ModelError
 from gaponet.base.files import atomic_write
+from gaponet.deploy.transfer import own_context
 from gaponet.export.onnx_to_torch import OnnxModule
 from gaponet.export.shipped.gaponet_action import PROGRAM, Past
 from gaponet.nn.artifact import WEIGHTS, GapModel
 from gaponet.nn.onnx_export import MAX_DIFFERENCE_RAD, trained_network
 from gaponet.nn.packaged_networks import is_packaged_network
+from gaponet.sim.batch import Condition
 
 CHECK_PERIODS = 12  # control periods
 CHECK_WORLDS = 3
@@ -33,7 +35,8 @@ class DeltaStep(nn.Module):
     Attributes:
         depth: Frames in the past; a frame is [q | q̇ | applied target], 3n numbers.
         told: The network is told the simulator's answers to fixed probes (sim/context.py).
-        context: If so, these answers, (8n) rad: of the robot's own simulator, until others are written into it.
+        context: If so, these answers, (8n) rad: of the robot's own simulator, until others are written into it. Of a
+            network that is not told the payload, with the payload of the export in hand.
         refused: Number of answers of the network that were not finite, () int64; there Δa is zero, as in nn/bound.py.
     """
 
@@ -42,7 +45,7 @@ class DeltaStep(nn.Module):
     high: Tensor
     refused: Tensor
 
-    def __init__(self, net: nn.Module, model: GapModel) -> None:
+    def __init__(self, net: nn.Module, model: GapModel, payload_mass: float = 0.0) -> None:
         super().__init__()
         config = model.config
         self.net = net.requires_grad_(False)
@@ -55,7 +58,8 @@ class DeltaStep(nn.Module):
         self.delta_max: float = config.delta_max
         low, high = torch.from_numpy(model.qpos_range.T.copy()).float()
         if config.context:
-            self.register_buffer("context", torch.from_numpy(model.nominal_context.copy()))
+            context = _context(model, payload_mass)
+            self.register_buffer("context", torch.from_numpy(context.copy()))
         self.register_buffer("low", low)
         self.register_buffer("high", high)
         self.register_buffer("refused", torch.zeros((), dtype=torch.int64))
@@ -103,8 +107,19 @@ class DeltaStep(nn.Module):
         return torch.where(finite[:, None], limited, torch.zeros_like(limited))
 
 
-def delta_step(model: GapModel, run: Path) -> DeltaStep:
+def _context(model: GapModel, payload_mass: float) -> np.ndarray:
+    """Return the answers of the robot's own simulator, (8n) rad, with a payload in each hand, kg."""
+    robot = model.simulator()
+    dt = (model.card.get("dt") or [robot.dt])[0]
+    loaded = own_context(model, robot, [Condition(payload_mass, "both", dt)])
+    return np.asarray(model.nominal_context if loaded is None else loaded[0], np.float32)
+
+
+def delta_step(model: GapModel, run: Path, payload_mass: float = 0.0) -> DeltaStep:
     """Load the step of a run's network from its checkpoint, and of a network of the package from its ONNX file.
+
+    Args:
+        payload_mass: In each hand, kg, of a network that is not told it.
 
     Raises:
         ModelError: There is no checkpoint, or the model holds corrections, has sensors or reads the recorded state.
@@ -128,7 +143,7 @@ def delta_step(model: GapModel, run: Path) -> DeltaStep:
         net = OnnxModule(model.path / WEIGHTS)
     else:
         net = trained_network(run, model.config, len(model.card["joint_names"]))
-    return DeltaStep(net, model)
+    return DeltaStep(net, model, payload_mass)
 
 
 def program(step: DeltaStep) -> torch.export.ExportedProgram:
@@ -142,8 +157,11 @@ def program(step: DeltaStep) -> torch.export.ExportedProgram:
         )
 
 
-def export_program(model: GapModel, run: Path, folder: Path) -> float:
+def export_program(model: GapModel, run: Path, folder: Path, payload_mass: float = 0.0) -> float:
     """Write delta.pt2, load it again and compare it with the artifact over some control periods.
+
+    Args:
+        payload_mass: In each hand, kg, of a network that is not told it.
 
     Returns:
         Largest difference, rad.
@@ -151,7 +169,7 @@ def export_program(model: GapModel, run: Path, folder: Path) -> float:
     Raises:
         ModelError: The difference is above 1e-5 rad, or `delta_step` refuses the model; nothing is written.
     """
-    step, path = delta_step(model, run), folder / PROGRAM
+    step, path = delta_step(model, run, payload_mass), folder / PROGRAM
     content = io.BytesIO()  # torch ends the process if it writes to a full disk itself
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of torch about its own storages
@@ -171,7 +189,8 @@ def export_program(model: GapModel, run: Path, folder: Path) -> float:
 def _largest_difference(program: Any, step: DeltaStep, model: GapModel) -> float:
     """Return the largest |program − artifact| on random motions, rad; one world restarts half-way."""
     rng = np.random.default_rng(0)
-    loop, past = model.loop(CHECK_WORLDS), Past(program, CHECK_WORLDS, step.depth, step.n, "cpu")
+    loop = model.loop(CHECK_WORLDS, step.context.numpy() if step.told else None)
+    past = Past(program, CHECK_WORLDS, step.depth, step.n, "cpu")
     payload = rng.uniform(0, model.config.payload_max, CHECK_WORLDS).astype(np.float32)
     low, high = np.clip(model.qpos_range.T, -1.0, 1.0)
     ctrl = rng.uniform(low, high, (CHECK_WORLDS, step.n))
