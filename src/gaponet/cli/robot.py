@@ -12,7 +12,7 @@ import tyro
 from gaponet import api
 from gaponet.base.errors import UsageError
 from gaponet.base.files import atomic_write
-from gaponet.cli.options import Flag, Folder, Json, Model, actions
+from gaponet.cli.options import Flag, Folder, Json, actions
 from gaponet.cli.out import Out
 from gaponet.nn.packaged_networks import packaged_networks
 from gaponet.robot.card import ROBOT_HEADINGS, robot_cards
@@ -120,7 +120,9 @@ def check(
 
 
 def new(
-    model: Model, out: Path, joints: tuple[str, ...] = (), kp: tuple[str, ...] = (), kd: tuple[str, ...] = (),
+    model: Annotated[tyro.conf.Positional[Path | None], tyro.conf.arg(metavar="MODEL")] = None,
+    *, out: Path, from_: Annotated[str, tyro.conf.arg(name="from", metavar="COLLECTION:NAME")] = "",
+    joints: tuple[str, ...] = (), kp: tuple[str, ...] = (), kd: tuple[str, ...] = (),
     effort_limit: tuple[str, ...] = (), servo: tuple[str, ...] = (), packages: tuple[str, ...] = (),
     rate: float = 50.0, keyframe: str = "", contacts: Flag = False, name: str = "", json: Json = False,
 ) -> None:  # fmt: skip
@@ -129,6 +131,8 @@ def new(
     Args:
         model: MJCF or URDF file with the files that it names.
         out: New robot folder.
+        from_: A model of this disk by name, instead of a file: menagerie:franka_fr3, robot_descriptions:NAME or
+            example-robot-data:NAME. Nothing is downloaded.
         joints: Recorded joints, by name or pattern ('*_elbow_*'); all others are frozen. Default: all hinges with an
             actuator, or all hinges.
         kp: Position gain of the controller while recording, N·m/rad: 100 for all joints, '*wrist*=20' for some; a later
@@ -147,6 +151,13 @@ def new(
 
     prepare()
     from gaponet.robot.new import PICTURE, RobotOptions, new_robot
+    from gaponet.robot.vendor import find_model
+
+    if (model is None) == (not from_):
+        raise UsageError(
+            "give a model file, or --from COLLECTION:NAME, such as --from menagerie:franka_fr3"
+        )
+    model = model or find_model(from_)
 
     screen = Out(json)
     options = RobotOptions(

@@ -1,9 +1,14 @@
-"""Reading of vendors' models, MJCF or URDF, with the meshes that exist and without those that do not."""
+"""Vendors' models, MJCF or URDF: found by name on this disk, and read with the meshes that exist."""
 
 from __future__ import annotations
 
+import importlib
+import os
+import re
+import sys
 import xml.etree.ElementTree as ET
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -23,6 +28,155 @@ MESHES = (".stl", ".obj", ".msh")  # formats that MuJoCo reads
 URDF_COMPILER = {"strippath": "false", "fusestatic": "false", "discardvisual": "false", "balanceinertia": "true",
         "boundmass": "1e-6", "boundinertia": "1e-9", "autolimits": "true"}  # fmt: skip
 BALL_DENSITY = 1000.0  # kg/m³, of the ball that replaces an impossible inertia
+
+
+# Where collections of models lie: variables that name their folder, and usual folders.
+MENAGERIE_VARIABLES = ("MUJOCO_MENAGERIE", "MUJOCO_MENAGERIE_PATH", "MENAGERIE_PATH")
+EXAMPLE_VARIABLES = ("EXAMPLE_ROBOT_DATA_MODEL_DIR", "EXAMPLE_ROBOT_DATA")
+CACHE_VARIABLE = "ROBOT_DESCRIPTIONS_CACHE"  # of the package robot_descriptions
+COLLECTIONS = ("menagerie", "robot_descriptions", "example-robot-data")
+
+
+def find_model(name: str) -> Path:
+    """Return the model file of a name such as menagerie:franka_fr3, on this disk; nothing is downloaded.
+
+    Args:
+        name: menagerie:FOLDER or menagerie:FOLDER/FILE of MuJoCo Menagerie; robot_descriptions:NAME with or without
+            _description; example-robot-data:NAME, such as panda.
+
+    Raises:
+        RobotError: It is not there; the message says how to get it.
+    """
+    collection, _, rest = name.partition(":")
+    strange = collection == "robot_descriptions" and not rest.isidentifier()
+    if collection not in COLLECTIONS or not rest or ".." in Path(rest).parts or strange:
+        known = ", ".join(f"{c}:NAME" for c in COLLECTIONS)
+        raise RobotError(f"'{name}': use one of {known}")
+    if collection == "menagerie":
+        return _of_menagerie(rest)
+    if collection == "robot_descriptions":
+        return _of_robot_descriptions(rest)
+    return _of_example_robot_data(rest)
+
+
+def _cache() -> Path:
+    """Return the folder into which the package robot_descriptions clones repositories."""
+    return Path(os.environ.get(CACHE_VARIABLE, "~/.cache/robot_descriptions")).expanduser()
+
+
+def _stated(variables: tuple[str, ...]) -> list[Path]:
+    return [Path(os.environ[v]).expanduser() for v in variables if os.environ.get(v)]
+
+
+def _of_menagerie(name: str) -> Path:
+    versions = sorted(_cache().glob("mujoco_menagerie-*/mujoco_menagerie"))
+    usual = [
+        _cache() / "mujoco_menagerie",
+        *versions,
+        Path("mujoco_menagerie"),
+        Path.home() / "mujoco_menagerie",
+    ]
+    roots = [p for p in (*_stated(MENAGERIE_VARIABLES), *usual) if p.is_dir()]
+    place = next((p / name for p in roots if (p / name).exists()), None)
+    if place is None:
+        there = sorted(p.name for root in roots[:1] for p in root.iterdir() if any(p.glob("*.xml")))
+        where = f"{roots[0]} has {abbreviate(there)}" if roots else "it is not on this disk"
+        raise RobotError(
+            f"menagerie:{name}: {where}. Get MuJoCo Menagerie (git clone "
+            "https://github.com/google-deepmind/mujoco_menagerie) and name its folder in MUJOCO_MENAGERIE"
+        )
+    return place if place.is_file() else _main_model(place, f"menagerie:{name}")
+
+
+def _main_model(folder: Path, name: str) -> Path:
+    """Return the robot's own file in a folder of Menagerie: franka_fr3/fr3.xml, not its scenes."""
+    models = sorted(f for f in folder.glob("*.xml") if not re.search(r"scene|keyframe|mjx", f.stem))
+    named = [f for f in models if folder.name.endswith(f.stem)]
+    if len(models) == 1 or named:
+        return max(named or models, key=lambda f: len(f.stem))
+    files = ", ".join(f.name for f in models) or "no model"
+    raise RobotError(f"{name}: {folder} has {files}; name one: {name}/FILE.xml")
+
+
+def _of_robot_descriptions(name: str) -> Path:
+    try:
+        cache: Any = importlib.import_module("robot_descriptions._cache")
+        repositories = importlib.import_module("robot_descriptions._repositories").REPOSITORIES
+    except ImportError:
+        raise RobotError(
+            f"robot_descriptions:{name}: the package is not installed: pip install robot_descriptions, and "
+            f"robot_descriptions pull {name}"
+        ) from None
+    pulled = f"robot_descriptions pull {name}"
+
+    def cached(repository: str, commit: str | None = None) -> str:
+        path = repositories[repository].cache_path
+        place = _cache() / (f"{path}-{commit}/{path}" if commit else path)
+        if not place.is_dir():
+            raise RobotError(f"robot_descriptions:{name}: {place} is not there; get it: {pulled}")
+        return str(place)
+
+    original = cache.clone_to_cache
+    cache.clone_to_cache = cached  # its modules would download at import
+    try:
+        description = _description(name)
+    finally:
+        cache.clone_to_cache = original
+    paths = [getattr(description, kind, "") for kind in ("MJCF_PATH", "URDF_PATH", "XACRO_PATH")]
+    path = next((Path(p) for p in paths if p), Path())
+    if not path.is_file():
+        raise RobotError(f"robot_descriptions:{name}: {path} is not there; get it: {pulled}")
+    return path
+
+
+def _description(name: str) -> Any:
+    """Return the module of a description, such as fr3_mj_description for fr3."""
+    for module in (name, f"{name}_mj_description", f"{name}_description"):
+        full = f"robot_descriptions.{module}"
+        try:
+            return importlib.import_module(full)
+        except ModuleNotFoundError as error:
+            if error.name != full:
+                raise
+        finally:
+            sys.modules.pop(full, None)
+    raise RobotError(
+        f"robot_descriptions:{name}: no such description; robot_descriptions list shows them"
+    )
+
+
+def _of_example_robot_data(name: str) -> Path:
+    share = Path("share/example-robot-data/robots")
+    prefixes = []
+    for variable in ("CONDA_PREFIX", "AMENT_PREFIX_PATH"):
+        prefixes += [Path(p) for p in os.environ.get(variable, "").split(os.pathsep) if p]
+    prefixes += [Path(p) / "cmeel.prefix" for p in sys.path]
+    usual = [prefix / share for prefix in prefixes]
+    usual += [
+        _cache() / "example-robot-data/robots",
+        Path("/opt/openrobots") / share,
+        Path("/usr") / share,
+    ]
+    roots = [p for p in (*_stated(EXAMPLE_VARIABLES), *usual) if p.is_dir()]
+    if not roots:
+        raise RobotError(
+            f"example-robot-data:{name}: it is not on this disk; pip install example-robot-data, or name its folder "
+            f"robots in {EXAMPLE_VARIABLES[0]}"
+        )
+    root = roots[0]
+    if (root / name).is_file():
+        return root / name
+    stems = {name, f"{name}_robot"}
+    found = sorted(f for f in root.rglob("*.urdf") if f.stem in stems)
+    if len(found) == 1:
+        return found[0]
+    if found:
+        files = ", ".join(f.relative_to(root).as_posix() for f in found)
+        raise RobotError(
+            f"example-robot-data:{name}: several files have this name; name one: {files}"
+        )
+    there = sorted(f.stem for f in root.rglob("*.urdf"))
+    raise RobotError(f"example-robot-data:{name}: not among {', '.join(there)} of {root}")
 
 
 def read_vendor(path: Path, packages: dict[str, Path]) -> tuple[mujoco.MjSpec, list[str]]:
