@@ -3,11 +3,13 @@
 import json
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from logs import SO101, stock, wave
 
 from gaponet.base.errors import LogError, UsageError
+from gaponet.data.doctor import DoctorResult
 from gaponet.data.importer import import_logs
 
 HAND = ("ee.x", "ee.y", "ee.z", "ee.wx", "ee.wy", "ee.wz")
@@ -128,3 +130,18 @@ def test_degrees_that_are_called_percent_are_refused(so101, tmp_path):
     folder = stock(tmp_path / "set", [108 * wave(120, 6, 1 / 30, amplitude=1.0)])
     with pytest.raises(LogError, match="degrees"):
         read(folder, so101, tmp_path / "data", position_unit="signed_percent")
+
+
+def test_steps_under_the_names_of_joints_are_no_position_targets_to_the_doctor(so101, tmp_path):
+    path = 60 * wave(400, 6, 1 / 30, amplitude=1.0)
+    path[:, 5] = np.abs(path[:, 5])
+    folder = stock(tmp_path / "set", [path])
+    file = folder / "data" / "chunk-000" / "file-000.parquet"
+    table = pq.read_table(file)
+    steps = np.diff(path, axis=0, append=path[-1:]).astype(np.float32)
+    column = table.schema.get_field_index("action")
+    action = pa.FixedSizeListArray.from_arrays(pa.array(steps.ravel()), 6)
+    pq.write_table(table.set_column(column, "action", action), file)
+    dataset = read(folder, so101, tmp_path / "data", position_unit="deg")
+    findings = DoctorResult.of(dataset, so101).findings
+    assert [f for f in findings if f.level == "error" and "deltas" in f.message]

@@ -91,6 +91,18 @@ def test_two_echoed_topics_are_one_recording(tmp_path, arm):
     )
 
 
+def test_measured_and_desired_tables_with_the_same_columns_are_one_recording_each(tmp_path):
+    robot = write_arm(tmp_path / "one", ONE_JOINT_TOML, ONE_JOINT)
+    folder = tmp_path / "logs"
+    folder.mkdir()
+    for file, values in (("a_measured.csv", STATE), ("a_desired.csv", COMMAND)):
+        columns = {"time": TIME, "position": values[:, 0], "velocity": 0 * TIME, "torque": 0 * TIME}
+        (folder / file).write_text(table_text(columns))
+    command, state = understood(folder, robot)
+    assert np.allclose(command[:, 0], COMMAND[:, 0], atol=1e-6)
+    assert np.allclose(state[:, 0], STATE[:, 0], atol=1e-6)
+
+
 ONE_JOINT = """
 <mujoco><compiler angle="radian"/><worldbody><body><joint name="motor" axis="0 1 0" range="-3 3"/>
 <geom type="capsule" fromto="0 0 0 0.1 0 0" size="0.01" mass="0.1"/></body></worldbody></mujoco>

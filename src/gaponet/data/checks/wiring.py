@@ -120,7 +120,11 @@ def _command(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
         )
     }
     best = max(correlation, key=lambda kind: np.nan_to_num(correlation[kind]))
-    kind = f"they are most like {best} (correlation {correlation[best]:.2f})"
+    words = {
+        "velocities": "velocities, or steps from the present position (deltas)",
+        "torques": "torques",
+    }
+    kind = f"they are most like {words[best]} (correlation {correlation[best]:.2f})"
     kind = kind if correlation[best] > MIN_KIND_CORRELATION else "are they torques?"
     text = f"states are {np.median(distance[judged]):.2f} times as far from their commands as from their own mean"
     follows = np.stack([np.diag(s.follows) for s in surveys])[:, robot.operated_index]

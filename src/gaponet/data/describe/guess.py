@@ -65,10 +65,17 @@ def guess_logs(
         raise LogError("no recording found")
     family = _family([Path(r.source).name for r in recordings])
     if family:
-        return _guess_family(recordings, robot, fmt, family)
+        by_kind = {
+            kind: next(r for r in recordings if _fits(Path(r.source).name, pattern))
+            for kind, pattern in family.items()
+        }
+        if "qpos" in _channels(by_kind["qpos"], robot) and "ctrl" in family:
+            return _guess_two_files(by_kind, family, robot, fmt, known)
+        return _guess_family(by_kind, family, robot, fmt)
     topics = _state_and_command(recordings)
     if topics:
-        return _guess_two_files(*topics, robot, fmt, known)
+        files = {kind: Path(recording.source).name for kind, recording in topics.items()}
+        return _guess_two_files(topics, files, robot, fmt, known)
     first = recordings[0]
     specified = dict(known) | {k: v for k, v in first.default.items() if k not in known}
     lines = [f"# {fmt}; the first recording: {first.where or first.source}",
@@ -125,13 +132,14 @@ def _family(files: list[str]) -> dict[str, str]:
 
 
 def _guess_family(
-    recordings: list[RawRecording], robot: RobotSpec, fmt: str, family: dict[str, str]
+    by_kind: dict[str, RawRecording], family: dict[str, str], robot: RobotSpec, fmt: str
 ) -> str:
-    """The text of a logs.toml for signals in files of their own. family: of _family."""
-    by_kind = {
-        kind: next(r for r in recordings if _fits(Path(r.source).name, pattern))
-        for kind, pattern in family.items()
-    }
+    """The text of a logs.toml for signals in files of their own, without names of columns.
+
+    Args:
+        by_kind: The first recording of each kind.
+        family: Of _family.
+    """
     state = by_kind["qpos"]
     joints = list(state.columns)
     values = np.stack([state.load([c])[c].values[:ROWS] for c in state.signals], axis=1)
@@ -173,30 +181,41 @@ def _channel_line(channel: str, name: str, lines: list[str]) -> str:
     return line
 
 
-def _state_and_command(recordings: list[RawRecording]) -> tuple[RawRecording, RawRecording] | None:
+def _state_and_command(recordings: list[RawRecording]) -> dict[str, RawRecording] | None:
     """Return state and command where there are two files, called like joint_states.csv and command.csv."""
-    by_kind = {_kind(Path(r.source).stem): r for r in recordings}
+    by_kind = {_kind(Path(r.source).stem) or "": r for r in recordings}
     if len(recordings) != 2 or by_kind.keys() != {"qpos", "ctrl"}:
         return None
-    return by_kind["qpos"], by_kind["ctrl"]
+    return by_kind
 
 
 def _guess_two_files(
-    state: RawRecording, command: RawRecording, robot: RobotSpec, fmt: str, known: dict[str, Any]
+    by_kind: dict[str, RawRecording],
+    files: dict[str, str],
+    robot: RobotSpec,
+    fmt: str,
+    known: dict[str, Any],
 ) -> str:
-    """The text of a logs.toml for one recording whose commands lie in a file of their own."""
+    """The text of a logs.toml for recordings whose commands lie in files of their own.
+
+    Args:
+        by_kind: A state and its command, as qpos and ctrl.
+        files: Their names, or patterns of these with {name}.
+    """
+    state = by_kind["qpos"]
+    command = by_kind["ctrl"]
     channels = _channels(state, robot)
     channels.pop("ctrl", None)
     commands = _channels(command, robot)
     told = commands.get("ctrl") or commands.get("qpos") or _numbered(command)
     lines = [
-        f"# {fmt}; one recording in two files",
+        f"# {fmt}; each recording in two files",
         f"# columns of the state: {state.shown(20)}",
         f"# columns of the command: {command.shown(20)}",
         "# Lines with a ? are guesses: look at them.",
         "",
-        f"state_file = {_text(Path(state.source).name)}",
-        f"command_file = {_text(Path(command.source).name)}",
+        f"state_file = {_text(files['qpos'])}",
+        f"command_file = {_text(files['ctrl'])}",
     ]
     lines += _clock(state, dict(known))
     lines += _positions(state, channels)
