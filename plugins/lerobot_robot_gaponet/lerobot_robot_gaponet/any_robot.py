@@ -18,10 +18,14 @@ POSITION = ".pos"  # end of LeRobot's name of a joint's position and position ta
 @RobotConfig.register_subclass("gaponet_robot")
 @dataclass
 class GaponetRobotConfig(RobotConfig):
-    """A robot of LeRobot behind gaponet's correction: --robot.type=gaponet_robot --robot.robot.type=koch_follower."""
+    """A robot of LeRobot behind gaponet's correction.
 
-    # LeRobot's own robot with its port, cameras, id and calibration.
-    robot: RobotConfig
+    --robot.type=gaponet_robot --robot.robot="{type: koch_follower, port: /dev/ttyACM0, id: mine}"
+    """
+
+    # Configuration of LeRobot's own robot: its type, and its port, cameras, id and other fields. It is no RobotConfig,
+    # because a choice of robots that contains itself has no end for LeRobot's command line.
+    robot: dict[str, Any]
     # Robot folder of gaponet identify, or a name of the package; its joints are matched by name.
     known: str = ""
     # Instead of it, a run of gaponet train.
@@ -50,7 +54,7 @@ class GaponetRobot(Robot):
     def __init__(self, config: GaponetRobotConfig) -> None:
         super().__init__(config)
         self.config = config
-        self.robot = make_robot_from_config(config.robot)
+        self.robot = make_robot_from_config(inner_config(config.robot))
         self.corrector = Corrector.load(
             known=config.known,
             model=config.model,
@@ -114,6 +118,16 @@ class GaponetRobot(Robot):
 
     def disconnect(self) -> None:
         self.robot.disconnect()
+
+
+def inner_config(given: Any) -> RobotConfig:
+    """Return the configuration of LeRobot's robot from its fields; one that is made already stays as it is."""
+    if isinstance(given, RobotConfig):
+        return given
+    import draccus
+
+    decoded: RobotConfig = draccus.decode(RobotConfig, given)
+    return decoded
 
 
 def joint_keys(features: dict[str, Any], joints: ListOf[str], joint_name: Any) -> list[str]:

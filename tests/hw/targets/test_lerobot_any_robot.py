@@ -116,3 +116,16 @@ def test_values_of_a_robot_are_in_the_unit_that_its_configuration_states(
     action = dict.fromkeys(units.keys, value)
     np.testing.assert_allclose(units.rad(action), [rad, rad])
     assert units.named(units.rad(action)) == pytest.approx(action)
+
+
+def test_lerobots_command_line_reads_the_robot_that_is_wrapped(plugin, own):
+    draccus = pytest.importorskip("draccus")
+    words = ["--type=gaponet_robot", "--robot={type: two_joints, id: mine}", "--unit=rad"]
+
+    config = draccus.parse(plugin.GaponetRobotConfig.__mro__[1], args=words)
+
+    assert config.unit == "rad"
+    module = importlib.import_module("lerobot_robot_gaponet.any_robot")
+    inner = module.inner_config(config.robot)
+    assert isinstance(inner, own.TwoJointsConfig)
+    assert inner.id == "mine"
