@@ -1,8 +1,8 @@
 """AlignedSim: a simulator that behaves like the robot.
 
-An identified robot needs no model for that. With a model, a target becomes target + Δa before it reaches the servos. In
-the simulator of training, Δa is the model's correction. In another simulator, commands are transferred so that it moves
-like the corrected one (deploy/transfer.py).
+An identified robot needs no model for that. With a model, a target becomes target + Δa before it
+reaches the servos. In the simulator of training, Δa is the model's correction. In another
+simulator, commands are transferred so that it moves like the corrected one (deploy/transfer.py).
 """
 
 from __future__ import annotations
@@ -19,14 +19,17 @@ from gaponet.sim.inverse import AnalyticInverse
 
 
 class AlignedSim:
-    """num_envs aligned simulations, one control period per step. It equals sim.replay with the model's corrector.
+    """num_envs aligned simulations, one control period per step.
+
+    It equals sim.replay with the model's corrector.
 
         sim = AlignedSim(load_robot("./my_h1_2"), payload_mass=3.0)  # and GapModel.load("run"), if a model helps
         sim.reset(qpos)
         sim.step(target)          # for one control period
         sim.qpos, sim.qvel
 
-    Arrays are (num_envs, n) in the order of `joint_names`; without num_envs there is one simulation and they are (n,).
+    Arrays are (num_envs, n) in the order of `joint_names`; without num_envs there is one simulation
+    and they are (n,).
     """
 
     def __init__(
@@ -44,18 +47,22 @@ class AlignedSim:
     ) -> None:
         """
         Args:
-            robot: The simulator. If the model was trained in another one, commands are transferred; where that is
-                refused, a model for many simulators is told this one's answers to fixed probes (`transfer` is None).
-            model: A trained model, or an identified robot that the simulator then moves like; None for the simulator
-                without correction.
+            robot: The simulator. If the model was trained in another one, commands are transferred;
+                where that is refused, a model for many simulators is told this one's answers to
+                fixed probes (`transfer` is None).
+            model: A trained model, or an identified robot that the simulator then moves like; None
+                for the simulator without correction.
             payload_mass: kg in each hand of payload_side, one number or one per simulation.
             payload_side: "both", or the side of one mount.
             dt: Control period, s; default the robot's.
             num_envs: Simulations side by side; None for one, with arrays (n,).
             nthread: Threads, 0 for all cores.
-            locked: Joints clamped at home (sim.model.idle_joints): quicker; arrays are without them.
-            extrapolate: Take payloads beyond those trained on, and simulators beyond those measured.
-            simulator_payload: kg that the simulator has in its hands, where it does not know of payload_mass.
+            locked: Joints clamped at home (sim.model.idle_joints): quicker; arrays are without
+                them.
+            extrapolate: Take payloads beyond those trained on, and simulators beyond those
+                measured.
+            simulator_payload: kg that the simulator has in its hands, where it does not know of
+                payload_mass.
         """
         self.dt = robot.dt if dt is None else dt
         if isinstance(model, GapModel):
@@ -130,7 +137,8 @@ class AlignedSim:
         Args:
             qpos: Positions, rad; default home.
             qvel: Velocities, rad/s.
-            ctrl: Target in force before, rad, which delayed servos (robot.delay) still follow; default qpos.
+            ctrl: Target in force before, rad, which delayed servos (robot.delay) still follow;
+                default qpos.
             ids: Which simulations, (k,); arrays are then (k, n).
         """
         count = len(np.arange(self.num_envs)[ids])

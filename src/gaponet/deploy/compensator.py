@@ -1,23 +1,28 @@
 """Compensator: commands with which the real robot does what it is asked to do.
 
-A shadow simulates the robot, with nominal, identified or adapted parameters. It receives targets a′ and shows how the
-robot should move. Without a model, the command is u = a′. With a model, the robot with command u moves like the shadow
-with target u + G(u), G being the model's correction. So u + G(u) = a′ is solved by u ← u + γ (a′ − u − G(u)).
+A shadow simulates the robot, with nominal, identified or adapted parameters. It receives targets a′
+and shows how the robot should move. Without a model, the command is u = a′. With a model, the robot
+with command u moves like the shadow with target u + G(u), G being the model's correction. So u +
+G(u) = a′ is solved by u ← u + γ (a′ − u − G(u)).
 
     aim "target":     a′ = a + τ / kp. τ is the torque with which the shadow follows the targets: gravity and, with
                       dynamics, the torque for their velocity and acceleration (feedforward.py)
     aim "simulator":  a′ = a, so that the robot moves like the simulator, including sag and lag
-    follow "nominal": a′ moves the shadow as the nominal simulator moves under a (follow.py); without a model
+    follow "nominal": a′ moves the shadow as the nominal simulator moves under a (follow.py);
+        without a model
 
-G is evaluated at the state and history of the shadow, not of the robot. If the compensation is right, both are the
-same. The command does not depend on measurements, so there is no loop that can become unstable, and measurement noise
-does not reach the servos. (With the measured state, the error was not smaller and commands were four times rougher.)
+G is evaluated at the state and history of the shadow, not of the robot. If the compensation is
+right, both are the same. The command does not depend on measurements, so there is no loop that can
+become unstable, and measurement noise does not reach the servos. (With the measured state, the
+error was not smaller and commands were four times rougher.)
 
-Where the network's answer is not finite, G counts as zero (nn/bound.py). The iteration then forgets the correction: it
-falls to (1 − γ)² of itself in each control period, and what remains is the feed-forward.
+Where the network's answer is not finite, G counts as zero (nn/bound.py). The iteration then forgets
+the correction: it falls to (1 − γ)² of itself in each control period, and what remains is the
+feed-forward.
 
-The remaining error is integrated, slowly and with a low-pass. A loaded arm swings on its servo with little damping
-(3 kg on H1-2's shoulder yaw: 10 rad/s, damping ratio 0.1). There, an integrator alone is unstable above 2ζω, 2 1/s.
+The remaining error is integrated, slowly and with a low-pass. A loaded arm swings on its servo with
+little damping (3 kg on H1-2's shoulder yaw: 10 rad/s, damping ratio 0.1). There, an integrator
+alone is unstable above 2ζω, 2 1/s.
 """
 
 from __future__ import annotations
@@ -50,9 +55,11 @@ class CompensatorConfig:
     """Settings of the compensator."""
 
     aim: Literal["target", "simulator"] = "target"
-    """target: the robot reaches the commanded positions. simulator: the robot moves like the simulator."""
+    """target: the robot reaches the commanded positions. simulator: it moves like the simulator."""
     dynamics: bool = False
-    """Feed forward the torque of motion too, not only of holding; aim target alone. For smooth targets: it halves the
+    """Feed forward the torque of motion too, not only of holding; aim target alone.
+
+    For smooth targets: it halves the
     error of planned motions, but amplifies 5 mrad of noise on targets to 0.2 rad on commands."""
     acceleration_time: float = 0.02
     """Low-pass of the targets' acceleration, s."""
@@ -73,7 +80,10 @@ class CompensatorConfig:
     blend: float = 1.0
     """Time in which the compensation increases from 0 to 1 after a start, s."""
     payload_max: float = 3.0
-    """Largest payload without a model, stated or estimated, kg. With a model, the training data give it."""
+    """Largest payload without a model, stated or estimated, kg.
+
+    With a model, the training data give it.
+    """
 
     def __post_init__(self) -> None:
         numbers = np.array([x for x in vars(self).values() if not isinstance(x, str)], float)
@@ -94,10 +104,11 @@ class Compensator:
         compensate.reset(target, payload_mass=3.0)
         u = compensate.step(target, qpos)      # once per control period; send u instead of target
 
-    With follow="nominal" the robot moves as the nominal simulator does under the targets, instead of reaching them:
-    for policies that were trained in an ordinary simulator.
+    With follow="nominal" the robot moves as the nominal simulator does under the targets, instead
+    of reaching them: for policies that were trained in an ordinary simulator.
 
-    Arrays hold all joints of the robot, (num_envs, n), or (n,) without num_envs; only operated joints are changed.
+    Arrays hold all joints of the robot, (num_envs, n), or (n,) without num_envs; only operated
+    joints are changed.
     """
 
     def __init__(
@@ -116,22 +127,25 @@ class Compensator:
     ) -> None:
         """
         Args:
-            robot: Nominal, identified or adapted parameters of the robot. With a model and aim target, the simulator of
-                training replaces another one. With aim simulator, another one is refused.
+            robot: Nominal, identified or adapted parameters of the robot. With a model and aim
+                target, the simulator of training replaces another one. With aim simulator, another
+                one is refused.
             model: The trained model; None for the feed-forward of the robot alone.
             dt: Control period, s; default the robot's.
             num_envs: Number of robots; None for one, with arrays (n,).
             payload_side: The hands that carry the payload: "both", or the side of one mount.
             payload_step: Distance between the masses that the shadow can carry, kg.
             nthread: Threads of the shadow simulators.
-            extrapolate: Accept payloads beyond the training data, up to the model's payload_max, and other servo gains.
+            extrapolate: Accept payloads beyond the training data, up to the model's payload_max,
+                and other servo gains.
             adaptation: Result of `adapt` for this unit; the shadow then has the unit's parameters.
-            follow: "nominal": let the robot move as its nominal simulator does under the targets. It needs an
-                identified robot and takes no model; the aim of the configuration does not count.
+            follow: "nominal": let the robot move as its nominal simulator does under the targets.
+                It needs an identified robot and takes no model; the aim of the configuration does
+                not count.
 
         Raises:
-            ModelError: The model does not fit the robot, the control period or the aim; or the robot is too different
-                from the nominal one to follow it, without `extrapolate`.
+            ModelError: The model does not fit the robot, the control period or the aim; or the
+                robot is too different from the nominal one to follow it, without `extrapolate`.
             UsageError: `follow` with a model, or with a robot that is not identified.
         """
         self.dt = robot.dt if dt is None else dt
@@ -151,7 +165,8 @@ class Compensator:
         max_mass = max_mass if robot.payload_mounts else 0.0
         self.masses = np.linspace(0.0, max_mass, 1 + int(np.ceil(max_mass / payload_step - 1e-9)))
         locked = idle_joints(robot, robot.operated)
-        # The last rows never move. Their models have one of the masses each, and are copied when a payload changes.
+        # The last rows never move. Their models have one of the masses each, and are copied when a
+        # payload changes.
         carried = [Condition(float(m), payload_side, self.dt) for m in (*[0.0] * num, *self.masses)]
         self.shadow = BatchSim(robot, carried, nthread, locked)
         self.ids, self.op = np.arange(num), robot.operated_index
@@ -211,7 +226,8 @@ class Compensator:
 
         Args:
             target: The target in force, rad.
-            payload_mass: kg, one number or (num_envs,); None to estimate it from commands and positions.
+            payload_mass: kg, one number or (num_envs,); None to estimate it from commands and
+                positions.
 
         Raises:
             ModelError: The payload is outside the training data, without `extrapolate`.
@@ -246,12 +262,15 @@ class Compensator:
         self._deviation[:] = 0.0
 
     def set_payload(self, payload_mass: Array | float) -> None:
-        """Set the payload after a pick or place, kg, one number or (num_envs,); errors as of `reset`."""
+        """Set the payload after a pick or place, kg, one number or (num_envs,).
+
+        Errors as of `reset`.
+        """
         self.require_payload(payload_mass)
         self._carry(np.array(np.broadcast_to(np.asarray(payload_mass, float), self.num_envs)))
 
     def require_payload(self, payload_mass: Array | float) -> None:
-        """Refuse payloads, kg, that are not physical or that the model or the shadow cannot carry."""
+        """Refuse payloads, kg, that are not physical, or that model or shadow cannot carry."""
         if self.model is not None:
             self.model.require_payload(payload_mass, self.extrapolate)
             return
@@ -282,8 +301,8 @@ class Compensator:
 
         Args:
             target: Target of the robot, rad. If it is not finite, the last finite one holds.
-            qpos: Measured position, rad; None if no new state has arrived. Feedback then pauses, as it does for a qpos
-                or qvel that is not finite.
+            qpos: Measured position, rad; None if no new state has arrived. Feedback then pauses, as
+                it does for a qpos or qvel that is not finite.
             qvel: Measured velocity, rad/s.
             tau: Measured joint torque, N·m, for the payload estimate; default kp (u − q) − kd q̇.
 
@@ -329,15 +348,18 @@ class Compensator:
         return self._target is not None
 
     def observe(self, qpos: Array | None = None) -> tuple[Array, Array]:
-        """Return the positions, rad, and velocities, rad/s, that a policy of the nominal simulator is to see.
+        """Return what a policy of the nominal simulator is to see.
 
-        They are the nominal simulator's, which has no delay, plus the slow part of what distinguishes the robot from
-        its identified simulator. A policy that sees the measured state instead is a loop with the delay of the servos,
-        for which it was not trained. Only with follow="nominal"; once per control period, before `step`.
+        These are positions, rad, and velocities, rad/s.
+
+        They are the nominal simulator's, which has no delay, plus the slow part of what
+        distinguishes the robot from its identified simulator. A policy that sees the measured state
+        instead is a loop with the delay of the servos, for which it was not trained. Only with
+        follow="nominal"; once per control period, before `step`.
 
         Args:
-            qpos: Measured position, rad; None if no new state has arrived. Joints that are not operated are returned
-                as measured, or at home.
+            qpos: Measured position, rad; None if no new state has arrived. Joints that are not
+                operated are returned as measured, or at home.
 
         Raises:
             UsageError: Nothing is followed, or `reset` was not called before.
@@ -357,7 +379,7 @@ class Compensator:
         return positions, velocities
 
     def _update_deviation(self, measured: Array) -> None:
-        """Update the slow deviation of the robots from their shadows by positions, (num_envs, n) rad."""
+        """Update the slow deviation of robots from their shadows; (num_envs, n) rad."""
         deviation = measured - self.shadow.qpos[: self.num_envs, self.operated]
         valid = np.isfinite(deviation).all(axis=1, keepdims=True)
         limit = self.config.feedback_limit
@@ -367,7 +389,7 @@ class Compensator:
 
     @property
     def doubt(self) -> str:
-        """Message if the network fails, or if one robot's servo torques contradict the stated payload; else ""."""
+        """Message if the network fails or servo torques contradict the stated payload; else ""."""
         sentences = []
         if self.refused_answers:
             sentences.append(
@@ -382,10 +404,10 @@ class Compensator:
 
     @property
     def limited_shares(self) -> dict[str, float]:
-        """Joint → share of the periods since the start in which it could not do what was asked of it.
+        """Joint → share of the periods in which it could not do what was asked of it.
 
-        Its command was at a limit or, where the nominal simulator is followed, its motor. Joints with a share below
-        MIN_LIMITED_SHARE are left out; of several robots the mean counts.
+        Its command was at a limit or, where the nominal simulator is followed, its motor. Joints
+        with a share below MIN_LIMITED_SHARE are left out; of several robots the mean counts.
         """
         shares = self.limited_periods.mean(axis=0) / max(self.periods, 1)
         named = zip(self.robot.operated, shares.tolist(), strict=True)
@@ -393,30 +415,37 @@ class Compensator:
 
     @property
     def refused_answers(self) -> int:
-        """Number of the network's answers that were not finite; one answer per robot and iteration."""
+        """Number of the network's answers that were not finite.
+
+        One answer per robot and iteration.
+        """
         return 0 if self.loop is None else self.loop.refused_answers
 
     # ---- internals
 
     def _at_limit(self) -> Array:
         """Return which commands, or motors that follow, are at their limits, (num_envs, n)."""
-        at_limit = self.feedback.saturation != 0
+        at_limit: Array = self.feedback.saturation != 0
         if self.follower is not None:
             at_limit = at_limit | self.follower.saturated[:, self.operated]
         return at_limit
 
     def _shadow_target(self, targets: Array) -> Array:
-        """Return a′, the shadow's targets of the operated joints, (num_envs, n) rad; targets of the free ones."""
+        """Return a′, the shadow's targets of the operated joints, (num_envs, n) rad.
+
+        Targets of the free ones.
+        """
         if self.follower is not None:
             commands = self.follower.command(targets)[:, self.operated]
-            return np.clip(commands, self.low, self.high)
+            return np.asarray(np.clip(commands, self.low, self.high))
         a = targets[:, self.operated]
         if self.config.aim == "simulator":
-            return np.clip(a, self.low, self.high)
+            return np.asarray(np.clip(a, self.low, self.high))
         tau = self.bias[: self.num_envs, self.operated]
         if self.config.dynamics:
             tau = tau + self.feedforward.torque(tau)
-        return np.clip(a + tau / self.kp - self.zero_offset, self.low, self.high)
+        held = a + tau / self.kp - self.zero_offset
+        return np.asarray(np.clip(held, self.low, self.high))
 
     def _invert(self, shadow_target: Array) -> Array:
         """Return u with u + G(u) = a′. Without a model, u = a′."""
@@ -457,7 +486,9 @@ class Compensator:
 
 
 class Feedback:
-    """Integrator of the remaining position error, with a low-pass, limits and anti-windup. Arrays are (num_envs, n).
+    """Integrator of the remaining position error, with a low-pass, limits and anti-windup.
+
+    Arrays are (num_envs, n).
 
     Attributes:
         integral: Correction of the command, rad.

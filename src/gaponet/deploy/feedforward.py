@@ -1,8 +1,10 @@
-"""Feed-forward torque for motion: inertia, damping and friction, on top of the torque that holds a posture.
+"""Feed-forward torque for motion: inertia, damping and friction.
 
-Velocity and acceleration come from the last targets, so the feed-forward is causal. It amplifies noise of the targets
-by inertia / (kp dt²); the low-pass of the acceleration reduces that. The delay of servos is not compensated, because
-that leads to overshoot.
+It comes on top of the torque that holds a posture.
+
+Velocity and acceleration come from the last targets, so the feed-forward is causal. It amplifies
+noise of the targets by inertia / (kp dt²); the low-pass of the acceleration reduces that. The delay
+of servos is not compensated, because that leads to overshoot.
 """
 
 from __future__ import annotations
@@ -25,7 +27,8 @@ class Feedforward:
     """Torques for the motion of the first `num` simulations of a batch; all have the same joints.
 
     Attributes:
-        target, qvel, qacc: Last targets, their velocity and filtered acceleration, (num, n operated).
+        target, qvel, qacc: Last targets, their velocity and filtered acceleration, (num, n
+            operated).
     """
 
     def __init__(
@@ -64,7 +67,10 @@ class Feedforward:
         self.target = target.copy()
 
     def torque(self, holding: Array | float = 0.0) -> Array:
-        """Return the torque for motion, (num, n operated) N·m; holding is the torque against gravity."""
+        """Return the torque for motion, (num, n operated) N·m.
+
+        Holding is the torque against gravity.
+        """
         inertial = np.einsum("kij,kj->ki", self.inertia.matrix(len(self.qacc)), self.qacc)
         moving = inertial + self.damping * self.qvel
         friction = friction_limit(

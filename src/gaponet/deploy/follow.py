@@ -1,13 +1,14 @@
 """Follow the nominal simulator: commands under which the robot moves as its nominal simulator does.
 
-A policy that was trained in the nominal simulator then runs on the robot as it is. The nominal simulator runs beside
-the robot, under the targets of the policy. The command is the inverse dynamics of the identified robot along that
-motion, and the robot's own servos hold it there.
+A policy that was trained in the nominal simulator then runs on the robot as it is. The nominal
+simulator runs beside the robot, under the targets of the policy. The command is the inverse
+dynamics of the identified robot along that motion, and the robot's own servos hold it there.
 
-The measured state is not used, so following adds no loop that could become unstable. Where servos are late, the nominal
-motion is moved ahead by their delay at its present speed. What a delay still costs is half the acceleration times its
-square, 1 mrad at 5 rad/s² and 20 ms. (Simulating the nominal robot ahead under the present target is worse: it brakes
-for a target that will have moved on.)
+The measured state is not used, so following adds no loop that could become unstable. Where servos
+are late, the nominal motion is moved ahead by their delay at its present speed. What a delay still
+costs is half the acceleration times its square, 1 mrad at 5 rad/s² and 20 ms. (Simulating the
+nominal robot ahead under the present target is worse: it brakes for a target that will have moved
+on.)
 """
 
 from __future__ import annotations
@@ -27,7 +28,10 @@ from gaponet.sim.model import build_model
 
 
 class Follower:
-    """Targets of num policies → commands of num robots. Arrays are (num, n), of the joints that are not locked."""
+    """Targets of num policies → commands of num robots.
+
+    Arrays are (num, n), of the joints that are not locked.
+    """
 
     def __init__(
         self,

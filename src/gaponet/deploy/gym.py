@@ -29,8 +29,9 @@ except ModuleNotFoundError as error:
 class TrackingEnv(gymnasium.Env):
     """Follow joint motions with an AlignedSim. The end of a motion truncates; nothing terminates.
 
-    Observation [q | q̇ | r_t+1 − q | r_t+2 − q … ], float32, of the operated joints, r the reference. Action in [−1, 1]:
-    offset of the target from r_t+1, times `reach`. Reward −mean (q − r)² / 0.01 after the step, so −1 is 0.1 rad.
+    Observation [q | q̇ | r_t+1 − q | r_t+2 − q … ], float32, of the operated joints, r the
+    reference. Action in [−1, 1]: offset of the target from r_t+1, times `reach`. Reward −mean (q −
+    r)² / 0.01 after the step, so −1 is 0.1 rad.
     """
 
     def __init__(
@@ -44,7 +45,8 @@ class TrackingEnv(gymnasium.Env):
         """
         Args:
             sim: A single simulation, without num_envs.
-            references: Joint motions to follow, (T, n) rad each, in the order of sim.joint_names, one row per period.
+            references: Joint motions to follow, (T, n) rad each, in the order of sim.joint_names,
+                one row per period.
             reach: Offset of the target for action 1, rad.
             preview: Number of reference rows in the observation.
             seed: Seed of the choice of motions.
@@ -89,7 +91,8 @@ class TrackingEnv(gymnasium.Env):
 
     def _row(self, ahead: int) -> Array:
         motion = self.references[self.motion]
-        return motion[min(self.t + ahead, len(motion) - 1)]
+        row: Array = motion[min(self.t + ahead, len(motion) - 1)]
+        return row
 
     def _observe(self) -> Array:
         q, v, op = self.sim.qpos, self.sim.qvel, self.sim.op
@@ -104,7 +107,9 @@ def _tracking(
     payload_mass: float = 0.0,
     **options: Any,
 ) -> TrackingEnv:
-    """gymnasium.make("gaponet.deploy.gym:gaponet/Tracking-v0", robot="so101"): follow the library's motions.
+    """Make an environment that follows the library's motions.
+
+    gymnasium.make("gaponet.deploy.gym:gaponet/Tracking-v0", robot="so101")
 
     Args:
         robot: Name, or folder with a slash; an identified one is played as identified.
@@ -124,7 +129,10 @@ gymnasium.register("gaponet/Tracking-v0", entry_point="gaponet.deploy.gym:_track
 
 
 class AlignedActions(gymnasium.Wrapper):
-    """Aligns a gymnasium environment on MuJoCo (unwrapped.model, .data, .dt) whose actions are targets in rad."""
+    """Aligns a gymnasium environment on MuJoCo whose actions are targets in rad.
+
+    It needs unwrapped.model, .data and .dt.
+    """
 
     def __init__(
         self,

@@ -19,18 +19,22 @@ from gaponet.sim.inverse import AnalyticInverse
 
 
 class MujocoAligner:
-    """ctrl → ctrl + Δa in a scene with a position actuator on each operated joint. One object per MjData.
+    """ctrl → ctrl + Δa in a scene with a position actuator on each operated joint.
+
+    One object per MjData.
 
     align = MujocoAligner(load_robot("./my_h1_2"), mj_model, dt=0.02, payload_mass=3.0)  # or GapModel.load("run")
     data.ctrl[:] = align(data, target)                    # once per control period
     mujoco.mj_step(mj_model, data, round(0.02 / mj_model.opt.timestep))
 
-    If the robot of the scene differs from the identified one or from the simulator of training, commands are
-    transferred (deploy/transfer.py): other gains, friction, inertias, actuators, or a payload that the scene does not
-    have. The base and the rest of the scene have their present state in each period.
+    If the robot of the scene differs from the identified one or from the simulator of training,
+    commands are transferred (deploy/transfer.py): other gains, friction, inertias, actuators, or a
+    payload that the scene does not have. The base and the rest of the scene have their present
+    state in each period.
 
-    Where commands cannot be transferred, a network for many simulators measures the scene's answers to fixed probes
-    (sim/context.py), and corrects the scene directly if they lie within those of its training.
+    Where commands cannot be transferred, a network for many simulators measures the scene's answers
+    to fixed probes (sim/context.py), and corrects the scene directly if they lie within those of
+    its training.
     """
 
     def __init__(
@@ -44,12 +48,14 @@ class MujocoAligner:
     ) -> None:
         """
         Args:
-            model: The identified robot that the scene is to move like, or a trained model with its simulator.
+            model: The identified robot that the scene is to move like, or a trained model with its
+                simulator.
             mj_model: The compiled scene.
             dt: Control period, s.
             payload_mass: kg in each hand of the robot that the scene is to move like.
             prefix: Prefix of the robot's names in the scene ("left/").
-            extrapolate: Accept a payload outside the training data, and a scene outside the measured ranges.
+            extrapolate: Accept a payload outside the training data, and a scene outside the
+                measured ranges.
 
         Raises:
             ModelError: The scene, the control period or the payload does not fit.
@@ -121,7 +127,7 @@ class MujocoAligner:
 def _known_context(
     model: Reference, scene: mujoco.MjModel, robot: RobotSpec, dt: float, prefix: str
 ) -> Array | None:
-    """Return the scene's answers to fixed probes if the network was trained in simulators with such answers."""
+    """Return the scene's answers to fixed probes if the network's training has such answers."""
     if not isinstance(model, GapModel) or control_periods_of(model, dt) != 1:
         return None
     known = model.known_simulators

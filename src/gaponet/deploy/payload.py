@@ -13,14 +13,14 @@ FORGETTING_TIME_S = 1.0  # time constant
 MAX_RATE_KG_S = 1.0  # of the estimate: a payload that appears at once must not make commands jump
 HALF_WEIGHT_SPEED = 0.5  # rad/s; samples at this speed have half the weight, faster ones less
 MIN_LEVERAGE = 0.4  # (N·m/kg)² s; below it, the estimate does not change
-# Least share of the excess torque over the empty arm's that must look like the largest payload's. On a virtual H1-2,
-# 3 kg give 0.57 to 0.97, and no payload with positions wrong by 0.12 rad up to 0.56. Friction lowers the share of
-# smaller payloads.
+# Least share of the excess torque over the empty arm's that must look like the largest payload's.
+# On a virtual H1-2, 3 kg give 0.57 to 0.97, and no payload with positions wrong by 0.12 rad up to
+# 0.56. Friction lowers the share of smaller payloads.
 MIN_SIMILARITY = 0.55
 
 
 class PayloadFields:
-    """Values of the model fields that depend on the payload, for each mass that a simulation can carry."""
+    """Values of the model fields that depend on the payload, for each possible mass."""
 
     def __init__(self, batch: Batch, models: list[mujoco.MjModel]) -> None:
         """models: The batch's model with each of the masses."""
@@ -36,8 +36,8 @@ class PayloadFields:
 class PayloadEstimate:
     """Least squares with forgetting: τ = τ_0(q) + m dτ(q) is linear in the mass m per hand.
 
-    Friction hides a few N·m, so the error is some hundred grams on an arm with 40 N·m. The estimate is slow on purpose.
-    Torques that do not look like a payload's give the mass 0.
+    Friction hides a few N·m, so the error is some hundred grams on an arm with 40 N·m. The estimate
+    is slow on purpose. Torques that do not look like a payload's give the mass 0.
 
     Attributes:
         mass: Estimate of each robot, (num,) kg, with a limited rate.
@@ -50,7 +50,8 @@ class PayloadEstimate:
     ) -> None:
         """
         Args:
-            sim: Its last num_masses rows carry payloads from 0 to the largest. The first and last of them are used.
+            sim: Its last num_masses rows carry payloads from 0 to the largest. The first and last
+                of them are used.
             operated: Operated joints among the simulation's, (n,).
             dt: Control period, s.
         """
@@ -103,15 +104,19 @@ class PayloadEstimate:
         return self.mass
 
     def contradiction(self, stated: float) -> str:
-        """Return a message if the first robot's torques are those of another payload than stated, kg; else ""."""
+        """Return a message if torques are those of another payload than stated, kg; else "".
+
+        They are the first robot's.
+        """
         if not self.certain[0] or abs(self.latest[0] - stated) <= self.max_mass / 2:
             return ""
         estimate = f"{self.latest[0]:.1f} kg"
         return f"{stated:g} kg were stated, but the torques are those of about {estimate}: what is in the hand?"
 
     def gravity(self, qpos: Array) -> Array:
-        """Return the torques that hold a posture, empty and with the largest payload, (2, n) N·m."""
+        """Return the torques that hold a posture, empty and with most payload, (2, n) N·m."""
         self.sim.qpos[self.rows], self.sim.qvel[self.rows] = self.home, 0.0
         self.sim.qpos[self.rows[:, None], self.operated] = qpos
         self.sim.batch.forward(self.rows, stage=mujoco.mjtStage.mjSTAGE_VEL.value)
-        return self.bias[self.rows][:, self.operated]
+        torques: Array = self.bias[self.rows][:, self.operated]
+        return torques

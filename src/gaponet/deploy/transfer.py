@@ -1,14 +1,15 @@
 """Transfer: commands with which one simulator, the target, moves like another one, the reference.
 
-A model is trained in one simulator, the reference. In each control period, the reference is set to the state of the
-target simulator and steps with the model's correction. The target's command is the inverse dynamics of that step
-(sim/inverse.py).
+A model is trained in one simulator, the reference. In each control period, the reference is set to
+the state of the target simulator and steps with the model's correction. The target's command is the
+inverse dynamics of that step (sim/inverse.py).
 
-In free motion the result is exact, except for what happens within a control period. The simulators may differ in gains,
-damping, friction, inertia, payload, offsets, delays up to the reference's, torque limits, integrator and time step.
-After a push, the reference continues from the target's state. In contact, the motors have the torques of the reference
-in free space, and the target's contacts respond to them. Where the reference itself has a contact (the table of an
-identified robot), the target's motors stop the motion.
+In free motion the result is exact, except for what happens within a control period. The simulators
+may differ in gains, damping, friction, inertia, payload, offsets, delays up to the reference's,
+torque limits, integrator and time step. After a push, the reference continues from the target's
+state. In contact, the motors have the torques of the reference in free space, and the target's
+contacts respond to them. Where the reference itself has a contact (the table of an identified
+robot), the target's motors stop the motion.
 """
 
 from __future__ import annotations
@@ -38,9 +39,10 @@ STICTION_SPEED = 0.02  # rad/s at which three quarters of the friction act, for 
 
 
 class Transfer:
-    """Commands for num_envs simulations of the target, with one simulation of the reference for each.
+    """Commands for num_envs simulations of the target, each with one of the reference.
 
-    Arrays are (num_envs, n) in the order of `joint_names`, the reference's joints that are not locked.
+    Arrays are (num_envs, n) in the order of `joint_names`, the reference's joints that are not
+    locked.
     """
 
     def __init__(
@@ -62,7 +64,8 @@ class Transfer:
             extrapolate: Accept a target outside the measured ranges.
 
         Raises:
-            ModelError: The control period does not fit the model, or the target is outside the measured ranges.
+            ModelError: The control period does not fit the model, or the target is outside the
+                measured ranges.
         """
         model = reference if isinstance(reference, GapModel) else None
         robot = reference.simulator() if isinstance(reference, GapModel) else reference
@@ -88,7 +91,7 @@ class Transfer:
         self._dt = (sim.nstep * sim.timestep)[:, None]
 
     def reset(self, ids: Array | slice, qpos: Array, qvel: Array, past: Array) -> None:
-        """Reset simulations to a state, (k, n), with the targets of past control periods, (k, depth, n)."""
+        """Reset simulations to a state, (k, n), with targets of past periods, (k, depth, n)."""
         self.sim.reset(ids, qpos, qvel, past=past)
         self._delta[ids] = 0.0
         if self.loop is not None:
@@ -97,7 +100,9 @@ class Transfer:
             self._elapsed = 0
 
     def command(self, qpos: Array, qvel: Array, target: Array) -> Array:
-        """Return the commands of the coming control period, rad, without joint limits. Call this once per period.
+        """Return the commands of the coming control period, rad, without joint limits.
+
+        Call this once per period.
 
         Args:
             qpos, qvel: State of the target simulator, rad, rad/s.
@@ -113,7 +118,10 @@ class Transfer:
         return self.inverse(periods)
 
     def _corrected(self, qpos: Array, qvel: Array, target: Array) -> Array:
-        """Return target + Δa. The model has the control period of training, which can be several of these."""
+        """Return target + Δa.
+
+        The model has the control period of training, which can be several of these.
+        """
         corrected = np.array(target, float)
         if self.loop is not None:
             if self._elapsed % self.periods == 0:
@@ -134,11 +142,14 @@ class Transfer:
         return Period(qpos, qvel, *end, self._friction_share(end[0] - qpos))
 
     def _friction_share(self, motion: Array) -> Array:
-        """Return the used share of friction. Where stops or contacts block a joint, it follows from the speed."""
+        """Return the used share of friction.
+
+        Where stops or contacts block a joint, it follows from the speed.
+        """
         share = -self._constraint_force / np.maximum(self._frictionloss, 1e-9)
         by_speed = np.tanh(motion / self._dt / STICTION_SPEED)
         blocked = (np.abs(share) > 1.05) | (self._frictionloss == 0)
-        return np.where(blocked, by_speed, np.clip(share, -1.0, 1.0))
+        return np.asarray(np.where(blocked, by_speed, np.clip(share, -1.0, 1.0)))
 
 
 class TransferCorrector:
@@ -230,8 +241,8 @@ def _require_between(what: str, values: Array, bounds: tuple[float, float]) -> N
 def own_context(model: GapModel, robot: RobotSpec, conditions: list[Condition]) -> Array | None:
     """Return the context of a network in its simulator, (conditions, 8n) rad.
 
-    None for most networks: the context that is stored with them holds for every payload. A network that is not told the
-    payload reads it from the simulator's answers with the payload in hand.
+    None for most networks: the context that is stored with them holds for every payload. A network
+    that is not told the payload reads it from the simulator's answers with the payload in hand.
 
     Args:
         robot: Simulator of training.
@@ -248,7 +259,7 @@ def control_periods_of(model: GapModel, dt: float) -> int:
         ModelError: It is not a whole number.
     """
     for trained in model.card.get("dt") or [dt]:
-        count = max(1, round(trained / dt))
+        count = max(1, round(float(trained) / dt))
         if abs(dt * count / trained - 1) <= RATE_TOLERANCE:
             return count
     rates = ", ".join(f"{1 / trained:.1f}" for trained in model.card["dt"])

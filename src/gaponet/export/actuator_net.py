@@ -1,10 +1,13 @@
-"""Actuator networks of a run, one per joint: past target − position and past velocity in, torque out.
+"""Actuator networks of a run, one per joint.
 
-mjlab, Newton and Isaac Lab load this form (Hwangbo et al. 2019, Science Robotics 4, eaau5872). It contains the
-identified servo exactly: a delayed target minus the present position is the error at that time minus the motion since.
-A small network is fitted to the torque that the run's network adds, kp · Δa, on rollouts that the run's network
-corrects. Its inputs are clipped and its torque is at most kp times the run's delta_max, so it is finite wherever the
-engine's state is. Engines give a joint's network neither posture nor payload, so effects of these are lost.
+Past target − position and past velocity go in, the torque comes out.
+
+mjlab, Newton and Isaac Lab load this form (Hwangbo et al. 2019, Science Robotics 4, eaau5872). It
+contains the identified servo exactly: a delayed target minus the present position is the error at
+that time minus the motion since. A small network is fitted to the torque that the run's network
+adds, kp · Δa, on rollouts that the run's network corrects. Its inputs are clipped and its torque is
+at most kp times the run's delta_max, so it is finite wherever the engine's state is. Engines give a
+joint's network neither posture nor payload, so effects of these are lost.
 """
 
 from __future__ import annotations
@@ -68,26 +71,25 @@ class ActuatorNet(nn.Module):
             joint: The servo, as in facts.json.
             step: Physics step, s.
             length: Physics steps of the past, L.
-            delta_max: Largest correction of the run's network, rad; kp times it bounds the torque that is added.
+            delta_max: Largest correction of the run's network, rad; kp times it bounds the torque
+                that is added.
         """
         super().__init__()
-        kp, delayed = joint["kp"], np.zeros(length)
+        kp = joint["kp"]
         weights = delay_weights(np.array([joint["delay"]]), step)[:, 0]
+        delayed = np.zeros(length)
         delayed[: len(weights)] = weights
-        damping = (
-            kp * step * (np.cumsum(delayed[::-1])[::-1] - delayed)
-        )  # q_t − q_{t-k} = step · (q̇_t + … + q̇_{t-k+1})
+        # q_t − q_{t-k} = step · (q̇_t + … + q̇_{t-k+1})
+        damping = kp * step * (np.cumsum(delayed[::-1])[::-1] - delayed)
         damping[0] += joint["kd"]
         servo = np.concatenate([kp * delayed, -damping])[:, None]
         self.register_buffer("servo", torch.tensor(servo, dtype=torch.float32))
         self.register_buffer("mean", torch.zeros(2 * length))
         self.register_buffer("std", torch.ones(2 * length))
-        self.rest, self.limit, self.scale, self.gain = (
-            kp * joint["offset"],
-            joint["effort_limit"],
-            kp,
-            1.0,
-        )
+        self.rest = kp * joint["offset"]  # N·m
+        self.limit = joint["effort_limit"]  # N·m
+        self.scale = kp
+        self.gain = 1.0
         self.most_added = kp * delta_max  # N·m
         widths = (2 * length, *HIDDEN)
         layers = [layer for a, b in pairwise(widths) for layer in (nn.Linear(a, b), nn.ELU())]
@@ -101,14 +103,17 @@ class ActuatorNet(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         added = (self.gain * self.scale) * self.net(self.standardised(x))
-        torque = x @ self.servo + self.rest + added.clamp(-self.most_added, self.most_added)
+        added = added.clamp(-self.most_added, self.most_added)
+        torque: Tensor = x @ self.servo + self.rest + added
         return torque.clamp(-self.limit, self.limit)
 
 
 def read_run_recordings(
     run: Path, data: str | None, robot: RobotSpec, payload_mass: float
 ) -> list[list[Sequence]]:
-    """Read training and validation motions of a run that were made with this payload and the robot's own gains.
+    """Read training and validation motions of a run.
+
+    Only those that were made with this payload and the robot's own gains.
 
     Raises:
         UsageError: There is none.
@@ -130,10 +135,14 @@ def read_run_recordings(
 
 
 def write_networks(
-    sequences: ListOf[Sequence], motions: ListOf[Sequence], corrector: Corrector, robot: RobotSpec, folder: Path,
+    sequences: ListOf[Sequence],
+    motions: ListOf[Sequence],
+    corrector: Corrector,
+    robot: RobotSpec,
+    folder: Path,
     facts: dict[str, Any],
-) -> dict[str, float]:  # fmt: skip
-    """Fit the networks to rollouts of sequences, choose their gain on motions, write them, and note them in facts.
+) -> dict[str, float]:
+    """Fit the networks to rollouts, choose their gain, and write them and their facts.
 
     Returns:
         Mean |error| on the motions by form, rad.
@@ -207,7 +216,7 @@ def _samples(
     rng: np.random.Generator,
     rows: int,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return inputs of joint i's network in random physics steps of a rollout, (k, 2L), and delayed Δa, (k, 1) rad."""
+    """Return inputs of a joint in random physics steps, (k, 2L), and delayed Δa, (k, 1) rad."""
     count, length = facts["decimation"], len(net.mean) // 2
     path = CubicHermiteSpline(np.arange(len(s)) * s.dt, rollout.qpos[:, i], rollout.qvel[:, i])
     time = np.arange((len(s) - 1) * count) * (s.dt / count)
@@ -245,22 +254,33 @@ def _fit(net: ActuatorNet, x: Tensor, y: Tensor) -> None:
 
 def _stacked(nets: ListOf[ActuatorNet]) -> Callable[[np.ndarray], np.ndarray]:
     """Return the networks of all joints as one numpy function: pasts (n, 2L) → torque (n,) N·m."""
-    stack = lambda get: np.stack([get(net).detach().numpy() for net in nets])  # noqa: E731
-    servo, mean, std = (stack(lambda net, f=f: getattr(net, f)) for f in ("servo", "mean", "std"))
-    rest, limit, scale = np.array([(net.rest, net.limit, net.gain * net.scale) for net in nets]).T
+
+    def stack(tensors: ListOf[Tensor]) -> np.ndarray:
+        return np.stack([tensor.detach().numpy() for tensor in tensors])
+
+    servo = stack([net.servo for net in nets])
+    mean = stack([net.mean for net in nets])
+    std = stack([net.std for net in nets])
+    rest = np.array([net.rest for net in nets])
+    limit = np.array([net.limit for net in nets])
+    scale = np.array([net.gain * net.scale for net in nets])
     most_added = np.array([net.most_added for net in nets])
-    layers = [
-        (stack(lambda net, k=k: net.net[k].weight), stack(lambda net, k=k: net.net[k].bias))
-        for k in (0, 2, 4)
-    ]
+    layers = []
+    for k in (0, 2, 4):
+        linear: list[Any] = [net.net[k] for net in nets]
+        weights = stack([layer.weight for layer in linear])
+        biases = stack([layer.bias for layer in linear])
+        layers.append((weights, biases))
 
     def torque(past: np.ndarray) -> np.ndarray:
         z = np.clip((past - mean) / std, -MAX_INPUT_STD, MAX_INPUT_STD)
         for k, (weight, bias) in enumerate(layers):
             z = np.einsum("noi,ni->no", weight, z) + bias
-            z = np.where(z > 0, z, np.expm1(np.minimum(z, 0))) if k < len(layers) - 1 else z
+            if k < len(layers) - 1:
+                z = np.where(z > 0, z, np.expm1(np.minimum(z, 0)))
         added = np.clip(scale * z[:, 0], -most_added, most_added)
-        return np.clip((past * servo[:, :, 0]).sum(1) + rest + added, -limit, limit)
+        asked = (past * servo[:, :, 0]).sum(1) + rest + added
+        return np.asarray(np.clip(asked, -limit, limit))
 
     return torque
 
@@ -312,14 +332,21 @@ def _write(net: ActuatorNet, folder: Path, name: str, info: dict[str, Any]) -> N
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         with atomic_write(folder / f"{name}.onnx") as path:
-            torch.onnx.export(net, (x,), path, input_names=["past"], output_names=["torque"], dynamo=False,
-                              dynamic_axes={"past": {0: "batch"}, "torque": {0: "batch"}})  # fmt: skip
+            torch.onnx.export(
+                net,
+                (x,),
+                path,
+                input_names=["past"],
+                output_names=["torque"],
+                dynamo=False,
+                dynamic_axes={"past": {0: "batch"}, "torque": {0: "batch"}},
+            )
             graph = onnx.load(path)
             onnx.helper.set_model_props(graph, {"metadata": json.dumps(info)})
             onnx.save(graph, path)
         with atomic_write(folder / f"{name}.pt2") as path, path.open("wb") as file:
             batch = ({0: torch.export.Dim("batch", min=1, max=2**31)},)
-            torch.export.save(torch.export.export(net, (x,), dynamic_shapes=batch), file,
-                              extra_files={"metadata.json": json.dumps(info)})  # fmt: skip
+            program = torch.export.export(net, (x,), dynamic_shapes=batch)
+            torch.export.save(program, file, extra_files={"metadata.json": json.dumps(info)})
         with atomic_write(folder / f"{name}.pt") as path:
             torch.jit.save(torch.jit.trace(net, x), path)

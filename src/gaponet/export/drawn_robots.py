@@ -1,8 +1,9 @@
 """Units drawn from a robot's uncertainty, chosen and judged by rollouts of its recordings.
 
-The uncertainty is Gaussian on its axes, and holds for small deviations. Rollouts of recorded commands show which drawn
-units move like the robot, and the best quarter is retained. Engines without the servo model need units of the robot as
-it was fitted without it: the deviation of a unit is then added to those values, on the same axes.
+The uncertainty is Gaussian on its axes, and holds for small deviations. Rollouts of recorded
+commands show which drawn units move like the robot, and the best quarter is retained. Engines
+without the servo model need units of the robot as it was fitted without it: the deviation of a unit
+is then added to those values, on the same axes.
 """
 
 from __future__ import annotations
@@ -46,8 +47,10 @@ class DrawnRobots:
     """Units of one form of a robot: with its servo model, or fitted without it.
 
     Attributes:
-        units: Field → (retained units, n) in SI units, and coordinates of drawn links; a row is one unit.
-        errors: "exported", "units", "one by one" (each number from the range of 9 of 10 units) and "by hand" → mean
+        units: Field → (retained units, n) in SI units, and coordinates of drawn links; a row is one
+            unit.
+        errors: "exported", "units", "one by one" (each number from the range of 9 of 10 units) and
+            "by hand" → mean
             |error| on validation motions, rad.
     """
 
@@ -85,7 +88,8 @@ def draw_robots(
         robot: Identified.
         drawn: Units of `randomization.sample_units`.
         recordings: Training and validation motions, with the robot's own gains.
-        plain: Units of the robot as fitted without its servo model but for `engine_terms`, which the engine has.
+        plain: Units of the robot as fitted without its servo model but for `engine_terms`, which
+            the engine has.
         progress: Called with done, total and a note.
     """
     train, validation = recordings
@@ -131,9 +135,11 @@ def _draw(
     )
     alone = rng.uniform(low, high, (JUDGED, *low.shape)).swapaxes(0, 1)
     robots = {
-        "exported": [base], "units": robots_of(base, units)[:JUDGED],
-        "one by one": robots_of(base, dict(zip(units, alone, strict=False))), "by hand": _by_hand(base, rng),
-    }  # fmt: skip
+        "exported": [base],
+        "units": robots_of(base, units)[:JUDGED],
+        "one by one": robots_of(base, dict(zip(units, alone, strict=False))),
+        "by hand": _by_hand(base, rng),
+    }
     judged = iter(
         errors_of(
             validation,
@@ -164,7 +170,10 @@ def robots_of(base: RobotSpec, units: Mapping[str, Array]) -> list[RobotSpec]:
 
 
 def _moved(robot: RobotSpec, base: RobotSpec, drawn: Units) -> Units:
-    """Return units that deviate from `base` as the drawn ones deviate from `robot`, every second one half as far."""
+    """Return units that deviate from `base` as the drawn ones deviate from `robot`.
+
+    Every second one deviates half as far.
+    """
     lacking = [] if base is robot else [f for f in SERVO_TERMS if not getattr(base, f).any()]
     fields = [f for f in drawn if f not in ("effort_limit", "links", *lacking)]
     own, center = (np.stack(list(to_axes(r, fields).values())) for r in (robot, base))

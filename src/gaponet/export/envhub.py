@@ -1,4 +1,7 @@
-"""What an environment of LeRobot's EnvHub has beside the MJCF: units to draw, units of joints, and a model card."""
+"""What an environment of LeRobot's EnvHub has beside the MJCF.
+
+These are units to draw, units of joints, and a model card.
+"""
 
 from __future__ import annotations
 
@@ -62,7 +65,8 @@ def write_units(
     """Write units drawn from the robot's uncertainty; return False if none is known.
 
     Args:
-        recordings: Training and validation motions that choose the units; None: they are taken as drawn.
+        recordings: Training and validation motions that choose the units; None: they are taken as
+            drawn.
     """
     if ParameterUncertainty.load(robot) is None:
         return False

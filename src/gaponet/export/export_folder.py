@@ -1,4 +1,4 @@
-"""Export folders: a robot or a run's network for another program, with a check that needs no gaponet."""
+"""Export folders: a robot or a network for another program, with a check without gaponet."""
 
 from __future__ import annotations
 
@@ -157,7 +157,7 @@ class _RobotExport:
         return file
 
     def write_scene(self) -> Path:
-        """Write robot.xml, for mjlab with its servos, and the configuration of Isaac Lab or Newton."""
+        """Write robot.xml, for mjlab with servos, and the configuration of Isaac Lab or Newton."""
         file = self.out / ROBOT
         has_servos = self.to == "mjlab"
         robot = self.robot if has_servos else self.plain
@@ -202,7 +202,8 @@ def export_robot(
         to: mjcf, envhub, urdf, mjlab, isaaclab, newton or json.
         out: Folder.
         recordings: Training and validation motions; default: simulated motions of the robot itself.
-        source: For mjcf, envhub and urdf, a file of the user's; by default, except for urdf, the robot's.
+        source: For mjcf, envhub and urdf, a file of the user's; by default, except for urdf, the
+            robot's.
         payload_mass: In each hand, kg.
         progress: Progress of the fit without the servo model, as of `identify`.
 
@@ -287,7 +288,7 @@ def _notes(robot: RobotSpec, facts: dict[str, Any], to: str) -> list[str]:
 
 
 def _stop_notes(robot: RobotSpec) -> list[str]:
-    """Return a question for each joint with identified stops, which an MJCF of the user's does not get."""
+    """Return a question for each joint with stops, which the MJCF of the user does not get."""
     notes = []
     for name, low, high in zip(robot.joint_names, robot.stop_low, robot.stop_high, strict=True):
         stops = " and ".join(f"{x:.2f}" for x in (low, high) if np.isfinite(x))
@@ -331,8 +332,8 @@ def export_model(model: GapModel, run: Path, folder: Path, payload_mass: float =
         Largest difference between program and artifact, rad.
 
     Raises:
-        ModelError: There is no simulator beside the model, the payload is larger than in training, `delta_step`
-            refuses the model, or the program differs by more than 1e-5 rad.
+        ModelError: There is no simulator beside the model, the payload is larger than in training,
+            `delta_step` refuses the model, or the program differs by more than 1e-5 rad.
     """
     from gaponet.export.torch_program import export_program
 
@@ -356,7 +357,9 @@ def export_model(model: GapModel, run: Path, folder: Path, payload_mass: float =
 def export_networks(
     model: GapModel, run: Path, folder: Path, data: str | None = None, payload_mass: float = 0.0
 ) -> ExportedFolder:
-    """Write a run as actuator networks, for every joint .onnx (Newton), .pt (mjlab, Isaac Lab), .pt2 (torch.export).
+    """Write a run as actuator networks.
+
+    Each joint has .onnx (Newton), .pt (mjlab, Isaac Lab) and .pt2 (torch.export).
 
     Args:
         run: Run with the motions that the networks are fitted to and tested on.
@@ -397,7 +400,7 @@ def export_networks(
 def _write_scene(
     robot: RobotSpec, file: Path, payload_mass: float, servos: bool = True, dt: float | None = None
 ) -> None:
-    """Write the simulator as one MJCF, without its servos for engines that add servos themselves."""
+    """Write the simulator as one MJCF, without its servos where an engine adds them itself."""
     text = mjcf_text(robot, dt or robot.dt, payload_mass)
     write_text(file, text if servos else ACTUATORS.sub("", text))
 

@@ -16,7 +16,8 @@ from gaponet.sim import servo
 SHIPPED = Path(__file__).parent / "shipped"
 MUJOCO_HELPER = "mujoco_servos"
 TORCH_HELPER = "gaponet_action"
-# Helper → modules of SHIPPED that it consists of, beside the servo model; the last one gives its docstring.
+# Helper → modules of SHIPPED that it consists of, beside the servo model; the last one gives its
+# docstring.
 MODULES: dict[str, tuple[str, ...]] = {
     MUJOCO_HELPER: ("mujoco_servos",),
     TORCH_HELPER: (
@@ -63,7 +64,7 @@ def helper_text(helper: str) -> str:
 
 
 def without_gaponet(text: str, helper: str) -> str:
-    """Return the text of a module with its imports from gaponet replaced by imports from the helper."""
+    """Return the text of a module whose imports from gaponet are imports from the helper."""
     lines = text.splitlines(keepends=True)
     for node in ast.parse(text).body:
         if isinstance(node, ast.ImportFrom) and _is_own(node):
@@ -73,7 +74,7 @@ def without_gaponet(text: str, helper: str) -> str:
 
 
 def defined_names(text: str) -> ListOf[str]:
-    """Return the names that a module binds at its top level, in order, as often as it binds them."""
+    """Return the names that a module binds at its top level, in order, as often as it does."""
     names = []
     for node in ast.parse(text).body:
         if isinstance(node, ast.FunctionDef | ast.ClassDef):

@@ -1,7 +1,7 @@
-"""Servos in Isaac Lab's own configuration classes, as robot_cfg.py, and what these cannot hold, in mrad.
+"""Servos in Isaac Lab's own configuration classes, and what these cannot hold, in mrad.
 
-Isaac Lab 3 runs the classes as native Newton actuators, its default: a PD servo with a torque limit and a delay in
-whole physics steps, or a DC motor without a delay.
+Isaac Lab 3 runs the classes as native Newton actuators, its default: a PD servo with a torque limit
+and a delay in whole physics steps, or a DC motor without a delay.
 """
 
 from __future__ import annotations
@@ -37,7 +37,8 @@ from isaaclab.actuators import DCMotorCfg, DelayedPDActuatorCfg, IdealPDActuator
 
 PHYSICS_STEP = {step!r}  # s; delays are in whole steps of it
 HOME = {home}
-# A servo aims at its target plus this, rad: JointPositionActionCfg(offset=OFFSETS, use_default_offset=False, ...)
+# A servo aims at its target plus this, rad: JointPositionActionCfg(offset=OFFSETS,
+# use_default_offset=False, ...)
 OFFSETS = {offsets}
 '''
 README = """# {robot} for Isaac Lab 3
@@ -73,9 +74,11 @@ class NativeForm:
     """A robot as far as Isaac Lab's own classes hold it.
 
     Attributes:
-        robot: Without servo model, table, and limits of the speed of targets; delays in whole physics steps.
+        robot: Without servo model, table, and limits of the speed of targets; delays in whole
+            physics steps.
         delay_steps: Delay of each servo, (n) physics steps.
-        losses: What is lost, one after the other, and the mean |error| then, rad; the first is the whole robot.
+        losses: What is lost, one after the other, and the mean |error| then, rad; the first is the
+            whole robot.
     """
 
     robot: RobotSpec
@@ -101,7 +104,7 @@ class NativeForm:
 def native_form(
     robot: RobotSpec, plain: RobotSpec, step: float, motions: ListOf[Sequence]
 ) -> NativeForm:
-    """Return what Isaac Lab's own classes hold of a robot, and what each effect that they lack costs.
+    """Return what Isaac Lab's own classes hold of a robot, and the cost of what they lack.
 
     Args:
         robot: Identified.
@@ -174,7 +177,10 @@ def _actuator(joint: str, servo: dict[str, Any]) -> str:
 
 
 def readme(robot: str, form: NativeForm, errors_mrad: dict[str, float]) -> str:
-    """Return the README of the export; errors_mrad: form of the robot → error on the motions of check.npz."""
+    """Return the README of the export.
+
+    errors_mrad: form of the robot → error on the motions of check.npz.
+    """
     return README.format(
         robot=robot,
         native=errors_mrad["native"],

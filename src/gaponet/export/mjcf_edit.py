@@ -1,8 +1,8 @@
 """Write a copy of a user's MJCF with identified servos.
 
-Only attributes of named joints and servos change. Edits are made in the text, so comments, includes, defaults, meshes,
-sensors, tendons and keyframes stay as they were written. A table is added at the end of the file, a payload at the
-beginning of its body.
+Only attributes of named joints and servos change. Edits are made in the text, so comments,
+includes, defaults, meshes, sensors, tendons and keyframes stay as they were written. A table is
+added at the end of the file, a payload at the beginning of its body.
 """
 
 from __future__ import annotations
@@ -153,7 +153,8 @@ class Source:
             for name, text in self.sections.items()
         )
         edits = [*self.edits, (self.main, place, place, ends.encode())]
-        # From the back. Of an insertion right before an element that changes, the element comes first.
+        # From the back. Of an insertion right before an element that changes, the element comes
+        # first.
         for _, (file, start, end, new) in sorted(
             enumerate(edits), key=lambda e: (-e[1][1], e[1][1] == e[1][2], -e[0])
         ):
@@ -210,15 +211,18 @@ def edit_mjcf(
         path: The file.
         out: Folder for the copy.
         robot: Robot with the table and payload mounts to add.
-        facts: facts.json, with the prefix of joint names in the file. The plain form is written; delay buffers are long
-            enough for both forms. A joint that is not operated changes only if the file has no servo for it.
+        facts: facts.json, with the prefix of joint names in the file. The plain form is written;
+            delay buffers are long enough for both forms. A joint that is not operated changes only
+            if the file has no servo for it.
         payload_mass: In each hand, kg.
 
     Returns:
-        The copied main file, and joints with targets in another unit than rad. changes.diff in `out` has the changes.
+        The copied main file, and joints with targets in another unit than rad. changes.diff in
+        `out` has the changes.
 
     Raises:
-        RobotError: A joint is not in the text or has several servos, or the compiled copy lacks the wanted servos.
+        RobotError: A joint is not in the text or has several servos, or the compiled copy lacks the
+            wanted servos.
     """
     path, joints, prefix = path.resolve(), facts["plain"], facts["prefix"]
     before = compile_spec(spec := read_mjcf(path), path)
@@ -301,12 +305,15 @@ def _servo(servo: dict[str, Any], samples: int, own: dict[str, str]) -> str:
 
 
 def _is_ramped(servo: dict[str, Any]) -> bool:
-    """Return True for a servo that limits the speed of its targets, where MuJoCo can do that (<pid slewmax>)."""
+    """Return True for a servo that limits its targets' speed, if MuJoCo can (<pid slewmax>)."""
     return MUJOCO_HAS_RAMPS and servo["target_speed"] > 0
 
 
 def _servo_attributes(tag: Tag, model: mujoco.MjModel, joint: str) -> dict[str, str]:
-    """Return the attributes that a servo keeps: name, class, and the range of its targets if it is a position servo."""
+    """Return the attributes that a servo keeps.
+
+    Name, class, and the range of its targets if it is a position servo.
+    """
     own = {k: tag.attributes[k] for k in SERVO_ATTRIBUTES if k in tag.attributes} | {"joint": joint}
     i = _actuator(model, joint)
     if model.actuator_ctrllimited[i] and model.actuator_biasprm[i, 1]:
@@ -320,7 +327,10 @@ def _actuator(model: mujoco.MjModel, joint: str) -> int:
 
 
 def _radians_per_unit(model: mujoco.MjModel, joint: str) -> float:
-    """Return the position of a servo for a target of 1, rad: 0.0175 if targets are degrees; 1 if it has no targets."""
+    """Return the position of a servo for a target of 1, rad: 0.0175 if targets are degrees.
+
+    1 if it has no targets.
+    """
     i = _actuator(model, joint)
     stiffness = -float(model.actuator_biasprm[i, 1] * model.actuator_gear[i, 0])
     return float(model.actuator_gainprm[i, 0]) / stiffness if stiffness > 0 else 1.0
@@ -329,7 +339,7 @@ def _radians_per_unit(model: mujoco.MjModel, joint: str) -> float:
 def _add_surroundings(
     source: Source, robot: RobotSpec, prefix: str, payload_mass: float, model: mujoco.MjModel
 ) -> None:
-    """Add the solver's tolerance, the table and the payload, and write the inertias of identified links."""
+    """Add the solver's tolerance, table and payload, and write inertias of identified links."""
     option = {"tolerance": text_of(TOLERANCE)} if model.opt.tolerance > TOLERANCE else {}
 
     def body(name: str, what: str) -> Tag:
@@ -348,12 +358,18 @@ def _add_surroundings(
         option["cone"] = "elliptic"  # a pyramid's stiffness depends on friction
         if off:  # contacts are disabled in the file, and the pairs below are the only ones
             source.append("option", '    <flag contact="enable"/>\n')
-        source.append("worldbody", f'    <geom name="{table}" type="plane" size="2 2 0.1" contype="0" conaffinity="0" '
-                      f'pos="0 0 {text_of(robot.table.height)}" rgba="0.55 0.5 0.45 1"/>\n')  # fmt: skip
+        plane = (
+            f'<geom name="{table}" type="plane" size="2 2 0.1" contype="0" conaffinity="0" '
+            f'pos="0 0 {text_of(robot.table.height)}" rgba="0.55 0.5 0.45 1"/>'
+        )
+        source.append("worldbody", f"    {plane}\n")
         for i, tip in enumerate(robot.tips):
             name, size = f"{table}_tip_{i}", text_of(tip.radius)
-            source.insert(body(prefix + tip.body, "tip"), f'<geom name="{name}" type="sphere" size="{size}"'
-                          f' pos="{text_of(*tip.pos)}" mass="0" contype="0" conaffinity="0" group="3"/>')  # fmt: skip
+            sphere = (
+                f'<geom name="{name}" type="sphere" size="{size}" pos="{text_of(*tip.pos)}" '
+                'mass="0" contype="0" conaffinity="0" group="3"/>'
+            )
+            source.insert(body(prefix + tip.body, "tip"), sphere)
             words = _attributes(
                 {
                     f: text_of(*getattr(own, f"pair_{f}")[i])
@@ -374,9 +390,12 @@ def _add_surroundings(
     for mount in robot.payload_mounts:
         if mass := payload_mass + mount.mass:
             radius = (3 * mass / (4 * math.pi * PAYLOAD_DENSITY)) ** (1 / 3)
-            ball = f'<geom type="sphere" size="{text_of(radius)}" mass="{mass}" contype="0" conaffinity="0"/>'
-            source.insert(body(prefix + mount.body, "payload_mount"), f'<body name="{prefix}payload_{mount.side}" '
-                          f'pos="{text_of(*mount.pos)}">{ball}</body>')  # fmt: skip
+            ball = (
+                f'<geom type="sphere" size="{text_of(radius)}" mass="{mass}" '
+                'contype="0" conaffinity="0"/>'
+            )
+            payload = f'<body name="{prefix}payload_{mount.side}" pos="{text_of(*mount.pos)}">{ball}</body>'
+            source.insert(body(prefix + mount.body, "payload_mount"), payload)
     if option:
         source.append(f"option {_attributes(option)}", "")
 
@@ -386,7 +405,10 @@ def _attributes(values: dict[str, str]) -> str:
 
 
 def _write(source: Source, out: Path) -> Path:
-    """Write the edited files and all files that they name, in the same relative places; return the main one."""
+    """Write the edited files and all files that they name, in the same relative places.
+
+    Return the main one.
+    """
     needed = {
         Path(os.path.abspath(f)) for f in mujoco.mju_getXMLDependencies(str(source.main))
     } | set(source.text)

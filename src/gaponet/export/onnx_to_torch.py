@@ -27,16 +27,19 @@ def _gemm(inputs: list[Any], attributes: Attributes) -> Tensor:
     if attributes.get("transB", 0):
         right = right.T
     alpha = attributes.get("alpha", 1.0)
-    if len(inputs) < 3:
-        return alpha * (left @ right)
-    return torch.addmm(inputs[2], left, right, beta=attributes.get("beta", 1.0), alpha=alpha)
+    if len(inputs) == 3:
+        beta = attributes.get("beta", 1.0)
+        return torch.addmm(inputs[2], left, right, beta=beta, alpha=alpha)
+    product: Tensor = alpha * (left @ right)
+    return product
 
 
 def _cast(inputs: list[Any], attributes: Attributes) -> Tensor:
     import onnx
 
     kind = onnx.helper.tensor_dtype_to_np_dtype(attributes["to"])
-    return inputs[0].to(torch.from_numpy(np.zeros(0, kind)).dtype)
+    result: Tensor = inputs[0].to(torch.from_numpy(np.zeros(0, kind)).dtype)
+    return result
 
 
 def _clip(inputs: list[Any], attributes: Attributes) -> Tensor:
@@ -45,7 +48,7 @@ def _clip(inputs: list[Any], attributes: Attributes) -> Tensor:
 
 def _slice(inputs: list[Any], attributes: Attributes) -> Tensor:
     """inputs: Data, starts, ends, axes, and perhaps steps, which are 1."""
-    part = inputs[0]
+    part: Tensor = inputs[0]
     starts, ends, axes = inputs[1:4]
     for start, end, axis in zip(starts, ends, axes, strict=True):
         size = part.shape[axis]
@@ -58,22 +61,25 @@ def _slice(inputs: list[Any], attributes: Attributes) -> Tensor:
 def _flatten(inputs: list[Any], attributes: Attributes) -> Tensor:
     axis = attributes.get("axis", 1)
     width = int(np.prod(inputs[0].shape[axis:]))
-    return inputs[0].reshape(-1, width)
+    result: Tensor = inputs[0].reshape(-1, width)
+    return result
 
 
 def _reduce_sum(inputs: list[Any], attributes: Attributes) -> Tensor:
     axes = attributes["axes"] if len(inputs) < 2 else inputs[1]
-    return inputs[0].sum(axes, keepdim=bool(attributes.get("keepdims", 1)))
+    result: Tensor = inputs[0].sum(axes, keepdim=bool(attributes.get("keepdims", 1)))
+    return result
 
 
 def _squeeze(inputs: list[Any], attributes: Attributes) -> Tensor:
     axes = attributes["axes"] if len(inputs) < 2 else inputs[1]
-    return inputs[0].squeeze(tuple(axes))
+    result: Tensor = inputs[0].squeeze(tuple(axes))
+    return result
 
 
 def _unsqueeze(inputs: list[Any], attributes: Attributes) -> Tensor:
     axes = attributes["axes"] if len(inputs) < 2 else inputs[1]
-    result = inputs[0]
+    result: Tensor = inputs[0]
     for axis in sorted(axes):
         result = result.unsqueeze(axis)
     return result
@@ -106,7 +112,8 @@ OPERATORS: dict[str, Operator] = {
 class OnnxModule(nn.Module):
     """An ONNX file as a module: x (B, dim) float32 → Δa (B, n) rad.
 
-    What depends on no input is computed once, so weights that are stored with fewer digits cost nothing afterwards.
+    What depends on no input is computed once, so weights that are stored with fewer digits cost
+    nothing afterwards.
     """
 
     def __init__(self, file: Path) -> None:
@@ -156,7 +163,8 @@ class OnnxModule(nn.Module):
         values[self.input] = x
         for operator, names, attributes, output in self.steps:
             values[output] = operator([values[name] for name in names], attributes)
-        return values[self.output]
+        result: Tensor = values[self.output]
+        return result
 
 
 def _weights(graph: Any) -> dict[str, Any]:

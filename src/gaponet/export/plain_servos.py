@@ -1,4 +1,4 @@
-"""PD servos nearest to an identified robot with a servo model, and errors of a robot's forms on recordings."""
+"""PD servos nearest to a robot with a servo model, and errors of a robot's forms."""
 
 from __future__ import annotations
 
@@ -52,10 +52,13 @@ class _Stored(TypedDict):
 def read_recordings(
     folder: Path, data: str | None, robot: RobotSpec
 ) -> tuple[list[Sequence], list[Sequence]] | None:
-    """Read training and validation motions of a dataset, by default those that the robot was identified from.
+    """Read training and validation motions of a dataset.
+
+    The default are those that the robot was identified from.
 
     Returns:
-        None if there is no dataset, or if its robot was driven by torque, so that no motion can be commanded again.
+        None if there is no dataset, or if its robot was driven by torque, so that no motion can be
+        commanded again.
     """
     origin = read_origin(folder)
     if data is None and origin is not None:
@@ -82,13 +85,16 @@ def fit_plain_servos(
     progress: Progress = no_progress,
     engine_terms: tuple[str, ...] = (),
 ) -> RobotSpec:
-    """Fit the parameters of PD servos, without a servo model but for the terms that the engine has, to recordings.
+    """Fit the parameters of PD servos to recordings.
 
-    The result is stored in the robot folder, and read from there if nothing changed. A robot of the package brings it,
-    fitted to the recordings that it was identified from.
+    They have no servo model but for the terms that the engine has.
+
+    The result is stored in the robot folder, and read from there if nothing changed. A robot of the
+    package brings it, fitted to the recordings that it was identified from.
 
     Args:
-        robot: Identified; table, zeros and stops do not change. Returned unchanged if the engine has its servo model.
+        robot: Identified; table, zeros and stops do not change. Returned unchanged if the engine
+            has its servo model.
         recordings: Motions that it was fitted to, or its own (`own_motions`).
         progress: Called with done, total and a note, as by `identify`.
     """
@@ -120,7 +126,10 @@ def keep_plain_servos(folder: Path, fitted: RobotSpec, recordings: ListOf[Sequen
 
 
 def _without_terms(robot: RobotSpec, engine_terms: tuple[str, ...] = ()) -> RobotSpec:
-    """Return the robot without terms of the servo model but those of the engine; `robot` itself if it has none."""
+    """Return the robot without terms of the servo model but those of the engine.
+
+    `robot` itself if it has none.
+    """
     names = [name for name in SERVO_TERMS if name not in engine_terms]
     if not any(getattr(robot, name).any() for name in names):
         return robot
@@ -138,7 +147,10 @@ def _servos(robot: RobotSpec) -> PlainServos:
 
 
 def _key(robot: RobotSpec, recordings: ListOf[Sequence], *other: Array) -> str:
-    """Return a hash of all that a stored result depends on; the recordings' order is of no account."""
+    """Return a hash of all that a stored result depends on.
+
+    The recordings' order is of no account.
+    """
     key = hashlib.sha256(
         f"{__version__} {mujoco.__version__} {model_hash(robot)} {robot.operated}".encode()
     )
@@ -162,7 +174,7 @@ def _recording_digest(sequence: Sequence) -> bytes:
 
 
 def _ships_plain_servos(robot: RobotSpec, engine_terms: tuple[str, ...]) -> bool:
-    """Return True for a robot of the package, whose nearest servos without any further term lie beside it."""
+    """Return True for a robot of the package, beside which its nearest plain servos lie."""
     packaged = identified_catalogue().holds(robot.folder) and (robot.folder / CACHE).is_file()
     return packaged and not any(getattr(robot, name).any() for name in engine_terms)
 
@@ -175,7 +187,7 @@ def stored_result(
     recordings: ListOf[Sequence],
     *other: Array,
 ) -> T:
-    """Return a result from a file in the robot folder if its inputs are the same, else compute and store it.
+    """Return a stored result of the robot folder if its inputs are the same, else compute it.
 
     Args:
         kind: Type of the result, for `validated`.
@@ -196,7 +208,10 @@ def stored_result(
 
 
 def own_motions(robot: RobotSpec, payload_mass: float = 0.0, count: int = 24) -> list[Sequence]:
-    """Simulate motions of the robot itself, for use without recordings: all joints swing about home and pause."""
+    """Simulate motions of the robot itself, for use without recordings.
+
+    All joints swing about home and pause.
+    """
     rng, op = np.random.default_rng(0), robot.operated_index
     t = np.arange(0.0, OWN_MOTION_S, robot.dt)[:, None]
     home = robot.qpos_home[op]
@@ -228,7 +243,7 @@ def comparable(
 
 
 def rollout_error(recordings: ListOf[Sequence], robot: RobotSpec) -> float:
-    """Return the mean |error| of the operated joints over rollouts of recordings in gaponet, rad."""
+    """Return the mean |error| of operated joints over rollouts of recordings, rad."""
     op = robot.operated_index
     rollouts = replay(recordings, robot, lock_idle=True)
     return float(
@@ -251,7 +266,8 @@ def check_motions(
 ) -> list[Sequence]:
     """Return the first motions by name, cut in length, for check.npz.
 
-    ramped: Targets change as slowly as the servos change them, for engines that do not limit the speed of targets.
+    ramped: Targets change as slowly as the servos change them, for engines that do not limit the
+    speed of targets.
     """
     first = {s.meta.motion: s for s in reversed(recordings)}
     low, high = robot.qpos_range.T

@@ -1,9 +1,10 @@
-"""Randomisation for training: units sampled from the uncertainty of a robot, and a range for each number.
+"""Randomisation for training: units sampled from a robot's uncertainty, and ranges.
 
-Scope "today" uses the errors of this robot's values, "any-day" also the differences between its sessions on several
-days, "any-robot" the differences between several robots of its type. Days and robots are sampled whole, so that numbers
-which change together (a cold day) stay together; numbers sampled one by one give robots that do not exist. Motions show
-torques over kp: if kp of a unit is wrong, its torque limit is wrong by the same factor.
+Scope "today" uses the errors of this robot's values, "any-day" also the differences between its
+sessions on several days, "any-robot" the differences between several robots of its type. Days and
+robots are sampled whole, so that numbers which change together (a cold day) stay together; numbers
+sampled one by one give robots that do not exist. Motions show torques over kp: if kp of a unit is
+wrong, its torque limit is wrong by the same factor.
 """
 
 from __future__ import annotations
@@ -46,7 +47,8 @@ class Randomization:
     """Sampled units of a robot.
 
     Attributes:
-        units: Field → (samples, n), SI units, and coordinates of drawn links, (samples, Q); a row is one unit.
+        units: Field → (samples, n), SI units, and coordinates of drawn links, (samples, Q); a row
+            is one unit.
         ranges: Joint → field → low, value, high; 9 of 10 units lie between.
         unknown: "joint: field" of the numbers that no log determines.
         links: Axes of drawn links.
@@ -66,15 +68,19 @@ class Randomization:
 
 
 def sample_units(
-    robot: RobotSpec | Path, scope: Scope = "today", others: ListOf[Path] = (), samples: int = 256, seed: int = 0,
+    robot: RobotSpec | Path,
+    scope: Scope = "today",
+    others: ListOf[Path] = (),
+    samples: int = 256,
+    seed: int = 0,
     engine: Engine = "json",
-) -> Randomization:  # fmt: skip
+) -> Randomization:
     """Sample units of a robot.
 
     Args:
         robot: Robot folder that gaponet identify or gaponet adapt wrote.
-        scope: "today": errors of the values of this robot. "any-day": also differences between its sessions on
-            different days. "any-robot": differences between robots of its type.
+        scope: "today": errors of the values of this robot. "any-day": also differences between its
+            sessions on different days. "any-robot": differences between robots of its type.
         others: Robot folders of the type, each identified from its own logs.
         samples: Number of units.
         engine: Isaac Lab's units have the identified links.
@@ -153,10 +159,12 @@ def judge_units(
     progress: Progress = no_progress,
     engine_terms: tuple[str, ...] = (),
 ) -> Randomization:
-    """Choose the units that follow the robot's recordings, and state their errors (export/drawn_robots.py).
+    """Choose the units that follow the robot's recordings, and state their errors.
 
-    Units of other days and robots are left as they are: this robot's recordings cannot judge them. The engine has the
-    `engine_terms` of the servo model.
+    How they are chosen is in export/drawn_robots.py.
+
+    Units of other days and robots are left as they are: this robot's recordings cannot judge them.
+    The engine has the `engine_terms` of the servo model.
     """
     mass = recordings[0][0].meta.payload_mass if recordings and recordings[0] else 0.0
     train, validation = (comparable(part, robot, mass) for part in recordings or ((), ()))
@@ -185,7 +193,10 @@ def judge_units(
 
 
 def _days(uncertainty: ParameterUncertainty, joints: tuple[str, ...]) -> Array:
-    """Return the values of each day's session, (days, n, P); of several sessions on one day, the last."""
+    """Return the values of each day's session, (days, n, P).
+
+    Of several sessions on one day, the last.
+    """
     units = {s["unit"] for s in uncertainty.sources}
     if len(units) > 1:
         raise UsageError(
@@ -218,9 +229,12 @@ def _robots(spec: RobotSpec, fields: tuple[str, ...], others: ListOf[Path]) -> A
 
 
 def _uncorrelated_share(deviations: Array) -> float:
-    """Return the share of the variance between k days or robots, (k, n, P), that is sampled number by number.
+    """Return the share of the variance that is sampled number by number.
 
-    In few days or robots, numbers change together by chance (shrinkage of correlations, Schäfer and Strimmer 2005).
+    The deviations are those of k days or robots, (k, n, P).
+
+    In few days or robots, numbers change together by chance (shrinkage of correlations, Schäfer and
+    Strimmer 2005).
     """
     if len(deviations) < MIN_ROBOTS:
         return 0.0
@@ -231,33 +245,43 @@ def _uncorrelated_share(deviations: Array) -> float:
 
 
 def _std_factor(count: int) -> float:
-    """Return the factor by which a standard deviation of `count` values may be too small, 9 of 10 times."""
+    """Return by which factor a standard deviation may be too small, 9 of 10 times.
+
+    It is that of `count` values.
+    """
     from scipy.stats import chi2
 
     return float(np.sqrt((count - 1) / chi2.ppf(0.1, count - 1)))
 
 
 def write_randomization(made: Randomization, engine: Engine, folder: Path) -> Path:
-    """Write units and ranges as JSON, and the file of an engine beside it; return the engine's file.
+    """Write units and ranges as JSON, and the file of an engine beside it.
+
+    Return the engine's file.
 
     Raises:
-        NoGainError: Units of the engine's form follow the recordings worse than ± 20 % on each number.
+        NoGainError: Units of the engine's form follow the recordings worse than ± 20 % on each
+            number.
     """
     if (runs := made.plain if engine in ("mujoco", "isaaclab") else made.judged) is not None:
         runs.require_better_than_by_hand()
     content: dict[str, Any] = {
-        "robot": made.robot, "scope": made.scope, "joints": list(made.ranges),
-        "ranges": {j: {f: dict(zip(("low", "value", "high"), r, strict=True)) for f, r in by.items()}
-                   for j, by in made.ranges.items()},
-        "units": _written(made.units, made.links), "unknown": made.unknown, "notes": made.notes,
-    }  # fmt: skip
-    content |= {"bodies": made.links.bodies} if made.links else {}
+        "robot": made.robot,
+        "scope": made.scope,
+        "joints": list(made.ranges),
+        "ranges": {joint: _written_ranges(by_field) for joint, by_field in made.ranges.items()},
+        "units": _written(made.units, made.links),
+        "unknown": made.unknown,
+        "notes": made.notes,
+    }
+    if made.links:
+        content["bodies"] = made.links.bodies
     if made.judged is not None and made.plain is not None:
-        content |= {
-            "plain_units": _written(made.plain.units, made.links),
-            "error_mrad": {form: {name: 1e3 * error for name, error in drawn.errors.items()}
-                           for form, drawn in (("servo model", made.judged), ("plain", made.plain))},
-        }  # fmt: skip
+        content["plain_units"] = _written(made.plain.units, made.links)
+        content["error_mrad"] = {
+            "servo model": _in_mrad(made.judged.errors),
+            "plain": _in_mrad(made.plain.errors),
+        }
     with lock_folder(folder, FOLDER_KIND):
         write_json(folder / FILE, content)
         if engine == "json":
@@ -266,6 +290,17 @@ def write_randomization(made: Randomization, engine: Engine, folder: Path) -> Pa
         shipped = "mujoco_randomization.py" if engine == "mujoco" else "unit_events.py"
         write_text(file, (SHIPPED / shipped).read_text(encoding="utf-8"))
     return file
+
+
+def _written_ranges(ranges: dict[str, tuple[float, float, float]]) -> dict[str, Any]:
+    """Return field → low, value and high by name."""
+    return {
+        field: dict(zip(("low", "value", "high"), r, strict=True)) for field, r in ranges.items()
+    }
+
+
+def _in_mrad(errors: dict[str, float]) -> dict[str, float]:
+    return {name: 1e3 * error for name, error in errors.items()}
 
 
 def _written(units: Mapping[str, Any], axes: LinkAxes | None) -> dict[str, Any]:
@@ -277,7 +312,7 @@ def _written(units: Mapping[str, Any], axes: LinkAxes | None) -> dict[str, Any]:
 
 
 def table_rows(made: Randomization) -> tuple[list[str], list[list[str]]]:
-    """Return headings and rows: joint, and low … high of each number that is not zero everywhere."""
+    """Return headings and rows: joint, and low … high of numbers that are not all zero."""
     fields = [
         SERVO_FIELDS[f]
         for f in next(iter(made.ranges.values()))

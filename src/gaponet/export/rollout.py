@@ -1,4 +1,4 @@
-"""Predict what an identified robot does under the targets of a policy's rollout, with an error band."""
+"""Predict what an identified robot does under a policy's targets, with an error band."""
 
 from __future__ import annotations
 
@@ -49,9 +49,12 @@ def sample_robots(
 
 
 def validation_error(robot: RobotSpec, recordings: ListOf[Sequence]) -> Array:
-    """Return an |error| that BAND_SHARE of the rows of every recording stay below, (n,) rad for the operated joints.
+    """Return an |error| that BAND_SHARE of the rows of every recording stay below.
 
-    The quantile over all rows together would be too narrow: motions differ, and there are few of them.
+    It is (n,) rad for the operated joints.
+
+    The quantile over all rows together would be too narrow: motions differ, and there are few of
+    them.
     """
     op = robot.operated_index
     rollouts = replay(recordings, robot, lock_idle=True)
@@ -68,7 +71,8 @@ def predict(
         robot: Identified.
         rollouts: Sequences with the targets as ctrl and the states of the policy's simulator.
         error: (n,) rad, as of `validation_error`.
-        sampled: Robots as of `sample_robots`; their deviation from the prediction is added to the band.
+        sampled: Robots as of `sample_robots`; their deviation from the prediction is added to the
+            band.
     """
     op = robot.operated_index
     played = [r.qpos[:, op] for r in replay(rollouts, robot, lock_idle=True)]
@@ -90,7 +94,10 @@ def predict(
 def summary(
     predictions: ListOf[RolloutPrediction], joints: ListOf[str]
 ) -> dict[str, dict[str, Any]]:
-    """Return mean and largest differences of each joint over all rollouts, rad and shares of time."""
+    """Return mean and largest differences of each joint over all rollouts.
+
+    They are in rad, and in shares of time.
+    """
 
     def rows(values: Any) -> Array:
         """All rows but the first ones, which are given."""
@@ -109,12 +116,17 @@ def summary(
     worst_at = [
         float(np.abs(p.rollout - p.robot)[:, j].argmax() * p.dt) for j, p in enumerate(worst)
     ]
-    return {
-        joint: {
-            "rollout_behind": float(rollout_behind[:, j].mean()), "robot_behind": float(robot_behind[:, j].mean()),
-            "apart": float(difference[:, j].mean()), "apart_first_second": float(first[:, j].mean()),
-            "band": float(band[:, j].mean()), "inside": float(inside[:, j].mean()),
-            "worst": float(largest[:, j].max()), "worst_in": worst[j].name, "worst_at": worst_at[j],
+    by_joint = {}
+    for j, joint in enumerate(joints):
+        by_joint[joint] = {
+            "rollout_behind": float(rollout_behind[:, j].mean()),
+            "robot_behind": float(robot_behind[:, j].mean()),
+            "apart": float(difference[:, j].mean()),
+            "apart_first_second": float(first[:, j].mean()),
+            "band": float(band[:, j].mean()),
+            "inside": float(inside[:, j].mean()),
+            "worst": float(largest[:, j].max()),
+            "worst_in": worst[j].name,
+            "worst_at": worst_at[j],
         }
-        for j, joint in enumerate(joints)
-    }  # fmt: skip
+    return by_joint

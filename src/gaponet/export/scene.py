@@ -1,7 +1,9 @@
-"""Identified servos in a user's own scene: an mjSpec with other objects, other robots, another table.
+"""Identified servos in a user's own scene.
 
-`apply` writes what MuJoCo can hold into the specification, by joint name. What it cannot hold, the servo model, is
-computed before each physics step by the object that `Applied.servos` returns.
+It is an mjSpec with other objects, other robots or another table.
+
+`apply` writes what MuJoCo can hold into the specification, by joint name. What it cannot hold, the
+servo model, is computed before each physics step by the object that `Applied.servos` returns.
 """
 
 from __future__ import annotations
@@ -48,10 +50,12 @@ class Applied:
     facts: dict[str, Any]
 
     def servos(self, model: mujoco.MjModel) -> Servos:
-        """Return the servos of the compiled scene; call their `before(data)` before each physics step.
+        """Return the servos of the compiled scene.
 
-        This also makes joint friction as stiff as in gaponet, which no MJCF can express, so it is worth a call where
-        there is no servo model, too.
+        Call their `before(data)` before each physics step.
+
+        This also makes joint friction as stiff as in gaponet, which no MJCF can express, so it is
+        worth a call where there is no servo model, too.
         """
         return Servos(model, self.facts, self.prefix)
 
@@ -63,20 +67,23 @@ def apply(robot: RobotSpec, spec: mujoco.MjSpec, *, prefix: str = "") -> Applied
         applied = gp.apply(gp.load_robot("./my_so101"), spec, prefix="left/")
         model = spec.compile()
 
-    Joints get armature, damping, dry friction and the encoder's zero; links their identified inertias. A servo gets its
-    gains, torque limit, offset and delay, and a limit of its target's speed where one was identified. A joint without
-    an actuator gets one of the joint's name. Names, classes and groups stay, like everything else in the scene. Only
-    operated joints change. Nothing is changed if anything contradicts.
+    Joints get armature, damping, dry friction and the encoder's zero; links their identified
+    inertias. A servo gets its gains, torque limit, offset and delay, and a limit of its target's
+    speed where one was identified. A joint without an actuator gets one of the joint's name. Names,
+    classes and groups stay, like everything else in the scene. Only operated joints change. Nothing
+    is changed if anything contradicts.
 
     Args:
         robot: Identified, or nominal.
-        spec: The scene; it is changed. Set its timestep before, because buffers of delays are as long as it asks.
+        spec: The scene; it is changed. Set its timestep before, because buffers of delays are as
+            long as it asks.
         prefix: Text before the names of the robot's joints and bodies in the scene.
 
     Raises:
-        RobotError: The scene contradicts the robot: a joint is missing, has another kind, axis or range, or more than
-            one actuator, or one that takes no position targets in rad; a body with identified inertia is missing; or
-            this MuJoCo is too old for what was identified. Every contradiction is named.
+        RobotError: The scene contradicts the robot: a joint is missing, has another kind, axis or
+            range, or more than one actuator, or one that takes no position targets in rad; a body
+            with identified inertia is missing; or this MuJoCo is too old for what was identified.
+            Every contradiction is named.
     """
     problems = [*_joint_problems(robot, spec, prefix), *_body_problems(robot, spec, prefix)]
     if not problems:
@@ -197,7 +204,8 @@ def _axis_problems(
 ) -> list[str]:
     """Return the joints whose axis stands otherwise to that of the operated joint before.
 
-    The robot may stand anywhere in the scene, so only angles between its own axes count. Both stand at home.
+    The robot may stand anywhere in the scene, so only angles between its own axes count. Both stand
+    at home.
     """
     names = robot.operated
     home = robot.qpos_home[robot.operated_index]

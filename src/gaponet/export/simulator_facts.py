@@ -1,4 +1,7 @@
-"""The simulator of a robot for other engines: numbers with units (facts.json), and one MJCF with its servos."""
+"""The simulator of a robot for other engines.
+
+Numbers with units (facts.json), and one MJCF with its servos.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +28,7 @@ MEANING = {
     "offset": "the servo aims at command + offset",
     "zero": "the MJCF's angle is reading + zero; robot.xml has it as ref",
     "dof_invweight0_factor": "of joints' dof_invweight0 after compilation, for stiff friction; MJCF has no such field",
-    "law": "servo model beyond PD, by joint; not in any MJCF, but in the helper file, and for mjlab in its action term",
+    "law": "servo model beyond PD, by joint; not in any MJCF, but in the helper file, and for mjlab in its actuators",
     "plain": "numbers fitted for PD servos without the servo model; equal to joints without one",
     "error_mrad": "mean |error| of joints on the motions of check.npz, in gaponet",
     "mujoco": "fields of the compiled MjModel by their names",
@@ -36,7 +39,7 @@ Joints = dict[str, dict[str, Any]]  # joint → an identified servo and its join
 
 
 def control_period(robot: RobotSpec, periods: Iterable[float]) -> float:
-    """Return the robot's control period if one of these equals it within 2 %, otherwise the first of these, s."""
+    """Return the robot's control period if one of these is within 2 % of it, else the first, s."""
     periods = [*periods]
     return robot.dt if any(abs(dt / robot.dt - 1) < 0.02 for dt in periods) else periods[0]
 
@@ -55,39 +58,58 @@ def simulator_facts(
     model = build_model(robot, payload_mass, dt=dt)
     plain_model = model if plain is None else build_model(plain, payload_mass, dt=dt)
     joints: dict[str, Any] = {}
+    without_model: dict[str, Any] = {}
     for i, name in enumerate(robot.joint_names):
-        law = (
-            {term: float(getattr(robot, term)[i]) for term in SERVO_TERMS}
-            if robot.has_servo_model
-            else {}
-        )
-        joints[name] = servo_facts(robot, model, i) | {"mujoco": joint_fields(model, name)} | law
+        joints[name] = servo_facts(robot, model, i) | {"mujoco": joint_fields(model, name)}
+        if robot.has_servo_model:
+            joints[name] |= {term: float(getattr(robot, term)[i]) for term in SERVO_TERMS}
+        without_model[name] = servo_facts(plain or robot, plain_model, i)
     return {
-        "format": 2, "robot": robot.name, "simulator": model_hash(robot), "units": UNITS, "meaning": MEANING,
-        "versions": {"mujoco": mujoco.__version__}, "dt": dt, "decimation": robot.steps_per(dt),
-        "payload_mass": payload_mass, "corrected": list(robot.operated), "options": solver_options(model),
-        "dof_invweight0_factor": STIFF_MOBILITY, "law": [term for term in SERVO_TERMS if getattr(robot, term).any()],
+        "format": 2,
+        "robot": robot.name,
+        "simulator": model_hash(robot),
+        "units": UNITS,
+        "meaning": MEANING,
+        "versions": {"mujoco": mujoco.__version__},
+        "dt": dt,
+        "decimation": robot.steps_per(dt),
+        "payload_mass": payload_mass,
+        "corrected": list(robot.operated),
+        "options": solver_options(model),
+        "dof_invweight0_factor": STIFF_MOBILITY,
+        "law": [term for term in SERVO_TERMS if getattr(robot, term).any()],
         "joints": joints,
-        "plain": {name: servo_facts(plain or robot, plain_model, i) for i, name in enumerate(robot.joint_names)},
-    }  # fmt: skip
+        "plain": without_model,
+    }
 
 
 def servo_facts(robot: RobotSpec, model: mujoco.MjModel, i: int) -> dict[str, Any]:
     """Return joint i of a robot as its compiled model has it."""
     joint = model.joint(robot.joint_names[i])
     dof = joint.dofadr[0]
-    return {
+    servo = {
         "home": float(robot.qpos_home[i]),
         "range": model.jnt_range[joint.id].tolist() if model.jnt_limited[joint.id] else None,
-        "kp": float(robot.kp[i]), "kd": float(robot.kd[i]), "effort_limit": float(robot.effort_limit[i]),
-        "armature": float(model.dof_armature[dof]), "damping": float(np.ravel(model.dof_damping[dof])[0]),
-        "frictionloss": float(model.dof_frictionloss[dof]), "delay": float(robot.delay[i]),
-        "offset": float(robot.offset[i]), "zero": float(robot.zero[i]), "target_speed": float(robot.target_speed[i]),
-    } | ({"no_load_speed": speed} if (speed := float(robot.no_load_speed[i])) else {})  # fmt: skip
+        "kp": float(robot.kp[i]),
+        "kd": float(robot.kd[i]),
+        "effort_limit": float(robot.effort_limit[i]),
+        "armature": float(model.dof_armature[dof]),
+        "damping": float(np.ravel(model.dof_damping[dof])[0]),
+        "frictionloss": float(model.dof_frictionloss[dof]),
+        "delay": float(robot.delay[i]),
+        "offset": float(robot.offset[i]),
+        "zero": float(robot.zero[i]),
+        "target_speed": float(robot.target_speed[i]),
+    }
+    if robot.no_load_speed[i]:
+        servo["no_load_speed"] = float(robot.no_load_speed[i])
+    return servo
 
 
 def mjcf_text(robot: RobotSpec, dt: float, payload_mass: float = 0.0) -> str:
-    """Return the simulator as one MJCF without other files: joints, solver options and servos with their delays.
+    """Return the simulator as one MJCF without other files.
+
+    It has joints, solver options, and servos with their delays.
 
     Raises:
         RobotError: One file cannot express the simulator.

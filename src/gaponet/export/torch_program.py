@@ -1,4 +1,6 @@
-"""One control period of a model (nn/loop.DeltaLoop) as a torch.export program (.pt2), which plain torch loads.
+"""One control period of a model (nn/loop.DeltaLoop) as a torch.export program (.pt2).
+
+Plain torch loads it:
 
 step = torch.export.load("delta.pt2").module()
 delta, frames = step(qpos, qvel, ctrl, payload_mass, frames, fresh)   # as DeltaStep.forward
@@ -35,9 +37,11 @@ class DeltaStep(nn.Module):
     Attributes:
         depth: Frames in the past; a frame is [q | q̇ | applied target], 3n numbers.
         told: The network is told the simulator's answers to fixed probes (sim/context.py).
-        context: If so, these answers, (8n) rad: of the robot's own simulator, until others are written into it. Of a
-            network that is not told the payload, with the payload of the export in hand.
-        refused: Number of answers of the network that were not finite, () int64; there Δa is zero, as in nn/bound.py.
+        context: If so, these answers, (8n) rad: of the robot's own simulator, until others are
+            written into it. Of a network that is not told the payload, with the payload of the
+            export in hand.
+        refused: Number of answers of the network that were not finite, () int64; there Δa is zero,
+            as in nn/bound.py.
     """
 
     context: Tensor
@@ -78,7 +82,8 @@ class DeltaStep(nn.Module):
         Gradients do not reach earlier periods.
 
         Args:
-            qpos, qvel, ctrl: (B, n) rad, rad/s, rad; a target that is not finite counts as the last applied one.
+            qpos, qvel, ctrl: (B, n) rad, rad/s, rad; a target that is not finite counts as the last
+                applied one.
             payload_mass: (B,) kg.
             frames: The past, newest first, (B, depth, 3n).
             fresh: Worlds without a past, (B,) bool; their past is the present frame, repeated.
@@ -100,7 +105,10 @@ class DeltaStep(nn.Module):
         return applied - ctrl, torch.cat([newest[:, None], frames[:, :-1]], dim=1)
 
     def _bounded(self, delta: Tensor) -> Tensor:
-        """Return answers (B, n) rad within ±delta_max, and zero where one is not finite; count these."""
+        """Return answers (B, n) rad within ±delta_max, and zero where one is not finite.
+
+        Count these.
+        """
         finite = torch.isfinite(delta).all(dim=1)
         self.refused += (~finite).sum()
         limited = delta.clamp(-self.delta_max, self.delta_max)
@@ -108,7 +116,7 @@ class DeltaStep(nn.Module):
 
 
 def _context(model: GapModel, payload_mass: float) -> np.ndarray:
-    """Return the answers of the robot's own simulator, (8n) rad, with a payload in each hand, kg."""
+    """Return the answers of the robot's simulator, (8n) rad, with a payload in each hand, kg."""
     robot = model.simulator()
     dt = (model.card.get("dt") or [robot.dt])[0]
     loaded = own_context(model, robot, [Condition(payload_mass, "both", dt)])
@@ -116,13 +124,16 @@ def _context(model: GapModel, payload_mass: float) -> np.ndarray:
 
 
 def delta_step(model: GapModel, run: Path, payload_mass: float = 0.0) -> DeltaStep:
-    """Load the step of a run's network from its checkpoint, and of a network of the package from its ONNX file.
+    """Load the step of a run's network, or of a network of the package.
+
+    The first is in a checkpoint, the second in an ONNX file.
 
     Args:
         payload_mass: In each hand, kg, of a network that is not told it.
 
     Raises:
-        ModelError: There is no checkpoint, or the model holds corrections, has sensors or reads the recorded state.
+        ModelError: There is no checkpoint, or the model holds corrections, has sensors or reads the
+            recorded state.
     """
     if model.config.holds:
         raise ModelError(
@@ -167,7 +178,8 @@ def export_program(model: GapModel, run: Path, folder: Path, payload_mass: float
         Largest difference, rad.
 
     Raises:
-        ModelError: The difference is above 1e-5 rad, or `delta_step` refuses the model; nothing is written.
+        ModelError: The difference is above 1e-5 rad, or `delta_step` refuses the model; nothing is
+            written.
     """
     step, path = delta_step(model, run, payload_mass), folder / PROGRAM
     content = io.BytesIO()  # torch ends the process if it writes to a full disk itself
@@ -187,7 +199,10 @@ def export_program(model: GapModel, run: Path, folder: Path, payload_mass: float
 
 
 def _largest_difference(program: Any, step: DeltaStep, model: GapModel) -> float:
-    """Return the largest |program − artifact| on random motions, rad; one world restarts half-way."""
+    """Return the largest |program − artifact| on random motions, rad.
+
+    One world restarts half-way.
+    """
     rng = np.random.default_rng(0)
     loop = model.loop(CHECK_WORLDS, step.context.numpy() if step.told else None)
     past = Past(program, CHECK_WORLDS, step.depth, step.n, "cpu")

@@ -1,4 +1,6 @@
-"""Write a copy of a user's URDF with identified damping, friction, effort limits and inertias; nothing else changes.
+"""Write a copy of a user's URDF with identified damping, friction, effort limits and inertias.
+
+Nothing else changes.
 
 URDF has no place for gains, armature, delay or offsets.
 """
@@ -39,7 +41,8 @@ def edit_urdf(
         robot: Robot with the joints and links to change.
 
     Returns:
-        The copy, and links that stay: their mass in the file is not the nominal one, so their frame may differ too.
+        The copy, and links that stay: their mass in the file is not the nominal one, so their frame
+            may differ too.
 
     Raises:
         RobotError: A joint is not in the file, or it is no URDF.
@@ -78,7 +81,10 @@ def edit_urdf(
 
 
 def _set_links(source: Source, robot: RobotSpec, prefix: str) -> list[str]:
-    """Write the inertias of identified links whose mass is as before; return the names of others."""
+    """Write the inertias of identified links whose mass is as before.
+
+    Return the names of others.
+    """
     before, other = build_model(robot.before_identification), list[str]()
     tags = {t.attributes.get("name", ""): t for t in source.tags if t.name == "link"}
     for name, link in robot.links.items():
@@ -92,13 +98,17 @@ def _set_links(source: Source, robot: RobotSpec, prefix: str) -> list[str]:
             ("ixx", "iyy", "izz", "ixy", "ixz", "iyz"), map(text_of, link.inertia), strict=True
         )
         numbers = " ".join(f'{axis}="{value}"' for axis, value in axes)
-        source.replace(inertial, f'<inertial><origin xyz="{text_of(*link.pos)}"/><mass value="{text_of(link.mass)}"/>'
-                                 f"<inertia {numbers}/></inertial>")  # fmt: skip
+        origin = f'<origin xyz="{text_of(*link.pos)}"/>'
+        weight = f'<mass value="{text_of(link.mass)}"/>'
+        source.replace(inertial, f"<inertial>{origin}{weight}<inertia {numbers}/></inertial>")
     return other
 
 
 def with_urdf_fields(plain: RobotSpec) -> RobotSpec:
-    """Return the robot as such a file describes it: gains, armature, delays, offsets and stops are the nominal ones."""
+    """Return the robot as such a file describes it.
+
+    Gains, armature, delays, offsets and stops are the nominal ones.
+    """
     nominal = plain.before_identification
     missing = {f: getattr(nominal, f) for f in (*MISSING_FIELDS, "stop_low", "stop_high")}
     return replace(plain, **missing, nominal=nominal)

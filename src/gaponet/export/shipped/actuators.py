@@ -1,4 +1,6 @@
-"""Classes of mjlab and Isaac Lab for the actuator networks beside this file; robot.xml has no servos.
+"""Classes of mjlab and Isaac Lab for the actuator networks beside this file.
+
+robot.xml has no servos.
 
 mjlab:      EntityArticulationInfoCfg(actuators=mjlab_actuators(FOLDER))
 Isaac Lab:  ArticulationCfg(actuators=isaaclab_actuators(FOLDER), …)
@@ -20,14 +22,21 @@ def mjlab_actuators(folder: Path) -> tuple[Any, ...]:
     from mjlab.actuator import LearnedMlpActuatorCfg
 
     facts = read(folder / "facts.json")
-    return tuple(
-        LearnedMlpActuatorCfg(
-            target_names_expr=(name,), network_file=str(folder / f"{name}.pt"), pos_scale=1.0, vel_scale=1.0,
-            torque_scale=1.0, history_length=facts["actuator_net"]["length"], effort_limit=joint["effort_limit"],
-            saturation_effort=NO_LIMIT, velocity_limit=NO_LIMIT,
+    actuators = []
+    for name, joint in facts["joints"].items():
+        actuator = LearnedMlpActuatorCfg(
+            target_names_expr=(name,),
+            network_file=str(folder / f"{name}.pt"),
+            pos_scale=1.0,
+            vel_scale=1.0,
+            torque_scale=1.0,
+            history_length=facts["actuator_net"]["length"],
+            effort_limit=joint["effort_limit"],
+            saturation_effort=NO_LIMIT,
+            velocity_limit=NO_LIMIT,
         )
-        for name, joint in facts["joints"].items()
-    )  # fmt: skip
+        actuators.append(actuator)
+    return tuple(actuators)
 
 
 def isaaclab_actuators(folder: Path) -> dict[str, Any]:
@@ -36,15 +45,23 @@ def isaaclab_actuators(folder: Path) -> dict[str, Any]:
 
     facts = read(folder / "facts.json")
     fields = ActuatorNetMLPCfg.__dataclass_fields__
-    limit = (
-        "actuator_effort_limit" if "actuator_effort_limit" in fields else "effort_limit"
-    )  # Isaac Lab 3 renamed it
-    return {
-        name: ActuatorNetMLPCfg(
-            joint_names_expr=[name], network_file=str(folder / f"{name}.pt"), pos_scale=1.0, vel_scale=1.0,
-            torque_scale=1.0, input_order="pos_vel", input_idx=list(range(facts["actuator_net"]["length"])),
-            saturation_effort=NO_LIMIT, velocity_limit=NO_LIMIT, armature=joint["armature"],
-            friction=joint["frictionloss"], viscous_friction=joint["damping"], **{limit: joint["effort_limit"]},
+    # Isaac Lab 3 renamed it.
+    limit = "actuator_effort_limit" if "actuator_effort_limit" in fields else "effort_limit"
+    actuators = {}
+    for name, joint in facts["joints"].items():
+        actuators[name] = ActuatorNetMLPCfg(
+            joint_names_expr=[name],
+            network_file=str(folder / f"{name}.pt"),
+            pos_scale=1.0,
+            vel_scale=1.0,
+            torque_scale=1.0,
+            input_order="pos_vel",
+            input_idx=list(range(facts["actuator_net"]["length"])),
+            saturation_effort=NO_LIMIT,
+            velocity_limit=NO_LIMIT,
+            armature=joint["armature"],
+            friction=joint["frictionloss"],
+            viscous_friction=joint["damping"],
+            **{limit: joint["effort_limit"]},
         )
-        for name, joint in facts["joints"].items()
-    }  # fmt: skip
+    return actuators

@@ -1,5 +1,6 @@
-"""Play the motions of check.npz in Isaac Lab 3 on Newton's MuJoCo-Warp, in a few worlds, and print the error beside
-gaponet's. The USD is made by mujoco-usd-converter.
+"""Play the motions of check.npz in Isaac Lab 3, and print the error beside gaponet's.
+
+A few worlds run on Newton's MuJoCo-Warp. The USD is made by mujoco-usd-converter.
 
 python check.py                            # robot_cfg.py: Isaac Lab's own classes, its native actuators
 python check.py action                     # the action term of gaponet_action.py; its native actuators are off
@@ -79,13 +80,20 @@ fields = ("integrator", "tolerance", "iterations", "ls_iterations")
 solver = MJWarpSolverCfg(
     disable_contacts=True, **{field: check.facts["options"][field] for field in fields}
 )
+simulation = sim_utils.SimulationCfg(
+    dt=check.step,
+    use_newton_actuators=is_native,
+    device="cpu",
+    physics=NewtonCfg(solver_cfg=solver),
+)
 cfg = ManagerBasedEnvCfg(
-    decimation=check.facts["decimation"], scene=Scene(num_envs=check.worlds, env_spacing=2.0),
-    sim=sim_utils.SimulationCfg(
-        dt=check.step, use_newton_actuators=is_native, device="cpu", physics=NewtonCfg(solver_cfg=solver)
-    ),
-    observations=Observations(), actions=Actions(), events=events,
-)  # fmt: skip
+    decimation=check.facts["decimation"],
+    scene=Scene(num_envs=check.worlds, env_spacing=2.0),
+    sim=simulation,
+    observations=Observations(),
+    actions=Actions(),
+    events=events,
+)
 env = ManagerBasedEnv(cfg)
 path = player.run(env, env.action_manager.get_term("joint_pos")._joint_names)
 what = "'s own classes" if is_native else ", action term"

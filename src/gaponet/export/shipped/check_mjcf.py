@@ -1,4 +1,7 @@
-"""Play the motions of check.npz with the MJCF in plain MuJoCo, and print the error beside gaponet's: python check.py"""
+"""Play the motions of check.npz in plain MuJoCo, and print the error beside gaponet's.
+
+python check.py
+"""
 
 from pathlib import Path
 

@@ -1,4 +1,6 @@
-"""Play the motions of check.npz in mjlab, in a few worlds, and print the error beside gaponet's: python check.py
+"""Play the motions of check.npz in a few worlds of mjlab, and print the error beside gaponet's.
+
+python check.py
 
 python check.py randomization.json ROW     # the same with a unit of gaponet export ROBOT --to randomization
 

@@ -1,7 +1,9 @@
-"""Play the motions of check.npz in Newton (MuJoCo-Warp), with PD servos or with neural drives for actuator networks.
+"""Play the motions of check.npz in Newton (MuJoCo-Warp), and print the error beside gaponet's.
 
-Newton ignores actuators' delays; PD servos get their targets through a buffer here. Neural drives need onnx and
-warp-nn.
+The servos are PD servos, or neural drives for actuator networks.
+
+Newton ignores actuators' delays; PD servos get their targets through a buffer here. Neural drives
+need onnx and warp-nn.
 """
 
 from pathlib import Path

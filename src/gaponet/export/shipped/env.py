@@ -1,10 +1,12 @@
-"""EnvHub environment of LeRobot: the robot with its identified servos, in MuJoCo. It needs no gaponet.
+"""EnvHub environment of LeRobot: the robot with its identified servos, in MuJoCo.
+
+It needs no gaponet.
 
 envs = lerobot.envs.factory.make_env("USER/NAME", n_envs=4, trust_remote_code=True)   # this folder, on the Hub
 envs = make_env(n_envs=4)                                                             # this file, without LeRobot
 
-The task is to bring the joints to angles that are drawn for each episode, and to keep them there. Values are LeRobot's:
-degrees, and 0..100 for a joint whose unit in facts.json is percent.
+The task is to bring the joints to angles that are drawn for each episode, and to keep them there.
+Values are LeRobot's: degrees, and 0..100 for a joint whose unit in facts.json is percent.
 """
 
 from __future__ import annotations
@@ -29,7 +31,10 @@ IMAGE_SIZE = 480, 640  # height, width
 
 
 def _folder() -> Path:
-    """Return the folder of this file; LeRobot fetches env.py alone, so the rest comes from the same repository."""
+    """Return the folder of this file.
+
+    LeRobot fetches env.py alone, so the rest comes from the same repository.
+    """
     here = Path(__file__).absolute().parent  # not resolved: files of the Hub's cache are links
     if (here / "facts.json").is_file():
         return here
@@ -47,8 +52,8 @@ from gaponet.export.shipped.mujoco_servos import Servos, addresses, fill_delays,
 class RobotEnv(gymnasium.Env[Any, Any]):
     """One robot that is to reach a goal, and stay there.
 
-    Observation: agent_pos (n), environment_state (n), the goal, and with `pixels` an image; action: targets (n).
-    Reward: minus the mean distance of the operated joints from the goal, rad.
+    Observation: agent_pos (n), environment_state (n), the goal, and with `pixels` an image; action:
+    targets (n). Reward: minus the mean distance of the operated joints from the goal, rad.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 50}  # noqa: RUF012
@@ -176,13 +181,15 @@ def make_env(
     servos: str = "identified",
     pixels: bool = False,
 ) -> dict[str, dict[int, Any]]:
-    """Return environments as LeRobot's EnvHub takes them: suite → number of the task → vector environment.
+    """Return environments as LeRobot's EnvHub takes them.
+
+    Suite → number of the task → vector environment.
 
     Args:
         n_envs: Number of robots.
         use_async_envs: Whether each has a process of its own.
-        cfg: LeRobot's EnvConfig, if any. Its task may be one of SERVOS; an obs_type that begins with pixels adds
-            images.
+        cfg: LeRobot's EnvConfig, if any. Its task may be one of SERVOS; an obs_type that begins
+            with pixels adds images.
         servos, pixels: As in RobotEnv, without cfg.
     """
     if getattr(cfg, "task", None) in SERVOS:

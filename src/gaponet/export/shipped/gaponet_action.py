@@ -9,12 +9,14 @@ mjlab:      cfg.scene.entities["robot"] = mjlab_entity(FOLDER)
             cfg.sim.mujoco, cfg.decimation = mjlab_options(FOLDER)
             cfg.events |= mjlab_events(FOLDER)
             and of a run, for its network:
-            cfg.actions["joint_pos"] = mjlab_action(FOLDER, entity_name="robot", actuator_names=(".*",))
+            cfg.actions["joint_pos"] = mjlab_action(FOLDER, entity_name="robot",
+            actuator_names=(".*",))
 Isaac Lab:  cfg.scene.robot.actuators = isaaclab_actuators(FOLDER)
             cfg.actions.joint_pos = isaaclab_action(FOLDER, asset_name="robot", joint_names=[".*"])
 
-Both action terms call process_actions once per control period. It replaces the targets of the policy by targets that
-make the simulator move like the robot. Options are those of JointPositionActionCfg.
+Both action terms call process_actions once per control period. It replaces the targets of the
+policy by targets that make the simulator move like the robot. Options are those of
+JointPositionActionCfg.
 """
 
 from __future__ import annotations
@@ -47,11 +49,15 @@ def read_facts(folder: str | Path) -> dict[str, Any]:
 
 def tensor(values: Any) -> Tensor:
     """Return a tensor of joint data; Isaac Lab 3 wraps tensors."""
-    return getattr(values, "torch", values)
+    wrapped: Tensor = getattr(values, "torch", values)
+    return wrapped
 
 
 class Past:
-    """History of num_envs worlds, and the program (export/torch_program.py) that corrects their commands, if any."""
+    """History of num_envs worlds, and the program that corrects their commands, if any.
+
+    The program is that of export/torch_program.py.
+    """
 
     def __init__(self, program: Any, num_envs: int, depth: int, n: int, device: Any) -> None:
         self.program = program
@@ -77,7 +83,9 @@ class Past:
 
 
 class Aligner:
-    """Replaces targets of `joint_names`, in any order, by targets that make the simulator move like the robot.
+    """Replaces targets by targets that make the simulator move like the robot.
+
+    The targets are of `joint_names`, in any order.
 
     Attributes:
         payload_mass: kg in each hand, (num_envs,); may be written.
@@ -123,7 +131,10 @@ class Aligner:
 
     @property
     def refused_answers(self) -> int:
-        """Number of the network's answers that were not finite, one per world and period; there it corrects nothing."""
+        """Number of the network's answers that were not finite, one per world and period.
+
+        There it corrects nothing.
+        """
         return 0 if self.past.program is None else int(self.past.program.refused)
 
     @torch.no_grad()
@@ -132,8 +143,8 @@ class Aligner:
 
         Args:
             qpos, qvel: Present state, (num_envs, joints) rad and rad/s.
-            target: (num_envs, joints) rad. A target that is not finite counts as the one sent last, and in worlds that
-                restart as the present position.
+            target: (num_envs, joints) rad. A target that is not finite counts as the one sent last,
+                and in worlds that restart as the present position.
         """
         last = torch.where(self.past.fresh[:, None], qpos, self.sent)
         target = torch.where(torch.isfinite(target), target, last)
@@ -145,10 +156,13 @@ class Aligner:
 
 
 class AlignedAction:
-    """Mix-in for JointPositionAction of both engines; it comes before that class among the base classes.
+    """Mix-in for JointPositionAction of both engines.
+
+    It comes before that class among the base classes.
 
     Attributes:
-        standing_command: Command in force before a world restarts, (num_envs, joints) rad; None for its position.
+        standing_command: Command in force before a world restarts, (num_envs, joints) rad; None for
+            its position.
     """
 
     folder: Path
@@ -190,7 +204,7 @@ class AlignedAction:
         )
 
     def restart(self, qpos: Tensor, command: Tensor) -> None:
-        """Restart the fresh worlds at a position, under a command that has been in force for long."""
+        """Restart fresh worlds at a position, under a command that has been in force for long."""
 
     def reset(self, env_ids: Any = None, **other: Any) -> None:
         super().reset(env_ids, **other)  # type: ignore[misc]
@@ -198,7 +212,10 @@ class AlignedAction:
 
 
 class CheckPlayer:
-    """Plays the motions of a `Check` in an environment of mjlab or Isaac Lab with one robot, "robot"."""
+    """Plays the motions of a `Check` in an environment of mjlab or Isaac Lab.
+
+    It has one robot, "robot".
+    """
 
     def __init__(self, check: Check) -> None:
         self.check = check
@@ -207,7 +224,10 @@ class CheckPlayer:
         )  # qpos and qvel in which worlds start
 
     def reset_event(self) -> Any:
-        """Return the function of an event term in mode "reset"; a copy of it still reads this object."""
+        """Return the function of an event term in mode "reset".
+
+        A copy of it still reads this object.
+        """
 
         def reset(env: Any, env_ids: Any) -> None:
             robot = env.scene["robot"]
@@ -254,7 +274,8 @@ def mjlab_action(
 ) -> Any:
     """Return a JointPositionActionCfg whose targets the network of a run corrects.
 
-    `check` refuses a scene that is not the simulator of training. Without a network, mjlab's own class does.
+    `check` refuses a scene that is not the simulator of training. Without a network, mjlab's own
+    class does.
     """
     from mjlab.envs.mdp.actions import JointPositionAction, JointPositionActionCfg
 
@@ -302,8 +323,8 @@ def mjlab_events(folder: str | Path, entity: str = "robot") -> dict[str, Any]:
 def mjlab_options(folder: str | Path) -> tuple[Any, int]:
     """Return MujocoCfg and decimation of the simulator of training.
 
-    If links touched nothing in training, remove "contact" from its disableflags for a scene with a floor; robot.xml
-    says which geoms touch.
+    If links touched nothing in training, remove "contact" from its disableflags for a scene with a
+    floor; robot.xml says which geoms touch.
     """
     from mjlab.sim import MujocoCfg
 
@@ -329,7 +350,10 @@ def hold_friction(sim: Any, entity: str, folder: str | Path) -> None:
 
 
 class DelayedAction:
-    """Mix-in that delays commands in the action term: worlds start at rest, and no delay is rounded to a step."""
+    """Mix-in that delays commands in the action term.
+
+    Worlds start at rest, and no delay is rounded to a step.
+    """
 
     def set_delays(self, delay: Any) -> None:
         """Set the delays of the term's joints, s, (num_envs, n) or (1, n)."""
@@ -381,7 +405,10 @@ class DelayedAction:
 def isaaclab_action(
     folder: str | Path, payload_mass: float | None = None, check: bool = True, **options: Any
 ) -> Any:
-    """Return a JointPositionActionCfg that aligns; `check` refuses a network trained with a servo model."""
+    """Return a JointPositionActionCfg that aligns.
+
+    `check` refuses a network trained with a servo model.
+    """
     here: Any = sys.modules[__name__]
     own = {
         "class_type": here.IsaacLabTerm,
@@ -435,12 +462,15 @@ def _isaaclab_term() -> Any:
 
 
 def _isaaclab_form(facts: dict[str, Any]) -> str:
-    """Return the key of facts.json for Isaac Lab, which has no servo model: a robot without a network is "plain"."""
+    """Return the key of facts.json for Isaac Lab, which has no servo model.
+
+    A robot without a network is "plain".
+    """
     return "joints" if "model" in facts else "plain"
 
 
 def isaaclab_actuators(folder: str | Path) -> dict[str, Any]:
-    """Return an IdealPDActuatorCfg of the servos, and a DCMotorCfg for each joint with a no-load speed.
+    """Return an IdealPDActuatorCfg of the servos, or a DCMotorCfg with a no-load speed.
 
     `isaaclab_action` has their delays and offsets.
     """
@@ -452,20 +482,32 @@ def isaaclab_actuators(folder: str | Path) -> dict[str, Any]:
     own = "actuator_" if "actuator_effort_limit" in fields else ""  # Isaac Lab 3 renamed the limits
 
     def group(kind: Any, names: list[str], **more: float) -> Any:
-        column = lambda field: {name: joints[name][field] for name in names}  # noqa: E731
-        return kind(
-            joint_names_expr=names, stiffness=column("kp"), damping=column("kd"), armature=column("armature"),
-            friction=column("frictionloss"), viscous_friction=column("damping"),
-            **{f"{own}effort_limit": column("effort_limit")}, **more,
-        )  # fmt: skip
+        def column(field: str) -> dict[str, float]:
+            return {name: joints[name][field] for name in names}
 
-    motors = {name: joint for name, joint in joints.items() if joint.get("no_load_speed")}
+        return kind(
+            joint_names_expr=names,
+            stiffness=column("kp"),
+            damping=column("kd"),
+            armature=column("armature"),
+            friction=column("frictionloss"),
+            viscous_friction=column("damping"),
+            **{f"{own}effort_limit": column("effort_limit")},
+            **more,
+        )
+
+    motors = [name for name, joint in joints.items() if joint.get("no_load_speed")]
     plain = [name for name in joints if name not in motors]
-    return ({"servos": group(IdealPDActuatorCfg, plain)} if plain else {}) | {
-        name: group(DCMotorCfg, [name], saturation_effort=joint["effort_limit"],
-                    **{f"{own}velocity_limit": joint["no_load_speed"]})
-        for name, joint in motors.items()
-    }  # fmt: skip
+    groups = {}
+    if plain:
+        groups["servos"] = group(IdealPDActuatorCfg, plain)
+    for name in motors:
+        line = {
+            "saturation_effort": joints[name]["effort_limit"],
+            f"{own}velocity_limit": joints[name]["no_load_speed"],
+        }
+        groups[name] = group(DCMotorCfg, [name], **line)
+    return groups
 
 
 def __getattr__(name: str) -> Any:

@@ -1,6 +1,9 @@
-"""Identified servos as an actuator of mjlab. This file is copied into exports; it needs torch, not gaponet.
+"""Identified servos as an actuator of mjlab.
 
-EntityArticulationInfoCfg(actuators=(mjlab_servos(FOLDER),)), and mjlab_events(FOLDER) of gaponet_action.py
+This file is copied into exports; it needs torch, not gaponet.
+
+EntityArticulationInfoCfg(actuators=(mjlab_servos(FOLDER),)), and mjlab_events(FOLDER) of
+gaponet_action.py
 """
 
 from __future__ import annotations
@@ -15,7 +18,8 @@ from torch import Tensor
 
 from gaponet.export.shipped.mujoco_servos import delay_weights, read
 from gaponet.export.shipped.unit_events import columns_of, write_model
-from gaponet.sim.servo import SERVO_TERMS, friction_limit, present, servo_bias, torque_range
+from gaponet.robot.servo_fields import SERVO_TERMS
+from gaponet.sim.servo import friction_limit, present, servo_bias, torque_range
 
 # Fields of the model that each world needs for itself.
 SERVO_FIELDS = ("dof_frictionloss", "actuator_biasprm", "actuator_forcerange")
@@ -42,12 +46,12 @@ class Addresses:
 class WorldServos:
     """Delays and the servo model beyond PD of some joints, in all worlds.
 
-    mjlab's own delay fields count how often a target is written, and it writes once more whenever a world begins anew;
-    these delays count physics steps, and may be parts of one.
+    mjlab's own delay fields count how often a target is written, and it writes once more whenever a
+    world begins anew; these delays count physics steps, and may be parts of one.
 
     Attributes:
-        starts_under_command: How a world begins: as if its first target had been in force for long; False: as if its
-            first position had been.
+        starts_under_command: How a world begins: as if its first target had been in force for long;
+            False: as if its first position had been.
     """
 
     def __init__(
@@ -86,20 +90,25 @@ class WorldServos:
         self.starts_under_command = False
 
     def restart(self, env_ids: Any = None) -> None:
-        """Let worlds (indices, a mask, a slice; None for all) begin anew at the next physics step."""
+        """Let worlds (indices, a mask, a slice.
+
+        None for all) begin anew at the next physics step.
+        """
         self.fresh = self.fresh.clone()
         self.fresh[slice(None) if env_ids is None else env_ids] = True
 
     def before_step(self, model: Any, data: Any, target: Tensor) -> Tensor:
-        """Write the servo model into mjlab's model for the next physics step, and return ctrl, (num_envs, n) rad.
+        """Write the servo model for the next physics step, and return ctrl, (num_envs, n) rad.
 
-        mjlab calls it once a step, and again when a world begins anew: only `after_step` moves the delays on.
+        mjlab calls it once a step, and again when a world begins anew: only `after_step` moves the
+        delays on.
         """
         qpos = data.qpos[:, self.addresses.qpos]
         qvel = data.qvel[:, self.addresses.dof]
         if self.fresh.any():
             self._start(data, qpos, target)
-        self.targets[0] = target
+        # Not in place: tensors of inference mode cannot be written to outside of it.
+        self.targets = torch.cat([target[None], self.targets[1:]])
         if self.terms:
             self._write_servo_model(model, qpos, qvel, target)
         return (self.weights * self.targets).sum(0)
@@ -138,7 +147,10 @@ class WorldServos:
     def set_units(
         self, model: Any, env_ids: Tensor, joints: list[str], units: dict[str, Tensor]
     ) -> None:
-        """Give worlds the numbers of units: field → (len(env_ids), joints). Delays stay as exported."""
+        """Give worlds the numbers of units: field → (len(env_ids), joints).
+
+        Delays stay as exported.
+        """
         columns = torch.tensor(
             columns_of(joints, self.joints, "the actuators"), device=env_ids.device
         )
@@ -159,7 +171,10 @@ class WorldServos:
 
 
 def mjlab_servos(folder: str | Path, **options: Any) -> Any:
-    """Return the ActuatorCfg of the servos in robot.xml, for EntityArticulationInfoCfg; options are its fields."""
+    """Return the ActuatorCfg of the servos in robot.xml, for EntityArticulationInfoCfg.
+
+    Options are its fields.
+    """
     own = {"target_names_expr": (".*",), "command_field": "position", "folder": str(folder)}
     return _servo_cfg_class()(**own | options)
 

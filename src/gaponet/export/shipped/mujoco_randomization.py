@@ -1,4 +1,7 @@
-"""Set a MuJoCo model to one of the sampled units of a robot. This file is copied into exports; it needs no gaponet."""
+"""Set a MuJoCo model to one of the sampled units of a robot.
+
+This file is copied into exports; it needs no gaponet.
+"""
 
 from __future__ import annotations
 
@@ -18,10 +21,13 @@ def units(file: Path = HERE / "randomization.json") -> dict[str, Any]:
 
 
 def apply(model: mujoco.MjModel, drawn: dict[str, Any], row: int) -> None:
-    """Set the joints and position servos of a model, such as the robot.xml of gaponet export --to mjcf, to a unit.
+    """Set the joints and position servos of a model to a unit.
 
-    The unit is one without the servo model, where the file has these. kd of the servos does not change, servos without
-    a torque limit get none, and a delay is at most as long as the servo's buffer (nsample).
+    The model is, for example, the robot.xml of gaponet export --to mjcf.
+
+    The unit is one without the servo model, where the file has these. kd of the servos does not
+    change, servos without a torque limit get none, and a delay is at most as long as the servo's
+    buffer (nsample).
     """
     form = "plain_units" if "plain_units" in drawn else "units"
     for i, name in enumerate(drawn["joints"]):
@@ -49,7 +55,10 @@ def apply(model: mujoco.MjModel, drawn: dict[str, Any], row: int) -> None:
 
 
 def set_links(model: mujoco.MjModel, drawn: dict[str, Any], row: int, form: str = "units") -> None:
-    """Give bodies the links of a unit with the servo model ("plain_units": without it), where the file has links."""
+    """Give bodies the links of a unit, where the file has links.
+
+    The form "units" has the servo model, "plain_units" has not.
+    """
     for i, name in enumerate(drawn.get("bodies", ())):
         body, x = model.body(name), drawn[form]["links"][row][i]
         body.mass[:], body.ipos[:], body.inertia[:], body.iquat[:] = x[0], x[1:4], x[4:7], x[7:]
@@ -58,7 +67,9 @@ def set_links(model: mujoco.MjModel, drawn: dict[str, Any], row: int, form: str 
 
 
 def unit_facts(facts: dict[str, Any], drawn: dict[str, Any], row: int) -> dict[str, Any]:
-    """Return the facts.json of gaponet export --to mjcf with the numbers of a unit, for mujoco_servos.Servos.
+    """Return facts.json with the numbers of a unit, for mujoco_servos.Servos.
+
+    The facts are those of gaponet export --to mjcf.
 
     Servos(model, unit_facts(facts, drawn, row)) moves a model like the unit after `set_links`.
     """

@@ -1,4 +1,6 @@
-"""Identified servos in plain MuJoCo. This file is copied into exports; it needs MuJoCo and numpy, not gaponet.
+"""Identified servos in plain MuJoCo.
+
+This file is copied into exports; it needs MuJoCo and numpy, not gaponet.
 
 servos = Servos(model, read("facts.json"))     # once; prefix="left/" where the robot was attached to a scene
 data.ctrl[...] = …; fill_delays(model, data)   # after each reset
@@ -14,7 +16,8 @@ from typing import Any
 
 import numpy as np
 
-from gaponet.sim.servo import SERVO_TERMS, Play, friction_limit, present, servo_bias, torque_range
+from gaponet.robot.servo_fields import SERVO_TERMS
+from gaponet.sim.servo import Play, friction_limit, present, servo_bias, torque_range
 
 CHECK_WORLDS = 3
 SLEW_MAX = 1  # place of slewmax in the dynprm of a <pid>
@@ -32,7 +35,10 @@ def read(path: str | Path) -> dict[str, Any]:
 
 
 class Servos:
-    """Servos of a compiled model: sets the identified numbers once, and the servo model before each step."""
+    """Servos of a compiled model.
+
+    Sets the identified numbers once, and the servo model before each step.
+    """
 
     def __init__(self, model: Any, facts: dict[str, Any], prefix: str = "") -> None:
         """
@@ -55,7 +61,8 @@ class Servos:
             column["armature"],
             column["damping"],
         )
-        # A servo that limits the speed of its targets (<pid slewmax>) has its stiffness in biasprm alone.
+        # A servo that limits the speed of its targets (<pid slewmax>) has its stiffness in biasprm
+        # alone.
         self._ramped = np.array([ramp_speed(model, i) > 0 for i in self.servo])
         model.actuator_gainprm[self.servo, 0] = np.where(self._ramped, 0.0, self.kp)
         model.actuator_biasprm[self.servo, 0] = self.bias
@@ -76,7 +83,9 @@ class Servos:
         self.terms = present({name: column[name] for name in SERVO_TERMS if name in column})
 
     def before(self, data: Any) -> None:
-        """Set bias, torque limits and friction for the next physics step, under data.ctrl; with backlash qfrc_applied
+        """Set bias, torque limits and friction for the next physics step, under data.ctrl.
+
+        With backlash qfrc_applied
         too."""
         if not self.terms:
             return
@@ -105,7 +114,10 @@ class Servos:
         model.actuator_biasprm[self.servo, 0] = bias
 
     def _targets_in_force(self, data: Any) -> Any:
-        """Return the targets of the next physics step, rad: where a servo limits their speed, as far as they are."""
+        """Return the targets of the next physics step, rad.
+
+        Where a servo limits their speed, these are the targets so far.
+        """
         targets = np.array(data.ctrl[self.servo])
         for k in np.flatnonzero(self._ramped):
             i = self.servo[k]
@@ -133,9 +145,12 @@ def addresses(model: Any, joints: list[str], prefix: str = "") -> tuple[Any, Any
 
 
 def fill_delays(model: Any, data: Any) -> None:
-    """Let each delayed actuator act as if data.ctrl had always been in force; MuJoCo's reset lets it begin at 0.
+    """Let each delayed actuator act as if data.ctrl had always been in force.
 
-    Where a servo limits the speed of its targets, these begin at most 0.05 rad and the way of 0.1 s from the joint.
+    MuJoCo's reset lets it begin at 0.
+
+    Where a servo limits the speed of its targets, these begin at most 0.05 rad and the way of 0.1 s
+    from the joint.
     """
     import mujoco
 
@@ -154,7 +169,9 @@ def fill_delays(model: Any, data: Any) -> None:
 def play(
     model: Any, facts: dict[str, Any], motion: Motion, prefix: str = "", form: str = "joints"
 ) -> Any:
-    """Play a motion in plain MuJoCo from its first state, as if its first command had always been in force.
+    """Play a motion in plain MuJoCo from its first state.
+
+    Its first command counts as if it had always been in force.
 
     Args:
         model: Compiled; its physics step is changed to divide the motion's period.
@@ -203,7 +220,9 @@ def delay_weights(delay: Any, step: float) -> Any:
 
 
 class Check:
-    """The motions of an export's check.npz, arranged in a few worlds, so that worlds restart while others go on.
+    """The motions of an export's check.npz, arranged in a few worlds.
+
+    So worlds restart while others go on.
 
     Attributes:
         facts: facts.json.
@@ -243,7 +262,8 @@ class Check:
 
         Args:
             start: Puts worlds into the first states of motions, under commands (worlds, n) rad.
-            step: Simulates one control period under commands (worlds, n) rad; returns positions (worlds, n) rad.
+            step: Simulates one control period under commands (worlds, n) rad; returns positions
+                (worlds, n) rad.
         """
         path = []
         for row, ctrl in enumerate(self.ctrl):
@@ -267,7 +287,10 @@ class Check:
         self.report_motions(f"{engine}, {self.worlds} worlds", paths, form)
 
     def report_motions(self, engine: str, paths: list[Any], form: str = "plain") -> None:
-        """Print the same for motions played one by one; paths: positions after each period, (T, n) rad each."""
+        """Print the same for motions played one by one.
+
+        paths: positions after each period, (T, n) rad each.
+        """
         columns = [self.names.index(name) for name in self.facts["corrected"]]
         pairs = zip(paths, self.motions, strict=True)
         errors = [np.abs(path - motion["qpos"][1:])[:, columns].mean() for path, motion in pairs]

@@ -67,7 +67,10 @@ def _differs(what: str, now: Any, wanted: Any) -> list[str]:
 
 
 def joint_fields(model: Any, name: str) -> dict[str, Any]:
-    """Return the fields of an MjModel for a joint and the servo of that name; three of each of a servo's parameters."""
+    """Return the fields of an MjModel for a joint and the servo of that name.
+
+    Three of each of a servo's parameters.
+    """
     row = {
         "jnt": model.joint(name).id,
         "dof": model.joint(name).dofadr[0],
@@ -78,7 +81,10 @@ def joint_fields(model: Any, name: str) -> dict[str, Any]:
 
 
 def solver_options(model: Any) -> dict[str, Any]:
-    """Return the options of an MjModel that affect motion, with the names of MuJoCo and of mjlab's MujocoCfg."""
+    """Return the options of an MjModel that affect motion.
+
+    The names are those of MuJoCo and of mjlab's MujocoCfg.
+    """
     import mujoco
 
     values = {name: getattr(model.opt, name) for name in OPTIONS}

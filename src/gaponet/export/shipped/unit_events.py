@@ -5,7 +5,8 @@ This file is copied into exports; it needs torch, not gaponet. A unit is a row o
 mjlab:      EventTermCfg(func=mjlab_units(FILE), mode="reset")
 Isaac Lab:  EventTermCfg(func=apply_units, mode="reset", params={"asset_cfg": SceneEntityCfg("robot"), "file": FILE})
 
-FILE is the path of randomization.json. Mode "reset" draws a unit for each episode, "startup" one for each world.
+FILE is the path of randomization.json. Mode "reset" draws a unit for each episode, "startup" one
+for each world.
 """
 
 from __future__ import annotations
@@ -30,7 +31,10 @@ Units = dict[str, Tensor]  # field → (worlds, joints), SI units
 
 @cache
 def read_units(file: str | Path, form: str) -> tuple[list[str], Units]:
-    """Return joints and all units, (units, joints). A robot without a servo model has one form of them."""
+    """Return joints and all units, (units, joints).
+
+    A robot without a servo model has one form of them.
+    """
     drawn = json.loads(Path(file).read_text(encoding="utf-8"))
     return drawn["joints"], {
         field: torch.tensor(x) for field, x in drawn.get(form, drawn["units"]).items()
@@ -72,7 +76,8 @@ def columns_of(joints: Iterable[str], names: Iterable[str], what: str) -> list[i
 def mjlab_units(file: str | Path, term: str = "joint_pos", rows: Any = None) -> Any:
     """Return the function of an event term for mjlab. Delays stay as they are.
 
-    With the servos of `mjlab_entity`, units have the servo model. With other position servos they have not.
+    With the servos of `mjlab_entity`, units have the servo model. With other position servos they
+    have not.
 
     Args:
         term: Action term of the robot.
@@ -95,13 +100,17 @@ def mjlab_units(file: str | Path, term: str = "joint_pos", rows: Any = None) -> 
         if identified:
             identified[0].set_units(env.sim.model, ids, joints, units)
             return
-        model, joints = env.sim.mj_model, [f"{action.cfg.entity_name}/{name}" for name in joints]
-        driven = {model.joint(joint).name: servo for servo, joint in enumerate(model.actuator_trnid[:, 0])
-                  if (model.actuator_trntype[servo], model.actuator_biastype[servo]) == (0, 1)}  # fmt: skip
+        model = env.sim.mj_model
+        joints = [f"{action.cfg.entity_name}/{name}" for name in joints]
+        driven = {}
+        for servo, joint in enumerate(model.actuator_trnid[:, 0]):
+            kind = model.actuator_trntype[servo], model.actuator_biastype[servo]
+            if kind == (0, 1):  # of a joint, with an affine bias
+                driven[model.joint(joint).name] = servo
         columns_of(joints, driven, "joints with position servos")
         at = [[driven[name] for name in joints], [model.joint(name).dofadr[0] for name in joints]]
-        servo, dof = torch.tensor(at, device=env.device)
-        write_model(env.sim.model, ids, dof, servo, units)
+        servos, dofs = torch.tensor(at, device=env.device)
+        write_model(env.sim.model, ids, dofs, servos, units)
 
     return use_units
 
@@ -124,7 +133,7 @@ def write_model(model: Any, env_ids: Tensor, dof: Tensor, servo: Tensor, units: 
 
 
 def write_links(sim: Any, env_ids: Tensor, bodies: list[str], links: Tensor) -> None:
-    """Write mass, centre of mass and inertia of bodies to a model of mjlab, (worlds, bodies, 11)."""
+    """Write masses, centres of mass and inertias to a model of mjlab, (worlds, bodies, 11)."""
     model, parents = sim.model, sim.mj_model.body_parentid.tolist()
     at = (
         env_ids[:, None],
@@ -149,12 +158,15 @@ def apply_units(
     term: str | None = "joint_pos",
     rows: Any = None,
 ) -> None:
-    """Event term of Isaac Lab 2.3 and 3. Of the servo model units have torque-speed lines; kd stays.
+    """Event term of Isaac Lab 2.3 and 3.
+
+    Of the servo model units have torque-speed lines; kd stays.
 
     Args:
         asset_cfg: SceneEntityCfg of the robot. All joints of the file are set.
-        term: Action term of `isaaclab_action`, which applies delays and offsets. None: DelayedPDActuators apply delays
-            in whole physics steps, in mode "reset" only, and offsets are not applied.
+        term: Action term of `isaaclab_action`, which applies delays and offsets. None:
+            DelayedPDActuators apply delays in whole physics steps, in mode "reset" only, and
+            offsets are not applied.
         rows: As in `draw_units`.
 
     Raises:
@@ -163,8 +175,12 @@ def apply_units(
     robot = env.scene[asset_cfg.name]
     ids, joints, units = draw_units(file, "plain_units", env, env_ids, rows)
     columns = columns_of(joints, robot.joint_names, "joints of the articulation")
-    groups = {joint: group for group in robot.actuators.values() if not hasattr(group, "network")
-              for joint in getattr(group, "joint_names", ())}  # fmt: skip
+    groups = {}
+    for group in robot.actuators.values():
+        if hasattr(group, "network"):
+            continue
+        for joint in getattr(group, "joint_names", ()):
+            groups[joint] = group
     columns_of(
         joints, groups, "joints with PD actuators (set cfg.sim.use_newton_actuators = False)"
     )
@@ -200,7 +216,7 @@ def apply_units(
 
 
 def _write(robot: Any, what: str, columns: list[int], ids: Tensor, *values: Tensor | None) -> None:
-    """Call a writer of Isaac Lab 3 or 2, whose first parameters are the values, (worlds, joints)."""
+    """Call a writer of Isaac Lab 3 or 2; its first parameters are values, (worlds, joints)."""
     names = f"write_joint_{what}_to_sim_index", f"write_joint_{what}_to_sim"
     write = getattr(robot, names[0], getattr(robot, names[1], None))
     places = (
@@ -216,7 +232,9 @@ def _write(robot: Any, what: str, columns: list[int], ids: Tensor, *values: Tens
 def _speed_lines(
     robot: Any, joints: list[str], groups: dict[str, Any], units: Units, ids: Tensor
 ) -> None:
-    """Set the torque-speed lines of DCMotors: torque at rest, and the speed without torque. A speed of 0 is no line.
+    """Set the torque-speed lines of DCMotors: torque at rest, and the speed without torque.
+
+    A speed of 0 is no line.
 
     Isaac Lab 3 computes the groups of a class as one, by an actuator of its own.
     """
@@ -248,7 +266,10 @@ def _speed_lines(
 
 
 def _delay(joints: list[str], groups: dict[str, Any], steps: Tensor, ids: Tensor) -> None:
-    """Set the delays of DelayedPDActuators, physics steps (worlds, joints); a group has one delay for all joints."""
+    """Set the delays of DelayedPDActuators, physics steps (worlds, joints).
+
+    A group has one delay for all joints.
+    """
     lags = dict[int, Tensor]()
     for joint, lag in zip(joints, steps.round().int().T, strict=True):
         group = groups[joint]
