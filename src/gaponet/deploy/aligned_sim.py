@@ -67,27 +67,33 @@ class AlignedSim:
         self.dt = robot.dt if dt is None else dt
         if isinstance(model, GapModel):
             model.require_payload(payload_mass, extrapolate)
-        self.robot, self.model, self.single = robot, model, num_envs is None
+        self.robot = robot
+        self.model = model
+        self.single = num_envs is None
         self.num_envs = 1 if num_envs is None else num_envs
         self.payload_mass = np.array(
             np.broadcast_to(np.asarray(payload_mass, float), self.num_envs)
         )
         conditions = [Condition(float(mass), payload_side, self.dt) for mass in self.payload_mass]
-        own, other_payload = conditions, simulator_payload is not None
+        own = conditions
+        other_payload = simulator_payload is not None
         if other_payload:
             masses = np.broadcast_to(np.asarray(simulator_payload, float), self.num_envs)
             own = [
                 c._replace(payload_mass=float(m)) for c, m in zip(conditions, masses, strict=True)
             ]
         self.sim = BatchSim(robot, own, nthread, locked)
-        self.joint_names, self.n = self.sim.joint_names, self.sim.n
+        self.joint_names = self.sim.joint_names
+        self.n = self.sim.n
         free = robot.index(self.joint_names)
-        self.qpos_home, self.qpos_range = robot.qpos_home[free], self.sim.range
+        self.qpos_home = robot.qpos_home[free]
+        self.qpos_range = self.sim.range
         missing = [name for name in robot.operated if name in locked]
         if missing:
             raise UsageError(f"joint '{missing[0]}' is corrected by the model and cannot be locked")
         self.op = np.array([self.joint_names.index(name) for name in robot.operated])
-        self.loop, self.transfer = None, None
+        self.loop = None
+        self.transfer = None
         trained = model if isinstance(model, GapModel) and not other_payload else None
         if (
             trained is not None
@@ -158,7 +164,9 @@ class AlignedSim:
 
     def step(self, ctrl: Array) -> None:
         """Step one control period with targets `ctrl`, rad, which the model corrects."""
-        sim, op, target = self.sim, self.op, self.target
+        sim = self.sim
+        op = self.op
+        target = self.target
         target[:] = ctrl
         self._uncorrected = target[:, op]
         if self.loop is not None:

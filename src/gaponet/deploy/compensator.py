@@ -159,7 +159,10 @@ class Compensator:
             robot = _simulator_of(model, robot, self.dt, config)
             max_mass = model.config.payload_max if extrapolate else model.max_payload
         robot = robot if adaptation is None else adaptation.robot(robot)
-        self.robot, self.model, self.config, self.single = robot, model, config, num_envs is None
+        self.robot = robot
+        self.model = model
+        self.config = config
+        self.single = num_envs is None
         self.extrapolate = extrapolate
         self.num_envs = num = 1 if num_envs is None else num_envs
         max_mass = max_mass if robot.payload_mounts else 0.0
@@ -169,11 +172,13 @@ class Compensator:
         # payload changes.
         carried = [Condition(float(m), payload_side, self.dt) for m in (*[0.0] * num, *self.masses)]
         self.shadow = BatchSim(robot, carried, nthread, locked)
-        self.ids, self.op = np.arange(num), robot.operated_index
+        self.ids = np.arange(num)
+        self.op = robot.operated_index
         self.free = robot.index(self.shadow.joint_names)
         self.operated = np.searchsorted(self.free, self.op)  # operated joints among the shadow's
         self.low, self.high = robot.qpos_range[self.op].T
-        self.kp, self.zero_offset = robot.kp[self.op], robot.offset[self.op]
+        self.kp = robot.kp[self.op]
+        self.zero_offset = robot.offset[self.op]
         self.bias: Array = self.shadow.batch.bind("qfrc_bias")
         self.loop = None if model is None else model.loop(num)
         loads = [Condition(float(mass), payload_side, self.dt) for mass in self.masses]
@@ -190,7 +195,9 @@ class Compensator:
         if follow is not None:
             empty = Condition(0.0, payload_side, self.dt)
             self.follower = Follower(robot, empty, self.masses, num, locked, extrapolate)
-        self.payload_mass, self.payload_stated, self.periods = np.zeros(num), False, 0
+        self.payload_mass = np.zeros(num)
+        self.payload_stated = False
+        self.periods = 0
         self.offset, self.command = np.zeros(
             (2, num, len(self.op))
         )  # u − a′ of the iteration; last command, rad
@@ -214,7 +221,8 @@ class Compensator:
         nominal = self.robot.nominal or self.robot
         for joint, i in zip(nominal.operated, nominal.operated_index, strict=True):
             for name, gains in (("kp", kp), ("kd", kd)):
-                was, now = float(getattr(nominal, name)[i]), float(gains[joint_names.index(joint)])
+                was = float(getattr(nominal, name)[i])
+                now = float(gains[joint_names.index(joint)])
                 if abs(now - was) > GAIN_TOLERANCE * max(was, now):
                     raise RobotError(
                         f"{nominal.folder}: {name} of {joint} is {was:g} there, the servo has {now:.4g}; set the "
@@ -245,7 +253,9 @@ class Compensator:
         require_radians(
             a, self.robot.joint_names, self.robot, lambda row: "compensator: the target to begin at"
         )
-        self._target, self.command, self.periods = a, a[:, self.op], 0
+        self._target = a
+        self.command = a[:, self.op]
+        self.periods = 0
         if self.loop is not None:
             self.loop.reset()
         self.offset = np.zeros(self.command.shape)
@@ -452,7 +462,8 @@ class Compensator:
         if self.loop is None:
             return shadow_target
         q, v = (x[: self.num_envs, self.operated] for x in (self.shadow.qpos, self.shadow.qvel))
-        gain, iterations = self.config.gain, self.config.iterations
+        gain = self.config.gain
+        iterations = self.config.iterations
         return self.loop.solve(
             q, v, shadow_target, self.payload_mass, self.offset, gain, iterations
         )
@@ -497,7 +508,8 @@ class Feedback:
 
     def __init__(self, config: CompensatorConfig, dt: float) -> None:
         """dt: Control period, s."""
-        self.config, self.dt = config, dt
+        self.config = config
+        self.dt = dt
         self.integral, self.saturation, self._filtered = np.zeros((3, 0, 0))
 
     def reset(self, shape: tuple[int, ...]) -> None:
@@ -506,7 +518,8 @@ class Feedback:
 
     def update(self, error: Array, valid: Array) -> None:
         """Process position errors, rad, of the robots `valid`, (num_envs,)."""
-        config, limit = self.config, self.config.feedback_limit
+        config = self.config
+        limit = self.config.feedback_limit
         # A blocked joint has a large error, which must not take long to decrease.
         limited = np.clip(error, -limit, limit)
         filtered = self._filtered + (limited - self._filtered) * min(

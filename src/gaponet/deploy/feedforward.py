@@ -42,8 +42,10 @@ class Feedforward:
             dt: Control period, s.
             acceleration_time: Time constant of the low-pass, s.
         """
-        model, op = next(iter(sim.models.values())), robot.operated_index
-        self.dt, self.share = dt, min(1.0, dt / max(acceleration_time, dt))
+        model = next(iter(sim.models.values()))
+        op = robot.operated_index
+        self.dt = dt
+        self.share = min(1.0, dt / max(acceleration_time, dt))
         self.damping = robot.kd[op] + model.dof_damping[operated]
         self.friction = model.dof_frictionloss[operated]
         self.servo_terms = present({name: getattr(robot, name)[op] for name in SERVO_TERMS})
@@ -52,11 +54,9 @@ class Feedforward:
 
     def reset(self, target: Array) -> None:
         """Start at rest at targets, (num, n operated) rad."""
-        self.target, self.qvel, self.qacc = (
-            target.copy(),
-            np.zeros_like(target),
-            np.zeros_like(target),
-        )
+        self.target = target.copy()
+        self.qvel = np.zeros_like(target)
+        self.qacc = np.zeros_like(target)
 
     def update(self, target: Array) -> None:
         """Set the targets of the coming control period, (num, n operated) rad."""

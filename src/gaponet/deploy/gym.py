@@ -57,8 +57,13 @@ class TrackingEnv(gymnasium.Env):
             )
         if not len(references) or any(r.shape[1] != sim.n or len(r) < 3 for r in references):
             raise UsageError(f"give motions (T, {sim.n}) of at least 3 rows")
-        self.sim, self.references, self.reach, self.preview = sim, references, reach, preview
-        self.motion, self.t, self.np_random = 0, 0, np.random.default_rng(seed)
+        self.sim = sim
+        self.references = references
+        self.reach = reach
+        self.preview = preview
+        self.motion = 0
+        self.t = 0
+        self.np_random = np.random.default_rng(seed)
         n = len(sim.op)
         self.observation_space = gymnasium.spaces.Box(
             -np.inf, np.inf, ((2 + preview) * n,), np.float32
@@ -71,16 +76,17 @@ class TrackingEnv(gymnasium.Env):
         """Start a motion at its first row: a random one, or options {"motion": 3}."""
         super().reset(seed=seed)
         chosen = (options or {}).get("motion")
-        self.motion, self.t = (
-            int(self.np_random.integers(len(self.references)) if chosen is None else chosen),
-            0,
+        self.motion = int(
+            self.np_random.integers(len(self.references)) if chosen is None else chosen
         )
+        self.t = 0
         self.sim.reset(self._row(0))
         return self._observe(), {"motion": self.motion}
 
     def step(self, action: Array) -> tuple[Array, float, bool, bool, dict[str, Any]]:
         """Step one control period."""
-        target, op = self._row(1).copy(), self.sim.op
+        target = self._row(1).copy()
+        op = self.sim.op
         target[op] += self.reach * np.clip(action, -1.0, 1.0)
         self.sim.step(target)
         self.t += 1
@@ -95,7 +101,9 @@ class TrackingEnv(gymnasium.Env):
         return row
 
     def _observe(self) -> Array:
-        q, v, op = self.sim.qpos, self.sim.qvel, self.sim.op
+        q = self.sim.qpos
+        v = self.sim.qvel
+        op = self.sim.op
         ahead = [self._row(k)[op] - q[op] for k in range(1, self.preview + 1)]
         return np.concatenate([q[op], v[op], *ahead]).astype(np.float32)
 

@@ -95,7 +95,8 @@ class MujocoAligner:
                 context = _known_context(model, mj_model, robot, dt, prefix)
                 if context is None or not isinstance(model, GapModel):
                     raise
-                self.loop, joints = model.loop(context=context), robot.operated
+                self.loop = model.loop(context=context)
+                joints = robot.operated
         names = [prefix + name for name in joints]
         self.qpos = np.array([mj_model.joint(name).qposadr[0] for name in names])
         self.qvel = np.array([mj_model.joint(name).dofadr[0] for name in names])
@@ -109,7 +110,9 @@ class MujocoAligner:
     def __call__(self, data: mujoco.MjData, ctrl: Array) -> Array:
         """Return corrected targets, (nu,) rad. Call this once per control period."""
         out = np.array(ctrl, float)
-        q, v, a = data.qpos[None, self.qpos], data.qvel[None, self.qvel], out[None, self.actuator]
+        q = data.qpos[None, self.qpos]
+        v = data.qvel[None, self.qvel]
+        a = out[None, self.actuator]
         if self.loop is not None:
             if self._fresh:
                 self.loop.reset()
@@ -139,7 +142,8 @@ def _known_context(
 
 def _of_scene(scene: mujoco.MjModel, joints: tuple[str, ...], dt: float) -> AnalyticInverse:
     """Return the inverse dynamics of a robot in a scene, without contacts."""
-    model, h = copy.copy(scene), scene.opt.timestep
+    model = copy.copy(scene)
+    h = scene.opt.timestep
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
     return AnalyticInverse(
         Batch(model, nsim=1, nthread=1), model, joints, np.array([round(dt / h)]), np.array([h])

@@ -55,9 +55,12 @@ class PayloadEstimate:
             operated: Operated joints among the simulation's, (n,).
             dt: Control period, s.
         """
-        self.sim, self.operated, self.dt = sim, operated, dt
+        self.sim = sim
+        self.operated = operated
+        self.dt = dt
         self.rows = np.array([sim.num_envs - num_masses, sim.num_envs - 1])
-        self.kp, self.kd = robot.kp[robot.operated_index], robot.kd[robot.operated_index]
+        self.kp = robot.kp[robot.operated_index]
+        self.kd = robot.kd[robot.operated_index]
         self.max_mass = float(sorted(c[0] for c in sim.models)[-1])
         self.bias: Array = sim.batch.bind("qfrc_bias")
         self.home = robot.qpos_home[robot.index(sim.joint_names)]
@@ -84,7 +87,8 @@ class PayloadEstimate:
         keep = np.exp(-self.dt / FORGETTING_TIME_S)
         for i in np.flatnonzero(valid):
             empty, full = self.gravity(qpos[i])
-            per_kg, excess = (full - empty) / self.max_mass, torque[i] - empty
+            per_kg = (full - empty) / self.max_mass
+            excess = torque[i] - empty
             weight = 1.0 / (1.0 + (np.abs(qvel[i]).max() / HALF_WEIGHT_SPEED) ** 2)
             self._projection[i] = (
                 keep * self._projection[i] + weight * float(per_kg @ excess) * self.dt
@@ -115,7 +119,8 @@ class PayloadEstimate:
 
     def gravity(self, qpos: Array) -> Array:
         """Return the torques that hold a posture, empty and with most payload, (2, n) N·m."""
-        self.sim.qpos[self.rows], self.sim.qvel[self.rows] = self.home, 0.0
+        self.sim.qpos[self.rows] = self.home
+        self.sim.qvel[self.rows] = 0.0
         self.sim.qpos[self.rows[:, None], self.operated] = qpos
         self.sim.batch.forward(self.rows, stage=mujoco.mjtStage.mjSTAGE_VEL.value)
         torques: Array = self.bias[self.rows][:, self.operated]

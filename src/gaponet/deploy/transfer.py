@@ -69,7 +69,8 @@ class Transfer:
         """
         model = reference if isinstance(reference, GapModel) else None
         robot = reference.simulator() if isinstance(reference, GapModel) else reference
-        self.inverse, self.num_envs = inverse, len(conditions)
+        self.inverse = inverse
+        self.num_envs = len(conditions)
         self.sim = sim = BatchSim(robot, conditions, nthread, locked)
         if not extrapolate:
             _require_measured(inverse, AnalyticInverse.of(sim), sim.joint_names)
@@ -108,7 +109,8 @@ class Transfer:
             qpos, qvel: State of the target simulator, rad, rad/s.
             target: Targets of the robot, rad.
         """
-        self.sim.qpos[:], self.sim.qvel[:] = qpos, qvel
+        self.sim.qpos[:] = qpos
+        self.sim.qvel[:] = qvel
         corrected = self._corrected(qpos, qvel, target)
         periods = [self.step_reference(corrected)]
         if self.inverse.ahead:
@@ -136,7 +138,8 @@ class Transfer:
     def step_reference(self, targets: Array) -> Period:
         """Simulate a control period of the reference under targets, rad, without the model."""
         sim = self.sim
-        qpos, qvel = sim.qpos.copy(), sim.qvel.copy()
+        qpos = sim.qpos.copy()
+        qvel = sim.qvel.copy()
         sim.step(targets)
         end = sim.qpos.copy(), sim.qvel.copy()
         return Period(qpos, qvel, *end, self._friction_share(end[0] - qpos))
@@ -162,7 +165,9 @@ class TransferCorrector:
             target: The simulator of the rollout.
             extrapolate: Accept a target outside the measured ranges.
         """
-        self.reference, self.target, self.extrapolate = reference, target, extrapolate
+        self.reference = reference
+        self.target = target
+        self.extrapolate = extrapolate
         self.robot = reference.simulator() if isinstance(reference, GapModel) else reference
         self.transfer: Transfer | None = None
         self.free = np.zeros(0, int)  # joints that are not locked
@@ -185,7 +190,8 @@ class TransferCorrector:
     def correct(self, t: int, target: Array, qpos: Array, qvel: Array) -> Array:
         """Return commands, (k, n_all) rad."""
         assert self.transfer is not None
-        commands, free = np.array(target, float), self.free
+        commands = np.array(target, float)
+        free = self.free
         commands[:, free] = self.transfer.command(qpos[:, free], qvel[:, free], target[:, free])
         return commands
 

@@ -185,7 +185,8 @@ def _fit_networks(
     sequences: ListOf[Sequence], rollouts: ListOf[Any], robot: RobotSpec, facts: dict[str, Any]
 ) -> dict[str, ActuatorNet]:
     """Return a network for each joint; joints that are not operated have the servo alone."""
-    step, length = facts["options"]["timestep"], _length(facts)
+    step = facts["options"]["timestep"]
+    length = _length(facts)
     delta_max = facts["delta_max"]
     nets = {
         name: ActuatorNet(joint, step, length, delta_max) for name, joint in facts["joints"].items()
@@ -193,7 +194,9 @@ def _fit_networks(
     rng = np.random.default_rng(0)
     torch.manual_seed(0)
     for name in robot.joint_names:
-        i, net, rows = robot.joint_names.index(name), nets[name], ROWS // len(sequences) + 1
+        i = robot.joint_names.index(name)
+        net = nets[name]
+        rows = ROWS // len(sequences) + 1
         if name in robot.operated:
             samples = [
                 _samples(s, r, i, net, facts, rng, rows)
@@ -217,10 +220,12 @@ def _samples(
     rows: int,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return inputs of a joint in random physics steps, (k, 2L), and delayed Δa, (k, 1) rad."""
-    count, length = facts["decimation"], len(net.mean) // 2
+    count = facts["decimation"]
+    length = len(net.mean) // 2
     path = CubicHermiteSpline(np.arange(len(s)) * s.dt, rollout.qpos[:, i], rollout.qvel[:, i])
     time = np.arange((len(s) - 1) * count) * (s.dt / count)
-    q, v = path(time), path(time, 1)
+    q = path(time)
+    v = path(time, 1)
     target = np.repeat(s.ctrl[:-1, i], count)
     delta = np.repeat(rollout.ctrl[:-1, i] - s.ctrl[:-1, i], count)
     chosen = rng.integers(0, len(target), rows)
@@ -238,7 +243,8 @@ def _fit(net: ActuatorNet, x: Tensor, y: Tensor) -> None:
     """
     net.mean.copy_(x.mean(0))
     net.std.copy_(x.std(0).clamp_min(1e-4))
-    z, unit = net.standardised(x), float(y.square().mean().sqrt()) or 1.0
+    z = net.standardised(x)
+    unit = float(y.square().mean().sqrt()) or 1.0
     optimiser = torch.optim.AdamW(net.net.parameters(), lr=RATE, weight_decay=DECAY)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, STEPS)
     for _ in range(STEPS):
@@ -294,22 +300,30 @@ def _error_in_mujoco(
     gain: float,
 ) -> float:
     """Return the mean |error| of the networks in plain MuJoCo, rad; the scene has no servos."""
-    model, op, errors = mujoco.MjModel.from_xml_path(str(file)), robot.operated_index, []
+    model = mujoco.MjModel.from_xml_path(str(file))
+    op = robot.operated_index
+    errors = []
     ids = [model.joint(name).id for name in robot.joint_names]
-    at, dof = model.jnt_qposadr[ids], model.jnt_dofadr[ids]
+    at = model.jnt_qposadr[ids]
+    dof = model.jnt_dofadr[ids]
     model.dof_invweight0[dof] *= facts["dof_invweight0_factor"]
     for net in nets.values():
         net.gain = gain
-    data, torque, length = mujoco.MjData(model), _stacked(list(nets.values())), _length(facts)
+    data = mujoco.MjData(model)
+    torque = _stacked(list(nets.values()))
+    length = _length(facts)
     for s in motions:
         mujoco.mj_resetData(model, data)
-        data.qpos[at], data.qvel[dof], path = s.qpos[0], s.qvel[0], [s.qpos[0]]
+        data.qpos[at] = s.qpos[0]
+        data.qvel[dof] = s.qvel[0]
+        path = [s.qpos[0]]
         past = np.zeros((len(ids), 2, length))
         past[:, 0] = (s.ctrl[0] - s.qpos[0])[:, None]
         for target in s.ctrl[:-1]:
             for _ in range(facts["decimation"]):
                 past[:, :, 1:] = past[:, :, :-1].copy()
-                past[:, 0, 0], past[:, 1, 0] = target - data.qpos[at], data.qvel[dof]
+                past[:, 0, 0] = target - data.qpos[at]
+                past[:, 1, 0] = data.qvel[dof]
                 data.qfrc_applied[dof] = torque(past.reshape(len(ids), -1))
                 mujoco.mj_step(model, data)
             path.append(data.qpos[at].copy())
@@ -349,4 +363,5 @@ def _write(net: ActuatorNet, folder: Path, name: str, info: dict[str, Any]) -> N
             program = torch.export.export(net, (x,), dynamic_shapes=batch)
             torch.export.save(program, file, extra_files={"metadata.json": json.dumps(info)})
         with atomic_write(folder / f"{name}.pt") as path:
-            torch.jit.save(torch.jit.trace(net, x), path)
+            trace: Any = torch.jit.trace  # has no types
+            torch.jit.save(trace(net, x), path)

@@ -128,7 +128,8 @@ def _draw(
 
     costs = errors_of(_windows(train), robots_of(base, drawn), "units on training motions")
     best = np.sort(np.argsort(costs)[: max(round(KEPT_SHARE * len(costs)), 1)])
-    units, rng = {field: values[best] for field, values in drawn.items()}, np.random.default_rng(0)
+    units = {field: values[best] for field, values in drawn.items()}
+    rng = np.random.default_rng(0)
     servos = [values for field, values in units.items() if field != "links"]
     low, high = (
         np.array([np.percentile(v, side, axis=0) for v in servos]) for side in RANGE_PERCENT

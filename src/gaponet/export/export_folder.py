@@ -41,7 +41,9 @@ from gaponet.nn.artifact import GapModel
 from gaponet.robot.spec import RobotSpec
 
 FOLDER_KIND = "engine"
-FACTS, ROBOT, CHECK = "facts.json", "robot.xml", "check.npz"
+FACTS = "facts.json"
+ROBOT = "robot.xml"
+CHECK = "check.npz"
 CONFIG = "robot_cfg.py"  # servos in the classes of Isaac Lab or Newton
 # Engine → name in the export folder → file in SHIPPED; beside the helper file.
 CHECK_FILES: dict[str, dict[str, str]] = {
@@ -217,7 +219,8 @@ def export_robot(
     if played is None:
         motions = own_motions(robot, payload_mass, 24 if robot.has_servo_model else 2)
         played = motions[::2], motions[1::2] or motions
-    train, validation = played[0], comparable(played[1], robot, payload_mass)
+    train = played[0]
+    validation = comparable(played[1], robot, payload_mass)
     if not validation:
         raise UsageError(
             f"no validation motion was made with {payload_mass:g} kg and the robot's own gains"
@@ -374,7 +377,8 @@ def export_networks(
     model.require_payload(payload_mass)
     robot = model.simulator()
     train, val = read_run_recordings(run, data, robot, payload_mass)
-    motions, dt = check_motions(val, robot), train[0].dt
+    motions = check_motions(val, robot)
+    dt = train[0].dt
     facts = simulator_facts(robot, dt, payload_mass) | {
         "file": ROBOT,
         "virtual": train[0].meta.virtual,

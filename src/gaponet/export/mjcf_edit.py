@@ -95,10 +95,12 @@ class Source:
         text = self.text[file] = file.read_bytes()
         if text[:2] in (b"\xff\xfe", b"\xfe\xff"):
             raise RobotError(f"{file}: is in UTF-16; write it in UTF-8")
-        parser, open_tags = expat.ParserCreate(), list[Tag]()
+        parser = expat.ParserCreate()
+        open_tags = list[Tag]()
 
         def begin(name: str, attributes: dict[str, str]) -> None:
-            start, match = parser.CurrentByteIndex, START_TAG.match(text, parser.CurrentByteIndex)
+            start = parser.CurrentByteIndex
+            match = START_TAG.match(text, parser.CurrentByteIndex)
             assert match is not None
             parent = open_tags[-1].name if open_tags else ""
             open_tags.append(Tag(file, name, attributes, parent, start, match.end()))
@@ -109,7 +111,8 @@ class Source:
             closed = text[: tag.open_end].endswith(b"/>")
             tag.end = tag.open_end if closed else text.index(b">", parser.CurrentByteIndex) + 1
 
-        parser.StartElementHandler, parser.EndElementHandler = begin, end
+        parser.StartElementHandler = begin
+        parser.EndElementHandler = end
         try:
             parser.Parse(text, True)
         except expat.ExpatError as error:
@@ -195,7 +198,8 @@ class Source:
 
     def write_changes(self, folder: Path) -> None:
         """Write the changes as a unified diff, changes.diff."""
-        edited, lines = self.edited(), list[str]()
+        edited = self.edited()
+        lines = list[str]()
         for file, old in self.text.items():
             a, b = (text.decode("utf-8").splitlines(keepends=True) for text in (old, edited[file]))
             lines += difflib.unified_diff(a, b, f"a/{file.name}", f"b/{file.name}", n=1)
@@ -224,9 +228,13 @@ def edit_mjcf(
         RobotError: A joint is not in the text or has several servos, or the compiled copy lacks the
             wanted servos.
     """
-    path, joints, prefix = path.resolve(), facts["plain"], facts["prefix"]
+    path = path.resolve()
+    joints = facts["plain"]
+    prefix = facts["prefix"]
     before = compile_spec(spec := read_mjcf(path), path)
-    source, added, not_rad = Source(path), list[str](), list[str]()
+    source = Source(path)
+    added = list[str]()
+    not_rad = list[str]()
     for name, servo in joints.items():
         full = prefix + name
         tag = source.one(f"joints '{full}'", "joint", name=full)
@@ -354,7 +362,8 @@ def _add_surroundings(
     if robot.table is not None and not (
         off and (model.geom_contype | model.geom_conaffinity).any()
     ):
-        own, table = build_model(robot), prefix + TABLE
+        own = build_model(robot)
+        table = prefix + TABLE
         option["cone"] = "elliptic"  # a pyramid's stiffness depends on friction
         if off:  # contacts are disabled in the file, and the pairs below are the only ones
             source.append("option", '    <flag contact="enable"/>\n')
@@ -364,7 +373,8 @@ def _add_surroundings(
         )
         source.append("worldbody", f"    {plane}\n")
         for i, tip in enumerate(robot.tips):
-            name, size = f"{table}_tip_{i}", text_of(tip.radius)
+            name = f"{table}_tip_{i}"
+            size = text_of(tip.radius)
             sphere = (
                 f'<geom name="{name}" type="sphere" size="{size}" pos="{text_of(*tip.pos)}" '
                 'mass="0" contype="0" conaffinity="0" group="3"/>'
@@ -380,10 +390,8 @@ def _add_surroundings(
                 "contact", f'    <pair geom1="{name}" geom2="{table}" condim="3" {words}/>\n'
             )
     for name, link in robot.links.items():
-        tag, values = (
-            body(prefix + name, "identified_link"),
-            {"mass": text_of(link.mass), "pos": text_of(*link.pos)},
-        )
+        tag = body(prefix + name, "identified_link")
+        values = {"mass": text_of(link.mass), "pos": text_of(*link.pos)}
         inertial = f"<inertial {_attributes(values | {'fullinertia': text_of(*link.inertia)})}/>"
         own = source.child(tag, "inertial")
         source.replace(own, inertial) if own else source.insert(tag, inertial)
@@ -438,11 +446,9 @@ def _require(
     counts = {f: (getattr(before, f), getattr(now, f)) for f in UNCHANGED_COUNTS}
     wrong = [f"{f} {old} → {new}" for f, (old, new) in counts.items() if old != new]
     for name in robot.operated:
-        servo, dof, i = (
-            joints[name],
-            now.joint(prefix + name).dofadr[0],
-            _actuator(now, prefix + name),
-        )
+        servo = joints[name]
+        dof = now.joint(prefix + name).dofadr[0]
+        i = _actuator(now, prefix + name)
         passive = [
             float(np.ravel(getattr(now, f"dof_{field}")[dof])[0]) for field in JOINT_ATTRIBUTES
         ]

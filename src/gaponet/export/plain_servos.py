@@ -212,7 +212,8 @@ def own_motions(robot: RobotSpec, payload_mass: float = 0.0, count: int = 24) ->
 
     All joints swing about home and pause.
     """
-    rng, op = np.random.default_rng(0), robot.operated_index
+    rng = np.random.default_rng(0)
+    op = robot.operated_index
     t = np.arange(0.0, OWN_MOTION_S, robot.dt)[:, None]
     home = robot.qpos_home[op]
     low, high = (np.clip(x, home - np.pi, home + np.pi) for x in robot.qpos_range[op].T)

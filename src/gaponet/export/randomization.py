@@ -90,29 +90,21 @@ def sample_units(
     """
     spec = robot if isinstance(robot, RobotSpec) else load_robot(robot)
     uncertainty = ParameterUncertainty.require(spec)
-    fields, joints = uncertainty.fields, spec.operated
+    fields = uncertainty.fields
+    joints = spec.operated
     now = np.stack([uncertainty.array(j, "values") for j in joints])
     covariance = np.stack([uncertainty.array(j, "covariance") for j in joints])
-    mean, deviations, notes = now, np.zeros((0, *now.shape)), list[str]()
-    if scope != "today":
-        each = _days(uncertainty, joints) if scope == "any-day" else _robots(spec, fields, others)
-        mean = each.mean(axis=0)
-        deviations = (each - mean) * np.sqrt((1 + 1 / len(each)) / (len(each) - 1))
-        what, factor = "days" if scope == "any-day" else "robots", _std_factor(len(each))
-        notes.append(
-            f"from {len(each)} {what}: how far they differ is known to a factor of {factor:.1f}"
-        )
+    mean, deviations, notes = _between_units(spec, uncertainty, scope, others)
     unknown = np.sqrt(np.einsum("njj->nj", covariance)) > UNDETERMINED_STD * prior_std(fields, now)
-    rng, count, single = (
-        np.random.default_rng(seed),
-        max(RANGE_SAMPLES, samples),
-        _uncorrelated_share(deviations),
-    )
+    rng = np.random.default_rng(seed)
+    count = max(RANGE_SAMPLES, samples)
+    single = _uncorrelated_share(deviations)
     weights = rng.standard_normal((count, len(deviations)))
     x = mean + np.sqrt(1 - single) * np.einsum("sd,dnp->snp", weights, deviations)
     x = x + np.sqrt(single * np.square(deviations).sum(axis=0)) * rng.standard_normal(x.shape)
     limit = np.repeat(spec.effort_limit[spec.operated_index][None], count, axis=0)
-    links, drawn = uncertainty.links if engine != "isaaclab" else None, dict[str, Array]()
+    links = uncertainty.links if engine != "isaaclab" else None
+    drawn = dict[str, Array]()
     if links:
         drawn["links"] = np.random.default_rng([seed, 1]).multivariate_normal(
             links.values, links.covariance, count
@@ -138,7 +130,8 @@ def sample_units(
         inverse, np.maximum(x, LEAST_INVERSE * mean), x
     )  # zero is no limit, which no range states
     x = np.where(optional & (mean == 0), 0.0, x)  # a joint without the effect gets none
-    sampled, value = from_axes(fields, x), from_axes(fields, mean)
+    sampled = from_axes(fields, x)
+    value = from_axes(fields, mean)
     ranges: dict[str, dict[str, tuple[float, float, float]]] = {j: {} for j in joints}
     for i, joint in enumerate(joints):
         for field in fields:
@@ -190,6 +183,26 @@ def judge_units(
         for i, (joint, by_field) in enumerate(made.ranges.items())
     }
     return replace(made, units=units, ranges=ranges, judged=judged, plain=plain)
+
+
+def _between_units(
+    spec: RobotSpec, uncertainty: ParameterUncertainty, scope: Scope, others: ListOf[Path]
+) -> tuple[Array, Array, list[str]]:
+    """Return the mean of days or robots, (n, P), their deviations, (units, n, P), and notes."""
+    if scope == "today":
+        now = np.stack([uncertainty.array(j, "values") for j in spec.operated])
+        return now, np.zeros((0, *now.shape)), []
+    if scope == "any-day":
+        what = "days"
+        each = _days(uncertainty, spec.operated)
+    else:
+        what = "robots"
+        each = _robots(spec, uncertainty.fields, others)
+    mean = each.mean(axis=0)
+    deviations = (each - mean) * np.sqrt((1 + 1 / len(each)) / (len(each) - 1))
+    factor = _std_factor(len(each))
+    note = f"from {len(each)} {what}: how far they differ is known to a factor of {factor:.1f}"
+    return mean, deviations, [note]
 
 
 def _days(uncertainty: ParameterUncertainty, joints: tuple[str, ...]) -> Array:

@@ -104,7 +104,8 @@ def summary(
         return np.concatenate([values(p)[1:] for p in predictions])
 
     difference = rows(lambda p: np.abs(p.rollout - p.robot))
-    inside, band = rows(lambda p: p.inside), rows(lambda p: p.half_width)
+    inside = rows(lambda p: p.inside)
+    band = rows(lambda p: p.half_width)
     rollout_behind, robot_behind = (
         rows(lambda p, f=f: np.abs(getattr(p, f) - p.target)) for f in ("rollout", "robot")
     )

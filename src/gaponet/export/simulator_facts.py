@@ -128,7 +128,8 @@ def mjcf_text(robot: RobotSpec, dt: float, payload_mass: float = 0.0) -> str:
         )
     servos = ET.SubElement(root, "actuator")
     for i in range(model.nu):
-        name, bias = model.actuator(i).name, model.actuator_biasprm[i]
+        name = model.actuator(i).name
+        bias = model.actuator_biasprm[i]
         if bias[0]:
             servo = ET.SubElement(
                 servos, "general", {"name": name, "joint": name, "biastype": "affine"}

@@ -181,7 +181,8 @@ def export_program(model: GapModel, run: Path, folder: Path, payload_mass: float
         ModelError: The difference is above 1e-5 rad, or `delta_step` refuses the model; nothing is
             written.
     """
-    step, path = delta_step(model, run, payload_mass), folder / PROGRAM
+    step = delta_step(model, run, payload_mass)
+    path = folder / PROGRAM
     content = io.BytesIO()  # torch ends the process if it writes to a full disk itself
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of torch about its own storages
@@ -209,7 +210,8 @@ def _largest_difference(program: Any, step: DeltaStep, model: GapModel) -> float
     payload = rng.uniform(0, model.config.payload_max, CHECK_WORLDS).astype(np.float32)
     low, high = np.clip(model.qpos_range.T, -1.0, 1.0)
     ctrl = rng.uniform(low, high, (CHECK_WORLDS, step.n))
-    qpos, largest = ctrl.copy(), 0.0
+    qpos = ctrl.copy()
+    largest = 0.0
     with torch.inference_mode():
         for t in range(CHECK_PERIODS):
             if t == CHECK_PERIODS // 2:

@@ -47,7 +47,8 @@ def edit_urdf(
     Raises:
         RobotError: A joint is not in the file, or it is no URDF.
     """
-    source, prefix = Source(path.resolve()), facts["prefix"]
+    source = Source(path.resolve())
+    prefix = facts["prefix"]
     if source.tags[0].name != "robot":
         raise RobotError(f"{path}: begins with <{source.tags[0].name}>, so it is no URDF")
     tags = {
@@ -85,7 +86,8 @@ def _set_links(source: Source, robot: RobotSpec, prefix: str) -> list[str]:
 
     Return the names of others.
     """
-    before, other = build_model(robot.before_identification), list[str]()
+    before = build_model(robot.before_identification)
+    other = list[str]()
     tags = {t.attributes.get("name", ""): t for t in source.tags if t.name == "link"}
     for name, link in robot.links.items():
         inertial = source.child(tag, "inertial") if (tag := tags.get(prefix + name)) else None

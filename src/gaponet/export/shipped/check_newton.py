@@ -17,7 +17,9 @@ from gaponet.export.shipped.mujoco_servos import Check, Motion, delay_weights
 
 HERE = Path(__file__).parent
 check = Check(HERE)
-facts, names, worlds = check.facts, check.names, check.worlds
+facts = check.facts
+names = check.names
+worlds = check.worlds
 networks = "actuator_net" in facts
 step = facts["actuator_net"]["step"] if networks else check.step
 robot = newton.ModelBuilder()
@@ -48,8 +50,15 @@ model = scene.finalize(device="cpu")
 fields = ("integrator", "tolerance", "iterations", "ls_iterations", "jacobian")
 options = {field: facts["options"][field] for field in fields}
 solver = newton.solvers.SolverMuJoCo(model, disable_contacts=True, **options)
-states, control = [model.state(), model.state()], model.control()
-rows = lambda x: x.numpy().reshape(worlds, -1)  # noqa: E731
+states = [model.state(), model.state()]
+control = model.control()
+
+
+def rows(x: Any) -> Any:
+    """Return an array of all worlds, (worlds, numbers of each)."""
+    return x.numpy().reshape(worlds, -1)
+
+
 target = 0.0 * rows(model.joint_q)
 histories = (
     [[actuator.state(), actuator.state()] for actuator in model.actuators] if networks else []
@@ -62,16 +71,19 @@ past = np.zeros((len(weights), worlds, len(names)))
 
 
 def start(motions: dict[int, Motion], ctrl: Any) -> None:
-    q, v = rows(states[0].joint_q).copy(), rows(states[0].joint_qd).copy()
+    q = rows(states[0].joint_q).copy()
+    v = rows(states[0].joint_qd).copy()
     for world, motion in motions.items():
-        q[world, at], v[world, dof] = motion["qpos"][0], motion["qvel"][0]
+        q[world, at] = motion["qpos"][0]
+        v[world, dof] = motion["qvel"][0]
         past[:, world] = ctrl[world]
     states[0].joint_q.assign(q.ravel())
     states[0].joint_qd.assign(v.ravel())
     newton.eval_fk(model, states[0].joint_q, states[0].joint_qd, states[0])
     target[:, at] = ctrl
     for actuator, (history, _) in zip(model.actuators if networks else [], histories, strict=True):
-        errors, places = history.drive_state.pos_error_history.numpy(), actuator.pos_indices.numpy()
+        errors = history.drive_state.pos_error_history.numpy()
+        places = actuator.pos_indices.numpy()
         fresh = [i for i, place in enumerate(places) if place // q.shape[1] in motions]
         errors[:, fresh] = (target.ravel() - q.ravel())[
             places[fresh]

@@ -88,7 +88,8 @@ class RobotEnv(gymnasium.Env[Any, Any]):
         self._renderer: Any = None
         self._use(self.facts, None)
         box = partial(gymnasium.spaces.Box, dtype=np.float32)
-        low, high = self._shown(self._low), self._shown(self._high)
+        low = self._shown(self._low)
+        high = self._shown(self._high)
         self.action_space = box(low, high)
         everything = np.full(len(self.names), np.inf, np.float32)
         spaces: dict[str, Any] = {

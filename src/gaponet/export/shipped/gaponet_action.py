@@ -39,7 +39,9 @@ from gaponet.export.shipped.scene_facts import require_scene
 from gaponet.export.shipped.unit_events import columns_of
 from gaponet.export.shipped.unit_events import mjlab_units as mjlab_units
 
-PROGRAM, FACTS, ROBOT = "delta.pt2", "facts.json", "robot.xml"
+PROGRAM = "delta.pt2"
+FACTS = "facts.json"
+ROBOT = "robot.xml"
 
 
 def read_facts(folder: str | Path) -> dict[str, Any]:
@@ -189,11 +191,13 @@ class AlignedAction:
         self.servo_offset = offset * torch.tensor(
             [facts[form][name]["offset"] for name in names], device=me.device
         )
-        self._aligned, self._columns = entity, ids
+        self._aligned = entity
+        self._columns = ids
 
     def process_actions(self, actions: Tensor) -> None:
         super().process_actions(actions)  # type: ignore[misc]
-        data, ids = self._aligned.data, self._columns
+        data = self._aligned.data
+        ids = self._columns
         q, v = (tensor(x)[:, ids] for x in (data.joint_pos, data.joint_vel))
         bias = (
             data.encoder_bias[:, ids] if hasattr(data, "encoder_bias") else 0.0
@@ -244,7 +248,8 @@ class CheckPlayer:
 
     def run(self, env: Any, action_joints: list[str]) -> Any:
         """Play all motions with action term "joint_pos"; return positions, (T, worlds, n) rad."""
-        robot, term = env.scene["robot"], env.action_manager.get_term("joint_pos")
+        robot = env.scene["robot"]
+        term = env.action_manager.get_term("joint_pos")
         columns = [self.check.names.index(name) for name in action_joints]
         for actuator in robot.actuators:
             if hasattr(actuator, "servos"):  # of mjlab
@@ -380,10 +385,8 @@ class DelayedAction:
         delay, me.servo_offset = (
             x.expand(me.num_envs, -1).clone() for x in (self.delay, me.servo_offset)
         )
-        delay[env_ids[:, None], columns], me.servo_offset[env_ids[:, None], columns] = (
-            units["delay"],
-            units["offset"],
-        )
+        delay[env_ids[:, None], columns] = units["delay"]
+        me.servo_offset[env_ids[:, None], columns] = units["offset"]
         self.set_delays(delay)
 
     def restart(self, qpos: Tensor, command: Tensor) -> None:
@@ -441,7 +444,8 @@ def _isaaclab_term() -> Any:
 
         def __init__(self, cfg: Any, env: Any) -> None:
             super().__init__(cfg, env)
-            self.folder, self.payload_mass = Path(cfg.folder), cfg.payload_mass
+            self.folder = Path(cfg.folder)
+            self.payload_mass = cfg.payload_mass
             facts = read_facts(self.folder)
             law = ", ".join(term for term in facts["law"] if term != "no_load_speed")
             if cfg.check and law and "model" in facts:

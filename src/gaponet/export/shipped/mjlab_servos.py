@@ -134,7 +134,8 @@ class WorldServos:
             raise ValueError(
                 "all worlds share one friction: cfg.events.update(mjlab_events(FOLDER)) gives each its own"
             )
-        dof, servo = self.addresses.dof, self.addresses.servo
+        dof = self.addresses.dof
+        servo = self.addresses.servo
         friction = friction_limit(self.terms, self.frictionloss, qvel, self.torque, self.load)
         model.dof_frictionloss[:, dof] = friction
         if "no_load_speed" in self.terms:
@@ -154,7 +155,8 @@ class WorldServos:
         columns = torch.tensor(
             columns_of(joints, self.joints, "the actuators"), device=env_ids.device
         )
-        dof, servo = self.addresses.dof[columns], self.addresses.servo[columns]
+        dof = self.addresses.dof[columns]
+        servo = self.addresses.servo[columns]
         write_model(model, env_ids, dof, servo, units)
         rows = env_ids[:, None]
 

@@ -37,8 +37,11 @@ def apply(model: mujoco.MjModel, drawn: dict[str, Any], row: int) -> None:
             if field != "links"
         }
         joint = model.joint(name)
-        dof, kp, limit = joint.dofadr[0], unit["kp"], unit["effort_limit"]
-        model.dof_damping[dof], model.dof_frictionloss[dof] = unit["damping"], unit["frictionloss"]
+        dof = joint.dofadr[0]
+        kp = unit["kp"]
+        limit = unit["effort_limit"]
+        model.dof_damping[dof] = unit["damping"]
+        model.dof_frictionloss[dof] = unit["frictionloss"]
         model.dof_armature[dof] = unit["armature"]
         for servo in np.flatnonzero(model.actuator_trnid[:, 0] == joint.id):
             if model.actuator_trntype[servo] == mujoco.mjtTrn.mjTRN_JOINT:
@@ -60,8 +63,12 @@ def set_links(model: mujoco.MjModel, drawn: dict[str, Any], row: int, form: str 
     The form "units" has the servo model, "plain_units" has not.
     """
     for i, name in enumerate(drawn.get("bodies", ())):
-        body, x = model.body(name), drawn[form]["links"][row][i]
-        body.mass[:], body.ipos[:], body.inertia[:], body.iquat[:] = x[0], x[1:4], x[4:7], x[7:]
+        body = model.body(name)
+        x = drawn[form]["links"][row][i]
+        body.mass[:] = x[0]
+        body.ipos[:] = x[1:4]
+        body.inertia[:] = x[4:7]
+        body.iquat[:] = x[7:]
         model.body_sameframe[body.id] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
     mujoco.mj_setConst(model, mujoco.MjData(model))
 

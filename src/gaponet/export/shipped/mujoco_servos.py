@@ -54,22 +54,21 @@ class Servos:
         column = {f: np.array([j.get(f, 0.0) for j in joints.values()]) for f in numbers}
         self.model = model
         self.dof, self.qpos, self.servo = addresses(model, list(joints), prefix)
-        self.kp, self.frictionloss = column["kp"], column["frictionloss"]
-        self._motor, self._play_time = (column["armature"], column["damping"], column["kd"]), np.nan
-        self.bias, self.effort = self.kp * column["offset"], column["effort_limit"]
-        model.dof_armature[self.dof], model.dof_damping[self.dof, ...] = (
-            column["armature"],
-            column["damping"],
-        )
+        self.kp = column["kp"]
+        self.frictionloss = column["frictionloss"]
+        self._motor = (column["armature"], column["damping"], column["kd"])
+        self._play_time = np.nan
+        self.bias = self.kp * column["offset"]
+        self.effort = column["effort_limit"]
+        model.dof_armature[self.dof] = column["armature"]
+        model.dof_damping[self.dof, ...] = column["damping"]
         # A servo that limits the speed of its targets (<pid slewmax>) has its stiffness in biasprm
         # alone.
         self._ramped = np.array([ramp_speed(model, i) > 0 for i in self.servo])
         model.actuator_gainprm[self.servo, 0] = np.where(self._ramped, 0.0, self.kp)
         model.actuator_biasprm[self.servo, 0] = self.bias
-        model.actuator_biasprm[self.servo, 1], model.actuator_biasprm[self.servo, 2] = (
-            -self.kp,
-            -column["kd"],
-        )
+        model.actuator_biasprm[self.servo, 1] = -self.kp
+        model.actuator_biasprm[self.servo, 2] = -column["kd"]
         model.dof_frictionloss[self.dof] = self.frictionloss
         model.qpos0[self.qpos] += (
             np.array([facts["plain"][name]["zero"] for name in joints]) - column["zero"]
@@ -89,7 +88,9 @@ class Servos:
         too."""
         if not self.terms:
             return
-        model, torque, load = self.model, data.actuator_force[self.servo], data.qfrc_bias[self.dof]
+        model = self.model
+        torque = data.actuator_force[self.servo]
+        load = data.qfrc_bias[self.dof]
         q = data.qpos[self.qpos]
         qvel = data.qvel[self.dof]
         limit = friction_limit(self.terms, self.frictionloss, qvel, torque, load)
@@ -107,9 +108,12 @@ class Servos:
             limit, armature, damping, applied, gear, more = self.play.before(
                 limit, self.kp, q, qvel, h
             )
-            model.dof_armature[self.dof], model.dof_damping[self.dof, ...] = armature, damping
-            data.qfrc_applied[self.dof], model.actuator_gear[self.servo, 0] = applied, gear
-            bias, self._play_time = bias + more, data.time + h
+            model.dof_armature[self.dof] = armature
+            model.dof_damping[self.dof, ...] = damping
+            data.qfrc_applied[self.dof] = applied
+            model.actuator_gear[self.servo, 0] = gear
+            bias = bias + more
+            self._play_time = data.time + h
         model.dof_frictionloss[self.dof] = limit
         model.actuator_biasprm[self.servo, 0] = bias
 
@@ -183,12 +187,17 @@ def play(
     """
     import mujoco
 
-    names, ctrl, qpos = list(facts["joints"]), motion["ctrl"], np.array(motion["qpos"])
+    names = list(facts["joints"])
+    ctrl = motion["ctrl"]
+    qpos = np.array(motion["qpos"])
     steps = max(1, round(float(motion["dt"]) / model.opt.timestep))
     model.opt.timestep = float(motion["dt"]) / steps
-    servos, data = Servos(model, facts, prefix) if form == "joints" else None, mujoco.MjData(model)
+    servos = Servos(model, facts, prefix) if form == "joints" else None
+    data = mujoco.MjData(model)
     dof, at, servo = addresses(model, names, prefix)
-    data.qpos[at], data.qvel[dof], data.ctrl[servo] = qpos[0], motion["qvel"][0], ctrl[0]
+    data.qpos[at] = qpos[0]
+    data.qvel[dof] = motion["qvel"][0]
+    data.ctrl[servo] = ctrl[0]
     fill_delays(model, data)
     mujoco.mj_forward(model, data)
     for t in range(len(ctrl) - 1):
@@ -234,7 +243,8 @@ class Check:
     """
 
     def __init__(self, folder: Path) -> None:
-        self.facts, stored = read(folder / "facts.json"), np.load(folder / "check.npz")
+        self.facts = read(folder / "facts.json")
+        stored = np.load(folder / "check.npz")
         self.names = list(self.facts["joints"])
         fields = ("ctrl", "qpos", "qvel", "dt")
         self.motions: list[Motion] = [

@@ -37,7 +37,8 @@ def require_scene(
     Raises:
         ValueError: The message names the fields that differ.
     """
-    facts, wrong = read(Path(folder) / "facts.json"), []
+    facts = read(Path(folder) / "facts.json")
+    wrong = []
     for name, joint in facts["joints"].items():
         for field, value in joint_fields(model, prefix + name).items():
             if field in skipped:
@@ -46,7 +47,8 @@ def require_scene(
     here = solver_options(model)
     for field, value in facts["options"].items():
         if field.endswith("flags"):
-            now, then = sorted(set(here[field]) - FREE_FLAGS), sorted(set(value) - FREE_FLAGS)
+            now = sorted(set(here[field]) - FREE_FLAGS)
+            then = sorted(set(value) - FREE_FLAGS)
             wrong += [] if now == then else [f"{field} {now} instead of {then}"]
         elif isinstance(value, str):
             wrong += [] if here[field] == value else [f"{field} {here[field]} instead of {value}"]

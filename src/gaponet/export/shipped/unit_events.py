@@ -117,30 +117,31 @@ def mjlab_units(file: str | Path, term: str = "joint_pos", rows: Any = None) -> 
 
 def write_model(model: Any, env_ids: Tensor, dof: Tensor, servo: Tensor, units: Units) -> None:
     """Write units to a model of mjlab, at the addresses of the joints."""
-    at, kp, limit = env_ids[:, None], units["kp"], units["effort_limit"]
-    model.dof_armature[at, dof], model.dof_frictionloss[at, dof] = (
-        units["armature"],
-        units["frictionloss"],
-    )
+    at = env_ids[:, None]
+    kp = units["kp"]
+    limit = units["effort_limit"]
+    model.dof_armature[at, dof] = units["armature"]
+    model.dof_frictionloss[at, dof] = units["frictionloss"]
     damping = model.dof_damping  # MuJoCo's versions differ in whether it has powers of the speed
     damping[(at, dof, 0) if damping.ndim == 3 else (at, dof)] = units["damping"]
     model.actuator_gainprm[at, servo, 0] = kp
-    model.actuator_biasprm[at, servo, 0], model.actuator_biasprm[at, servo, 1] = (
-        kp * units["offset"],
-        -kp,
-    )
+    model.actuator_biasprm[at, servo, 0] = kp * units["offset"]
+    model.actuator_biasprm[at, servo, 1] = -kp
     model.actuator_forcerange[at, servo] = torch.stack([-limit, limit], dim=-1)
 
 
 def write_links(sim: Any, env_ids: Tensor, bodies: list[str], links: Tensor) -> None:
     """Write masses, centres of mass and inertias to a model of mjlab, (worlds, bodies, 11)."""
-    model, parents = sim.model, sim.mj_model.body_parentid.tolist()
+    model = sim.model
+    parents = sim.mj_model.body_parentid.tolist()
     at = (
         env_ids[:, None],
         torch.tensor([sim.mj_model.body(name).id for name in bodies], device=links.device),
     )
-    model.body_mass[at], model.body_ipos[at] = links[..., 0], links[..., 1:4]
-    model.body_inertia[at], model.body_iquat[at] = links[..., 4:7], links[..., 7:]
+    model.body_mass[at] = links[..., 0]
+    model.body_ipos[at] = links[..., 1:4]
+    model.body_inertia[at] = links[..., 4:7]
+    model.body_iquat[at] = links[..., 7:]
     total = model.body_mass[env_ids].clone()
     for body in range(len(parents) - 1, 0, -1):
         total[:, parents[body]] += total[:, body]
@@ -240,7 +241,8 @@ def _speed_lines(
     """
     together = [batch.actuator for batch in getattr(robot.actuators, "_execution_batches", ())]
     for i, joint in enumerate(joints):
-        limit, speed = units["effort_limit"][:, i], units["no_load_speed"][:, i]
+        limit = units["effort_limit"][:, i]
+        speed = units["no_load_speed"][:, i]
         motors = [
             m
             for m in (groups[joint], *together)
@@ -251,10 +253,8 @@ def _speed_lines(
                 f"joint '{joint}' needs a torque-speed line: take isaaclab_actuators, or a DCMotorCfg"
             )
         for motor in motors:
-            column, top = (
-                list(motor.joint_names).index(joint),
-                getattr(motor, "actuator_velocity_limit", None),
-            )
+            column = list(motor.joint_names).index(joint)
+            top = getattr(motor, "actuator_velocity_limit", None)
             top = motor.velocity_limit if top is None else top
             top = getattr(top, "torch", top)
             motor._saturation_effort = (
