@@ -35,6 +35,7 @@ class GaponetRobotConfig(RobotConfig):
     follow: bool = False
     payload_mass: float = 0.0  # kg in each hand
     dynamics: bool = False  # feed forward accelerations: only for planned, smooth targets
+    fps: float | None = None  # control rate, Hz, equal to LeRobot's; default that of known or model
     # deg, rad, or signed_percent: -100..100 over the joint's range, as robots without use_degrees have it.
     unit: JointUnit = "deg"
     # LeRobot's name of a joint → its name in robot.toml, where they differ.
@@ -61,6 +62,7 @@ class GaponetRobot(Robot):
             payload_mass=config.payload_mass,
             dynamics=config.dynamics,
             follow=config.follow,
+            fps=config.fps,
         )
         spec = self.corrector.spec
         keys = joint_keys(self.robot.action_features, spec.joint_names, self._joint_name)
@@ -80,6 +82,12 @@ class GaponetRobot(Robot):
     @cached_property
     def action_features(self) -> dict[str, Any]:
         return self.robot.action_features
+
+    @property
+    def cameras(self) -> dict[str, Any]:
+        """Cameras of LeRobot's robot, which lerobot-record counts."""
+        cameras: dict[str, Any] = getattr(self.robot, "cameras", {})
+        return cameras
 
     @property
     def is_connected(self) -> bool:

@@ -44,6 +44,7 @@ class Corrector:
         payload_mass: float = 0.0,
         dynamics: bool = False,
         follow: bool = False,
+        fps: float | None = None,
     ) -> "Corrector":
         """Make the corrector of an identified robot or of a trained network.
 
@@ -53,6 +54,7 @@ class Corrector:
             payload_mass: In each hand, kg.
             dynamics: Feed forward accelerations: only for planned, smooth targets.
             follow: Move as the nominal simulator of `known` does.
+            fps: Control rate, Hz; default that of the model or of robot.toml.
 
         Raises:
             ValueError: Not one of known and model was given, or a model with follow.
@@ -70,6 +72,8 @@ class Corrector:
         place = Path(known) if Path(known).is_dir() else known
         spec = load_robot(place) if network is None else network.simulator()
         dt = spec.dt if network is None else network.card["dt"][0]
+        if fps is not None:
+            dt = 1 / fps
         config = CompensatorConfig(dynamics=dynamics)
         compensator = Compensator(spec, network, config, dt, follow="nominal" if follow else None)
         return cls(spec, compensator, dt, payload_mass)
