@@ -70,7 +70,7 @@ ACTUATORS = re.compile(r"\s*<actuator>.*?</actuator>", re.DOTALL)
 WITHOUT_TABLE = ("isaaclab", "newton")  # engines in whose scenes robot.xml's table is not
 WITHOUT_SERVO_MODEL = ("isaaclab", "newton", "urdf")
 DELAY_NOTES = {
-    "newton": "Newton has no delays: check.py has a buffer of five lines",
+    "newton": "Newton's joint targets have no delay: check.py has a buffer of five lines",
     "mjcf": "delays need MuJoCo 3.5, and after each reset fill_delays of mujoco_servos.py; MJX ignores them without a "
     "message",
 }
