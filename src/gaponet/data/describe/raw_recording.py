@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import zipfile
 from collections.abc import Callable, Iterator
+from collections.abc import Sequence as ListOf
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -15,7 +16,7 @@ import numpy as np
 from gaponet.base.arrays import Array
 from gaponet.base.errors import LogError, UsageError
 from gaponet.data.describe.clocks import clock_periods, named_like_a_clock, require_one_rate
-from gaponet.data.describe.encoders import read_encoders
+from gaponet.data.describe.encoders import Encoder, read_encoders
 from gaponet.data.describe.joints import ignored, resolve_all
 from gaponet.data.describe.logs_file import HINT, LogsFile
 from gaponet.data.describe.plausibility import to_radians
@@ -130,51 +131,36 @@ class RawRecording:
         self, robot: RobotSpec, specified: LogsFile, joint_map: dict[str, str] | None
     ) -> Log:
         """The columns that `specified` calls ctrl, qpos, …, in SI and on one time axis; channels keep their clocks."""
-        given, specified = specified, self.default | specified
+        stated = specified
+        specified = self.default | stated
         chosen = _choose(self, robot, specified, joint_map)
-        if FEEDFORWARD in given and FEEDFORWARD not in chosen:
+        if FEEDFORWARD in stated and FEEDFORWARD not in chosen:
             raise LogError(
                 f"{self.where or self.source}: no column holds {FEEDFORWARD}; there are: {self.shown()}"
             )
-        own: dict[Any, str] = specified.get("clock", {})
-        clocks = {channel: own.get(channel) or specified.get("time") for channel in chosen}
+        clocks = _clocks(specified, chosen)
+        self._require_one_clock(clocks, specified)
         gains = {
             name: _gain_columns(self, specified, name, chosen["ctrl"]) for name in ("kp", "kd")
         }
-        names = {
-            signal
-            for joints in (*chosen.values(), *gains.values())
-            for signal, _ in joints.values()
-        }
-        self._require_one_clock(clocks, specified)
-        loaded = self.load(
-            [*names, *{c for c in clocks.values() if c in self.signals and c not in names}]
-        )
-        if any(loaded[c].in_seconds for c in clocks.values() if c in loaded):
+        loaded = self._load_columns([*chosen.values(), *gains.values()], clocks)
+        if any(loaded[clock].in_seconds for clock in clocks.values() if clock in loaded):
             specified = LogsFile(time_unit="s") | specified
         units = _units(robot, specified, list(chosen["ctrl"]), joint_map)
-        times = {
-            channel: _time(self, specified, loaded, clocks[channel], channel, chosen[channel])
-            for channel in chosen
-        }
         joints = tuple(name for name in robot.joint_names if name in chosen["ctrl"])
-        in_units = [units[j] for j in joints]
-        encoders = None
-        if "calibration" in specified:
-            encoders = read_encoders(Path(specified["calibration"]), robot, joint_map)
+        in_si = _Conversion(
+            robot,
+            joints,
+            [units[j] for j in joints],
+            specified,
+            _encoders(robot, specified, joint_map),
+        )
         channels = {}
         for channel, columns in chosen.items():
-            values = np.stack([_column(loaded, *columns[j]) for j in joints], axis=1).astype(float)
-            if channel == "ctrl" and "action_scale" in specified:
-                values = robot.qpos_home[robot.index(joints)] + specified["action_scale"] * values
-            channels[channel] = Channel(
-                times[channel], to_radians(channel, values, joints, in_units, robot, encoders)
-            )
+            time = _time(self, specified, loaded, clocks[channel], channel, columns)
+            channels[channel] = Channel(time, in_si.values(channel, columns, loaded))
         channels, empty = sampled_channels(channels, joints, self.where or self.source)
-        start = min((float(c.time[0]) for c in channels.values() if len(c.time)), default=0.0)
-        shifted = {
-            id(c.time): c.time - start for c in channels.values()
-        }  # epoch nanoseconds would lose their digits
+        channels = _from_zero(channels)
         meta = dict(self.meta)
         if empty:
             meta["notes"] = meta.get("notes", {}) | empty
@@ -183,15 +169,19 @@ class RawRecording:
                 meta[name] = [_constant(self, name, _column(loaded, *columns[j])) for j in joints]
         if "rate" in specified:
             meta["dt"] = 1 / specified["rate"]
-        return Log(
-            robot.name, joints, {n: Channel(shifted[id(c.time)], c.values) for n, c in channels.items()}, self.source,
-            meta | {
-                "files": dict.fromkeys(channels, self.files[0] if self.files else self.source),
-                "all_files": self.files,
-                "first_line": self.first_line,
-                "converted_from": {j: u for j, u in zip(joints, in_units, strict=True) if u != "rad"},
-            },
-        )  # fmt: skip
+        meta["files"] = dict.fromkeys(channels, self.files[0] if self.files else self.source)
+        meta["all_files"] = self.files
+        meta["first_line"] = self.first_line
+        meta["converted_from"] = {j: units[j] for j in joints if units[j] != "rad"}
+        return Log(robot.name, joints, channels, self.source, meta)
+
+    def _load_columns(
+        self, columns: list[Columns], clocks: dict[str, str | None]
+    ) -> dict[str, Signal]:
+        """Load the signals of some columns, and those that are clocks."""
+        names = {signal for joints in columns for signal, _ in joints.values()}
+        of_time = {c for c in clocks.values() if c in self.signals and c not in names}
+        return self.load([*names, *of_time])
 
     def _require_one_clock(self, clocks: dict[str, str | None], specified: LogsFile) -> None:
         """Refuse clocks of channels that another column contradicts."""
@@ -292,6 +282,54 @@ Columns = dict[str, tuple[str, int | None]]  # joint → (signal, column)
 Chosen = dict[str, Columns]  # by channel
 
 
+@dataclass(frozen=True)
+class _Conversion:
+    """How columns of a log become SI.
+
+    Attributes:
+        joints: The robot's own names, (n).
+        units: Of their positions, (n).
+        specified: logs.toml with all defaults.
+        encoders: The arm's calibration, if one is given.
+    """
+
+    robot: RobotSpec
+    joints: tuple[str, ...]
+    units: list[str]
+    specified: LogsFile
+    encoders: dict[str, Encoder] | None
+
+    def values(self, channel: str, columns: Columns, loaded: dict[str, Signal]) -> Array:
+        """Return the values of a channel, (k, n) in SI."""
+        logged = [_column(loaded, *columns[joint]) for joint in self.joints]
+        values = np.stack(logged, axis=1).astype(float)
+        if channel == "ctrl" and "action_scale" in self.specified:
+            home = self.robot.qpos_home[self.robot.index(self.joints)]
+            values = home + self.specified["action_scale"] * values
+        return to_radians(channel, values, self.joints, self.units, self.robot, self.encoders)
+
+
+def _encoders(
+    robot: RobotSpec, specified: LogsFile, joint_map: dict[str, str] | None
+) -> dict[str, Encoder] | None:
+    if "calibration" not in specified:
+        return None
+    return read_encoders(Path(specified["calibration"]), robot, joint_map)
+
+
+def _clocks(specified: LogsFile, chosen: Chosen) -> dict[str, str | None]:
+    """Return channel → column of its clock; None where none is named."""
+    own: dict[Any, str] = specified.get("clock", {})
+    return {channel: own.get(channel) or specified.get("time") for channel in chosen}
+
+
+def _from_zero(channels: dict[str, Channel]) -> dict[str, Channel]:
+    """Return channels whose time starts at 0: nanoseconds since 1970 would lose their digits."""
+    start = min((float(c.time[0]) for c in channels.values() if len(c.time)), default=0.0)
+    shifted = {id(c.time): c.time - start for c in channels.values()}  # a shared clock stays shared
+    return {name: Channel(shifted[id(c.time)], c.values) for name, c in channels.items()}
+
+
 def _choose(
     recording: RawRecording, robot: RobotSpec, specified: LogsFile, joint_map: dict[str, str] | None
 ) -> Chosen:
@@ -338,35 +376,14 @@ def _matching(
     if not isinstance(pattern, str):
         return []
     if pattern in recording.signals and "{joint}" not in pattern:
-        own, given = recording.signals[pattern], specified.get("joints")
-        labels = own or ("0",)
-        if all(label.isdigit() for label in labels):
-            if given is None or len(given) != len(labels):
-                explanation = f"joints has {len(given)}" if given else "nothing names them"
-                raise LogError(
-                    f"{recording.where or recording.source}: {pattern} has {len(labels)} columns and {explanation}; "
-                    f"write joints = [{len(labels)} names, in its order] into logs.toml"
-                )
-            labels = tuple(given)
-        return [
-            (joint, f"{pattern}[{x}]" if own else pattern)
-            for joint, x in zip(labels, own or "0", strict=True)
-        ]
+        return _columns_of_array(recording, pattern, specified.get("joints"))
     if pattern.count("{joint}") != 1:
         return []  # an array that this recording does not have
-    # q_{joint} reads q_des_1 as well: where another channel says more of a column's name, it is that channel's.
-    longer = [
-        str(p)
-        for c in CHANNELS
-        if (p := specified.get(c)) and "{joint}" in str(p) and len(str(p)) > len(pattern)
-    ]
-    mine, *others = [
-        re.compile("(?P<joint>.+?)".join(map(re.escape, p.split("{joint}"))))
-        for p in (pattern, *longer)
-    ]
+    fits = _column_pattern(pattern)
+    others = [_column_pattern(longer) for longer in _longer_patterns(specified, pattern)]
     found = []
     for column in recording.columns:
-        match = mine.fullmatch(column)
+        match = fits.fullmatch(column)
         if match is None or column in taken or column.startswith(TIME):
             continue
         if column.startswith(COMMAND) and channel not in COMMANDS:
@@ -374,6 +391,40 @@ def _matching(
         if not any(other.fullmatch(column) for other in others):
             found.append((match["joint"], column))
     return found
+
+
+def _columns_of_array(
+    recording: RawRecording, array: str, given: list[str] | None
+) -> list[tuple[str, str]]:
+    """Return (joint, column) of each column of an array.
+
+    Args:
+        given: Names of its columns, where the file does not name them.
+    """
+    own = recording.signals[array]
+    labels = own or ("0",)
+    names: ListOf[str] = labels
+    if all(label.isdigit() for label in labels):
+        if given is None or len(given) != len(labels):
+            explanation = f"joints has {len(given)}" if given else "nothing names them"
+            raise LogError(
+                f"{recording.where or recording.source}: {array} has {len(labels)} columns and {explanation}; "
+                f"write joints = [{len(labels)} names, in its order] into logs.toml"
+            )
+        names = given
+    columns = [f"{array}[{label}]" for label in own] or [array]
+    return list(zip(names, columns, strict=True))
+
+
+def _longer_patterns(specified: LogsFile, pattern: str) -> list[str]:
+    """Return patterns that say more of a column's name: q_{joint} reads q_des_1 as well, which is q_des_{joint}'s."""
+    patterns = [str(specified.get(channel, "")) for channel in CHANNELS]
+    return [p for p in patterns if "{joint}" in p and len(p) > len(pattern)]
+
+
+def _column_pattern(pattern: str) -> re.Pattern[str]:
+    before, after = map(re.escape, pattern.split("{joint}"))
+    return re.compile(f"{before}(?P<joint>.+?){after}")
 
 
 def _gain_columns(
