@@ -24,6 +24,7 @@ OPTIONAL = ("qacc", "tau", "tau_eq", "temperature")
 MIN_PERIOD_S, MAX_PERIOD_S = 1e-4, 1.0  # periods, s
 MAX_GAP = 2.0  # between two samples of the state, s: what moved there is not known, and a clock that jumps is no clock
 MAX_UNEVEN_SHARE = 0.1  # of the median period, by which the periods of even rows differ from it
+EXACT_PERIOD_S = 2e-6  # by which the periods of a clock that does not waver differ from their mean
 MAX_GROWTH = 3  # times as many rows as were recorded: a few bursts must not set the period of all
 FEW = 16  # rows of which a loop's period is told first
 ASSUMED = "of robot.toml"  # note of gains that the log did not say
@@ -244,71 +245,107 @@ def to_sequence(log: Log, robot: RobotSpec, meta: SequenceMeta) -> Sequence:
             "posture", {joint: rad}) says, else at home, which is noted.
         robot: Decides the joint order; its gains stand where neither meta nor the log (meta "kp", "kd") says them.
     """
-    time = log.channels["qpos"].time
     _require_both_ends(log)
-    period = np.diff(time)
     median = _median_period(log)
-    shared = _share_clock(log)
-    even = shared and bool((np.abs(period - median) <= MAX_UNEVEN_SHARE * median).all())
-    mean = round(float(period.mean()), 7)
-    exact = (mean,) if np.abs(period - mean).max() < 2e-6 else ()  # a clock that does not waver
-    periods = (log.meta["dt"],) if "dt" in log.meta else (*exact, round(median, 5), mean)
-    dt = _row_period(time, periods) if even else None
-    regular = dt is not None
-    if dt is not None:
-        arrays = {name: channel.values for name, channel in log.channels.items()}
-    else:
-        free = shared and "dt" not in log.meta
-        begin, dt = _loop(time, median, robot.dt) if free else (None, round(median, 5))
-        arrays = _resample(log, dt, begin)
     copies = _copies(log)
+    arrays, dt, regular = _on_grid(log, median, robot.dt)
     same = [copies.get(name) == 0 for name in log.joint_names]
     if any(same) and not regular:  # the same numbers stay the same between the rows
         arrays["ctrl"][:, same] = arrays["qpos"][:, same]
     arrays = {name: _to_robot(name, values, log, robot) for name, values in arrays.items()}
-    converted = log.meta.get("converted_from", {})
-    odd = [
-        j
-        for j, name in enumerate(robot.joint_names)
-        if "qvel" not in arrays or converted.get(name) == "fraction"
-    ]
-    if odd:  # a joint logged as a fraction of its range has its velocity in any unit at all
-        qvel = differentiate(arrays["qpos"], dt)
-        arrays.setdefault("qvel", qvel)[:, odd] = qvel[:, odd]
+    _add_velocities(arrays, dt, log, robot)
     notes = meta.notes | log.meta.get("notes", {}) | _row_notes(log, median, dt, regular)
     if copies:
         notes["copied_rows"] = copies
-    posture = {j: x for j, x in log.meta.get("posture", {}).items() if j not in log.joint_names}
-    known = {*log.joint_names, *posture, *_led(log, robot)}
-    absent = [name for name in robot.joint_names if name not in known]
-    notes |= ({"posture": posture} if posture else {}) | (
-        {"held_at_home": absent} if absent else {}
-    )
-    if converted:
-        notes["converted_from"] = converted
+    notes |= _posture_notes(log, robot)
     gains = {name: getattr(meta, name) or _recorded(name, log, robot) for name in ("kp", "kd")}
-    origins = [
-        "as stated" if getattr(meta, n) else "as recorded" if n in log.meta else ASSUMED
-        for n in gains
-    ]
-    notes["gains"] = origins[0] if origins[0] == origins[1] else f"kp {origins[0]}, kd {origins[1]}"
+    origins = {name: _gain_origin(name, meta, log) for name in gains}
+    different = f"kp {origins['kp']}, kd {origins['kd']}"
+    notes["gains"] = origins["kp"] if origins["kp"] == origins["kd"] else different
     if FEEDFORWARD in arrays:
-        assumed = origins[0] == ASSUMED
-        further = _feedforward_position(
-            arrays.pop(FEEDFORWARD), np.array(gains["kp"]), assumed, log, robot
-        )
+        torque = arrays.pop(FEEDFORWARD)
+        assumed = origins["kp"] == ASSUMED
+        further = _feedforward_position(torque, np.array(gains["kp"]), assumed, log, robot)
         arrays["ctrl"] = arrays["ctrl"] + further
-        largest = {
-            j: round(float(x), 4)
-            for j, x in zip(robot.joint_names, abs(further).max(axis=0), strict=True)
-            if x
-        }
-        notes |= (
-            {FEEDFORWARD: {"in": "ctrl, as torque / kp", "largest_rad": largest}} if largest else {}
-        )
+        notes |= _feedforward_notes(further, robot)
     meta = SequenceMeta(**(asdict(meta) | gains | {"notes": notes}))
     channels: dict[str, Any] = dict(arrays)
     return Sequence(meta, robot.joint_names, dt, **channels)
+
+
+def _on_grid(log: Log, median: float, usual: float) -> tuple[dict[str, Array], float, bool]:
+    """Return the channels' values on one grid, its period, and whether these are the rows as they were recorded.
+
+    Args:
+        median, usual: Period of the log's state, and of the robot's controller, s.
+    """
+    time = log.channels["qpos"].time
+    period = np.diff(time)
+    shared = _share_clock(log)
+    if shared and bool((np.abs(period - median) <= MAX_UNEVEN_SHARE * median).all()):
+        dt = _row_period(time, _even_periods(log, median))
+        if dt is not None:
+            return {name: channel.values for name, channel in log.channels.items()}, dt, True
+    if shared and "dt" not in log.meta:
+        begin, dt = _loop(time, median, usual)
+        return _resample(log, dt, begin), dt, False
+    dt = round(median, 5)
+    return _resample(log, dt, None), dt, False
+
+
+def _even_periods(log: Log, median: float) -> tuple[float, ...]:
+    """Return periods that even rows may have, s, the likeliest first."""
+    if "dt" in log.meta:
+        return (log.meta["dt"],)
+    period = np.diff(log.channels["qpos"].time)
+    mean = round(float(period.mean()), 7)
+    rounded = (round(median, 5), mean)
+    if np.abs(period - mean).max() < EXACT_PERIOD_S:
+        return (mean, *rounded)
+    return rounded
+
+
+def _add_velocities(arrays: dict[str, Array], dt: float, log: Log, robot: RobotSpec) -> None:
+    """Compute velocities that were not recorded, or that a joint logged as a fraction has in any unit at all."""
+    qvel = differentiate(arrays["qpos"], dt)
+    if "qvel" not in arrays:
+        arrays["qvel"] = qvel
+        return
+    converted = log.meta.get("converted_from", {})
+    odd = [j for j, name in enumerate(robot.joint_names) if converted.get(name) == "fraction"]
+    arrays["qvel"][:, odd] = qvel[:, odd]
+
+
+def _posture_notes(log: Log, robot: RobotSpec) -> dict[str, Any]:
+    """Return notes of joints that the log does not hold, and of units that were converted."""
+    notes: dict[str, Any] = {}
+    posture = {j: x for j, x in log.meta.get("posture", {}).items() if j not in log.joint_names}
+    known = {*log.joint_names, *posture, *_led(log, robot)}
+    absent = [name for name in robot.joint_names if name not in known]
+    if posture:
+        notes["posture"] = posture
+    if absent:
+        notes["held_at_home"] = absent
+    if log.meta.get("converted_from"):
+        notes["converted_from"] = log.meta["converted_from"]
+    return notes
+
+
+def _gain_origin(name: str, meta: SequenceMeta, log: Log) -> str:
+    if getattr(meta, name):
+        return "as stated"
+    return "as recorded" if name in log.meta else ASSUMED
+
+
+def _feedforward_notes(further: Array, robot: RobotSpec) -> dict[str, Any]:
+    """Return notes of positions (T, n) rad that were added to the command for a torque."""
+    most = np.abs(further).max(axis=0)
+    largest = {
+        name: round(float(x), 4) for name, x in zip(robot.joint_names, most, strict=True) if x
+    }
+    if not largest:
+        return {}
+    return {FEEDFORWARD: {"in": "ctrl, as torque / kp", "largest_rad": largest}}
 
 
 def _copies(log: Log) -> dict[str, int]:
