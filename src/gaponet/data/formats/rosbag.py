@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -247,57 +247,94 @@ def _load(bag: Path, meta: dict[str, Any], names: list[str]) -> dict[str, Signal
     return loaded
 
 
+class _Row(NamedTuple):
+    """What one message tells of the wanted fields of a topic."""
+
+    received: float  # by the recorder's clock, s
+    stamp: float  # by its header, s; the recorder's where it has none
+    stamped: bool
+    values: list[
+        list[float]
+    ]  # by field, in the order of its columns; NaN for those of which it tells nothing
+
+
+Wanted = dict[str, dict[str, tuple[str, ...]]]  # topic → field → names of its columns
+
+
 @sandboxed(LogError, "rosbags.highlevel", 4.0)
 def _read(bag: Path, names: list[str]) -> tuple[dict[str, Signal], dict[str, Any]]:
     """The same, and notes."""
     with _opened(bag) as reader:
-        topics = _peek(bag, reader)
-        wanted = {
-            t: {f: labels for f, labels in fields.items() if f"{t}.{f}" in names}
-            for t, fields in topics.items()
-        }
-        wanted = {topic: fields for topic, fields in wanted.items() if fields}
-        rows: dict[str, list[Any]] = {topic: [] for topic in wanted}
-        used = {topic.split("#")[0] for topic in wanted}
-        partial = set[str]()  # topics whose messages tell of some of their joints each
-        for connection, time, fields, stamp in _messages(
-            reader, [c for c in _known(reader) if c.topic in used]
-        ):
-            for topic, known in wanted.items():
-                if topic.split("#")[0] != connection.topic:
-                    continue
-                told = {f: fields[f] for f in known if f in fields}
-                told = {f: (own, x) for f, (own, x) in told.items() if set(own) <= set(known[f])}
-                if told:
-                    if len(told) < len(known) or any(
-                        set(known[f]) - set(own) for f, (own, _) in told.items()
-                    ):
-                        partial.add(topic)
-                    values = [_in_order(told.get(f), labels) for f, labels in known.items()]
-                    rows[topic].append(
-                        (time, time if stamp is None else stamp, stamp is not None, values)
-                    )
+        wanted = _wanted(_peek(bag, reader), names)
+        rows, partial = _collect(reader, wanted)
     notes: dict[str, Any] = {}
-    times = _clocks(
-        {
-            t: np.array([r[:3] for r in messages], float).reshape(-1, 3)
-            for t, messages in rows.items()
-        },
-        notes,
-    )
+    stamps = {
+        topic: np.array([row[:3] for row in messages], float).reshape(-1, 3)
+        for topic, messages in rows.items()
+    }
+    times = _clocks(stamps, notes)
     loaded: dict[str, Signal] = {}
     for topic, known in wanted.items():
-        columns = [np.array([r[3][i] for r in rows[topic]], float) for i in range(len(known))]
+        time = times[topic]
+        columns = [
+            np.array([row.values[i] for row in rows[topic]], float) for i in range(len(known))
+        ]
         if topic in partial:
-            times[topic], columns = _together(times[topic], columns)
-        fresh = _fresh(times[topic], columns)
+            time, columns = _together(time, columns)
+        fresh = _fresh(time, columns)
         if not fresh.all():
             notes["repeated"] = notes.get("repeated", 0) + int((~fresh).sum())
-        loaded |= {
-            f"{topic}.{f}": Signal(v[fresh], times[topic][fresh])
-            for f, v in zip(known, columns, strict=True)
-        }
+        for field, values in zip(known, columns, strict=True):
+            loaded[f"{topic}.{field}"] = Signal(values[fresh], time[fresh])
     return {name: loaded[name] for name in names}, notes
+
+
+def _wanted(topics: Wanted, names: list[str]) -> Wanted:
+    """Return the fields of these names, and the topics that have any."""
+    wanted: Wanted = {}
+    for topic, fields in topics.items():
+        mine = {field: labels for field, labels in fields.items() if f"{topic}.{field}" in names}
+        if mine:
+            wanted[topic] = mine
+    return wanted
+
+
+def _collect(reader: Any, wanted: Wanted) -> tuple[dict[str, list[_Row]], set[str]]:
+    """Return the rows of each topic, and the topics whose messages tell of some of their joints each."""
+    rows: dict[str, list[_Row]] = {topic: [] for topic in wanted}
+    partial = set[str]()
+    used = {topic.split("#")[0] for topic in wanted}
+    connections = [c for c in _known(reader) if c.topic in used]
+    for connection, time, fields, stamp in _messages(reader, connections):
+        for topic, known in wanted.items():
+            if topic.split("#")[0] != connection.topic:
+                continue
+            told = _told(fields, known)
+            if not told:
+                continue
+            if not _tells_all(told, known):
+                partial.add(topic)
+            values = [_in_order(told.get(field), labels) for field, labels in known.items()]
+            rows[topic].append(
+                _Row(time, time if stamp is None else stamp, stamp is not None, values)
+            )
+    return rows, partial
+
+
+def _told(fields: Fields, known: dict[str, tuple[str, ...]]) -> Fields:
+    """Return the fields of a message that are known, and whose columns are."""
+    told: Fields = {}
+    for field, labels in known.items():
+        if field in fields and set(fields[field][0]) <= set(labels):
+            told[field] = fields[field]
+    return told
+
+
+def _tells_all(told: Fields, known: dict[str, tuple[str, ...]]) -> bool:
+    """Return True if a message tells of every column of every field."""
+    if len(told) < len(known):
+        return False
+    return all(set(known[field]) <= set(own) for field, (own, _) in told.items())
 
 
 def _in_order(told: tuple[tuple[str, ...], Any] | None, labels: tuple[str, ...]) -> list[float]:
