@@ -10,7 +10,7 @@ import numpy as np
 from gaponet.base.arrays import Array
 from gaponet.data.checks.check import Check
 from gaponet.data.checks.survey import SPECTRUM_HZ, Survey
-from gaponet.data.signals import FAST_COMMAND_RAD_S, SHIFTS_S, Response
+from gaponet.data.signals import FAST_COMMAND_RAD_S, SHIFTS_S, CommonResponse, Response
 from gaponet.robot.finding import Finding, abbreviate
 from gaponet.robot.spec import RobotSpec
 
@@ -52,48 +52,83 @@ def _timing(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     unknown = max(s.uneven_ms for s in complete) * UNEVEN_ROWS_SHARE / 1e3  # s
     findings = [*_late_recordings(comparable, unknown)]
     odd = {recording for f in findings for recording in f.values["recordings"]}
-    common = Response.common(
-        [s.response for s in complete], [s.entry.id not in odd for s in complete]
-    )
-    known = np.isfinite(common.onset)
-    onset = float(np.median(common.onset[known])) if known.any() else np.nan
-    if known.any() and np.median(common.early[known]) < MIN_EARLY_RATIO:
-        onset = max(onset, 0.0)
-    error = MIN_DRIFT_ERRORS * _standard_error(common.onset - onset)
-    if onset < -unknown - MIN_LEAD_S - step or onset < -unknown - max(MIN_LEAD_S / 3, step, error):
+    usual = [s.entry.id not in odd for s in complete]
+    common = Response.common([s.response for s in complete], usual)
+    onset = _usual_onset(common)
+    if _moves_early(common, onset, unknown, step):
         text = (
             f"joints begin to move {-onset * 1e3:.0f} ms before their commands: are command and state swapped, or are "
             "their clocks apart? Shift one of them at import"
         )
         findings.append(Finding("error", "copied", text, (), {"onset_s": onset}))
     elif np.isfinite(onset):
-        verdict = next(words for limit, words in DEAD_TIMES if onset <= limit)
-        text = f"joints begin to move {max(onset, 0) * 1e3:.0f} ms after their commands: {verdict}"
-        yield Finding(
-            "warning" if onset > MAX_DEAD_TIME_S else "ok", "lag", text, (), {"onset_s": onset}
-        )
+        yield _dead_time(onset)
+    findings += _late_joints(common, onset, robot)
+    findings += _drift(complete, common.shifts, unknown)
+    if unknown < step:
+        findings += _averaged(complete)
+    yield from findings or [Finding("ok", "timing", "commands and states have the same clock")]
+
+
+def _usual_onset(common: CommonResponse) -> float:
+    """Return when joints usually begin to move after their commands, s; NaN if it is not known."""
+    known = np.isfinite(common.onset)
+    if not known.any():
+        return np.nan
+    onset = float(np.median(common.onset[known]))
+    if np.median(common.early[known]) < MIN_EARLY_RATIO:
+        return max(onset, 0.0)
+    return onset
+
+
+def _moves_early(common: CommonResponse, onset: float, unknown: float, step: float) -> bool:
+    """Return True if joints begin to move before their commands.
+
+    Args:
+        onset: Of _usual_onset, s.
+        unknown: Time that uneven rows leave open, s.
+        step: Resolution of the response, s.
+    """
+    error = MIN_DRIFT_ERRORS * _standard_error(common.onset - onset)
+    surely = onset < -unknown - MIN_LEAD_S - step
+    return surely or onset < -unknown - max(MIN_LEAD_S / 3, step, error)
+
+
+def _dead_time(onset: float) -> Finding:
+    verdict = next(words for limit, words in DEAD_TIMES if onset <= limit)
+    text = f"joints begin to move {max(onset, 0) * 1e3:.0f} ms after their commands: {verdict}"
+    level = "warning" if onset > MAX_DEAD_TIME_S else "ok"
+    return Finding(level, "lag", text, (), {"onset_s": onset})
+
+
+def _late_joints(common: CommonResponse, onset: float, robot: RobotSpec) -> Iterator[Finding]:
+    """Find joints that begin to move later than the others."""
+    if np.isfinite(common.onset).sum() <= 2:
+        return
     for name, extra in zip(robot.operated, common.onset - onset, strict=True):
-        if extra > MAX_EXTRA_LAG_S and np.isfinite(common.onset).sum() > 2:
+        if extra > MAX_EXTRA_LAG_S:
             text = (
                 f"{name} begins to move {extra * 1e3:.0f} ms later than the other joints: its channel is read late, "
                 "filtered or from another bus, or it moves stiffly; shift it at import if the time of reading is known"
             )
-            findings.append(Finding("warning", "lag", text, (name,), {"extra_s": float(extra)}))
-    findings += _drift(complete, common.shifts, unknown)
-    commanded, moved = np.mean([s.spectra for s in complete], axis=0)
+            yield Finding("warning", "lag", text, (name,), {"extra_s": float(extra)})
+
+
+def _averaged(surveys: list[Survey]) -> Iterator[Finding]:
+    """Find states that are averages over time."""
+    commanded, moved = np.mean([s.spectra for s in surveys], axis=0)
     width, depth = _averaging(moved)
-    # Steps at a regular pace have notches too.
-    if (
-        depth > MIN_NOTCH_DEPTH
-        and unknown < step
-        and _averaging(commanded, np.array([width]))[1] < depth / 3
-    ):
+    if depth <= MIN_NOTCH_DEPTH:
+        return
+    in_commands = _averaging(commanded, np.array([width]))[
+        1
+    ]  # steps at a regular pace have notches too
+    if in_commands < depth / 3:
         text = (
             f"states never move at the multiples of {1 / width:.1f} Hz, as averages over {width * 1e3:.0f} ms: log the "
             "encoder itself; what is averaged is late, and fast motions are lost"
         )
-        findings.append(Finding("warning", "averaged", text, (), {"width_s": width}))
-    yield from findings or [Finding("ok", "timing", "commands and states have the same clock")]
+        yield Finding("warning", "averaged", text, (), {"width_s": width})
 
 
 def _standard_error(deviations: Array) -> float:
