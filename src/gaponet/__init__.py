@@ -19,6 +19,8 @@ from gaponet.base.errors import GAPONetError as GAPONetError
 TYPE_CHECKING = False
 if TYPE_CHECKING:
     from gaponet.api import *  # noqa: F403
+    from gaponet.api.options import IdentifyOptions as IdentifyOptions
+    from gaponet.api.options import ImportOptions as ImportOptions
     from gaponet.api.paper import paper_experiment as paper_experiment
     from gaponet.api.results import *  # noqa: F403
     from gaponet.api.run_options import Connection as Connection
@@ -58,6 +60,8 @@ else:
              "IdentifyResult", "PairResult", "ReplayResult", "RunResult", "TorqueResult", "TrainResult"),
             "gaponet.api.results",
         ),
+        "IdentifyOptions": "gaponet.api.options",
+        "ImportOptions": "gaponet.api.options",
         "paper_experiment": "gaponet.api.paper",
         "PaperOptions": "gaponet.experiments.paper.options",
         "PaperResult": "gaponet.experiments.paper.experiment",

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from arm import XML, commands, record, write_arm
 
+from gaponet.api.steps import Start
 from gaponet.cli import start
 from gaponet.cli.main import main
 
@@ -76,9 +77,9 @@ def test_an_interrupted_start_goes_on_and_keeps_the_commands_that_ran(place, mon
         return 0
 
     monkeypatch.setattr(start, "main", stopping)
-    every = start.make_commands
+    every = Start.steps
     monkeypatch.setattr(
-        start, "make_commands", lambda *args: [c for c in every(*args) if c[0] in ORDER[:5]]
+        Start, "steps", lambda *args: [s for s in every(*args) if s.command in ORDER[:5]]
     )
     assert main(["start", "arm.xml", "logs"]) == 2
     assert "stopped at: gaponet identify started/data" in capsys.readouterr().err
@@ -107,9 +108,9 @@ def test_other_logs_need_another_folder_and_more_logs_run_again_what_followed_fr
 ):
     ran, look = [], start.api.doctor
     monkeypatch.setattr(start, "main", lambda words: ran.append(words[0]) or main(words))
-    every = start.make_commands
+    every = Start.steps
     monkeypatch.setattr(
-        start, "make_commands", lambda *args: [c for c in every(*args) if c[0] in ORDER[:3]]
+        Start, "steps", lambda *args: [s for s in every(*args) if s.command in ORDER[:3]]
     )
     monkeypatch.setattr(
         start.api, "doctor", lambda data, **how: ran.append("doctor") or look(data, **how)

@@ -12,8 +12,9 @@ from gaponet.base.errors import RobotError, UsageError
 from gaponet.data.log import Channel, Log
 from gaponet.data.sequence import SequenceMeta, to_sequence
 from gaponet.robot.mjcf import read_mjcf
-from gaponet.robot.new import NewRobot, RobotOptions, new_robot
+from gaponet.robot.new import NewRobot, new_robot
 from gaponet.robot.spec import servo_type
+from gaponet.robot.toml_file import RobotOptions
 from gaponet.sim.model import build_model
 from gaponet.sim.robot_check import check_robot
 

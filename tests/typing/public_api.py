@@ -19,7 +19,13 @@ assert_type(gp.open_dataset("data"), tuple[gp.Dataset, gp.RobotSpec])
 
 with gp.progress_bar("importing") as update:
     imported = gp.import_logs(
-        Path("logs"), robot="so101", out="data", unit_id="a", payload_mass=0.0, progress=update
+        Path("logs"),
+        robot="so101",
+        out="data",
+        unit_id="a",
+        payload_mass=0.0,
+        options=gp.ImportOptions(time_unit="ms", joint_map={"a1": "elbow"}),
+        progress=update,
     )
 assert_type(imported, gp.ImportResult)
 assert_type(imported.dataset, gp.Dataset)
@@ -34,7 +40,7 @@ assert_type(gp.gap(data).mpjae, dict[str, float])
 assert_type(gp.check("robot", "logs"), gp.CheckResult)
 assert_type(gp.replay("rollouts", robot="robot"), gp.ReplayResult)
 
-identified = gp.identify(data, out="robot", terms=("stribeck",))
+identified = gp.identify(data, out="robot", options=gp.IdentifyOptions(terms=("stribeck",)))
 assert_type(identified, gp.IdentifyResult)
 assert_type(identified.robot, gp.RobotSpec)
 assert_type(gp.identify_torque(data, out="robot"), gp.TorqueResult)

@@ -25,6 +25,7 @@ from runs import random_run, untrained
 from strange_logs import write_bag
 
 import gaponet.api
+from gaponet.api.options import IdentifyOptions
 from gaponet.base.plugins import load
 from gaponet.cli.main import COMMANDS, main
 from gaponet.data.store import Dataset
@@ -182,9 +183,8 @@ def quick(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
     def identify(dataset: str, *, out: str, **others: object) -> None:
         if not (place / "identified").exists():
-            original(
-                dataset, out=place / "identified", windows=4, terms=(), table=False, budget="1s"
-            )
+            options = IdentifyOptions(windows=4, terms=(), table=False, budget="1s")
+            original(dataset, out=place / "identified", options=options)
         shutil.copytree(place / "identified", out)
 
     def train(dataset: str, *, out: str, budget: str, progress: object) -> SimpleNamespace:

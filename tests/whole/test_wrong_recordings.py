@@ -9,12 +9,14 @@ from arm import commands, record, recordings, write_arm, write_dataset
 from runs import corrects_by
 
 from gaponet import api
+from gaponet.api.options import IdentifyOptions
 from gaponet.base.errors import DatasetError
 from gaponet.cli.main import main
 from gaponet.nn.artifact import GapModel
 
 pytest.importorskip("torch")
 
+QUICK = IdentifyOptions(windows=2, terms=(), table=False)
 STOPPED = "stopped at what the doctor calls an error, sign: shoulder moves against its command"
 
 
@@ -37,7 +39,7 @@ def mirrored(robot, tmp_path_factory):
 
 def test_identify_writes_nothing(mirrored, tmp_path):
     with pytest.raises(DatasetError, match=STOPPED):
-        api.identify(mirrored, out=tmp_path / "out", windows=2, terms=(), table=False)
+        api.identify(mirrored, out=tmp_path / "out", options=QUICK)
     assert not (tmp_path / "out").exists()
 
 
@@ -53,9 +55,7 @@ def test_a_person_may_insist_and_the_robot_folder_says_so(robot, tmp_path):
     data = write_dataset(tmp_path / "data", robot, [*logs, twice])
     with pytest.raises(DatasetError, match="labels: same samples under different labels"):
         api.identify(data, out=tmp_path / "out")
-    made = api.identify(
-        data, out=tmp_path / "out", windows=2, terms=(), table=False, despite_errors=True
-    )
+    made = api.identify(data, out=tmp_path / "out", options=replace(QUICK, despite_errors=True))
     origin = json.loads((tmp_path / "out" / "identified.json").read_text())
     for doctor in (made.to_dict()["doctor"], origin["doctor"]):
         assert doctor["despite_errors"][0].startswith("labels: same samples")

@@ -1,7 +1,8 @@
 """Public functions: what the commands do, without a terminal.
 
-Datasets, runs and robots are given as paths or as objects. Every function returns one frozen result (api/results.py).
-Nothing is printed: `progress` is called with done, total and a note, and messages go to the logger "gaponet".
+Datasets, runs and robots are given as paths or as objects. Every function returns one frozen result
+(api/results.py). Nothing is printed: `progress` is called with done, total and a note, and messages
+go to the logger "gaponet".
 """
 
 from gaponet.api.files import export_network as export_network
@@ -21,4 +22,4 @@ from gaponet.api.measure import check as check
 from gaponet.api.measure import evaluate as evaluate
 from gaponet.api.measure import gap as gap
 from gaponet.api.measure import replay as replay
-from gaponet.api.networks import networks as networks
+from gaponet.api.robots import networks as networks

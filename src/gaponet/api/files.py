@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+import json
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Final, Literal, get_args
+
+from typing_extensions import TypeIs
 
 from gaponet.api.opening import Place
 from gaponet.api.results import ExportResult
 from gaponet.base.errors import UsageError
+from gaponet.base.files import write_text
 from gaponet.base.progress import Progress, no_progress
+from gaponet.base.result_table import ResultTable
+from gaponet.evaluation.tables import mrad
 from gaponet.nn.packaged_networks import (
     is_packaged,
     is_packaged_network,
@@ -27,6 +33,17 @@ if TYPE_CHECKING:
 
 RobotTarget = Literal["mjcf", "envhub", "urdf", "mjlab", "isaaclab", "newton", "json"]
 NetworkTarget = Literal["onnx", "torch", "actuator-net"]
+RANDOMIZATION_TARGET: Final = "randomization"
+LEROBOT_TARGET: Final = "lerobot"
+RANDOMIZATION_FILE = "randomization.json"
+POLICY_FILE = "policy_postprocessor.json"  # of a LeRobot policy
+POLICY_STEP = "gaponet_correct"
+JUDGED_UNITS = {  # sets of units whose errors are compared → heading
+    "exported": "exported",
+    "units": "units",
+    "one by one": "single numbers of the ranges",
+    "by hand": "± 20 % by hand",
+}
 
 
 def export_robot(
@@ -43,14 +60,17 @@ def export_robot(
     """Write an identified robot, or the simulator of a run, for another program.
 
     Args:
-        robot: Robot folder, name of an identified robot of the package (give `out`), or run folder of `train`.
-        to: mjcf (plain MuJoCo), envhub (an environment of LeRobot's EnvHub in MuJoCo), mjlab, isaaclab and newton, each
-            with a check.py that needs no gaponet; urdf (damping, friction, effort limits); json (the numbers).
+        robot: Robot folder, name of an identified robot of the package (give `out`), or run folder
+            of `train`.
+        to: mjcf (plain MuJoCo), envhub (an environment of LeRobot's EnvHub in MuJoCo), mjlab,
+            isaaclab and newton, each with a check.py that needs no gaponet; urdf (damping,
+            friction, effort limits); json (the numbers).
         out: Folder; default one with that name in the robot or run.
-        data: Dataset on which a servo model's nearest plain servos are fitted, and every form is measured; default the
-            one that the robot was identified from, and without any the robot's own simulated motions.
-        into: For mjcf, envhub and urdf: a file of the user's own; an edited copy is written (but for urdf, default the
-            robot's).
+        data: Dataset on which a servo model's nearest plain servos are fitted, and every form is
+            measured; default the one that the robot was identified from, and without any the
+            robot's own simulated motions.
+        into: For mjcf, envhub and urdf: a file of the user's own; an edited copy is written (but
+            for urdf, default the robot's).
         prefix: Prefix of joint names in that file.
         payload_mass: kg in each hand.
 
@@ -65,7 +85,8 @@ def export_robot(
     require_run_folder(
         holder,
         f"--to {to}",
-        "its simulator is a robot of the package, with the gain_scale that gaponet robot networks shows: export that",
+        "its simulator is a robot of the package, with the gain_scale that gaponet robot networks "
+        "shows: export that",
     )
     require_out(holder, out)
     if prefix and into is None:
@@ -93,16 +114,16 @@ def export_network(
 
     Args:
         run: Run folder of `train`, or a network of the package by name; for that give `out`.
-        to: onnx (model.onnx and card.json), torch (delta.pt2 with simulator and action term for mjlab and Isaac Lab),
-            actuator-net (one network per joint: past of target − position and speed in, torque out; the form of mjlab,
-            Newton and Isaac Lab).
+        to: onnx (model.onnx and card.json), torch (delta.pt2 with simulator and action term for
+            mjlab and Isaac Lab), actuator-net (one network per joint: past of target − position and
+            speed in, torque out; the form of mjlab, Newton and Isaac Lab).
         out: Folder; default one with that name in the run, for onnx the run's model folder.
         data: For actuator-net: where the run's recordings are now; default where they were.
         payload_mass: kg in each hand.
 
     Raises:
-        ModelError, UsageError: The run holds no such model, its payload is beyond those trained on, or a network of the
-            package has no `out`, or not what actuator-net needs.
+        ModelError, UsageError: The run holds no such model, its payload is beyond those trained on,
+            or a network of the package has no `out`, or not what actuator-net needs.
     """
     from gaponet.export.export_folder import export_model, export_networks
     from gaponet.nn.artifact import GapModel
@@ -114,7 +135,8 @@ def export_network(
         require_run_folder(holder, f"--to {to}", instead)
     if to == "onnx":
         return _export_onnx(holder, None if out is None else Path(out))
-    model, folder = GapModel.load(holder), Path(out) if out else holder / to
+    model = GapModel.load(holder)
+    folder = Path(out) if out else holder / to
     if to == "torch":
         parity = export_model(model, holder, folder, payload_mass)
         return ExportResult(path=folder, to=to, robot=model.card["robot"], parity=parity)
@@ -134,16 +156,19 @@ def randomization(
 ) -> tuple[Path, Randomization]:
     """Write sampled units and ranges of an identified robot's parameters, for domain randomisation.
 
-    Of the sampled units, the quarter that follows the robot's recordings best is written. Its error is stated beside
-    that of the robot with ± 20 % on each number; units with a larger error are refused.
+    Of the sampled units, the quarter that follows the robot's recordings best is written. Its error
+    is stated beside that of the robot with ± 20 % on each number; units with a larger error are
+    refused.
 
     Args:
         robot: Robot folder that `identify` or `adapt_robot` wrote, or run folder.
         out: Folder.
         engine: Engine whose file is written, which applies a unit of randomization.json.
-        scope: today: this robot as last fitted. any-day: over sessions on several days. any-robot: over its type.
+        scope: today: this robot as last fitted. any-day: over sessions on several days. any-robot:
+            over its type.
         units: For any-robot: robot folders of the type.
-        data: Dataset whose motions choose and judge the units; default: the dataset of the identification.
+        data: Dataset whose motions choose and judge the units; default: the dataset of the
+            identification.
 
     Returns:
         The file, and the ranges with sampled units.
@@ -164,12 +189,121 @@ def randomization(
     return write_randomization(made, engine, Path(out)), made
 
 
+def randomization_tables(made: Randomization, scope: Scope) -> list[ResultTable]:
+    """Return the ranges of the parameters, and the errors of the units beside simpler ones."""
+    from gaponet.export.randomization import table_rows
+
+    columns, rows = table_rows(made)
+    title = f"{made.robot}, {scope}: range of 9 of 10 units"
+    tables = [ResultTable(title, tuple(columns), tuple(tuple(row) for row in rows))]
+    forms = {"with the servo model": made.judged, "without it": made.plain}
+    if made.plain is made.judged:
+        forms = {"identified": made.judged}
+    errors = []
+    for form, judged in forms.items():
+        if judged is not None:
+            errors.append((form, *(mrad(judged.errors[name]) for name in JUDGED_UNITS)))
+    if errors:
+        title = "Mean error on validation motions, mrad"
+        tables.append(ResultTable(title, ("robot", *JUDGED_UNITS.values()), tuple(errors)))
+    return tables
+
+
+@dataclass(frozen=True, kw_only=True)
+class AttachResult:
+    """Correction behind a LeRobot policy.
+
+    Attributes:
+        file: Processor of the policy.
+        steps: Names of its steps.
+        config: What the step of gaponet was given; empty if it was removed.
+    """
+
+    file: Path
+    steps: list[str]
+    config: dict[str, object]
+
+    def to_dict(self) -> dict[str, object]:
+        return {"file": str(self.file), "steps": self.steps, "config": self.config}
+
+
+def attach_correction(
+    policy: Place, holder: Place | None, *, payload_mass: float = 0.0, dynamics: bool = False
+) -> AttachResult:
+    """Put the correction of a robot or a run behind a LeRobot policy, in place of an earlier one.
+
+    Args:
+        policy: Folder of a policy (pretrained_model) that holds policy_postprocessor.json.
+        holder: Robot folder, run folder or name of the package; None removes the correction.
+        payload_mass: kg in each hand.
+        dynamics: Feed forward inertia and damping too, for smooth targets.
+
+    Raises:
+        UsageError: The folder holds no LeRobot policy, or no robot and no run.
+    """
+    file = Path(policy) / POLICY_FILE
+    if not file.is_file():
+        raise UsageError(
+            f"{policy}: has no {POLICY_FILE}; give the folder that holds a LeRobot policy and its "
+            "processors"
+        )
+    try:
+        document = json.loads(file.read_text(encoding="utf-8"))
+        steps = [step for step in document["steps"] if step.get("registry_name") != POLICY_STEP]
+    except (ValueError, KeyError, TypeError, AttributeError):
+        raise UsageError(f"{file}: is no processor of LeRobot") from None
+    config: dict[str, object] = {}
+    if holder is not None:
+        kind, name = _correction_of(named_folder(holder))
+        config = {kind: name, "payload_mass": payload_mass, "dynamics": dynamics}
+        steps.append({"registry_name": POLICY_STEP, "config": config})
+    write_text(file, json.dumps(document | {"steps": steps}, indent=2) + "\n")
+    names = [step.get("registry_name", step.get("class", "?")) for step in steps]
+    return AttachResult(file=file, steps=names, config=config)
+
+
+def _correction_of(holder: Path) -> tuple[str, str]:
+    """Return the option of the LeRobot step that a folder is for, and the folder as its value.
+
+    Raises:
+        UsageError: It holds no robot and no run.
+        RobotError: The robot is damaged.
+    """
+    kind = "model"
+    if not is_packaged_network(holder):
+        if (holder / "robot.toml").is_file():
+            load_robot(holder)
+            kind = "known"
+        elif not (holder / "model").is_dir():
+            raise UsageError(
+                f"{holder}: is neither a robot folder of gaponet identify nor a run of gaponet "
+                "train"
+            )
+    return kind, holder.name if is_packaged(holder) else str(holder.resolve())
+
+
+def is_network_target(to: str) -> TypeIs[NetworkTarget]:
+    """Return True if an export is of the network of a run."""
+    return to in get_args(NetworkTarget)
+
+
+def require_network(holder: Path) -> None:
+    """Refuse a robot folder where a network is to be exported.
+
+    Raises:
+        UsageError: It is one.
+    """
+    if (holder / "robot.toml").is_file():
+        engines = "mjcf, mjlab, isaaclab, newton or json"
+        raise UsageError(f"{holder}: is a robot, which has no network; --to {engines}")
+
+
 def require_out(holder: Path, out: Place | None) -> None:
     """Refuse to write beside a network or a robot of the package."""
     if is_packaged(holder) and out is None:
         raise UsageError(
-            f"'{holder.name}' lies in the package or in the Hub's cache, where nothing is written; give a folder with "
-            "--out"
+            f"'{holder.name}' lies in the package or in the Hub's cache, where nothing is "
+            "written; give a folder with --out"
         )
 
 
@@ -181,9 +315,15 @@ def simulator_folder(holder: Path) -> Path:
 def _exported(made: ExportedFolder, folder: Path, to: str, robot: str) -> ExportResult:
     script = folder / "check.py"
     return ExportResult(
-        path=made.file or folder, to=to, robot=robot, errors=made.errors, motions=made.motions, virtual=made.virtual,
-        notes=tuple(made.notes), check=script if script.is_file() else None,
-    )  # fmt: skip
+        path=made.file or folder,
+        to=to,
+        robot=robot,
+        errors=made.errors,
+        motions=made.motions,
+        virtual=made.virtual,
+        notes=tuple(made.notes),
+        check=script if script.is_file() else None,
+    )
 
 
 def _export_onnx(run: Path, out: Path | None) -> ExportResult:
@@ -199,14 +339,15 @@ def _export_onnx(run: Path, out: Path | None) -> ExportResult:
     net = trained_network(run, config, len(card["joint_names"]))
     parity = write(net, path, card, sample_inputs(net))
     if path != run / "model" and has_stored_robot(run):
-        save_robot(
-            load_stored_robot(run, card["robot"]), path / STORED_ROBOT
-        )  # commands can then be transferred
+        # commands can then be transferred
+        save_robot(load_stored_robot(run, card["robot"]), path / STORED_ROBOT)
     return ExportResult(path=path, to="onnx", robot=card["robot"], parity=parity)
 
 
 def _copy_packaged(network: Path, out: Path) -> ExportResult:
-    """Copy a network of the package into a folder of the user's, with its simulator as a robot folder."""
+    """Copy a network of the package into a folder of the user's, with its simulator as a robot
+    folder.
+    """
     import shutil
 
     from gaponet.base.files import lock_folder

@@ -21,11 +21,13 @@ from gaponet.api.opening import (
     entries_of_unit,
     require_commands,
 )
+from gaponet.api.options import IdentifyOptions
 from gaponet.api.results import AdaptResult, IdentifyResult, TorqueResult, TrainResult
 from gaponet.base.errors import NoGainError, UsageError
 from gaponet.base.files import write_json, write_text
 from gaponet.base.progress import Progress, no_progress
 from gaponet.data.store import Dataset
+from gaponet.nn.config import ModelKind as ModelKind
 from gaponet.nn.packaged_networks import require_run_folder
 from gaponet.robot.folder import (
     ADAPTATION_FILE,
@@ -33,22 +35,22 @@ from gaponet.robot.folder import (
     PROVENANCE_FILE,
     UNCERTAINTY_FILE,
 )
-from gaponet.robot.servo_fields import Term
 from gaponet.robot.spec import RobotSpec, load_robot
 
 if TYPE_CHECKING:
+    from gaponet.base.arrays import Array
     from gaponet.data.checks.gate import GateReport
     from gaponet.data.sequence import Sequence
     from gaponet.data.store import Entry
     from gaponet.nn.artifact import GapModel
-    from gaponet.nn.config import ModelKind
     from gaponet.nn.training.config import Status, TrainConfig
-    from gaponet.sim.links import LinkResult
-    from gaponet.sysid.acceptance import Covariance, HeldOut
+    from gaponet.sysid.acceptance import Covariance, HeldOut, Identified
+    from gaponet.sysid.adapt import Adapted
     from gaponet.sysid.uncertainty import ParameterUncertainty
 
 # Files of an earlier robot in the same folder, which do not describe the new one.
 OUTDATED_FILES = (PROVENANCE_FILE, ADAPTATION_FILE, UNCERTAINTY_FILE, OLD_UNCERTAINTY_FILE)
+JUDGED_AFTER_S = 0.5  # time from a recorded state to the error that judges a torque-driven fit
 MIN_MOTIONS_TO_SPLIT = 3  # with fewer motions, halves of the recordings fit and validate in turn
 
 
@@ -56,122 +58,155 @@ def identify(
     dataset: Dataset | Place,
     *,
     out: Place,
-    windows: int = 40,
     robot: RobotSpec | Place | None = None,
-    like: RobotSpec | Place | None = None,
-    units: tuple[str, ...] = (),
-    holdout_units: tuple[str, ...] = (),
-    terms: tuple[Term, ...] | None = None,
-    table: bool = True,
-    threads: int = 0,
-    budget: str | None = None,
-    stops: bool = False,
-    masses: bool = False,
-    despite_errors: bool = False,
+    options: IdentifyOptions = IdentifyOptions(),  # noqa: B008
     progress: Progress = no_progress,
 ) -> IdentifyResult:
     """Fit the servos of the simulator, and the table under the robot, to the training motions.
 
-    A robot folder is written if motions that were not fitted are followed better than by the given robot; otherwise
-    nothing is. Where fewer than three motions validate a set of joints, cross-validation over motions decides, and the
-    robot is then fitted to all of them.
-    Recordings made with several gains are fitted together, each in a simulator with its own gains. If all state
-    the same gains, the robot folder has these.
+    A robot folder is written if motions that were not fitted are followed better than by the given
+    robot; otherwise nothing is. Where fewer than three motions validate a set of joints,
+    cross-validation over motions decides, and the robot is then fitted to all of them. Recordings
+    made with several gains are fitted together, each in a simulator with its own gains. If all
+    state the same gains, the robot folder has these.
 
     Args:
         dataset: Recordings, a folder.
         out: Robot folder to write; `train(…, robot=out)` starts from it.
-        windows: Number of 8 s rollouts that are fitted, taken evenly from the training motions.
         robot: Start of the fit, if not the robot that the dataset keeps.
-        like: Identified robot whose servos are the start and the prior, by joint name, mirrored name (left, right)
-            or type of servo: another arm, another unit, another robot.
-        units: Only these, pooled: one set of parameters for all of them; default: all others than --holdout-units.
-        holdout_units: Units to leave out, as in training.
-        terms: Terms of the servo model to try; each is accepted only if validation motions improve. Default: stribeck
-            and load, after limit if a joint reaches its stated torque limit; then backlash where a gap makes the
-            rollouts better at otherwise equal values; then temperature where it varies at equal gains and payload.
-        table: Look for a table under the robot's tips ([[tip]] in robot.toml).
-        threads: 0 for all cores.
-        budget: Time such as 60s or 4m that the fit may take, the table included; default no limit. What does not fit
-            into it is left out and named in a warning. Results are the same on every machine only without a limit.
-        stops: Add an end stop to joints that stayed behind several commands; otherwise they are reported.
-        masses: Fit masses, centres of mass and inertias of the links too; accepted as a term is.
-        despite_errors: Go on although the doctor finds an error in the recordings; the result keeps the errors.
+        options: What is fitted, to which units, and within which time.
 
     Raises:
         DatasetError: The doctor finds an error in the recordings of the units that are fitted.
-        DatasetError, UsageError: A unit is not there, or `like` has no joint that corresponds.
+        DatasetError, UsageError: A unit is not there, or `options.like` has no joint that
+            corresponds.
         NoGainError: Nothing that was fitted does better; it names the joints and what to record.
     """
-    from gaponet.base.files import lock_folder, whole_folder
+    from gaponet.base.files import lock_folder
     from gaponet.data.checks.gate import pass_gate, used_recordings
     from gaponet.data.split import split_entries
-    from gaponet.export.plain_servos import keep_plain_servos
-    from gaponet.nn.training.config import Budget
-    from gaponet.robot.folder import require_other_folder, save_robot
-    from gaponet.sim.metrics import MIN_RELATIVE_GAIN
-    from gaponet.sysid.acceptance import HeldOut, held_out_errors
+    from gaponet.robot.folder import require_other_folder
     from gaponet.sysid.identify import identify as fit
-    from gaponet.sysid.options import IdentifyOptions
     from gaponet.sysid.servo_types import servos_like
 
+    began = time.monotonic()
+    folder = Path(out)
     data, spec = as_dataset(dataset, robot)
     data.require_robot(spec)
     data.require_sequences()
     require_commands(data)
-    all_units = {e.meta.unit_id for e in data.entries}
-    if set(units) - all_units:
-        raise UsageError(f"--units {min(set(units) - all_units)}: not in {data.path}")
-    left_out = (all_units - set(units) if units else set()) | set(holdout_units)
-    split = split_entries(data, tuple(sorted(left_out)))
-    began, val, folder = time.monotonic(), data.sequences(split["val"]), Path(out)
-    if len(gains := {e.meta.recorded_gains for e in data.entries}) == 1:
-        spec = spec.with_gains(*gains.pop())
-    start, taken = (spec, {}) if like is None else servos_like(spec, as_robot(like))
-    seconds = None if budget is None else Budget.parse(budget).seconds
-    if budget is not None and seconds is None:
-        raise UsageError(f"--budget {budget}: give a time such as 60s or 4m")
+    split = split_entries(data, _units_left_out(data, options))
+    spec = _with_recorded_gains(spec, data)
+    start = spec
+    taken_from: dict[str, str] = {}
+    if options.like is not None:
+        start, taken_from = servos_like(spec, as_robot(options.like))
+    searches = options.searches()
     require_other_folder(folder, spec)
     train_set = data.sequences(split["train"])
+    val_set = data.sequences(split["val"])
     with lock_folder(folder, "robot"):
         gate = pass_gate(
             data,
             used_recordings(data, split),
             spec,
-            despite_errors=despite_errors,
+            despite_errors=options.despite_errors,
             progress=progress,
         )
-        options = IdentifyOptions(
-            windows=windows,
-            terms=terms,
-            table=table,
-            stops=stops,
-            masses=masses,
-            seconds=seconds,
-            nthread=threads,
-        )
-        fitted = fit(train_set, start, val, options, progress)
-        after, given, nominal = (
-            held_out_errors(HeldOut(s, one or own) for s, own in fitted.held_out)
-            for one in (None, spec, spec.nominal or spec)
-        )
-        if not (fitted.improved or taken) or after.mean() > (1 - MIN_RELATIVE_GAIN) * given.mean():
-            raise NoGainError(fitted.no_gain_message(spec, given, after))
-        errors = {"nominal": nominal, "identified": after}
-        means = {name: float(e.mean()) for name, e in errors.items()}
-        judges = [] if fitted.held_out[0].robot is fitted.robot else fitted.held_out
-        with whole_folder(folder, "robot", "robot.toml", OUTDATED_FILES) as place:
-            save_robot(fitted.robot, place)
-            if fitted.without_terms is not None:
-                keep_plain_servos(place, fitted.without_terms, train_set)
-            write_json(
-                place / PROVENANCE_FILE, _origin(folder, data, split, means, gate, fitted.findings)
-            )
-            _save_uncertainty(place, train_set, val, fitted.covariance, None, judges, fitted.links)
+        fitted = fit(train_set, start, val_set, searches, progress)
+        errors = _require_gain(fitted, spec, accepted=bool(taken_from))
+        origin = _origin(folder, data, split, errors, gate, fitted.findings)
+        _write_identified(folder, fitted, train_set, val_set, origin)
     return IdentifyResult(
-        robot=fitted.robot, folder=folder, errors=errors, fit=fitted, seconds=time.monotonic() - began,
-        taken_from=taken, doctor=gate,
-    )  # fmt: skip
+        robot=fitted.robot,
+        folder=folder,
+        errors=errors,
+        fit=fitted,
+        seconds=time.monotonic() - began,
+        taken_from=taken_from,
+        doctor=gate,
+    )
+
+
+def _units_left_out(data: Dataset, options: IdentifyOptions) -> tuple[str, ...]:
+    """Return the units of a dataset that are not fitted.
+
+    Raises:
+        UsageError: A unit is not there.
+    """
+    present = {entry.meta.unit_id for entry in data.entries}
+    wanted = set(options.units)
+    unknown = wanted - present
+    if unknown:
+        raise UsageError(f"--units {min(unknown)}: not in {data.path}")
+    left_out = set(options.holdout_units)
+    if wanted:
+        left_out |= present - wanted
+    return tuple(sorted(left_out))
+
+
+def _with_recorded_gains(robot: RobotSpec, data: Dataset) -> RobotSpec:
+    """Return the robot with the gains of the recordings, if all state the same."""
+    gains = {entry.meta.recorded_gains for entry in data.entries}
+    if len(gains) != 1:
+        return robot
+    kp, kd = gains.pop()
+    return robot.with_gains(kp, kd)
+
+
+def _require_gain(fitted: Identified, given: RobotSpec, *, accepted: bool) -> dict[str, Array]:
+    """Return nominal and identified → mean |error| of each motion that was not fitted, (motions,)
+    rad.
+
+    Args:
+        given: The robot before the fit.
+        accepted: The start of the fit counts as fitted: its servos are another robot's.
+
+    Raises:
+        NoGainError: The fitted robot is no better than the given one.
+    """
+    from gaponet.sim.metrics import MIN_RELATIVE_GAIN
+    from gaponet.sysid.acceptance import held_out_errors
+
+    after = held_out_errors(fitted.held_out)
+    before = _errors_of_robot(fitted.held_out, given)
+    least = (1 - MIN_RELATIVE_GAIN) * before.mean()
+    if after.mean() > least or not (fitted.improved or accepted):
+        raise NoGainError(fitted.no_gain_message(given, before, after))
+    nominal = _errors_of_robot(fitted.held_out, given.before_identification)
+    return {"nominal": nominal, "identified": after}
+
+
+def _errors_of_robot(folds: ListOf[HeldOut], robot: RobotSpec) -> Array:
+    """Return the mean |error| of each held-out motion in rollouts of one robot, (motions,) rad."""
+    from gaponet.sysid.acceptance import HeldOut, held_out_errors
+
+    return held_out_errors(HeldOut(fold.sequences, robot) for fold in folds)
+
+
+def _write_identified(
+    folder: Path,
+    fitted: Identified,
+    train_set: list[Sequence],
+    val_set: list[Sequence],
+    origin: dict[str, Any],
+) -> None:
+    """Write the robot folder of an identification, whole or not at all."""
+    from gaponet.base.files import whole_folder
+    from gaponet.export.plain_servos import keep_plain_servos
+    from gaponet.robot.folder import save_robot
+    from gaponet.sysid.uncertainty import LinkUncertainty
+
+    fitted_to_all = fitted.held_out[0].robot is not fitted.robot
+    with whole_folder(folder, "robot", "robot.toml", OUTDATED_FILES) as place:
+        save_robot(fitted.robot, place)
+        if fitted.without_terms is not None:
+            keep_plain_servos(place, fitted.without_terms, train_set)
+        write_json(place / PROVENANCE_FILE, origin)
+        judges = fitted.held_out if fitted_to_all else ()
+        made = _uncertainty(place, train_set, val_set, fitted.covariance, held_out=judges)
+        links = LinkUncertainty.of(fitted.links, load_robot(place), made.fields)
+        replace(made, links=links).save(place)
 
 
 def identify_torque(
@@ -184,16 +219,18 @@ def identify_torque(
 ) -> TorqueResult:
     """Fit friction, inertia and delay of a robot that is driven by torque.
 
-    The fit is measured on recordings that were not fitted: the error of the simulator some time after a recorded state,
-    with the recorded torque as its input. A robot folder is written only if that error falls.
+    The fit is measured on recordings that were not fitted: the error of the simulator some time
+    after a recorded state, with the recorded torque as its input. A robot folder is written only if
+    that error falls.
 
     Args:
-        dataset: Recordings with the torque (tau) of every operated joint. Where no position was commanded, logs.toml
-            names the position's column for ctrl too.
+        dataset: Recordings with the torque (tau) of every operated joint. Where no position was
+            commanded, logs.toml names the position's column for ctrl too.
         out: Robot folder to write.
         current: The recorded torque is a current, or its constant is unknown: fit N·m per unit too.
         robot: Start of the fit, if not the robot that the dataset keeps.
-        despite_errors: Go on although the doctor finds an error in the recordings; the result keeps the errors.
+        despite_errors: Go on although the doctor finds an error in the recordings; the result keeps
+            the errors.
 
     Raises:
         DatasetError: The doctor finds an error in the recordings.
@@ -202,53 +239,79 @@ def identify_torque(
     """
     from gaponet.base.files import lock_folder, whole_folder
     from gaponet.data.checks.gate import TORQUE_DRIVEN_CHECKS, pass_gate
-    from gaponet.data.split import split_entries
     from gaponet.robot.folder import require_other_folder, save_robot
     from gaponet.sysid.torque_motors import fit_torque_driven
 
     data, spec = as_dataset(dataset, robot)
     data.require_robot(spec)
-    few = len({e.meta.motion for e in data.entries}) < MIN_MOTIONS_TO_SPLIT
-    split = (
-        {"train": data.entries, "val": data.entries, "test": []} if few else split_entries(data, ())
-    )
-    folder, train_set = Path(out), data.sequences(split["train"])
+    folder = Path(out)
+    split = _split_or_all(data)
+    train_set = data.sequences(split["train"])
     require_other_folder(folder, spec)
     with lock_folder(folder, "robot"):
         gate = pass_gate(
             data, data.entries, spec, despite_errors=despite_errors, checks=TORQUE_DRIVEN_CHECKS
         )
-        fitted = fit_torque_driven(
-            train_set, train_set if few else data.sequences(split["val"]), spec, current
-        )
-        before, after = (float(np.mean(x)) for x in fitted.angle[0.5])
+        val_set = train_set if split["val"] is split["train"] else data.sequences(split["val"])
+        fitted = fit_torque_driven(train_set, val_set, spec, current)
+        by_joint_before, by_joint_after = fitted.angle[JUDGED_AFTER_S]
+        before = float(np.mean(by_joint_before))
+        after = float(np.mean(by_joint_after))
         if not after < before:
             raise NoGainError(
-                f"nothing is written: half a second on, the error is {1e3 * after:.2f} mrad with the fit and "
-                f"{1e3 * before:.2f} mrad with {spec.name} as given"
+                f"nothing is written: half a second on, the error is {1e3 * after:.2f} mrad with "
+                f"the fit and {1e3 * before:.2f} mrad with {spec.name} as given"
             )
-        means = {"nominal": before, "identified": after}
+        errors = {"nominal": np.array([before]), "identified": np.array([after])}
+        origin = _origin(folder, data, split, errors, gate)
         with whole_folder(folder, "robot", "robot.toml", OUTDATED_FILES) as place:
             save_robot(fitted.robot, place)
-            write_json(place / PROVENANCE_FILE, _origin(folder, data, split, means, gate))
+            write_json(place / PROVENANCE_FILE, origin)
     return TorqueResult(
-        robot=fitted.robot, folder=folder, before=before, after=after, fit=fitted,
-        virtual=any(e.meta.virtual for e in data.entries), doctor=gate,
-    )  # fmt: skip
+        robot=fitted.robot,
+        folder=folder,
+        before=before,
+        after=after,
+        fit=fitted,
+        virtual=any(entry.meta.virtual for entry in data.entries),
+        doctor=gate,
+    )
+
+
+def _split_or_all(data: Dataset) -> dict[str, list[Entry]]:
+    """Return the split of a dataset; with few motions all recordings both fit and validate."""
+    from gaponet.data.split import split_entries
+
+    motions = {entry.meta.motion for entry in data.entries}
+    if len(motions) < MIN_MOTIONS_TO_SPLIT:
+        return {"train": data.entries, "val": data.entries, "test": []}
+    return dict(split_entries(data, ()))
 
 
 def _origin(
-    folder: Path, data: Dataset, split: Mapping[str, ListOf[Entry]], val_mpjae: Mapping[str, float],
-    gate: GateReport, findings: ListOf[str] = (),
-) -> dict[str, Any]:  # fmt: skip
-    """Return what a robot folder was identified from: dataset, recordings and motions by split, validation errors, what
-    the doctor found, and what the fit found."""
+    folder: Path,
+    data: Dataset,
+    split: Mapping[str, ListOf[Entry]],
+    errors: Mapping[str, Array],
+    gate: GateReport,
+    findings: ListOf[str] = (),
+) -> dict[str, Any]:
+    """Return what a robot folder was identified from: dataset, recordings and motions by split,
+    mean validation errors, what the doctor found, and what the fit found.
+    """
+    parts = {}
+    motions = {}
+    for name, entries in split.items():
+        parts[name] = {entry.id: entry.hash for entry in entries}
+        motions[name] = sorted({entry.meta.motion for entry in entries})
     return {
         "dataset": os.path.relpath(data.path, folder),
-        "parts": {name: {e.id: e.hash for e in entries} for name, entries in split.items()},
-        "motions": {name: sorted({e.meta.motion for e in entries}) for name, entries in split.items()},
-        "val_mpjae": dict(val_mpjae), "findings": list(findings), "doctor": gate.to_dict(),
-    }  # fmt: skip
+        "parts": parts,
+        "motions": motions,
+        "val_mpjae": {name: float(values.mean()) for name, values in errors.items()},
+        "findings": list(findings),
+        "doctor": gate.to_dict(),
+    }
 
 
 def _copy_origin(source: Path, folder: Path) -> None:
@@ -258,21 +321,23 @@ def _copy_origin(source: Path, folder: Path) -> None:
         write_text(folder / PROVENANCE_FILE, text)
 
 
-def _save_uncertainty(
-    folder: Path, sequences: list[Sequence], validation: list[Sequence], covariance: Covariance,
-    before: ParameterUncertainty | None, held_out: ListOf[HeldOut] = (), links: LinkResult | None = None,
-) -> None:  # fmt: skip
-    """Write the parameter uncertainty of a robot folder."""
+def _uncertainty(
+    folder: Path,
+    sequences: list[Sequence],
+    validation: list[Sequence],
+    covariance: Covariance,
+    before: ParameterUncertainty | None = None,
+    held_out: ListOf[HeldOut] = (),
+) -> ParameterUncertainty:
+    """Return the parameter uncertainty of the robot in a folder, where that of an earlier robot is
+    removed.
+    """
     from gaponet.sysid.evidence.evidence import estimate_uncertainty
-    from gaponet.sysid.uncertainty import LinkUncertainty
 
     for name in (UNCERTAINTY_FILE, OLD_UNCERTAINTY_FILE):
-        (folder / name).unlink(missing_ok=True)  # of the robot as it was before this fit
+        (folder / name).unlink(missing_ok=True)
     robot = load_robot(folder)
-    made = estimate_uncertainty(robot, sequences, validation, covariance, before, held_out)
-    replace(
-        made, links=before.links if before else LinkUncertainty.of(links, robot, made.fields)
-    ).save(folder)
+    return estimate_uncertainty(robot, sequences, validation, covariance, before, held_out)
 
 
 def train(
@@ -289,7 +354,8 @@ def train(
     despite_errors: bool = False,
     progress: Progress = no_progress,
 ) -> TrainResult:
-    """Train a delta-action model; the run keeps the model with the least error in rollouts of validation motions.
+    """Train a delta-action model; the run keeps the model with the least error in rollouts of
+    validation motions.
 
     Ctrl-C ends training and leaves a usable run.
 
@@ -298,22 +364,27 @@ def train(
         out: Run folder.
         budget: Time such as 90s, 10m or 2h, or control steps such as 2000000.
         config: Everything else; default `TrainConfig()`.
-        model: gaponet, paper (the paper's literal network), or a baseline: shared_mlp, mlp, trees. auto: gaponet,
-            shared_mlp, mlp and, with scikit-learn, trees get a fifth of the budget each. The best network on validation
-            gets the rest, and trees are chosen if they are still better. Default: that of the config.
-        robot: Another robot than the one that the dataset keeps, e.g. the folder that `identify` wrote.
+        model: gaponet, paper (the paper's literal network), or a baseline: shared_mlp, mlp, trees.
+            auto: gaponet, shared_mlp, mlp and, with scikit-learn, trees get a fifth of the budget
+            each. The best network on validation gets the rest, and trees are chosen if they are
+            still better. Default: that of the config.
+        robot: Another robot than the one that the dataset keeps, e.g. the folder that `identify`
+            wrote.
         holdout_units: Units never trained on; their test motions stay in the test split.
         resume: Continue the run in `out`.
         log: tensorboard, wandb.
-        despite_errors: Go on although the doctor finds an error in the recordings; the result keeps the errors.
+        despite_errors: Go on although the doctor finds an error in the recordings; the result keeps
+            the errors.
 
     Returns:
         The exported model; RUN/model holds it.
 
     Raises:
         ModelError: The budget bought no training step.
-        DatasetError: The doctor finds an error in the recordings of the units that train or validate.
-        DatasetError, UsageError: The recordings, the config or the folder do not fit; the message says what.
+        DatasetError: The doctor finds an error in the recordings of the units that train or
+            validate.
+        DatasetError, UsageError: The recordings, the config or the folder do not fit; the message
+            says what.
     """
     from gaponet.base.files import lock_folder
     from gaponet.data.checks.gate import pass_gate, used_recordings
@@ -322,7 +393,9 @@ def train(
     from gaponet.nn.training.selection import candidate_errors, train_best
     from gaponet.nn.training.trainer import Trainer
 
-    config, whole, folder = config or TrainConfig(), Budget.parse(budget), Path(out)
+    config = config or TrainConfig()
+    whole = Budget.parse(budget)
+    folder = Path(out)
     shared: dict[str, Any] = {}
     with lock_folder(folder, "run"):
         data, spec = as_dataset(dataset, robot)
@@ -334,10 +407,20 @@ def train(
             def show(status: Status) -> None:
                 progress(spent + share * status.fraction, 1.0, f"{kind}: {status.note}")
 
-            return Trainer(
-                data, spec, run, replace(config, model=replace(config.model, kind=kind)), whole.part(share),
-                resume=resume, holdout_units=holdout_units, show=show, log=log, shared=shared, gate=gate,
-            ).run()  # fmt: skip
+            trainer = Trainer(
+                data,
+                spec,
+                run,
+                replace(config, model=replace(config.model, kind=kind)),
+                whole.part(share),
+                resume=resume,
+                holdout_units=holdout_units,
+                show=show,
+                log=log,
+                shared=shared,
+                gate=gate,
+            )
+            return trainer.run()
 
         if model == "auto":
             trained = train_best(folder, resume, one)
@@ -362,19 +445,20 @@ def adapt_model(
 ) -> AdaptResult:
     """Fit the servo parameters of one unit under a trained model, to a short log.
 
-    Gain, damping, friction, zero offset and delay of each joint are fitted. The model stays as it is. The run keeps the
-    result, and `evaluate` then shows the unit with it too.
+    Gain, damping, friction, zero offset and delay of each joint are fitted. The model stays as it
+    is. The run keeps the result, and `evaluate` then shows the unit with it too.
 
     Args:
         run: Run folder, or a trained model.
         dataset: Recordings of the unit, perhaps among others.
         unit: Unit to adapt to, where the dataset holds several.
-        motions: Only these; default: those that the run was trained on, so that its test motions stay unseen, or all
-            where the unit played none of them.
+        motions: Only these; default: those that the run was trained on, so that its test motions
+            stay unseen, or all where the unit played none of them.
         seconds: Duration of the recordings to use, in windows of 8 s.
         robot: Another robot than the one that the dataset keeps.
         mixed_gains: Accept recordings made with different kp or kd together.
-        despite_errors: Go on although the doctor finds an error in the recordings; the result keeps the errors.
+        despite_errors: Go on although the doctor finds an error in the recordings; the result keeps
+            the errors.
 
     Raises:
         DatasetError: The doctor finds an error in the recordings of the unit.
@@ -394,23 +478,32 @@ def adapt_model(
     )
     data, spec = as_dataset(dataset, robot, folder)
     data.require_robot(spec)
-    model, simulator = GapModel.load(folder), corrected_robot(folder, spec)
+    model = GapModel.load(folder)
+    simulator = corrected_robot(folder, spec)
     _, entries = entries_of_unit(data, unit, motions)
     gate = pass_gate(data, entries, spec, despite_errors=despite_errors)
     if not motions:
-        entries = [e for e in entries if e.meta.motion in model.card["motions"]["train"]] or entries
+        trained_on = model.card["motions"]["train"]
+        entries = [e for e in entries if e.meta.motion in trained_on] or entries
     if not mixed_gains:
         require_same_gains((e.meta for e in entries), data.joint_names, spec.operated)
-    fitted = Adaptation.fit(
-        model, simulator, data.sequences(entries), seconds, _window_rms(progress)
-    )
+    sequences = data.sequences(entries)
+    fitted = Adaptation.fit(model, simulator, sequences, seconds, _window_rms(progress))
     fitted = replace(fitted, doctor=gate.to_dict())
     fitted.save(folder)
+    servos = {}
+    for joint, values in fitted.servos.items():
+        servos[joint] = {str(name): value for name, value in values.items()}
     return AdaptResult(
-        unit_id=fitted.unit_id, servos={j: {str(f): v for f, v in s.items()} for j, s in fitted.servos.items()},
-        before=fitted.before, after=fitted.after, robot=None, folder=folder, recordings=len(entries),
+        unit_id=fitted.unit_id,
+        servos=servos,
+        before=fitted.before,
+        after=fitted.after,
+        robot=None,
+        folder=folder,
+        recordings=len(entries),
         doctor=gate,
-    )  # fmt: skip
+    )
 
 
 def adapt_robot(
@@ -425,7 +518,8 @@ def adapt_robot(
     despite_errors: bool = False,
     progress: Progress = no_progress,
 ) -> AdaptResult:
-    """Fit the servo parameters of one unit on one day to a short log: a robot folder in, a robot folder out.
+    """Fit the servo parameters of one unit on one day to a short log: a robot folder in, a robot
+    folder out.
 
     Parameters that the log does not determine keep their values.
 
@@ -435,28 +529,28 @@ def adapt_robot(
         out: Robot folder to write.
         unit: Unit to adapt to, where the dataset holds several.
         motions: Only these.
-        seconds: Duration of the recordings to fit, in windows of 8 s; all of them are used for validation.
+        seconds: Duration of the recordings to fit, in windows of 8 s; all of them are used for
+            validation.
         payload_mass: kg in each hand, of logs whose format does not state it.
-        despite_errors: Go on although the doctor finds an error in the recordings; the result keeps the errors.
+        despite_errors: Go on although the doctor finds an error in the recordings; the result keeps
+            the errors.
 
     Raises:
         DatasetError: The doctor finds an error in the recordings.
         UsageError: The unit is not named.
-        NoGainError: The fit does not follow the recordings, or motions that it was not given, better than the given
-            robot; nothing is written.
+        NoGainError: The fit does not follow the recordings, or motions that it was not given,
+            better than the given robot; nothing is written.
     """
-    from gaponet.base.files import lock_folder, whole_folder
+    from gaponet.base.files import lock_folder
     from gaponet.data.checks.gate import pass_gate
-    from gaponet.robot.folder import require_other_folder, save_robot
-    from gaponet.sim.metrics import MIN_RELATIVE_GAIN
-    from gaponet.sim.replay import rollout_errors
+    from gaponet.robot.folder import require_other_folder
     from gaponet.sysid.adapt import FIELDS, adapt
     from gaponet.sysid.uncertainty import ParameterUncertainty
 
-    folder, spec = (
-        Path(out),
-        as_robot(Path(robot) if isinstance(robot, str) and "/" in robot else robot),
-    )
+    folder = Path(out)
+    if isinstance(robot, str) and "/" in robot:
+        robot = Path(robot)
+    spec = as_robot(robot)
     require_other_folder(folder, spec)
     uncertainty = ParameterUncertainty.load(spec)
     with (
@@ -472,36 +566,78 @@ def adapt_robot(
         )
         sequences = recorded.sequences()
         fitted = adapt(sequences, spec, seconds, None, _window_rms(progress), judge=True)
-        if not fitted.accepted:
-            before, after = (1e3 * float(e.mean()) if len(e) else 0.0 for e in fitted.judged)
-            why = (
-                f"the error of motions that the fit does not see is {after:.2f} mrad, and {before:.2f} without the fit"
-                if before
-                else "no joint has a motion that the fit does not see"
-            )
-            raise NoGainError(
-                f"nothing is written: {why}; keep {spec.name} as it is, or record motions that move each joint more"
-            )
-        before, after = (float(rollout_errors(sequences, r).mean()) for r in (spec, fitted.robot))
-        if after > (1 - MIN_RELATIVE_GAIN) * before:
-            raise NoGainError(
-                f"nothing is written: over all {len(sequences)} recording(s) the error is {1e3 * after:.2f} mrad with "
-                f"the fit and {1e3 * before:.2f} mrad with {spec.name}; give longer logs (--seconds), or keep the robot"
-            )
+        before, after = _require_adaptation(fitted, spec, sequences)
         adapted = {"unit_id": recorded.unit_id, "doctor": gate.to_dict()}
-        with whole_folder(folder, "robot", "robot.toml", OUTDATED_FILES) as place:
-            save_robot(fitted.robot, place)
-            _copy_origin(spec.folder, place)
-            write_json(place / ADAPTATION_FILE, adapted)
-            _save_uncertainty(place, sequences, [], {}, uncertainty)
-    robot, joints = (
-        fitted.robot,
-        zip(fitted.robot.operated, fitted.robot.operated_index, strict=True),
-    )
+        _write_adapted(folder, spec, fitted.robot, sequences, adapted, uncertainty)
+    servos: dict[str, dict[str, float]] = {}
+    for joint, i in zip(fitted.robot.operated, fitted.robot.operated_index, strict=True):
+        servos[joint] = {name: float(getattr(fitted.robot, name)[i]) for name in FIELDS}
     return AdaptResult(
-        unit_id=recorded.unit_id, servos={j: {f: float(getattr(robot, f)[i]) for f in FIELDS} for j, i in joints},
-        before=before, after=after, robot=robot, folder=folder, recordings=len(sequences), doctor=gate,
-    )  # fmt: skip
+        unit_id=recorded.unit_id,
+        servos=servos,
+        before=before,
+        after=after,
+        robot=fitted.robot,
+        folder=folder,
+        recordings=len(sequences),
+        doctor=gate,
+    )
+
+
+def _require_adaptation(
+    fitted: Adapted, given: RobotSpec, sequences: list[Sequence]
+) -> tuple[float, float]:
+    """Return the mean |error| of all recordings before and after an adaptation, rad.
+
+    Raises:
+        NoGainError: The adapted robot is no better, on motions that the fit does not see or on all
+            recordings.
+    """
+    from gaponet.sim.metrics import MIN_RELATIVE_GAIN
+    from gaponet.sim.replay import rollout_errors
+
+    if not fitted.accepted:
+        why = "no joint has a motion that the fit does not see"
+        before, after = (1e3 * float(e.mean()) if len(e) else 0.0 for e in fitted.judged)
+        if before:
+            why = (
+                f"the error of motions that the fit does not see is {after:.2f} mrad, and "
+                f"{before:.2f} without the fit"
+            )
+        raise NoGainError(
+            f"nothing is written: {why}; keep {given.name} as it is, or record motions that move "
+            "each joint more"
+        )
+    before = float(rollout_errors(sequences, given).mean())
+    after = float(rollout_errors(sequences, fitted.robot).mean())
+    if after > (1 - MIN_RELATIVE_GAIN) * before:
+        raise NoGainError(
+            f"nothing is written: over all {len(sequences)} recording(s) the error is "
+            f"{1e3 * after:.2f} mrad with the fit and {1e3 * before:.2f} mrad with {given.name}; "
+            "give longer logs (--seconds), or keep the robot"
+        )
+    return before, after
+
+
+def _write_adapted(
+    folder: Path,
+    given: RobotSpec,
+    adapted: RobotSpec,
+    sequences: list[Sequence],
+    facts: dict[str, Any],
+    uncertainty: ParameterUncertainty | None,
+) -> None:
+    """Write the robot folder of an adaptation, whole or not at all."""
+    from gaponet.base.files import whole_folder
+    from gaponet.robot.folder import save_robot
+
+    with whole_folder(folder, "robot", "robot.toml", OUTDATED_FILES) as place:
+        save_robot(adapted, place)
+        _copy_origin(given.folder, place)
+        write_json(place / ADAPTATION_FILE, facts)
+        made = _uncertainty(place, sequences, [], {}, before=uncertainty)
+        links = uncertainty.links if uncertainty is not None else None
+        replace(made, links=links).save(place)
 
 
 def _window_rms(progress: Progress) -> Callable[[int, int, float], None]:

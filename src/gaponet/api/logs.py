@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from concurrent.futures import Executor
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from gaponet.api.opening import Place, as_dataset, as_robot, entries_of_unit
+from gaponet.api.options import ImportOptions
 from gaponet.api.results import ExciteResult, PairResult, Prediction
 from gaponet.base.errors import DatasetError, UsageError
 from gaponet.base.progress import Progress, no_progress, with_note
@@ -28,10 +29,8 @@ if TYPE_CHECKING:
     from gaponet.sysid.uncertainty import ParameterUncertainty
     from gaponet.virtual.collect import CollectResult
 
-DEFAULT_MINUTES, DEFAULT_FURTHER_MINUTES = (
-    10.0,
-    0.5,
-)  # of motions for a new robot, and for an identified one
+DEFAULT_MINUTES = 10.0  # of motions for a new robot
+DEFAULT_FURTHER_MINUTES = 0.5  # of further motions for an identified robot
 
 
 def import_logs(
@@ -41,23 +40,11 @@ def import_logs(
     out: Place,
     unit_id: str | None = None,
     payload_mass: float | None = None,
-    payload_side: str | None = None,
-    format: str | None = None,
-    joint_map: Mapping[str, str] | None = None,
-    logs: Place | None = None,
-    position_unit: str | None = None,
-    time_unit: str | None = None,
-    rate: float | None = None,
-    cut: float | None = None,
-    level: str | None = None,
-    kp: tuple[str, ...] = (),
-    kd: tuple[str, ...] = (),
-    skip_bad: bool = False,
-    strict: bool = False,
-    allow_pickle: bool = False,
+    options: ImportOptions = ImportOptions(),  # noqa: B008
     progress: Progress = no_progress,
 ) -> ImportResult:
-    """Read logs into a dataset, with delays and static offsets of the unit; a bad log refuses them all.
+    """Read logs into a dataset, with delays and static offsets of the unit; a bad log refuses them
+    all.
 
     The same call again adds what is missing.
 
@@ -65,40 +52,95 @@ def import_logs(
         src: File or folder of logs; `gaponet import --formats` lists what is read.
         robot: The robot that was recorded.
         out: Dataset folder; appended to where it exists.
-        unit_id: Name of the recorded robot, the same for all its logs. Needed unless the format states it.
+        unit_id: Name of the recorded robot, the same for all its logs. Needed unless the format
+            states it.
         payload_mass: kg in each hand, 0.0 when empty. Needed unless the format states it.
-        payload_side: Hand that carries it: both (default), or the side of one payload mount.
-        format: Format of the logs; default by inspection.
-        joint_map: Joint name in the logs → joint name of the robot.
-        logs: A logs.toml: what columns, names, units, signs and clocks mean; default the one in the folder of the logs.
-        position_unit: rad, deg, fraction, ticks or signed_percent, where the format leaves it open.
-        time_unit: s, ms, us or ns, where the format leaves it open.
-        rate: Hz, of logs without a clock.
-        cut: Cut long recordings into equal pieces of about this length, s; each is a motion of its own.
-        level: joint, upper_body or whole_body (default): what the motions move.
-        kp: Stiffness while recording, N·m/rad: a number, or JOINT=NUMBER for some joints; default what the format
-            states, else the robot's.
-        kd: Damping gain while recording, N·m·s/rad, likewise.
-        skip_bad: Cut bad rows and leave out unreadable logs, instead of refusing all.
-        strict: Refuse logs with implausible velocity, torque or temperature, instead of repairing them.
-        allow_pickle: Open pickled files (ASAP), with an unpickler that makes arrays, numbers and text only.
+        options: How the logs are read: names, units, clocks, gains, what to do with bad rows.
 
     Raises:
-        LogError, JointMismatchError, UsageError, DatasetError: The message says which file and what to do.
+        LogError, JointMismatchError, UsageError, DatasetError: The message says which file and what
+            to do.
     """
     from gaponet.data.importer import import_logs as read_logs
     from gaponet.sim.dynamics import gravity_of
-    from gaponet.sim.model import model_hash, require_stored_robot
+    from gaponet.sim.model import model_hash
 
     spec = as_robot(robot)
-    if Dataset.open_existing(out, spec) is not None:
-        require_stored_robot(Path(out), spec, DatasetError, MOVE_STORED_ROBOT)
+    require_robot_of_folder(Path(out), spec)
+    read_options = vars(options).copy()
+    joint_map = read_options.pop("joint_map")
     return read_logs(
-        src, spec, unit_id, payload_mass, out, payload_side=payload_side, fmt=format,
-        joint_map=None if joint_map is None else dict(joint_map), logs=logs, position_unit=position_unit,
-        time_unit=time_unit, rate=rate, cut=cut, level=level, kp=kp, kd=kd, skip_bad=skip_bad, strict=strict,
-        allow_pickle=allow_pickle, gravity=gravity_of(spec), simulator=model_hash(spec), progress=progress,
-    )  # fmt: skip
+        src,
+        spec,
+        unit_id,
+        payload_mass,
+        out,
+        fmt=read_options.pop("format"),
+        joint_map=None if joint_map is None else dict(joint_map),
+        gravity=gravity_of(spec),
+        simulator=model_hash(spec),
+        progress=progress,
+        **read_options,
+    )
+
+
+def require_robot_of_folder(folder: Path, robot: RobotSpec) -> Dataset | None:
+    """Return the dataset in a folder, which must be of this robot; None if there is none.
+
+    Raises:
+        DatasetError: It is another robot's.
+    """
+    from gaponet.sim.model import require_stored_robot
+
+    dataset = Dataset.open_existing(folder, robot)
+    if dataset is not None:
+        require_stored_robot(folder, robot, DatasetError, MOVE_STORED_ROBOT)
+    return dataset
+
+
+@dataclass(frozen=True)
+class LogFormat:
+    """A format that import_logs reads.
+
+    Attributes:
+        about: What it is.
+        extra: Extra of the package that it needs; "" for none.
+    """
+
+    name: str
+    about: str
+    extra: str
+
+
+def log_formats() -> list[LogFormat]:
+    """Return the formats that import_logs reads, those of installed extensions too."""
+    from gaponet.data.formats import about, extra_of, formats
+
+    found = []
+    for name in formats():
+        extra = extra_of(name)
+        if extra is not None:
+            found.append(LogFormat(name, about(name), extra))
+    return found
+
+
+def guess_description(
+    src: Place,
+    *,
+    robot: RobotSpec | Place,
+    options: ImportOptions = ImportOptions(),  # noqa: B008
+) -> str:
+    """Return a logs.toml for logs, filled in as far as they show what they are.
+
+    Raises:
+        LogError: The logs cannot be read.
+    """
+    from gaponet.data.describe.guess import guess_logs
+    from gaponet.data.formats import look
+
+    described = None if options.logs is None else Path(options.logs)
+    kind, facts, recordings = look(Path(src), options.format, described, options.allow_pickle)
+    return guess_logs(recordings, as_robot(robot), kind, dict(facts))
 
 
 def doctor(
@@ -108,12 +150,14 @@ def doctor(
     executor: str | Executor = "local",
     progress: Progress = no_progress,
 ) -> DoctorResult:
-    """Check a dataset: order, sign, unit, range, rate, gaps, saturation, stuck channels, lag, sag, torque.
+    """Check a dataset: order, sign, unit, range, rate, gaps, saturation, stuck channels, lag, sag,
+    torque.
 
     Args:
         dataset: Recordings.
         robot: Another robot than the one that the dataset keeps.
-        executor: Where many unchecked recordings are read: local, ray, ray:ADDRESS, or one of concurrent.futures.
+        executor: Where many unchecked recordings are read: local, ray, ray:ADDRESS, or one of
+            concurrent.futures.
 
     Raises:
         DatasetError: The folder is no dataset, or damaged.
@@ -132,6 +176,26 @@ def doctor(
     )
 
 
+def draw_findings(
+    dataset: Dataset | Place,
+    diagnosis: DoctorResult,
+    *,
+    out: Place,
+    robot: RobotSpec | Place | None = None,
+) -> list[Path]:
+    """Draw what the doctor found in a dataset: an SVG and a PNG for each finding. Return the files.
+
+    Raises:
+        FolderError: The folder holds something else.
+    """
+    from gaponet.base.files import lock_folder
+    from gaponet.report.figures import dataset_figures
+
+    data, spec = as_dataset(dataset, robot)
+    with lock_folder(Path(out), "figures"):
+        return dataset_figures.draw_findings(data, spec, list(diagnosis.findings), Path(out))
+
+
 def pair(
     dataset: Dataset | Place,
     *,
@@ -139,14 +203,16 @@ def pair(
     executor: str | Executor = "local",
     progress: Progress = no_progress,
 ) -> PairResult:
-    """Simulate the commands of every recording in the nominal simulator and store the result beside it.
+    """Simulate the commands of every recording in the nominal simulator and store the result
+    beside it.
 
     Recordings that have a paired simulation keep it.
 
     Args:
         dataset: Recordings.
         robot: Another robot than the one that the dataset keeps.
-        executor: Where they are simulated: local, ray, ray:ADDRESS (docs/install.md), or one of concurrent.futures.
+        executor: Where they are simulated: local, ray, ray:ADDRESS (docs/install.md), or one of
+            concurrent.futures.
 
     Raises:
         DatasetError, JointMismatchError: The folder is no dataset, or one of another robot.
@@ -176,14 +242,15 @@ def collect(
     Args:
         out: Dataset folder.
         robot: A robot of the package, or a folder with robot.toml.
-        fleet: Virtual units: hard, easy, shifted, unnamed, firm (hard at nine times the gains), or a .toml file.
-        recipe: demo (under a minute), small (about two), simlifter (30 h: 48 min on one core), arm (any robot), or a
-            .toml file.
+        fleet: Virtual units: hard, easy, shifted, unnamed, firm (hard at nine times the gains), or
+            a .toml file.
+        recipe: demo (under a minute), small (about two), simlifter (30 h: 48 min on one core), arm
+            (any robot), or a .toml file.
         payloads: kg per hand instead of the recipe's.
         units: Units of the fleet instead of the recipe's.
         seed: Seed of motions, noise and start states.
-        nproc: Processes, or jobs at a time; 0 for one per core. More than one starts fresh interpreters: a script that
-            calls this needs `if __name__ == "__main__":`.
+        nproc: Processes, or jobs at a time; 0 for one per core. More than one starts fresh
+            interpreters: a script that calls this needs `if __name__ == "__main__":`.
         executor: Where it is played: local, ray or ray:ADDRESS (docs/install.md).
 
     Raises:
@@ -195,7 +262,8 @@ def collect(
     from gaponet.virtual import collect as recording
     from gaponet.virtual.fleet import load_fleet
 
-    spec, plan = as_robot(robot), recording.load_recipe(recipe)
+    spec = as_robot(robot)
+    plan = recording.load_recipe(recipe)
     plan = replace(plan, payloads=payloads or plan.payloads, units=units or plan.units)
     return recording.collect(
         spec, load_fleet(fleet, spec), plan, out, seed, nproc, progress, executor=executor
@@ -217,14 +285,16 @@ def excite(
     """Write motions to play on a robot, and instructions to print.
 
     Args:
-        robot: Robot whose range, torque and payload limits bound the motions; an identified one for `further`.
+        robot: Robot whose range, torque and payload limits bound the motions; an identified one for
+            `further`.
         out: Folder for the motion files and sheet.md.
         further: Choose the motions that reduce an identified robot's standard errors most.
-        minutes: Duration of all motions; default 10, for `further` 0.5. 10 identify gains, friction and delay; 40 train
-            a good model.
+        minutes: Duration of all motions; default 10, for `further` 0.5. 10 identify gains, friction
+            and delay; 40 train a good model.
         payloads: kg in each hand; every motion is played with each. For `further` the choices.
         rate: Commands per second, Hz.
-        format: txt (SAGE, 50 Hz), csv (with time) or npz; `gaponet run` and `gaponet record` play each.
+        format: txt (SAGE, 50 Hz), csv (with time) or npz; `gaponet run` and `gaponet record` play
+            each.
         seed: Seed of the motions.
 
     Raises:
@@ -234,7 +304,9 @@ def excite(
     from gaponet.motion.files import write_motion
     from gaponet.motion.plan import make_plan, sheet
 
-    spec, masses, folder = as_robot(robot), tuple(sorted(set(payloads))), Path(out)
+    spec = as_robot(robot)
+    masses = tuple(sorted(set(payloads)))
+    folder = Path(out)
     prediction = None
     with lock_folder(folder, "motions"):
         if further:
@@ -252,9 +324,13 @@ def excite(
             folder / "sheet.md", sheet(spec, plan, files, rate, spec.folder if further else None)
         )
     return ExciteResult(
-        folder=folder, motions=tuple(files.values()), minutes=plan.minutes, payloads=tuple(plan.payloads),
-        sheet=folder / "sheet.md", prediction=prediction,
-    )  # fmt: skip
+        folder=folder,
+        motions=tuple(files.values()),
+        minutes=plan.minutes,
+        payloads=tuple(plan.payloads),
+        sheet=folder / "sheet.md",
+        prediction=prediction,
+    )
 
 
 def _further_motions(
@@ -268,7 +344,7 @@ def _further_motions(
         candidate_motions,
         simulated_recordings,
         undetermined_gains,
-    )  # fmt: skip
+    )
     from gaponet.sysid.uncertainty import ParameterUncertainty
 
     uncertainty = ParameterUncertainty.require(spec)
@@ -286,15 +362,18 @@ def _further_motions(
     picks = sorted(design.choose(seconds), key=lambda i: pairs[i][0])
     if not picks:
         raise UsageError(
-            f"--minutes {seconds / 60:g}: no motion is so short; give {design.seconds.min() / 60:.2f}"
+            f"--minutes {seconds / 60:g}: no motion is so short; give "
+            f"{design.seconds.min() / 60:.2f}"
         )
     before, after = (_standard_errors(uncertainty, design.after(chosen)) for chosen in ([], picks))
     chosen = tuple(pairs[i] for i in picks)
     return Plan(chosen), Prediction(
-        before=before, after=after, useful_seconds=design.worth(),
+        before=before,
+        after=after,
+        useful_seconds=design.worth(),
         undetermined=undetermined_gains(uncertainty, design),
         played=tuple((mass, motion.name) for mass, motion in chosen),
-    )  # fmt: skip
+    )
 
 
 def _standard_errors(

@@ -10,6 +10,7 @@ import numpy as np
 
 from gaponet.api.logs import import_logs, pair, unit_recordings
 from gaponet.api.opening import Place, as_dataset, as_robot, as_run, require_commands
+from gaponet.api.options import ImportOptions
 from gaponet.api.results import CheckResult, EvalResult, GapResult, ReplayResult
 from gaponet.base.errors import UsageError
 from gaponet.base.files import FOLDER_MARKER, write_text
@@ -32,15 +33,18 @@ def gap(
     executor: str = "local",
     progress: Progress = no_progress,
 ) -> GapResult:
-    """Measure the error of the nominal simulator in open-loop rollouts; for an identified robot also by cause.
+    """Measure the error of the nominal simulator in open-loop rollouts; for an identified robot
+    also by cause.
 
     Args:
         dataset: Recordings; those without a paired simulation are simulated first.
-        robot: Another robot than the one that the dataset keeps. An identified one is measured as `run` is.
+        robot: Another robot than the one that the dataset keeps. An identified one is measured as
+            `run` is.
         motions: Only these.
-        run: Robot folder that `identify` wrote, a run of `train`, or a network of the package by name. The result then
-            says how much each identified cause and the model reduce the error, and the floor, on motions that were not
-            used in training; a folder of yours keeps it as gap.json, gap.svg and gap.png.
+        run: Robot folder that `identify` wrote, a run of `train`, or a network of the package by
+            name. The result then says how much each identified cause and the model reduce the
+            error, and the floor, on motions that were not used in training; a folder of yours keeps
+            it as gap.json, gap.svg and gap.png.
         executor: Where recordings are simulated: local, ray or ray:ADDRESS (docs/install.md).
     """
     from gaponet.evaluation.baselines import baseline_errors, command_run
@@ -48,12 +52,13 @@ def gap(
     from gaponet.sim.model import model_hash
 
     spec = None if robot is None else as_robot(robot)
-    if run is not None or (spec is not None and spec.nominal is not None):
+    if run is not None or (spec is not None and spec.is_identified):
         return _gap_by_cause(dataset, spec, None if run is None else as_run(run), motions, progress)
     data, spec = as_dataset(dataset, spec)
     require_commands(data)
     pair(data, robot=spec, executor=executor, progress=progress)
-    entries, simulator = data.select(motions), model_hash(spec)
+    entries = data.select(motions)
+    simulator = model_hash(spec)
     simulated = []
     commands = []
     for entry in entries:
@@ -61,16 +66,19 @@ def gap(
         simulated.append(Run.of(both.real, both.sim.qpos, spec))
         commands.append(command_run(both.real, spec))
     methods = {"nominal": summary(simulated, spec)}
-    return GapResult(methods=methods, table={
-        "methods": methods,
-        "baselines": baseline_errors(simulated, commands),
-        "dataset": data.path.name,
-        "sequences": len(entries),
-        "hours": sum(e.rows * e.dt for e in entries) / 3600,
-        "virtual": any(e.meta.virtual for e in entries),
-        "robot": spec.name,
-        "simulator_hash": simulator,
-    })  # fmt: skip
+    return GapResult(
+        methods=methods,
+        table={
+            "methods": methods,
+            "baselines": baseline_errors(simulated, commands),
+            "dataset": data.path.name,
+            "sequences": len(entries),
+            "hours": sum(e.rows * e.dt for e in entries) / 3600,
+            "virtual": any(e.meta.virtual for e in entries),
+            "robot": spec.name,
+            "simulator_hash": simulator,
+        },
+    )
 
 
 def _gap_by_cause(
@@ -98,7 +106,8 @@ def _may_be_written(folder: Path, *, given: bool) -> bool:
     """Return True if a result may be stored in the folder of a candidate.
 
     Args:
-        given: The user named the folder as the candidate. Other folders are written to only if gaponet made them.
+        given: The user named the folder as the candidate. Other folders are written to only if
+            gaponet made them.
     """
     if is_packaged(folder):
         return False
@@ -115,21 +124,23 @@ def evaluate(
     units: tuple[str, ...] = (),
     progress: Progress = no_progress,
 ) -> EvalResult:
-    """Measure simulators on recordings that were not used in training: nominal, identified, and with the model.
+    """Measure simulators on recordings that were not used in training: nominal, identified, and
+    with the model.
 
     Args:
-        run: Robot folder that `identify` wrote; run folder; network of the package by name; or a trained model. The
-            result is kept in a folder of yours.
+        run: Robot folder that `identify` wrote; run folder; network of the package by name; or a
+            trained model. The result is kept in a folder of yours.
         dataset: The dataset trained on (its test motions are used) or another.
         also: Further runs to compare, e.g. the MLP's.
         motions: Only these.
-        robot: Another robot than the one that the dataset keeps. If it is not the simulator that the run was trained
-            in, it is shown as it is, and with the run transferred into it (deploy/transfer.py).
+        robot: Another robot than the one that the dataset keeps. If it is not the simulator that
+            the run was trained in, it is shown as it is, and with the run transferred into it
+            (deploy/transfer.py).
         units: Only recordings of these, such as the one left out of training.
 
     Raises:
-        DatasetError, ModelError: A recording is not there or was used in training, a model fits another robot, or
-            transfer was never measured so far from the simulator of the run.
+        DatasetError, ModelError: A recording is not there or was used in training, a model fits
+            another robot, or transfer was never measured so far from the simulator of the run.
     """
     from gaponet.evaluation import evaluate as measuring
     from gaponet.evaluation.candidate import is_robot
@@ -138,19 +149,23 @@ def evaluate(
 
     folder = as_run(run)
     data, spec = as_dataset(dataset, robot, folder)
-    target, own = None, spec
+    target = None
+    own = spec
     if robot is not None and (is_robot(folder) or has_stored_robot(folder)):
         own = load_robot(folder) if is_robot(folder) else load_stored_robot(folder, spec.name)
     if model_hash(own) != model_hash(spec):
-        target, spec = spec, own.nominal or own
+        target = spec
+        spec = own.before_identification
     evaluation = measuring.evaluate(
         [folder, *map(named_folder, also)], data, spec, motions, progress, target, units
     )
     if not is_packaged(folder):
         evaluation.save(folder)
     return EvalResult(
-        methods=evaluation.result["methods"], unseen=evaluation.result["unseen"], evaluation=evaluation
-    )  # fmt: skip
+        methods=evaluation.result["methods"],
+        unseen=evaluation.result["unseen"],
+        evaluation=evaluation,
+    )
 
 
 def check(
@@ -185,7 +200,11 @@ def check(
         sequences = recorded.sequences()
         drifted = drift(spec, uncertainty, sequences, threads)
     return CheckResult(
-        verdict=drifted.verdict, advice=drifted.advice, recordings=len(sequences), drift=drifted
+        verdict=drifted.verdict,
+        advice=drifted.advice,
+        recordings=len(sequences),
+        drift=drifted,
+        uncertainty=uncertainty,
     )
 
 
@@ -200,11 +219,13 @@ def replay(
 ) -> ReplayResult:
     """Predict what an identified robot would do in the rollouts of a policy.
 
-    The targets of a rollout are played as they stand. A policy that observes the state would have answered the
-    difference. The band holds nine tenths of every validation motion, and the uncertainty of the servos in this motion.
+    The targets of a rollout are played as they stand. A policy that observes the state would have
+    answered the difference. The band holds nine tenths of every validation motion, and the
+    uncertainty of the servos in this motion.
 
     Args:
-        logs: File or folder of rollouts, in any format that `import_logs` reads: targets as commands, and states.
+        logs: File or folder of rollouts, in any format that `import_logs` reads: targets as
+            commands, and states.
         robot: Robot folder that `identify` wrote.
         data: Dataset whose validation motions give the band; default that of the identification.
         described: A logs.toml that says what the rollouts' columns mean.
@@ -219,10 +240,8 @@ def replay(
     from gaponet.sysid.uncertainty import ParameterUncertainty
 
     spec = as_robot(Path(robot) if isinstance(robot, str) else robot)
-    uncertainty, recordings = (
-        ParameterUncertainty.load(spec),
-        read_recordings(spec.folder, data, spec),
-    )
+    uncertainty = ParameterUncertainty.load(spec)
+    recordings = read_recordings(spec.folder, data, spec)
     drawn = sample_robots(spec) if uncertainty is not None else []
     errors: Array
     if recordings is not None:
@@ -231,7 +250,8 @@ def replay(
         errors = np.array([uncertainty.joints[j].residual_p90 for j in spec.operated])
     else:
         raise UsageError(
-            f"{spec.folder}: nothing says how far it is from its robot; give --data, or what identify wrote"
+            f"{spec.folder}: nothing says how far it is from its robot; give --data, or what "
+            "identify wrote"
         )
     with tempfile.TemporaryDirectory() as place:
         toml = None if described is None else Path(described)
@@ -239,9 +259,14 @@ def replay(
         if guessed:
             write_text(toml := Path(place) / "logs.toml", guessed)
         report = import_logs(
-            logs, robot=spec, out=Path(place) / "data", unit_id="rollout", payload_mass=payload_mass, logs=toml,
+            logs,
+            robot=spec,
+            out=Path(place) / "data",
+            unit_id="rollout",
+            payload_mass=payload_mass,
+            options=ImportOptions(logs=toml),
             progress=progress,
-        )  # fmt: skip
+        )
         rollouts = report.dataset.sequences(list(report.added))
     prediction = predict(spec, rollouts, errors, drawn)
     joints = summary(prediction, spec.operated)
@@ -250,6 +275,11 @@ def replay(
         key=lambda j: joints[j]["inside"],
     )
     return ReplayResult(
-        robot=spec, joints=joints, differ=tuple(differ), rollouts=tuple(prediction), share=BAND_SHARE, drawn=len(drawn),
+        robot=spec,
+        joints=joints,
+        differ=tuple(differ),
+        rollouts=tuple(prediction),
+        share=BAND_SHARE,
+        drawn=len(drawn),
         band_from_recordings=recordings is not None,
-    )  # fmt: skip
+    )

@@ -26,7 +26,9 @@ def as_robot(robot: RobotSpec | Place) -> RobotSpec:
 
 
 def as_run(run: GapModel | Place) -> Path:
-    """Return the folder of a run, or of a network of the package by name; a trained model lies in it."""
+    """Return the folder of a run, or of a network of the package by name; a trained model lies in
+    it.
+    """
     if isinstance(run, (str, Path)):
         return named_folder(run)
     return run.path.parent if run.path.name == "model" else run.path
@@ -56,20 +58,50 @@ def entries_of_unit(data: Dataset, unit: str, motions: tuple[str, ...]) -> tuple
     return unit, [e for e in data.select(motions) if e.meta.unit_id == unit]
 
 
+def test_motions(data: Dataset) -> tuple[str, ...]:
+    """Return the names of the motions that no fit to a dataset sees."""
+    from gaponet.data.split import split_entries
+
+    return tuple(sorted({entry.meta.motion for entry in split_entries(data)["test"]}))
+
+
 def driven_by_torque(data: Dataset) -> bool:
-    """True if torque was recorded and no position commanded: the commands of the first recording are its positions."""
+    """True if torque was recorded and no position commanded: the commands of the first recording
+    are its positions.
+    """
     first = data.read(data.entries[0]) if data.entries else None
     return first is not None and first.tau is not None and set(_copies(first)) == {0}
 
 
+def require_torque_for_current(data: Dataset) -> None:
+    """Refuse --current for recordings that hold position commands, or no torque.
+
+    Raises:
+        UsageError: The commands are no copies of the positions, or no torque was recorded.
+    """
+    if driven_by_torque(data) or copies_with_torque(data):
+        return
+    raise UsageError(
+        f"--current is for a robot that is driven by torque or current, and {data.path} holds "
+        "position commands beside the positions, or no torque. Leave --current out. If no "
+        "position was commanded, name the position's column for ctrl too, and the torque's or "
+        "current's for tau (docs/logs.md, 'Driven by torque or current')"
+    )
+
+
 def copies_with_torque(data: Dataset) -> bool:
-    """True if torque was recorded, and the commands of the first recording are its positions, of any row."""
+    """True if torque was recorded, and the commands of the first recording are its positions, of
+    any row.
+    """
     first = data.read(data.entries[0]) if data.entries else None
     return first is not None and first.tau is not None and None not in _copies(first)
 
 
 def _copies(sequence: Sequence) -> list[int | None]:
-    """Return by how many rows each moving joint repeats its command; None: it does not. All are None if none moves."""
+    """Return by how many rows each moving joint repeats its command; None: it does not.
+
+    All are None if none moves.
+    """
     moving = np.flatnonzero(np.ptp(sequence.qpos, axis=0) > MOVING_RAD)
     copies: list[int | None] = [
         0
@@ -83,12 +115,13 @@ def _copies(sequence: Sequence) -> list[int | None]:
 def _what_torque_tells(data: Dataset, first: Sequence) -> str:
     if first.tau is None:
         return (
-            "Log what the servos were sent. This log also has no torque of every operated joint, as of a robot that "
-            "is driven by torque; if it was recorded, say its column as tau in logs.toml"
+            "Log what the servos were sent. This log also has no torque of every operated joint, "
+            "as of a robot that is driven by torque; if it was recorded, say its column as tau in "
+            "logs.toml"
         )
     return (
-        f"If the robot is driven by torque, gaponet identify {data.path} --out ROBOT fits its friction, inertia and "
-        "delay, and says how far it is"
+        f"If the robot is driven by torque, gaponet identify {data.path} --out ROBOT fits its "
+        "friction, inertia and delay, and says how far it is"
     )
 
 
@@ -97,6 +130,6 @@ def require_commands(data: Dataset) -> None:
     first = data.read(data.entries[0]) if data.entries else None
     if first is not None and set(_copies(first)) == {0}:
         raise UsageError(
-            f"{data.path}: no position was commanded, so there is nothing to follow: command and state are the same "
-            f"numbers. {_what_torque_tells(data, first)}"
+            f"{data.path}: no position was commanded, so there is nothing to follow: command and "
+            f"state are the same numbers. {_what_torque_tells(data, first)}"
         )

@@ -10,10 +10,12 @@ from typing import TYPE_CHECKING
 from gaponet.api.opening import Place, as_dataset
 from gaponet.base.progress import Running
 from gaponet.data.store import Dataset
-from gaponet.experiments.paper.options import PaperOptions
+from gaponet.experiments.paper.options import DEMO as DEMO
+from gaponet.experiments.paper.options import PaperOptions as PaperOptions
 
 if TYPE_CHECKING:
-    from gaponet.experiments.paper.experiment import OpenBar, OpenBars, PaperResult
+    from gaponet.experiments.paper.experiment import OpenBar, OpenBars
+    from gaponet.experiments.paper.experiment import PaperResult as PaperResult
 
 
 @contextmanager
@@ -34,14 +36,15 @@ def paper_experiment(
     open_bar: OpenBar = _no_bar,
     open_bars: OpenBars = _no_bars,
 ) -> PaperResult:
-    """Run the experiment of the paper "SimLifter and GAPONet": its claims, Figures 2 and 3, Tables 1 and 2.
+    """Run the experiment of the paper "SimLifter and GAPONet": its claims, Figures 2 and 3, Tables
+    1 and 2.
 
-    Every network has the same recordings, inputs, training and seeds. All are measured on motions and on a unit that no
-    network has seen. The same call continues an interrupted experiment.
+    Every network has the same recordings, inputs, training and seeds. All are measured on motions
+    and on a unit that no network has seen. The same call continues an interrupted experiment.
 
     Args:
-        dataset: Recordings of a VIRTUAL fleet (gaponet collect), or of a real robot. Of a real robot simulators are
-            compared on its test motions, and nothing is commanded.
+        dataset: Recordings of a VIRTUAL fleet (gaponet collect), or of a real robot. Of a real
+            robot simulators are compared on its test motions, and nothing is commanded.
         out: Folder of the results; OUT/paper.html is the page.
         options: Size of the experiment, and where it runs.
         open_bar: Opens a progress bar: title → update(share).
@@ -51,7 +54,8 @@ def paper_experiment(
         Claims, tables (Q_dis in rad·s, MPJAE in mrad, offsets in cm) and the page.
 
     Raises:
-        UsageError: The dataset or the folder does not fit, or a motion of the experiment was recorded.
+        UsageError: The dataset or the folder does not fit, or a motion of the experiment was
+            recorded.
         ModelError: Every training failed.
     """
     from gaponet.experiments.paper.experiment import run_paper_experiment

@@ -20,16 +20,16 @@ SWITCHED_OFF = {  # by Connection.joints, with topic lowcmd
 class Permission:
     """Permission to move one robot in one run.
 
-    A virtual robot in this process and a dry run need none. Any other robot needs `options.yes`, a True from the
-    caller's function, or yes typed on the terminal.
+    A virtual robot in this process and a dry run need none. Any other robot needs `options.yes`, a
+    True from the caller's function, or yes typed on the terminal.
     """
 
     def __init__(self, driver: str, options: RunOptions, consent: Consent | None) -> None:
         """
         Args:
             driver: Name of the driver.
-            consent: Called with each statement that needs consent, after the plan was shown; it returns True to let the
-                robot move. None: the person at the terminal is asked.
+            consent: Called with each statement that needs consent, after the plan was shown; it
+                returns True to let the robot move. None: the person at the terminal is asked.
         """
         self.driver = driver
         self.options = options
@@ -64,7 +64,8 @@ class Permission:
         off = SWITCHED_OFF[connection.joints]
         if options.yes:
             raise UsageError(
-                f"with --topic lowcmd {off} go off, and a robot that stands falls; say --hangs if it hangs"
+                f"with --topic lowcmd {off} go off, and a robot that stands falls; say --hangs if "
+                "it hangs"
             )
         statement = f"With --topic lowcmd {off} go off: a robot that stands falls."
         self._ask(statement, question="Does it hang?", word="it hangs", option="--hangs")

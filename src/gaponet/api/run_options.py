@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Literal
 
 from gaponet.deploy.compensator import CompensatorConfig
-from gaponet.hw.control.phases import ControlConfig
+from gaponet.hw.control.phases import ControlConfig as ControlConfig
 from gaponet.hw.control.safety import SafetyConfig
 from gaponet.hw.targets.live import LiveConfig
 
@@ -20,24 +20,27 @@ class Connection:
     """How the robot is connected."""
 
     topic: Literal["arm_sdk", "lowcmd"] = "arm_sdk"
-    """unitree: arm_sdk leaves legs and balance to the robot's own controller; lowcmd requires that the robot hangs."""
+    """unitree: arm_sdk leaves legs and balance to the robot's own controller; lowcmd requires that
+    the robot hangs."""
     joints: Literal["arms", "upper_body", "all"] = "arms"
     """unitree: joints that are commanded. The legs are commanded with all on lowcmd only."""
     domain: int = 0
     """unitree, and targets over DDS: DDS domain."""
     interface: str = "lo"
-    """unitree, and targets over DDS: network interface to the robot; lo for a virtual one on this machine."""
+    """unitree, and targets over DDS: network interface to the robot; lo for a virtual one on this
+    machine."""
     port: str = "/dev/ttyACM0"
     """so101: serial port."""
     calibration: Path | None = None
-    """so101: calibration file of lerobot-calibrate for this arm. It must agree with the calibration in the servos.
-    Default: the calibration in the servos."""
+    """so101: calibration file of lerobot-calibrate for this arm. It must agree with the calibration
+    in the servos. Default: the calibration in the servos."""
     unit: str = "4"
     """virtual: number or name of the robot in the fleet."""
     fleet: str = "hard"
     """virtual: hard, easy, shifted, unnamed, or a .toml file."""
     hangs: bool = False
-    """unitree: state that the robot hangs. lowcmd switches off all motors that are not commanded, legs too."""
+    """unitree: state that the robot hangs. lowcmd switches off all motors that are not commanded,
+    legs too."""
     fast: bool = False
     """virtual: run as fast as this machine can instead of in real time."""
 
@@ -64,14 +67,14 @@ class ControlOptions:
     """Robot, limits and control loop."""
 
     limits_from: str | None = None
-    """Robot folder whose gains, joint ranges, effort limits and collision shapes are used on hardware instead of the
-    packaged robot. Check its values first. The driver of an extension requires it. Identified values come from --robot
-    or --model."""
+    """Robot folder whose gains, joint ranges, effort limits and collision shapes are used on
+    hardware instead of the packaged robot. Check its values first. The driver of an extension
+    requires it. Identified values come from --robot or --model."""
     payload_side: str = "both"
     """Hand that carries the payload: both, or the side of one payload mount."""
     max_payload: float | None = None
-    """Payload for which the motion must be feasible, kg in each hand. Default: payload_mass, or 0. To play one library
-    motion with several payloads, give the heaviest."""
+    """Payload for which the motion must be feasible, kg in each hand. Default: payload_mass, or 0.
+    To play one library motion with several payloads, give the heaviest."""
     connection: Connection = Connection()
     """Connection to the robot."""
     control: ControlConfig = ControlConfig()  # noqa: RUF009
@@ -79,7 +82,8 @@ class ControlOptions:
     safety: SafetyConfig = SafetyConfig()  # noqa: RUF009
     """Limits and checks of states."""
     plane: float | None = None
-    """Height of the floor or table in the robot's frame, m. Default: the height in its collision.toml."""
+    """Height of the floor or table in the robot's frame, m. Default: the height in its
+    collision.toml."""
     unchecked: bool = False
     """Skip the check for collisions of the robot with itself and with the floor or table."""
     yes: bool = False
@@ -91,26 +95,31 @@ class RunOptions(ControlOptions):
     """Settings of a run beyond robot, motion and driver."""
 
     targets: Literal["zmq", "dds", "stdin"] | None = None
-    """Follow targets that arrive while the robot moves, instead of a motion: JSON over ZeroMQ, JSON lines on standard
-    input, or ROS 2's JointTrajectory over DDS. docs/deploy.md describes the messages."""
+    """Follow targets that arrive while the robot moves, instead of a motion: JSON over ZeroMQ, JSON
+    lines on standard input, or ROS 2's JointTrajectory over DDS. docs/deploy.md describes the
+    messages."""
     live: LiveOptions = LiveOptions()
     """Source and limits of live targets."""
     payload_mass: float | None = None
     """Payload, kg in each hand. Compensation estimates it if it is not given."""
     model: Path | None = None
-    """Run or artifact folder, or name of a network of the package, whose network corrects the commands in addition."""
+    """Run or artifact folder, or name of a network of the package, whose network corrects the
+    commands in addition."""
     follow: Literal["nominal"] | None = None
-    """Command the robot so that it moves as its nominal simulator does under the targets, for a policy that was trained
-    in an ordinary simulator. --robot must be identified. Instead of --compensate and --model."""
+    """Command the robot so that it moves as its nominal simulator does under the targets, for a
+    policy that was trained in an ordinary simulator. --robot must be identified. Instead of
+    --compensate and --model."""
     compensation: CompensatorConfig = CompensatorConfig()  # noqa: RUF009
     """Settings of the compensation."""
     unit_id: str = ""
-    """Name of this robot. With a model, the adaptation that gaponet adapt stored for this name is used."""
+    """Name of this robot. With a model, the adaptation that gaponet adapt stored for this name is
+    used."""
     extrapolate: bool = False
     """Accept payloads (with a model) and servo gains outside those of the recorded data."""
     dry_run: bool = False
     """Connect, read and compute, but send nothing; print the commands instead."""
     out: Path | None = None
-    """Folder for the recording: MOTION.parquet (gaponet import reads it), MOTION.json and MOTION.cycles.npy."""
+    """Folder for the recording: MOTION.parquet (gaponet import reads it), MOTION.json and
+    MOTION.cycles.npy."""
     seed: int = 0
     """virtual: seed of the robot's noise."""

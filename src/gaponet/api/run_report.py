@@ -1,6 +1,7 @@
 """What a run tells its user: the plan, notes, changes of phase, and the commands of a dry run.
 
-The texts are made here, once. A `RunReporter` shows them; the command line has its own, with tables and colours.
+The texts are made here, once. A `RunReporter` shows them; the command line has its own, with tables
+and colours.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import numpy as np
 from gaponet.base.text import escape
 from gaponet.hw.control.driver import Driver
 from gaponet.hw.control.plan import NO_MOVEMENT, Plan
-from gaponet.hw.control.recording import Event
+from gaponet.hw.control.recording import Event as Event
 from gaponet.robot.spec import RobotSpec
 
 COLUMNS = ("moves", "found, rad", "begins", "lowest", "highest", "ends")
@@ -54,7 +55,10 @@ class PlanText:
 
 
 class RunReporter(Protocol):
-    """Shows what happens in a run. Texts may hold names that strangers chose: escape them before a terminal."""
+    """Shows what happens in a run.
+
+    Texts may hold names that strangers chose: escape them before a terminal.
+    """
 
     def plan(self, text: PlanText) -> None:
         """Show the plan; the question for consent follows."""
@@ -99,7 +103,8 @@ def event_text(event: Event) -> str:
 
 
 def describe_plan(plan: Plan, robot: RobotSpec, driver: Driver, heaviest: float) -> PlanText:
-    """Describe a plan with a motion: what moves from where to where, what is held, clearances, and how it ends.
+    """Describe a plan with a motion: what moves from where to where, what is held, clearances, and
+    how it ends.
 
     Args:
         robot: Whose limits and shapes hold.
@@ -156,8 +161,9 @@ def _clearances(plan: Plan) -> list[str]:
         sentences.append("nobody looks whether it meets itself or what it stands on")
     if plan.corrected_joint:
         sentences.append(
-            f"commands lead their targets by at most {plan.correction:.2f} rad ({plan.corrected_joint}); nearest to "
-            f"each other: {100 * plan.command_clearance:.1f} cm"
+            f"commands lead their targets by at most {plan.correction:.2f} rad "
+            f"({plan.corrected_joint}); nearest to each other: {100 * plan.command_clearance:.1f} "
+            "cm"
         )
     return sentences
 

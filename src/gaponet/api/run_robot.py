@@ -1,7 +1,8 @@
 """Motions and live targets on a robot, real or virtual, with limits, plan, consent and watchdog.
 
-`execute` is one run: it resolves the robot, makes driver, compensator and live targets, plans, asks, and runs the
-controller. `run_robot` is its public form. gaponet run and gaponet record call the same.
+`execute` is one run: it resolves the robot, makes driver, compensator and live targets, plans,
+asks, and runs the controller. `run_robot` is its public form. gaponet run and gaponet record call
+the same.
 """
 
 from __future__ import annotations
@@ -50,14 +51,21 @@ ROBOTS = ROBOT_OF_DRIVER | {VIRTUAL: "h1_2"}  # driver → robot, where none is 
 DEFAULT_ROBOT = "h1_2"
 
 
+def known_drivers() -> tuple[str, ...]:
+    """Return the names of all drivers: virtual, those of the package and of installed extensions."""
+    return (VIRTUAL, *driver_names())
+
+
 @dataclass(frozen=True)
 class RunRequest:
     """What is played, on which robot, and how."""
 
     robot: RobotSpec | Place | None = None
-    """Robot, its name or folder; it may be identified. None: that of the model's run, or the driver's."""
+    """Robot, its name or folder; it may be identified. None: that of the model's run, or the
+    driver's."""
     motion: Motion | Place | None = None
-    """Motion, its name in the library, or its file (.txt, .csv, .npz). None: live targets, options.targets."""
+    """Motion, its name in the library, or its file (.txt, .csv, .npz). None: live targets,
+    options.targets."""
     driver: str = VIRTUAL
     """virtual, unitree, so101, or the driver of an installed extension."""
     compensate: bool = False
@@ -82,23 +90,14 @@ class RunRequest:
             UsageError: Always with what to do instead.
         """
         options = self.options
-        if not self.is_virtual and self.driver not in driver_names():
-            raise UsageError(
-                f"no driver '{self.driver}'; there are {', '.join((VIRTUAL, *driver_names()))}"
-            )
+        if self.driver not in known_drivers():
+            raise UsageError(f"no driver '{self.driver}'; there are {', '.join(known_drivers())}")
         if (self.motion is None) == (options.targets is None):
             raise UsageError(
-                "give either --motion, what to play, or --targets, where targets come from while it moves"
+                "give either --motion, what to play, or --targets, where targets come from while "
+                "it moves"
             )
-        if options.follow is not None and (self.compensate or options.model is not None):
-            raise UsageError(
-                "--follow already corrects the commands; leave out --compensate and --model"
-            )
-        corrects = self.compensate or options.model is not None or options.follow is not None
-        if options.compensation != CompensatorConfig() and not corrects:
-            raise UsageError(
-                "settings of the compensation are given, and it is off; add --compensate, --model or --follow"
-            )
+        self._require_one_correction()
         if options.live != LiveOptions() and options.targets is None:
             raise UsageError(
                 "settings of live targets are given, and this is a motion; leave them out"
@@ -108,6 +107,21 @@ class RunRequest:
         if options.dry_run and options.out:
             raise UsageError(
                 "a dry run moves nothing, so there is nothing to record; leave out --out"
+            )
+
+    def _require_one_correction(self) -> None:
+        """Refuse two ways to correct the commands, and settings of a correction that is off."""
+        options = self.options
+        corrects = self.compensate or options.model is not None
+        follows = options.follow is not None
+        if follows and corrects:
+            raise UsageError(
+                "--follow already corrects the commands; leave out --compensate and --model"
+            )
+        if options.compensation != CompensatorConfig() and not (corrects or follows):
+            raise UsageError(
+                "settings of the compensation are given, and it is off; add --compensate, --model "
+                "or --follow"
             )
 
 
@@ -123,30 +137,35 @@ def run_robot(
 ) -> RunResult:
     """Play a motion, or follow live targets, on a robot: what gaponet run does.
 
-    The gains, ranges, effort limits and collision shapes are those of the package's robot (or options.limits_from); a
-    folder that differs is refused. The whole run is planned and shown before the first command. A real robot moves only
-    after consent. A watchdog in another process damps the robot if this one dies or hangs. Any key on the terminal,
-    Ctrl-C included, stops it.
+    The gains, ranges, effort limits and collision shapes are those of the package's robot (or
+    options.limits_from); a folder that differs is refused. The whole run is planned and shown
+    before the first command. A real robot moves only after consent. A watchdog in another process
+    damps the robot if this one dies or hangs. Any key on the terminal, Ctrl-C included, stops it.
 
     Args:
-        robot: Robot, its name or folder; it may be identified. Default: the robot of the model's run; without a model
-            h1_2, or so101 for the so101 driver.
-        motion: Motion, its name in the library, or its file (.txt, .csv, .npz). Leave it out with options.targets.
-        driver: virtual (a simulated robot in this process), unitree (DDS), so101 (serial), or the driver of an
-            installed extension.
-        compensate: Correct the commands so that the robot follows the motion, by what was identified.
+        robot: Robot, its name or folder; it may be identified. Default: the robot of the model's
+            run; without a model h1_2, or so101 for the so101 driver.
+        motion: Motion, its name in the library, or its file (.txt, .csv, .npz). Leave it out with
+            options.targets.
+        driver: virtual (a simulated robot in this process), unitree (DDS), so101 (serial), or the
+            driver of an installed extension.
+        compensate: Correct the commands so that the robot follows the motion, by what was
+            identified.
         options: All other settings.
-        consent: Called with a statement of what will happen, after the plan was shown. The robot moves only if it
-            returns True. Default: the person at the terminal types yes. RunOptions(yes=True) moves it without asking.
+        consent: Called with a statement of what will happen, after the plan was shown. The robot
+            moves only if it returns True. Default: the person at the terminal types yes.
+            RunOptions(yes=True) moves it without asking.
         report: Shows plan, notes and phases; default on standard error.
 
     Returns:
-        Recording, plan and tracking errors. After a fault `result.fault` says which; the robot has then damped.
+        Recording, plan and tracking errors. After a fault `result.fault` says which; the robot has
+        then damped.
 
     Raises:
-        UsageError: Nobody consented or could be asked, options contradict each other, or no clear way exists; nothing
-            was commanded.
-        RobotError: The folder differs from the known robot, or its identified values are implausible.
+        UsageError: Nobody consented or could be asked, options contradict each other, or no clear
+            way exists; nothing was commanded.
+        RobotError: The folder differs from the known robot, or its identified values are
+            implausible.
         DriverError: The robot does not answer.
     """
     request = RunRequest(robot, motion, driver, compensate, options)
@@ -158,7 +177,10 @@ def run_robot(
 
 
 def execute(request: RunRequest, report: RunReporter, consent: Consent | None = None) -> RunResult:
-    """Prepare, ask for consent and run. The periods are written to options.out as they come, but not saved there."""
+    """Prepare, ask for consent and run.
+
+    The periods are written to options.out as they come, but not saved there.
+    """
     options = request.options
     permission = Permission(request.driver, options, consent)
     request.require_consistent()
@@ -223,7 +245,8 @@ def execute(request: RunRequest, report: RunReporter, consent: Consent | None = 
 
 
 def resolve_robot(request: RunRequest) -> RobotSpec:
-    """Return the robot of the model's run, which a given robot must equal; without a model the given or the driver's.
+    """Return the robot of the model's run, which a given robot must equal; without a model the
+    given or the driver's.
 
     Raises:
         ModelError: The given robot is not that of the run.
@@ -265,8 +288,9 @@ def require_shapes(request: RunRequest, robot: RobotSpec, report: RunReporter) -
     if request.options.unchecked or (robot.folder / "collision.toml").is_file():
         return
     text = (
-        f"{robot.name} has no collision.toml, so nobody would look whether it meets itself or what it stands on. Write "
-        f"one into {robot.folder} (docs/new-robot.md has the fields), or say --unchecked"
+        f"{robot.name} has no collision.toml, so nobody would look whether it meets itself or "
+        f"what it stands on. Write one into {robot.folder} (docs/new-robot.md has the fields), or "
+        "say --unchecked"
     )
     if not request.is_virtual:
         raise UsageError(text)
@@ -301,8 +325,9 @@ def require_commanded(motion: Motion, robot: RobotSpec, driver: Driver) -> None:
     left = [name for name in motion.moved(robot) if name not in driver.commanded]
     if left:
         raise UsageError(
-            f"motion '{motion.name}' moves {', '.join(left)}, which {driver.address} does not command; it commands "
-            f"{', '.join(driver.commanded)}. Choose another motion, or let the driver command more joints"
+            f"motion '{motion.name}' moves {', '.join(left)}, which {driver.address} does not "
+            f"command; it commands {', '.join(driver.commanded)}. Choose another motion, or let "
+            "the driver command more joints"
         )
 
 
@@ -350,9 +375,8 @@ def make_virtual_driver(request: RunRequest, robot: RobotSpec, clock: Clock) -> 
 
     options = request.options
     connection = options.connection
-    nominal = (
-        robot.before_identification
-    )  # what was identified is a unit's, and this unit has its own
+    # what was identified is a unit's, and this unit has its own
+    nominal = robot.before_identification
     name = connection.unit_name
     physics = load_fleet(connection.fleet, nominal).unit(name)
     payload = (options.payload_mass or 0.0, options.payload_side)
@@ -364,8 +388,14 @@ def listen(request: RunRequest, robot: RobotSpec, driver: Driver, clock: Clock) 
     """Open the transport of live targets."""
     options = request.options
     return LiveTargets(
-        open_transport(options), robot, driver.commanded, clock, request.dt, options.safety.speed, options.live
-    )  # fmt: skip
+        open_transport(options),
+        robot,
+        driver.commanded,
+        clock,
+        request.dt,
+        options.safety.speed,
+        options.live,
+    )
 
 
 def open_transport(options: RunOptions) -> Transport:
@@ -400,7 +430,9 @@ class Compensation:
     adapted: str | None = None
 
     def observe(self, qpos: Array) -> tuple[Array, Array] | None:
-        """Return what a policy is to see while the nominal simulator is followed, else None; (n) rad and rad/s."""
+        """Return what a policy is to see while the nominal simulator is followed, else None; (n)
+        rad and rad/s.
+        """
         compensator = self.compensator
         if compensator is None or compensator.follower is None or not compensator.started:
             return None
@@ -412,10 +444,12 @@ class Compensation:
             self.compensator.require_gains(driver.joint_names, driver.kp, driver.kd)
 
     def judge(self, planner: Planner, plan: Plan, payload_mass: float | None) -> Plan:
-        """Return the plan with the compensator's commands checked, for the stated payload or the extreme ones, kg.
+        """Return the plan with the compensator's commands checked, for the stated payload or the
+        extreme ones, kg.
 
         Raises:
-            UsageError: A command is not a number or comes too near to something, or the network fails.
+            UsageError: A command is not a number or comes too near to something, or the network
+                fails.
         """
         compensator = self.compensator
         if compensator is None:
@@ -424,8 +458,8 @@ class Compensation:
         plan = planner.judge_commands(plan, compensator, masses)
         if compensator.refused_answers:
             raise UsageError(
-                f"{compensator.refused_answers} answers of the network are not finite on the planned motion; choose "
-                "another motion, train the model again, or leave out --model"
+                f"{compensator.refused_answers} answers of the network are not finite on the "
+                "planned motion; choose another motion, train the model again, or leave out --model"
             )
         return plan
 
@@ -444,7 +478,8 @@ class Compensation:
         recording.meta["refused_answers"] = refused
         if refused:
             report.note(
-                f"{refused} answers of the network were not finite; there the feed-forward alone was sent"
+                f"{refused} answers of the network were not finite; there the feed-forward alone "
+                "was sent"
             )
 
 
@@ -457,7 +492,8 @@ def _extremes(compensator: Compensator) -> tuple[float, ...]:
 def make_compensation(
     request: RunRequest, robot: RobotSpec, unit: Unit, report: RunReporter
 ) -> Compensation:
-    """Make the compensator that the request asks for; everything is checked before anything is opened.
+    """Make the compensator that the request asks for; everything is checked before anything is
+    opened.
 
     Raises:
         ModelError: The model does not fit the robot, the rate or the payload.
@@ -482,7 +518,10 @@ def make_compensation(
 
 
 def _feedforward(request: RunRequest, robot: RobotSpec, report: RunReporter) -> Compensation:
-    """Return the compensation by the robot alone. Velocity and acceleration of live targets are not fed forward."""
+    """Return the compensation by the robot alone.
+
+    Velocity and acceleration of live targets are not fed forward.
+    """
     options = request.options
     config = options.compensation
     if options.targets is None:
@@ -494,7 +533,7 @@ def _feedforward(request: RunRequest, robot: RobotSpec, report: RunReporter) -> 
         payload_side=options.payload_side,
         extrapolate=options.extrapolate,
     )
-    if robot.nominal is None:
+    if not robot.is_identified:
         report.note(f"{robot.folder} is not identified: the feed-forward is the nominal robot's")
     return Compensation(compensator)
 
@@ -529,7 +568,8 @@ def _with_model(
         report.note(f"commands are found with the adaptation of unit {name}")
     elif known:
         report.note(
-            f"the run holds adaptations of {', '.join(known)}, none of which is used: --unit-id says which unit this is"
+            f"the run holds adaptations of {', '.join(known)}, none of which is used: --unit-id "
+            "says which unit this is"
         )
     compensator = Compensator(
         robot,

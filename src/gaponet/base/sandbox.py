@@ -130,7 +130,8 @@ def _run(
         raise error(f"{file}: is not readable ({failure}); copy or make it again")
     if isinstance(answer, Exception):
         raise answer
-    return answer
+    result: T = answer
+    return result
 
 
 def _size(path: Path) -> int:
@@ -181,7 +182,8 @@ class _Child:
         timeout.start()
         try:
             _write(self.process.stdin, request)
-            return pickle.load(self.process.stdout)
+            result: tuple[Any, str] = pickle.load(self.process.stdout)
+            return result
         except (EOFError, BrokenPipeError, pickle.UnpicklingError):
             # The child has ended, the last error: within its answer.
             code = self.process.wait()

@@ -126,7 +126,8 @@ def parse_json(
         raise error(_message(where, str(invalid), hint)) from None
     if value is None:
         raise error(_message(where, "holds nothing (null)", hint))
-    return value
+    result: T = value
+    return result
 
 
 def read_json(

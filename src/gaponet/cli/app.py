@@ -6,7 +6,7 @@ from pathlib import Path
 
 import tyro
 
-from gaponet.base.files import lock_folder
+from gaponet.api.pages import serve_app
 from gaponet.cli.out import Out
 
 
@@ -25,8 +25,4 @@ def app(
         port: Port of the page, on this machine; the next free one is taken.
         outside: Other folders that the results in `folder` may use, as gaponet view prints them.
     """
-    from gaponet.report.view.app import App, serve
-
-    with lock_folder(folder, "app"):
-        allowed = tuple(path.resolve() for path in outside)
-        serve(App(folder.resolve(), port, allowed), Out().say)
+    serve_app(folder, port=port, outside=outside, say=Out().say)

@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 import sys
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import tyro
 
 from gaponet import api
+from gaponet.api.results import CheckResult
 from gaponet.cli.options import Folder, Json, Motions, Unit, like
 from gaponet.cli.out import Out
-from gaponet.robot.spec import load_robot
-from gaponet.sysid.uncertainty import ParameterUncertainty
-
-if TYPE_CHECKING:
-    from gaponet.sysid.evidence.drift import ParameterChange
 
 Robot = Annotated[
     Folder,
@@ -30,13 +26,19 @@ Logs = Annotated[
         metavar="LOGS",
     ),
 ]
+COLUMNS = ["joint", "parameter", "change", "standard errors", "effect, mrad", "verdict"]
 
 
 @like(api.check)
 def check(
-    robot: Robot, logs: Logs, unit: Unit = "", motions: Motions = (), payload_mass: float | None = None,
-    threads: int = 0, json: Json = False,
-) -> None:  # fmt: skip
+    robot: Robot,
+    logs: Logs,
+    unit: Unit = "",
+    motions: Motions = (),
+    payload_mass: float | None = None,
+    threads: int = 0,
+    json: Json = False,
+) -> None:
     """Is this still the robot that was identified? What changed?
 
     The exit code is 0 if the robot is unchanged, 1 if it changed, and 2 if that cannot be decided.
@@ -45,40 +47,24 @@ def check(
     made = api.check(
         robot, logs, unit=unit, motions=motions, payload_mass=payload_mass, threads=threads
     )
-    drift, uncertainty = made.drift, ParameterUncertainty.require(load_robot(robot))
-    named, count = (
-        {m.joint for m in drift.moved},
-        f"{made.recordings} recording{'s' * (made.recordings != 1)}",
-    )
-    screen.table(
-        f"Largest change of each joint ({count}, {drift.seconds:.0f} s)",
-        ["joint", "parameter", "change", "standard errors", "effect, mrad", "verdict"],
-        [
-            _row(m, uncertainty, m.joint in named)
-            for m in (*drift.moved, *(m for j, m in drift.largest.items() if j not in named))
-        ],
-    )
-    for a in drift.against:
-        what = f"{a.recording} differs from the others: {a.joint}, {a.field}, {abs(a.sigmas):.0f} standard errors"
-        screen.say(f"  {what}", "warning", "yellow")
-    screen.say(
-        f"{made.verdict}: {made.advice.replace('ROBOT', robot.as_posix()).replace('LOGS', logs)}"
-    )
+    _show_changes(screen, made)
+    advice = made.advice.replace("ROBOT", robot.as_posix()).replace("LOGS", logs)
+    screen.say(f"{made.verdict}: {advice}")
     screen.result(made.to_dict())
     if made.verdict != "same":
         sys.stdout.flush()
         raise SystemExit(1)
 
 
-def _row(m: ParameterChange, uncertainty: ParameterUncertainty, counts: bool) -> list[str]:
-    from gaponet.sysid.uncertainty import format_change
-
-    by = format_change(m.field, m.by, uncertainty, m.joint)
-    return [
-        m.joint,
-        m.field,
-        by,
-        f"{m.sigmas:+.1f}",
-        f"{1e3 * m.moves:.2f}",
-        "changed" if counts else "same",
-    ]
+def _show_changes(screen: Out, made: CheckResult) -> None:
+    """Print the largest change of each joint, and recordings that contradict the others."""
+    plural = "" if made.recordings == 1 else "s"
+    count = f"{made.recordings} recording{plural}"
+    title = f"Largest change of each joint ({count}, {made.drift.seconds:.0f} s)"
+    screen.table(title, COLUMNS, made.rows())
+    for found in made.drift.against:
+        text = (
+            f"  {found.recording} differs from the others: {found.joint}, {found.field}, "
+            f"{abs(found.sigmas):.0f} standard errors"
+        )
+        screen.say(text, "warning", "yellow")

@@ -12,23 +12,44 @@ from gaponet.cli.out import Out
 
 @like(api.collect)
 def collect(
-    out: Path, robot: str = "h1_2", fleet: str = "hard", recipe: str = "small", payloads: tuple[float, ...] = (),
-    units: tuple[str, ...] = (), seed: int = 0, nproc: int = 0, executor: str = "local", json: Json = False,
-) -> None:  # fmt: skip
+    out: Path,
+    robot: str = "h1_2",
+    fleet: str = "hard",
+    recipe: str = "small",
+    payloads: tuple[float, ...] = (),
+    units: tuple[str, ...] = (),
+    seed: int = 0,
+    nproc: int = 0,
+    executor: str = "local",
+    json: Json = False,
+) -> None:
     """Record motions of VIRTUAL robots into a dataset.
 
-    Run again after an interruption: recordings that exist stay, missing ones are recorded, and the result is the same.
+    Run again after an interruption: recordings that exist stay, missing ones are recorded, and the
+    result is the same.
     """
     screen = Out(json)
     with progress_bar("virtual recordings") as update:
         made = api.collect(
-            out=out, robot=robot, fleet=fleet, recipe=recipe, payloads=payloads, units=units, seed=seed, nproc=nproc,
-            executor=executor, progress=update,
-        )  # fmt: skip
-    screen.table(f"VIRTUAL recordings, fleet {fleet}", ["dataset", str(made.dataset)], [
-        ["sequences written", str(made.written)],
-        ["already there", str(made.present)],
-        ["recorded time", f"{made.hours:.2f} h"],
-        ["wall time", f"{made.seconds:.0f} s ({made.times_real_time:.0f} × real time)"],
-    ])  # fmt: skip
+            out=out,
+            robot=robot,
+            fleet=fleet,
+            recipe=recipe,
+            payloads=payloads,
+            units=units,
+            seed=seed,
+            nproc=nproc,
+            executor=executor,
+            progress=update,
+        )
+    screen.table(
+        f"VIRTUAL recordings, fleet {fleet}",
+        ["dataset", str(made.dataset)],
+        [
+            ["sequences written", str(made.written)],
+            ["already there", str(made.present)],
+            ["recorded time", f"{made.hours:.2f} h"],
+            ["wall time", f"{made.seconds:.0f} s ({made.times_real_time:.0f} × real time)"],
+        ],
+    )
     screen.result(made.to_dict())

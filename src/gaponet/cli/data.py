@@ -7,12 +7,15 @@ from typing import Any, Literal
 
 import tyro
 
+from gaponet.api import datasets
+from gaponet.api.datasets import CardResult
 from gaponet.base.progress import progress_bar
 from gaponet.cli.options import Data, Json, Robot, actions
 from gaponet.cli.out import Out
-from gaponet.data.store import Dataset
 from gaponet.robot.finding import abbreviate
-from gaponet.sim.dataset_robot import open_dataset
+
+MAX_SETS = 20  # on the screen
+SPLIT_COLUMNS = ["part", "sequences", "hours", "frames", "motions", "units", "payloads, kg"]
 
 
 def _card(
@@ -27,64 +30,57 @@ def _card(
     Args:
         licence: Record this licence in dataset.json, such as CC-BY-4.0; "" removes it.
         source: Record where the data come from: a paper, a laboratory, an address.
-        beside: "paper" adds the counts of the SimLifter and GAPONet paper's dataset beside those of this one.
+        beside: "paper" adds the counts of the SimLifter and GAPONet paper's dataset beside those of
+            this one.
     """
-    from gaponet.data.card import beside_paper, make_card, write_card
-
-    out, data = Out(json), Dataset(dataset)
-    stated = {k: v for k, v in (("licence", licence), ("source", source)) if v is not None}
-    if stated:
-        data.set_provenance(**stated)
+    screen = Out(json)
     with progress_bar("reading") as update:
-        made = make_card(data, update)
-    if beside == "paper":
-        made["beside_paper"] = beside_paper(data)
-    _show_card(out, made)
-    if data.read_only:
-        out.say("nothing may be written into that folder, so the card is only shown")
+        made = datasets.dataset_card(
+            dataset,
+            licence=licence,
+            source=source,
+            beside_paper=beside == "paper",
+            progress=update,
+        )
+    _show_card(screen, made)
+    if made.written:
+        screen.say(f"written: {dataset / 'CARD.md'!s}, {dataset / 'card.json'!s}")
     else:
-        write_card(data, made)
-        out.say(f"written: {dataset / 'CARD.md'!s}, {dataset / 'card.json'!s}")
-    out.result(made)
+        screen.say("nothing may be written into that folder, so the card is only shown")
+    screen.result(made.to_dict())
 
 
 def _split(
     dataset: Data,
-    by: Literal["motion", "unit", "payload", "repetition", "time"],
+    by: datasets.SplitBy,
     holdout: tuple[str, ...] = (),
     json: Json = False,
 ) -> None:
-    """Divide a dataset into training, validation and test parts that share no recording; writes splits/….json into it.
+    """Divide a dataset into training, validation and test parts that share no recording; writes
+    splits/….json into it.
 
     Args:
-        by: Property whose values are divided among the parts. The last repetitions, or the last pieces in time (logs
-            imported with --cut), are the test part.
-        holdout: Motions, units or payloads (kg) for the test part; default a quarter of them by a fixed rule.
+        by: Property whose values are divided among the parts. The last repetitions, or the last
+            pieces in time (logs imported with --cut), are the test part.
+        holdout: Motions, units or payloads (kg) for the test part; default a quarter of them by a
+            fixed rule.
     """
-    from gaponet.data.card import count_entries
-    from gaponet.data.split import make_split, require_distinct_samples, write_split
-
-    out, data = Out(json), Dataset(dataset)
-    parts = make_split(data, by, holdout)
+    screen = Out(json)
     with progress_bar("comparing") as update:
-        require_distinct_samples(data, parts, update)
-    path = write_split(data, parts, by, holdout)
-    rows: dict[str, dict[str, Any]] = {
-        part: count_entries(entries) | {
-            "units": sorted({e.meta.unit_id for e in entries}),
-            "payloads_kg": [f"{p:g}" for p in sorted({e.meta.payload_mass for e in entries})],
-        }
-        for part, entries in parts.items()
-    }  # fmt: skip
-    columns = ["part", "sequences", "hours", "frames", "motions", "units", "payloads, kg"]
-    virtual = ", VIRTUAL robots" if any(e.meta.virtual for e in data.entries) else ""
-    out.table(f"{data.path.name} by {by}{virtual}; parts share no recording", columns, [
-        [part, f"{r['sequences']:,}", f"{r['hours']:.2f}", f"{r['frames']:,}", str(r["motions"]),
-         abbreviate(r["units"]), abbreviate(r["payloads_kg"])]
-        for part, r in rows.items()
-    ])  # fmt: skip
-    out.say(f"written: {path!s}")
-    out.result({"split": str(path), "by": by, "parts": rows})
+        made = datasets.split_dataset(dataset, by=by, holdout=holdout, progress=update)
+    rows = []
+    for name, part in made.parts.items():
+        counts = part.counts
+        row = [name, f"{counts['sequences']:,}", f"{counts['hours']:.2f}"]
+        row += [f"{counts['frames']:,}", str(counts["motions"])]
+        row += [abbreviate(part.units), abbreviate(part.payloads_kg)]
+        rows.append(row)
+    data = made.dataset
+    virtual = ", VIRTUAL robots" if any(entry.meta.virtual for entry in data.entries) else ""
+    title = f"{data.path.name} by {by}{virtual}; parts share no recording"
+    screen.table(title, SPLIT_COLUMNS, rows)
+    screen.say(f"written: {made.path!s}")
+    screen.result(made.to_dict())
 
 
 def _figures(dataset: Data, out: Path, robot: Robot = None, json: Json = False) -> None:
@@ -93,17 +89,14 @@ def _figures(dataset: Data, out: Path, robot: Robot = None, json: Json = False) 
     Args:
         out: Folder for the pictures, each as SVG and PNG.
     """
-    from gaponet.report.figures.dataset_figures import write_figures
-
     screen = Out(json)
-    data, spec = open_dataset(dataset, robot)
     with progress_bar("drawing") as update:
-        written, left_out = write_figures(data, spec, out, update)
-    for path in written:
+        made = datasets.draw_dataset(dataset, out=out, robot=robot, progress=update)
+    for path in made.written:
         screen.say(f"written: {path!s}")
-    for name, reason in left_out.items():
+    for name, reason in made.left_out.items():
         screen.say(f"  {name}: {reason}", "left out", "yellow")
-    screen.result({"figures": [str(path) for path in written], "left_out": left_out})
+    screen.result(made.to_dict())
 
 
 def _export(dataset: Data, out: Path, json: Json = False) -> None:
@@ -112,36 +105,33 @@ def _export(dataset: Data, out: Path, json: Json = False) -> None:
     Args:
         out: New folder.
     """
-    from gaponet.data.writers import export
-
     screen = Out(json)
-    data = Dataset(dataset)
     with progress_bar("exporting") as update:
-        sets = export(data, out, update)
-    shown = sets[:20]
-    screen.table(str(out), ["set", "episodes", "frames", "fps"], [
-        [str(s.path), f"{s.episodes:,}", f"{s.frames:,}", f"{s.fps:g}"] for s in shown
-    ])  # fmt: skip
-    if len(shown) < len(sets):
-        screen.say(f"… and {len(sets) - len(shown)} more")
-    screen.say(f"Back: gaponet import {out!s} --robot {data.robot_name} --out NEW")
-    screen.result(
-        {"sets": [{"path": str(s.path), "episodes": s.episodes, "frames": s.frames} for s in sets]}
-    )
+        made = datasets.export_dataset(dataset, out=out, progress=update)
+    shown = made.sets[:MAX_SETS]
+    rows = [[str(s.path), f"{s.episodes:,}", f"{s.frames:,}", f"{s.fps:g}"] for s in shown]
+    screen.table(str(out), ["set", "episodes", "frames", "fps"], rows)
+    more = len(made.sets) - len(shown)
+    if more:
+        screen.say(f"… and {more} more")
+    screen.say(f"Back: gaponet import {out!s} --robot {made.dataset.robot_name} --out NEW")
+    screen.result(made.to_dict())
 
 
 def _remove(dataset: Data, ids: tyro.conf.Positional[tuple[str, ...]], json: Json = False) -> None:
-    """Remove sequences from a dataset, with their simulated replays; their logs can be imported again.
+    """Remove sequences from a dataset, with their simulated replays; their logs can be imported
+    again.
 
     Args:
         ids: Ids in sequences.jsonl, or patterns: '*-1kg-*' removes all with a payload of 1 kg.
     """
-    out, data = Out(json), Dataset(dataset)
-    gone = data.remove(ids)
-    out.say(
-        f"removed {len(gone)}: {abbreviate([e.id for e in gone])}; {data.path!s} now holds {len(data)}"
+    screen = Out(json)
+    data, gone = datasets.remove_recordings(dataset, ids)
+    names = [entry.id for entry in gone]
+    screen.say(
+        f"removed {len(gone)}: {abbreviate(names)}; {data.path!s} now holds {len(data)}",
     )
-    out.result({"removed": [e.id for e in gone], "sequences": len(data)})
+    screen.result({"removed": names, "sequences": len(data)})
 
 
 @actions(card=_card, split=_split, figures=_figures, export=_export, remove=_remove)
@@ -149,27 +139,27 @@ def data(action: None) -> None:
     """A dataset's card, splits, pictures, export and removal."""
 
 
-def _show_card(out: Out, made: dict[str, Any]) -> None:
+def _show_card(screen: Out, made: CardResult) -> None:
     """Counts, repeatability and licence; ranges of all signals stand in CARD.md."""
-    from gaponet.data.card import NOT_STATED, PROPERTIES, count_table, headline, paper_table
-
-    out.say("", headline(made))
-    for name in PROPERTIES:
-        out.show("", count_table(made, name))
-    if "beside_paper" in made:
-        counts = paper_table(made)
-        out.show("Beside the paper's counts", counts)
-        out.say(counts.caption)
-    repeated = made["repeatability"]
-    if repeated["channels"]:
-        spread = ", ".join(
-            f"{name} {c['mean']:.3g} {c['unit']}" for name, c in repeated["channels"].items()
-        )
-        out.say(
-            f"repeatability (std over {repeated['sequences']} repetitions in {repeated['groups']} groups): {spread}"
-        )
-    else:
-        out.say("repeatability: no motion was repeated with the same command, unit and payload")
+    screen.say("", made.headline)
+    for table in made.counts():
+        screen.show("", table)
+    beside_paper = made.beside_paper()
+    if beside_paper is not None:
+        screen.show("Beside the paper's counts", beside_paper)
+        screen.say(beside_paper.caption)
+    screen.say(_repeatability(made.card["repeatability"]))
     for name in ("licence", "source"):
-        ask = f"; set it with gaponet data card DIR --{name} …" if made[name] == NOT_STATED else ""
-        out.say(f"{name}: {made[name]}{ask}")
+        ask = "" if made.states(name) else f"; set it with gaponet data card DIR --{name} …"
+        screen.say(f"{name}: {made.card[name]}{ask}")
+
+
+def _repeatability(repeated: dict[str, Any]) -> str:
+    """Return how much repetitions of a motion differ, in a sentence."""
+    if not repeated["channels"]:
+        return "repeatability: no motion was repeated with the same command, unit and payload"
+    spreads = []
+    for name, channel in repeated["channels"].items():
+        spreads.append(f"{name} {channel['mean']:.3g} {channel['unit']}")
+    source = f"{repeated['sequences']} repetitions in {repeated['groups']} groups"
+    return f"repeatability (std over {source}): {', '.join(spreads)}"

@@ -1,4 +1,5 @@
-"""gaponet demo: the paper in small on VIRTUAL robots, or with --real the identification of a real arm."""
+"""gaponet demo: the paper in small on VIRTUAL robots, or with --real the identification of a real
+arm."""
 
 from __future__ import annotations
 
@@ -9,7 +10,10 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from gaponet import api
+from gaponet.api.opening import test_motions
+from gaponet.api.paper import DEMO, paper_experiment
 from gaponet.api.results import GapResult
+from gaponet.api.steps import Step, public_recordings, steps_from_logs
 from gaponet.base.errors import UsageError
 from gaponet.base.installation import install_command
 from gaponet.base.progress import progress_bar, progress_bars
@@ -18,7 +22,6 @@ from gaponet.cli.gap import show_steps
 from gaponet.cli.options import Flag, Json
 from gaponet.cli.out import Out, writes
 from gaponet.evaluation.tables import mrad
-from gaponet.robot.spec import robot_argument
 
 FLEET = "firm"
 RECIPE = "demo"
@@ -30,14 +33,15 @@ REAL_ROBOT = "so101"
 def demo(out: Path = Path("demo_run"), real: Flag = False, json: Json = False) -> None:
     """The paper in small on VIRTUAL robots; --real identifies a real arm.
 
-    The experiment records three units of an H1-2 and an unseen fourth with 0 and 3 kg, shows how far the simulator is
-    from them, identifies the robot, trains GAPONet and an MLP on three units, and measures both on the fourth. Lengths
-    are counted in control steps, so that every machine gets the same result. It takes four minutes on two cores; an
-    interrupted demo continues.
+    The experiment records three units of an H1-2 and an unseen fourth with 0 and 3 kg, shows how
+    far the simulator is from them, identifies the robot, trains GAPONet and an MLP on three units,
+    and measures both on the fourth. Lengths are counted in control steps, so that every machine
+    gets the same result. It takes four minutes on two cores; an interrupted demo continues.
 
-    With --real it takes the public recordings of a real SO-101 arm, measures the simulator's error, identifies the arm,
-    draws what each cause removes, and exports the result for MuJoCo. It needs no torch. The recordings come from the
-    network once (9 MB), or from the folder in the environment variable GAPONET_DATA.
+    With --real it takes the public recordings of a real SO-101 arm, measures the simulator's error,
+    identifies the arm, draws what each cause removes, and exports the result for MuJoCo. It needs
+    no torch. The recordings come from the network once (9 MB), or from the folder in the
+    environment variable GAPONET_DATA.
 
     Args:
         out: Folder for datasets and results.
@@ -52,63 +56,67 @@ def demo(out: Path = Path("demo_run"), real: Flag = False, json: Json = False) -
 
 def identify_real_arm(screen: Out, out: Path) -> dict[str, object]:
     """Identify the SO-101 of the public recordings; return errors and places for --json."""
-    from gaponet.data.split import split_entries
-    from gaponet.data.store import Dataset
-    from gaponet.share.public_recordings import PublicFiles
-
     began = time.monotonic()
-    public = PublicFiles.read()
     with progress_bar("fetching") as update:
-        logs = public.provide(update)
-    screen.say(f"{public.origin}.", "Recordings: ")
-    data = out / REAL_ROBOT / "data"
-    robot = out / REAL_ROBOT / "identified"
-    name = robot_argument(robot)
+        logs, origin = public_recordings(update)
+    screen.say(f"{origin}.", "Recordings: ")
+    folder = out / REAL_ROBOT
+    data = folder / "data"
+    robot = folder / "identified"
+    import_words = ["--unit-id", REAL_ROBOT, "--payload-mass", "0"]
+    steps = steps_from_logs(logs, REAL_ROBOT, import_words, folder, [], "mjcf")
+    read, _, measure, fit, causes, export, _ = steps
 
-    command = f"gaponet import {logs} --robot {REAL_ROBOT} --unit-id {REAL_ROBOT} --payload-mass 0 --out {data}"
-    screen.say(f"  ({command})", "1 Import")
+    _announce(screen, 1, read)
     with progress_bar("importing") as update:
-        api.import_logs(
+        imported = api.import_logs(
             logs, robot=REAL_ROBOT, out=data, unit_id=REAL_ROBOT, payload_mass=0.0, progress=update
         )
-    dataset = Dataset(data)
-    test_motions = tuple(sorted({entry.meta.motion for entry in split_entries(dataset)["test"]}))
+    dataset = imported.dataset
+    motions = test_motions(dataset)
     screen.say(
-        f": the simulator gets the commands alone, on {len(test_motions)} motions that stay out of the fit  "
-        f"(gaponet gap {data}, which takes all 40)",
-        "2 Measure the gap",
+        f": the simulator gets the commands alone, on {len(motions)} motions that stay out of the "
+        f"fit  ({measure.line}, which takes all 40)",
+        f"2 {measure.title}",
     )
     with progress_bar("gap") as update:
-        nominal = api.gap(dataset, motions=test_motions, progress=update)
+        nominal = api.gap(dataset, motions=motions, progress=update)
     by_joint = nominal.methods["nominal"]["by_joint"]
     rows = [[joint, mrad(errors["mpjae"])] for joint, errors in by_joint.items()]
     screen.table("Nominal simulator beside the real robot", ["joint", "mean |error|, mrad"], rows)
-    screen.say(f"  (gaponet identify {data} --out {robot})", "3 Identify")
+    _announce(screen, 3, fit)
     with progress_bar("identifying") as update:
         api.identify(dataset, out=robot, progress=update)
-    screen.say(f"  (gaponet gap {data} --robot {name})", "4 What each cause removes")
+    _announce(screen, 4, causes)
     with progress_bar("gap") as update:
         after = api.gap(dataset, run=robot, progress=update)
     show_steps(screen, after.table)
-    screen.say(f"picture: {robot / 'gap.png'}")
-    screen.say(f"  (gaponet export {robot} --to mjcf)", "5 Export")
+    picture = robot / "gap.png"
+    screen.say(f"picture: {picture}")
+    _announce(screen, 5, export)
     with progress_bar("exporting") as update:
         exported = api.export_robot(robot, to="mjcf", progress=update)
     screen.say(
-        f"{mean_error(after, 'nominal')} → {mean_error(after, 'identified')} mrad on motions that the fit never saw "
-        f"({time.monotonic() - began:.0f} s in all); the robot for MuJoCo: {exported.path}",
+        f"{mean_error(after, 'nominal')} → {mean_error(after, 'identified')} mrad on motions that "
+        f"the fit never saw ({time.monotonic() - began:.0f} s in all); the robot for MuJoCo: "
+        f"{exported.path}",
         "Result: ",
     )
     screen.next(f"gaponet robot show {robot}; for your robot gaponet start MODEL LOGS")
     return {
-        "origin": public.origin,
+        "origin": origin,
         "nominal_rad": after.methods["nominal"]["mpjae"],
         "identified_rad": after.methods["identified"]["mpjae"],
-        "motions": test_motions,
+        "motions": motions,
         "robot": str(robot),
-        "picture": str(robot / "gap.png"),
+        "picture": str(picture),
         "export": str(exported.path),
     }
+
+
+def _announce(screen: Out, number: int, step: Step) -> None:
+    """Print what comes next, and the command that does it."""
+    screen.say(f"  ({step.line})", f"{number} {step.title}")
 
 
 def mean_error(result: GapResult, method: str) -> str:
@@ -120,9 +128,6 @@ def run_paper_in_small(screen: Out, out: Path) -> dict[str, object]:
     """Run the paper's experiment in small; return page and sentences for --json."""
     if any(find_spec(module) is None for module in NEEDED_MODULES):
         raise UsageError(f"the demo trains networks: {install_command('train')}; --real needs none")
-    from gaponet.api.paper import paper_experiment
-    from gaponet.experiments.paper.options import DEMO
-
     began = time.monotonic()
     dataset = out / "dataset"
     experiment = out / "experiment"
@@ -133,9 +138,9 @@ def run_paper_in_small(screen: Out, out: Path) -> dict[str, object]:
         api.collect(out=dataset, robot="h1_2", fleet=FLEET, recipe=RECIPE, progress=update)
     screen.say(f": how far is the simulator?  (gaponet gap {dataset})", "2 Measure the gap")
     show_gap_by_payload(screen, dataset)
+    command = f"gaponet experiment paper {dataset} --out {experiment}"
     screen.say(
-        f": GAPONet and an MLP on three robots, both measured on the fourth  (gaponet experiment paper {dataset} "
-        f"--out {experiment})",
+        f": GAPONet and an MLP on three robots, both measured on the fourth  ({command})",
         "3 The paper's experiment, in small",
     )
     result = paper_experiment(
@@ -153,8 +158,7 @@ def show_gap_by_payload(screen: Out, dataset: Path) -> None:
     with progress_bar("gap") as update:
         gap = api.gap(str(dataset), progress=update)
     by_payload = gap.methods["nominal"]["by_payload"]
-    rows = [
-        [f"{float(mass):g} kg", f"{1e3 * by_payload[mass]['mpjae']:.2f}"]
-        for mass in sorted(by_payload, key=float)
-    ]
+    rows = []
+    for mass in sorted(by_payload, key=float):
+        rows.append([f"{float(mass):g} kg", f"{1e3 * by_payload[mass]['mpjae']:.2f}"])
     screen.table("Nominal simulator, VIRTUAL robots", ["payload in each hand", "MPJAE, mrad"], rows)

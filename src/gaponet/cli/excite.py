@@ -19,22 +19,29 @@ from gaponet.robot.spec import load_robot
 
 @writes("motions")
 def excite(
-    out: Path, robot: str = "", known: Annotated[Path | None, tyro.conf.arg(name="for")] = None,
-    minutes: float | None = None, payloads: tuple[float, ...] = (0.0,), rate: float = 50.0,
-    format: Literal["txt", "csv", "npz"] = "txt", seed: int = 0, json: Json = False,
-) -> None:  # fmt: skip
+    out: Path,
+    robot: str = "",
+    known: Annotated[Path | None, tyro.conf.arg(name="for")] = None,
+    minutes: float | None = None,
+    payloads: tuple[float, ...] = (0.0,),
+    rate: float = 50.0,
+    format: Literal["txt", "csv", "npz"] = "txt",
+    seed: int = 0,
+    json: Json = False,
+) -> None:
     """Write the motions to play on a robot: first, or next.
 
-    Without data, give --robot NAME. For an identified robot, --for FOLDER chooses the motions that add most information
-    to its logs, and says how much more is worth playing.
+    Without data, give --robot NAME. For an identified robot, --for FOLDER chooses the motions that
+    add most information to its logs, and says how much more is worth playing.
 
     Args:
         robot: Robot name or folder; its range, torque and payload limits bound the motions.
         known: Robot folder of gaponet identify or adapt.
         out: Folder for the motion files and sheet.md.
-        minutes: Total duration of the motions. 10 (default) suffice to identify gains, friction and delay, 40 to train
-            a good model. With --for the default is half a minute.
-        payloads: kg in each hand; every motion is played with each payload. With --for: payloads to choose from.
+        minutes: Total duration of the motions. 10 (default) suffice to identify gains, friction and
+            delay, 40 to train a good model. With --for the default is half a minute.
+        payloads: kg in each hand; every motion is played with each payload. With --for: payloads to
+            choose from.
         rate: Commands per second, Hz.
         format: txt (SAGE, 50 Hz), csv (with time) or npz; gaponet run and record play each.
         seed: Seed of the random choice of motions.
@@ -42,19 +49,28 @@ def excite(
     screen = Out(json)
     if bool(robot) == (known is not None):
         raise UsageError(
-            "give --robot NAME where there is no data yet, or --for FOLDER of a robot that was identified"
+            "give --robot NAME where there is no data yet, or --for FOLDER of a robot that was "
+            "identified"
         )
     spec = load_robot(known or robot)
     with progress_bar("choosing motions") as update:
         made = api.excite(
-            spec, out=out, further=known is not None, minutes=minutes, payloads=payloads, rate=rate, format=format,
-            seed=seed, progress=update,
-        )  # fmt: skip
+            spec,
+            out=out,
+            further=known is not None,
+            minutes=minutes,
+            payloads=payloads,
+            rate=rate,
+            format=format,
+            seed=seed,
+            progress=update,
+        )
     if made.prediction is not None:
         _show_prediction(screen, spec.name, made.prediction)
-    masses = ", ".join(f"{p:g}" for p in made.payloads)
+    masses = ", ".join(f"{mass:g}" for mass in made.payloads)
     screen.say(
-        f"{len(made.motions)} motions, {made.minutes:.1f} min at {masses} kg for {spec.name}: {out!s}"
+        f"{len(made.motions)} motions, {made.minutes:.1f} min at {masses} kg for {spec.name}: "
+        f"{out!s}"
     )
     screen.next(
         f"print {made.sheet}; play them (gaponet run or record --motion FILE, or your own player)"
@@ -64,19 +80,30 @@ def excite(
 
 def _show_prediction(screen: Out, name: str, prediction: Prediction) -> None:
     """Print standard errors before and after the motions, and how much more playing is useful."""
-    before, after = prediction.before, prediction.after
-    fields = [f for f in next(iter(before.values())) if any(by[f] > 0 for by in before.values())]
-    screen.table(
-        f"{name}: standard errors, now → at best",
-        ["joint", *(SERVO_FIELDS[f].heading for f in fields)],
-        [[j, *(" → ".join(_two_digits(by[j][f] * SERVO_FIELDS[f].factor) for by in (before, after)) for f in fields)]
-         for j in before],
-    )  # fmt: skip
+    before = prediction.before
+    fields = []
+    for field in next(iter(before.values())):
+        if any(errors[field] > 0 for errors in before.values()):
+            fields.append(field)
+    rows = []
+    for joint in before:
+        cells = []
+        for field in fields:
+            factor = SERVO_FIELDS[field].factor
+            now = _two_digits(before[joint][field] * factor)
+            then = _two_digits(prediction.after[joint][field] * factor)
+            cells.append(f"{now} → {then}")
+        rows.append([joint, *cells])
+    headings = [SERVO_FIELDS[field].heading for field in fields]
+    screen.table(f"{name}: standard errors, now → at best", ["joint", *headings], rows)
     seconds = prediction.useful_seconds
-    screen.say(
-        f"{seconds:.0f} s are worth playing: after them half a minute more makes the errors less than 5 % smaller"
-        if seconds else "no more is worth playing: half a minute makes the errors less than 5 % smaller"
-    )  # fmt: skip
+    if seconds:
+        screen.say(
+            f"{seconds:.0f} s are worth playing: after them half a minute more makes the errors "
+            "less than 5 % smaller"
+        )
+    else:
+        screen.say("no more is worth playing: half a minute makes the errors less than 5 % smaller")
     for joint, why in prediction.undetermined.items():
         screen.say(f"  {joint}: {why}", "warning", "yellow")
 

@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from gaponet.api.paper import PaperOptions, paper_experiment
 from gaponet.base.errors import ModelError, UsageError
 from gaponet.base.progress import progress_bar, progress_bars
 from gaponet.cli.options import Data, Json
 from gaponet.cli.out import Out, writes
-from gaponet.experiments.paper.options import PaperOptions
 
 if TYPE_CHECKING:
-    from gaponet.experiments.paper.experiment import PaperResult
+    from gaponet.api.paper import PaperResult
 
 TITLES = {  # of tables on the terminal; the page numbers them too
     "claims_labels": "The paper's claims (labels, then PPO)",
@@ -46,9 +46,9 @@ def experiment(
 ) -> None:
     """Run the paper's experiment; show its numbers beside the paper's.
 
-    Every network has the same recordings, inputs, training and seeds, and is measured on motions and on a unit that no
-    network has seen. The same command continues an interrupted experiment. With three seeds it takes a night on two
-    cores, with one about two hours.
+    Every network has the same recordings, inputs, training and seeds, and is measured on motions
+    and on a unit that no network has seen. The same command continues an interrupted experiment.
+    With three seeds it takes a night on two cores, with one about two hours.
 
     Args:
         name: "paper", the only experiment.
@@ -57,9 +57,6 @@ def experiment(
     """
     if name != "paper":
         raise UsageError(f"{name}: no such experiment; there is: paper")
-    import gaponet.report.page  # noqa: F401  # needs an extra; without it nothing is trained
-    from gaponet.api.paper import paper_experiment
-
     screen = Out(json)
     result = paper_experiment(
         dataset, out=out, options=options, open_bar=share_bar, open_bars=progress_bars

@@ -2,190 +2,206 @@
 
 from __future__ import annotations
 
-import json as json_text
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 import tyro
 
 from gaponet import api
-from gaponet.api.files import NetworkTarget, RobotTarget, require_out
+from gaponet.api.files import (
+    LEROBOT_TARGET,
+    RANDOMIZATION_FILE,
+    RANDOMIZATION_TARGET,
+    NetworkTarget,
+    RobotTarget,
+    attach_correction,
+    is_network_target,
+    randomization_tables,
+    require_network,
+    require_out,
+)
+from gaponet.api.opening import as_run
+from gaponet.api.results import ExportResult
 from gaponet.base.errors import UsageError
-from gaponet.base.files import write_text
 from gaponet.base.progress import progress_bar
-from gaponet.cli.options import Flag, Folder, Json, like
+from gaponet.cli.options import Flag, Folder, Json
 from gaponet.cli.out import Out
 from gaponet.evaluation.tables import mrad
-from gaponet.nn.packaged_networks import is_packaged, is_packaged_network, named_folder
-from gaponet.robot.spec import load_robot
 
-if TYPE_CHECKING:
-    from gaponet.export.randomization import Engine, Scope
-
-POLICY_FILE, POLICY_STEP = "policy_postprocessor.json", "gaponet_correct"  # of a LeRobot policy
+# Options, their fields, and whether a target uses them.
+OPTIONS: tuple[tuple[str, tuple[str, ...], Callable[[str], bool]], ...] = (
+    (
+        "--engine, --scope, --units",
+        ("engine", "scope", "units"),
+        lambda to: to == RANDOMIZATION_TARGET,
+    ),
+    ("--payload-mass", ("payload_mass",), lambda to: to != RANDOMIZATION_TARGET),
+    ("--out", ("out",), lambda to: to != LEROBOT_TARGET),
+    (
+        "--into and --prefix",
+        ("into", "prefix"),
+        lambda to: to in ("mjcf", "envhub", "urdf", LEROBOT_TARGET),
+    ),
+    ("--data", ("data",), lambda to: to not in ("onnx", "torch", LEROBOT_TARGET)),
+)
 CHECKED_IN = {"mjcf": "MuJoCo", "envhub": "MuJoCo", "actuator-net": "mjlab"}
 Holder = Annotated[
     Folder,
     tyro.conf.arg(
-        help="Robot folder, run folder of gaponet train, or a name of the package (gaponet robot list, networks).",
+        help="Robot folder, run folder of gaponet train, or a name of the package (gaponet robot "
+        "list, networks).",
         metavar="ROBOT|RUN|NAME",
     ),
 ]
 
 
-@like(api.export_robot)
+@dataclass(frozen=True)
+class ExportArgs:
+    """What is exported and where to; each target uses some of the options."""
+
+    to: RobotTarget | NetworkTarget | Literal["randomization", "lerobot"] = "onnx"
+    """Simulator of a robot or a run: mjcf (plain MuJoCo), envhub (an environment of LeRobot's EnvHub
+    in MuJoCo), mjlab, isaaclab and newton, each with a check.py that needs no gaponet; urdf
+    (damping, friction, effort limits); json (the numbers).
+    Network of a run: onnx (model.onnx and card.json), torch (delta.pt2 with simulator and action
+    term for mjlab and Isaac Lab), actuator-net (one network per joint; its inputs are past target −
+    position and speed, its output is the torque). randomization: sets of a robot's parameters
+    ("units") for training. lerobot: add the correction to the LeRobot policy in --into; LeRobot
+    finds it through the plug-in lerobot_robot_gaponet."""
+    out: Path | None = None
+    """Folder; default one with that name in the robot or run."""
+    data: str | None = None
+    """Dataset on which a servo model's nearest plain servos are fitted, and every form is measured;
+    default the one that the robot was identified from, and without any the robot's own simulated
+    motions."""
+    into: Path | None = None
+    """For mjcf, envhub and urdf: a file of your own; an edited copy is written (but for urdf, default
+    the robot's). For lerobot: folder of a policy (pretrained_model) that holds policy_postprocessor.json."""
+    prefix: str = ""
+    """Prefix of joint names in that file."""
+    payload_mass: float = 0.0
+    """kg in each hand."""
+    engine: Literal["json", "mujoco", "mjlab", "isaaclab"] = "json"
+    """For randomization: engine for which a file is written that applies units of
+    randomization.json."""
+    scope: Literal["today", "any-day", "any-robot"] = "today"
+    """today: this robot as last fitted. any-day: sessions on several days. any-robot: all robots of
+    its type."""
+    units: tuple[Path, ...] = ()
+    """For any-robot: robot folders of the type."""
+    dynamics: Flag = False
+    """For lerobot: feed forward inertia and damping too; use it for smooth targets only."""
+    remove: Flag = False
+    """For lerobot: remove the correction."""
+
+    def require_used(self) -> None:
+        """Refuse options that the target does not use.
+
+        Raises:
+            UsageError: One is given.
+        """
+        for words, names, uses in OPTIONS:
+            given = any(getattr(self, name) != getattr(ExportArgs, name) for name in names)
+            if given and not uses(self.to):
+                raise UsageError(f"--to {self.to} does not use {words}; leave out what you gave")
+
+
 def export(
-    robot: Holder, to: RobotTarget | NetworkTarget | Literal["randomization", "lerobot"] = "onnx",
-    out: Path | None = None, data: str | None = None, into: Path | None = None, prefix: str = "",
-    payload_mass: float = 0.0, engine: Literal["json", "mujoco", "mjlab", "isaaclab"] = "json",
-    scope: Literal["today", "any-day", "any-robot"] = "today", units: tuple[Path, ...] = (), dynamics: Flag = False,
-    remove: Flag = False, json: Json = False,
-) -> None:  # fmt: skip
+    robot: Holder,
+    args: Annotated[ExportArgs, tyro.conf.arg(name="")] = ExportArgs(),
+    json: Json = False,
+) -> None:
     """Write an identified robot or a network for another program.
 
     Args:
-        to: Simulator of a robot or a run: mjcf (plain MuJoCo), envhub (an environment of LeRobot's EnvHub in MuJoCo),
-            mjlab, isaaclab and newton, each with a check.py that needs no gaponet; urdf (damping, friction, effort
-            limits); json (the numbers). Network of a run: onnx (model.onnx and card.json), torch (delta.pt2 with
-            simulator and action term for mjlab and Isaac Lab), actuator-net (one network per joint; its inputs are past
-            target − position and speed, its output is the torque). randomization: sets of a robot's parameters
-            ("units") for training. lerobot: add the correction to the LeRobot policy in --into; LeRobot finds it
-            through the plug-in lerobot_robot_gaponet.
-        into: For mjcf, envhub and urdf: a file of your own; an edited copy is written (but for urdf, default the
-            robot's). For lerobot: folder of a policy (pretrained_model) that holds policy_postprocessor.json.
-        engine: For randomization: engine for which a file is written that applies units of randomization.json.
-        scope: today: this robot as last fitted. any-day: sessions on several days. any-robot: all robots of its type.
-        units: For any-robot: robot folders of the type.
-        dynamics: For lerobot: feed forward inertia and damping too; use it for smooth targets only.
-        remove: For lerobot: remove the correction.
+        args: What is exported and where to.
     """
     screen = Out(json)
-    robot = named_folder(robot)
-    for words, unused in (
-        (
-            "--engine, --scope, --units",
-            to != "randomization" and (engine != "json" or scope != "today" or units),
-        ),
-        ("--payload-mass", to == "randomization" and payload_mass),
-        ("--out", to == "lerobot" and out),
-        (
-            "--into and --prefix",
-            to not in ("mjcf", "envhub", "urdf", "lerobot") and (into or prefix),
-        ),
-        ("--data", to in ("onnx", "torch", "lerobot") and data),
-    ):
-        if unused:
-            raise UsageError(f"--to {to} does not use {words}; leave out what you gave")
-    if to == "randomization":
-        require_out(robot, out)
-        _show_ranges(screen, robot, out or robot / "randomization", engine, scope, units, data)
-        return
-    if to == "lerobot":
-        if into is None:
-            raise UsageError("--to lerobot: give the folder of a LeRobot policy with --into POLICY")
-        _attach(screen, into, None if remove else robot, payload_mass, dynamics)
-        return
-    if to == "onnx" or to == "torch" or to == "actuator-net":
-        if (robot / "robot.toml").is_file():
-            engines = "mjcf, mjlab, isaaclab, newton or json"
-            raise UsageError(f"{robot}: is a robot, which has no network; --to {engines}")
-        made = api.export_network(robot, to=to, out=out, data=data, payload_mass=payload_mass)
+    holder = as_run(robot)
+    args.require_used()
+    if args.to == RANDOMIZATION_TARGET:
+        _export_ranges(screen, holder, args)
+    elif args.to == LEROBOT_TARGET:
+        _attach(screen, holder, args)
+    elif is_network_target(args.to):
+        require_network(holder)
+        made = api.export_network(
+            holder, to=args.to, out=args.out, data=args.data, payload_mass=args.payload_mass
+        )
+        _show(screen, made)
     else:
         with progress_bar("exporting") as update:
             made = api.export_robot(
-                robot, to=to, out=out, data=data, into=into, prefix=prefix, payload_mass=payload_mass, progress=update
-            )  # fmt: skip
+                holder,
+                to=args.to,
+                out=args.out,
+                data=args.data,
+                into=args.into,
+                prefix=args.prefix,
+                payload_mass=args.payload_mass,
+                progress=update,
+            )
+        _show(screen, made)
+
+
+def _show(screen: Out, made: ExportResult) -> None:
+    """Print what was written, its errors, and what it leaves out."""
     if made.parity is not None:
         screen.say(f"{made.path}: differs by {made.parity:.1e} rad from what was trained")
-    else:
-        motions = (
-            ("VIRTUAL" if made.virtual else "validation") + " motion" + "s" * (made.motions != 1)
-        )
-        rows = [[form, mrad(error)] for form, error in made.errors.items()]
-        screen.table(f"Mean |error| on {made.motions} {motions}", ["form", "mrad"], rows)
-        for line in made.notes:
-            screen.say(f"  {line}", "warning", "yellow")
-        screen.say(f"{made.path}: {made.robot} for {to}")
-        if made.check:
-            screen.next(f"python {made.check}, in {CHECKED_IN.get(to, to)}")
+        screen.result(made.to_dict())
+        return
+    kind = "VIRTUAL" if made.virtual else "validation"
+    plural = "" if made.motions == 1 else "s"
+    rows = [[form, mrad(error)] for form, error in made.errors.items()]
+    title = f"Mean |error| on {made.motions} {kind} motion{plural}"
+    screen.table(title, ["form", "mrad"], rows)
+    for line in made.notes:
+        screen.say(f"  {line}", "warning", "yellow")
+    screen.say(f"{made.path}: {made.robot} for {made.to}")
+    if made.check:
+        screen.next(f"python {made.check}, in {CHECKED_IN.get(made.to, made.to)}")
     screen.result(made.to_dict())
 
 
-def _show_ranges(
-    screen: Out,
-    robot: Path,
-    out: Path,
-    engine: Engine,
-    scope: Scope,
-    units: tuple[Path, ...],
-    data: str | None,
-) -> None:
-    from gaponet.export.randomization import FILE, table_rows
-
+def _export_ranges(screen: Out, robot: Path, args: ExportArgs) -> None:
+    """Write and show sampled units and ranges of a robot's parameters."""
+    require_out(robot, args.out)
     with progress_bar("drawing") as update:
         file, made = api.randomization(
-            robot, out=out, engine=engine, scope=scope, units=units, data=data, progress=update
-        )  # fmt: skip
-    screen.table(f"{made.robot}, {scope}: range of 9 of 10 units", *table_rows(made))
-    forms = {"with the servo model": made.judged, "without it": made.plain}
-    if made.plain is made.judged:
-        forms = {"identified": made.judged}
-    rows = [
-        [form, *(mrad(judged.errors[name]) for name in ("exported", "units", "one by one", "by hand"))]
-        for form, judged in forms.items() if judged is not None
-    ]  # fmt: skip
-    if rows:
-        heading = ["robot", "exported", "units", "single numbers of the ranges", "± 20 % by hand"]
-        screen.table("Mean error on validation motions, mrad", heading, rows)
+            robot,
+            out=args.out or robot / RANDOMIZATION_TARGET,
+            engine=args.engine,
+            scope=args.scope,
+            units=args.units,
+            data=args.data,
+            progress=update,
+        )
+    for table in randomization_tables(made, args.scope):
+        screen.show(table.name, table)
     for note in made.notes:
         screen.say(f"  {note}", "note", "cyan")
     if made.unknown:
         names = "; ".join(made.unknown)
-        screen.say(
-            f"  no log determines these, drawn from the prior range: {names}", "warning", "yellow"
-        )
-    use = "" if engine == "json" else f"; {file.name} applies them in {engine}"
-    screen.say(f"{file.parent / FILE}: {len(next(iter(made.units.values())))} units{use}")
-    screen.result(
-        {"path": str(file), "scope": scope, "ranges": made.ranges, "unknown": made.unknown}
+        text = f"  no log determines these, drawn from the prior range: {names}"
+        screen.say(text, "warning", "yellow")
+    count = len(next(iter(made.units.values())))
+    use = "" if args.engine == "json" else f"; {file.name} applies them in {args.engine}"
+    screen.say(f"{file.parent / RANDOMIZATION_FILE}: {count} units{use}")
+    ranges = {"ranges": made.ranges, "unknown": made.unknown}
+    screen.result({"path": str(file), "scope": args.scope, **ranges})
+
+
+def _attach(screen: Out, holder: Path, args: ExportArgs) -> None:
+    """Put the correction of a robot or a run behind a LeRobot policy, or remove it."""
+    if args.into is None:
+        raise UsageError("--to lerobot: give the folder of a LeRobot policy with --into POLICY")
+    made = attach_correction(
+        args.into,
+        None if args.remove else holder,
+        payload_mass=args.payload_mass,
+        dynamics=args.dynamics,
     )
-
-
-def _attach(
-    screen: Out, policy: Path, holder: Path | None, payload_mass: float, dynamics: bool
-) -> None:
-    """Put the correction of a robot or a run behind a LeRobot policy, in place of an earlier one; None removes it."""
-    file = policy / POLICY_FILE
-    if not file.is_file():
-        raise UsageError(
-            f"{policy}: has no {POLICY_FILE}; give the folder that holds a LeRobot policy and its processors"
-        )
-    try:
-        document = json_text.loads(file.read_text(encoding="utf-8"))
-        steps = [step for step in document["steps"] if step.get("registry_name") != POLICY_STEP]
-    except (ValueError, KeyError, TypeError, AttributeError):
-        raise UsageError(f"{file}: is no processor of LeRobot") from None
-    config: dict[str, object] = {}
-    if holder is not None and is_packaged_network(holder):
-        config = {"model": holder.name, "payload_mass": payload_mass, "dynamics": dynamics}
-        steps.append({"registry_name": POLICY_STEP, "config": config})
-    elif holder is not None:
-        is_robot = (holder / "robot.toml").is_file()
-        if is_robot:
-            load_robot(holder)
-        elif not (holder / "model").is_dir():
-            raise UsageError(
-                f"{holder}: is neither a robot folder of gaponet identify nor a run of gaponet train"
-            )
-        config = {
-            "known" if is_robot else "model": holder.name
-            if is_packaged(holder)
-            else str(holder.resolve()),
-            "payload_mass": payload_mass,
-            "dynamics": dynamics,
-        }
-        steps.append({"registry_name": POLICY_STEP, "config": config})
-    write_text(file, json_text.dumps(document | {"steps": steps}, indent=2) + "\n")
-    names = [step.get("registry_name", step.get("class", "?")) for step in steps]
-    screen.say(f"{file}: {' → '.join(names) or 'no steps'}")
-    screen.result({"file": str(file), "steps": names, "config": config})
+    screen.say(f"{made.file}: {' → '.join(made.steps) or 'no steps'}")
+    screen.result(made.to_dict())

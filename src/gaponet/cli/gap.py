@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from gaponet import api
+from gaponet.api.opening import as_dataset, as_run
 from gaponet.base.executor import LOCAL
 from gaponet.base.progress import progress_bar
 from gaponet.cli.options import Data, Json, Motions, Robot, like
@@ -14,68 +15,113 @@ from gaponet.cli.out import Out
 from gaponet.cli.show import show_baselines, show_methods, show_verdict
 from gaponet.evaluation.methods import title
 from gaponet.evaluation.tables import mrad
-from gaponet.nn.packaged_networks import named_folder
-from gaponet.sim.dataset_robot import open_dataset
+
+NO_FLOOR = "floor (what no model can explain): {}, since no motion was recorded twice"
 
 
 @like(api.gap)
 def gap(
-    dataset: Data, run: Path | None = None, motions: Motions = (), robot: Robot = None, executor: str = LOCAL,
+    dataset: Data,
+    run: Path | None = None,
+    motions: Motions = (),
+    robot: Robot = None,
+    executor: str = LOCAL,
     json: Json = False,
-) -> None:  # fmt: skip
+) -> None:
     """How far is the simulator from the robot, by joint and payload?
 
-    Without --robot the nominal simulator is measured. With an identified robot the causes of the error are shown.
+    Without --robot the nominal simulator is measured. With an identified robot the causes of the
+    error are shown.
     """
-    out = Out(json)
-    run = None if run is None else named_folder(run)
-    data, spec = open_dataset(dataset, robot, run)
+    screen = Out(json)
+    run = None if run is None else as_run(run)
+    data, spec = as_dataset(dataset, robot, run)
     with progress_bar("gap") as update:
         result = api.gap(
             data, robot=spec, motions=motions, run=run, executor=executor, progress=update
         )
-    folder = run or (spec.folder if robot is None else Path(robot))
-    if not result.by_cause:
-        show_methods(out, result.to_dict())
-    else:
-        show_steps(out, result.table)
+    folder = run
+    if folder is None:
+        folder = spec.folder if robot is None else Path(robot)
+    if result.by_cause:
+        show_steps(screen, result.table)
         if (folder / "gap.png").is_file():
-            out.say(f"figure: {folder / 'gap.png'}")
+            screen.say(f"figure: {folder / 'gap.png'}")
+    else:
+        show_methods(screen, result.to_dict())
     baselines = result.table["baselines"]
     count = len(result.methods["nominal"]["by_independent_motion"])
-    show_baselines(out, baselines, count)
-    own = folder if result.by_cause else None
-    show_verdict(out, result.methods, str(dataset), own, baselines)
-    out.result(result.to_dict())
+    show_baselines(screen, baselines, count)
+    candidate = folder if result.by_cause else None
+    show_verdict(screen, result.methods, str(dataset), candidate, baselines)
+    screen.result(result.to_dict())
 
 
-def show_steps(out: Out, result: Mapping[str, Any]) -> None:
-    """Print the error after each step, in total, by joint and by payload, and its reduction in total."""
-    who = "VIRTUAL robot" if result["virtual"] else "real robot"
-    count = f"{result['sequences']} {'test ' * result['unseen']}recording{'s' * (result['sequences'] != 1)} of a {who}"
-    fitted = "" if result["unseen"] else ", some of them used in training"
-    joints, loads, ends = result["by_joint"], result["by_payload"], ("floor", "unexplained")
-    loads = loads if len(loads) > 1 else {}
-    rest = lambda part: (part["floor"]["both"], part["unexplained"])  # noqa: E731
-    removed = {s: [*map(mrad, result["removed"].get(s, ()))] or ["", ""] for s in result["left"]}
-    one = list(removed.values())[-1][1] == mrad(None)  # motion: no standard error
-    columns = ["reduced by, mrad"] if one else ["reduced by, mrad", "± standard error"]
-    rows = [
-        [title(s), mrad(left), *removed[s][: len(columns)], *(mrad(p[s]) for p in loads.values())]
-        for s, left in result["left"].items()
-    ]
-    known = [(end, mrad(of)) for end, of in zip(ends, rest(result), strict=True) if of is not None]
-    rows += [[end, of, *[""] * (len(columns) + len(loads))] for end, of in known]
-    out.table(
-        f"Mean |error| after each step: {count}{fitted}{', one motion' * one}",
-        ["step", "error, mrad", *columns, *(f"{p} kg" for p in loads)],
-        rows,
-    )
-    steps = list(result["left"])
-    out.table("Mean |error| by joint and step, mrad", ["joint", *map(title, steps), *(end for end, _ in known)], [
-        [name, *(mrad(part["left"][s]) for s in steps), *map(mrad, rest(part)[: len(known)])]
-        for name, part in joints.items()
-    ])  # fmt: skip
-    if result["floor"]["repeatability"] is None:
-        floor = "unknown" if result["floor"]["encoder"] is None else "of the encoder alone"
-        out.say(f"floor (what no model can explain): {floor}, since no motion was recorded twice")
+def show_steps(screen: Out, table: Mapping[str, Any]) -> None:
+    """Print the error after each step, in total, by joint and by payload, and its reduction.
+
+    Args:
+        table: GapResult.table of an identified robot or a run.
+    """
+    _show_totals(screen, table)
+    _show_joints(screen, table)
+    if table["floor"]["repeatability"] is None:
+        only = "unknown" if table["floor"]["encoder"] is None else "of the encoder alone"
+        screen.say(NO_FLOOR.format(only))
+
+
+def _show_totals(screen: Out, table: Mapping[str, Any]) -> None:
+    """Print the error after each step, its reduction, and the same by payload."""
+    steps = list(table["left"])
+    one_motion = _removed(table, steps[-1])[1] == mrad(None)  # it has no standard error
+    payloads = table["by_payload"] if len(table["by_payload"]) > 1 else {}
+    columns = ["step", "error, mrad", "reduced by, mrad"]
+    if not one_motion:
+        columns.append("± standard error")
+    columns += [f"{payload} kg" for payload in payloads]
+    rows = []
+    for step in steps:
+        reduction, error = _removed(table, step)
+        row = [title(step), mrad(table["left"][step]), reduction]
+        if not one_motion:
+            row.append(error)
+        rows.append([*row, *(mrad(errors[step]) for errors in payloads.values())])
+    for name, value in _unexplained(table).items():
+        row = [name, mrad(value)]
+        rows.append(row + [""] * (len(columns) - len(row)))
+    screen.table(f"Mean |error| after each step: {_measured_on(table, one_motion)}", columns, rows)
+
+
+def _show_joints(screen: Out, table: Mapping[str, Any]) -> None:
+    """Print the error of each joint after each step."""
+    steps = list(table["left"])
+    known = list(_unexplained(table))
+    rows = []
+    for joint, part in table["by_joint"].items():
+        own = {"floor": part["floor"]["both"], "unexplained": part["unexplained"]}
+        row = [joint, *(mrad(part["left"][step]) for step in steps)]
+        rows.append([*row, *(mrad(own[name]) for name in known)])
+    columns = ["joint", *map(title, steps), *known]
+    screen.table("Mean |error| by joint and step, mrad", columns, rows)
+
+
+def _measured_on(table: Mapping[str, Any], one_motion: bool) -> str:
+    """Return on which recordings a gap was measured."""
+    who = "VIRTUAL robot" if table["virtual"] else "real robot"
+    test = "test " if table["unseen"] else ""
+    plural = "" if table["sequences"] == 1 else "s"
+    fitted = "" if table["unseen"] else ", some of them used in training"
+    one = ", one motion" if one_motion else ""
+    return f"{table['sequences']} {test}recording{plural} of a {who}{fitted}{one}"
+
+
+def _removed(table: Mapping[str, Any], step: str) -> list[str]:
+    """Return by how much a step reduces the error, and the standard error; "" for the first."""
+    values = table["removed"].get(step, ())
+    return [mrad(value) for value in values] or ["", ""]
+
+
+def _unexplained(table: Mapping[str, Any]) -> dict[str, float]:
+    """Return what no model can explain, and the rest above it, rad, as far as they are known."""
+    values = {"floor": table["floor"]["both"], "unexplained": table["unexplained"]}
+    return {name: value for name, value in values.items() if value is not None}

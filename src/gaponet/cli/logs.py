@@ -3,42 +3,63 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Sequence as ListOf
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import tyro
 
 from gaponet import api
+from gaponet.api import logs as recordings
+from gaponet.api.opening import as_dataset, driven_by_torque
+from gaponet.api.options import ImportOptions, parse_joint_map
 from gaponet.base.errors import UsageError
-from gaponet.base.files import lock_folder
 from gaponet.base.progress import progress_bar
-from gaponet.cli.options import Data, Flag, Json, like
+from gaponet.cli.options import Data, Flag, Json
 from gaponet.cli.out import Out
-from gaponet.robot.finding import abbreviate
-from gaponet.robot.spec import RobotSpec, load_robot
+from gaponet.robot.finding import Finding, abbreviate
+from gaponet.robot.spec import load_robot
 
 if TYPE_CHECKING:
-    from gaponet.data.doctor import DoctorResult
-    from gaponet.data.importer import ImportResult
-    from gaponet.data.offsets import JointOffset
-    from gaponet.data.store import Entry
+    from gaponet import DoctorResult, ImportResult
 
 MAX_ROWS = 60
+RECORDING_COLUMNS = ["motion", "kg", "s", "Hz", "jitter, ms", "longest gap, ms", "lag, ms"]
+JOINT_COLUMNS = ["joint", "commanded, rad", "lag, ms", "error at rest ± stiction, mrad", "rests"]
+OFFSET_COLUMNS = ["joint", "lag, ms", "error at rest, mrad", "offset, mrad"]
+HELD_AT_HOME = (
+    "missing in some recordings, assumed at the home position there; [posture] in logs.toml sets "
+    "another"
+)
 
 
-@like(api.import_logs)
+@dataclass(frozen=True)
+class ImportArgs(ImportOptions):
+    """How logs are read; joints are mapped by words instead of a dictionary."""
+
+    joint_map: tyro.conf.Suppress[None] = None
+    map: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
+    """A joint's name in the log and the robot's, as a=b; may be repeated."""
+
+    def options(self) -> ImportOptions:
+        """Return the options of api.import_logs."""
+        values = {field.name: getattr(self, field.name) for field in fields(ImportOptions)}
+        values["joint_map"] = parse_joint_map(self.map)
+        return ImportOptions(**values)
+
+
 def import_logs(
-    src: tyro.conf.Positional[Path | None] = None, robot: str = "", out: Path | None = None, unit_id: str | None = None,
-    payload_mass: float | None = None, payload_side: str | None = None,
-    map: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = (), format: str | None = None,
-    logs: Path | None = None, position_unit: Literal["rad", "deg", "fraction", "ticks", "signed_percent"] | None = None,
-    time_unit: Literal["s", "ms", "us", "ns"] | None = None, rate: float | None = None, cut: float | None = None,
-    level: Literal["joint", "upper_body", "whole_body"] | None = None, kp: tuple[str, ...] = (),
-    kd: tuple[str, ...] = (), skip_bad: bool = False, strict: bool = False, allow_pickle: bool = False,
-    guess: bool = False, formats: Flag = False, json: Json = False,
-) -> None:  # fmt: skip
+    src: tyro.conf.Positional[Path | None] = None,
+    robot: str = "",
+    out: Path | None = None,
+    unit_id: str | None = None,
+    payload_mass: float | None = None,
+    args: Annotated[ImportArgs, tyro.conf.arg(name="")] = ImportArgs(),
+    guess: bool = False,
+    formats: Flag = False,
+    json: Json = False,
+) -> None:
     """Read a robot's logs into a dataset; the same call adds what is new.
 
     If one log is bad, nothing is imported. With --skip-bad only the bad log is left out.
@@ -47,9 +68,12 @@ def import_logs(
         src: File or folder of logs.
         robot: Robot name or folder.
         out: Dataset folder; appended to where it exists.
-        map: A joint's name in the log and the robot's, as a=b; may be repeated.
-        format: Format of the logs; default by inspection; --formats lists them.
-        guess: Print a logs.toml for these logs, filled in as far as they show it, and import nothing.
+        unit_id: Name of the recorded robot, the same for all its logs. Needed unless the format
+            states it.
+        payload_mass: kg in each hand, 0.0 when empty. Needed unless the format states it.
+        args: How the logs are read.
+        guess: Print a logs.toml for these logs, filled in as far as they show it, and import
+            nothing.
         formats: List the formats that are read, and what each needs.
     """
     if formats:
@@ -59,25 +83,26 @@ def import_logs(
         raise UsageError(
             "give a folder of logs and --robot ROBOT (or --formats, to see which formats are read)"
         )
-    spec = load_robot(robot)
+    options = args.options()
     if guess:
-        from gaponet.data.describe.guess import guess_logs
-        from gaponet.data.formats import look
-
-        kind, facts, recordings = look(src, format, logs, allow_pickle)
-        print(guess_logs(recordings, spec, kind, dict(facts)), end="")
+        print(recordings.guess_description(src, robot=robot, options=options), end="")
         return
     if out is None:
         raise UsageError(
-            "say where the dataset goes: --out FOLDER (or --guess, to see how these logs are described)"
+            "say where the dataset goes: --out FOLDER (or --guess, to see how these logs are "
+            "described)"
         )
+    spec = load_robot(robot)
     with progress_bar("importing") as update:
         made = api.import_logs(
-            src, robot=spec, out=out, unit_id=unit_id, payload_mass=payload_mass, payload_side=payload_side,
-            level=level, format=format, joint_map=joint_map(map), logs=logs, position_unit=position_unit,
-            time_unit=time_unit, rate=rate, cut=cut, kp=kp, kd=kd, skip_bad=skip_bad, allow_pickle=allow_pickle,
-            strict=strict, progress=update,
-        )  # fmt: skip
+            src,
+            robot=spec,
+            out=out,
+            unit_id=unit_id,
+            payload_mass=payload_mass,
+            options=options,
+            progress=update,
+        )
     _show_import(Out(json), made)
 
 
@@ -95,177 +120,212 @@ def doctor(
         fix: Print a proposal for logs.toml after the findings; nothing is applied.
         figures: Folder for a picture of each finding.
     """
-    from gaponet.api.opening import driven_by_torque
-    from gaponet.robot.finding import Finding
-    from gaponet.sim.dataset_robot import open_dataset
-
-    out = Out(json)
-    data, spec = open_dataset(dataset, robot)
+    screen = Out(json)
+    data, spec = as_dataset(dataset, robot)
     with progress_bar("examining") as update:
         diagnosis = api.doctor(data, robot=spec, progress=update)
-    out.say(f", {diagnosis.inventory(data)}", spec.name)
-    show_diagnosis(out, diagnosis)
+    screen.say(f", {diagnosis.inventory(data)}", spec.name)
+    show_diagnosis(screen, diagnosis)
     proposal = Finding.proposal(list(diagnosis.findings)) if fix else ""
     for line in proposal.splitlines():
-        out.say(line)
+        screen.say(line)
     drawn: list[Path] = []
     if figures is not None:
-        from gaponet.report.figures.dataset_figures import draw_findings
-
-        with lock_folder(figures, "figures"):
-            drawn = draw_findings(data, spec, list(diagnosis.findings), figures)
-        out.say(f"{len(drawn)} pictures written: {figures!s}")
-    if diagnosis.count("error"):
-        out.next(
-            "correct the logs, import them into a new folder"
-            if fix
-            else f"gaponet doctor {dataset} --fix"
-        )
+        drawn = recordings.draw_findings(data, diagnosis, out=figures, robot=spec)
+        screen.say(f"{len(drawn)} pictures written: {figures!s}")
+    if diagnosis.count("error") and fix:
+        screen.next("correct the logs, import them into a new folder")
+    elif diagnosis.count("error"):
+        screen.next(f"gaponet doctor {dataset} --fix")
     elif driven_by_torque(data):
-        out.next(f"gaponet identify {dataset} --out ROBOT")
+        screen.next(f"gaponet identify {dataset} --out ROBOT")
     else:
-        out.next(f"gaponet gap {dataset}")
-    out.result({"dataset": data.path.name, "robot": spec.name, "logs_toml": proposal,
-                "figures": [str(path) for path in drawn]} | diagnosis.to_dict())  # fmt: skip
+        screen.next(f"gaponet gap {dataset}")
+    facts = {
+        "dataset": data.path.name,
+        "robot": spec.name,
+        "logs_toml": proposal,
+        "figures": [str(path) for path in drawn],
+    }
+    screen.result(facts | diagnosis.to_dict())
 
 
-def _show_formats(out: Out) -> None:
-    from gaponet.data.formats import about, extra_of, formats
-
-    rows = {fmt: (about(fmt), extra) for fmt in formats() if (extra := extra_of(fmt)) is not None}
-    out.table("Formats that gaponet import reads", ["format", "what it is", "needs"], [
-        [fmt, what, f"gaponet[{extra}]" if extra else ""] for fmt, (what, extra) in rows.items()
-    ])  # fmt: skip
-    out.say(
-        "Other columns: gaponet import LOGS --robot ROBOT --guess > LOGS/logs.toml; then check that file."
+def _show_formats(screen: Out) -> None:
+    formats = recordings.log_formats()
+    rows = []
+    for made in formats:
+        rows.append([made.name, made.about, f"gaponet[{made.extra}]" if made.extra else ""])
+    screen.table("Formats that gaponet import reads", ["format", "what it is", "needs"], rows)
+    screen.say(
+        "Other columns: gaponet import LOGS --robot ROBOT --guess > LOGS/logs.toml; then check "
+        "that file."
     )
-    out.result({fmt: {"about": what, "extra": extra} for fmt, (what, extra) in rows.items()})
+    screen.result({made.name: {"about": made.about, "extra": made.extra} for made in formats})
 
 
-def _notes(entries: ListOf[Entry], robot: RobotSpec) -> list[str]:
-    """Return lines about recordings that were cut, implausible rows, and operated joints that the logs lack."""
-    cuts, implausible = (
-        defaultdict[str, list[str]](list),
-        defaultdict[str, list[tuple[str, dict[str, Any]]]](list),
-    )
-    for entry in entries:
-        if cut := entry.meta.notes.get("cut"):
-            cuts[cut].append(entry.meta.motion)
-        for channel, rows in entry.meta.notes.get("nonsense", {}).items():
-            implausible[channel].append((entry.meta.motion, rows))
-    lines = [
-        f"{', '.join(motions)}: {cut}; what follows was left out" for cut, motions in cuts.items()
-    ]
-    lines += [
-        f"{channel} is implausible in {sum(rows['rows'] for _, rows in counts)} rows of {len(counts)} recordings "
-        f"(first {counts[0][1]['worst']:.4g} of {counts[0][1]['joints'][0]} in {counts[0][0]}): "
-        f"{', '.join(dict.fromkeys(rows['done'] for _, rows in counts))}; --strict refuses them"
-        for channel, counts in implausible.items()
-    ]
-    if uneven := [e.meta for e in entries if "why_resampled" in e.meta.notes]:
-        why = f"{uneven[0].notes['rows']}; {uneven[0].notes['why_resampled']}"
-        lines.append(f"{abbreviate([meta.motion for meta in uneven])}: {why}")
-    lacking = [
-        j for j in robot.operated if any(j in e.meta.notes.get("held_at_home", ()) for e in entries)
-    ]
-    where = "missing in some recordings, assumed at the home position there; [posture] in logs.toml sets another"
-    return [*lines, f"{abbreviate(lacking)}: {where}"] if lacking else lines
-
-
-def joint_map(pairs: tuple[str, ...]) -> dict[str, str] | None:
-    """("a=b",) → {"a": "b"}."""
-    for pair in pairs:
-        if pair.count("=") != 1 or not all(part.strip() for part in pair.split("=")):
-            raise UsageError(f"--map {pair}: write NAME_IN_LOG=NAME_OF_ROBOT")
-    names = {a.strip(): b.strip() for a, b in (pair.split("=") for pair in pairs)}
-    if len(names) < len(pairs):
-        raise UsageError(f"--map {' '.join(pairs)}: names one joint of the log twice")
-    return names or None
-
-
-def _show_import(out: Out, made: ImportResult) -> None:
+def _show_import(screen: Out, made: ImportResult) -> None:
     """Print what was added, the lag and the offsets of each joint, and the next command."""
-    entries, data, robot, table = made.entries, made.dataset, made.robot, made.to_dict()
-    minutes, rates = table["minutes"], table["rate_hz"]
-    units = ", ".join(dict.fromkeys(e.meta.unit_id for e in entries))
-    payloads = ", ".join(f"{p:g}" for p in sorted({e.meta.payload_mass for e in entries}))
-    virtual = "VIRTUAL " if any(e.meta.virtual for e in entries) else ""
+    entries = made.entries
+    data = made.dataset
+    table = made.to_dict()
+    rates = ", ".join(f"{rate:g}" for rate in table["rate_hz"])
+    units = ", ".join(dict.fromkeys(entry.meta.unit_id for entry in entries))
+    masses = sorted({entry.meta.payload_mass for entry in entries})
+    payloads = ", ".join(f"{mass:g}" for mass in masses)
+    virtual = "VIRTUAL " if any(entry.meta.virtual for entry in entries) else ""
     if made.present:
-        out.say(f"{len(made.present)} recordings were imported before, {len(made.added)} are new")
-    out.say(
-        f"{len(entries)} recordings, {minutes:.1f} min at {', '.join(f'{r:g}' for r in rates)} Hz, {virtual}robot "
-        f"{robot.name}, unit {units}, payload {payloads} kg; {data.path!s} now holds {len(data)}"
+        screen.say(
+            f"{len(made.present)} recordings were imported before, {len(made.added)} are new"
+        )
+    screen.say(
+        f"{len(entries)} recordings, {table['minutes']:.1f} min at {rates} Hz, {virtual}robot "
+        f"{made.robot.name}, unit {units}, payload {payloads} kg; {data.path!s} now holds "
+        f"{len(data)}"
     )
-    for line in _notes(entries, robot):
-        out.say(f"  {line}", "note", "cyan")
+    for line in _notes(made):
+        screen.say(f"  {line}", "note", "cyan")
     for line in made.cut[:MAX_ROWS]:
-        out.say(f"  {line}", "cut", "yellow")
+        screen.say(f"  {line}", "cut", "yellow")
     if len(made.cut) > MAX_ROWS:
-        out.say(f"  … and {len(made.cut) - MAX_ROWS} more; --json lists all", "cut", "yellow")
-    offsets = made.offsets or {}
-    _show_offsets(out, table["fast_lag_s"], offsets)
-    if offsets:
-        out.say(
+        more = len(made.cut) - MAX_ROWS
+        screen.say(f"  … and {more} more; --json lists all", "cut", "yellow")
+    _show_offsets(screen, made, table["fast_lag_s"])
+    if made.offsets:
+        screen.say(
             f"Offsets are recorded in {data.path!s}/offsets.json; nothing was applied to the data."
         )
-    out.next(f"gaponet doctor {data.path!s}")
-    out.result(table)
+    screen.next(f"gaponet doctor {data.path!s}")
+    screen.result(table)
 
 
-def _show_offsets(out: Out, lags: dict[str, list[float]], offsets: dict[str, JointOffset]) -> None:
+def _notes(made: ImportResult) -> list[str]:
+    """Return lines about what was cut, implausible, resampled or missing in the recordings."""
+    return [
+        *_notes_of_cuts(made),
+        *_notes_of_implausible_rows(made),
+        *_notes_of_resampling(made),
+        *_notes_of_missing_joints(made),
+    ]
+
+
+def _notes_of_cuts(made: ImportResult) -> list[str]:
+    motions = defaultdict[str, list[str]](list)  # where it was cut → motions
+    for entry in made.entries:
+        cut = entry.meta.notes.get("cut")
+        if cut:
+            motions[cut].append(entry.meta.motion)
+    return [
+        f"{', '.join(names)}: {cut}; what follows was left out" for cut, names in motions.items()
+    ]
+
+
+def _notes_of_implausible_rows(made: ImportResult) -> list[str]:
+    counted = defaultdict[str, list[tuple[str, dict[str, Any]]]](list)  # channel → motion, rows
+    for entry in made.entries:
+        for channel, rows in entry.meta.notes.get("nonsense", {}).items():
+            counted[channel].append((entry.meta.motion, rows))
+    lines = []
+    for channel, counts in counted.items():
+        total = sum(rows["rows"] for _, rows in counts)
+        motion, first = counts[0]
+        done = ", ".join(dict.fromkeys(rows["done"] for _, rows in counts))
+        lines.append(
+            f"{channel} is implausible in {total} rows of {len(counts)} recordings (first "
+            f"{first['worst']:.4g} of {first['joints'][0]} in {motion}): {done}; --strict refuses "
+            "them"
+        )
+    return lines
+
+
+def _notes_of_resampling(made: ImportResult) -> list[str]:
+    uneven = [entry.meta for entry in made.entries if "why_resampled" in entry.meta.notes]
+    if not uneven:
+        return []
+    first = uneven[0].notes
+    motions = abbreviate([meta.motion for meta in uneven])
+    return [f"{motions}: {first['rows']}; {first['why_resampled']}"]
+
+
+def _notes_of_missing_joints(made: ImportResult) -> list[str]:
+    held: set[str] = set()
+    for entry in made.entries:
+        held |= set(entry.meta.notes.get("held_at_home", ()))
+    missing = [joint for joint in made.robot.operated if joint in held]
+    return [f"{abbreviate(missing)}: {HELD_AT_HOME}"] if missing else []
+
+
+def _show_offsets(screen: Out, made: ImportResult, lags: dict[str, list[float]]) -> None:
     """Show lag and static errors by joint."""
+    offsets = made.offsets or {}
     rows = []
     for name, counts in lags.items():
         median = f"{np.median(counts) * 1e3:.0f}" if counts else "–"
         joint = offsets.get(name)
         at_rest = _signed_mrad(joint.static_error, joint.stiction_band) if joint else "–"
         rows.append([name, median, at_rest, _signed_mrad(joint.tracking_offset) if joint else "–"])
-    out.table(
-        "Lag and errors at rest", ["joint", "lag, ms", "error at rest, mrad", "offset, mrad"], rows
-    )
+    screen.table("Lag and errors at rest", OFFSET_COLUMNS, rows)
     if offsets:
-        out.say(
-            "error at rest: state − command ± stiction, both directions. offset: without the sag that kp explains"
+        screen.say(
+            "error at rest: state − command ± stiction, both directions. offset: without the sag "
+            "that kp explains"
         )
 
 
-def show_diagnosis(out: Out, diagnosis: DoctorResult) -> None:
+def show_diagnosis(screen: Out, diagnosis: DoctorResult) -> None:
     """Tables of sequences and joints, the findings, the verdict."""
     shown = diagnosis.sequences[:MAX_ROWS]
-    columns = ["motion", "kg", "s", "Hz", "jitter, ms", "longest gap, ms", "lag, ms"]
-    out.table("Recordings", columns, [
-        [r["motion"] + f" ({r['repetition']})" * (r["repetition"] > 0), f"{r['payload_mass']:g}",
-         f"{r['seconds']:.1f}", f"{r['rate_hz']:.2f}", f"{r['jitter_ms']:.2f}", f"{r['longest_gap_ms']:.1f}",
-         _span(list(r["fast_lag_s"].values()))]
-        for r in shown
-    ])  # fmt: skip
-    if len(shown) < len(diagnosis.sequences):
-        out.say(f"… and {len(diagnosis.sequences) - len(shown)} more; --json lists all")
-    columns = ["joint", "commanded, rad", "lag, ms", "error at rest ± stiction, mrad", "rests"]
-    out.table("Joints", columns, [
-        [r["joint"], "{:.2f}…{:.2f}".format(*r["commanded_rad"]), _lag(r["lag_s"]),
-         _signed_mrad(r["static_error_rad"], r["stiction_band_rad"]), str(r["rests"])]
-        for r in diagnosis.joints
-    ])  # fmt: skip
-    out.findings(diagnosis.findings)
-    out.say("", diagnosis.verdict)
+    screen.table("Recordings", RECORDING_COLUMNS, [_recording_row(facts) for facts in shown])
+    more = len(diagnosis.sequences) - len(shown)
+    if more:
+        screen.say(f"… and {more} more; --json lists all")
+    screen.table("Joints", JOINT_COLUMNS, [_joint_row(facts) for facts in diagnosis.joints])
+    screen.findings(diagnosis.findings)
+    screen.say("", diagnosis.verdict)
+
+
+def _recording_row(facts: dict[str, Any]) -> list[str]:
+    repetition = f" ({facts['repetition']})" if facts["repetition"] else ""
+    return [
+        facts["motion"] + repetition,
+        f"{facts['payload_mass']:g}",
+        f"{facts['seconds']:.1f}",
+        f"{facts['rate_hz']:.2f}",
+        f"{facts['jitter_ms']:.2f}",
+        f"{facts['longest_gap_ms']:.1f}",
+        _span(list(facts["fast_lag_s"].values())),
+    ]
+
+
+def _joint_row(facts: dict[str, Any]) -> list[str]:
+    low, high = facts["commanded_rad"]
+    return [
+        facts["joint"],
+        f"{low:.2f}…{high:.2f}",
+        _lag(facts["lag_s"]),
+        _signed_mrad(facts["static_error_rad"], facts["stiction_band_rad"]),
+        str(facts["rests"]),
+    ]
 
 
 def _lag(values: dict[str, float] | None) -> str:
-    """Median and range, "104 (81–120)"."""
-    return (
-        f"{values['median'] * 1e3:.0f} ({_span([values['min'], values['max']])})" if values else "–"
-    )
+    """Return median and range, "104 (81–120)"."""
+    if not values:
+        return "–"
+    return f"{values['median'] * 1e3:.0f} ({_span([values['min'], values['max']])})"
 
 
 def _span(seconds: list[float]) -> str:
-    """[0.08, 0.12] → "80–120" ms."""
-    low, high = (f"{f(seconds) * 1e3:.0f}" for f in (min, max)) if seconds else ("–", "–")
+    """Return [0.08, 0.12] as "80–120" ms."""
+    if not seconds:
+        return "–"
+    low = f"{min(seconds) * 1e3:.0f}"
+    high = f"{max(seconds) * 1e3:.0f}"
     return low if low == high else f"{low}–{high}"
 
 
 def _signed_mrad(value: float | None, band: float | None = None) -> str:
-    """0.037, 0.031 → "+37 ± 31"."""
+    """Return 0.037, 0.031 as "+37 ± 31"."""
     if value is None:
         return "–"
-    return f"{round(value * 1e3):+d}" + (f" ± {band * 1e3:.0f}" if band is not None else "")
+    text = f"{round(value * 1e3):+d}"
+    return text if band is None else f"{text} ± {band * 1e3:.0f}"

@@ -1,4 +1,6 @@
-"""`gaponet COMMAND …`: one function per command; an input error is one line on stderr and exit code 2."""
+"""`gaponet COMMAND …`: one function per command; an input error is one line on stderr and exit
+code 2.
+"""
 
 from __future__ import annotations
 
@@ -33,52 +35,64 @@ TASKS = {
 }
 # Functions that have another name or are in another module than their command.
 ELSEWHERE = {
-    "import": "logs:import_logs", "doctor": "logs:doctor", "eval": "train:evaluate", "push": "share:push",
+    "import": "logs:import_logs",
+    "doctor": "logs:doctor",
+    "eval": "train:evaluate",
+    "push": "share:push",
     "pull": "share:pull",
-}  # fmt: skip
+}
 # Command → module:function. A module is imported when its command runs.
 COMMANDS = {
     name: f"gaponet.cli.{ELSEWHERE.get(name, f'{name}:{name}')}"
     for names in TASKS.values()
     for name in names
 }
+SIGPIPE = 13  # Windows does not have it
 ABOUT = "Close the gap between simulated and real motors from joint logs."
 
 
 def main(argv: Sequence[str] | None = None, begin: Callable[[], object] = lambda: None) -> int:
-    """Run a command; returns its exit code. `begin` is called once all options are understood, just before it."""
+    """Run a command; returns its exit code.
+
+    `begin` is called once all options are understood, just before it.
+    """
     for stream in (sys.stdout, sys.stderr):
-        if isinstance(
-            stream, io.TextIOWrapper
-        ):  # a terminal may lack our letters, and a file's name may be no text
+        # a terminal may lack our letters, and a file's name may be no text
+        if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
     try:
         _run(list(sys.argv[1:] if argv is None else argv), begin)
         sys.stdout.flush()
-    except GAPONetError as error:
-        return _say(f"{type(error).__name__.removesuffix('Error')}: {error}")
-    except ModuleNotFoundError as error:
-        missing = missing_package(error)
-        if missing is None:
-            raise
-        return _say(f"Missing: {missing}")
     except BrokenPipeError:  # `| head` has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 128 + 13  # SIGPIPE, which Windows has not
-    except OSError as error:  # a full disk, a missing permission: the user's to mend, not a bug
-        return _say(
-            ": ".join(
-                str(part) for part in ("File", error.filename, error.strerror or error) if part
-            )
-        )
-    except MemoryError:
-        return _say(
-            "Memory: there is not enough of it for this; give less at once, or close other programs"
-        )
+        return 128 + SIGPIPE
     except KeyboardInterrupt as stop:
         print(f"interrupted; {str(stop) or 'what was written so far is complete'}", file=sys.stderr)
         return 128 + signal.SIGINT
+    except Exception as error:
+        text = _error_line(error)
+        if text is None:
+            raise
+        print(escape(text), file=sys.stderr)
+        return 2
     return 0
+
+
+def _error_line(error: Exception) -> str | None:
+    """Return an error of input or of the machine in one line; None for a fault of the program."""
+    if isinstance(error, GAPONetError):
+        return f"{type(error).__name__.removesuffix('Error')}: {error}"
+    if isinstance(error, ModuleNotFoundError):
+        missing = missing_package(error)
+        return None if missing is None else f"Missing: {missing}"
+    if isinstance(error, OSError):  # a full disk, a missing permission: the user's to mend
+        parts = ("File", error.filename, error.strerror or error)
+        return ": ".join(str(part) for part in parts if part)
+    if isinstance(error, MemoryError):
+        return (
+            "Memory: there is not enough of it for this; give less at once, or close other programs"
+        )
+    return None
 
 
 def _run(argv: list[str], begin: Callable[[], object]) -> None:
@@ -90,7 +104,8 @@ def _run(argv: list[str], begin: Callable[[], object]) -> None:
     if not argv or argv[0] in ("-h", "--help"):
         print(_overview())
         return
-    name, completing = argv[0], argv[0].startswith("--tyro-")
+    name = argv[0]
+    completing = argv[0].startswith("--tyro-")
     if name not in COMMANDS and not completing:
         close = get_close_matches(name, COMMANDS, 1)
         guess = f"do you mean {close[0]}? " if close else ""
@@ -121,7 +136,9 @@ def _run(argv: list[str], begin: Callable[[], object]) -> None:
 
 
 def _require_counts(options: dict[str, Any]) -> None:
-    """Refuse an option that is nan, and a whole number below 0: no option has a meaning for them."""
+    """Refuse an option that is nan, and a whole number below 0: no option has a meaning for
+    them.
+    """
     for name, value in options.items():
         for number in value if isinstance(value, tuple) else (value,):
             if is_dataclass(number):
@@ -149,9 +166,3 @@ def _purpose(where: str) -> str:
     tree = ast.parse(Path(spec.origin).read_text(encoding="utf-8"))
     definition = next(n for n in tree.body if isinstance(n, ast.FunctionDef) and n.name == function)
     return (ast.get_docstring(definition) or "").splitlines()[0]
-
-
-def _say(text: str) -> int:
-    """An error in one line, and its exit code."""
-    print(escape(text), file=sys.stderr)
-    return 2

@@ -21,8 +21,8 @@ Run = Annotated[Folder, tyro.conf.arg(help="Run folder of gaponet train.", metav
 Known = Annotated[
     Folder,
     tyro.conf.arg(
-        help="Robot folder of gaponet identify, run folder of gaponet train, or name of a network of the package "
-        "(gaponet robot networks).",
+        help="Robot folder of gaponet identify, run folder of gaponet train, or name of a network "
+        "of the package (gaponet robot networks).",
         metavar="ROBOT|RUN|NAME",
     ),
 ]
@@ -39,26 +39,32 @@ Json = Annotated[Flag, tyro.conf.arg(help="One JSON object on stdout.")]
 
 
 def join_lines(command: Callable[..., Any]) -> None:
-    """Join the lines of each argument in the docstring of a command: tyro would show the line breaks."""
+    """Join the lines of each argument in the docstring of a command: tyro would show the line
+    breaks.
+    """
     command = inspect.unwrap(command)
     command.__doc__ = re.sub(r"\n {8,}", " ", inspect.getdoc(command) or "")
 
 
 def like(function: Callable[..., Any]) -> Callable[[Command], Command]:
-    """Decorator of a command: options that it does not explain itself mean what this function's arguments do."""
+    """Decorator of a command: options that it does not explain itself mean what this function's
+    arguments do.
+    """
 
     def decorate(command: Command) -> Command:
         own, theirs = (inspect.getdoc(f) or "" for f in (command, function))
         arguments = theirs.partition("Args:\n")[2].partition("\n\n")[0]
         about, _, explained = own.partition("Args:\n")
-        command.__doc__ = f"{about.rstrip()}\n\nArgs:\n{arguments}\n{explained}"  # of two explanations the last counts
+        # of two explanations the last counts
+        command.__doc__ = f"{about.rstrip()}\n\nArgs:\n{arguments}\n{explained}"
         return command
 
     return decorate
 
 
 def actions(**functions: Callable[..., Any]) -> Callable[[Command], Command]:
-    """Decorator of a command with actions, such as gaponet robot check: each runs while the command line is parsed.
+    """Decorator of a command with actions, such as gaponet robot check: each runs while the
+    command line is parsed.
 
     Args:
         functions: Name of the action → function.

@@ -1,4 +1,6 @@
-"""`gaponet run`: play a motion, or live targets, on a robot, real or virtual, with or without a model."""
+"""`gaponet run`: play a motion, or live targets, on a robot, real or virtual, with or without a
+model.
+"""
 
 from __future__ import annotations
 
@@ -8,23 +10,27 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from gaponet.api.run_options import Connection, ControlOptions, RunOptions
-from gaponet.api.run_report import PlanText, event_text
-from gaponet.api.run_robot import VIRTUAL, run_robot
+from gaponet.api.run_options import Connection, ControlConfig, ControlOptions, RunOptions
+from gaponet.api.run_report import Event, PlanText, event_text
+from gaponet.api.run_robot import VIRTUAL, known_drivers, run_robot
 from gaponet.cli.options import Json
 from gaponet.cli.out import Out, holds_folder
-from gaponet.hw.control.phases import ControlConfig
-from gaponet.hw.drivers.open import driver_names
 
 if TYPE_CHECKING:
     from gaponet.api.results import RunResult
-    from gaponet.hw.control.recording import Event
 
-DRIVERS = (VIRTUAL, *driver_names())
-DriverName = Annotated[str, tyro.constructors.PrimitiveConstructorSpec(
-    nargs=1, metavar=f"{{{','.join(DRIVERS)}}}", choices=DRIVERS, instance_from_str=lambda words: words[0],
-    is_instance=lambda value: isinstance(value, str), str_from_instance=lambda name: [name],
-)]  # fmt: skip
+DRIVERS = known_drivers()
+DriverName = Annotated[
+    str,
+    tyro.constructors.PrimitiveConstructorSpec(
+        nargs=1,
+        metavar=f"{{{','.join(DRIVERS)}}}",
+        choices=DRIVERS,
+        instance_from_str=lambda words: words[0],
+        is_instance=lambda value: isinstance(value, str),
+        str_from_instance=lambda name: [name],
+    ),
+]
 SUMMARY_COLUMNS = ["what", "value"]
 DRY_RUN_COLUMNS = ["joint", "from, rad", "to, rad", "fastest, rad/s", "torque asked, N·m"]
 
@@ -34,11 +40,11 @@ class ControlArgs(ControlOptions):
     """Options about robot and control loop. The docstrings are the command-line help."""
 
     driver: DriverName = VIRTUAL
-    """virtual (a simulated robot in this process), unitree (DDS: a real H1-2 or gaponet virtual serve), so101 (serial),
-    or the driver of an installed extension."""
+    """virtual (a simulated robot in this process), unitree (DDS: a real H1-2 or gaponet virtual
+    serve), so101 (serial), or the driver of an installed extension."""
     robot: str | None = None
-    """Robot name or folder; it may be identified. Default: the robot of the model's run; without a model h1_2, or so101
-    for the so101 driver."""
+    """Robot name or folder; it may be identified. Default: the robot of the model's run; without a
+    model h1_2, or so101 for the so101 driver."""
     connection: tyro.conf.OmitArgPrefixes[Connection] = Connection()  # noqa: RUF009
     """Connection to the robot."""
     control: tyro.conf.OmitArgPrefixes[ControlConfig] = ControlConfig()  # noqa: RUF009
@@ -50,9 +56,9 @@ class RunArgs(ControlArgs, RunOptions):
     """Options of a run: those of ControlArgs, compensation and live targets."""
 
     compensate: bool = False
-    """Correct the commands so that the robot follows the motion: feed-forward by --robot, best a folder of gaponet
-    identify. Velocity and acceleration of a motion are fed forward; those of live targets only with
-    --compensation.dynamics."""
+    """Correct the commands so that the robot follows the motion: feed-forward by --robot, best a
+    folder of gaponet identify. Velocity and acceleration of a motion are fed forward; those of live
+    targets only with --compensation.dynamics."""
 
 
 def run(
@@ -62,10 +68,12 @@ def run(
 ) -> None:
     """Play a motion or live targets on a robot; any key stops it.
 
-    Ctrl-C, Ctrl-Z and SIGTERM also stop it, within one control period. A real robot moves only after you typed yes.
+    Ctrl-C, Ctrl-Z and SIGTERM also stop it, within one control period. A real robot moves only
+    after you typed yes.
 
     Args:
-        motion: Motion name (gaponet collect lists the forms) or motion file (.txt, .csv, .npz). Or give --targets.
+        motion: Motion name (gaponet collect lists the forms) or motion file (.txt, .csv, .npz). Or
+            give --targets.
         args: Robot, control loop and model.
     """
     screen = Out(json)

@@ -38,7 +38,9 @@ def baseline_rows(baselines: Mapping[str, float]) -> list[list[str]]:
 
 
 def show_baselines(out: Out, baselines: Mapping[str, float], motions: int) -> None:
-    """Print the errors of predictions that need no identified simulator, measured on so many motions."""
+    """Print the errors of predictions that need no identified simulator, measured on so many
+    motions.
+    """
     fitted_to = "other motions" if motions > 1 else "the same motion"
     title = f"Without an identified simulator; delay and offset of each joint fitted to {fitted_to}"
     out.table(title, ["prediction", "error, mrad"], baseline_rows(baselines))
@@ -46,7 +48,8 @@ def show_baselines(out: Out, baselines: Mapping[str, float], motions: int) -> No
 
 def show_methods(out: Out, result: dict[str, Any], groups: tuple[str, ...] = GROUPS) -> None:
     """The tables of gap and eval: totals by method, then by each group."""
-    methods, kind = result["methods"], "VIRTUAL robot" if result["virtual"] else "real robot"
+    methods = result["methods"]
+    kind = "VIRTUAL robot" if result["virtual"] else "real robot"
     out.say(
         f", {kind}, {result['sequences']} recordings, open-loop rollouts of whole motions",
         result["robot"],

@@ -37,7 +37,8 @@ from gaponet.base.files import atomic_write, lock_folder, require_own_folder, wr
 from gaponet.base.structure import Name, read_format
 from gaponet.data.fingerprint import fingerprint
 from gaponet.data.journal import FILE as JOURNAL
-from gaponet.data.journal import Entry, EntryHeader, Findings, Journal
+from gaponet.data.journal import Entry as Entry
+from gaponet.data.journal import EntryHeader, Findings, Journal
 from gaponet.data.log import UNITS
 from gaponet.data.pair import Pair, SimulatedReplay
 from gaponet.data.sequence import ARRAYS, OPTIONAL, Sequence, SequenceMeta

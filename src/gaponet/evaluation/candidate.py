@@ -66,7 +66,7 @@ class Candidate:
         own = require_same_robot(
             load_robot(folder), robot, folder, RobotError, "data of this robot"
         )
-        if own.nominal is None:
+        if not own.is_identified:
             raise UsageError(
                 f"{folder}: nothing was identified of this robot; gaponet identify DATASET --out "
                 "FOLDER does"

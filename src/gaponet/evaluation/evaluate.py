@@ -342,7 +342,7 @@ def _methods(
         yield "delay_offset", nominal, DelayOffset.read(first.folder).corrector(nominal)
     identified = {}
     for candidate in candidates.values():
-        if candidate.robot.nominal is not None:
+        if candidate.robot.is_identified:
             identified[model_hash(candidate.robot)] = candidate.robot
     if len(identified) > 1:
         raise UsageError(

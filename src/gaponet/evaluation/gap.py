@@ -235,7 +235,7 @@ BESIDE_SERVOS = {"contact": "table", "hand": "payload_mounts", "links": "links"}
 
 def cause_steps(simulator: RobotSpec) -> list[GapStep]:
     """Return the simulators from the first cause on; the last one is the identified simulator."""
-    if simulator.nominal is None:
+    if not simulator.is_identified:
         return []
     robot = simulator.before_identification
     steps = []

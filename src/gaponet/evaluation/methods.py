@@ -46,7 +46,7 @@ def method(kind: str, simulator: RobotSpec) -> str:
     """Return the method of a model: its kind, with identified+ in front where it corrects an
     identified simulator.
     """
-    return (IDENTIFIED if simulator.nominal is not None else "") + kind
+    return (IDENTIFIED if simulator.is_identified else "") + kind
 
 
 def title(method: str) -> str:

@@ -41,9 +41,10 @@ class NetworkGain(NamedTuple):
     @property
     def helps(self) -> bool:
         """True if the reduction exceeds its standard error and MIN_RELATIVE_REDUCTION."""
-        return self.reduction > max(
+        result: bool = self.reduction > max(
             np.nan_to_num(self.standard_error), MIN_RELATIVE_REDUCTION * self.base_error
         )
+        return result
 
 
 def network_gain(methods: Scores, own: str) -> NetworkGain:

@@ -85,7 +85,8 @@ class HandIK:
         """Palm centre in the world at a posture (n,), (3,) m."""
         self.data.qpos = qpos
         mujoco.mj_kinematics(self.model, self.data)
-        return self.data.xpos[self.body].copy()
+        result: Array = self.data.xpos[self.body].copy()
+        return result
 
     def solve(self, qpos: Array, target: Array) -> Array:
         """Joint positions (n,) that bring the palm as near to target (3,) m as limits allow.
@@ -146,7 +147,8 @@ class Kit:
         for side, angles in values.items():
             arm = self.arms[side]
             q[arm.columns] = mirrored(np.asarray(angles), arm)
-        return np.clip(q, self.limits.low, self.limits.high)
+        result: Array = np.clip(q, self.limits.low, self.limits.high)
+        return result
 
     def at(self, q: Array, sides: Sides, point: Array | list[float], roll: float = 0.0) -> Array:
         """Posture q with these hands at a point, and their wrists rolled.

@@ -172,7 +172,8 @@ def stretch(ctrl: Array, factor: float) -> Array:
 
     rows = round((len(ctrl) - 1) * factor) + 1
     path = CubicSpline(np.arange(len(ctrl)), ctrl)
-    return path(np.linspace(0, len(ctrl) - 1, rows))
+    result: Array = path(np.linspace(0, len(ctrl) - 1, rows))
+    return result
 
 
 GRID_POINTS = 41  # across the range

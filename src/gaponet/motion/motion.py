@@ -87,7 +87,8 @@ PEAK_ACCELERATION = 10 / 3**0.5  # of one, times its duration squared, over its 
 def blend(s: Array) -> Array:
     """0 → 1 with zero velocity and acceleration at both ends; s is clipped to [0, 1]."""
     s = np.clip(s, 0.0, 1.0)
-    return s**3 * (10 - 15 * s + 6 * s**2)
+    result: Array = s**3 * (10 - 15 * s + 6 * s**2)
+    return result
 
 
 def through(points: Array, moves: Array, holds: Array, dt: float) -> Array:
@@ -113,7 +114,8 @@ def through(points: Array, moves: Array, holds: Array, dt: float) -> Array:
 
 def move_time(distance: Array, speed: float, least: float = 0.5) -> Array:
     """Duration of a minimum-jerk move whose peak speed is `speed` (rad/s), at least `least` s."""
-    return np.maximum(PEAK_SPEED * np.abs(distance) / speed, least)
+    result: Array = np.maximum(PEAK_SPEED * np.abs(distance) / speed, least)
+    return result
 
 
 def fade(steps: int, dt: float, ramp: float) -> Array:
@@ -121,4 +123,5 @@ def fade(steps: int, dt: float, ramp: float) -> Array:
     start at rest.
     """
     time = np.arange(steps) * dt
-    return blend(time / ramp) * blend((time[-1] - time) / ramp)
+    result: Array = blend(time / ramp) * blend((time[-1] - time) / ramp)
+    return result

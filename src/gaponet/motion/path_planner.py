@@ -56,7 +56,8 @@ class Trajectory:
         a, b = self.points[leg : leg + 2]
         since, until = self.times[leg : leg + 2]
         share = np.array((time - since) / (until - since))
-        return a + float(blend(share)) * (b - a)
+        result: Array = a + float(blend(share)) * (b - a)
+        return result
 
     def rows(self, dt: float) -> Array:
         """Return postures at a period of dt s, both ends included, (T, n) rad."""
@@ -78,7 +79,8 @@ def finish_search(search: Search[_T]) -> _T:
         try:
             next(search)
         except StopIteration as end:
-            return end.value
+            result: _T = end.value
+            return result
 
 
 def find_points(free: Free, start: Array, goal: Array, home: Array) -> Search[Array | None]:

@@ -349,7 +349,8 @@ class GapModel:
         """
         from gaponet.sim.batch import Condition
 
-        return self.contexts_of(robot, [Condition(0.0, "both", dt)])[0]
+        result: Array = self.contexts_of(robot, [Condition(0.0, "both", dt)])[0]
+        return result
 
     def contexts_of(self, robot: RobotSpec, conditions: list[Condition]) -> Array:
         """Measure answers to fixed probes, (conditions, 8n) rad: with empty hands, or loaded if

@@ -102,7 +102,8 @@ class Features(nn.Module):
         z = self.standardise(self.relative(x)).clamp(-MAX_FEATURE, MAX_FEATURE)
         if self.noise_std:
             z = z + self.noise_std * torch.randn_like(z)
-        return z
+        result: Tensor = z
+        return result
 
 
 class BoundedOutput(nn.Module):
@@ -159,7 +160,8 @@ class DeltaNet(nn.Module):
 
     def sensor_inputs(self, x: Tensor) -> Tensor:
         """x → inputs of the sensor predictor, (B, …)."""
-        return self.features(x)[:, self.features.layout.observation]
+        result: Tensor = self.features(x)[:, self.features.layout.observation]
+        return result
 
     def prepare(self, x: Tensor) -> Tensor:
         """x → input of `correct`, (B, …)."""

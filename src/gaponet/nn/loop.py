@@ -250,7 +250,8 @@ class DeltaLoop:
             self._action[...] = wanted + offset
             offset -= gain * (offset + self.answer())
         self.push(qpos, qvel, wanted)
-        return wanted + offset
+        result: Array = wanted + offset
+        return result
 
     # ---- internals
 

@@ -45,6 +45,8 @@ class NetworkCard:
         size_bytes: Size of all its files.
     """
 
+    headings = HEADINGS
+
     name: str
     robot: str
     gain_scale: float

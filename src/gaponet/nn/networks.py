@@ -114,7 +114,8 @@ class OperatorNet(DeltaNet):
         z = self.context_scale(x[:, self.features.layout.context]).clamp(-MAX_CONTEXT, MAX_CONTEXT)
         if self.features.noise_std:
             z = z + self.features.noise_std * torch.randn_like(z)
-        return z
+        result: Tensor = z
+        return result
 
     def arrange(self, z: Tensor) -> Tensor:
         """Features, and the context if there is one → [branch inputs | trunk inputs] of each
@@ -134,13 +135,15 @@ class OperatorNet(DeltaNet):
         shape = (-1, self.n, self.config.num_basis)
         branch = self.branch(branch_rows).reshape(shape)
         trunk = self.trunk(trunk_rows).reshape(shape)
-        return self.bounded((branch * trunk).sum(-1) + self.bias)
+        result: Tensor = self.bounded((branch * trunk).sum(-1) + self.bias)
+        return result
 
     def sensors(self, z: Tensor) -> Tensor:
         """Features → predicted sensor values, standardised, (B, 2nm): n positions and n velocities
         per probe.
         """
-        return self.predictor.mean(z[:, self.features.layout.observation])
+        result: Tensor = self.predictor.mean(z[:, self.features.layout.observation])
+        return result
 
 
 class DeltaMLP(DeltaNet):
@@ -154,7 +157,8 @@ class DeltaMLP(DeltaNet):
         self.net = dense(self.features.dim, hidden, n, zero_output=True)
 
     def correct(self, prepared: Tensor) -> Tensor:
-        return self.bounded(self.net(prepared))
+        result: Tensor = self.bounded(self.net(prepared))
+        return result
 
     @staticmethod
     def matched_hidden(
@@ -203,7 +207,8 @@ class SharedMLP(OperatorNet):
         self.net = dense(inputs, hidden, 1, zero_output=True)
 
     def correct(self, prepared: Tensor) -> Tensor:
-        return self.bounded(self.net(prepared).squeeze(-1))
+        result: Tensor = self.bounded(self.net(prepared).squeeze(-1))
+        return result
 
 
 NETWORKS: dict[ModelKind, Callable[[ModelConfig, int], DeltaNet]] = {

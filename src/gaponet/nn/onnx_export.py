@@ -123,7 +123,8 @@ def _with_facts(content: bytes, card: dict[str, Any]) -> bytes:
     graph = onnx.load_model_from_string(content)
     facts = json.dumps(facts_in_network(card), ensure_ascii=False)
     onnx.helper.set_model_props(graph, {CARD_FACTS: facts})
-    return graph.SerializeToString()
+    result: bytes = graph.SerializeToString()
+    return result
 
 
 def with_small_matrices(content: bytes, *, int16: bool) -> bytes:

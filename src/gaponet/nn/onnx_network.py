@@ -35,7 +35,8 @@ class OnnxNetwork:
         self.session = ort.InferenceSession(content, options, providers=["CPUExecutionProvider"])
 
     def __call__(self, x: Array) -> Array:
-        return self.session.run(None, {"x": x})[0]
+        result: Array = self.session.run(None, {"x": x})[0]
+        return result
 
     @property
     def stored_facts(self) -> dict[str, Any]:

@@ -128,7 +128,8 @@ class SensorPredictor(nn.Module):
         observed_weight, chosen_weight = first.weight.split(sizes, dim=1)
         from_observed = linear(observed, observed_weight)
         from_chosen = linear(chosen, chosen_weight, first.bias)
-        return rest(from_observed.unsqueeze(1) + from_chosen)
+        result: Tensor = rest(from_observed.unsqueeze(1) + from_chosen)
+        return result
 
 
 class JointSensorPredictor(SensorPredictor):
@@ -271,7 +272,8 @@ class PaperNet(DeltaNet):
             z = z + self.features.noise_std * torch.randn_like(z)
         if self.config.predictor_inputs == "equation_1":
             z = torch.cat([z, self.real_state(x)], dim=1)
-        return z
+        result: Tensor = z
+        return result
 
     def real_state(self, x: Tensor) -> Tensor:
         """x → scaled [q_real − q | q̇_real − q̇ | 1], (B, 2n + 1), or zeros where the recorded
@@ -292,14 +294,16 @@ class PaperNet(DeltaNet):
         if source == "none":
             return z
         if source == "fixed":
-            return self.sensor_scale(x[:, self.features.layout.sensors])
+            scaled: Tensor = self.sensor_scale(x[:, self.features.layout.sensors])
+            return scaled
         if not self.training:
             return z if source == "learned" else self.predictor.mean(z)
         noise = torch.randn(len(z), self.config.sensor_dim(self.n), device=z.device)
         if source == "learned":
             return torch.cat([z, noise], dim=1)
         mean, log_var = self.predictor(z)
-        return mean + noise * (0.5 * log_var).exp()
+        sample: Tensor = mean + noise * (0.5 * log_var).exp()
+        return sample
 
     # ---- the operator, which PPO trains
 
@@ -314,7 +318,8 @@ class PaperNet(DeltaNet):
         shape = (-1, self.config.num_basis, self.n)
         b = self.branch(seen_by_branch).reshape(shape)  # (2)
         y = self.trunk(query).reshape(shape)  # (3)
-        return self.bounded((b * y).sum(1))  # (4)
+        result: Tensor = self.bounded((b * y).sum(1))  # (4)
+        return result
 
     def probed(self, inputs: Tensor) -> Tensor:
         """Result of `sensors` with learned probes → S, (B, 2nm)."""

@@ -72,7 +72,8 @@ class TreesNet(DeltaNet):
         return self.features.relative(x)[:, self.columns]
 
     def correct(self, prepared: Tensor) -> Tensor:
-        return self.bounded(self._sums(prepared))
+        result: Tensor = self.bounded(self._sums(prepared))
+        return result
 
     def _sums(self, prepared: Tensor) -> Tensor:
         """Output of `prepare` → sums of leaves and c, in units of bounded.scale, (B, n)."""

@@ -1,13 +1,15 @@
-"""Robots and trained networks that people name: folders of the package, and hf://USER/NAME of the Hugging Face Hub.
+"""Robots and trained networks that people name: folders of the package, and hf://USER/NAME of the
+Hugging Face Hub.
 
 Identified robots of the package are here, its networks in nn/packaged_networks.py:
 
-IDENTIFIED/ROBOT@DATA/robot.toml, robot.xml  the identified robot    card.json          what it is, and how good it is
-                      identified.json        hashes of its data      uncertainty.json   of its values
-                      plain_servos.json      its nearest PD servos, for export without recordings
+IDENTIFIED/ROBOT@DATA/robot.toml, robot.xml  the identified robot    card.json          what it is,
+                      and how good it is identified.json        hashes of its data
+                      uncertainty.json   of its values plain_servos.json      its nearest PD servos,
+                      for export without recordings
 
-`benchmarks/ship_robots.py` makes such a folder from one of `gaponet identify`. The Hub's own library keeps what it
-downloads in its cache, by commit. Nothing writes into either afterwards.
+`benchmarks/ship_robots.py` makes such a folder from one of `gaponet identify`. The Hub's own
+library keeps what it downloads in its cache, by commit. Nothing writes into either afterwards.
 """
 
 from __future__ import annotations
@@ -28,10 +30,23 @@ SNAPSHOTS = "snapshots"  # folder of the Hub's cache that holds a folder for eac
 FILE_REFERENCES = re.compile(r"<include\b|\bfile\s*=|\b(mesh|texture|asset)dir\s*=")
 # What a robot folder has, and what a run has that is not trained further.
 FILES = (
-    "robot.toml", "robot.xml", "collision.toml", "look.toml", "identified.json", "uncertainty.json",
-    "config.json", "split.json", "delay_offset.json", "model/card.json", "model/model.onnx", "robot/robot.toml",
-    "robot/robot.xml", "robot/collision.toml", "robot/look.toml", "robot/identified.json",
-)  # fmt: skip
+    "robot.toml",
+    "robot.xml",
+    "collision.toml",
+    "look.toml",
+    "identified.json",
+    "uncertainty.json",
+    "config.json",
+    "split.json",
+    "delay_offset.json",
+    "model/card.json",
+    "model/model.onnx",
+    "robot/robot.toml",
+    "robot/robot.xml",
+    "robot/collision.toml",
+    "robot/look.toml",
+    "robot/identified.json",
+)
 
 
 @dataclass(frozen=True)
@@ -61,8 +76,9 @@ class Catalogue:
     def find(self, name_or_path: str | Path) -> Path | None:
         """Return the folder of a name; None if the package has no such name, or if it is a path.
 
-        One word without a slash is a name if the package has it. The command line drops the slash of "./so101@sage",
-        so a folder of that name in the working directory needs its absolute path.
+        One word without a slash is a name if the package has it. The command line drops the slash
+        of "./so101@sage", so a folder of that name in the working directory needs its absolute
+        path.
 
         Raises:
             UsageError: It is a name of the package, and of something in the working directory.
@@ -73,8 +89,8 @@ class Catalogue:
             return None
         if path.exists():
             raise UsageError(
-                f"'{text}' is a {self.what} of the package and a folder here; for the folder give {path.absolute()}, "
-                f"for the {self.what} work in another directory"
+                f"'{text}' is a {self.what} of the package and a folder here; for the folder give "
+                f"{path.absolute()}, for the {self.what} work in another directory"
             )
         return self.place / text
 
@@ -85,10 +101,12 @@ def identified_catalogue() -> Catalogue:
 
 
 def hub_folder(name_or_path: str | Path) -> Path | None:
-    """Return the folder of a robot or a run of the Hub, downloaded if need be; None if it is no address of the Hub.
+    """Return the folder of a robot or a run of the Hub, downloaded if need be; None if it is no
+    address of the Hub.
 
     Args:
-        name_or_path: hf://USER/NAME, with @REVISION behind it for another branch, tag or commit than main.
+        name_or_path: hf://USER/NAME, with @REVISION behind it for another branch, tag or commit
+            than main.
 
     Raises:
         RemoteError: It cannot be reached.
@@ -121,7 +139,9 @@ def is_from_hub(folder: Path) -> bool:
 
 
 def require_self_contained(folder: Path) -> None:
-    """Refuse a stored robot whose MJCF names other files: a downloaded one could name any file of this machine."""
+    """Refuse a stored robot whose MJCF names other files: a downloaded one could name any file of
+    this machine.
+    """
     try:
         table = tomllib.loads((folder / "robot.toml").read_text(encoding="utf-8"))
     except ValueError:  # load_robot says what is wrong

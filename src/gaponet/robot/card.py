@@ -1,4 +1,6 @@
-"""What the card of a robot or a network of the package says for people: data, errors, limits of use."""
+"""What the card of a robot or a network of the package says for people: data, errors, limits of
+use.
+"""
 
 from __future__ import annotations
 
@@ -15,8 +17,14 @@ from gaponet.robot.by_name import CARD, identified_catalogue
 
 PUBLISHED = "published"  # field of card.json with a Published
 ROBOT_HEADINGS = (
-    "name", "data", "motions of the test", "nominal → identified, mrad", "payload, kg", "rate, Hz", "date",
-)  # fmt: skip
+    "name",
+    "data",
+    "motions of the test",
+    "nominal → identified, mrad",
+    "payload, kg",
+    "rate, Hz",
+    "date",
+)
 
 Text = Annotated[str, Len(1)]
 
@@ -63,8 +71,9 @@ class Published:
         data: Data set.
         test: Error on its test motions.
         limits_of_use: What it is not for, in a sentence.
-        largest_difference_rad: Of a network whose weights have fewer digits here, the largest difference from the one
-            that was trained over states of the training data, rad. 0 if all weights are equal.
+        largest_difference_rad: Of a network whose weights have fewer digits here, the largest
+            difference from the one that was trained over states of the training data, rad. 0 if all
+            weights are equal.
     """
 
     licence: Text
@@ -95,7 +104,8 @@ class RobotFacts:
         rates_hz: Their control rates, Hz.
         units: Their units.
         gaponet: Version that identified the robot.
-        plain_mrad: Error on the test motions of its nearest PD servos, which have no servo model, mrad.
+        plain_mrad: Error on the test motions of its nearest PD servos, which have no servo model,
+            mrad.
         published: Licence, data, errors and limits of use.
     """
 
@@ -141,8 +151,9 @@ class RobotCard:
         """Return its errors on the test motions as a sentence, for an export without recordings."""
         test = self.facts.published.test
         return (
-            f"on {test.recordings} recordings that were not fitted: nominal {test.nominal_mrad:.2f} mrad, identified "
-            f"{test.model_mrad:.2f}, without the servo model {self.facts.plain_mrad:.2f}"
+            f"on {test.recordings} recordings that were not fitted: nominal "
+            f"{test.nominal_mrad:.2f} mrad, identified {test.model_mrad:.2f}, without the servo "
+            f"model {self.facts.plain_mrad:.2f}"
         )
 
     def details(self) -> str:
@@ -151,8 +162,8 @@ class RobotCard:
         published = facts.published
         return (
             f"licence {published.licence}, model {facts.model}, gaponet {facts.gaponet}; data: "
-            f"{published.data.address}, units {', '.join(facts.units)}; without the servo model {facts.plain_mrad:.2f} "
-            f"mrad. {published.limits_of_use}"
+            f"{published.data.address}, units {', '.join(facts.units)}; without the servo model "
+            f"{facts.plain_mrad:.2f} mrad. {published.limits_of_use}"
         )
 
 

@@ -1,7 +1,8 @@
-"""Collision check of commands: distances between capsules of the robot, and from capsules to the floor or table.
+"""Collision check of commands: distances between capsules of the robot, and from capsules to the
+floor or table.
 
-`collision.toml` in the robot's folder holds capsules per body, groups of bodies that are not compared, and the height
-of the floor or table. A robot without that file is not checked.
+`collision.toml` in the robot's folder holds capsules per body, groups of bodies that are not
+compared, and the height of the floor or table. A robot without that file is not checked.
 """
 
 from __future__ import annotations
@@ -41,7 +42,9 @@ class Box:
 
 @dataclass(frozen=True)
 class Plane:
-    """Level floor or table: its height in the MJCF's world, and prefixes of the bodies that stand on it."""
+    """Level floor or table: its height in the MJCF's world, and prefixes of the bodies that stand
+    on it.
+    """
 
     height: Metres = 0.0
     stands: str = ""
@@ -59,7 +62,8 @@ class Shapes:
 
 
 class Collision:
-    """Collision model of a robot: capsules, the pairs that can collide, and the capsules that can hit the plane.
+    """Collision model of a robot: capsules, the pairs that can collide, and the capsules that can
+    hit the plane.
 
     Attributes:
         checked: True if the robot has shapes.
@@ -83,48 +87,50 @@ class Collision:
         self.data = mujoco.MjData(model)
         shapes = Shapes() if unchecked else read_shapes(robot.folder)
         _require_bodies(robot, model, shapes)
-        groups = [group.split() for group in shapes.same_limb]
-        self.checked, self.clearance = bool(shapes.capsule), shapes.clearance
-        self.names = [c["body"] for c in shapes.capsule]
+        self.checked = bool(shapes.capsule)
+        self.clearance = shapes.clearance
+        self.names = [capsule["body"] for capsule in shapes.capsule]
         self.body = np.array([model.body(name).id for name in self.names], int)
-        self.ends = np.array([[c["from"], c["to"]] for c in shapes.capsule], float).reshape(
-            -1, 2, 3
-        )
-        self.radius = np.array([c["radius"] for c in shapes.capsule], float)
-        self.pairs = np.array(
-            [
-                (i, k)
-                for i, k in itertools.combinations(range(len(self.names)), 2)
-                if self.names[i] != self.names[k]
-                and not _grouped(self.names[i], self.names[k], groups)
-            ],
-            int,
-        ).reshape(-1, 2)
+        ends = [[capsule["from"], capsule["to"]] for capsule in shapes.capsule]
+        self.ends = np.array(ends, float).reshape(-1, 2, 3)
+        self.radius = np.array([capsule["radius"] for capsule in shapes.capsule], float)
+        self.pairs = self._pairs_that_can_collide(shapes)
         plane = shapes.plane
         self.height = plane.height if height is None and plane else height
         if not abs(self.height or 0.0) <= 10:
             raise RobotError(
                 f"the plane is at {self.height:g} m; give its height in metres, up to 10 (--plane)"
             )
-        stands = tuple(plane.stands.split()) if plane else ()
-        above = [
-            i
-            for i, n in enumerate(self.names)
-            if self.height is not None and not n.startswith(stands)
-        ]
+        above = []
+        if self.height is not None:
+            stands = tuple(plane.stands.split()) if plane else ()
+            above = [i for i, name in enumerate(self.names) if not name.startswith(stands)]
         self.above = np.array(above, int)
 
+    def _pairs_that_can_collide(self, shapes: Shapes) -> Array:
+        """Return the capsules of different bodies that are not of one limb, (pairs, 2)."""
+        groups = [group.split() for group in shapes.same_limb]
+        pairs = []
+        for i, k in itertools.combinations(range(len(self.names)), 2):
+            one = self.names[i]
+            other = self.names[k]
+            if one != other and not _grouped(one, other, groups):
+                pairs.append((i, k))
+        return np.array(pairs, int).reshape(-1, 2)
+
     def distances(self, qpos: Array) -> Array:
-        """Return distances of pairs, then of capsules to the plane, (T, n) rad → (T, pairs + capsules) m."""
-        position, rotation = (
-            np.empty((len(qpos), len(self.body), 3)),
-            np.empty((len(qpos), len(self.body), 9)),
-        )
-        data, body = self.data, self.body
+        """Return distances of pairs, then of capsules to the plane, (T, n) rad → (T, pairs +
+        capsules) m.
+        """
+        position = np.empty((len(qpos), len(self.body), 3))
+        rotation = np.empty((len(qpos), len(self.body), 9))
+        data = self.data
+        body = self.body
         for t, q in enumerate(qpos):
             data.qpos = q
             mujoco.mj_kinematics(self.model, data)
-            position[t], rotation[t] = data.xpos[body], data.xmat[body]
+            position[t] = data.xpos[body]
+            rotation[t] = data.xmat[body]
         ends = (
             self.ends @ rotation.reshape(*rotation.shape[:2], 3, 3).swapaxes(-1, -2)
             + position[:, :, None]
@@ -138,11 +144,15 @@ class Collision:
 
     def distance(self, qpos: Array) -> Array:
         """Return the smallest distance at each posture, (T, n) rad → (T,) m; inf without shapes."""
-        return self.distances(qpos).min(axis=1, initial=np.inf)
+        result: Array = self.distances(qpos).min(axis=1, initial=np.inf)
+        return result
 
     def along(self, ctrl: Array) -> Array:
-        """Return the smallest distance of each pair and capsule along a command, (T, n) rad → (pairs + capsules,) m."""
-        return self.distances(thinned(ctrl)).min(axis=0, initial=np.inf)
+        """Return the smallest distance of each pair and capsule along a command, (T, n) rad →
+        (pairs + capsules,) m.
+        """
+        result: Array = self.distances(thinned(ctrl)).min(axis=0, initial=np.inf)
+        return result
 
     def nearest(self, free: Array) -> str:
         """Name the nearest pair for messages, from distances (pairs + capsules,) m."""
@@ -153,19 +163,24 @@ class Collision:
 
 
 def thinned(ctrl: Array, step: float = POSTURE_STEP_RAD) -> Array:
-    """Select rows of a command (T, n) rad, so that no joint moves more than `step` rad between them if possible."""
+    """Select rows of a command (T, n) rad, so that no joint moves more than `step` rad between
+    them if possible.
+    """
     travelled = np.concatenate([[0.0], np.abs(np.diff(ctrl, axis=0)).max(axis=1).cumsum()])
     marks = np.searchsorted(travelled, np.arange(0.0, travelled[-1], step))
-    return ctrl[np.unique(np.append(marks, len(ctrl) - 1))]
+    result: Array = ctrl[np.unique(np.append(marks, len(ctrl) - 1))]
+    return result
 
 
 def segment_distance(a0: Array, a1: Array, b0: Array, b1: Array) -> Array:
     """Return the distance between segments a0–a1 and b0–b1, (…, 3) each → (…).
 
-    The nearest points of the two lines are clamped to the segments in turn (Ericson, Real-Time Collision
-    Detection, 5.1.9).
+    The nearest points of the two lines are clamped to the segments in turn (Ericson, Real-Time
+    Collision Detection, 5.1.9).
     """
-    u, v, w = a1 - a0, b1 - b0, a0 - b0
+    u = a1 - a0
+    v = b1 - b0
+    w = a0 - b0
     uu, vv, uv, uw, vw = (
         np.einsum("...i,...i", x, y) for x, y in ((u, u), (v, v), (u, v), (u, w), (v, w))
     )
@@ -174,7 +189,8 @@ def segment_distance(a0: Array, a1: Array, b0: Array, b1: Array) -> Array:
     t = np.clip((uv * s + vw) / np.maximum(vv, tiny), 0.0, 1.0)
     s = np.clip((uv * t - uw) / np.maximum(uu, tiny), 0.0, 1.0)
     gap = w + s[..., None] * u - t[..., None] * v
-    return np.sqrt(np.einsum("...i,...i", gap, gap))
+    result: Array = np.sqrt(np.einsum("...i,...i", gap, gap))
+    return result
 
 
 def read_shapes(folder: Path) -> Shapes:
@@ -195,7 +211,8 @@ def _require_bodies(robot: RobotSpec, model: mujoco.MjModel, shapes: Shapes) -> 
     bodies = [model.body(b).name for b in range(model.nbody)]
     for capsule in shapes.capsule:
         if capsule["body"] not in bodies:
-            path, there = robot.folder / "collision.toml", ", ".join(bodies)
+            path = robot.folder / "collision.toml"
+            there = ", ".join(bodies)
             raise RobotError(
                 f"{path}: capsule names body '{capsule['body']}', the MJCF has: {there}"
             )

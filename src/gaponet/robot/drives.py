@@ -1,10 +1,13 @@
-"""Gains, torque limit and home of each joint, from the model's actuators or from the user, with their sources."""
+"""Gains, torque limit and home of each joint, from the model's actuators or from the user, with
+their sources.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -73,57 +76,95 @@ def drives(
     Raises:
         UsageError: An option is no number or names no joint, or a joint has no kp.
     """
-    words = {name: _by_joint(name, given[name], joints) for name in given}
-    servos = {
-        j: servo_type(word.rpartition("=")[2], f"--servo {word}")
-        for j, word in words.pop("servo").items()
-    }
-    options = {
-        name: {j: _number(name, word) for j, word in by.items()} for name, by in words.items()
-    }
-    result, without_gain = [], []
+    servos = {}
+    for joint, word in _by_joint("servo", given["servo"], joints).items():
+        servos[joint] = servo_type(word.rpartition("=")[2], f"--servo {word}")
+    stated: dict[str, dict[str, float]] = {}
+    for name in ("kp", "kd", "effort_limit"):
+        words = _by_joint(name, given[name], joints)
+        stated[name] = {joint: _number(name, word) for joint, word in words.items()}
+    found = []
+    without_gain = []
     for name in joints:
         j = model.joint(name).id
-        actuators = np.flatnonzero(
-            np.isin(model.actuator_trntype, ON_JOINT) & (model.actuator_trnid[:, 0] == j)
-        ).tolist()
-        kp, kd = _gains(model, actuators)
-        sources = dict.fromkeys(("kp", "kd"), f"its actuator in {file}")
-        if not kp and name not in options["kp"]:
+        is_own = np.isin(model.actuator_trntype, ON_JOINT) & (model.actuator_trnid[:, 0] == j)
+        actuators: list[int] = np.flatnonzero(is_own).tolist()
+        kp, kd = _gains_and_sources(model, name, actuators, stated, file)
+        if not kp.value and name not in stated["kp"]:
             without_gain.append(name)
-        if not kd:
-            sources["kd"] = f"its actuator in {file} has none" if actuators else f"{file} has none"
-        if name in options["kp"]:
-            kp, kd, sources["kp"], sources["kd"] = (
-                options["kp"][name],
-                0.0,
-                "--kp",
-                "--kp was given without --kd",
-            )
-        if name in options["kd"]:
-            kd, sources["kd"] = options["kd"][name], "--kd"
-        limits = [
-            *_limits(model, j, actuators, file),
-            (NO_LIMIT, f"{file} has none: write the motor's"),
-        ]
-        limit, why = min(limits, key=lambda x: x[0])
-        servo = servos.get(name)
-        if servo is not None and servo.effort_limit is not None:
-            limit, why = servo.effort_limit, f"servo {servo.name}"
-        if name in options["effort_limit"]:
-            limit, why = options["effort_limit"][name], "--effort-limit"
+        limit = _limit_and_source(model, name, actuators, stated, servos.get(name), file)
         actuator = model.actuator(actuators[0]).name if len(actuators) == 1 else ""
         home = float(pose[model.jnt_qposadr[j]])
-        result.append(
-            Drive(name, actuator, kp, sources["kp"], kd, sources["kd"], limit, why, home, servo)
+        found.append(
+            Drive(
+                name,
+                actuator,
+                kp.value,
+                kp.source,
+                kd.value,
+                kd.source,
+                limit.value,
+                limit.source,
+                home,
+                servos.get(name),
+            )
         )
     if without_gain:
         raise UsageError(
-            f"{file} has no position gain for {abbreviate(without_gain)}: give those of the controller that recorded "
-            "the logs, --kp 100 '*wrist*=20' and --kd likewise (N·m/rad, N·m·s/rad); if they are unknown, a guess is "
-            "enough, gaponet identify corrects it within a factor of 50"
+            f"{file} has no position gain for {abbreviate(without_gain)}: give those of the "
+            "controller that recorded the logs, --kp 100 '*wrist*=20' and --kd likewise (N·m/rad, "
+            "N·m·s/rad); if they are unknown, a guess is enough, gaponet identify corrects it "
+            "within a factor of 50"
         )
-    return tuple(result)
+    return tuple(found)
+
+
+class _Sourced(NamedTuple):
+    """A number and where it comes from."""
+
+    value: float
+    source: str
+
+
+def _gains_and_sources(
+    model: mujoco.MjModel,
+    joint: str,
+    actuators: list[int],
+    stated: dict[str, dict[str, float]],
+    file: str,
+) -> tuple[_Sourced, _Sourced]:
+    """Return kp, N·m/rad, and kd, N·m·s/rad: the user's, else those of the actuators."""
+    own_kp, own_kd = _gains(model, actuators)
+    kp = _Sourced(own_kp, f"its actuator in {file}")
+    kd = _Sourced(own_kd, f"its actuator in {file}")
+    if not own_kd:
+        why = f"its actuator in {file} has none" if actuators else f"{file} has none"
+        kd = _Sourced(0.0, why)
+    if joint in stated["kp"]:
+        kp = _Sourced(stated["kp"][joint], "--kp")
+        kd = _Sourced(0.0, "--kp was given without --kd")
+    if joint in stated["kd"]:
+        kd = _Sourced(stated["kd"][joint], "--kd")
+    return kp, kd
+
+
+def _limit_and_source(
+    model: mujoco.MjModel,
+    joint: str,
+    actuators: list[int],
+    stated: dict[str, dict[str, float]],
+    servo: ServoType | None,
+    file: str,
+) -> _Sourced:
+    """Return the torque limit, N·m: the user's, else the servo type's, else the model's least."""
+    if joint in stated["effort_limit"]:
+        return _Sourced(stated["effort_limit"][joint], "--effort-limit")
+    if servo is not None and servo.effort_limit is not None:
+        return _Sourced(servo.effort_limit, f"servo {servo.name}")
+    limits = list(_limits(model, model.joint(joint).id, actuators, file))
+    limits.append((NO_LIMIT, f"{file} has none: write the motor's"))
+    value, source = min(limits, key=lambda limit: limit[0])
+    return _Sourced(value, source)
 
 
 def _gains(model: mujoco.MjModel, actuators: list[int]) -> tuple[float, float]:
@@ -140,7 +181,9 @@ def _gains(model: mujoco.MjModel, actuators: list[int]) -> tuple[float, float]:
 def _limits(
     model: mujoco.MjModel, j: int, actuators: list[int], file: str
 ) -> Iterator[tuple[float, str]]:
-    """Yield the torque limits that the model states for a joint, with sources; of both directions, the smaller."""
+    """Yield the torque limits that the model states for a joint, with sources; of both directions,
+    the smaller.
+    """
     if model.jnt_actfrclimited[j]:
         yield (
             float(np.abs(model.jnt_actfrcrange[j]).min()),
@@ -160,10 +203,12 @@ def _limits(
 
 def _by_joint(name: str, words: tuple[str, ...], joints: list[str]) -> dict[str, str]:
     """Return joint → its last word among ("100", "*wrist*=20")."""
-    by, option = dict[str, str](), f"--{name.replace('_', '-')}"
+    by = dict[str, str]()
+    option = f"--{name.replace('_', '-')}"
     if any("=" not in word for word in words[1:]):
         raise UsageError(
-            f"{option} {' '.join(words)}: give one value for all joints first, then {joints[0]}=NUMBER"
+            f"{option} {' '.join(words)}: give one value for all joints first, then "
+            f"{joints[0]}=NUMBER"
         )
     for word in words:
         matches = [j for j in joints if fnmatchcase(j, word.rpartition("=")[0] or "*")]
@@ -180,6 +225,7 @@ def _number(name: str, word: str) -> float:
         value = np.nan
     if not 0 <= value <= NO_LIMIT:
         raise UsageError(
-            f"--{name.replace('_', '-')} {word}: give a number from 0 to {NO_LIMIT:g}, or PATTERN=NUMBER"
+            f"--{name.replace('_', '-')} {word}: give a number from 0 to {NO_LIMIT:g}, or "
+            "PATTERN=NUMBER"
         )
     return value

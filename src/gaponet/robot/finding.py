@@ -29,12 +29,15 @@ class Finding:
 
     @staticmethod
     def proposal(findings: list[Finding]) -> str:
-        """Return lines for logs.toml, with the findings that they correct as comments, and the names of the others."""
+        """Return lines for logs.toml, with the findings that they correct as comments, and the
+        names of the others.
+        """
         bad = [f for f in findings if f.level in ("warning", "error")]
         if not bad:
             return "# gaponet doctor --fix: nothing to mend.\n"
         lines = [
-            "# gaponet doctor --fix: a proposal, applied to nothing. Check it, add it to the logs.toml of these logs,",
+            "# gaponet doctor --fix: a proposal, applied to nothing. Check it, add it to the "
+            "logs.toml of these logs,",
             "# import into a new folder and call the doctor again. Joints have the robot's names.",
             "",
         ]

@@ -1,9 +1,12 @@
-"""Fingerprint of a compiled model: lines of rounded numbers. Two models with equal lines have equal dynamics.
+"""Fingerprint of a compiled model: lines of rounded numbers.
 
-The lines do not depend on how a model was written. Bodies welded together are one link, inertias are tensors about the
-link's centre, and positions are those of the reference pose. Comments, file names, geoms without contact, sites,
-cameras and sensors are ignored. Rounding steps are far below any physical effect and far above the differences between
-compilers. They are no decimal fractions, because a number from a file could lie half way between two of those.
+Two models with equal lines have equal dynamics.
+
+The lines do not depend on how a model was written. Bodies welded together are one link, inertias
+are tensors about the link's centre, and positions are those of the reference pose. Comments, file
+names, geoms without contact, sites, cameras and sensors are ignored. Rounding steps are far below
+any physical effect and far above the differences between compilers. They are no decimal fractions,
+because a number from a file could lie half way between two of those.
 """
 
 from __future__ import annotations
@@ -16,22 +19,47 @@ import numpy as np
 from gaponet.base.arrays import Array
 
 NO_DECIMAL = 1.0471975511965976
-LENGTH_STEP, MASS_STEP, INERTIA_STEP = (
-    1e-7 * NO_DECIMAL,
-    1e-7 * NO_DECIMAL,
-    1e-11 * NO_DECIMAL,
-)  # m, kg, kg·m²
+# m, kg, kg·m²
+LENGTH_STEP = 1e-7 * NO_DECIMAL
+MASS_STEP = 1e-7 * NO_DECIMAL
+INERTIA_STEP = 1e-11 * NO_DECIMAL
 MESH_STEP = 1e-4 * NO_DECIMAL  # m, of the extent of a mesh
 JOINT_FIELDS = ("solref", "solimp", "margin", "actgravcomp")
 DOF_FIELDS = ("armature", "frictionloss", "solref", "solimp")
 ACTUATOR_FIELDS = (
-    "trntype", "gear", "gaintype", "gainprm", "biastype", "biasprm", "dyntype", "dynprm", "armature", "damping",
-    "dampingpoly", "delay", "history", "user",
-)  # fmt: skip
+    "trntype",
+    "gear",
+    "gaintype",
+    "gainprm",
+    "biastype",
+    "biasprm",
+    "dyntype",
+    "dynprm",
+    "armature",
+    "damping",
+    "dampingpoly",
+    "delay",
+    "history",
+    "user",
+)
 OPTIONS = (
-    "integrator", "cone", "solver", "gravity", "wind", "density", "viscosity", "impratio", "iterations", "tolerance",
-    "ls_iterations", "ls_tolerance", "noslip_iterations", "noslip_tolerance", "ccd_iterations", "ccd_tolerance",
-)  # fmt: skip
+    "integrator",
+    "cone",
+    "solver",
+    "gravity",
+    "wind",
+    "density",
+    "viscosity",
+    "impratio",
+    "iterations",
+    "tolerance",
+    "ls_iterations",
+    "ls_tolerance",
+    "noslip_iterations",
+    "noslip_tolerance",
+    "ccd_iterations",
+    "ccd_tolerance",
+)
 IGNORED_FLAGS = {
     "mjDSBL_WARMSTART",
     "mjDSBL_SENSOR",
@@ -39,8 +67,20 @@ IGNORED_FLAGS = {
     "mjDSBL_AUTORESET",
     "mjDSBL_ISLAND",
 }
-GEOM_FIELDS = ("type", "contype", "conaffinity", "condim", "priority", "friction", "margin", "gap", "solref", "solimp",
-        "solmix", "fluid")  # fmt: skip
+GEOM_FIELDS = (
+    "type",
+    "contype",
+    "conaffinity",
+    "condim",
+    "priority",
+    "friction",
+    "margin",
+    "gap",
+    "solref",
+    "solimp",
+    "solmix",
+    "fluid",
+)
 
 
 def model_fingerprint(model: mujoco.MjModel) -> Iterator[str]:
@@ -49,29 +89,38 @@ def model_fingerprint(model: mujoco.MjModel) -> Iterator[str]:
     data.qpos[:] = model.qpos0
     mujoco.mj_kinematics(model, data)
     roots = [b for b in range(1, model.nbody) if model.body_weldid[b] == b and model.body_jntnum[b]]
-    link = {
-        b: roots.index(root) + 1 if root in roots else 0
-        for b, root in enumerate(model.body_weldid.tolist())
-    }
+    link = {}
+    for body, root in enumerate(model.body_weldid.tolist()):
+        link[body] = roots.index(root) + 1 if root in roots else 0
     yield from _options(model)
     for number, root in enumerate(roots, 1):
-        yield f"link {number} on {link[int(model.body_parentid[root])]}" + _inertia(
-            model, data, root
-        )
+        parent = link[int(model.body_parentid[root])]
+        yield f"link {number} on {parent}{_inertia(model, data, root)}"
     for j in range(model.njnt):
         yield from _joint(model, data, j, link)
-    for i in range(model.nu):
-        text = _fields(model, "actuator", ACTUATOR_FIELDS, i)
-        limits = [_range(model, "actuator", kind, i) for kind in ("force", "ctrl", "act")]
-        yield f"actuator of {model.joint(model.actuator_trnid[i, 0]).name} {text} {' '.join(limits)}"
-    for body in range(1, model.nbody):
-        if model.body(body).name.startswith("payload_"):
-            yield f"mount {model.body(body).name} on {link[body]} at {_rounded(data.xpos[body], LENGTH_STEP)}"
+    yield from _actuators(model)
+    yield from _mounts(model, data, link)
     if model.neq or model.ntendon:
         yield from _couplings(model, data, link)
     touching = not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONTACT
     if touching or model.opt.density or model.opt.viscosity:
         yield from _geoms(model, data, link, touching)
+
+
+def _actuators(model: mujoco.MjModel) -> Iterator[str]:
+    for i in range(model.nu):
+        joint = model.joint(model.actuator_trnid[i, 0]).name
+        fields = _fields(model, "actuator", ACTUATOR_FIELDS, i)
+        limits = [_range(model, "actuator", kind, i) for kind in ("force", "ctrl", "act")]
+        yield f"actuator of {joint} {fields} {' '.join(limits)}"
+
+
+def _mounts(model: mujoco.MjModel, data: mujoco.MjData, link: dict[int, int]) -> Iterator[str]:
+    """Yield the bodies of payloads."""
+    for body in range(1, model.nbody):
+        name = model.body(body).name
+        if name.startswith("payload_"):
+            yield f"mount {name} on {link[body]} at {_rounded(data.xpos[body], LENGTH_STEP)}"
 
 
 def _options(model: mujoco.MjModel) -> Iterator[str]:
@@ -81,9 +130,8 @@ def _options(model: mujoco.MjModel) -> Iterator[str]:
         (mujoco.mjtDisableBit, "disableflags"),
         (mujoco.mjtEnableBit, "enableflags"),
     ):
-        bits = [
-            bit for bit in kind.__members__.values() if "BL_" in bit.name
-        ]  # not the count of flags
+        # not the count of flags
+        bits = [bit for bit in kind.__members__.values() if "BL_" in bit.name]
         names = {bit.name for bit in bits if getattr(model.opt, flags) & bit.value}
         yield f"{flags} {' '.join(sorted(names - IGNORED_FLAGS))}"
     if model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_OVERRIDE:
@@ -94,9 +142,12 @@ def _options(model: mujoco.MjModel) -> Iterator[str]:
 
 
 def _inertia(model: mujoco.MjModel, data: mujoco.MjData, root: int) -> str:
-    """Return mass, centre, inertia tensor and gravity compensation of the bodies welded to a body."""
+    """Return mass, centre, inertia tensor and gravity compensation of the bodies welded to a
+    body.
+    """
     bodies = np.flatnonzero(model.body_weldid == root)
-    mass, centre = model.body_mass[bodies], data.xipos[bodies]
+    mass = model.body_mass[bodies]
+    centre = data.xipos[bodies]
     rotation = data.ximat[bodies].reshape(-1, 3, 3)
     inertia = rotation @ (model.body_inertia[bodies, :, None] * rotation.mT)
     total = mass.sum()
@@ -108,15 +159,17 @@ def _inertia(model: mujoco.MjModel, data: mujoco.MjData, root: int) -> str:
     tensor = inertia.sum(axis=0)[np.triu_indices(3)]
     compensated = mass * model.body_gravcomp[bodies]
     return (
-        f": {_rounded(total, MASS_STEP)} at {_rounded(middle, LENGTH_STEP)} inertia {_rounded(tensor, INERTIA_STEP)} "
-        f"gravcomp {_rounded(compensated.sum(), MASS_STEP)} at {_rounded(compensated @ centre, LENGTH_STEP)}"
+        f": {_rounded(total, MASS_STEP)} at {_rounded(middle, LENGTH_STEP)} inertia "
+        f"{_rounded(tensor, INERTIA_STEP)} gravcomp {_rounded(compensated.sum(), MASS_STEP)} at "
+        f"{_rounded(compensated @ centre, LENGTH_STEP)}"
     )
 
 
 def _joint(
     model: mujoco.MjModel, data: mujoco.MjData, j: int, link: dict[int, int]
 ) -> Iterator[str]:
-    dof, at = int(model.jnt_dofadr[j]), int(model.jnt_qposadr[j])
+    dof = int(model.jnt_dofadr[j])
+    at = int(model.jnt_qposadr[j])
     yield (
         f"joint {model.joint(j).name} of {link[int(model.jnt_bodyid[j])]} type {model.jnt_type[j]} "
         f"axis {_rounded(data.xaxis[j], LENGTH_STEP)} at {_rounded(data.xanchor[j], LENGTH_STEP)}"
@@ -124,7 +177,8 @@ def _joint(
     springs = [model.jnt_stiffness[j], *np.ravel(_row(model, "jnt_stiffnesspoly", j))]
     dampers = [model.dof_damping[dof], *np.ravel(_row(model, "dof_dampingpoly", dof))]
     rest = model.qpos_spring[at] if any(springs) else 0.0
-    yield f"ref {_exact(model.qpos0[at])} spring {_exact(springs)} at {_exact(rest)} damping {_exact(dampers)}"
+    spring = f"spring {_exact(springs)} at {_exact(rest)}"
+    yield f"ref {_exact(model.qpos0[at])} {spring} damping {_exact(dampers)}"
     yield _fields(model, "jnt", JOINT_FIELDS, j)
     yield _fields(model, "dof", DOF_FIELDS, dof)
     limits = f"{_exact(model.jnt_range[j])}" if model.jnt_limited[j] else "none"
@@ -134,11 +188,26 @@ def _joint(
 def _couplings(model: mujoco.MjModel, data: mujoco.MjData, link: dict[int, int]) -> Iterator[str]:
     """Yield equality constraints, tendons and sites, which they may refer to."""
     for s in range(model.nsite):
-        yield f"site {s} on {link[int(model.site_bodyid[s])]} at {_rounded(data.site_xpos[s], LENGTH_STEP)}"
+        place = _rounded(data.site_xpos[s], LENGTH_STEP)
+        yield f"site {s} on {link[int(model.site_bodyid[s])]} at {place}"
     for name in ("type", "obj1id", "obj2id", "objtype", "active0", "solref", "solimp", "data"):
         yield f"equality {name} {_exact(getattr(model, f'eq_{name}'))}"
-    names = ("adr", "num", "limited", "range", "margin", "stiffness", "damping", "frictionloss", "armature",
-             "lengthspring", "solref_lim", "solimp_lim", "solref_fri", "solimp_fri")  # fmt: skip
+    names = (
+        "adr",
+        "num",
+        "limited",
+        "range",
+        "margin",
+        "stiffness",
+        "damping",
+        "frictionloss",
+        "armature",
+        "lengthspring",
+        "solref_lim",
+        "solimp_lim",
+        "solref_fri",
+        "solimp_fri",
+    )
     for name in names:
         yield f"tendon {name} {_exact(getattr(model, f'tendon_{name}'))}"
     yield f"wrap {_exact(model.wrap_type)} {_exact(model.wrap_objid)} {_exact(model.wrap_prm)}"
@@ -147,19 +216,26 @@ def _couplings(model: mujoco.MjModel, data: mujoco.MjData, link: dict[int, int])
 def _geoms(
     model: mujoco.MjModel, data: mujoco.MjData, link: dict[int, int], touching: bool
 ) -> Iterator[str]:
-    """Yield geoms that can collide or interact with a fluid; a mesh by the mean and extent of its vertices."""
+    """Yield geoms that can collide or interact with a fluid; a mesh by the mean and extent of its
+    vertices.
+    """
     paired = {*model.pair_geom1.tolist(), *model.pair_geom2.tolist()}
     for g in range(model.ngeom):
         collides = touching and (model.geom_contype[g] or model.geom_conaffinity[g] or g in paired)
         if not collides and not model.geom_fluid[g].any():
             continue
-        position, rotation = data.geom_xpos[g], data.geom_xmat[g].reshape(3, 3)
+        position = data.geom_xpos[g]
+        rotation = data.geom_xmat[g].reshape(3, 3)
         text = _fields(model, "geom", GEOM_FIELDS, g)
         if model.geom_type[g] == mujoco.mjtGeom.mjGEOM_MESH:
             mesh = int(model.geom_dataid[g])
-            start, count = int(model.mesh_vertadr[mesh]), int(model.mesh_vertnum[mesh])
+            start = int(model.mesh_vertadr[mesh])
+            count = int(model.mesh_vertnum[mesh])
             v = position + model.mesh_vert[start : start + count].astype(float) @ rotation.T
-            shape = f"{count} vertices {_rounded([v.mean(axis=0), v.min(axis=0), v.max(axis=0)], MESH_STEP)}"
+            shape = (
+                f"{count} vertices "
+                f"{_rounded([v.mean(axis=0), v.min(axis=0), v.max(axis=0)], MESH_STEP)}"
+            )
         else:
             frame = f"{_rounded(position, LENGTH_STEP)} {_rounded(rotation, LENGTH_STEP)}"
             shape = f"{_exact(model.geom_size[g])} at {frame}"
@@ -185,7 +261,9 @@ def _range(model: mujoco.MjModel, prefix: str, kind: str, i: int) -> str:
 
 
 def _fields(model: mujoco.MjModel, kind: str, names: tuple[str, ...], i: int) -> str:
-    """Return fields of element i of a kind; an array that this version of MuJoCo lacks counts as zeros."""
+    """Return fields of element i of a kind; an array that this version of MuJoCo lacks counts as
+    zeros.
+    """
     return " ".join(f"{name} {_exact(_row(model, f'{kind}_{name}', i))}" for name in names)
 
 
@@ -196,7 +274,9 @@ def _row(model: mujoco.MjModel, name: str, i: int) -> Array:
 
 
 def _exact(values: object) -> str:
-    """Format numbers with seven digits, without trailing zeros: their count differs between versions of MuJoCo."""
+    """Format numbers with seven digits, without trailing zeros: their count differs between
+    versions of MuJoCo.
+    """
     texts = [f"{x + 0.0:.7g}" for x in np.ravel(np.asarray(values, float))]
     while texts and texts[-1] == "0":
         texts.pop()

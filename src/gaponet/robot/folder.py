@@ -1,6 +1,7 @@
 """Robot folders inside runs and datasets: complete copies that may be moved.
 
-A network of the package has no copy. A file beside it names a robot of the package and the factor on its gains.
+A network of the package has no copy. A file beside it names a robot of the package and the factor
+on its gains.
 """
 
 from __future__ import annotations
@@ -88,7 +89,8 @@ class PackagedRobot:
 
 
 def save_robot(robot: RobotSpec, folder: Path) -> None:
-    """Write a robot folder: robot.toml with [identified.JOINT] tables for identified parameters, and robot.xml.
+    """Write a robot folder: robot.toml with [identified.JOINT] tables for identified parameters,
+    and robot.xml.
 
     An MJCF that includes or names files is written without them (gaponet.robot.self_contained).
 
@@ -102,45 +104,57 @@ def save_robot(robot: RobotSpec, folder: Path) -> None:
     from gaponet.robot.self_contained import self_contained_mjcf
 
     require_other_folder(folder, robot)
-    text = (robot.folder / "robot.toml").read_text(encoding="utf-8").split(IDENTIFIED_HEADING)[0]
-    text = IDENTIFIED_TABLES.sub("", re.sub(r"(?m)^mjcf\s*=.*\n", "", text)).rstrip() + "\n"
-    text = _with_gains(text, robot.nominal or robot)
-    for name, default in (("carries_payload", True), ("gain_scale", 1.0)):
-        value, text = getattr(robot, name), re.sub(rf"(?m)^{name}\s*=.*\n", "", text)
-        text = text if value == default else f"{name} = {str(value).lower()}\n{text}"
-    if robot.nominal is not None:
-        text += f"\n{IDENTIFIED_HEADING}\n" + "".join(
-            _servo(robot, joint) for joint in robot.operated
-        )
-        if robot.table is not None and robot.table != robot.nominal.table:
-            lines = [f"{name} = {value!r}\n" for name, value in vars(robot.table).items()]
-            text += "[identified_table]\n" + "".join(lines)
-        if robot.payload_mounts != robot.nominal.payload_mounts:
-            text += "".join(
-                f"[identified_mount.{_key(m.side)}]\npos = {list(m.pos)}\nmass = {m.mass!r}\n"
-                for m in robot.payload_mounts
-            )
-        text += "".join(
-            f"[identified_link.{_key(b)}]\nmass = {x.mass!r}\npos = {list(x.pos)}\ninertia = {list(x.inertia)}\n"
-            for b, x in robot.links.items()
-        )
+    text = _nominal_text(robot) + _identified_text(robot)
     xml = robot.mjcf.read_text(encoding="utf-8")
-    xml = self_contained_mjcf(robot.mjcf) if FILE_REFERENCES.search(xml) else xml
+    if FILE_REFERENCES.search(xml):
+        xml = self_contained_mjcf(robot.mjcf)
     copied = {name: robot.folder / name for name in COPIED_FILES if (robot.folder / name).is_file()}
     with lock_folder(folder, "robot"):
-        (folder / "robot.toml").unlink(
-            missing_ok=True
-        )  # its presence marks a complete folder: it is written last
+        # its presence marks a complete folder: it is written last
+        (folder / "robot.toml").unlink(missing_ok=True)
         write_text(folder / "robot.xml", xml)
         for name, file in copied.items():
             write_text(folder / name, file.read_text(encoding="utf-8"))
         write_text(folder / "robot.toml", text)
-    if not np.allclose(
-        load_robot(folder).before_identification.kd, (robot.nominal or robot).kd, rtol=1e-4
-    ):
+    written = load_robot(folder).before_identification
+    if not np.allclose(written.kd, robot.before_identification.kd, rtol=1e-4):
         raise RobotError(
             f"{robot.folder}/robot.toml: write each joint as a [[joint]] table of its own"
         )
+
+
+def _nominal_text(robot: RobotSpec) -> str:
+    """Return the text of robot.toml without identified values: the robot's file, with its gains."""
+    text = (robot.folder / "robot.toml").read_text(encoding="utf-8").split(IDENTIFIED_HEADING)[0]
+    text = re.sub(r"(?m)^mjcf\s*=.*\n", "", text)
+    text = IDENTIFIED_TABLES.sub("", text).rstrip() + "\n"
+    text = _with_gains(text, robot.before_identification)
+    for name, default in (("carries_payload", True), ("gain_scale", 1.0)):
+        value = getattr(robot, name)
+        text = re.sub(rf"(?m)^{name}\s*=.*\n", "", text)
+        if value != default:
+            text = f"{name} = {str(value).lower()}\n{text}"
+    return text
+
+
+def _identified_text(robot: RobotSpec) -> str:
+    """Return the tables of identified values; "" for a robot without any."""
+    if robot.nominal is None:
+        return ""
+    parts = [f"\n{IDENTIFIED_HEADING}\n", *(_servo(robot, joint) for joint in robot.operated)]
+    if robot.table is not None and robot.table != robot.nominal.table:
+        parts.append("[identified_table]\n")
+        parts += [f"{name} = {value!r}\n" for name, value in vars(robot.table).items()]
+    if robot.payload_mounts != robot.nominal.payload_mounts:
+        for mount in robot.payload_mounts:
+            heading = f"[identified_mount.{_key(mount.side)}]"
+            parts.append(f"{heading}\npos = {list(mount.pos)}\nmass = {mount.mass!r}\n")
+    for body, link in robot.links.items():
+        parts.append(
+            f"[identified_link.{_key(body)}]\nmass = {link.mass!r}\npos = {list(link.pos)}\n"
+            f"inertia = {list(link.inertia)}\n"
+        )
+    return "".join(parts)
 
 
 def require_other_folder(folder: Path, robot: RobotSpec) -> None:
@@ -152,7 +166,8 @@ def require_other_folder(folder: Path, robot: RobotSpec) -> None:
 def load_stored_robot(holder: Path, name: str) -> RobotSpec:
     """Load the robot that a run, a network of the package or a dataset stores.
 
-    Older ones store none; for them, return the packaged robot of that name, but never another folder of that name.
+    Older ones store none; for them, return the packaged robot of that name, but never another
+    folder of that name.
     """
     if has_robot_folder(holder):
         return load_robot(holder / STORED_ROBOT)
@@ -162,7 +177,8 @@ def load_stored_robot(holder: Path, name: str) -> RobotSpec:
     if name in packaged_robots():
         return load_robot(PACKAGE_FOLDER / name)
     raise RobotError(
-        f"{holder}: stores no robot, and the package has no '{name}'; say which robot it is with --robot ./FOLDER"
+        f"{holder}: stores no robot, and the package has no '{name}'; say which robot it is with "
+        "--robot ./FOLDER"
     )
 
 
@@ -182,7 +198,9 @@ def stored_robot_holder(artifact: Path) -> Path:
 
 
 def _with_gains(text: str, robot: RobotSpec) -> str:
-    """Return the text of a robot.toml with kp and kd of this robot in its [[joint]] tables where they differ."""
+    """Return the text of a robot.toml with kp and kd of this robot in its [[joint]] tables where
+    they differ.
+    """
     scale = np.where(np.isin(robot.joint_names, robot.operated), robot.gain_scale, 1.0)
     tables = re.split(r"(?m)^(?=\[)", text)
     joints = [i for i, table in enumerate(tables) if table.startswith("[[joint]]")]

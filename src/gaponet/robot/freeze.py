@@ -25,12 +25,16 @@ def freeze(spec: mujoco.MjSpec, joint: mujoco.MjsJoint, value: float) -> None:
     Raises:
         RobotError: Another joint of its body comes before it, and the value is not its reference.
     """
-    body, move = joint.parent, value - joint.ref / units_per_si(spec, joint)
+    body = joint.parent
+    move = value - joint.ref / units_per_si(spec, joint)
     if move and body.joints[0].name != joint.name:
         raise RobotError(
-            f"joint '{joint.name}' turns after '{body.joints[0].name}' in one body: keep or clamp both"
+            f"joint '{joint.name}' turns after '{body.joints[0].name}' in one body: keep or clamp "
+            "both"
         )
-    turn, quat, offset = np.zeros(4), np.zeros(4), np.zeros(3)
+    turn = np.zeros(4)
+    quat = np.zeros(4)
+    offset = np.zeros(3)
     slides = joint.type == mujoco.mjtJoint.mjJNT_SLIDE
     axis = np.array(joint.axis) / np.linalg.norm(joint.axis)
     mujoco.mju_axisAngle2Quat(turn, axis, 0.0 if slides else move)
@@ -39,5 +43,6 @@ def freeze(spec: mujoco.MjSpec, joint: mujoco.MjsJoint, value: float) -> None:
         offset, axis * move if slides else np.array(joint.pos) - offset, np.array(body.quat)
     )
     mujoco.mju_mulQuat(quat, np.array(body.quat), turn)
-    body.pos, body.quat = np.array(body.pos) + offset, quat
+    body.pos = np.array(body.pos) + offset
+    body.quat = quat
     spec.delete(joint)

@@ -22,14 +22,54 @@ MAX_CELLS = 1 << 24  # pixels of a texture, samples of a height field
 MAX_BYTES = 256 << 20  # of one file, or of a simulation's memory
 MAX_VALUE = 1e10  # kg, kg·m², m: MuJoCo's own mjMAXVAL
 PACKAGED = Path(__file__).resolve().with_name("robots")
-# Elements whose cost is visible in the file. Others (meshes, textures, attached models) are read in the sandbox first.
+# Elements whose cost is visible in the file. Others (meshes, textures, attached models) are read in
+# the sandbox first.
 PLAIN_TAGS = {
-    "mujoco", "compiler", "option", "flag", "size", "memory", "default", "worldbody", "body", "frame", "inertial",
-    "joint", "freejoint", "geom", "site", "light", "camera", "statistic", "visual", "global", "headlight", "map",
-    "scale", "rgba", "quality", "contact", "pair", "exclude", "actuator", "position", "velocity", "motor", "general",
-    "keyframe", "key", "sensor", "jointpos", "jointvel", "actuatorfrc", "gyro", "accelerometer", "framepos",
-}  # fmt: skip
+    "mujoco",
+    "compiler",
+    "option",
+    "flag",
+    "size",
+    "memory",
+    "default",
+    "worldbody",
+    "body",
+    "frame",
+    "inertial",
+    "joint",
+    "freejoint",
+    "geom",
+    "site",
+    "light",
+    "camera",
+    "statistic",
+    "visual",
+    "global",
+    "headlight",
+    "map",
+    "scale",
+    "rgba",
+    "quality",
+    "contact",
+    "pair",
+    "exclude",
+    "actuator",
+    "position",
+    "velocity",
+    "motor",
+    "general",
+    "keyframe",
+    "key",
+    "sensor",
+    "jointpos",
+    "jointvel",
+    "actuatorfrc",
+    "gyro",
+    "accelerometer",
+    "framepos",
+}
 MAX_PLAIN_ELEMENTS = 2000
+# create more than the file shows
 EXPANDING_ATTRIBUTES = {
     "nsample",
     "resolution",
@@ -37,13 +77,19 @@ EXPANDING_ATTRIBUTES = {
     "file",
     "num",
     "dim",
-}  # create more than the file shows
+}
 USER_SIZES = [
     f"nuser_{kind}"
     for kind in ("body", "jnt", "geom", "site", "cam", "tendon", "actuator", "sensor")
 ]
-SOLVER_ITERATIONS = ("iterations", "ls_iterations", "noslip_iterations", "ccd_iterations", "sdf_iterations",
-                     "sdf_initpoints")  # fmt: skip
+SOLVER_ITERATIONS = (
+    "iterations",
+    "ls_iterations",
+    "noslip_iterations",
+    "ccd_iterations",
+    "sdf_iterations",
+    "sdf_initpoints",
+)
 LIMITED_ATTRIBUTES = {"size": {"nuserdata", "nkey", *USER_SIZES}, "option": {*SOLVER_ITERATIONS}}
 MAX_ATTRIBUTE = 1000
 _ACCEPTED: set[frozenset[tuple[str, int, int]]] = set()
@@ -52,8 +98,8 @@ _ACCEPTED: set[frozenset[tuple[str, int, int]]] = set()
 def read_mjcf(path: Path, tried: bool = False) -> mujoco.MjSpec:
     """Read an MJCF as a specification, which can be changed and compiled.
 
-    A file of plain elements, or of the package, is as small as it looks. Others are first read in the sandbox, once for
-    each state of their files.
+    A file of plain elements, or of the package, is as small as it looks. Others are first read in
+    the sandbox, once for each state of their files.
 
     Args:
         tried: The caller has read it in the sandbox.
@@ -122,14 +168,17 @@ def require_simulable(model: mujoco.MjModel, path: Path) -> None:
     data = mujoco.MjData(model)
     if mujoco.mj_sizeModel(model) + data.nbuffer > MAX_BYTES:
         raise RobotError(
-            f"{path}: a simulation of it takes more than {MAX_BYTES >> 20} MiB; gaponet does not load it"
+            f"{path}: a simulation of it takes more than {MAX_BYTES >> 20} MiB; gaponet does not "
+            "load it"
         )
     mujoco.mj_step(model, data)
 
 
 @dataclass
 class _Inspection:
-    """Content of an MJCF: its files (path, size, time), the number of elements, and whether all are plain."""
+    """Content of an MJCF: its files (path, size, time), the number of elements, and whether all
+    are plain.
+    """
 
     files: set[tuple[str, int, int]] = field(default_factory=set)
     count: float = 0.0
@@ -137,7 +186,9 @@ class _Inspection:
 
 
 def inspect_mjcf(path: Path) -> _Inspection:
-    """Inspect an MJCF before MuJoCo reads it; refuses files that are not XML or are larger than a robot."""
+    """Inspect an MJCF before MuJoCo reads it; refuses files that are not XML or are larger than a
+    robot.
+    """
     inspection = _Inspection()
     _count(path, path.parent, {path.resolve()}, inspection, 1.0)
     inspection.plain = inspection.plain and inspection.count <= MAX_PLAIN_ELEMENTS
@@ -161,25 +212,10 @@ def _count(
         tag, times = open_tags.pop()
         times *= _copies(tag)
         inspection.count += times
-        inspection.plain = (
-            inspection.plain
-            and tag.tag in PLAIN_TAGS
-            and not EXPANDING_ATTRIBUTES & tag.attrib.keys()
-        )
-        cells = max(_extent(tag, "width", "height"), _extent(tag, "nrow", "ncol"))
-        if inspection.count > MAX_ELEMENTS or cells > MAX_CELLS:
-            raise RobotError(
-                f"{path}: <{tag.tag}> makes a model far larger than a robot; gaponet does not load it"
-            )
-        if tag.tag == "size" and _bytes(tag.get("memory", "0")) > MAX_BYTES:
-            raise RobotError(
-                f"{path}: <size memory> is above {MAX_BYTES >> 20} MiB; delete it, MuJoCo chooses the size"
-            )
-        for name in LIMITED_ATTRIBUTES.get(tag.tag, set()) & tag.attrib.keys():
-            if not _extent(tag, name) <= MAX_ATTRIBUTE:
-                raise RobotError(
-                    f"{path}: <{tag.tag} {name}> is above {MAX_ATTRIBUTE}, more than a robot needs; delete it"
-                )
+        expands = EXPANDING_ATTRIBUTES & tag.attrib.keys()
+        if tag.tag not in PLAIN_TAGS or expands:
+            inspection.plain = False
+        _require_small(tag, inspection.count, path)
         if tag.tag == "include":
             other = folder / tag.get("file", "")
             if other.resolve() in seen:
@@ -187,6 +223,30 @@ def _count(
             _count(other, folder, seen | {other.resolve()}, inspection, times)
         open_tags += [(child, times) for child in tag]
     _require_files(root, path, folder, inspection)
+
+
+def _require_small(tag: ElementTree.Element, count: float, path: Path) -> None:
+    """Refuse an element that makes a model far larger than a robot.
+
+    Args:
+        count: Number of elements so far.
+    """
+    cells = max(_extent(tag, "width", "height"), _extent(tag, "nrow", "ncol"))
+    if count > MAX_ELEMENTS or cells > MAX_CELLS:
+        raise RobotError(
+            f"{path}: <{tag.tag}> makes a model far larger than a robot; gaponet does not load it"
+        )
+    if tag.tag == "size" and _bytes(tag.get("memory", "0")) > MAX_BYTES:
+        raise RobotError(
+            f"{path}: <size memory> is above {MAX_BYTES >> 20} MiB; delete it, MuJoCo chooses "
+            "the size"
+        )
+    for name in LIMITED_ATTRIBUTES.get(tag.tag, set()) & tag.attrib.keys():
+        if not _extent(tag, name) <= MAX_ATTRIBUTE:
+            raise RobotError(
+                f"{path}: <{tag.tag} {name}> is above {MAX_ATTRIBUTE}, more than a robot needs; "
+                "delete it"
+            )
 
 
 def _require_files(

@@ -1,11 +1,13 @@
-"""Robot folders from vendors' models: unlogged joints become fixed, and every number states its source."""
+"""Robot folders from vendors' models: unlogged joints become fixed, and every number states its
+source.
+"""
 
 from __future__ import annotations
 
 import json
 import math
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -20,6 +22,7 @@ from gaponet.robot.freeze import freeze
 from gaponet.robot.mjcf import compile_spec
 from gaponet.robot.self_contained import self_contained_text
 from gaponet.robot.spec import Follower, RobotSpec, load_robot
+from gaponet.robot.toml_file import RobotOptions
 from gaponet.robot.vendor import read_vendor
 
 PICTURE = "picture.png"  # of a robot folder
@@ -28,32 +31,6 @@ IMPLICIT_INTEGRATORS = (
     mujoco.mjtIntegrator.mjINT_IMPLICIT,
     mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
 )
-
-
-@dataclass(frozen=True)
-class RobotOptions:
-    """Options of `gaponet robot new`; joints are given by name or pattern (*_elbow_*).
-
-    Attributes:
-        joints: Logged joints; all others are fixed. Default: those with an actuator, or all hinges if none has one.
-        kp, kd, effort_limit: "100" or "*wrist*=20", N·m/rad, N·m·s/rad, N·m; a later value overrides earlier ones.
-        servo: "STS3215" or "*wrist*=XL330-M288-T": types whose measured values and torque limits replace the model's.
-        packages: "NAME=FOLDER" of package://NAME.
-        rate: Rate of commands, Hz.
-        keyframe: Home position, also of fixed joints; default: the first keyframe.
-        contacts: Keep geoms that can collide, and simulate contacts.
-    """
-
-    joints: tuple[str, ...] = ()
-    kp: tuple[str, ...] = ()
-    kd: tuple[str, ...] = ()
-    effort_limit: tuple[str, ...] = ()
-    servo: tuple[str, ...] = ()
-    packages: tuple[str, ...] = ()
-    rate: float = 50.0
-    keyframe: str = ""
-    contacts: bool = False
-    name: str = ""
 
 
 @dataclass(frozen=True)
@@ -73,7 +50,8 @@ def new_robot(
     options: RobotOptions,
     draw: Callable[[NewRobot], bytes | None] = lambda made: None,
 ) -> NewRobot:
-    """Write the robot folder `out` from the MJCF or URDF at `path`; the folder is complete or absent.
+    """Write the robot folder `out` from the MJCF or URDF at `path`; the folder is complete or
+    absent.
 
     Args:
         draw: Returns the PNG of picture.png, or None for no picture.
@@ -82,35 +60,30 @@ def new_robot(
         RobotError: The model is damaged, or has no joint to log.
         UsageError: An option does not fit the model, or a gain is stated nowhere.
     """
-    spec, notes = read_vendor(path, {k: Path(v) for k, v in map(_pair, options.packages)})
+    packages = {name: Path(folder) for name, folder in map(_pair, options.packages)}
+    spec, notes = read_vendor(path, packages)
     model = compile_spec(spec, path)
-    logged = _logged_joints(model, options.joints, path)
+    recorded = _logged_joints(model, options.joints, path)
     pose, source = _home(model, options.keyframe, path)
     given = {name: getattr(options, name) for name in ("kp", "kd", "effort_limit", "servo")}
-    followers = _followers(model, logged, options.joints)
-    motors = [name for name in logged if name not in followers]
+    followers = _followers(model, recorded, options.joints)
+    motors = [name for name in recorded if name not in followers]
     logged = [name for name in _joint_names(model) if name in (*motors, *followers)]
     joint_drives = drives(model, motors, pose, given, path.name)
     notes += _notes(spec, model, logged, pose, path)
-    notes += [f"{name} follows {led.joint}, without a motor" for name, led in followers.items()]
-    for d in joint_drives:
-        for name, value in d.passive.items():
-            polynomial = np.ndim(
-                getattr(spec.joint(d.name), name)
-            )  # of newer MuJoCo; a number of older
-            setattr(spec.joint(d.name), name, [[value], [0.0], [0.0]] if polynomial else value)
-    text = _robot_xml(spec, model, logged, pose, path, options.contacts)
-    robot_toml = _robot_toml(model, joint_drives, options, path, source, followers)
-    for name in (*_joint_names(model), *(model.body(b).name for b in range(model.nbody))):
-        if "/" in name:  # a joint name may become a file name
-            text, robot_toml = (
-                t.replace(f'"{name}"', f'"{name.replace("/", "_")}"') for t in (text, robot_toml)
-            )
-    if _holds_another_robot(out, text, robot_toml):
+    for name, led in followers.items():
+        notes.append(f"{name} follows {led.joint}, without a motor")
+    for drive in joint_drives:
+        _set_passive(spec.joint(drive.name), drive.passive)
+    xml = _robot_xml(spec, model, logged, pose, path, options.contacts)
+    toml = _robot_toml(model, joint_drives, options, path, source, followers)
+    xml = _without_slashes(xml, model)
+    toml = _without_slashes(toml, model)
+    if _holds_another_robot(out, xml, toml):
         raise UsageError(f"{out}: holds a robot; choose another --out, or move it away")
     with whole_folder(out, "robot", last="robot.toml") as place:
-        write_text(place / "robot.xml", text)
-        write_text(place / "robot.toml", robot_toml)
+        write_text(place / "robot.xml", xml)
+        write_text(place / "robot.toml", toml)
         made = NewRobot(load_robot(place), joint_drives, model, pose, notes)
         picture = draw(made)
         if picture is not None:
@@ -118,8 +91,26 @@ def new_robot(
     return replace(made, robot=load_robot(out))
 
 
+def _set_passive(joint: mujoco.MjsJoint, passive: Mapping[str, float]) -> None:
+    """Give a joint damping, friction and armature, SI."""
+    for name, value in passive.items():
+        is_polynomial = np.ndim(getattr(joint, name))  # of newer MuJoCo; a number of older
+        setattr(joint, name, [[value], [0.0], [0.0]] if is_polynomial else value)
+
+
+def _without_slashes(text: str, model: mujoco.MjModel) -> str:
+    """Return a text with _ for / in the names of joints and bodies, which may become file names."""
+    bodies = [model.body(body).name for body in range(model.nbody)]
+    for name in (*_joint_names(model), *bodies):
+        if "/" in name:
+            text = text.replace(f'"{name}"', f'"{name.replace("/", "_")}"')
+    return text
+
+
 def _holds_another_robot(folder: Path, xml: str, toml: str) -> bool:
-    """True if a folder holds a robot that is not the one to be written: the same command may be given again."""
+    """True if a folder holds a robot that is not the one to be written: the same command may be
+    given again.
+    """
     if not (folder / "robot.toml").exists():
         return False
     for name, text in (("robot.toml", toml), ("robot.xml", xml)):
@@ -146,44 +137,53 @@ def _logged_joints(model: mujoco.MjModel, patterns: tuple[str, ...], path: Path)
     for name in set(patterns) & set(kinds) - set(hinges):
         kind = kinds[name].name.removeprefix("mjJNT_").lower()
         raise UsageError(
-            f"--joints {name}: is a {kind} joint, and gaponet supports angles only (rad, N·m); leave it out, then it "
-            "is fixed at home"
+            f"--joints {name}: is a {kind} joint, and gaponet supports angles only (rad, N·m); "
+            "leave it out, then it is fixed at home"
         )
+    named: set[str] = set()
     for pattern in patterns:
-        if not any(fnmatchcase(name, pattern) for name in hinges):
+        found = [name for name in hinges if fnmatchcase(name, pattern)]
+        if not found:
             raise UsageError(f"--joints {pattern}: no such joint; there are: {', '.join(hinges)}")
+        named.update(found)
     if patterns:
-        return [name for name in hinges if any(fnmatchcase(name, p) for p in patterns)]
-    actuated = {
-        model.joint(j).name
-        for j in model.actuator_trnid[np.isin(model.actuator_trntype, ON_JOINT), 0]
-    }
+        return [name for name in hinges if name in named]
+    on_joint = np.isin(model.actuator_trntype, ON_JOINT)
+    actuated = {model.joint(joint).name for joint in model.actuator_trnid[on_joint, 0]}
     return [name for name in hinges if name in actuated] or hinges
 
 
 def _followers(
     model: mujoco.MjModel, logged: list[str], patterns: tuple[str, ...]
 ) -> dict[str, Follower]:
-    """Return the hinges that an equality lets follow a logged hinge in proportion: URDF's mimic joints.
+    """Return the hinges that an equality lets follow a logged hinge in proportion: URDF's mimic
+    joints.
 
     A joint that the user names counts as driven by a motor of its own.
     """
     followers = {}
-    for e in np.flatnonzero(model.eq_type == mujoco.mjtEq.mjEQ_JOINT):
-        name, leader = (
-            model.joint(j).name if j >= 0 else "" for j in (model.eq_obj1id[e], model.eq_obj2id[e])
-        )
-        constant, ratio, *curved = model.eq_data[e, :5].tolist()
-        hinges = all(
-            x and model.joint(x).type == mujoco.mjtJoint.mjJNT_HINGE for x in (name, leader)
-        )
-        if not hinges or any(curved) or leader not in logged or name in patterns:
+    for equality in np.flatnonzero(model.eq_type == mujoco.mjtEq.mjEQ_JOINT):
+        name = _hinge_name(model, model.eq_obj1id[equality])
+        leader = _hinge_name(model, model.eq_obj2id[equality])
+        constant, ratio, *curved = model.eq_data[equality, :5].tolist()
+        if not (name and leader) or any(curved) or leader not in logged or name in patterns:
             continue
-        zero, leader_zero = (
-            float(model.qpos0[model.jnt_qposadr[model.joint(x).id]]) for x in (name, leader)
-        )
+        zero = _reference(model, name)
+        leader_zero = _reference(model, leader)
         followers[name] = Follower(leader, ratio, zero + constant - ratio * leader_zero)
-    return {name: f for name, f in followers.items() if f.joint not in followers}
+    return {name: led for name, led in followers.items() if led.joint not in followers}
+
+
+def _hinge_name(model: mujoco.MjModel, joint: int) -> str:
+    """Return the name of a hinge; "" for another joint, or none (−1)."""
+    if joint < 0 or model.jnt_type[joint] != mujoco.mjtJoint.mjJNT_HINGE:
+        return ""
+    return str(model.joint(joint).name)
+
+
+def _reference(model: mujoco.MjModel, joint: str) -> float:
+    """Return the angle of a hinge in the model's zero, rad."""
+    return float(model.qpos0[model.jnt_qposadr[model.joint(joint).id]])
 
 
 def _joint_names(model: mujoco.MjModel) -> list[str]:
@@ -198,7 +198,8 @@ def _home(model: mujoco.MjModel, keyframe: str, path: Path) -> tuple[np.ndarray,
     source = f'keyframe "{keyframe or keys[0]}"' if keys else "the model's zero"
     pose = (model.key_qpos[keys.index(keyframe) if keyframe else 0] if keys else model.qpos0).copy()
     for j in np.flatnonzero(model.jnt_limited):
-        at, (low, high) = model.jnt_qposadr[j], model.jnt_range[j]
+        at = model.jnt_qposadr[j]
+        low, high = model.jnt_range[j]
         if not low - 1e-6 <= pose[at] <= high + 1e-6:
             pose[at] = (low + high) / 2
         pose[at] = np.clip(pose[at], low, high)
@@ -209,25 +210,11 @@ def _notes(
     spec: mujoco.MjSpec, model: mujoco.MjModel, logged: list[str], pose: np.ndarray, path: Path
 ) -> list[str]:
     """Describe what is fixed and omitted."""
-    notes, fixed = [], []
-    for name, kind, at in zip(_joint_names(model), model.jnt_type, model.jnt_qposadr, strict=True):
-        unit = {int(mujoco.mjtJoint.mjJNT_HINGE): "rad", int(mujoco.mjtJoint.mjJNT_SLIDE): "m"}.get(
-            int(kind)
-        )
-        if name not in logged:
-            fixed.append(
-                f"{name or 'unnamed'} {f'at {pose[at]:.3g} {unit}' if unit else f'where {path.name} has it'}"
-            )
+    notes = []
+    fixed = _fixed_joints(model, logged, pose, path)
     if fixed:
         notes.append(f"frozen: {', '.join(fixed)}")
-    for e in spec.equalities:
-        pair = [name for name in (e.name1, e.name2) if name in logged]
-        if e.type == mujoco.mjtEq.mjEQ_JOINT and len(pair) == 1 and e.name2:
-            other = e.name2 if e.name1 in pair else e.name1
-            notes.append(
-                f"{other} moves with {pair[0]} and is fixed here: identified kp, friction and armature of {pair[0]} "
-                f"are those of its own link, smaller in proportion to the mass of both links"
-            )
+    notes += _coupled_joints(spec, logged)
     if (model.jnt_type == mujoco.mjtJoint.mjJNT_FREE).any():
         notes.append(
             "the base is fixed here: fasten the robot while it is recorded, a hanging base swings"
@@ -238,7 +225,41 @@ def _notes(
         notes.append(f"left out: {gone}; gains and limits stand in robot.toml")
     if spec.option.integrator not in IMPLICIT_INTEGRATORS:
         notes.append(
-            "integrator: implicitfast, which takes servos' kd into account; the model's own does not"
+            "integrator: implicitfast, which takes servos' kd into account; the model's own does "
+            "not"
+        )
+    return notes
+
+
+def _fixed_joints(
+    model: mujoco.MjModel, logged: list[str], pose: np.ndarray, path: Path
+) -> list[str]:
+    """Return the names of the joints that become fixed, and where."""
+    units = {mujoco.mjtJoint.mjJNT_HINGE: "rad", mujoco.mjtJoint.mjJNT_SLIDE: "m"}
+    fixed = []
+    for name, kind, at in zip(_joint_names(model), model.jnt_type, model.jnt_qposadr, strict=True):
+        if name in logged:
+            continue
+        unit = units.get(mujoco.mjtJoint(kind))
+        where = f"at {pose[at]:.3g} {unit}" if unit else f"where {path.name} has it"
+        fixed.append(f"{name or 'unnamed'} {where}")
+    return fixed
+
+
+def _coupled_joints(spec: mujoco.MjSpec, logged: list[str]) -> list[str]:
+    """Return a note on each fixed joint that moves with a logged one."""
+    notes = []
+    for equality in spec.equalities:
+        if equality.type != mujoco.mjtEq.mjEQ_JOINT or not equality.name2:
+            continue
+        pair = [name for name in (equality.name1, equality.name2) if name in logged]
+        if len(pair) != 1:
+            continue
+        own = pair[0]
+        other = equality.name2 if equality.name1 == own else equality.name1
+        notes.append(
+            f"{other} moves with {own} and is fixed here: identified kp, friction and armature of "
+            f"{own} are those of its own link, smaller in proportion to the mass of both links"
         )
     return notes
 
@@ -253,33 +274,37 @@ def _robot_xml(
 ) -> str:
     """Return robot.xml: one file without fixed joints and the elements that refer to them."""
     values = dict(zip(_joint_names(model), pose[model.jnt_qposadr], strict=True))
-    removed = {name for name in values if name not in logged}
+    _delete_references(spec, model, removed=set(values) - set(logged))
+    for joint in list(spec.joints):
+        if joint.type in (mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL):
+            spec.delete(joint)
+    if spec.option.integrator not in IMPLICIT_INTEGRATORS:
+        spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    # explicit inertias, quaternions, no classes
+    plain = mujoco.MjSpec.from_string(self_contained_text(spec, path))
+    for joint in list(plain.joints):
+        if joint.name not in logged:
+            freeze(plain, joint, values[joint.name])
+    for joint in plain.joints:
+        # effort_limit of robot.toml is the limit
+        joint.actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE
+    if not contacts:
+        _disable_contacts(plain)
+    return self_contained_text(plain, path)
+
+
+def _delete_references(spec: mujoco.MjSpec, model: mujoco.MjModel, removed: set[str]) -> None:
+    """Delete actuators, sensors and keyframes, and what refers to removed joints."""
     tendons = {model.tendon(t).name for t in range(model.ntendon) if _wraps(model, t) & removed}
     for kind in (spec.actuators, spec.sensors, spec.keys):
         for element in list(kind):
             spec.delete(element)
-    for equality in [e for e in spec.equalities if {e.name1, e.name2} & (removed | tendons)]:
-        spec.delete(equality)
-    for tendon in [t for t in spec.tendons if t.name in tendons]:
-        spec.delete(tendon)
-    for joint in [
-        j for j in spec.joints if j.type in (mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL)
-    ]:
-        spec.delete(joint)
-    if spec.option.integrator not in IMPLICIT_INTEGRATORS:
-        spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    plain = mujoco.MjSpec.from_string(
-        self_contained_text(spec, path)
-    )  # explicit inertias, quaternions, no classes
-    for joint in [j for j in plain.joints if j.name not in logged]:
-        freeze(plain, joint, values[joint.name])
-    for joint in plain.joints:
-        joint.actfrclimited = (
-            mujoco.mjtLimited.mjLIMITED_FALSE
-        )  # effort_limit of robot.toml is the limit
-    if not contacts:
-        _disable_contacts(plain)
-    return self_contained_text(plain, path)
+    for equality in list(spec.equalities):
+        if {equality.name1, equality.name2} & (removed | tendons):
+            spec.delete(equality)
+    for tendon in list(spec.tendons):
+        if tendon.name in tendons:
+            spec.delete(tendon)
 
 
 def _wraps(model: mujoco.MjModel, tendon: int) -> set[str]:
@@ -309,103 +334,150 @@ def _robot_toml(
     source: str,
     followers: dict[str, Follower],
 ) -> str:
-    if not (0 < options.rate <= 1000):
-        raise UsageError(f"--rate {options.rate}: give the rate of the commands in Hz, up to 1000")
-    names = [d.name for d in joint_drives]
-    by_name = {d.name: d for d in joint_drives}
-    dt = 1 / options.rate
-    steps = max(1, math.ceil(dt / model.opt.timestep - 1e-6))
-    stem = path.resolve().parent.name if path.stem in ("robot", "model", "scene") else path.stem
-    robot_name = options.name or "".join(c if c.isalnum() or c in "-_" else "_" for c in stem)
-    lines = [
-        f"# Made from {path.name} by gaponet robot new; every number may be changed here.",
-        f"name = {json.dumps(robot_name)}",
-        f"dt = {dt!r}  # control period, s: --rate",
-        f"timestep = {dt / steps!r}  # physics step, s; {path.name} has {model.opt.timestep:g}",
-        f"contacts = {str(options.contacts).lower()}  # --contacts keeps geoms that touch, and lets them",
-    ]
-    for name in (n for n in _joint_names(model) if n in by_name or n in followers):
+    """Return robot.toml, with the source of every number as a comment.
+
+    Args:
+        source: Of the home position.
+    """
+    drive_of = {drive.name: drive for drive in joint_drives}
+    lines = _head_lines(model, options, path)
+    for name in _joint_names(model):
         if name in followers:
             lines += _follower_lines(name, followers[name], path)
-            continue
-        d = by_name[name]
+        elif name in drive_of:
+            lines += _joint_lines(drive_of[name], source, names=set(drive_of))
+    for side, body, pos, why in _mounts(model, list(drive_of)):
         lines += [
-            "", "[[joint]]", f"name = {json.dumps(d.name)}",
-            *([f"aliases = [{json.dumps(d.actuator)}]  # its actuator"] if d.actuator not in ("", *names) else []),
-            f"kp = {d.kp!r}  # N·m/rad: {d.kp_source}", f"kd = {d.kd!r}  # N·m·s/rad: {d.kd_source}",
-            f"effort_limit = {d.limit!r}  # N·m: {d.limit_source}",
-            *([f"servo = {json.dumps(d.servo.name, ensure_ascii=False)}  # --servo"] if d.servo else []),
-            f"home = {float(d.home)!r}  # rad: {source}", "operated = true",
-        ]  # fmt: skip
-    for side, body, pos, why in _mounts(model, names):
-        lines += ["", f"[[payload_mount]]  # {why}", f"side = {json.dumps(side)}",
-                  f"body = {json.dumps(body)}", f"pos = {[round(float(x), 6) for x in pos]}"]  # fmt: skip
-    return "\n".join("".join(c if c.isprintable() else "?" for c in line) for line in lines) + "\n"
+            "",
+            f"[[payload_mount]]  # {why}",
+            f"side = {json.dumps(side)}",
+            f"body = {json.dumps(body)}",
+            f"pos = {[round(float(x), 6) for x in pos]}",
+        ]
+    return "\n".join(map(_printable, lines)) + "\n"
+
+
+def _printable(text: str) -> str:
+    return "".join(letter if letter.isprintable() else "?" for letter in text)
+
+
+def _head_lines(model: mujoco.MjModel, options: RobotOptions, path: Path) -> list[str]:
+    """Return the lines of robot.toml about the whole robot.
+
+    Raises:
+        UsageError: The rate is no rate.
+    """
+    if not (0 < options.rate <= 1000):
+        raise UsageError(f"--rate {options.rate}: give the rate of the commands in Hz, up to 1000")
+    dt = 1 / options.rate
+    steps = max(1, math.ceil(dt / model.opt.timestep - 1e-6))
+    name = options.name
+    if not name:
+        is_general = path.stem in ("robot", "model", "scene")
+        stem = path.resolve().parent.name if is_general else path.stem
+        name = re.sub(r"[^\w-]", "_", stem)
+    return [
+        f"# Made from {path.name} by gaponet robot new; every number may be changed here.",
+        f"name = {json.dumps(name)}",
+        f"dt = {dt!r}  # control period, s: --rate",
+        f"timestep = {dt / steps!r}  # physics step, s; {path.name} has {model.opt.timestep:g}",
+        f"contacts = {str(options.contacts).lower()}  # --contacts keeps geoms that touch, and "
+        "lets them",
+    ]
+
+
+def _joint_lines(drive: Drive, source: str, names: set[str]) -> list[str]:
+    """Return the lines of robot.toml about a joint.
+
+    Args:
+        source: Of the home position.
+        names: Of all joints; an actuator with another name is an alias.
+    """
+    lines = ["", "[[joint]]", f"name = {json.dumps(drive.name)}"]
+    if drive.actuator and drive.actuator not in names:
+        lines.append(f"aliases = [{json.dumps(drive.actuator)}]  # its actuator")
+    lines += [
+        f"kp = {drive.kp!r}  # N·m/rad: {drive.kp_source}",
+        f"kd = {drive.kd!r}  # N·m·s/rad: {drive.kd_source}",
+        f"effort_limit = {drive.limit!r}  # N·m: {drive.limit_source}",
+    ]
+    if drive.servo:
+        lines.append(f"servo = {json.dumps(drive.servo.name, ensure_ascii=False)}  # --servo")
+    return [*lines, f"home = {float(drive.home)!r}  # rad: {source}", "operated = true"]
 
 
 def _follower_lines(name: str, follower: Follower, path: Path) -> list[str]:
     return [
-        "", "[[joint]]", f"name = {json.dumps(name)}",
-        f"follows = {json.dumps(follower.joint)}  # a mimic joint of {path.name}: no motor of its own",
-        f"ratio = {follower.ratio!r}  # its angle per rad of that joint", f"at_zero = {follower.at_zero!r}  # rad",
-        "kp = 0.0", "effort_limit = 1.0  # of no use without kp", "operated = false",
-    ]  # fmt: skip
+        "",
+        "[[joint]]",
+        f"name = {json.dumps(name)}",
+        f"follows = {json.dumps(follower.joint)}  # a mimic joint of {path.name}: no motor of its "
+        "own",
+        f"ratio = {follower.ratio!r}  # its angle per rad of that joint",
+        f"at_zero = {follower.at_zero!r}  # rad",
+        "kp = 0.0",
+        "effort_limit = 1.0  # of no use without kp",
+        "operated = false",
+    ]
 
 
 def _mounts(model: mujoco.MjModel, joints: list[str]) -> list[tuple[str, str, np.ndarray, str]]:
     """Guess payload mounts: side, body, position in it (m), and source."""
     moved = {int(model.jnt_bodyid[model.joint(name).id]) for name in joints}
-    ends = tips = [
-        b for b in sorted(moved) if not moved & set(_beyond(model, b)[1:])
-    ]  # nothing moves beyond them
-    if len(ends) > 1:
-        ends = _palms(
-            model, [e for e in ends if any(_hand(model.body(b).name) for b in _beyond(model, e))]
-        )
-    result: list[tuple[str, str, np.ndarray, str]] = []
+    # nothing moves beyond them
+    tips = [body for body in sorted(moved) if not moved & set(_beyond(model, body)[1:])]
+    ends = tips
+    if len(tips) > 1:
+        ends = _palms(model, [tip for tip in tips if _has_hand(model, tip)])
+    mounts: list[tuple[str, str, np.ndarray, str]] = []
     for end in ends:
-        beyond = _beyond(model, end)
-        sites = [
-            s
-            for s in range(model.nsite)
-            if model.site_bodyid[s] in beyond and _hand(model.site(s).name)
-        ]
-        bodies = (
-            [b for b in beyond if b != end and _hand(model.body(b).name)] if end in tips else []
-        )
-        if sites:
-            body, pos, why = (
-                int(model.site_bodyid[sites[0]]),
-                model.site_pos[sites[0]],
-                model.site(sites[0]).name,
-            )
-        elif bodies:
-            body, pos, why = bodies[-1], np.zeros(3), model.body(bodies[-1]).name
-        else:
-            body, pos, why = end, model.body_ipos[end], "the last link's centre of mass"
-        name = model.body(end).name.lower()
-        side = next(
-            (word for word in ("left", "right") if word in name), f"hand{len(result) or ''}"
-        )
-        result.append(
-            (side, model.body(body).name, pos, f"a guess: {why}; correct side, body and pos")
-        )
-    return result
+        body, pos, why = _mount(model, end, is_tip=end in tips)
+        side = _side(model, end) or f"hand{len(mounts) or ''}"
+        text = f"a guess: {why}; correct side, body and pos"
+        mounts.append((side, model.body(body).name, pos, text))
+    return mounts
+
+
+def _mount(model: mujoco.MjModel, end: int, *, is_tip: bool) -> tuple[int, np.ndarray, str]:
+    """Return where a payload may hang on a body: body, position in it (m), and source.
+
+    A site of a hand is best; then, beyond a tip, a body of a hand; else the centre of mass.
+    """
+    beyond = _beyond(model, end)
+    for site in range(model.nsite):
+        name = model.site(site).name
+        if model.site_bodyid[site] in beyond and _hand(name):
+            return int(model.site_bodyid[site]), model.site_pos[site], name
+    bodies = [body for body in beyond if body != end and _hand(model.body(body).name)]
+    if is_tip and bodies:
+        return bodies[-1], np.zeros(3), model.body(bodies[-1]).name
+    return end, model.body_ipos[end], "the last link's centre of mass"
+
+
+def _side(model: mujoco.MjModel, body: int) -> str:
+    """Return left or right if the name of a body says so; else ""."""
+    name = model.body(body).name.lower()
+    for word in ("left", "right"):
+        if word in name:
+            return word
+    return ""
+
+
+def _has_hand(model: mujoco.MjModel, body: int) -> bool:
+    """Return True if a body or one beyond it is named as a hand is."""
+    return any(_hand(model.body(other).name) for other in _beyond(model, body))
 
 
 def _palms(model: mujoco.MjModel, ends: list[int]) -> list[int]:
     """Replace the fingers of one side by the body that carries them."""
     sides: dict[str, list[int]] = {}
     for end in ends:
-        name = model.body(end).name.lower()
-        sides.setdefault(next((word for word in ("left", "right") if word in name), ""), []).append(
-            end
-        )
-    result = []
+        sides.setdefault(_side(model, end), []).append(end)
+    palms = []
     for side_ends in sides.values():
         palm = max(set.intersection(*(set(_chain(model, end)) for end in side_ends)))
-        result += [palm] if model.body_parentid[palm] else side_ends
-    return sorted(result)
+        palms += [palm] if model.body_parentid[palm] else side_ends
+    return sorted(palms)
 
 
 def _chain(model: mujoco.MjModel, body: int) -> list[int]:

@@ -1,8 +1,8 @@
 """MJCF in one text without other files, for runs and datasets that store a robot.
 
-MuJoCo writes the structure, but numbers with six digits only. The numbers of bodies, joints, geoms and sites are
-therefore copied from the compiled model in full precision. Inertias are explicit. A mesh that can collide is written
-out; a visual mesh becomes its bounding box.
+MuJoCo writes the structure, but numbers with six digits only. The numbers of bodies, joints, geoms
+and sites are therefore copied from the compiled model in full precision. Inertias are explicit. A
+mesh that can collide is written out; a visual mesh becomes its bounding box.
 """
 
 from __future__ import annotations
@@ -48,13 +48,16 @@ def self_contained_mjcf(path: Path) -> str:
     """Return the MJCF at `path` in one text, without actuators: robot.toml holds their numbers.
 
     Raises:
-        RobotError: It does not compile, or such a text cannot hold it (plugins, tendons with more than six digits).
+        RobotError: It does not compile, or such a text cannot hold it (plugins, tendons with more
+            than six digits).
     """
     return self_contained_text(read_mjcf(path), path)
 
 
 def self_contained_text(spec: mujoco.MjSpec, path: Path) -> str:
-    """Return a specification, read from `path`, in one text; errors as for `self_contained_mjcf`."""
+    """Return a specification, read from `path`, in one text; errors as for
+    `self_contained_mjcf`.
+    """
     spec.compiler.discardvisual = spec.compiler.fusestatic = False
     model = compile_spec(spec, path)
     root = ET.fromstring(spec.to_xml())
@@ -63,7 +66,8 @@ def self_contained_text(spec: mujoco.MjSpec, path: Path) -> str:
     for element in root.iter("geom"):  # a default class may name a material that was dropped
         element.attrib.pop("material", None)
     root.insert(0, ET.Element("compiler", COMPILER_ATTRIBUTES))
-    asset, world = ET.SubElement(root, "asset"), root.find("worldbody")
+    asset = ET.SubElement(root, "asset")
+    world = root.find("worldbody")
     assert world is not None
     _fill(world, 0, model, asset, {tag: count() for tag in ("joint", "geom", "site")}, count(1))
     ET.indent(root)
@@ -88,7 +92,9 @@ def _fill(
     counters: Counters,
     bodies: Iterator[int],
 ) -> None:
-    """Copy the model's numbers into a body and its descendants, depth first, which is the model's order."""
+    """Copy the model's numbers into a body and its descendants, depth first, which is the model's
+    order.
+    """
     _unwrap(element)
     for child in [c for c in element if c.tag not in ("joint", "geom", "site", "body")]:
         element.remove(child)
@@ -96,8 +102,13 @@ def _fill(
         set_attributes(element, pos=model.body_pos[body], quat=model.body_quat[body])
         if model.body_mass[body]:
             inertial = ET.Element("inertial")
-            set_attributes(inertial, pos=model.body_ipos[body], quat=model.body_iquat[body], mass=model.body_mass[body],
-                 diaginertia=model.body_inertia[body])  # fmt: skip
+            set_attributes(
+                inertial,
+                pos=model.body_ipos[body],
+                quat=model.body_iquat[body],
+                mass=model.body_mass[body],
+                diaginertia=model.body_inertia[body],
+            )
             element.insert(0, inertial)
     for child in element:
         if child.tag == "joint":
@@ -120,11 +131,18 @@ def _unwrap(element: ET.Element) -> None:
 
 
 def _joint(element: ET.Element, model: mujoco.MjModel, j: int) -> None:
-    dof, at = int(model.jnt_dofadr[j]), int(model.jnt_qposadr[j])
+    dof = int(model.jnt_dofadr[j])
+    at = int(model.jnt_qposadr[j])
     set_attributes(
-        element, pos=model.jnt_pos[j], axis=model.jnt_axis[j], ref=model.qpos0[at], springref=model.qpos_spring[at],
-        armature=model.dof_armature[dof], frictionloss=model.dof_frictionloss[dof], margin=model.jnt_margin[dof],
-    )  # fmt: skip
+        element,
+        pos=model.jnt_pos[j],
+        axis=model.jnt_axis[j],
+        ref=model.qpos0[at],
+        springref=model.qpos_spring[at],
+        armature=model.dof_armature[dof],
+        frictionloss=model.dof_frictionloss[dof],
+        margin=model.jnt_margin[dof],
+    )
     for name, kind, i in (("stiffness", "jnt", j), ("damping", "dof", dof)):
         higher = getattr(model, f"{kind}_{name}poly", np.zeros((model.nv, 0)))[i]
         first = getattr(model, f"{kind}_{name}")[i]
@@ -141,7 +159,9 @@ def _geom(element: ET.Element, model: mujoco.MjModel, g: int, asset: ET.Element)
     """Copy a geom without its mass, since inertias are explicit."""
     for name in DROPPED_GEOM_ATTRIBUTES:
         element.attrib.pop(name, None)
-    pos, size, rotation = model.geom_pos[g], model.geom_size[g], np.zeros(9)
+    pos = model.geom_pos[g]
+    size = model.geom_size[g]
+    rotation = np.zeros(9)
     mujoco.mju_quat2Mat(rotation, model.geom_quat[g])
     kind = mujoco.mjtGeom(model.geom_type[g]).name.removeprefix("mjGEOM_").lower()
     if kind in ("mesh", "sdf", "hfield"):
@@ -150,7 +170,8 @@ def _geom(element: ET.Element, model: mujoco.MjModel, g: int, asset: ET.Element)
             element.set("mesh", _mesh(model, int(model.geom_dataid[g]), asset))
             kind = "mesh"
         else:
-            kind, pos = "box", pos + rotation.reshape(3, 3) @ model.geom_aabb[g, :3]
+            kind = "box"
+            pos = pos + rotation.reshape(3, 3) @ model.geom_aabb[g, :3]
             size = np.maximum(model.geom_aabb[g, 3:], 1e-4)
     element.set("type", kind)
     rgba = model.geom_rgba[g] if model.geom_matid[g] < 0 else model.mat_rgba[model.geom_matid[g]]

@@ -1,4 +1,5 @@
-"""Simulators that differ from a robot's own: gains, damping, friction, rotors, delay, and place of the payload.
+"""Simulators that differ from a robot's own: gains, damping, friction, rotors, delay, and place of
+the payload.
 
 One network is trained in many of them, so that it also corrects a simulator that it has never seen.
 """
@@ -40,8 +41,11 @@ class SimulatorChange:
 
 @dataclass(frozen=True)
 class SimulatorRanges:
-    """Ranges from which simulators are drawn. The defaults cover published parameter sets of the SO-101, whose
-    stiffness differs by a factor of 3.3, damping of 6, armature of 6, and friction from almost none to eight times."""
+    """Ranges from which simulators are drawn.
+
+    The defaults cover published parameter sets of the SO-101, whose stiffness differs by a factor
+    of 3.3, damping of 6, armature of 6, and friction from almost none to eight times.
+    """
 
     kp: Range = (0.5, 3.0)
     """Smallest and largest factor on the stiffness of a joint."""
@@ -65,7 +69,10 @@ class SimulatorRanges:
                 )
 
     def draw(self, joints: int, count: int, seed: int) -> list[SimulatorChange]:
-        """Return `count` simulators of a robot with this number of joints. Factors are uniform on a log scale."""
+        """Return `count` simulators of a robot with this number of joints.
+
+        Factors are uniform on a log scale.
+        """
         rng = np.random.default_rng(seed)
 
         def factors(bounds: Range, size: int) -> tuple[float, ...]:

@@ -1,8 +1,9 @@
-"""Robot description: joint names, gains, limits, control period and payload mounts, read from a robot folder.
+"""Robot description: joint names, gains, limits, control period and payload mounts, read from a
+robot folder.
 
-A folder holds `robot.toml` (what logs and controllers need) and `robot.xml` (MJCF: kinematics, inertia, friction).
-Position actuators with the gains of `robot.toml` replace the actuators of the MJCF. A new robot is a new folder; it
-needs no code.
+A folder holds `robot.toml` (what logs and controllers need) and `robot.xml` (MJCF: kinematics,
+inertia, friction). Position actuators with the gains of `robot.toml` replace the actuators of the
+MJCF. A new robot is a new folder; it needs no code.
 """
 
 from __future__ import annotations
@@ -62,7 +63,9 @@ class Follower(NamedTuple):
 
 @dataclass(frozen=True)
 class RobotSpec:
-    """Description of a robot, without simulation. Arrays have n joints in the order of `joint_names`.
+    """Description of a robot, without simulation.
+
+    Arrays have n joints in the order of `joint_names`.
 
     Attributes:
         name: Folder name, e.g. "so101".
@@ -73,39 +76,45 @@ class RobotSpec:
         kp, kd: PD gains, (n), N·m/rad and N·m·s/rad.
         effort_limit: Torque limit, (n), N·m.
         qpos_home: Rest position, (n), rad.
-        log_units: Unit of each joint in public logs, (n): rad, deg, or fraction (0..1 of the MJCF range).
+        log_units: Unit of each joint in public logs, (n): rad, deg, or fraction (0..1 of the MJCF
+            range).
         aliases: Other names of a joint in logs → its name here.
         payload_mounts: Places where payloads are attached.
         dt: Control period, s.
         timestep: Physics step at that control period, s; dt / timestep is an exact integer.
-        damping, armature, frictionloss: Identified values that replace the MJCF's, (n), N·m·s/rad, kg·m², N·m; NaN
-            keeps the MJCF's value.
+        damping, armature, frictionloss: Identified values that replace the MJCF's, (n), N·m·s/rad,
+            kg·m², N·m; NaN keeps the MJCF's value.
         delay: Time from command to servo, (n), s.
         offset: Offset of the servo's zero, (n), rad: its goal is command + offset.
         zero: Offset of the encoder, (n), rad: the MJCF's angle is reading + zero.
         target_speed: Speed of the servo's own trajectory generator, (n), rad/s; 0 without one.
-        stop_low, stop_high: Joint stops that narrow the MJCF's range, (n), rad; NaN keeps the MJCF's limit.
-        stribeck, stribeck_speed: Friction at rest beyond frictionloss, (n), N·m, and the speed at which it has
-            decreased to 1/e, rad/s.
-        friction_motor, friction_external: Friction per N·m of the motor's torque and of gravity's, (n).
+        stop_low, stop_high: Joint stops that narrow the MJCF's range, (n), rad; NaN keeps the
+            MJCF's limit.
+        stribeck, stribeck_speed: Friction at rest beyond frictionloss, (n), N·m, and the speed at
+            which it has decreased to 1/e, rad/s.
+        friction_motor, friction_external: Friction per N·m of the motor's torque and of gravity's,
+            (n).
         min_torque: Smallest torque that turns the motor, (n), N·m.
         encoder_step: Resolution of the servo's angle, (n), rad; 0 if it has no effect.
-        no_load_speed: Speed at which the motor has no torque left, (n), rad/s at the nominal supply; 0 without effect.
+        no_load_speed: Speed at which the motor has no torque left, (n), rad/s at the nominal
+            supply; 0 without effect.
         backlash: Width of the gap between motor and link, (n), rad.
-        friction_per_kelvin, damping_per_kelvin: Relative change of frictionloss, (n), 1/K, and change of damping, (n),
-            N·m·s/(rad·K); 0 without effect.
+        friction_per_kelvin, damping_per_kelvin: Relative change of frictionloss, (n), 1/K, and
+            change of damping, (n), N·m·s/(rad·K); 0 without effect.
         friction_temperature: Temperature at which frictionloss and damping hold, (n), °C.
-        servos: Servo type of each joint, (n), of robot.toml or servos.toml; None if robot.toml names none.
+        servos: Servo type of each joint, (n), of robot.toml or servos.toml; None if robot.toml
+            names none.
         tips, table: Tips that can touch a table, and the table; all other contacts are then off.
         links: MJCF body → identified mass, centre of mass and inertia, which replace the MJCF's.
         carries_payload: True if the simulated robot carries the payload of the recordings.
         gain_scale: Factor on kp and kd of operated joints in [[joint]]; kp and kd include it.
-        contacts: True if links collide as the MJCF states. It is off by default, because links welded to the world
-            collide permanently with their neighbours, which looks like a gap.
+        contacts: True if links collide as the MJCF states. It is off by default, because links
+            welded to the world collide permanently with their neighbours, which looks like a gap.
         followers: Mimic joints: they move with another joint, and have no motor.
-        nominal: The robot before identification; None if no parameter was identified (sysid/identify.py).
-        limits_accepted: True if the user stated that this folder's gains and ranges hold on hardware
-            (hw/control/hardware.py); no file states it.
+        nominal: The robot before identification; None if no parameter was identified
+            (sysid/identify.py).
+        limits_accepted: True if the user stated that this folder's gains and ranges hold on
+            hardware (hw/control/hardware.py); no file states it.
     """
 
     name: str
@@ -157,22 +166,13 @@ class RobotSpec:
     def __post_init__(self) -> None:
         n = len(self.joint_names)
         for name in ("kp", "kd", "effort_limit", "qpos_home"):
-            if np.shape(getattr(self, name)) != (n,):
-                shape = np.shape(getattr(self, name))
+            shape = np.shape(getattr(self, name))
+            if shape != (n,):
                 raise RobotError(
                     f"{self.name}: {name} must be {n} finite numbers, got shape {shape}"
                 )
         for name in ("qpos_home", *SERVO_FIELDS):
-            value = np.array(np.broadcast_to(np.asarray(getattr(self, name), float), n))
-            record = SERVO_FIELDS.get(name)
-            if np.isinf(value).any() or (
-                np.isnan(value).any() and not (record and record.from_mjcf)
-            ):
-                raise RobotError(f"{self.name}: {name} must be {n} finite numbers, got {value}")
-            if record and not record.signed and (value < 0).any():
-                raise RobotError(f"{self.name}: {name} must not be negative, got {value}")
-            value.flags.writeable = False
-            object.__setattr__(self, name, value)
+            object.__setattr__(self, name, self._read_only(name))
         object.__setattr__(self, "servos", self.servos or (None,) * n)
         if not self.operated:
             raise RobotError(
@@ -181,9 +181,27 @@ class RobotSpec:
         ratio = self.dt / self.timestep
         if abs(ratio - round(ratio)) > 1e-9 or ratio < 1:
             raise RobotError(
-                f"{self.name}: dt / timestep = {self.dt} / {self.timestep} = {ratio:.4g} is not a whole number; "
-                "choose a timestep that divides the control period"
+                f"{self.name}: dt / timestep = {self.dt} / {self.timestep} = {ratio:.4g} is not a "
+                "whole number; choose a timestep that divides the control period"
             )
+
+    def _read_only(self, name: str) -> Array:
+        """Return a field as a read-only array with a value for each joint, (n).
+
+        Raises:
+            RobotError: A value is infinite, or NaN or negative where it must not be.
+        """
+        n = len(self.joint_names)
+        value = np.array(np.broadcast_to(np.asarray(getattr(self, name), float), n))
+        record = SERVO_FIELDS.get(name)
+        may_be_nan = record is not None and record.from_mjcf
+        may_be_negative = record is None or record.signed
+        if np.isinf(value).any() or (np.isnan(value).any() and not may_be_nan):
+            raise RobotError(f"{self.name}: {name} must be {n} finite numbers, got {value}")
+        if not may_be_negative and (value < 0).any():
+            raise RobotError(f"{self.name}: {name} must not be negative, got {value}")
+        value.flags.writeable = False
+        return value
 
     def __getstate__(self) -> dict[str, Any]:
         """Include the files: another process may run on a machine without this folder."""
@@ -207,7 +225,9 @@ class RobotSpec:
         return self.steps_per(self.dt)
 
     def steps_per(self, dt: float) -> int:
-        """Return the physics steps per control period of length dt, s, with steps close to `timestep`."""
+        """Return the physics steps per control period of length dt, s, with steps close to
+        `timestep`.
+        """
         return max(1, round(dt / self.timestep))
 
     @property
@@ -216,12 +236,20 @@ class RobotSpec:
         return any(getattr(self, name).any() for name in SERVO_TERMS)
 
     @property
+    def is_identified(self) -> bool:
+        """True if at least one parameter was identified."""
+        return self.nominal is not None
+
+    @property
     def before_identification(self) -> RobotSpec:
         """The nominal robot: this one, or the one before identification."""
         return self.nominal or self
 
     def with_servos(self, servos: dict[str, dict[str, float]]) -> RobotSpec:
-        """Return the robot with identified values: joint → any of SERVO_FIELDS. Negative damping reduces kd instead."""
+        """Return the robot with identified values: joint → any of SERVO_FIELDS.
+
+        Negative damping reduces kd instead.
+        """
         changed: dict[str, Any] = {name: np.array(getattr(self, name)) for name in SERVO_FIELDS}
         for joint, values in servos.items():
             i = self.index([joint])[0]
@@ -230,20 +258,19 @@ class RobotSpec:
             if changed["damping"][i] < 0:
                 changed["kd"][i] = max(changed["kd"][i] + changed["damping"][i], 0.0)
                 changed["damping"][i] = 0.0
-        return dataclasses.replace(self, **changed, nominal=self.nominal or self)
+        return dataclasses.replace(self, **changed, nominal=self.before_identification)
 
     def with_gains(self, kp: tuple[float, ...] | None, kd: tuple[float, ...] | None) -> RobotSpec:
-        """Return the robot with other nominal gains, (n) N·m/rad and N·m·s/rad; None keeps the present ones.
+        """Return the robot with other nominal gains, (n) N·m/rad and N·m·s/rad; None keeps the
+        present ones.
 
         Identified gains keep their ratio to the nominal ones.
         """
         if kp is None and kd is None:
             return self
-        nominal = self.nominal or self
-        new_kp, new_kd = (
-            np.array(nominal.kp if kp is None else kp),
-            np.array(nominal.kd if kd is None else kd),
-        )
+        nominal = self.before_identification
+        new_kp = np.array(nominal.kp if kp is None else kp)
+        new_kd = np.array(nominal.kd if kd is None else kd)
         if np.allclose((new_kp, new_kd), (nominal.kp, nominal.kd), rtol=GAIN_TOLERANCE, atol=0.0):
             return self
         kp_ratio = np.divide(new_kp, nominal.kp, out=np.ones_like(nominal.kp), where=nominal.kp > 0)
@@ -255,7 +282,9 @@ class RobotSpec:
         return dataclasses.replace(self, kp=self.kp * kp_ratio, kd=new_kd * kd_ratio, nominal=own)
 
     def at_temperature(self, temperature: tuple[float, ...] | None) -> RobotSpec:
-        """Return the robot with friction and damping at joint temperatures, (n) °C; None or NaN: as stated."""
+        """Return the robot with friction and damping at joint temperatures, (n) °C; None or NaN:
+        as stated.
+        """
         if temperature is None:
             return self
         warming = np.nan_to_num(np.array(temperature) - self.friction_temperature)
@@ -267,7 +296,9 @@ class RobotSpec:
         )
 
     def with_gain_scale(self, scale: float) -> RobotSpec:
-        """Return the same robot with the operated joints set to `scale` times the kp and kd of [[joint]]."""
+        """Return the same robot with the operated joints set to `scale` times the kp and kd of
+        [[joint]].
+        """
         ratio = np.ones(len(self.joint_names))
         ratio[self.operated_index] = scale / self.gain_scale
         nominal = self.nominal and self.nominal.with_gain_scale(scale)
@@ -277,7 +308,10 @@ class RobotSpec:
 
     @functools.cached_property
     def qpos_range(self) -> Array:
-        """Joint limits of the MJCF, (n, 2), rad; ±inf where a joint is unlimited. Compiles the MJCF on first use."""
+        """Joint limits of the MJCF, (n, 2), rad; ±inf where a joint is unlimited.
+
+        Compiles the MJCF on first use.
+        """
         from gaponet.robot.mjcf import compile_spec, read_mjcf
 
         model = compile_spec(read_mjcf(self.mjcf), self.mjcf)
@@ -300,7 +334,9 @@ class RobotSpec:
         return self.index(self.operated)
 
     def index(self, names: tuple[str, ...] | list[str]) -> Array:
-        """Return the positions of `names` in `joint_names`; an unknown name raises JointMismatchError."""
+        """Return the positions of `names` in `joint_names`; an unknown name raises
+        JointMismatchError.
+        """
         for name in names:
             if name not in self.joint_names:
                 raise JointMismatchError(self._unknown(name, "a request")[0])
@@ -310,15 +346,16 @@ class RobotSpec:
         """Return the robot's name of a joint in a log.
 
         Args:
-            name: Name in the log. left/waist matches left_waist or else waist; kLeftElbow and left_elbow match
-                left_elbow_joint.
+            name: Name in the log. left/waist matches left_waist or else waist; kLeftElbow and
+                left_elbow match left_elbow_joint.
             where: File, for the error.
             extra: The user's --map, which has priority.
 
         Raises:
             JointMismatchError: No joint or several joints match.
         """
-        full, short = name.strip(), name.strip().split("/")[-1]
+        full = name.strip()
+        short = name.strip().split("/")[-1]
         for table in (extra or {}, self.aliases):
             mapped = table.get(full, table.get(short))
             if mapped is not None:
@@ -332,7 +369,8 @@ class RobotSpec:
         if len(matches) != 1:
             message, nearest = self._unknown(short, where)
             raise JointMismatchError(
-                f'{message}. Map it with --map {short}={nearest}, or leave it out with ignore = ["{short}"] in '
+                f"{message}. Map it with --map {short}={nearest}, or leave it out with ignore = "
+                f'["{short}"] in '
                 "logs.toml (--logs)"
             )
         return matches[0]
@@ -340,7 +378,10 @@ class RobotSpec:
     def _unknown(self, name: str, where: str) -> tuple[str, str]:
         """Return the error text for an unknown joint name, and the most similar joint."""
         near = difflib.get_close_matches(name, self.joint_names, n=MAX_SUGGESTIONS, cutoff=0.0)
-        message = f"{where} names joint '{name}', which robot '{self.name}' does not have; nearest: {', '.join(near)}"
+        message = (
+            f"{where} names joint '{name}', which robot '{self.name}' does not have; nearest: "
+            f"{', '.join(near)}"
+        )
         return message, near[0]
 
 
@@ -365,16 +406,20 @@ def packaged_robots() -> list[str]:
 
 
 def named_robots() -> list[str]:
-    """Return the names that load_robot takes: of the robots in the package, then of the identified ones."""
+    """Return the names that load_robot takes: of the robots in the package, then of the identified
+    ones.
+    """
     return [*packaged_robots(), *identified_catalogue().names()]
 
 
 def load_robot(name_or_path: str | Path) -> RobotSpec:
-    """Read a robot from the package by name, from a folder by path, or from the Hub by its address hf://USER/NAME.
+    """Read a robot from the package by name, from a folder by path, or from the Hub by its address
+    hf://USER/NAME.
 
-    A string without a slash is a name: "so101" is a robot as its maker states it, "so101@sage" one that was identified
-    (`gaponet robot list`). It is never a folder of the current directory. A Path, or a string with a slash such as
-    "./g1", is a folder, except for the path that is the name of an identified robot.
+    A string without a slash is a name: "so101" is a robot as its maker states it, "so101@sage" one
+    that was identified (`gaponet robot list`). It is never a folder of the current directory. A
+    Path, or a string with a slash such as "./g1", is a folder, except for the path that is the name
+    of an identified robot.
 
     Raises:
         RobotError: It names the folder, the field and what to write there.
@@ -389,7 +434,8 @@ def load_robot(name_or_path: str | Path) -> RobotSpec:
     mjcf = folder / table.mjcf
     if not mjcf.is_file():
         raise RobotError(
-            f'{toml}: {mjcf.name} is missing beside it; put the MJCF there or name it with mjcf = "..."'
+            f"{toml}: {mjcf.name} is missing beside it; put the MJCF there or name it with mjcf = "
+            '"..."'
         )
     try:
         return _spec(table, mjcf, folder)
@@ -398,7 +444,9 @@ def load_robot(name_or_path: str | Path) -> RobotSpec:
 
 
 def robot_argument(folder: Path) -> str:
-    """Return the value of --robot for a robot folder: with a slash, because a string without one is a name."""
+    """Return the value of --robot for a robot folder: with a slash, because a string without one
+    is a name.
+    """
     if identified_catalogue().holds(folder):
         return folder.name
     return f"./{folder}" if folder.name == str(folder) else str(folder)
@@ -406,13 +454,15 @@ def robot_argument(folder: Path) -> str:
 
 def _folder(name_or_path: str | Path) -> Path:
     """Return the folder of a robot; refuses an ambiguous name."""
-    text, folder = str(name_or_path), Path(name_or_path)
+    text = str(name_or_path)
+    folder = Path(name_or_path)
     found = identified_catalogue().find(name_or_path) or hub_folder(name_or_path)
     if found is not None:
         return found
     if isinstance(name_or_path, Path) or folder.name != text or text == "..":
         return folder
-    packaged, here = PACKAGE_FOLDER / text, (folder / "robot.toml").is_file()
+    packaged = PACKAGE_FOLDER / text
+    here = (folder / "robot.toml").is_file()
     if text not in packaged_robots():
         what = (
             f"for the folder here write ./{text}"
@@ -436,7 +486,9 @@ def servo_table() -> ServoTable:
 
 
 def servo_type(name: str, where: str, own: tuple[ServoType, ...] = ()) -> ServoType:
-    """Return the servo type of that name among a robot.toml's own and the package's; `where` begins the error."""
+    """Return the servo type of that name among a robot.toml's own and the package's; `where`
+    begins the error.
+    """
     types = {servo.name: servo for servo in (*servo_table().servo, *own)}
     if sum(servo.name == name for servo in own) > 1:
         raise RobotError(f"{where}: two [[servo]] have the name '{name}'")
@@ -449,67 +501,108 @@ def servo_type(name: str, where: str, own: tuple[ServoType, ...] = ()) -> ServoT
 
 
 def _spec(table: RobotTable, mjcf: Path, folder: Path) -> RobotSpec:
+    """Return the robot of a robot.toml, with its identified values.
+
+    Raises:
+        RobotError: Names contradict each other.
+    """
+    _require_known_names(table)
+    robot = _nominal(table, mjcf, folder)
+    identified = robot
+    servos = _identified_servos(table)
+    if servos:
+        identified = robot.with_servos(servos)
+    changed: dict[str, Any] = {}
+    if table.identified_table is not None:
+        changed["table"] = table.identified_table
+    if table.identified_mount:
+        changed["payload_mounts"] = _identified_mounts(table)
+    if table.identified_link:
+        changed["links"] = table.identified_link
+    if changed:
+        identified = dataclasses.replace(identified, **changed, nominal=robot)
+    return identified
+
+
+def _nominal(table: RobotTable, mjcf: Path, folder: Path) -> RobotSpec:
+    """Return the robot of a robot.toml without its identified values."""
     joints = table.joint
-    if len(set(names := [x for j in joints for x in dict.fromkeys((j.name, *j.aliases))])) != len(
-        names
-    ):
-        raise RobotError(
-            f"{table.name}: a joint name appears twice in {', '.join(names)} (names and aliases)"
-        )
+    aliases = {}
+    followers = {}
+    servos: list[ServoType | None] = []
+    for joint in joints:
+        for alias in joint.aliases:
+            aliases[alias] = joint.name
+        if joint.follows:
+            followers[joint.name] = Follower(joint.follows, joint.ratio, joint.at_zero)
+        servo = None
+        if joint.servo:
+            servo = servo_type(joint.servo, f"joint '{joint.name}'", table.servo)
+        servos.append(servo)
     robot = RobotSpec(
         name=table.name,
         description=table.description or table.name,
         mjcf=mjcf,
         folder=folder.absolute(),  # other processes may have another current folder
-        joint_names=tuple(j.name for j in joints),
-        operated=tuple(j.name for j in joints if j.operated),
-        kp=np.array([j.kp for j in joints]),
-        kd=np.array([j.kd for j in joints]),
-        effort_limit=np.array([j.effort_limit for j in joints]),
-        qpos_home=np.array([j.home for j in joints]),
-        log_units=tuple(j.log_unit for j in joints),
-        followers={j.name: Follower(j.follows, j.ratio, j.at_zero) for j in joints if j.follows},
-        aliases={alias: j.name for j in joints for alias in j.aliases},
+        joint_names=tuple(joint.name for joint in joints),
+        operated=tuple(joint.name for joint in joints if joint.operated),
+        kp=np.array([joint.kp for joint in joints]),
+        kd=np.array([joint.kd for joint in joints]),
+        effort_limit=np.array([joint.effort_limit for joint in joints]),
+        qpos_home=np.array([joint.home for joint in joints]),
+        log_units=tuple(joint.log_unit for joint in joints),
+        followers=followers,
+        aliases=aliases,
         payload_mounts=table.payload_mount,
         dt=table.dt,
         timestep=table.timestep,
-        servos=tuple(
-            servo_type(j.servo, f"joint '{j.name}'", table.servo) if j.servo else None
-            for j in joints
-        ),
+        servos=tuple(servos),
         tips=table.tip,
         table=table.table,
         contacts=table.contacts,
         carries_payload=table.carries_payload,
-    ).with_gain_scale(table.gain_scale)
-    identified_table = table.identified_table
-    if (robot.table or identified_table) and not robot.tips:
+    )
+    return robot.with_gain_scale(table.gain_scale)
+
+
+def _require_known_names(table: RobotTable) -> None:
+    """Refuse names that appear twice, and identified values of what is not there."""
+    joints = [joint.name for joint in table.joint]
+    names: list[str] = []
+    for joint in table.joint:
+        names += dict.fromkeys((joint.name, *joint.aliases))
+    if len(set(names)) != len(names):
+        raise RobotError(
+            f"{table.name}: a joint name appears twice in {', '.join(names)} (names and aliases)"
+        )
+    if (table.table or table.identified_table) and not table.tip:
         raise RobotError(
             "[table]: no [[tip]] can touch it; add a [[tip]] with body, pos and radius"
         )
-    for joint in table.identified:
-        if joint not in robot.joint_names:
-            raise RobotError(
-                f"[identified.{joint}] names no joint; joints are {', '.join(robot.joint_names)}"
-            )
-    servos = {
-        joint: {name: value for name, value in vars(servo).items() if value is not None}
-        for joint, servo in table.identified.items()
-    }
-    identified = robot.with_servos(servos) if servos else robot
-    if identified_table is not None:
-        identified = dataclasses.replace(identified, table=identified_table, nominal=robot)
-    sides = [mount.side for mount in robot.payload_mounts]
+    for name in table.identified:
+        if name not in joints:
+            raise RobotError(f"[identified.{name}] names no joint; joints are {', '.join(joints)}")
+    sides = [mount.side for mount in table.payload_mount]
     for side in table.identified_mount:
         if side not in sides:
             raise RobotError(
-                f"[identified_mount.{side}] names no [[payload_mount]]; sides are {', '.join(sides)}"
+                f"[identified_mount.{side}] names no [[payload_mount]]; sides are "
+                f"{', '.join(sides)}"
             )
-    if moved := {side: vars(mount) for side, mount in table.identified_mount.items()}:
-        mounts = tuple(
-            dataclasses.replace(m, **moved.get(m.side, {})) for m in robot.payload_mounts
-        )
-        identified = dataclasses.replace(identified, payload_mounts=mounts, nominal=robot)
-    if table.identified_link:
-        identified = dataclasses.replace(identified, links=table.identified_link, nominal=robot)
-    return identified
+
+
+def _identified_servos(table: RobotTable) -> dict[str, dict[str, float]]:
+    """Return joint → field → identified value, SI."""
+    servos = {}
+    for joint, servo in table.identified.items():
+        servos[joint] = {name: value for name, value in vars(servo).items() if value is not None}
+    return servos
+
+
+def _identified_mounts(table: RobotTable) -> tuple[PayloadMount, ...]:
+    """Return the payload mounts with their identified places and masses."""
+    mounts = []
+    for mount in table.payload_mount:
+        moved = table.identified_mount.get(mount.side)
+        mounts.append(mount if moved is None else dataclasses.replace(mount, **vars(moved)))
+    return tuple(mounts)

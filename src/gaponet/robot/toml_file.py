@@ -35,7 +35,9 @@ class _Joint:
 
 @dataclass(frozen=True)
 class Spread:
-    """Value of a servo type: the median of its joints, and the 5 and 95 % of their estimates and standard errors."""
+    """Value of a servo type: the median of its joints, and the 5 and 95 % of their estimates and
+    standard errors.
+    """
 
     value: float
     low: float
@@ -50,7 +52,9 @@ class Spread:
 
 @dataclass(frozen=True)
 class ServoType:
-    """[[servo]]: servo type that joints refer to; in servos.toml, or in a robot.toml, whose types come first."""
+    """[[servo]]: servo type that joints refer to; in servos.toml, or in a robot.toml, whose types
+    come first.
+    """
 
     name: Name
     variant: str = ""  # gear, supply, place
@@ -77,22 +81,38 @@ class ServoType:
     @property
     def measured(self) -> dict[str, Spread]:
         """Measured values by field; one without an interval is its own."""
-        values = ((f, getattr(self, f)) for f in MEASURED_FIELDS)
-        return {
-            f: x if isinstance(x, Spread) else Spread(x, x, x) for f, x in values if x is not None
-        }
+        found = {}
+        for name in MEASURED_FIELDS:
+            value = getattr(self, name)
+            if isinstance(value, Spread):
+                found[name] = value
+            elif value is not None:
+                found[name] = Spread(value, value, value)
+        return found
 
     def text(self, field: str) -> str:
-        """Return a value in the unit of the field's heading, with its interval or supply; "" if there is none."""
-        value, factor = (
-            getattr(self, field),
-            SERVO_FIELDS[field].factor if field in MEASURED_FIELDS else 1.0,
-        )
+        """Return a value in the unit of the field's heading, with its interval or supply; "" if
+        there is none.
+        """
+        value = getattr(self, field)
+        factor = SERVO_FIELDS[field].factor if field in MEASURED_FIELDS else 1.0
+        if value is None:
+            return ""
         if isinstance(value, Spread):
-            middle, low, high = (f"{float(f'{factor * x:.2g}'):g}" for x in vars(value).values())
+            middle, low, high = (
+                _two_digits(factor * x) for x in (value.value, value.low, value.high)
+            )
             return f"{middle} ({low}…{high})"
         supply = f" at {self.gain_volts:g} V" if field == "gain" and self.gain_volts else ""
-        return "" if value is None else f"{factor * value:.3g}{supply}"
+        return f"{factor * value:.3g}{supply}"
+
+    def measured_text(self, field: str) -> str:
+        """Return `text` of a measured field; "" for others."""
+        return self.text(field) if field in MEASURED_FIELDS else ""
+
+
+def _two_digits(value: float) -> str:
+    return f"{float(f'{value:.2g}'):g}"
 
 
 MEASURED_FIELDS = (*PASSIVE_FIELDS, "stribeck", "stribeck_speed", "friction_motor")
@@ -108,8 +128,10 @@ class ServoTable:
 
 @dataclass(frozen=True)
 class PayloadMount:
-    """[[payload_mount]]: a payload's centre is at `pos` (m) in the frame of MJCF body `body`. `mass` (kg) is always
-    there, such as a hand that the MJCF lacks."""
+    """[[payload_mount]]: a payload's centre is at `pos` (m) in the frame of MJCF body `body`.
+
+    `mass` (kg) is always there, such as a hand that the MJCF lacks.
+    """
 
     side: Name
     body: str
@@ -127,7 +149,9 @@ class _Mount:
 
 @dataclass(frozen=True)
 class Link:
-    """[identified_link.BODY]: mass (kg), centre (m), inertia about it (xx, yy, zz, xy, xz, yz, kg·m²), body's frame."""
+    """[identified_link.BODY]: mass (kg), centre (m), inertia about it (xx, yy, zz, xy, xz, yz,
+    kg·m²), body's frame.
+    """
 
     mass: Annotated[float, Interval(ge=0, le=1e4)]
     pos: tuple[Metres, Metres, Metres]
@@ -137,14 +161,21 @@ class Link:
 if TYPE_CHECKING:
     IdentifiedServo = Any
 else:  # [identified.JOINT]: values that replace those of the MJCF and the nominal gains
-    IdentifiedServo = make_dataclass("IdentifiedServo", [
-        (f.name, Annotated[float, Interval(ge=f.limits[0], le=f.limits[1])] | None, None) for f in SERVO_FIELDS.values()
-    ], frozen=True)  # fmt: skip
+    IdentifiedServo = make_dataclass(
+        "IdentifiedServo",
+        [
+            (f.name, Annotated[float, Interval(ge=f.limits[0], le=f.limits[1])] | None, None)
+            for f in SERVO_FIELDS.values()
+        ],
+        frozen=True,
+    )
 
 
 @dataclass(frozen=True)
 class Tip:
-    """[[tip]]: sphere of `radius` (m) that can touch the table, at `pos` (m) in the frame of MJCF body `body`."""
+    """[[tip]]: sphere of `radius` (m) that can touch the table, at `pos` (m) in the frame of MJCF
+    body `body`.
+    """
 
     body: str
     pos: tuple[Metres, Metres, Metres]
@@ -153,7 +184,9 @@ class Tip:
 
 @dataclass(frozen=True)
 class Table:
-    """[table]: level plane at `height` (m, MJCF world), with friction coefficient and stiffness under a tip (N/m)."""
+    """[table]: level plane at `height` (m, MJCF world), with friction coefficient and stiffness
+    under a tip (N/m).
+    """
 
     height: Metres
     friction: Annotated[float, Interval(ge=0, le=10)] = 0.3
@@ -182,3 +215,33 @@ class RobotTable:
     description: str = ""
     license: str = ""
     mjcf: str = "robot.xml"
+
+
+@dataclass(frozen=True)
+class RobotOptions:
+    """What a user states of a robot.toml that is made from a vendor's model (robot/new.py)."""
+
+    joints: tuple[str, ...] = ()
+    """Recorded joints, by name or pattern ('*_elbow_*'); all others are frozen. Default: all hinges
+    with an actuator, or all hinges."""
+    kp: tuple[str, ...] = ()
+    """Position gain of the controller while recording, N·m/rad: 100 for all joints, '*wrist*=20'
+    for some; a later value replaces an earlier one. Default: the model's actuators."""
+    kd: tuple[str, ...] = ()
+    """Damping gain, likewise, N·m·s/rad."""
+    effort_limit: tuple[str, ...] = ()
+    """Torque limit, likewise, N·m."""
+    servo: tuple[str, ...] = ()
+    """Servo type, likewise, as gaponet robot servos lists them: its measured damping, friction and
+    armature and its torque limit replace the model's."""
+    packages: tuple[str, ...] = ()
+    """NAME=FOLDER for package://NAME in a URDF. Default: searched around the file."""
+    rate: float = 50.0
+    """Commands per second, Hz."""
+    keyframe: str = ""
+    """Keyframe that gives the home position and the angles of frozen joints. Default: the first, or
+    zero."""
+    contacts: bool = False
+    """Keep the contacts between links that the model has."""
+    name: str = ""
+    """Name of the robot. Default: the file's name."""

@@ -1,4 +1,6 @@
-"""Vendors' models, MJCF or URDF: found by name on this disk, and read with the meshes that exist."""
+"""Vendors' models, MJCF or URDF: found by name on this disk, and read with the meshes that
+exist.
+"""
 
 from __future__ import annotations
 
@@ -25,8 +27,16 @@ from gaponet.robot.mjcf import (
 )
 
 MESHES = (".stl", ".obj", ".msh")  # formats that MuJoCo reads
-URDF_COMPILER = {"strippath": "false", "fusestatic": "false", "discardvisual": "false", "balanceinertia": "true",
-        "boundmass": "1e-6", "boundinertia": "1e-9", "autolimits": "true"}  # fmt: skip
+URDF_COMPILER = {
+    "strippath": "false",
+    "fusestatic": "false",
+    "discardvisual": "false",
+    "balanceinertia": "true",
+    "boundmass": "1e-6",
+    "boundinertia": "1e-9",
+    "autolimits": "true",
+}
+AXES = ("xx", "yy", "zz", "xy", "xz", "yz")  # of an inertia tensor
 BALL_DENSITY = 1000.0  # kg/m³, of the ball that replaces an impossible inertia
 
 
@@ -38,11 +48,12 @@ COLLECTIONS = ("menagerie", "robot_descriptions", "example-robot-data")
 
 
 def find_model(name: str) -> Path:
-    """Return the model file of a name such as menagerie:franka_fr3, on this disk; nothing is downloaded.
+    """Return the model file of a name such as menagerie:franka_fr3, on this disk; nothing is
+    downloaded.
 
     Args:
-        name: menagerie:FOLDER or menagerie:FOLDER/FILE of MuJoCo Menagerie; robot_descriptions:NAME with or without
-            _description; example-robot-data:NAME, such as panda.
+        name: menagerie:FOLDER or menagerie:FOLDER/FILE of MuJoCo Menagerie; robot_descriptions:NAME
+            with or without _description; example-robot-data:NAME, such as panda.
 
     Raises:
         RobotError: It is not there; the message says how to get it.
@@ -83,7 +94,8 @@ def _of_menagerie(name: str) -> Path:
         where = f"{roots[0]} has {abbreviate(there)}" if roots else "it is not on this disk"
         raise RobotError(
             f"menagerie:{name}: {where}. Get MuJoCo Menagerie (git clone "
-            "https://github.com/google-deepmind/mujoco_menagerie) and name its folder in MUJOCO_MENAGERIE"
+            "https://github.com/google-deepmind/mujoco_menagerie) and name its folder in "
+            "MUJOCO_MENAGERIE"
         )
     return place if place.is_file() else _main_model(place, f"menagerie:{name}")
 
@@ -104,8 +116,8 @@ def _of_robot_descriptions(name: str) -> Path:
         repositories = importlib.import_module("robot_descriptions._repositories").REPOSITORIES
     except ImportError:
         raise RobotError(
-            f"robot_descriptions:{name}: the package is not installed: pip install robot_descriptions, and "
-            f"robot_descriptions pull {name}"
+            f"robot_descriptions:{name}: the package is not installed: pip install "
+            f"robot_descriptions, and robot_descriptions pull {name}"
         ) from None
     pulled = f"robot_descriptions pull {name}"
 
@@ -160,8 +172,8 @@ def _of_example_robot_data(name: str) -> Path:
     roots = [p for p in (*_stated(EXAMPLE_VARIABLES), *usual) if p.is_dir()]
     if not roots:
         raise RobotError(
-            f"example-robot-data:{name}: it is not on this disk; pip install example-robot-data, or name its folder "
-            f"robots in {EXAMPLE_VARIABLES[0]}"
+            f"example-robot-data:{name}: it is not on this disk; pip install example-robot-data, "
+            f"or name its folder robots in {EXAMPLE_VARIABLES[0]}"
         )
     root = roots[0]
     if (root / name).is_file():
@@ -194,7 +206,8 @@ def read_vendor(path: Path, packages: dict[str, Path]) -> tuple[mujoco.MjSpec, l
             p.relative_to(path).as_posix() for e in ("xml", "urdf") for p in path.rglob(f"*.{e}")
         )
         raise RobotError(
-            f"{path}: is a folder; name the model in it: {abbreviate(models) or 'there is no .xml or .urdf'}"
+            f"{path}: is a folder; name the model in it: "
+            f"{abbreviate(models) or 'there is no .xml or .urdf'}"
         )
     if path.suffix == ".xacro":
         raise RobotError(
@@ -269,39 +282,61 @@ def _left_out(names: list[str], why: str) -> list[str]:
 
 
 def _correct_inertias(root: ET.Element) -> list[str]:
-    """Replace impossible inertias, such as zeros, by those of a ball of the link's mass; return notes."""
-    impossible, light = [], []
+    """Replace impossible inertias, such as zeros, by those of a ball of the link's mass; return
+    notes.
+    """
+    impossible = []
+    light = []
     for link in root.iter("link"):
         inertial = link.find("inertial")
-        mass, inertia = (
-            (None, None) if inertial is None else (inertial.find("mass"), inertial.find("inertia"))
-        )
-        m = _number(mass, "value")
-        if inertial is not None and mass is not None and m <= 0:
+        element = None if inertial is None else inertial.find("mass")
+        mass = _number(element, "value")
+        if inertial is not None and element is not None and mass <= 0:
             link.remove(inertial)
-        if inertial is None or mass is None or m <= 0:
+        if inertial is None or element is None or mass <= 0:
             light.append(link.get("name", ""))
             continue
-        xx, yy, zz, xy, xz, yz = (
-            _number(inertia, f"i{axes}") for axes in ("xx", "yy", "zz", "xy", "xz", "yz")
-        )
-        matrix = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-        if inertia is None or not np.isfinite(matrix).all() or np.linalg.eigvalsh(matrix)[0] > 0:
-            continue
-        ball = 0.4 * m * (3 * m / (4 * np.pi * BALL_DENSITY)) ** (2 / 3)
-        for axes in ("xx", "yy", "zz", "xy", "xz", "yz"):
-            inertia.set(f"i{axes}", repr(float(ball)) if axes[0] == axes[1] else "0")
-        impossible.append(link.get("name", ""))
-    moved = {j.find("child").get("link", "") for j in root.iter("joint")  # type: ignore[union-attr]
-             if j.get("type") != "fixed" and j.find("child") is not None}  # fmt: skip
+        inertia = inertial.find("inertia")
+        if inertia is not None and _is_impossible(inertia):
+            _set_ball(inertia, mass)
+            impossible.append(link.get("name", ""))
     notes = []
     if impossible:
         notes.append(
-            f"inertia that no body has, taken as a ball's of the link's mass: {abbreviate(impossible)}"
+            "inertia that no body has, taken as a ball's of the link's mass: "
+            f"{abbreviate(impossible)}"
         )
-    if light := [name for name in light if name in moved]:
+    moved = _moved_links(root)
+    light = [name for name in light if name in moved]
+    if light:
         notes.append(f"links without mass behind a joint, taken as 1 mg: {abbreviate(light)}")
     return notes
+
+
+def _is_impossible(inertia: ET.Element) -> bool:
+    """Return True for a finite inertia tensor that is not positive definite."""
+    xx, yy, zz, xy, xz, yz = (_number(inertia, f"i{axes}") for axes in AXES)
+    matrix = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    return bool(np.isfinite(matrix).all() and np.linalg.eigvalsh(matrix)[0] <= 0)
+
+
+def _set_ball(inertia: ET.Element, mass: float) -> None:
+    """Write the inertia of a ball of BALL_DENSITY: 2/5 m r²."""
+    squared_radius = (3 * mass / (4 * np.pi * BALL_DENSITY)) ** (2 / 3)
+    ball = 0.4 * mass * squared_radius
+    for axes in AXES:
+        on_diagonal = axes[0] == axes[1]
+        inertia.set(f"i{axes}", repr(float(ball)) if on_diagonal else "0")
+
+
+def _moved_links(root: ET.Element) -> set[str]:
+    """Return the links that a joint moves."""
+    moved = set()
+    for joint in root.iter("joint"):
+        child = joint.find("child")
+        if child is not None and joint.get("type") != "fixed":
+            moved.add(child.get("link", ""))
+    return moved
 
 
 def _number(element: ET.Element | None, name: str) -> float:

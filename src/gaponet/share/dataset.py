@@ -23,12 +23,13 @@ from gaponet.data.card import card_markdown, make_card
 from gaponet.data.formats.lerobot import read_episodes
 from gaponet.data.formats.lerobot_set import Set, Stated, sets_under
 from gaponet.data.importer import measure_delays
+from gaponet.data.journal import FILE as JOURNAL
 from gaponet.data.log import Log
 from gaponet.data.offsets import FILE as OFFSETS
 from gaponet.data.offsets import read_offsets
 from gaponet.data.sequence import Sequence, SequenceMeta, to_sequence
 from gaponet.data.split import read_split
-from gaponet.data.store import JOURNAL, Dataset
+from gaponet.data.store import Dataset
 from gaponet.data.writers.lerobot import write
 from gaponet.robot.by_name import require_self_contained
 from gaponet.robot.folder import STORED_ROBOT, load_stored_robot, save_robot

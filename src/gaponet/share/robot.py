@@ -29,7 +29,7 @@ def write_files(robot: Path, folder: Path, address: str, facts: ModelFacts) -> t
         UsageError: Nothing was identified of the robot.
     """
     spec = load_robot(robot)
-    if spec.nominal is None:
+    if not spec.is_identified:
         raise UsageError(f"{robot}: nothing was identified of this robot; gaponet identify does")
     save_robot(spec, folder)
     (folder / FOLDER_MARKER).unlink()

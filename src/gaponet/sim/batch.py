@@ -83,7 +83,8 @@ class OneByOne:
 
 
 if TYPE_CHECKING:
-    from mujoco.batch import MODEL_FIELDS, Batch
+    from mujoco.batch import MODEL_FIELDS
+    from mujoco.batch import Batch as Batch
 else:
     try:
         from mujoco.batch import MODEL_FIELDS, Batch

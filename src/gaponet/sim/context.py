@@ -106,7 +106,8 @@ def scene_context(scene: mujoco.MjModel, robot: RobotSpec, dt: float, prefix: st
         batch.step(nstep=steps)
         return qpos[:, address] - home, qvel[:, dof]
 
-    return _answers(step, dt, operated, towards)[0]
+    result: Array = _answers(step, dt, operated, towards)[0]
+    return result
 
 
 def _probe_targets(home: Array, operated: Array, limits: Array) -> tuple[Array, Array]:

@@ -8,7 +8,6 @@ of torques within a period.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from collections.abc import Sequence as ListOf
 from dataclasses import dataclass
 
@@ -143,11 +142,13 @@ class AnalyticInverse:
         """
         held = np.stack([self.targets_in_force(period) for period in periods])
         if not self.ahead:
-            return held[0]
+            undelayed: Array = held[0]
+            return undelayed
         late = np.broadcast_to(self.delay / self.dt, held[0].shape)
         whole = np.minimum(late.astype(int), self.ahead - 1)
         first, second = (np.take_along_axis(held, i[None], axis=0)[0] for i in (whole, whole + 1))
-        return first + (late - whole) * (second - first)
+        delayed: Array = first + (late - whole) * (second - first)
+        return delayed
 
     def targets_in_force(self, period: Period) -> Array:
         """Return the targets that must be in force in a period, (num, n) rad, not limited to any range."""
@@ -157,7 +158,8 @@ class AnalyticInverse:
             "ibkx,bkj->ikj", self.before, ends
         )  # at which physics steps begin
         before = np.einsum("ibkx,bkj->ikj", self.speeds, ends) / self.h
-        after, mean = before[1:], lambda x: np.einsum("ik,ikj->kj", self.share, x)
+        after = before[1:]
+        mean = self._mean
         torque = self._torque(mean(qpos), mean(before[:-1]), gain / self.dt, period.friction)
         torque += self.damping * (mean(after) - mean(before[:-1]))
         back = self.kp * (qpos - self.offset) + self.kd * (before[:-1] if self.explicit else after)
@@ -167,13 +169,17 @@ class AnalyticInverse:
             low, high = torque_range(self.high, before[:-1] / no_load)
             mean_low, mean_high = mean(low), mean(high)
         self.saturated = (torque < mean_low) | (torque > mean_high)
-        return self._targets(np.clip(torque, mean_low, mean_high), back, low, high, mean)
+        return self._targets(np.clip(torque, mean_low, mean_high), back, low, high)
 
-    def _targets(
-        self, torque: Array, back: Array, low: Array, high: Array, mean: Callable[[Array], Array]
-    ) -> Array:
+    def _mean(self, values: Array) -> Array:
+        """Return the mean over the physics steps of a period, (steps, num, n) → (num, n)."""
+        mean: Array = np.einsum("ik,ikj->kj", self.share, values)
+        return mean
+
+    def _targets(self, torque: Array, back: Array, low: Array, high: Array) -> Array:
         """Return targets u (num, n) for which the mean over steps of kp·u − back, (steps, num, n), within the motors'
         limits, (n,) or (steps, num, n), is torque (num, n)."""
+        mean = self._mean
         out = (torque + mean(back)) / self.kp
         for _ in range(len(back)):
             requested = self.kp * out - back
@@ -182,7 +188,8 @@ class AnalyticInverse:
                 break
             free = np.maximum(mean((applied == requested).astype(float)), 1 / len(back))
             out = out + (torque - mean(applied)) / (self.kp * free)
-        return out
+        result: Array = out
+        return result
 
     def _torque(self, qpos: Array, qvel: Array, qacc: Array, friction: Array) -> Array:
         self.qpos[:, self.at], self.qvel[:, self.dof] = qpos, qvel
@@ -193,7 +200,10 @@ class AnalyticInverse:
             - self.passive[:, self.dof]
             + np.einsum("kij,kj->ki", self.inertia.matrix(self.num), qacc)
         )
-        return torque + friction * friction_limit(self.terms, self.frictionloss, qvel, torque, load)
+        result: Array = torque + friction * friction_limit(
+            self.terms, self.frictionloss, qvel, torque, load
+        )
+        return result
 
     def agrees_with(self, other: AnalyticInverse, limits: Array) -> bool:
         """Return True if the inverses of two simulators of the same joints, limits (n, 2) rad, agree for any motion."""
@@ -235,7 +245,8 @@ class AnalyticInverse:
 def _own(batch: Batch, model: mujoco.MjModel, name: str) -> Array:
     """Return a field of the model by simulation, (num or 1, …)."""
     values = batch.expanded(name)
-    return getattr(model, name)[None] if values is None else values
+    result: Array = getattr(model, name)[None] if values is None else values
+    return result
 
 
 def _most_torque(model: mujoco.MjModel, joints: tuple[str, ...], actuators: Array) -> Array:

@@ -117,7 +117,8 @@ class Run:
     @property
     def error(self) -> Array:
         """e after each step, (T − 1, n) rad, without the common start."""
-        return (self.qpos_sim - self.qpos_real)[1:]
+        result: Array = (self.qpos_sim - self.qpos_real)[1:]
+        return result
 
     def holds(self, columns: list[int] | None) -> list[int]:
         """Return the columns, out of these (None: all), that the recording holds."""

@@ -120,7 +120,8 @@ def rollout_errors(
     """Return the mean |error| of each sequence's rollout, of the operated joints that it holds, (sequences,) rad."""
     replays = replay(sequences, robot, corrector, nthread, lock_idle=True)
     errors = [run.mean_error() for run in runs(sequences, [r.qpos for r in replays], robot)]
-    return np.nan_to_num(np.array(errors), nan=np.pi)
+    result: Array = np.nan_to_num(np.array(errors), nan=np.pi)
+    return result
 
 
 def motion_errors(sequences: ListOf[Sequence], robot: RobotSpec) -> Array:

@@ -171,7 +171,9 @@ def _contacts(robot: RobotSpec, postures: Array, logged: bool) -> Iterator[Findi
         )
         return
     data = mujoco.MjData(model)
-    name = lambda geom: model.body(model.geom_bodyid[geom]).name  # noqa: E731
+
+    def name(geom: int) -> str:
+        return str(model.body(model.geom_bodyid[geom]).name)
 
     def pairs(qpos: Array) -> set[str]:
         data.qpos[:] = qpos
@@ -233,7 +235,10 @@ def _steps(
         )
         yield Finding("warning", "step", text, (name,), {"growth": growth})
     else:
-        stable = lambda h, a: all(_growth(m, q, h, a)[0] <= 1 + MAX_GROWTH for _, m, q in cases)  # noqa: E731
+
+        def stable(step: float, armature: float) -> bool:
+            return all(_growth(m, q, step, armature)[0] <= 1 + MAX_GROWTH for _, m, q in cases)
+
         step = next(
             (h for h in (robot.timestep / 2**k for k in range(1, 7)) if stable(h, 0.0)), None
         )

@@ -22,7 +22,7 @@ import mujoco
 import numpy as np
 
 from gaponet.base.arrays import Array, array_module
-from gaponet.robot.servo_fields import SERVO_TERMS
+from gaponet.robot.servo_fields import SERVO_TERMS as SERVO_TERMS
 
 ServoTerms = dict[
     str, Any

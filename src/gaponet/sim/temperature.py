@@ -52,7 +52,8 @@ def temperature_spread(sequences: ListOf[Sequence], robot: RobotSpec) -> Array:
 def temperature_varies(sequences: ListOf[Sequence], robot: RobotSpec) -> Array:
     """Return the operated joints, (n,), whose temperature varies enough, and not with gains or payload."""
     whole, among = temperature_spread(sequences, robot)
-    return (among > MIN_STD_K) & (among**2 > (1 - MAX_CONFOUNDED) * whole**2)
+    result: Array = (among > MIN_STD_K) & (among**2 > (1 - MAX_CONFOUNDED) * whole**2)
+    return result
 
 
 def temperature_findings(

@@ -64,7 +64,7 @@ _friction = _warp_function(
 )
 
 
-@warp.kernel(enable_backward=False)
+@warp.kernel(enable_backward=False)  # type: ignore[untyped-decorator]
 def _set_servos(
     servos: _Servos, offset: _Floats, gain: _Parameters, ctrl: _Floats, qpos: _Floats, qvel: _Floats, torque: _Floats,
     load: _Floats, bias: _Parameters, friction: _Floats, force: _Pairs,
@@ -151,7 +151,8 @@ class _Worlds:
 
     def bind(self, name: str) -> Tensor:
         """Return a live view of a field of all worlds, (nworld, …)."""
-        return warp.to_torch(getattr(self.data, name))
+        result: Tensor = warp.to_torch(getattr(self.data, name))
+        return result
 
     def period(self) -> None:
         """Advance by a control period."""
@@ -252,11 +253,12 @@ class WarpSim:
     def array(self, values: Any) -> Tensor:
         """Copy values to the device, floats as float32, without waiting."""
         values = torch.as_tensor(values)
-        return values.to(
+        result: Tensor = values.to(
             self.qpos.device,
             torch.float32 if values.is_floating_point() else None,
             non_blocking=True,
         )
+        return result
 
     def reset(self, ids: Any, qpos: Any, qvel: Any, past: Any = None) -> None:
         """Reset as BatchSim.reset does; arrays of any kind."""

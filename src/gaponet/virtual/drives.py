@@ -66,12 +66,14 @@ class Drives:
         """Return the torque that the drives set at the rated torque constant, (N, active) N·m."""
         kp, kd, added = self.gains
         torque = kp * (ctrl - qpos) - kd * qvel + added
-        return np.clip(torque * self.gain_factor(), -self.effort, self.effort)
+        result: Array = np.clip(torque * self.gain_factor(), -self.effort, self.effort)
+        return result
 
     def gain_factor(self) -> Array:
         """Return the factor of the gain by supply, temperature and chain, (N, active)."""
         supply = 1.0 + self._physics.supply_gain * (self.supply - 1.0)
-        return supply * self.derating() * self.chain_gain
+        result: Array = supply * self.derating() * self.chain_gain
+        return result
 
     def derating(self) -> Array:
         """Return the factor of the gain at the temperature of the winding, (N, active)."""
@@ -79,7 +81,8 @@ class Drives:
 
     def max_torque(self) -> Array:
         """Return the largest torque at the present temperature and voltage, (N, active) N·m."""
-        return self.effort * self._thermal.kt() * np.minimum(self.supply, 1.0)
+        result: Array = self.effort * self._thermal.kt() * np.minimum(self.supply, 1.0)
+        return result
 
 
 class Transmission:

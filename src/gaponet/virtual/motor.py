@@ -54,9 +54,10 @@ def friction_limit(
     )
     loss = 1.0 - physics.efficiency
     backdriven = torque * direction < 0
-    return (nominal + dry) * thinning + loss * np.abs(torque) / np.where(
+    result: Array = (nominal + dry) * thinning + loss * np.abs(torque) / np.where(
         backdriven, physics.efficiency, 1.0
     )
+    return result
 
 
 class Bristles:
@@ -122,12 +123,16 @@ def speed_factor(physics: Physics, speed: Array) -> Array:
     """Return the factor of the torque limit, 0 to 1, at a speed (N, n) rad/s in the direction of
     the torque.
     """
-    return np.clip((1.0 - speed / physics.no_load_speed) / (1.0 - physics.corner), 0.0, 1.0)
+    result: Array = np.clip(
+        (1.0 - speed / physics.no_load_speed) / (1.0 - physics.corner), 0.0, 1.0
+    )
+    return result
 
 
 def cogging_torque(physics: Physics, qpos: Array) -> Array:
     """Return the torque ripple at joint angles (N, n) rad, N·m."""
-    return physics.cogging * np.sin(physics.cogging_count * qpos + physics.cogging_phase)
+    result: Array = physics.cogging * np.sin(physics.cogging_count * qpos + physics.cogging_phase)
+    return result
 
 
 class Couplings:
@@ -169,14 +174,18 @@ class Couplings:
 
     def drag(self, qpos: Array) -> Array:
         """Return the friction of the cables at joint angles (N, n) rad, N·m."""
-        return self.p.drag * 0.5 * (1.0 - np.cos(qpos[:, self.neighbour] - self.p.drag_angle))
+        result: Array = (
+            self.p.drag * 0.5 * (1.0 - np.cos(qpos[:, self.neighbour] - self.p.drag_angle))
+        )
+        return result
 
     def gain_factor(self, torque: Array) -> Array:
         """Return the factor of the gain that the supplies of the chains allow under motor torques,
         (N, n).
         """
         load = (np.abs(torque) / self.effort) @ self.same_chain
-        return 1.0 / (1.0 + self.p.limb_loss * np.maximum(load - self.p.limb_budget, 0.0))
+        result: Array = 1.0 / (1.0 + self.p.limb_loss * np.maximum(load - self.p.limb_budget, 0.0))
+        return result
 
     def flex(self, h: float) -> None:
         """Advance the tilt of the base by h s."""
@@ -286,11 +295,12 @@ class Thermal:
 
     def heat(self, torque_squared: Array) -> Array:
         """Return the copper loss, (N, n) W."""
-        return (
+        result: Array = (
             torque_squared
             / self.p.motor_constant**2
             * (1.0 + COPPER_COEFFICIENT * (self.winding - KT_TEMPERATURE))
         )
+        return result
 
     def step(self, torque_squared: Array, dt: float) -> None:
         """Advance by dt s with a mean squared motor torque (N, n), (N·m)²."""
@@ -315,7 +325,8 @@ def supply_factor(physics: Physics, power: Array) -> Array:
     resistance.
     """
     current = power / physics.supply_voltage
-    return 1.0 - current * physics.supply_resistance / physics.supply_voltage
+    result: Array = 1.0 - current * physics.supply_resistance / physics.supply_voltage
+    return result
 
 
 class CommandLink:

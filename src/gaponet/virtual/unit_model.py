@@ -68,4 +68,5 @@ def _tilted_gravity(model: mujoco.MjModel, roll: float, pitch: float) -> np.ndar
     """Return gravity as a base sees it that is tilted by roll and pitch, rad; (3,) m/s²."""
     g = np.linalg.norm(model.opt.gravity)
     down = [np.sin(pitch), -np.sin(roll) * np.cos(pitch), -np.cos(roll) * np.cos(pitch)]
-    return g * np.array(down)
+    result: np.ndarray = g * np.array(down)
+    return result

@@ -170,7 +170,8 @@ class VirtualH12:
 
     def _blend(self, own: Array, commanded: Array, share: Array) -> Array:
         """Return the robot's own values, in its order, and commanded ones, by motor, as shared."""
-        return (1 - share) * own[self._order] + share * commanded
+        result: Array = (1 - share) * own[self._order] + share * commanded
+        return result
 
     def _note(self, command: MotorCommands, topic: str, weight: float, now: float) -> None:
         """Append a command to `heard`, with the state of the joints."""

@@ -261,7 +261,8 @@ class VirtualRobot:
     def _servo_target(self, ctrl: Array) -> Array:
         """Return targets (N, n) rad as the encoders of the active joints see them."""
         within = np.clip(np.asarray(ctrl, float)[:, self.active], *self._limits.T)
-        return within - self.physics.zero_offset
+        result: Array = within - self.physics.zero_offset
+        return result
 
     def _target_at(self, elapsed: float) -> Array:
         """Return the target of the servos `elapsed` s after the start of the control period."""
@@ -332,7 +333,8 @@ class VirtualRobot:
     def _load(self) -> Array:
         """Return the load of gravity and cables on a joint at rest, (N, active), N·m."""
         self.batch.forward(stage=mujoco.mjtStage.mjSTAGE_VEL.value)
-        return self.batch.bind("qfrc_bias") - self.batch.bind("qfrc_passive")
+        result: Array = self.batch.bind("qfrc_bias") - self.batch.bind("qfrc_passive")
+        return result
 
     def _friction_limit(self, torque: Array) -> Array:
         """Return the present friction limit under a motor torque at the joint, (N, active), N·m."""

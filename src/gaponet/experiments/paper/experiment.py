@@ -23,9 +23,10 @@ from gaponet.data.checks.gate import pass_gate, used_recordings
 from gaponet.data.paper_counts import count_as_paper, table_beside_paper
 from gaponet.data.store import Dataset
 from gaponet.experiments.paper.claims import Claim, claim_table, claims
+from gaponet.experiments.paper.commands import ShareDone
 from gaponet.experiments.paper.figure3 import draw_figure_3, figure_3_table
 from gaponet.experiments.paper.jobs import Job, make_shared_inputs, run_jobs
-from gaponet.experiments.paper.measure import ShareDone, record_unit
+from gaponet.experiments.paper.measure import record_unit
 from gaponet.experiments.paper.options import Block, PaperOptions
 from gaponet.experiments.paper.page import Section, write_page
 from gaponet.experiments.paper.results import Results

@@ -136,7 +136,8 @@ class GoalPlanner:
             raise UsageError(
                 f"{self.robot.name}: no hand reaches {MIN_FRONT_M:g} m in front of the base"
             )
-        return positions[chosen]
+        result: Array = positions[chosen]
+        return result
 
     def _plan(self) -> Plan | None:
         """Return a random trajectory; None if a goal is too near, cannot be held, or the move to

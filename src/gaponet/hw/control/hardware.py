@@ -67,7 +67,7 @@ def hardware_robot(robot: RobotSpec, reference: RobotSpec) -> RobotSpec:
     """
     _require_equal(robot.before_identification, reference)
     require_plausible(robot)
-    if robot.nominal is None:
+    if not robot.is_identified:
         return reference
     values = {name: getattr(robot, name) for name in SERVO_FIELDS}
     values["effort_limit"] = np.minimum(robot.effort_limit, reference.effort_limit)

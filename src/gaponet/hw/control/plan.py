@@ -361,7 +361,8 @@ def advance(search: Search[_T], clock: Clock, seconds: float) -> _T | None:
         while clock.now() <= until:
             next(search)
     except StopIteration as end:
-        return end.value
+        result: _T | None = end.value
+        return result
     return None
 
 

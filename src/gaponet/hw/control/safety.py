@@ -250,7 +250,8 @@ def damping_gains(kd: Array, qvel: Array, effort: Array) -> Array:
     """
     speed = np.abs(np.nan_to_num(qvel, nan=0.0, posinf=0.0, neginf=0.0))
     believed = np.clip(speed, MIN_SPEED_RAD_S, MAX_BELIEVED_SPEED_RAD_S)
-    return np.minimum(kd, effort / believed)
+    result: Array = np.minimum(kd, effort / believed)
+    return result
 
 
 # Faults: what each one puts in doubt, what may still be used afterwards, and how the robot ends.
@@ -564,7 +565,8 @@ class StateMonitor:
         """
         qvel = state.qvel[self.commanded]
         if self._last is None or state.time <= self._last.time:
-            return qvel
+            result: Array = qvel
+            return result
         moved = state.qpos[self.commanded] - self._last.qpos[self.commanded]
         return np.asarray(moved / (state.time - self._last.time))
 

@@ -173,7 +173,7 @@ class TargetGenerator:
         self.following = following
         self.plan = plan
         self.start = state.qpos[context.joints]
-        self._last = self.start
+        self._last: Array = self.start
         self._origin = self.start  # of the way back
         if plan:
             self.path = plan.approach
@@ -335,4 +335,6 @@ class TargetGenerator:
         share = float(blend(np.array(passed / self.path.duration)))
         first = self.path.points[0][joints]
         last = self.path.points[-1][joints]
-        return self.path.at(passed)[joints] + (1 - share) * (start - first) + share * (goal - last)
+        moved_ends: Array = (1 - share) * (start - first) + share * (goal - last)
+        place: Array = self.path.at(passed)[joints] + moved_ends
+        return place

@@ -69,7 +69,8 @@ def _struct(name: str, fields: hg.Fields, **parts: type[IdlStruct]) -> type[IdlS
         field: kind if count == 1 else array[kind, count]
         for field, (kind, count) in members.items()
     }
-    return make_struct(f"unitree_hg.msg.dds_.{name}_", **hints)
+    result: type[IdlStruct] = make_struct(f"unitree_hg.msg.dds_.{name}_", **hints)
+    return result
 
 
 IMUState = _struct("IMUState", hg.IMU)
@@ -86,7 +87,8 @@ def as_bytes(kind: type[IdlStruct]) -> type[IdlStruct]:
     """
 
     def serialize(self: Any, *_: Any, **__: Any) -> bytes:
-        return hg.HEADER + self.data
+        result: bytes = hg.HEADER + self.data
+        return result
 
     def deserialize(cls: Any, data: bytes, *_: Any, **__: Any) -> Any:
         sample = cls.__new__(cls)

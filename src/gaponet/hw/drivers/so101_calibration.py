@@ -81,12 +81,14 @@ class ArmCalibration:
 
     def qpos(self, steps: Array) -> Array:
         """Return rad (n) of steps (n)."""
-        return (steps - self.zero) * STEP_RAD * self.sign
+        result: Array = (steps - self.zero) * STEP_RAD * self.sign
+        return result
 
     def steps(self, qpos: Array) -> Array:
         """Return the nearest whole steps (n) within the calibrated range, of rad (n)."""
         nearest = np.rint(qpos / (STEP_RAD * self.sign) + self.zero)
-        return np.clip(nearest, self.low, self.high).astype(int)
+        result: Array = np.clip(nearest, self.low, self.high).astype(int)
+        return result
 
 
 def read_calibration(path: str | Path, robot: RobotSpec) -> ArmCalibration:

@@ -148,9 +148,10 @@ def next_step(step: Array, distance: Array, max_step: float, max_change: float) 
     largest = np.where(
         far <= max_change, far, max_change * (far / max_change + m * (m + 1) / 2) / (m + 1)
     )
-    return np.clip(
+    result: Array = np.clip(
         np.copysign(np.minimum(largest, max_step), distance), step - max_change, step + max_change
     )
+    return result
 
 
 class LiveTargets:

@@ -53,7 +53,8 @@ JointState = dds.make_struct(
 
 def encode(message: Any) -> bytes:
     """Return a message as plain CDR, little-endian, without its header."""
-    return message.__idl__.serialize(message)[len(HEADER) :]
+    result: bytes = message.__idl__.serialize(message)[len(HEADER) :]
+    return result
 
 
 def decode(kind: Any, data: bytes) -> Any:

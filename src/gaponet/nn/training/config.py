@@ -265,7 +265,7 @@ def command(
     """Return the shell command that repeats a run."""
     limit = str(budget.steps) if budget.seconds is None else f"{budget.seconds:g}s"
     words = ["gaponet", "train", str(dataset), "--out", str(out), "--budget", limit]
-    if robot.nominal is not None:
+    if robot.is_identified:
         words += ["--robot", str(robot.folder)]
     if holdout_units:
         words += ["--holdout-units", *holdout_units]

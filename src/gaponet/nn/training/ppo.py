@@ -35,7 +35,8 @@ class Critic(nn.Module):
 
     def forward(self, features: Tensor, observations: Tensor) -> Tensor:
         standardised = self.standardise(observations).clamp(-MAX_FEATURE, MAX_FEATURE)
-        return self.net(torch.cat([features, standardised], dim=1))
+        result: Tensor = self.net(torch.cat([features, standardised], dim=1))
+        return result
 
 
 @dataclass
@@ -112,7 +113,8 @@ class PPO:
         config = self.config
         halvings = self.updates / config.std_half_life if config.std_half_life else 0.0
         std = max(config.std * 0.5**halvings, min(config.std, config.std_end))
-        return std * math.sqrt(1 - self.noise_correlation**2)
+        result: float = std * math.sqrt(1 - self.noise_correlation**2)
+        return result
 
     def update(self) -> Update:
         """Collect num_steps decisions of each environment and learn from them."""
@@ -239,7 +241,7 @@ class PPO:
     @staticmethod
     def _descend(optimiser: torch.optim.Optimizer, loss: Tensor) -> None:
         optimiser.zero_grad()
-        loss.backward()
+        loss.backward()  # type: ignore[no-untyped-call]
         parameters = [p for group in optimiser.param_groups for p in group["params"]]
         nn.utils.clip_grad_norm_(parameters, MAX_GRADIENT_NORM)
         optimiser.step()

@@ -275,7 +275,7 @@ class Pretraining:
             error = torch.nan_to_num(net(x[batch]) - labels[batch])
             loss = huber_loss(error / self.label_rms, torch.zeros_like(error), delta=HUBER_DELTA)
             self.optimiser.zero_grad()
-            loss.backward()
+            loss.backward()  # type: ignore[no-untyped-call]
             self.optimiser.step()
             squares[step] = error.detach().square().mean()
             tick()
@@ -319,7 +319,8 @@ def _mean_over_hold(labels: Array, hold: int) -> Array:
     if hold == 1:
         return labels
     rows = len(labels) - hold + 1
-    return np.mean([labels[i : i + rows] for i in range(hold)], axis=0)
+    result: Array = np.mean([labels[i : i + rows] for i in range(hold)], axis=0)
+    return result
 
 
 def _rms(squares: Array) -> float:

@@ -108,7 +108,10 @@ def _kind(run: Path) -> ModelKind | None:
     """Return the kind of network of a run; None if no run is there."""
     if not (run / CHECKPOINT).is_file():
         return None
-    return read_json(dict[str, Any], run / "config.json", ModelError)["model"]["kind"]
+    result: ModelKind | None = read_json(dict[str, Any], run / "config.json", ModelError)["model"][
+        "kind"
+    ]
+    return result
 
 
 def _copy(out: Path, kind: ModelKind) -> None:

@@ -336,7 +336,8 @@ def _count_payloads(entries: list[Entry]) -> int:
 def swing(values: Array) -> Array:
     """Return the range of a signal from its 5th to its 95th percentile, (T, n) → (n,)."""
     low, high = np.percentile(values, [5, 95], axis=0)
-    return high - low
+    result: Array = high - low
+    return result
 
 
 def draw_findings(

@@ -231,7 +231,8 @@ def _white(picture: mujoco.Renderer) -> Array:
     pixels = picture.render().copy()
     picture.enable_segmentation_rendering()
     pixels[picture.render()[:, :, 0] < 0] = 255
-    return pixels
+    result: Array = pixels
+    return result
 
 
 def portrait(robot: RobotSpec, meta: SequenceMeta, dt: float, qpos: Mapping[str, Array]) -> bytes:

@@ -69,7 +69,7 @@ class Player:
                 gui, np.arange(len(shown.real)) * shown.real.dt, curves, "mean |error|, mrad"
             )
 
-        @self.worst.on_click
+        @self.worst.on_click  # type: ignore[untyped-decorator]
         def _(_: Any) -> None:
             self.playing.value = False
             self.time.value = worst
@@ -158,7 +158,8 @@ def _page_colour(rgb: Array) -> Array:
     """Return a colour (3,) of 0 to 1 as one of 0 to 255 that a light and a dark page show: black
     becomes slate.
     """
-    return (255 * (rgb + LIGHTER * (rgb.max() < DARK))).astype(int)
+    result: Array = (255 * (rgb + LIGHTER * (rgb.max() < DARK))).astype(int)
+    return result
 
 
 def draw_curves(gui: Any, time: Array, curves: Mapping[str, tuple[Array, str]], title: str) -> Any:

@@ -184,7 +184,7 @@ def side_by_side(
     real = dataset.read(entry)
     simulators: dict[str, tuple[RobotSpec, Corrector | None]] = {}
     simulators["nominal"] = (robot.before_identification, None)
-    if robot.nominal is not None:
+    if robot.is_identified:
         simulators["identified"] = (robot, None)
     for run in runs:
         candidate = Candidate.load(run, robot)
@@ -207,7 +207,7 @@ def side_by_side(
         error = np.abs(qpos - real.qpos)[:, robot.operated_index].mean(axis=1)  # (T,) rad
         motions.append(Copy(name, qpos, error))
     folders = list(runs)
-    if robot.nominal is not None:
+    if robot.is_identified:
         folders.append(robot.folder)
     seen = was_used(entry, folders) if folders else None
     return SideBySide(real, robot, tuple(motions), seen)

@@ -1,0 +1,148 @@
+"""Options of the public functions. The command line reads the same classes.
+
+The docstring of a field is its command-line help. Options of a run on a robot are in
+run_options.py.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from gaponet.base.errors import UsageError
+from gaponet.robot.servo_fields import Term
+from gaponet.sysid.options import IdentifyOptions as SearchOptions
+
+
+@dataclass(frozen=True)
+class IdentifyOptions:
+    """What an identification fits, to which recordings, and from where it starts."""
+
+    windows: int = 40
+    """Number of 8 s rollouts that are fitted, taken evenly from the training motions."""
+    terms: tuple[Term, ...] | None = None
+    """Terms of the servo model to try; each is accepted only if validation motions improve.
+    Default: stribeck and load, after limit if a joint reaches its stated torque limit; then
+    backlash where a gap makes the rollouts better at otherwise equal values; then temperature where
+    it varies at equal gains and payload."""
+    table: bool = True
+    """Look for a table under the robot's tips ([[tip]] in robot.toml)."""
+    threads: int = 0
+    """0 for all cores."""
+    budget: str | None = None
+    """Time such as 60s or 4m that the fit may take, the table included; default no limit. What does
+    not fit into it is left out and named in a warning. Results are the same on every machine only
+    without a limit."""
+    stops: bool = False
+    """Add an end stop to joints that stayed behind several commands; otherwise they are
+    reported."""
+    masses: bool = False
+    """Fit masses, centres of mass and inertias of the links too; accepted as a term is."""
+    like: str | Path | None = None
+    """Identified robot whose servos are the start and the prior, by joint name, mirrored name
+    (left, right) or type of servo: another arm, another unit, another robot."""
+    units: tuple[str, ...] = ()
+    """Only these, pooled: one set of parameters for all of them; default: all others than
+    --holdout-units."""
+    holdout_units: tuple[str, ...] = ()
+    """Units to leave out, as in training."""
+    despite_errors: bool = False
+    """Go on although the doctor finds an error in the recordings; the result keeps the errors."""
+
+    def seconds(self) -> float | None:
+        """Return the budget, s; None without a limit.
+
+        Raises:
+            UsageError: It is no time.
+        """
+        from gaponet.nn.training.config import Budget
+
+        if self.budget is None:
+            return None
+        seconds = Budget.parse(self.budget).seconds
+        if seconds is None:
+            raise UsageError(f"--budget {self.budget}: give a time such as 60s or 4m")
+        return seconds
+
+    def searches(self) -> SearchOptions:
+        """Return the options of the searches for parameters.
+
+        Raises:
+            UsageError: The budget is no time.
+        """
+        return SearchOptions(
+            windows=self.windows,
+            terms=self.terms,
+            table=self.table,
+            stops=self.stops,
+            masses=self.masses,
+            seconds=self.seconds(),
+            nthread=self.threads,
+        )
+
+    def require_none_for_torque(self, dataset: str) -> None:
+        """Refuse options that a robot which is driven by torque has no use for.
+
+        Raises:
+            UsageError: One of them is given.
+        """
+        given = (self.like, self.units, self.holdout_units, self.terms, self.stops, self.masses)
+        if any(given):
+            what = "--like, --units, --holdout-units, --terms, --stops and --masses"
+            raise UsageError(f"{dataset} holds a robot that is driven by torque; leave out {what}")
+
+
+@dataclass(frozen=True)
+class ImportOptions:
+    """How logs are read."""
+
+    payload_side: str | None = None
+    """Hand that carries the payload: both (default), or the side of one payload mount."""
+    format: str | None = None
+    """Format of the logs; default by inspection; gaponet import --formats lists them."""
+    joint_map: Mapping[str, str] | None = None
+    """Joint name in the logs → joint name of the robot."""
+    logs: str | Path | None = None
+    """A logs.toml: what columns, names, units, signs and clocks mean; default the one in the folder
+    of the logs."""
+    position_unit: Literal["rad", "deg", "fraction", "ticks", "signed_percent"] | None = None
+    """Unit of positions, where the format leaves it open."""
+    time_unit: Literal["s", "ms", "us", "ns"] | None = None
+    """Unit of time, where the format leaves it open."""
+    rate: float | None = None
+    """Hz, of logs without a clock."""
+    cut: float | None = None
+    """Cut long recordings into equal pieces of about this length, s; each is a motion of its
+    own."""
+    level: Literal["joint", "upper_body", "whole_body"] | None = None
+    """What the motions move; default whole_body."""
+    kp: tuple[str, ...] = ()
+    """Stiffness while recording, N·m/rad: a number, or JOINT=NUMBER for some joints; default what
+    the format states, else the robot's."""
+    kd: tuple[str, ...] = ()
+    """Damping gain while recording, N·m·s/rad, likewise."""
+    skip_bad: bool = False
+    """Cut bad rows and leave out unreadable logs, instead of refusing all."""
+    strict: bool = False
+    """Refuse logs with implausible velocity, torque or temperature, instead of repairing them."""
+    allow_pickle: bool = False
+    """Open pickled files (ASAP), with an unpickler that makes arrays, numbers and text only."""
+
+
+def parse_joint_map(pairs: tuple[str, ...]) -> dict[str, str] | None:
+    """Return ("a=b",) as {"a": "b"}; None for nothing.
+
+    Raises:
+        UsageError: A pair is no pair, or a joint of the log has two names.
+    """
+    names: dict[str, str] = {}
+    for pair in pairs:
+        logged, equals, own = (part.strip() for part in pair.partition("="))
+        if not (logged and equals and own) or "=" in own:
+            raise UsageError(f"--map {pair}: write NAME_IN_LOG=NAME_OF_ROBOT")
+        names[logged] = own
+    if len(names) < len(pairs):
+        raise UsageError(f"--map {' '.join(pairs)}: names one joint of the log twice")
+    return names or None

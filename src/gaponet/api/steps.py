@@ -1,0 +1,465 @@
+"""The steps from a model and logs to a report, as one list of commands.
+
+gaponet start walks all of them, with the model and the logs of a laboratory. gaponet demo --real
+walks those in between, with public recordings. `StartRecord` remembers which have finished.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import shlex
+import tempfile
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from typing_extensions import TypedDict
+
+from gaponet.api.options import parse_joint_map
+from gaponet.base.errors import LogError, UsageError
+from gaponet.base.files import lock_folder, write_json, write_text
+from gaponet.base.progress import Progress, no_progress
+from gaponet.base.structure import read_json
+from gaponet.data.store import Dataset, dataset_hash
+from gaponet.robot.finding import abbreviate
+from gaponet.robot.spec import RobotSpec, load_robot, named_robots, robot_argument
+from gaponet.robot.toml_file import RobotOptions
+from gaponet.share.remote import FileRecord
+
+if TYPE_CHECKING:
+    from gaponet.data.doctor import DoctorResult
+    from gaponet.data.log import Log
+
+COMMANDS_FILE = "commands.sh"  # the commands that have finished, one per line
+RECORD_FILE = "start.json"
+MODEL_INPUT = "the model"  # what the command that makes the robot depends on
+MIN_RECORDINGS = 3  # fewer are cut into pieces, so that some can validate
+PIECE_S = 8.0
+MIN_PIECE_S = 4.0
+MAX_RELATIVE_ROUNDING = 0.01  # of the measured rate to a whole number of Hz
+
+
+@dataclass(frozen=True)
+class StartOptions:
+    """What the steps are told about the robot and its logs."""
+
+    unit_id: str = "lab"
+    """Name of the recorded robot."""
+    payload_mass: float = 0.0
+    """kg in each hand while recording."""
+    joints: tuple[str, ...] = ()
+    """Recorded joints of the model, by name or pattern. Default: those that the logs name."""
+    kp: tuple[str, ...] = ()
+    """Position gain of the controller while recording, N·m/rad: NUMBER or PATTERN=NUMBER. Default:
+    the model's."""
+    kd: tuple[str, ...] = ()
+    """Damping gain, likewise, N·m·s/rad."""
+    effort_limit: tuple[str, ...] = ()
+    """Torque limit, likewise, N·m."""
+    format: str | None = None
+    """Format of the logs; gaponet import --formats lists them."""
+    position_unit: Literal["rad", "deg", "fraction", "ticks", "signed_percent"] | None = None
+    """Unit of positions, where the format leaves it open."""
+    time_unit: Literal["s", "ms", "us", "ns"] | None = None
+    """Unit of time, where the format leaves it open."""
+    rate: float | None = None
+    """Hz, of logs without a clock."""
+    cut: float | None = None
+    """Length of the pieces of long recordings, s; default 8 where there are fewer than three
+    recordings."""
+    skip_bad: bool = False
+    """Cut bad rows and leave out logs that cannot be read."""
+    allow_pickle: bool = False
+    """Open pickled files."""
+    to: Literal["mjcf", "mjlab", "isaaclab", "newton", "json"] = "mjcf"
+    """Engine to export to."""
+    budget: str | None = None
+    """Time that identification may take, such as 4m; default no limit."""
+    despite_errors: bool = False
+    """Continue although the doctor finds errors in the logs; the identified robot keeps them."""
+    map: tuple[str, ...] = ()
+    """A joint's name in the log and the robot's, as a=b; may be repeated."""
+
+    @property
+    def robot(self) -> RobotOptions:
+        """Options of the command that makes a robot."""
+        return RobotOptions(self.joints, self.kp, self.kd, self.effort_limit)
+
+    def import_words(self) -> list[str]:
+        """Return the options of gaponet import about the recordings."""
+        words = ["--unit-id", self.unit_id, "--payload-mass", f"{self.payload_mass:g}"]
+        words += [f"--map={pair}" for pair in self.map]
+        for name in ("format", "position_unit", "time_unit", "rate", "cut"):
+            value = getattr(self, name)
+            if value is not None:
+                words.append(f"--{name.replace('_', '-')}={value}")
+        if self.skip_bad:
+            words.append("--skip-bad")
+        if self.allow_pickle:
+            words.append("--allow-pickle")
+        return words
+
+    def identify_words(self) -> list[str]:
+        """Return the options of gaponet identify."""
+        words = ["--budget", self.budget] if self.budget else []
+        return [*words, "--despite-errors"] if self.despite_errors else words
+
+    def read_options(self) -> dict[str, Any]:
+        """Return how the first recording is read, as read_first_recording takes it."""
+        return {
+            "fmt": self.format,
+            "joint_map": parse_joint_map(self.map),
+            "skip_bad": self.skip_bad,
+            "allow_pickle": self.allow_pickle,
+            "position_unit": self.position_unit,
+            "time_unit": self.time_unit,
+            "rate": self.rate,
+        }
+
+
+# ---- the list of steps
+
+
+@dataclass(frozen=True)
+class Step:
+    """One command on the way from logs to a report.
+
+    Attributes:
+        title: What it does.
+        words: The command, without gaponet in front.
+    """
+
+    title: str
+    words: tuple[str, ...]
+
+    @property
+    def command(self) -> str:
+        """Name of the command."""
+        return self.words[0]
+
+    @property
+    def line(self) -> str:
+        """The command as it is typed."""
+        return shlex.join(["gaponet", *self.words])
+
+
+def steps_from_logs(
+    logs: Path,
+    robot: str,
+    import_words: list[str],
+    out: Path,
+    identify_words: list[str],
+    to: str,
+) -> list[Step]:
+    """Return the steps from logs of a robot that exists to a report.
+
+    Args:
+        robot: Value of --robot.
+        import_words: Options of gaponet import.
+        out: Folder for the dataset (OUT/data) and the identified robot (OUT/identified).
+        identify_words: Options of gaponet identify.
+        to: Engine to export to.
+    """
+    data = str(out / "data")
+    identified = out / "identified"
+    read = ("import", str(logs), "--robot", robot, *import_words, "--out", data)
+    fit = ("identify", data, "--out", str(identified), *identify_words)
+    after = ("gap", data, "--robot", robot_argument(identified))
+    return [
+        Step("Import", read),
+        Step("Check", ("doctor", data)),
+        Step("Measure the gap", ("gap", data)),
+        Step("Identify", fit),
+        Step("What each cause removes", after),
+        Step("Export", ("export", str(identified), "--to", to)),
+        Step("Report", ("report", str(identified))),
+    ]
+
+
+def public_recordings(progress: Progress = no_progress) -> tuple[Path, str]:
+    """Return the folder of the public recordings of a real arm, and whose they are.
+
+    Raises:
+        UsageError, RemoteError: They are neither in GAPONET_DATA nor to be had from the network.
+    """
+    from gaponet.share.public_recordings import PublicFiles
+
+    public = PublicFiles.read()
+    return public.provide(progress), public.origin
+
+
+# ---- inspection of a model and logs
+
+
+@dataclass(frozen=True)
+class Inspection:
+    """A model and the first of its logs.
+
+    Attributes:
+        robot: The model's robot; of a model file with its default joints.
+        packaged: Argument of --robot for a robot that exists; "" for a model file.
+        log: The first recording.
+        recordings: Number of recordings.
+        logs_toml: Text of a logs.toml that was guessed; "" where the logs need none.
+    """
+
+    robot: RobotSpec
+    packaged: str
+    log: Log
+    recordings: int
+    logs_toml: str
+
+    @property
+    def seconds(self) -> float:
+        """Duration of the first recording, s."""
+        time = self.log.channels["ctrl"].time
+        return float(time[-1] - time[0])
+
+    @property
+    def rate(self) -> float:
+        """Rate of the commands, Hz, rounded to a whole number that is near."""
+        rate = 1 / float(np.median(np.diff(self.log.channels["ctrl"].time)))
+        is_near = abs(rate - round(rate)) < MAX_RELATIVE_ROUNDING * rate
+        return float(round(rate)) if is_near else rate
+
+
+@dataclass(frozen=True, kw_only=True)
+class Start:
+    """Steps from a model file and a folder of logs to a report.
+
+    Attributes:
+        out: Folder for all results.
+        logs: Folder of logs.
+    """
+
+    model: Path
+    logs: Path
+    out: Path
+    options: StartOptions = field(default_factory=StartOptions)
+
+    @property
+    def logs_toml(self) -> Path:
+        """Description of the logs that a person checked, if the file exists."""
+        return self.out / "logs.toml"
+
+    def inspect(self, *, guess_joints: bool = False) -> Inspection:
+        """Compile the model and read the first recording, with a guessed logs.toml if needed.
+
+        Args:
+            guess_joints: Accept a guess of which joint is which.
+
+        Raises:
+            UnclearLogsError: A person has to check the guess.
+            RobotError, UsageError, LogError: The model is broken, or the logs cannot be read.
+        """
+        from gaponet.report.view.gl import prepare
+
+        prepare()  # before MuJoCo is imported, which the report's picture would be too late for
+        from gaponet.data.describe.preview import DescriptionNeededError, read_first_recording
+        from gaponet.robot.new import new_robot
+
+        with tempfile.TemporaryDirectory() as place:
+            packaged = self._packaged()
+            if packaged:
+                robot = load_robot(packaged)
+            else:
+                robot = new_robot(self.model, Path(place) / "robot", self.options.robot).robot
+            checked = self.logs_toml if self.logs_toml.is_file() else None
+            try:
+                log, recordings, guessed = read_first_recording(
+                    self.logs, robot, checked, guess_joints, **self.options.read_options()
+                )
+            except DescriptionNeededError as error:
+                raise UnclearLogsError(str(error), error.text) from None
+        return Inspection(robot, packaged, log, recordings, guessed)
+
+    def _packaged(self) -> str:
+        """Return --robot of a robot folder or of a robot of the package; "" for a model file."""
+        if (self.model / "robot.toml").is_file():
+            return robot_argument(self.model)
+        if not self.model.exists() and str(self.model) in named_robots():
+            return str(self.model)
+        return ""
+
+    def steps(self, inspection: Inspection) -> list[Step]:
+        """Return the steps from model and logs to a report."""
+        options = self.options
+        steps = []
+        robot = inspection.packaged
+        if not robot:
+            steps.append(self._make_robot(inspection))
+            robot = robot_argument(self.out / "robot")
+        import_words = options.import_words()
+        if inspection.logs_toml or self.logs_toml.is_file():
+            import_words += ["--logs", str(self.logs_toml)]
+        piece = min(PIECE_S, inspection.seconds / MIN_RECORDINGS)
+        few = inspection.recordings < MIN_RECORDINGS
+        if options.cut is None and few and piece >= MIN_PIECE_S:
+            import_words += ["--cut", f"{piece:.3g}"]
+        return steps + steps_from_logs(
+            self.logs, robot, import_words, self.out, options.identify_words(), options.to
+        )
+
+    def _make_robot(self, inspection: Inspection) -> Step:
+        """Return the step that makes a robot folder from a model file."""
+        given = vars(self.options.robot)
+        recorded = inspection.log.joint_names
+        if not given["joints"] and len(recorded) < len(inspection.robot.joint_names):
+            given = given | {"joints": recorded}
+        words = ["robot", "new", str(self.model), "--out", str(self.out / "robot")]
+        words += ["--rate", f"{inspection.rate:g}"]
+        for name in ("joints", "kp", "kd", "effort_limit"):
+            if given[name]:
+                words += [f"--{name.replace('_', '-')}", *given[name]]
+        return Step("Make the robot", tuple(words))
+
+    def keep_guess(self, text: str) -> None:
+        """Write a guessed logs.toml into the folder, for a person to check."""
+        with lock_folder(self.out, "started"):
+            write_text(self.logs_toml, text)
+
+    def require_sound(self, dataset: str, diagnosis: DoctorResult) -> None:
+        """Refuse recordings in which the doctor found an error, unless the options accept it.
+
+        Raises:
+            DatasetError: With the first error, and what to do.
+        """
+        from gaponet.data.checks.gate import refuse_errors
+
+        if self.options.despite_errors:
+            return
+        way_out = (
+            f"Correct the logs or {self.logs_toml} (gaponet doctor {dataset} --fix proposes "
+            f"lines), delete {dataset}, and give the same command again"
+        )
+        refuse_errors(diagnosis.findings, dataset, way_out)
+
+
+class UnclearLogsError(LogError):
+    """A person has to look at `text`, a guessed logs.toml."""
+
+    def __init__(self, why: str, text: str) -> None:
+        super().__init__(why)
+        self.text = text
+
+
+# ---- what has run
+
+
+class _RecordFields(TypedDict):
+    """start.json: path of the logs, their hashes, options of import, finished command → hash of its
+    inputs."""
+
+    logs: str
+    options: str
+    files: dict[str, str]
+    done: dict[str, str]
+
+
+class StartRecord:
+    """Logs, options and finished commands of a folder that `gaponet start` fills, in start.json."""
+
+    def __init__(self, out: Path, logs: Path) -> None:
+        """Read the record of a folder, or start one.
+
+        Raises:
+            UsageError: The folder holds data of other logs.
+        """
+        self.out = out
+        self.data = out / "data"
+        known = _RecordFields(logs="", files={}, options="", done={})
+        path = out / RECORD_FILE
+        if path.is_file():
+            known = read_json(_RecordFields, path, UsageError, f"delete it and {self.data}")
+        self.fields = _RecordFields(
+            logs=str(logs.resolve()),
+            files=hash_logs(logs, out),
+            options=known["options"],
+            done=known["done"],
+        )
+        if not self.data.exists():  # only the robot is there
+            self.fields["options"] = ""
+            done = known["done"].items()
+            self.fields["done"] = {line: made for line, made in done if made == MODEL_INPUT}
+            return
+        self._require_same_logs(known, path.is_file(), logs)
+
+    def _require_same_logs(self, known: _RecordFields, stored: bool, logs: Path) -> None:
+        """Refuse data that were made from other logs.
+
+        Raises:
+            UsageError: A file is missing, has changed, or is not known.
+        """
+        other = []
+        for name, digest in known["files"].items():
+            if self.fields["files"].get(name) != digest:
+                other.append(name)
+        if known["logs"] and not other:
+            return
+        source = known["logs"] if stored else "logs that no file names"
+        if other:
+            verb = "is" if len(other) == 1 else "are"
+            source += f", of which {abbreviate(other)} {verb} missing or changed"
+            if self.fields["logs"] != known["logs"]:
+                source += f" in {logs}"
+        raise UsageError(
+            f"{self.data} was made from {source}. Give another --out for these logs, or the same "
+            f"logs again; or delete {self.data}, and it is made anew"
+        )
+
+    def begin(self, steps: list[Step]) -> None:
+        """Take the present logs and the options of import as those of this run.
+
+        Raises:
+            UsageError: The data that are there were imported with other options.
+        """
+        (options,) = [shlex.join(step.words[2:]) for step in steps if step.command == "import"]
+        if self.fields["options"] not in ("", options):
+            raise UsageError(
+                f"{self.data} was imported with {self.fields['options']}, not with {options}. Give "
+                f"another --out, or the same options again; or delete {self.data}, and it is made "
+                "anew"
+            )
+        self.fields["options"] = options
+        logs_toml = self.out / "logs.toml"
+        if logs_toml.is_file():
+            self.fields["files"][f"{self.out.name}/logs.toml"] = FileRecord.of(logs_toml).sha256
+        if not self.data.exists():  # an interrupted import leaves data of these logs
+            write_json(self.out / RECORD_FILE, self.fields)
+
+    def inputs(self, step: Step) -> str:
+        """Return what a step depends on: the model, the logs, or the recordings in the dataset."""
+        if step.command == "robot":
+            return MODEL_INPUT
+        if step.command == "import":
+            return hashlib.sha256(str(sorted(self.fields["files"].items())).encode()).hexdigest()
+        return dataset_hash(Dataset(self.data).entries)
+
+    def has_finished(self, step: Step, inputs: str) -> bool:
+        """Return True if a step has finished on these inputs."""
+        return self.fields["done"].get(step.line) == inputs
+
+    def finish(self, step: Step, inputs: str) -> None:
+        """Record a finished step."""
+        self.fields["done"][step.line] = inputs
+        write_json(self.out / RECORD_FILE, self.fields)
+        write_text(self.out / COMMANDS_FILE, "\n".join(self.fields["done"]) + "\n")
+
+
+def hash_logs(logs: Path, out: Path) -> dict[str, str]:
+    """Return file → SHA-256 of all logs, and of the logs.toml in `out`, which may lie among them."""
+    root = logs if logs.is_dir() else logs.parent
+    paths = logs.rglob("*") if logs.is_dir() else [logs]
+    files = {}
+    for file in paths:
+        below = file.relative_to(root)
+        hidden = any(part.startswith(".") for part in below.parts)
+        if not hidden and out.resolve() not in file.resolve().parents:
+            files[below.as_posix()] = file
+    files[f"{out.name}/logs.toml"] = out / "logs.toml"
+    hashes = {}
+    for name, file in sorted(files.items()):
+        if file.is_file():
+            hashes[name] = FileRecord.of(file).sha256
+    return hashes
