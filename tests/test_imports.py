@@ -114,6 +114,13 @@ def test_a_sub_package_imports_only_from_itself_and_from_lower_ones(package):
                 assert inner_rank(other) <= inner_rank(name), f"{name} imports {other}"
 
 
+def test_commands_know_public_functions_and_the_words_for_people_alone():
+    for name, file in MODULES.items():
+        if name.startswith("gaponet.cli"):
+            packages = {other.split(".")[1] for other in imported(file) - {"gaponet"}}
+            assert packages <= {"api", "base", "cli", "evaluation", "robot"}, name
+
+
 def test_every_sub_package_has_a_rank():
     assert {name.split(".")[1] for name in MODULES if "." in name} == set(RANKS)
 
