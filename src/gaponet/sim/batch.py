@@ -168,45 +168,47 @@ class BatchSim:
         """
         self.robot = robot
         self.joint_names = tuple(name for name in robot.joint_names if name not in locked)
-        conditions = [Condition(*c) for c in conditions]
-        delays = [c.simulator.delay for c in conditions if c.simulator]
-        self.longest_delay = float(robot.delay.max()) + max(delays, default=0.0)  # s
-        robots = {
-            c: robot.with_gains(c.kp, c.kd).at_temperature(c.temperature)
-            for c in dict.fromkeys(conditions)
-        }
-        buffer_s = self.longest_delay if any(delays) else 0.0
-        self.models = _compiled(robots, self.joint_names, locked, buffer_s)
-        first = self.models[conditions[0]]
-        kp_ratio = {c: r.kp / np.where(robot.kp > 0, robot.kp, 1.0) for c, r in robots.items()}
-        self._kp_ratio = np.array([kp_ratio[c] for c in conditions])
-        self._kd = np.array([robots[c].kd for c in conditions])
-        threads = nthread or max(
-            1, min(os.cpu_count() or 1, len(conditions) // 16)
-        )  # fewer each: threads mostly wait
-        self.batch = Batch(first, nsim=len(conditions), nthread=threads)
-        # Model fields that differ between conditions, each (num_envs, …): a row may be copied over another's.
-        self.fields = expand_differences(self.batch, [self.models[c] for c in conditions])
         self.num_envs = len(conditions)
         self.n = len(self.joint_names)
+        conditions = [Condition(*c) for c in conditions]
+        robots = {}
+        for c in dict.fromkeys(conditions):
+            robots[c] = robot.with_gains(c.kp, c.kd).at_temperature(c.temperature)
+        delays = [c.simulator.delay for c in conditions if c.simulator]
+        self.longest_delay = float(robot.delay.max()) + max(delays, default=0.0)  # s
+        buffer_s = self.longest_delay if any(delays) else 0.0
+        self.models = _compiled(robots, self.joint_names, locked, buffer_s)
+        models = [self.models[c] for c in conditions]
+        first = models[0]
+        own_kp = np.where(robot.kp > 0, robot.kp, 1.0)
+        self._kp_ratio = np.array([robots[c].kp / own_kp for c in conditions])
+        self._kd = np.array([robots[c].kd for c in conditions])
+        # Threads with fewer simulations mostly wait.
+        useful = max(1, min(os.cpu_count() or 1, self.num_envs // 16))
+        self.batch = Batch(first, nsim=self.num_envs, nthread=nthread or useful)
+        # Model fields that differ between conditions, each (num_envs, …): a row may be copied over another's.
+        self.fields = expand_differences(self.batch, models)
         bind: Callable[[str], Array] = self.batch.bind
-        self.qpos, self.qvel, self.ctrl = bind("qpos"), bind("qvel"), bind("ctrl")
-        self.torque, self._warmstart = bind("actuator_force"), bind("qacc_warmstart")
-        self.servo_model = (
-            ServoModel(self.batch, first) if robot.has_servo_model or servo_model else None
-        )
-        self._history = (
-            CommandHistory(bind("history"), bind("time"), first) if first.nhistory else None
-        )
+        self.qpos = bind("qpos")
+        self.qvel = bind("qvel")
+        self.ctrl = bind("ctrl")
+        self.torque = bind("actuator_force")
+        self._warmstart = bind("qacc_warmstart")
+        self.servo_model: ServoModel | None = None
+        if robot.has_servo_model or servo_model:
+            self.servo_model = ServoModel(self.batch, first)
+        self._history: CommandHistory | None = None
+        if first.nhistory:
+            self._history = CommandHistory(bind("history"), bind("time"), first)
         # Physics steps per control period, and their length in s, of each simulation.
-        self.nstep = np.array([robot.steps_per(c[2]) for c in conditions])
+        self.nstep = np.array([robot.steps_per(c.dt) for c in conditions])
         self._one_rate = bool((self.nstep == self.nstep[0]).all())
-        self.timestep = np.array([self.models[c].opt.timestep for c in conditions])
+        self.timestep = np.array([model.opt.timestep for model in models])
         self.range = qpos_range(first)
+        self.max_change: Array | None = None  # without speed limits
         speed = robot.target_speed[robot.index(self.joint_names)]
-        self.max_change = (
-            self._max_change(speed) if speed.any() else None
-        )  # None without speed limits
+        if speed.any():
+            self.max_change = self._max_change(speed)
 
     def array(self, values: Any) -> Array:
         """Return values as an array of this simulator: numpy here, torch in sim/warp.py."""
@@ -279,52 +281,52 @@ class BatchSim:
         Raises:
             UsageError: A value that these simulations cannot take, such as a delay where the robot has none.
         """
-        model, batch = next(iter(self.models.values())), self.batch
-        fixed = (
-            STOP_FIELDS
-            + ("delay",) * (not model.nhistory)
-            + SERVO_TERMS * (self.servo_model is None)
-        )
-        if refused := [f for f in fixed if f in values and np.any(values[f])]:
-            raise UsageError(f"{', '.join(refused)} cannot differ between simulations of {self.robot.name}: give them "
-                             "to the robot (with_servos) that BatchSim is made with")  # fmt: skip
-        at = np.array(
-            [model.actuator(j).id for j in joints]
-        )  # of the joint and of its degree of freedom too
+        self._require_settable(values)
+        model = next(iter(self.models.values()))
+        batch = self.batch
+        # Number of each joint's actuator: of the joint and of its degree of freedom too.
+        at = np.array([model.actuator(j).id for j in joints])
         own = self.robot.index(joints)
-        gain, bias = batch.expand("actuator_gainprm"), batch.expand("actuator_biasprm")
+        gain = batch.expand("actuator_gainprm")
+        bias = batch.expand("actuator_biasprm")
         kp = values["kp"] * self._kp_ratio[:, own]
-        gain[:, at, 0], bias[:, at, 1] = kp, -kp
-        bias[:, at, 0] = kp * values["offset"]
         kd = values.get("kd", self._kd[:, own])
+        gain[:, at, 0] = kp
+        bias[:, at, 0] = kp * values["offset"]
+        bias[:, at, 1] = -kp
         bias[:, at, 2] = -np.maximum(kd + np.minimum(values["damping"], 0.0), 0.0)
         batch.expand("dof_damping")[:, at] = np.maximum(values["damping"], 0.0)
-        for name in ("frictionloss", "armature"):
-            batch.expand(f"dof_{name}")[:, at] = values[name]
+        batch.expand("dof_frictionloss")[:, at] = values["frictionloss"]
+        batch.expand("dof_armature")[:, at] = values["armature"]
         if "effort_limit" in values:
             limit = values["effort_limit"]
             batch.expand("actuator_forcerange")[:, at] = np.stack([-limit, limit], axis=-1)
-            if self.servo_model is not None:
-                self.servo_model.effort[:, at] = limit
         if "delay" in values and model.nhistory:
             batch.expand("actuator_delay")[:, at] = values["delay"]
         if "zero" in values:
             batch.expand("qpos0")[:, at] = model.qpos0[at] + self.robot.zero[own] - values["zero"]
         if "target_speed" in values:
-            speed = np.tile(
-                self.robot.target_speed[self.robot.index(self.joint_names)], (self.num_envs, 1)
-            )
-            speed[:, at] = values["target_speed"]
-            self.max_change = self._max_change(speed)
+            speed = self.robot.target_speed[self.robot.index(self.joint_names)]
+            each = np.tile(speed, (self.num_envs, 1))
+            each[:, at] = values["target_speed"]
+            self.max_change = self._max_change(each)
         if self.servo_model is not None:
-            self.servo_model.bias[:, at], self.servo_model.frictionloss[:, at] = (
-                bias[:, at, 0],
-                values["frictionloss"],
+            self.servo_model.bias[:, at] = bias[:, at, 0]
+            self.servo_model.set_servos(at, values)
+
+    def _require_settable(self, values: dict[str, Array]) -> None:
+        """Raise UsageError if values hold what these simulations cannot take."""
+        fixed: list[str] = list(STOP_FIELDS)
+        if not next(iter(self.models.values())).nhistory:
+            fixed.append("delay")
+        if self.servo_model is None:
+            fixed += SERVO_TERMS
+        refused = [f for f in fixed if f in values and np.any(values[f])]
+        if refused:
+            raise UsageError(
+                f"{', '.join(refused)} cannot differ between simulations of {self.robot.name}: give them to the robot "
+                "(with_servos) that BatchSim is made with"
             )
-            self.servo_model.armature[:, at] = values["armature"]
-            self.servo_model.damping[:, at] = np.maximum(values["damping"], 0.0)
-            for name in SERVO_TERMS:
-                self.servo_model.values[name][:, at] = values.get(name, 0.0)
 
     def _max_change(self, speed: Array) -> Array:
         """Return the largest change of targets per period at `speed`, (…, n) rad/s (0: no limit), (num_envs, n) rad."""

@@ -7,7 +7,7 @@ number is the mean over its sequences.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from collections.abc import Sequence as ListOf
 from dataclasses import dataclass, field
 from typing import Any
@@ -20,6 +20,7 @@ from gaponet.robot.spec import RobotSpec
 
 THRESHOLDS = (0.05, 0.1, 0.5)  # rad, of the large-gap ratio
 HORIZONS_S = (0.02, 0.2, 1.0, 5.0)  # 1, 10, 50, 250 steps at 50 Hz
+HORIZON_NAMES = (*(f"{s:g}" for s in HORIZONS_S), "whole")
 MIN_RELATIVE_GAIN = 0.01  # of the mean error, where several motions judge
 MIN_RELATIVE_GAIN_ONE_MOTION = 0.1
 CONFIDENCE = 0.84  # one-sided level of Student's t: one standard error where motions are many
@@ -139,36 +140,42 @@ def summary(part: Iterable[Run], robot: RobotSpec) -> dict[str, Any]:
 
     Joints that no recording holds are left out of by_joint.
     """
-    joints: dict[str, list[int]] = {j: [i] for i, j in enumerate(robot.operated)}
-    no_wrist = [
-        i for i, j in enumerate(robot.operated) if "wrist" not in j
-    ]  # the paper's figure 3 is without wrists
     rows: dict[str, dict[str, list[_Row]]] = defaultdict(lambda: defaultdict(list))
     for run in part:
-        meta = run.meta
-        whole = _row(run)
-        for row, arm in zip(whole, _row(run, no_wrist), strict=False):
-            row["mpjae_no_wrist"] = arm["mpjae"]
-        names = {"": "", "motion": meta.motion, "independent_motion": meta.independent_motion}
-        names |= {"payload": f"{meta.payload_mass:g}", "unit": meta.unit_id}
-        for group, name in names.items():
-            rows[group][name] += whole
-        for j, column in joints.items():
-            rows["joint"][j] += _row(run, column)
-        for horizon, error in _horizons(run).items():
-            rows["horizon"][horizon].append({"mpjae": error})
-    held = [j for j in joints if rows["joint"][j]]
+        for group, name, of_run in _grouped_rows(run, robot):
+            rows[group][name] += of_run
     order = {
-        "joint": held,
-        **{g: sorted(rows[g]) for g in ("motion", "independent_motion", "payload", "unit")},
+        "joint": [j for j in robot.operated if rows["joint"][j]],
+        "motion": sorted(rows["motion"]),
+        "independent_motion": sorted(rows["independent_motion"]),
+        "payload": sorted(rows["payload"]),
+        "unit": sorted(rows["unit"]),
+        "horizon": [h for h in HORIZON_NAMES if h in rows["horizon"]],
     }
-    order["horizon"] = [
-        h for h in (*(f"{s:g}" for s in HORIZONS_S), "whole") if h in rows["horizon"]
-    ]
-    total = {"mpjae_no_wrist": float("nan")} | _mean(rows[""][""])
+    total = {"mpjae_no_wrist": float("nan")} | _mean(rows["all"][""])
     return total | {
-        f"by_{g}": {name: _mean(rows[g][name]) for name in names} for g, names in order.items()
+        f"by_{group}": {name: _mean(rows[group][name]) for name in names}
+        for group, names in order.items()
     }
+
+
+def _grouped_rows(run: Run, robot: RobotSpec) -> Iterator[tuple[str, str, list[_Row]]]:
+    """Yield groups, a run's name in each, and its metrics there: one row, or none if it holds no such joint."""
+    meta = run.meta
+    whole = _row(run)
+    # The paper's figure 3 is without wrists.
+    no_wrist = [i for i, joint in enumerate(robot.operated) if "wrist" not in joint]
+    for row, arm in zip(whole, _row(run, no_wrist), strict=False):
+        row["mpjae_no_wrist"] = arm["mpjae"]
+    yield "all", "", whole
+    yield "motion", meta.motion, whole
+    yield "independent_motion", meta.independent_motion, whole
+    yield "payload", f"{meta.payload_mass:g}", whole
+    yield "unit", meta.unit_id, whole
+    for i, joint in enumerate(robot.operated):
+        yield "joint", joint, _row(run, [i])
+    for horizon, error in _horizons(run).items():
+        yield "horizon", horizon, [{"mpjae": error}]
 
 
 def metrics(part: ListOf[Run], columns: list[int] | None = None) -> dict[str, float]:
@@ -226,9 +233,9 @@ def _mean_correlation(real: Array, sim: Array) -> float:
 def _horizons(run: Run) -> _Row:
     """Return the mean |error| at horizons after the start, over the last half of each, and over the whole motion."""
     error = np.abs(run.error[:, list(run.recorded)])
-    lasts = {
-        f"{s:g}": last for s in HORIZONS_S if (last := max(round(s / run.dt), 1)) <= len(error)
-    }
-    return {h: error[last // 2 : last].mean() for h, last in lasts.items()} | {
-        "whole": error.mean()
-    }
+    errors = {}
+    for name, seconds in zip(HORIZON_NAMES, HORIZONS_S, strict=False):
+        last = max(round(seconds / run.dt), 1)
+        if last <= len(error):
+            errors[name] = error[last // 2 : last].mean()
+    return errors | {"whole": error.mean()}

@@ -60,34 +60,38 @@ def replay(
         lock_idle: Clamp limbs that no command moves at home: faster, and equal up to rounding for others.
         creeps: Use MuJoCo's own friction, which creeps.
     """
-    idle: list[tuple[str, ...]] = (
-        _idle_limbs(sequences, robot) if lock_idle else [()] * len(sequences)
-    )
+    idle: list[tuple[str, ...]] = [()] * len(sequences)
+    if lock_idle:
+        idle = _idle_limbs(sequences, robot)
     locked = [_held(s, robot, limbs) for s, limbs in zip(sequences, idle, strict=True)]
     digest = _replay_hash(robot, creeps)
     total = sum(len(s) - 1 for s in sequences)
     done = 0
     replays: dict[int, SimulatedReplay] = {}
     for chunk in _chunks(sequences, locked):
-        part, clamped, home = (
-            [sequences[i] for i in chunk],
-            locked[chunk[0]],
-            np.array(robot.qpos_home),
-        )
-        joints = tuple(joint for joint, _ in clamped)
-        home[robot.index(joints)] = [angle for _, angle in clamped]
-        sim = BatchSim(
-            replace(robot, qpos_home=home), [Condition.of(s, robot) for s in part], nthread, joints
-        )
-        if creeps:  # MuJoCo's own mobility and impedance
-            sim.batch.expand("dof_invweight0")[:] /= STIFF_MOBILITY
-            sim.batch.expand("dof_solimp")[:, :, :2] = LOOSE_IMPEDANCE
+        part = [sequences[i] for i in chunk]
+        sim = _simulations(part, robot, locked[chunk[0]], nthread, creeps=creeps)
         tell = lambda k, before=done: progress(before + k, total)  # noqa: E731
         out = rollout(sim, part, corrector, tell)
         for i, s in enumerate(part):
             replays[chunk[i]] = SimulatedReplay(digest, *out[:, : len(s), i].astype(np.float32))
         done += sum(len(s) - 1 for s in part)
     return [replays[i] for i in range(len(sequences))]
+
+
+def _simulations(
+    sequences: ListOf[Sequence], robot: RobotSpec, clamped: Clamped, nthread: int, *, creeps: bool
+) -> BatchSim:
+    """Return a simulation of each recording, in which joints are clamped where they stand."""
+    joints = tuple(joint for joint, _ in clamped)
+    home = np.array(robot.qpos_home)
+    home[robot.index(joints)] = [angle for _, angle in clamped]
+    conditions = [Condition.of(s, robot) for s in sequences]
+    sim = BatchSim(replace(robot, qpos_home=home), conditions, nthread, joints)
+    if creeps:  # MuJoCo's own mobility and impedance
+        sim.batch.expand("dof_invweight0")[:] /= STIFF_MOBILITY
+        sim.batch.expand("dof_solimp")[:, :, :2] = LOOSE_IMPEDANCE
+    return sim
 
 
 def _replay_hash(robot: RobotSpec, creeps: bool) -> str:
@@ -180,18 +184,22 @@ def rollout(
         qpos, qvel, torque and target by row, (4, T, k, n of all joints): rad, rad/s, N·m, rad. Locked joints stand at
         sim.robot.qpos_home. Rows after the end of a sequence have no meaning.
     """
-    lengths, free = np.array([len(s) for s in sequences]), sim.robot.index(sim.joint_names)
+    lengths = np.array([len(s) for s in sequences])
+    free = sim.robot.index(sim.joint_names)
     ctrl = np.zeros((lengths.max(), len(sequences), len(sim.robot.joint_names)))
     out = np.zeros((4, *ctrl.shape))
     out[0] = sim.robot.qpos_home
     for i, s in enumerate(sequences):
         ctrl[: len(s), i] = s.ctrl
-    first = [np.stack([getattr(s, name)[0, free] for s in sequences]) for name in ("qpos", "qvel")]
-    sim.reset(slice(None), first[0], first[1], past=ctrl[0][:, None, free])
-    out[0, 0][:, free], out[1, 0][:, free] = sim.qpos, sim.qvel
+    qpos = np.stack([s.qpos[0, free] for s in sequences])
+    qvel = np.stack([s.qvel[0, free] for s in sequences])
+    sim.reset(slice(None), qpos, qvel, past=ctrl[0][:, None, free])
+    out[0, 0][:, free] = sim.qpos
+    out[1, 0][:, free] = sim.qvel
     if corrector is not None:
         corrector.reset(sequences)
-    finished, last = 0, len(ctrl) - 2
+    finished = 0
+    last = len(ctrl) - 2
     for t in range(last + 1):
         ids = np.flatnonzero(lengths > t + 1)  # still running
         target = ctrl[t]
@@ -201,15 +209,22 @@ def rollout(
         for channel, now in enumerate((sim.qpos, sim.qvel, sim.torque)):
             out[channel, t + 1][:, free] = now
         out[3, t] = target
-        for i in ids[touch[t + 1, ids]].tolist() if touch is not None else ():
-            sim.qpos[i], sim.qvel[i] = (
-                sequences[i].qpos[t + 1, free],
-                sequences[i].qvel[t + 1, free],
-            )
+        if touch is not None:
+            _go_on_from_recordings(sim, sequences, ids[touch[t + 1, ids]], t + 1)
         finished += len(ids)
         if t % 200 == 0 or t == last:
             progress(finished)
     return out
+
+
+def _go_on_from_recordings(
+    sim: BatchSim, sequences: ListOf[Sequence], ids: Array, row: int
+) -> None:
+    """Put simulations `ids` into the states of their recordings' rows."""
+    free = sim.robot.index(sim.joint_names)
+    for i in ids.tolist():
+        sim.qpos[i] = sequences[i].qpos[row, free]
+        sim.qvel[i] = sequences[i].qvel[row, free]
 
 
 def pair_dataset(

@@ -171,47 +171,57 @@ def _contacts(robot: RobotSpec, postures: Array, logged: bool) -> Iterator[Findi
         )
         return
     data = mujoco.MjData(model)
-
-    def name(geom: int) -> str:
-        return str(model.body(model.geom_bodyid[geom]).name)
-
-    def pairs(qpos: Array) -> set[str]:
-        data.qpos[:] = qpos
-        mujoco.mj_fwdPosition(model, data)
-        return {
-            " and ".join(sorted((name(c.geom1), name(c.geom2))))
-            for c in data.contact
-            if c.dist < -MIN_PENETRATION_M
-        }
-
-    home = pairs(robot.qpos_home)
-    seen = [pairs(q) for q in postures]
-    always = sorted({*home, *(set.intersection(*seen) if seen else ())})
+    home = _penetrating_pairs(model, data, robot.qpos_home)
+    seen = [_penetrating_pairs(model, data, q) for q in postures]
+    always = set(home)
+    if seen:
+        always |= set.intersection(*seen)
     if always:
-        level, effect = "ok", "they do not touch: contacts are off in robot.toml"
-        if robot.contacts:
-            level = "warning"
-            effect = "joints carry that for ever: write <exclude> in robot.xml, or contacts = false in robot.toml"
-        text = f"at home {abbreviate(always)} lie inside each other; {effect}"
-        yield Finding(level, "contacts", text, values={"pairs": always})
-    share = float(np.mean([bool(s - set(always)) for s in seen])) if seen else 0.0
+        yield _lasting_contact(robot, sorted(always))
+    share = float(np.mean([bool(pairs - always) for pairs in seen])) if seen else 0.0
     if share and (logged or robot.contacts):
-        what = "of the logs' postures" if logged else "of random postures"
-        often = sorted(set().union(*seen) - set(always))
-        does = (
-            "and touch: the logs' robot did not go through itself"
-            if robot.contacts
-            else "(contacts are off)"
-        )
-        level = "warning" if robot.contacts and logged else "note"
-        yield Finding(level, "contacts", f"in {share:.0%} {what} {abbreviate(often)} lie inside each other {does}",
-                      values={"pairs": often, "share": share})  # fmt: skip
+        often = sorted(set().union(*seen) - always)
+        yield _passing_contact(robot, often, share, logged=logged)
     if not always and not share:
         yield Finding(
             "ok",
             "contacts",
             f"no links lie inside each other at home and in {len(postures)} postures",
         )
+
+
+def _penetrating_pairs(model: mujoco.MjModel, data: mujoco.MjData, qpos: Array) -> set[str]:
+    """Return the pairs of links that lie inside each other in a posture."""
+    data.qpos[:] = qpos
+    mujoco.mj_fwdPosition(model, data)
+    pairs = set()
+    for contact in data.contact:
+        if contact.dist < -MIN_PENETRATION_M:
+            bodies = model.geom_bodyid[[contact.geom1, contact.geom2]]
+            pairs.add(" and ".join(sorted(model.body(body).name for body in bodies)))
+    return pairs
+
+
+def _lasting_contact(robot: RobotSpec, pairs: list[str]) -> Finding:
+    """Return the finding about links that lie inside each other at home or in every posture."""
+    level = "ok"
+    effect = "they do not touch: contacts are off in robot.toml"
+    if robot.contacts:
+        level = "warning"
+        effect = "joints carry that for ever: write <exclude> in robot.xml, or contacts = false in robot.toml"
+    text = f"at home {abbreviate(pairs)} lie inside each other; {effect}"
+    return Finding(level, "contacts", text, values={"pairs": pairs})
+
+
+def _passing_contact(robot: RobotSpec, pairs: list[str], share: float, *, logged: bool) -> Finding:
+    """Return the finding about links that lie inside each other in a share of the postures."""
+    what = "of the logs' postures" if logged else "of random postures"
+    does = "(contacts are off)"
+    if robot.contacts:
+        does = "and touch: the logs' robot did not go through itself"
+    text = f"in {share:.0%} {what} {abbreviate(pairs)} lie inside each other {does}"
+    level = "warning" if robot.contacts and logged else "note"
+    return Finding(level, "contacts", text, values={"pairs": pairs, "share": share})
 
 
 def _steps(
@@ -235,29 +245,35 @@ def _steps(
         )
         yield Finding("warning", "step", text, (name,), {"growth": growth})
     else:
+        yield _unstable_step(robot, cases, joint, growth)
 
-        def stable(step: float, armature: float) -> bool:
-            return all(_growth(m, q, step, armature)[0] <= 1 + MAX_GROWTH for _, m, q in cases)
 
-        step = next(
-            (h for h in (robot.timestep / 2**k for k in range(1, 7)) if stable(h, 0.0)), None
-        )
-        armature = next(
-            (a for a in (1e-4 * 2**k for k in range(14)) if stable(robot.timestep, a)), None
-        )
-        cures = [f"timestep = {step:g} in robot.toml"] if step else []
-        cures += [f"armature = {armature:g} in robot.xml where it is less"] if armature else []
-        text = (
-            f"{name}: kp {robot.kp[joint]:g} and kd {robot.kd[joint]:g} on so little inertia are unstable in physics "
-            f"steps of {robot.timestep * 1e3:g} ms: write {' or '.join([*cures, 'a smaller kp'])}"
-        )
-        yield Finding(
-            "error",
-            "step",
-            text,
-            (name,),
-            {"growth": growth, "timestep": step, "armature": armature},
-        )
+def _unstable_step(
+    robot: RobotSpec, cases: list[tuple[float, mujoco.MjModel, Array]], joint: int, growth: float
+) -> Finding:
+    """Return the finding about a joint that is unstable in the robot's physics steps, with what would cure it."""
+
+    def is_stable(timestep: float, armature: float) -> bool:
+        growths = (_growth(model, q, timestep, armature).factor for _, model, q in cases)
+        return all(growth <= 1 + MAX_GROWTH for growth in growths)
+
+    steps = (robot.timestep / 2**k for k in range(1, 7))
+    step = next((h for h in steps if is_stable(h, 0.0)), None)
+    armatures = (1e-4 * 2**k for k in range(14))
+    armature = next((a for a in armatures if is_stable(robot.timestep, a)), None)
+    cures = []
+    if step:
+        cures.append(f"timestep = {step:g} in robot.toml")
+    if armature:
+        cures.append(f"armature = {armature:g} in robot.xml where it is less")
+    cures.append("a smaller kp")
+    name = robot.joint_names[joint]
+    text = (
+        f"{name}: kp {robot.kp[joint]:g} and kd {robot.kd[joint]:g} on so little inertia are unstable in physics "
+        f"steps of {robot.timestep * 1e3:g} ms: write {' or '.join(cures)}"
+    )
+    values = {"growth": growth, "timestep": step, "armature": armature}
+    return Finding("error", "step", text, (name,), values)
 
 
 def _growth(
@@ -286,74 +302,106 @@ def _growth(
     )
 
 
-def _hold(robot: RobotSpec, payloads: tuple[float, ...]) -> Iterator[Finding]:
-    """Hold home for a minute at every payload; find motion, creep and sag."""
+class _Hold(NamedTuple):
+    """A hold at home at every payload, (payloads, n) each."""
+
+    speed: Array  # greatest in the last ten seconds, rad/s
+    saturated: Array  # whether the motor gave all it can then
+    creep: Array  # in the second half, rad
+    sag: Array  # at the end, rad
+
+
+class _HoldLimit(NamedTuple):
+    """A limit of an amount in a hold, and what to say where it is exceeded."""
+
+    what: str
+    amount: Array  # (payloads, n)
+    most: float
+    level: str
+    cure: str
+
+
+def _held(robot: RobotSpec, payloads: tuple[float, ...]) -> _Hold:
+    """Hold home for HOLD_S at every payload."""
     sim = BatchSim(robot, [Condition(mass, "both", robot.dt) for mass in payloads], nthread=1)
     home = np.tile(robot.qpos_home, (len(payloads), 1))
     low, high = robot.qpos_range.T
-    sim.reset(
-        slice(None),
-        np.clip(home + HOLD_START_RAD, low, high),
-        np.zeros_like(home),
-        past=home[:, None],
-    )
+    start = np.clip(home + HOLD_START_RAD, low, high)
+    sim.reset(slice(None), start, np.zeros_like(home), past=home[:, None])
     rows = round(HOLD_S / robot.dt)
-    speed, full, middle = np.zeros_like(home), np.zeros(home.shape, bool), home
+    speed = np.zeros_like(home)
+    saturated = np.zeros(home.shape, bool)
+    middle = home
     for t in range(rows):
         sim.step(home)
         if t >= rows * 5 // 6:
             speed = np.fmax(speed, np.abs(sim.qvel))
-            full |= np.abs(sim.torque) > 0.999 * robot.effort_limit
+            saturated |= np.abs(sim.torque) > 0.999 * robot.effort_limit
         if t == rows // 2:
             middle = sim.qpos.copy()
-    creep, sag = np.abs(sim.qpos - middle), np.abs(sim.qpos - home)
-    light = " where its armature is small: write armature = 0.003 or more in robot.xml"
+    return _Hold(speed, saturated, np.abs(sim.qpos - middle), np.abs(sim.qpos - home))
+
+
+def _hold_limits(hold: _Hold) -> list[_HoldLimit]:
+    """Return the limits of a hold, the worst first."""
     swings = "check kp and kd; write more damping in robot.xml"
-    if (full & (speed > MAX_REST_SPEED)).any():
+    if (hold.saturated & (hold.speed > MAX_REST_SPEED)).any():
         swings = (
             "its motor gives all it can, one way and the other, and MuJoCo's motors brake no more then: write kd as "
             "damping in robot.xml and kd = 0 in robot.toml, a shorter timestep, or armature"
         )
-    clean = True
-    for what, amount, most, level, cure in (
-        (
+    creeps = "friction gives way where its armature is small: write armature = 0.003 or more in robot.xml"
+    return [
+        _HoldLimit(
             "does not come to rest: {:.2g} rad/s after a minute",
-            speed,
+            hold.speed,
             MAX_REST_SPEED,
             "error",
             swings,
         ),
-        (
+        _HoldLimit(
             "creeps {:.2g} rad in half a minute of a hold",
-            creep,
+            hold.creep,
             MAX_CREEP_RAD,
             "warning",
-            f"friction gives way{light}",
+            creeps,
         ),
-        (
+        _HoldLimit(
             "hangs {:.2g} rad from its target",
-            sag,
+            hold.sag,
             MAX_SAG_RAD,
             "note",
             "check kp and effort_limit against masses",
         ),
-    ):
-        wrong = np.argwhere(~(amount <= most))
-        if not len(wrong) or (level != "error" and not clean):
-            continue
-        clean = False
-        p, j = max(wrong, key=lambda k: float(np.nan_to_num(amount[*k], nan=np.inf)))
-        names = tuple(dict.fromkeys(robot.joint_names[i] for _, i in wrong))
-        load = f" with {payloads[p]:g} kg" if payloads[p] else ""
-        more = f" ({len(names) - 1} more joints do)" if len(names) > 1 else ""
-        text = f"{robot.joint_names[j]} {what.format(amount[p, j])}{load}{more}: {cure}"
-        yield Finding(
-            level, "hold", text, names, {"payload_mass": payloads[p], "amount": float(amount[p, j])}
-        )
-    if clean:
-        masses = ", ".join(f"{p:g}" for p in payloads)
-        yield Finding(
-            "ok",
-            "hold",
-            f"home is held for {HOLD_S:g} s with {masses} kg without creeping or swinging",
-        )
+    ]
+
+
+def _hold(robot: RobotSpec, payloads: tuple[float, ...]) -> Iterator[Finding]:
+    """Hold home for a minute at every payload; find motion, else creep, else sag."""
+    for limit in _hold_limits(_held(robot, payloads)):
+        wrong = np.argwhere(~(limit.amount <= limit.most))
+        if len(wrong):
+            yield _hold_finding(robot, payloads, limit, wrong)
+            return
+    masses = ", ".join(f"{p:g}" for p in payloads)
+    yield Finding(
+        "ok",
+        "hold",
+        f"home is held for {HOLD_S:g} s with {masses} kg without creeping or swinging",
+    )
+
+
+def _hold_finding(
+    robot: RobotSpec, payloads: tuple[float, ...], limit: _HoldLimit, wrong: Array
+) -> Finding:
+    """Return the finding about a limit that is exceeded at `wrong`, rows of payload and joint, (k, 2)."""
+    amount = np.nan_to_num(limit.amount, nan=np.inf)
+    payload, joint = max(wrong, key=lambda place: float(amount[*place]))
+    names = tuple(dict.fromkeys(robot.joint_names[i] for _, i in wrong))
+    load = f" with {payloads[payload]:g} kg" if payloads[payload] else ""
+    more = f" ({len(names) - 1} more joints do)" if len(names) > 1 else ""
+    worst = limit.amount[payload, joint]
+    what = limit.what.format(worst)
+    text = f"{robot.joint_names[joint]} {what}{load}{more}: {limit.cure}"
+    values = {"payload_mass": payloads[payload], "amount": float(worst)}
+    return Finding(limit.level, "hold", text, names, values)

@@ -529,6 +529,16 @@ class ServoModel:
         for name, values in self.values.items():
             self._servos[name] = values
 
+    def set_servos(self, at: Array, values: dict[str, Array]) -> None:
+        """Set the joints `at` (k,) of all simulations to values (nsim, k), as of BatchSim.set_servos."""
+        self.frictionloss[:, at] = values["frictionloss"]
+        self.armature[:, at] = values["armature"]
+        self.damping[:, at] = np.maximum(values["damping"], 0.0)
+        if "effort_limit" in values:
+            self.effort[:, at] = values["effort_limit"]
+        for name in SERVO_TERMS:
+            self.values[name][:, at] = values.get(name, 0.0)
+
     @property
     def records(self) -> Array:
         """Present values of all servos, SERVO_RECORD (nsim, nu)."""

@@ -194,33 +194,57 @@ class Bounds:
         self.start |= {f: self.first[f] for f in (*SERVO_TERMS, *WARM) if self.first[f].any()}
         slow = 1 / greatest_speeds(sequences, robot)  # s/rad
         counts = np.array([encoder_step([s.qpos[:, j] for s in sequences]) for j in op])
-        one, heavy = np.ones(self.n), np.maximum(self.start["armature"] / kp, 1e-6)
-        self.limits: dict[str, tuple[Array, Array, Array]] = {
-            f.name: (f.bounds[0] * one, f.bounds[1] * one, f.bounds[2] * one)
-            for f in SERVO_FIELDS.values()
-            if f.bounds
-        } | {
-            "kp": (np.log(kp) - MAX_KP_LOG_CHANGE, np.log(kp) + MAX_KP_LOG_CHANGE, 0.3 * one),
-            "armature": (0 * one, MAX_ARMATURE_TIME_S**2 * one, np.clip(0.4 * heavy, 1e-5, 1e-3)),
-            "effort_limit": (0.05 * limit / kp, 5 * limit / kp, 0.2 * limit / kp),
-            "encoder_step": (counts, counts, one),
-            "no_load_speed": (0 * one, 2 * slow, LARGE_LINE_CHANGE * slow),
-        }
         varies = temperature_varies(sequences, robot)
-        for f in WARM[:2]:  # else the robot's own value stays
-            (low, high, large), own = self.limits[f], to_axis(f, self.first[f], kp)
-            self.limits[f] = np.where(varies, low, own), np.where(varies, high, own), large
-        guess = {
-            f.name: f.guess * (varies if f.name in WARM else one)
-            for f in SERVO_FIELDS.values()
-            if f.guess is not None
-        }
-        self.guess = from_axis(guess, kp) | {
+        self.limits = self._limits(kp, limit, slow, counts, varies)
+        self.guess = self._guess(kp, varies) | {
             "effort_limit": 0.6 * limit,  # one that is too high has no slope
             "encoder_step": counts,
             "no_load_speed": np.where(self.unexcited, 0.0, 2 / slow),
             WARM[2]: np.nan_to_num(recorded_temperatures(sequences, op)).mean(axis=0).round(),
         }
+
+    def _limits(
+        self, kp: Array, effort_limit: Array, slow: Array, counts: Array, varies: Array
+    ) -> dict[str, tuple[Array, Array, Array]]:
+        """Return field → lowest, highest and a large change on its axis, (n,) each.
+
+        Args:
+            kp, effort_limit: The robot's own, N·m/rad and N·m.
+            slow: One over the greatest speed, s/rad.
+            counts: Encoder steps, rad.
+            varies: Whether the temperature varies; else the robot's own values by temperature stay.
+        """
+        one = np.ones(self.n)
+        heavy = np.maximum(self.start["armature"] / kp, 1e-6)
+        limits = {}
+        for f in SERVO_FIELDS.values():
+            if f.bounds:
+                low, high, large = f.bounds
+                limits[f.name] = low * one, high * one, large * one
+        limits |= {
+            "kp": (np.log(kp) - MAX_KP_LOG_CHANGE, np.log(kp) + MAX_KP_LOG_CHANGE, 0.3 * one),
+            "armature": (0 * one, MAX_ARMATURE_TIME_S**2 * one, np.clip(0.4 * heavy, 1e-5, 1e-3)),
+            "effort_limit": (
+                0.05 * effort_limit / kp,
+                5 * effort_limit / kp,
+                0.2 * effort_limit / kp,
+            ),
+            "encoder_step": (counts, counts, one),
+            "no_load_speed": (0 * one, 2 * slow, LARGE_LINE_CHANGE * slow),
+        }
+        for name in WARM[:2]:
+            lowest, highest, change = limits[name]
+            own = to_axis(name, self.first[name], kp)
+            limits[name] = np.where(varies, lowest, own), np.where(varies, highest, own), change
+        return limits
+
+    def _guess(self, kp: Array, varies: Array) -> Values:
+        """Return the first values of fields with a guess on their axis, (n,) each; arguments as of `_limits`."""
+        guess = {}
+        for f in SERVO_FIELDS.values():
+            if f.guess is not None:
+                guess[f.name] = f.guess * (varies if f.name in WARM else np.ones(self.n))
+        return from_axis(guess, kp)
 
     def visible(self, field: str, values: Values) -> Array:
         """Return a field of values (n,), 0 where it is a torque-speed line of less than MIN_LINE, or of friction and
@@ -237,25 +261,29 @@ class Bounds:
 
     def warnings(self, values: Values, names: ListOf[str]) -> tuple[str, ...]:
         """Return a sentence for each field of values (n,) at its bound; no friction, armature or delay is ordinary."""
-        axes, warnings = Axes(self, names, values), []
+        axes = Axes(self, names, values)
         x = axes.normalize(values)
+        warnings = []
         for i, joint in enumerate(self._joints):
             for k, f in enumerate(names):
-                fixed = axes.low[i, k] == axes.high[i, k] or (
-                    f == "stribeck_speed" and not values["stribeck"][i]
-                )
-                below = x[i, k] - axes.low[i, k] < BOUND_TOLERANCE and (
-                    f == "damping" or axes.low[i, k] != 0
-                )
-                if fixed or not (below or axes.high[i, k] - x[i, k] < BOUND_TOLERANCE):
+                low, high = axes.low[i, k], axes.high[i, k]
+                without = f == "stribeck_speed" and not values["stribeck"][i]
+                if low == high or without:
                     continue
-                if f == "damping" and below:
-                    what = "none at all; check that commands are what the servo was given, and their clock"
-                else:
-                    end = "least" if below else "most"
-                    what = f"{values[f][i]:.4g}, the {end} that is tried; {SERVO_FIELDS[f].advice}"
-                warnings.append(f"{joint}: {f} ended at its bound: {what}")
+                zero_is_ordinary = f != "damping" and low == 0
+                if x[i, k] - low < BOUND_TOLERANCE and not zero_is_ordinary:
+                    warnings.append(_at_bound(joint, f, values[f][i], "least"))
+                elif high - x[i, k] < BOUND_TOLERANCE:
+                    warnings.append(_at_bound(joint, f, values[f][i], "most"))
         return tuple(warnings)
+
+
+def _at_bound(joint: str, field: str, value: float, end: str) -> str:
+    """Return a sentence about a field at the end of what is tried."""
+    what = f"{value:.4g}, the {end} that is tried; {SERVO_FIELDS[field].advice}"
+    if field == "damping" and end == "least":
+        what = "none at all; check that commands are what the servo was given, and their clock"
+    return f"{joint}: {field} ended at its bound: {what}"
 
 
 class Axes:

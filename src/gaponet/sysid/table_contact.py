@@ -125,23 +125,48 @@ def fit_table(
     """
     if not parts:
         return TableFit(robot, False, np.zeros(0), np.zeros(0), ())
-    n, measured = len(robot.operated), robot.table
-    with_table = replace(
-        robot, table=measured or Table(lowest, FRICTION[3], float(np.exp(STIFFNESS[3])))
-    )
-    away = np.array([[lowest - 10.0, FRICTION[3], STIFFNESS[3], *np.zeros(n)]])
+    measured = robot.table
+    guess = Table(lowest, FRICTION[3], float(np.exp(STIFFNESS[3])))
+    with_table = replace(robot, table=measured or guess)
+    zeros = np.zeros(len(robot.operated))
+    away = np.array([[lowest - 10.0, FRICTION[3], STIFFNESS[3], *zeros]])
     scene = _TableRollouts(parts, with_table, nthread)
     scene = _TableRollouts(_most_wrong(scene, away), with_table, nthread)
     motions = tuple(dict.fromkeys(s.meta.independent_motion for s in scene.parts))
     heights = lowest + START_HEIGHT_STEP_M * np.arange(-2, START_HEIGHTS - 2)
     if measured is not None:
         heights = np.array([measured.height])
-    guesses = np.tile(away, (len(START_LOG_STIFFNESS), len(heights), 1))
-    guesses[..., 0], guesses[..., 2] = heights, np.array(START_LOG_STIFFNESS)[:, None]
-    costs = soft_l1(scene.soft_errors(guesses.reshape(-1, 3 + n))).reshape(guesses.shape[:2])
+    results = _searches(scene, _starts(scene, away, heights), report, measured=measured is not None)
+    tables = [_with_table(robot, x) for x, _ in results]
+    errors = [cost for _, cost in results]
+    if validation:
+        errors = [float(rollout_errors(validation, one, nthread).mean()) for one in tables]
+    best = int(np.argmin(errors))
+    without = scene.mean(away[0])
+    within = scene.mean(results[best][0])
+    metas = [s.meta for s in scene.parts]
+    accepted = Comparison("table", by_motion(metas, without), by_motion(metas, within)).accepted
+    return TableFit(tables[best] if accepted else robot, accepted, without, within, motions)
+
+
+def _starts(scene: _TableRollouts, away: Array, heights: Array) -> Array:
+    """Return a start for each of START_LOG_STIFFNESS at its best height, the best first, (starts, 3 + n)."""
+    stiffnesses = np.array(START_LOG_STIFFNESS)
+    guesses = np.tile(away, (len(stiffnesses), len(heights), 1))
+    guesses[..., 0] = heights
+    guesses[..., 2] = stiffnesses[:, None]
+    costs = soft_l1(scene.soft_errors(guesses.reshape(-1, guesses.shape[-1])))
+    costs = costs.reshape(guesses.shape[:2])
     starts = guesses[np.arange(len(guesses)), costs.argmin(axis=1)]
-    pace, best_first = [np.inf], starts[costs.min(axis=1).argsort()]
+    return np.asarray(starts[costs.min(axis=1).argsort()])
+
+
+def _searches(
+    scene: _TableRollouts, starts: Array, report: Callable[[float], object], *, measured: bool
+) -> list[tuple[Array, float]]:
+    """Return the best tables near starts (k, 3 + n), as of `_searched`, until `report` says that the time is over."""
     over = False
+    pace = [np.inf]
 
     def tell(error: float) -> bool:
         nonlocal over
@@ -149,18 +174,10 @@ def fit_table(
         return over
 
     results = []
-    for start in best_first:
+    for start in starts:
         if not over:
-            results.append(_searched(scene, start, measured is not None, tell, pace))
-    tables = [_with_table(robot, x) for x, _ in results]
-    errors = [cost for _, cost in results]
-    if validation:
-        errors = [float(rollout_errors(validation, one, nthread).mean()) for one in tables]
-    best = int(np.argmin(errors))
-    without, within = scene.mean(away[0]), scene.mean(results[best][0])
-    metas = [s.meta for s in scene.parts]
-    accepted = Comparison("table", by_motion(metas, without), by_motion(metas, within)).accepted
-    return TableFit(tables[best] if accepted else robot, accepted, without, within, motions)
+            results.append(_searched(scene, start, measured, tell, pace))
+    return results
 
 
 def _searched(

@@ -87,50 +87,70 @@ def fit_torque_driven(
     Raises:
         UsageError: A recording has no torque.
     """
-    for s in (*train, *judging):
+    _require_torque([*train, *judging], robot)
+    if train is judging:
+        train, judging = _parts_in_turn(judging)
+    fitted_rows = [_rows(s, robot) for s in train]
+    judging_rows = [_rows(s, robot) for s in judging]
+    names = robot.operated
+    servos: dict[str, dict[str, float]] = {}
+    std: dict[str, dict[str, float]] = {}
+    factor = np.ones(len(names))
+    bias = np.zeros(len(names))
+    lags = np.zeros(len(names), int)  # numbers of DELAYS_S
+    for j, name in enumerate(names):
+        x, lag = _joint(fitted_rows, j, constant)
+        errors = _jackknife(fitted_rows, j, constant, lag)
+        servos[name] = dict(zip(PASSIVE_FIELDS, x[:3].tolist(), strict=True))
+        servos[name]["delay"] = float(DELAYS_S[lag])
+        std[name] = dict(zip((*PASSIVE_FIELDS, "bias", "constant"), errors.tolist(), strict=True))
+        bias[j] = x[3]
+        factor[j] = x[4]
+        lags[j] = lag
+    fitted = robot.with_servos(servos)
+    one = np.ones_like(factor)
+    given = build_model(robot)
+    op = robot.operated_index
+    old = {f: np.ravel(getattr(given, f"dof_{f}"))[op] for f in PASSIVE_FIELDS}
+    new = {f: getattr(fitted, f)[op] for f in PASSIVE_FIELDS}
+    torque_before = _residual(judging_rows, old, one, 0 * lags)
+    torque_after = _residual(judging_rows, new, factor, lags)
+    angle_before = _ahead(judging, robot, one)
+    angle_after = _ahead(judging, fitted, factor)
+    return TorqueDrivenFit(
+        robot=fitted,
+        constant=factor,
+        bias=bias,
+        std=std,
+        torque=(torque_before, torque_after),
+        angle={h: (angle_before[h], angle_after[h]) for h in HORIZONS_S},
+        windows=sum(len(_starts(s)) for s in judging),
+    )
+
+
+def _require_torque(sequences: ListOf[Sequence], robot: RobotSpec) -> None:
+    """Raise UsageError if a recording has no torque of an operated joint."""
+    for s in sequences:
         if s.tau is None or not np.isfinite(s.tau[:, robot.operated_index]).all():
             what = "has no torque of every operated joint; say its column as tau in logs.toml"
             raise UsageError(f"{s.meta.motion}: {what}")
-    if train is judging:
-        parts = [
-            s.rows(slice(i, i + round(PART_S / s.dt)))
-            for s in judging
-            for i in range(0, len(s) - round(2 / s.dt), round(PART_S / s.dt))
-        ]
-        train, judging = parts[::2], parts[1::2]
-        if not judging:
-            raise UsageError(
-                f"less than {2 * PART_S:g} s in all: record more, or other motions to judge by"
-            )
-    fit, test = ([_rows(s, robot) for s in part] for part in (train, judging))
-    names, servos, std = (
-        robot.operated,
-        dict[str, dict[str, float]](),
-        dict[str, dict[str, float]](),
-    )
-    factor, bias = np.ones(len(names)), np.zeros(len(names))
-    for j, name in enumerate(names):
-        x, lag = _joint(fit, j, constant)
-        errors = _jackknife(fit, j, constant, lag)
-        servos[name] = dict(zip(PASSIVE_FIELDS, x[:3].tolist(), strict=True)) | {
-            "delay": float(DELAYS_S[lag])
-        }
-        std[name] = dict(zip((*PASSIVE_FIELDS, "bias", "constant"), errors.tolist(), strict=True))
-        bias[j], factor[j] = x[3], x[4]
-    fitted = robot.with_servos(servos)
-    angles = [_ahead(judging, r, k) for r, k in ((robot, np.ones_like(factor)), (fitted, factor))]
-    given, op = build_model(robot), robot.operated_index
-    old = {f: np.ravel(getattr(given, f"dof_{f}"))[op] for f in PASSIVE_FIELDS}
-    new = {f: getattr(fitted, f)[op] for f in PASSIVE_FIELDS}
-    lags = np.array([round(servos[n]["delay"] / (DELAYS_S[1] - DELAYS_S[0])) for n in names])
-    residuals = (
-        _residual(test, old, np.ones_like(factor), 0 * lags),
-        _residual(test, new, factor, lags),
-    )
-    angle = {h: (angles[0][h], angles[1][h]) for h in HORIZONS_S}
-    return TorqueDrivenFit(
-        fitted, factor, bias, std, residuals, angle, sum(len(_starts(s)) for s in judging)
-    )
+
+
+def _parts_in_turn(sequences: ListOf[Sequence]) -> tuple[list[Sequence], list[Sequence]]:
+    """Return parts of PART_S, in turn to fit and to judge.
+
+    Raises:
+        UsageError: There are less than two.
+    """
+    parts = []
+    for s in sequences:
+        rows = round(PART_S / s.dt)
+        parts += [s.rows(slice(i, i + rows)) for i in range(0, len(s) - round(2 / s.dt), rows)]
+    if len(parts) < 2:
+        raise UsageError(
+            f"less than {2 * PART_S:g} s in all: record more, or other motions to judge by"
+        )
+    return parts[::2], parts[1::2]
 
 
 def _rows(s: Sequence, robot: RobotSpec) -> _Rows:

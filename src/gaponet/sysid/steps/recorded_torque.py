@@ -14,7 +14,7 @@ from gaponet.sysid.axes import CLASSIC, Bounds
 from gaponet.sysid.joint_rollouts import JointRollouts
 from gaponet.sysid.problem import JointFit, StandardErrors, standard_errors
 from gaponet.sysid.robot_rollouts import cut
-from gaponet.sysid.torque import MAX_WINDOWS, OPTIONS, TorqueFit
+from gaponet.sysid.torque import MAX_WINDOWS, OPTIONS, TorqueFit, TorqueOptions
 
 
 def with_torque(
@@ -28,15 +28,7 @@ def with_torque(
     torques = [TorqueFit(train, given) for train, _ in splits]
     if not all(t.known for t in torques):
         return fitted
-    tried = {}
-    for options in OPTIONS:
-        if options.place and not all(t.several_payloads for t in torques):
-            continue
-        tried[options] = [
-            HeldOut(part, t.fit(options)) for t, (_, part) in zip(torques, splits, strict=True)
-        ]
-    options = min(tried, key=lambda one: float(held_out_errors(tried[one]).mean()))
-    folds = tuple(tried[options])
+    options, folds = _best_options(torques, splits)
     comparison = Comparison(
         "torque",
         held_out_errors(fitted.held_out),
@@ -68,6 +60,22 @@ def with_torque(
         held_out=folds,
         without_terms=None,
     )
+
+
+def _best_options(
+    torques: ListOf[TorqueFit], splits: ListOf[Split]
+) -> tuple[TorqueOptions, tuple[HeldOut, ...]]:
+    """Return the options with the least error on motions that were not fitted, and the robot of each fold."""
+    tried = {}
+    for options in OPTIONS:
+        if options.place and not all(t.several_payloads for t in torques):
+            continue
+        folds = []
+        for torque, (_, held_out) in zip(torques, splits, strict=True):
+            folds.append(HeldOut(held_out, torque.fit(options)))
+        tried[options] = tuple(folds)
+    best = min(tried, key=lambda one: float(held_out_errors(tried[one]).mean()))
+    return best, tried[best]
 
 
 def _standard_errors(robot: RobotSpec, recordings: list[Sequence], nthread: int) -> StandardErrors:
