@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from arm import TOML, commands, recordings, write_arm
+from arm import TOML, XML, commands, recordings, write_arm
 
 from gaponet.robot.servo_fields import SERVO_TERMS
 from gaponet.robot.spec import Table
@@ -15,7 +15,8 @@ from gaponet.sysid.identify import identify
 from gaponet.sysid.joint_rollouts import JointRollouts
 from gaponet.sysid.motion_limits import default_terms
 from gaponet.sysid.options import IdentifyOptions
-from gaponet.sysid.problem import JointFit, standard_errors
+from gaponet.sysid.problem import JointFit, contradicted_gains, standard_errors
+from gaponet.sysid.robot_rollouts import cut
 
 SERVO = {
     "kp": 20.0,
@@ -149,3 +150,31 @@ def test_half_of_the_rows_remain_for_motions_close_to_the_table(tmp_path):
         table_contact.contact_height(robot, [np.r_[0.0, np.full(50, 0.4)]])
         == table_contact.CONTACT_CLEARANCE_M
     )
+
+
+def test_a_kd_of_the_file_that_is_eight_times_too_low_is_overruled_and_named(tmp_path):
+    """The prior of damping is weaker than recordings that keep their lag."""
+    light = XML.replace('damping="0.5"', 'damping="0.02"')
+
+    def robot(name, kd):
+        return write_arm(tmp_path / name, TOML.replace("kp = 20.0", f"kp = 20.0\nkd = {kd}"), light)
+
+    rng = np.random.default_rng(0)
+    sequences = []
+    for s in recordings(robot("real", 4.0), 4, rows=300, delay=2):
+        sequences.append(replace(s, qpos=s.qpos + 1e-3 * rng.standard_normal(s.qpos.shape)))
+    errors = []
+    doubts = []
+    for name, kd in (("right", 4.0), ("low", 0.5)):
+        given = robot(name, kd)
+        bounds = Bounds(given, sequences)
+        rollouts = JointRollouts(cut(sequences, 4), given, nthread=1)
+        fit = JointFit(rollouts, given, bounds)
+        found = fit.search(CLASSIC, bounds.start, fit.regressed())
+        np.testing.assert_allclose((found["damping"] + kd) / found["kp"], 4.0 / 20.0, rtol=0.05)
+        errors.append(np.abs(rollouts.errors({f: v[None] for f, v in found.items()})).mean())
+        doubts.append(contradicted_gains(bounds, found, standard_errors(fit, found).std))
+    assert errors[1] < 1.02 * errors[0]
+    assert doubts[0] == []
+    assert len(doubts[1]) == 2
+    assert all("kd" in text for text in doubts[1])
