@@ -174,10 +174,11 @@ class BatchSim:
         robots = {}
         for c in dict.fromkeys(conditions):
             robots[c] = robot.with_gains(c.kp, c.kd).at_temperature(c.temperature)
-        delays = [c.simulator.delay for c in conditions if c.simulator]
-        self.longest_delay = float(robot.delay.max()) + max(delays, default=0.0)  # s
-        buffer_s = self.longest_delay if any(delays) else 0.0
-        self.models = _compiled(robots, self.joint_names, locked, buffer_s)
+        late = max((c.simulator.delay for c in conditions if c.simulator), default=0.0)
+        self.longest_delay = float(robot.delay.max()) + late  # s
+        self.models = _compiled(
+            robots, self.joint_names, locked, self.longest_delay if late else 0.0
+        )
         models = [self.models[c] for c in conditions]
         first = models[0]
         own_kp = np.where(robot.kp > 0, robot.kp, 1.0)

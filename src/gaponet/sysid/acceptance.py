@@ -75,13 +75,19 @@ def cross_validation(
     for joints in several:
         for i, name in enumerate(motions[joints]):
             fold[joints, name] = i % count
-    fold_of = [fold.get((s.meta.unrecorded, s.meta.independent_motion)) for s in every]
-    splits = []
-    for i in range(count):
-        fitted = [s for s, k in zip(every, fold_of, strict=True) if k != i]
-        held_out = [s for s, k in zip(every, fold_of, strict=True) if k == i]
-        splits.append((fitted, held_out))
-    return splits
+    return [_split(every, fold, i) for i in range(count)]
+
+
+def _split(
+    sequences: ListOf[Sequence], fold: dict[tuple[tuple[str, ...], str], int], number: int
+) -> Split:
+    """Return the recordings outside and inside a fold; `fold` has its number by unrecorded joints and motion."""
+    fitted = []
+    held_out = []
+    for s in sequences:
+        own = fold.get((s.meta.unrecorded, s.meta.independent_motion))
+        (held_out if own == number else fitted).append(s)
+    return fitted, held_out
 
 
 def _motions(sequences: ListOf[Sequence]) -> dict[tuple[str, ...], list[str]]:

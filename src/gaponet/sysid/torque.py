@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from collections.abc import Sequence as ListOf
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -194,35 +194,13 @@ class TorqueFit:
     def _balance(self) -> tuple[list[int], Array, Array, Array, Array, Callable[[Array], Array]]:
         """Return the joints; joint, torque, acceleration and speed of each row; and the torque that inverse dynamics
         require for a payload's place and hand x, (4,) m and kg."""
-        robot, mounts, rows = self.robot, self.robot.payload_mounts, []
-        model = build_model(
-            replace(robot, payload_mounts=tuple(replace(m, mass=0.0) for m in mounts))
-        )
-        data, full = mujoco.MjData(model), np.empty((model.nv, model.nv))
-        bodies = [model.body(m.body).id for m in mounts]
-        jac = np.empty((len(mounts), 2, 3, model.nv))  # of each mount's body: position and rotation
+        rows = []
+        mounts = self.robot.payload_mounts
+        empty = tuple(replace(m, mass=0.0) for m in mounts)
+        model = build_model(replace(self.robot, payload_mounts=empty))
         every = max(ROW_STEP, sum(map(len, self.sequences)) // MAX_ROWS)
         for s in self.sequences:
-            assert s.tau is not None
-            qacc = differentiate(
-                differentiate(lowpass(s.qpos.astype(float), s.dt, CUTOFF_HZ), s.dt), s.dt
-            )
-            moved, carried = (
-                _moved(s, robot),
-                [s.meta.payload_side in ("both", m.side) for m in mounts],
-            )
-            for t in range(every, len(s) - 1, every) if moved else ():
-                data.qpos[:], data.qvel[:] = s.qpos[t], 0.0
-                mujoco.mj_forward(model, data)
-                mujoco.mj_fullM(model, data, full)
-                for body, (shift, turn) in zip(bodies, jac, strict=True):
-                    mujoco.mj_jac(model, data, shift, turn, data.xpos[body], body)
-                rows += [
-                    (j, s.meta.payload_mass * np.array(carried), data.qfrc_bias[j] + full[j, j] * qacc[t, j],
-                     jac[..., j].copy(), data.xmat[bodies].reshape(-1, 3, 3), float(s.tau[t, j]), qacc[t, j],
-                     float(s.qvel[t, j]))
-                    for j in moved
-                ]  # fmt: skip
+            rows += self._balance_rows(s, model, every)
         joints = sorted({r[0] for r in rows})
         column = np.array([joints.index(r[0]) for r in rows])
         mass, bias, motion, frame, tau, qacc, qvel = (
@@ -239,6 +217,41 @@ class TorqueFit:
             return np.asarray(bias + ((mass + x[3]) * there).sum(axis=1))
 
         return joints, column, tau, qacc, qvel, required
+
+    def _balance_rows(
+        self, s: Sequence, model: mujoco.MjModel, every: int
+    ) -> list[tuple[Any, ...]]:
+        """Return a row for each moved joint in every so many rows of a recording: its number; payload in each mount,
+        kg; torque without payloads, N·m; Jacobian and frame of each mount's body; torque, N·m; acceleration; speed."""
+        assert s.tau is not None
+        moved = _moved(s, self.robot)
+        if not moved:
+            return []
+        mounts = self.robot.payload_mounts
+        carried = [s.meta.payload_side in ("both", m.side) for m in mounts]
+        mass = s.meta.payload_mass * np.array(carried)
+        bodies = [model.body(m.body).id for m in mounts]
+        data = mujoco.MjData(model)
+        full = np.empty((model.nv, model.nv))
+        # Of each mount's body: position and rotation.
+        jac = np.empty((len(mounts), 2, 3, model.nv))
+        speed = differentiate(lowpass(s.qpos.astype(float), s.dt, CUTOFF_HZ), s.dt)
+        qacc = differentiate(speed, s.dt)
+        rows = []
+        for t in range(every, len(s) - 1, every):
+            data.qpos[:] = s.qpos[t]
+            data.qvel[:] = 0.0
+            mujoco.mj_forward(model, data)
+            mujoco.mj_fullM(model, data, full)
+            for body, (shift, turn) in zip(bodies, jac, strict=True):
+                mujoco.mj_jac(model, data, shift, turn, data.xpos[body], body)
+            frame = data.xmat[bodies].reshape(-1, 3, 3)
+            for j in moved:
+                without = data.qfrc_bias[j] + full[j, j] * qacc[t, j]
+                motion = jac[..., j].copy()
+                tau = float(s.tau[t, j])
+                rows.append((j, mass, without, motion, frame, tau, qacc[t, j], float(s.qvel[t, j])))
+        return rows
 
     def fit(self, options: TorqueOptions) -> RobotSpec:
         """Return the robot with values from torque, and near those with values from positions."""

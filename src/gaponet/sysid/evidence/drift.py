@@ -128,12 +128,7 @@ def drift(
             "no recording moves an operated joint away from what it may touch; record gaponet excite's"
         )
     joints = robot.operated
-    held = {j for j, rows in zip(joints, own.rows, strict=True) if rows}
-    if not held & identified_joints(robot):
-        raise UsageError(
-            f"{robot.folder}: these recordings hold only joints that were never identified: {', '.join(sorted(held))}. "
-            "Identify these joints first"
-        )
+    _require_identified(robot, own)
     repeatability = _repeatability(uncertainty, sequences, joints)
     far = _far_joints(uncertainty, own, joints, repeatability)
     overdispersion = np.stack(
@@ -162,6 +157,16 @@ def drift(
         seconds=float(sum(s.duration for s in sequences)),
         far=far,
     )
+
+
+def _require_identified(robot: RobotSpec, own: Evidence) -> None:
+    """Raise UsageError if no joint that the recordings hold was identified."""
+    held = {j for j, rows in zip(robot.operated, own.rows, strict=True) if rows}
+    if not held & identified_joints(robot):
+        raise UsageError(
+            f"{robot.folder}: these recordings hold only joints that were never identified: {', '.join(sorted(held))}. "
+            "Identify these joints first"
+        )
 
 
 def _repeatability(
@@ -412,18 +417,31 @@ def _advice(
             f"no number explains how far these logs are from the model ({times} the residual): another robot, payload "
             "or controller, or a part that gives way; look at it, then identify again"
         )
-    odd = [j for j in joints if _is_odd([m for m in moved if m.joint == j])]
-    if len(odd) > MAX_CHANGED_JOINTS * len(joints) and len(odd) > 1:
-        return (
-            f"{len(odd)} of {len(joints)} joints have another stiffness or several other numbers: is this the same "
-            "robot, with the same gains and payload? If so, identify again; an adaptation is not enough"
-        )
-    play = sorted({m.joint for m in moved if m.field == PLAY and m.by > 0})
-    if play:
-        return f"look at the gearbox and the screws of {', '.join(play)}: play that was not there; then identify again"
-    return _friction_advice(moved, joints) or (
-        "adapt with these logs: gaponet adapt ROBOT LOGS --out ROBOT_TODAY"
+    return (
+        _another_robot_advice(moved, joints)
+        or _gearbox_advice(moved)
+        or _friction_advice(moved, joints)
+        or "adapt with these logs: gaponet adapt ROBOT LOGS --out ROBOT_TODAY"
     )
+
+
+def _another_robot_advice(moved: ListOf[ParameterChange], joints: ListOf[str]) -> str:
+    """Return what to do if many joints changed as another robot's would; else nothing."""
+    odd = [j for j in joints if _is_odd([m for m in moved if m.joint == j])]
+    if len(odd) <= MAX_CHANGED_JOINTS * len(joints) or len(odd) == 1:
+        return ""
+    return (
+        f"{len(odd)} of {len(joints)} joints have another stiffness or several other numbers: is this the same "
+        "robot, with the same gains and payload? If so, identify again; an adaptation is not enough"
+    )
+
+
+def _gearbox_advice(moved: ListOf[ParameterChange]) -> str:
+    """Return what to do if joints have play that was not there; else nothing."""
+    play = sorted({m.joint for m in moved if m.field == PLAY and m.by > 0})
+    if not play:
+        return ""
+    return f"look at the gearbox and the screws of {', '.join(play)}: play that was not there; then identify again"
 
 
 def _is_odd(changes: ListOf[ParameterChange]) -> bool:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from collections.abc import Sequence as ListOf
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -156,12 +156,7 @@ def estimate_uncertainty(
         held_out: Recordings and the robots that were fitted without them, instead of `judges`, if `robot` was fitted to
             them as well.
     """
-    if before is None:
-        first = first_values(robot)
-        present = [f for f in SERVO_TERMS if SERVO_FIELDS[f].prior_std and first[f].any()]
-        fields: tuple[str, ...] = (*CLASSIC, *present)
-    else:
-        fields = before.fields
+    fields = before.fields if before else _fitted_fields(robot)
     own = evidence(robot, sequences, fields, nthread=nthread)
     values = to_axes(robot, fields)
     clusters, overdispersion = _overdispersion(own, before, robot.operated)
@@ -177,37 +172,64 @@ def estimate_uncertainty(
             joint, fields, values[joint], step_covariance[i, :-1, :-1], covariances, before
         )
         variance = max(np.trace(covariance @ information[i, :-1, :-1]), 0.0) / max(own.rows[i], 1)
-        old = before.joints[joint] if before else None
-        rms = float(np.sqrt(np.mean(np.concatenate(errors[joint]) ** 2)))
-        bound = _error_bound(errors[joint])
-        difference = float(repeatability[i])
-        if old is not None:
-            difference = max(difference, old.repeatability)
-        if old is not None and not (judges or held_out):
-            rms = max(rms, old.residual_rms)
-            bound = max(bound, old.residual_p90)
-        joints[joint] = JointUncertainty(
+        today = JointUncertainty(
             values=_nested(values[joint]),
             covariance=_nested(covariance),
             gauss_newton_step=_nested(step[i]),
             gauss_newton_covariance=_nested(step_covariance[i]),
             overdispersion=_nested(overdispersion[i]),
             parameter_rms=ERROR_SCALE_RAD * float(np.sqrt(variance)),
-            residual_rms=rms,
-            residual_p90=bound,
-            repeatability=difference,
+            residual_rms=float(np.sqrt(np.mean(np.concatenate(errors[joint]) ** 2))),
+            residual_p90=_error_bound(errors[joint]),
+            repeatability=float(repeatability[i]),
         )
-    source: Provenance = {
-        "made_by": "identify" if judges or covariances else "adapt",
+        joints[joint] = today
+        if before:
+            old = before.joints[joint]
+            joints[joint] = _no_better(today, old, errors_are_of_fit=not (judges or held_out))
+    source = _provenance(sequences, joints, "identify" if judges or covariances else "adapt")
+    sources = (*before.sources, source) if before else (source,)
+    return ParameterUncertainty(fields, joints, sources, clusters, bool(judges or held_out))
+
+
+def _fitted_fields(robot: RobotSpec) -> tuple[str, ...]:
+    """Return the fields that a robot's fit has: the classic ones, and those of its terms."""
+    first = first_values(robot)
+    present = [f for f in SERVO_TERMS if SERVO_FIELDS[f].prior_std and first[f].any()]
+    return (*CLASSIC, *present)
+
+
+def _no_better(
+    today: JointUncertainty, old: JointUncertainty, *, errors_are_of_fit: bool
+) -> JointUncertainty:
+    """Return a joint's uncertainty with repetitions that differ no less than before.
+
+    Errors of recordings that were fitted are too small, so they are no less than those of motions that were not.
+    """
+    repeatability = max(today.repeatability, old.repeatability)
+    if not errors_are_of_fit:
+        return replace(today, repeatability=repeatability)
+    return replace(
+        today,
+        repeatability=repeatability,
+        residual_rms=max(today.residual_rms, old.residual_rms),
+        residual_p90=max(today.residual_p90, old.residual_p90),
+    )
+
+
+def _provenance(
+    sequences: ListOf[Sequence], joints: Mapping[str, JointUncertainty], made_by: str
+) -> Provenance:
+    """Return where values and covariances come from."""
+    return {
+        "made_by": made_by,
         "days": tuple(sorted({s.meta.recorded_at[:10] for s in sequences} - {""})),
         "unit": ", ".join(sorted({s.meta.unit_id for s in sequences})),
         "logs": {_log_name(s): s.content_hash() for s in sequences},
         "seconds": float(sum(s.duration for s in sequences)),
-        "values": {j: joints[j].values for j in joints},
-        "covariance": {j: joints[j].covariance for j in joints},
+        "values": {name: joint.values for name, joint in joints.items()},
+        "covariance": {name: joint.covariance for name, joint in joints.items()},
     }
-    sources = (*before.sources, source) if before else (source,)
-    return ParameterUncertainty(fields, joints, sources, clusters, bool(judges or held_out))
 
 
 def _overdispersion(
