@@ -165,9 +165,14 @@ class JointFit(FitProblem):
         ]
 
     def search(
-        self, fields: ListOf[str], start: Values, others: ListOf[Values] = (), *, only: bool = False,
+        self,
+        fields: ListOf[str],
+        start: Values,
+        others: ListOf[Values] = (),
+        *,
+        only: bool = False,
         report: Progress = lambda cost: None,
-    ) -> Values:  # fmt: skip
+    ) -> Values:
         """Fit the fields, the classic ones and those of the servo model that `start` has; return values (n,).
 
         Args:
@@ -487,8 +492,8 @@ def _undetermined(
 
     std: Standard errors in SI units, (n,); width: those on the axes, (n, P), where torques are divided by kp.
     """
-    bounds, names, x = problem.bounds, axes.names, axes.normalize(values)
-    ahead, unknown = axes.values(x + 1), dict[str, tuple[tuple[str, ...], str]]()
+    bounds = problem.bounds
+    unknown = {}
     for i, joint in enumerate(problem.robot.operated):
         if bounds.unexcited[i]:
             why = (
@@ -496,26 +501,42 @@ def _undetermined(
                 "the file's values but for what others that move it show (kp, damping, friction, offset); record its "
                 "motion"
             )
-            unknown[joint] = tuple(names), why
+            unknown[joint] = tuple(axes.names), why
             continue
-        wide, also_over_kp = dict[str, str](), list[str]()
-        for k, f in enumerate(names):
-            if (f == "stribeck_speed" and not values["stribeck"][i]) or (
-                f == "no_load_speed" and not values[f][i]
-            ):
-                continue
-            value, error = values[f][i], std[f][i]
-            if error > MAX_RELATIVE_STD * max(abs(value), ahead[f][i] - value):
-                wide[f] = f"{f} {format_uncertainty(value, error)}"
-                if SERVO_FIELDS[f].axis != "over kp" or width[i, k] > MAX_RELATIVE_STD * max(
-                    abs(x[i, k]), 1.0
-                ):
-                    also_over_kp.append(f)
+        wide, also_over_kp = _wide_fields(values, axes, std, width, i)
         if wide:
-            as_set = set(also_over_kp) == {"kp"} and len(wide) > 1
-            advice = "; known as multiples of kp: take the values as a set" if as_set else ""
-            unknown[joint] = (
-                tuple(wide),
-                f"{joint}: not determined by these logs: {', '.join(wide.values())}{advice}",
-            )
+            texts = [f"{f} {format_uncertainty(values[f][i], std[f][i])}" for f in wide]
+            advice = ""
+            if set(also_over_kp) == {"kp"} and len(wide) > 1:
+                advice = "; known as multiples of kp: take the values as a set"
+            text = f"{joint}: not determined by these logs: {', '.join(texts)}{advice}"
+            unknown[joint] = tuple(wide), text
     return unknown
+
+
+def _wide_fields(
+    values: Values, axes: Axes, std: Values, width: Array, joint: int
+) -> tuple[list[str], list[str]]:
+    """Return the fields of a joint that the recordings do not determine, and which of them not even over kp.
+
+    Arguments as of `_undetermined`. A speed without its friction or line says nothing.
+    """
+    x = axes.normalize(values)
+    scale = axes.values(x + 1)
+    without = set()
+    for field, needed in (("stribeck_speed", "stribeck"), ("no_load_speed", "no_load_speed")):
+        if field in values and not values[needed][joint]:
+            without.add(field)
+    wide = []
+    also_over_kp = []
+    for k, field in enumerate(axes.names):
+        value = values[field][joint]
+        large = max(abs(value), scale[field][joint] - value)
+        if field in without or std[field][joint] <= MAX_RELATIVE_STD * large:
+            continue
+        wide.append(field)
+        is_over_kp = SERVO_FIELDS[field].axis == "over kp"
+        on_axis = MAX_RELATIVE_STD * max(abs(x[joint, k]), 1.0)
+        if not is_over_kp or width[joint, k] > on_axis:
+            also_over_kp.append(field)
+    return wide, also_over_kp
