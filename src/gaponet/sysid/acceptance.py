@@ -82,8 +82,8 @@ def _split(
     sequences: ListOf[Sequence], fold: dict[tuple[tuple[str, ...], str], int], number: int
 ) -> Split:
     """Return the recordings outside and inside a fold; `fold` has its number by unrecorded joints and motion."""
-    fitted = []
-    held_out = []
+    fitted: list[Sequence] = []
+    held_out: list[Sequence] = []
     for s in sequences:
         own = fold.get((s.meta.unrecorded, s.meta.independent_motion))
         (held_out if own == number else fitted).append(s)

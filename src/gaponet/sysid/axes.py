@@ -53,13 +53,11 @@ def to_axis(field: str, value: Array, kp: Array) -> Array:
     axis = SERVO_FIELDS[field].axis
     if axis == "inverse":
         return np.divide(1.0, value, out=np.zeros_like(value, float), where=value > 0)
-    return (
-        np.log(np.maximum(value, 1e-9))
-        if axis == "log"
-        else value / kp
-        if axis == "over kp"
-        else value
-    )
+    if axis == "log":
+        return np.asarray(np.log(np.maximum(value, 1e-9)))
+    if axis == "over kp":
+        return value / kp
+    return value
 
 
 def from_axis(x: dict[str, Array], kp: Array | None = None) -> Values:
@@ -77,7 +75,7 @@ def greatest_speeds(sequences: ListOf[Sequence], robot: RobotSpec) -> Array:
         np.quantile(np.abs(s.qvel[:, robot.operated_index]), SPEED_QUANTILE, axis=0)
         for s in sequences
     ]
-    return np.maximum(np.max(speeds, axis=0), MIN_SPEED)
+    return np.asarray(np.maximum(np.max(speeds, axis=0), MIN_SPEED))
 
 
 def first_values(robot: RobotSpec) -> Values:
@@ -253,11 +251,11 @@ class Bounds:
             total = np.maximum(values["damping"] + self.kd, 0.0)
             slow = np.abs(values[WARM[1]]) < MIN_PER_KELVIN * total
             return np.where(slow & (np.abs(values[field]) < MIN_PER_KELVIN), 0.0, values[field])
-        inverse = SERVO_FIELDS[field].axis == "inverse"
-        least = MIN_LINE / LARGE_LINE_CHANGE * self.limits[field][2] if inverse else 0.0
-        return np.where(
-            inverse & (to_axis(field, values[field], values["kp"]) < least), 0.0, values[field]
-        )
+        if SERVO_FIELDS[field].axis != "inverse":
+            return values[field]
+        least = MIN_LINE / LARGE_LINE_CHANGE * self.limits[field][2]
+        line = to_axis(field, values[field], values["kp"])
+        return np.where(line < least, 0.0, values[field])
 
     def warnings(self, values: Values, names: ListOf[str]) -> tuple[str, ...]:
         """Return a sentence for each field of values (n,) at its bound; no friction, armature or delay is ordinary."""
@@ -308,11 +306,14 @@ class Axes:
 
     def normalize(self, values: Values) -> Array:
         """Return values (…, n) on the axes, inside the bounds."""
-        return np.clip(self._unclipped(values), self.low, self.high)
+        return np.asarray(np.clip(self._unclipped(values), self.low, self.high))
 
     def _unclipped(self, values: Values) -> Array:
-        own = {f: values[f] + self._kd_slack if f == "damping" else values[f] for f in self.names}
-        return np.stack([to_axis(f, x, values["kp"]) for f, x in own.items()], axis=-1) / self.unit
+        own = {f: values[f] for f in self.names}
+        if "damping" in own:
+            own["damping"] = own["damping"] + self._kd_slack
+        on_axes = [to_axis(f, x, values["kp"]) for f, x in own.items()]
+        return np.asarray(np.stack(on_axes, axis=-1) / self.unit)
 
     def values(self, x: Array) -> Values:
         """Return values of x on the axes; fields that are not searched stay."""

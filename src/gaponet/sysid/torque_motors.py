@@ -213,7 +213,7 @@ def _jackknife(rows: ListOf[_Rows], j: int, constant: bool, lag: int) -> Array:
     a, y = _system(rows, j, constant, lag)
     block = np.arange(len(y)) * JACKKNIFE_BLOCKS // max(len(y), 1)
     each = np.array([_solved(a[block != k], y[block != k])[0] for k in range(JACKKNIFE_BLOCKS)])
-    return np.sqrt((JACKKNIFE_BLOCKS - 1) * each.var(axis=0))
+    return np.asarray(np.sqrt((JACKKNIFE_BLOCKS - 1) * each.var(axis=0)))
 
 
 def _residual(rows: ListOf[_Rows], terms: dict[str, Array], constant: Array, lags: Array) -> Array:
