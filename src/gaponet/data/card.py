@@ -56,7 +56,8 @@ def make_card(dataset: Dataset, progress: Progress = no_progress) -> dict[str, A
     for e in dataset.entries:
         groups[*e.meta.repetition_key, round(e.dt, 7)].append(e)
     rows_before: Counter[str] = Counter()
-    repeated, done = [], 0
+    repeated = []
+    done = 0
     for group in groups.values():
         repetitions = Repetitions()
         for entry in group:
@@ -147,8 +148,14 @@ def _by_joint(
     pooled: Statistics, samples: Array, names: tuple[str, ...]
 ) -> dict[str, dict[str, float]]:
     p1, p99 = np.percentile(samples, [1, 99], axis=0)
-    columns = {"min": pooled["min"], "p1": p1, "mean": pooled["mean"], "p99": p99, "max": pooled["max"],
-               "std": pooled["std"]}  # fmt: skip
+    columns = {
+        "min": pooled["min"],
+        "p1": p1,
+        "mean": pooled["mean"],
+        "p99": p99,
+        "max": pooled["max"],
+        "std": pooled["std"],
+    }
     return {j: {k: float(f"{v[i]:.6g}") for k, v in columns.items()} for i, j in enumerate(names)}
 
 
@@ -169,10 +176,14 @@ def write_card(dataset: Dataset, card: dict[str, Any]) -> None:
 
 def headline(card: dict[str, Any]) -> str:
     """Return the first line: "demo: 128 sequences, 0.39 h of h1_2, all on VIRTUAL robots"."""
-    total, virtual = card["total"], card["virtual_sequences"]
+    total = card["total"]
+    virtual = card["virtual_sequences"]
     count = "all" if virtual == total["sequences"] else f"{virtual} of them"
     kind = f", {count} on VIRTUAL robots" if virtual else ""
-    return f"{card['name']}: {total['sequences']:,} sequences, {total['hours']:.2f} h of {card['robot']}{kind}"
+    return (
+        f"{card['name']}: {total['sequences']:,} sequences, {total['hours']:.2f} h of "
+        f"{card['robot']}{kind}"
+    )
 
 
 def count_table(card: dict[str, Any], by: str) -> ResultTable:
@@ -206,7 +217,9 @@ def card_markdown(card: dict[str, Any]) -> str:
 
 
 def _facts(card: dict[str, Any]) -> Iterator[str]:
-    total, recorded, collected = card["total"], card["recorded"], card["collected"]
+    total = card["total"]
+    recorded = card["recorded"]
+    collected = card["collected"]
     for name in ("licence", "source"):
         ask = f"; set with `gaponet data card DIR --{name} …`" if card[name] == NOT_STATED else ""
         yield f"- {name}: {escape_markdown(card[name])}{ask}"
@@ -233,8 +246,9 @@ def _repeatability(card: dict[str, Any]) -> Iterator[str]:
         yield "No motion was repeated with the same command by the same unit with the same payload.\n"
         return
     yield (
-        f"Standard deviation over repetitions of the same command, root mean square over rows; {repeated['groups']:,} "
-        f"groups, {repeated['sequences']:,} sequences; joints that were commanded to move."
+        "Standard deviation over repetitions of the same command, root mean square over rows; "
+        f"{repeated['groups']:,} groups, {repeated['sequences']:,} sequences; joints that were "
+        "commanded to move."
     )
     if excluded := repeated["left_out_other_command"]:
         yield f"{excluded:,} sequences of these groups had another command and were left out."

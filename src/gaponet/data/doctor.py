@@ -60,16 +60,22 @@ class DoctorResult:
 
     @classmethod
     def of(
-        cls, dataset: Dataset, robot: RobotSpec, *, gravity_model: Gravity | None = None,
-        dynamics_model: Dynamics | None = None, progress: Progress = no_progress,
+        cls,
+        dataset: Dataset,
+        robot: RobotSpec,
+        *,
+        gravity_model: Gravity | None = None,
+        dynamics_model: Dynamics | None = None,
+        progress: Progress = no_progress,
         executor: str | Executor = LOCAL,
-    ) -> DoctorResult:  # fmt: skip
+    ) -> DoctorResult:
         """Examine every sequence, and judge them together.
 
         Args:
-            gravity_model: Gravity of the nominal model, which shows wrong zeros, signs, gains and payload labels; these
-                are not examined without it.
-            dynamics_model: Inverse dynamics of the nominal model, which show joints under each other's names; likewise.
+            gravity_model: Gravity of the nominal model, which shows wrong zeros, signs, gains and
+                payload labels; these are not examined without it.
+            dynamics_model: Inverse dynamics of the nominal model, which show joints under each
+                other's names; likewise.
 
         Raises:
             DatasetError: The dataset is empty, damaged or another robot's.
@@ -105,7 +111,9 @@ def _examine_loads(
     model: Gravity,
     dynamics: Dynamics | None,
 ) -> list[Finding]:
-    """Compare torques and static poses with gravity, unless another error would cause these findings too."""
+    """Compare torques and static poses with gravity, unless another error would cause these
+    findings too.
+    """
     errors = [f.check for f in findings if f.level == "error"]
     result = list[Finding]()
     if dynamics is not None and not errors:
@@ -114,7 +122,10 @@ def _examine_loads(
         return result
     errors += [f.check for f in findings if "slope" in f.values]
     if errors:
-        text = f"zeros, offsets, gains and payloads are judged by gravity once this is mended: {', '.join(set(errors))}"
+        text = (
+            "zeros, offsets, gains and payloads are judged by gravity once this is mended: "
+            f"{', '.join(set(errors))}"
+        )
         return [*result, Finding("ok", "gravity", text)]
     by_commands = () if driven_by_torque(surveys) else (feedforward, static_checks)
     for check in (gravity, *by_commands):
@@ -128,29 +139,39 @@ def _sequence_row(s: Survey, robot: RobotSpec) -> dict[str, Any]:
     lags = {name: round(x[0], 4) for name, x in fast_lags([s], robot).items()}
     meta = s.entry.meta
     return {
-        "motion": meta.motion, "unit": meta.unit_id, "payload_mass": meta.payload_mass, "repetition": meta.repetition,
-        "rows": s.entry.rows, "seconds": round(s.entry.rows * s.entry.dt, 2), "rate_hz": round(s.rate_hz, 2),
-        "jitter_ms": s.jitter_ms, "longest_gap_ms": s.longest_gap_ms, "rows_are": meta.notes.get("rows", ""),
+        "motion": meta.motion,
+        "unit": meta.unit_id,
+        "payload_mass": meta.payload_mass,
+        "repetition": meta.repetition,
+        "rows": s.entry.rows,
+        "seconds": round(s.entry.rows * s.entry.dt, 2),
+        "rate_hz": round(s.rate_hz, 2),
+        "jitter_ms": s.jitter_ms,
+        "longest_gap_ms": s.longest_gap_ms,
+        "rows_are": meta.notes.get("rows", ""),
         "fast_lag_s": lags,
-    }  # fmt: skip
+    }
 
 
 def _joint_rows(surveys: list[Survey], robot: RobotSpec) -> list[dict[str, Any]]:
-    lags, errors = fast_lags(surveys, robot), static_errors(surveys, robot)
+    lags = fast_lags(surveys, robot)
+    errors = static_errors(surveys, robot)
     ctrl = np.array([s.ctrl_limits for s in surveys])  # (sequences, n, 2)
     qpos = np.array([s.qpos_limits for s in surveys])
     rows = []
     for i, name in enumerate(robot.joint_names):
         error = errors.get(name)
-        rows.append({
-            "joint": name,
-            "operated": name in robot.operated,
-            "commanded_rad": [float(ctrl[:, i, 0].min()), float(ctrl[:, i, 1].max())],
-            "measured_rad": [float(qpos[:, i, 0].min()), float(qpos[:, i, 1].max())],
-            "lag_s": lag_values(lags[name]) if name in lags else None,
-            "static_error_rad": error.middle if error and np.isfinite(error.middle) else None,
-            "stiction_band_rad": error.half_band if error and error.balanced else None,
-            "rests": error.up + error.down if error else 0,
-            "torque_spikes": sum(int(s.torque.spikes[i]) for s in surveys if s.torque),
-        })  # fmt: skip
+        rows.append(
+            {
+                "joint": name,
+                "operated": name in robot.operated,
+                "commanded_rad": [float(ctrl[:, i, 0].min()), float(ctrl[:, i, 1].max())],
+                "measured_rad": [float(qpos[:, i, 0].min()), float(qpos[:, i, 1].max())],
+                "lag_s": lag_values(lags[name]) if name in lags else None,
+                "static_error_rad": error.middle if error and np.isfinite(error.middle) else None,
+                "stiction_band_rad": error.half_band if error and error.balanced else None,
+                "rests": error.up + error.down if error else 0,
+                "torque_spikes": sum(int(s.torque.spikes[i]) for s in surveys if s.torque),
+            }
+        )
     return rows

@@ -1,8 +1,9 @@
-"""Fingerprints of commands: recognise one command in recordings with different names, payloads, rates or lengths.
+"""Fingerprints of commands: recognise one command in recordings with different names, payloads,
+rates or lengths.
 
-Two motions with equal commands must not be on two sides of a split. A fingerprint holds hashes of a sample of the
-distinct rows, which are equal where one file was played, and an outline, which is similar where a command was computed
-again at slightly different times.
+Two motions with equal commands must not be on two sides of a split. A fingerprint holds hashes of a
+sample of the distinct rows, which are equal where one file was played, and an outline, which is
+similar where a command was computed again at slightly different times.
 """
 
 from __future__ import annotations
@@ -16,16 +17,15 @@ from typing_extensions import TypedDict
 
 from gaponet.base.arrays import Array
 
-SAMPLED_ROWS, OUTLINE_POINTS = 32, 24
+SAMPLED_ROWS = 32
+OUTLINE_POINTS = 24
 ROW_RESOLUTION_RAD = 1e-5  # rows that differ by less are equal
-MIN_SHARED_ROWS, MIN_SHARED_SHARE = (
-    2,
-    0.3,
-)  # of the sampled rows; one common resting place is not enough
-MAX_OUTLINE_DIFFERENCE, MAX_DURATION_DIFFERENCE = (
-    0.004,
-    0.01,
-)  # shares of the outline's range and of the duration
+# of the sampled rows; one common resting place is not enough
+MIN_SHARED_ROWS = 2
+MIN_SHARED_SHARE = 0.3
+# shares of the outline's range and of the duration
+MAX_OUTLINE_DIFFERENCE = 0.004
+MAX_DURATION_DIFFERENCE = 0.01
 MAX_START_SHIFT = 0.1  # outline points by which one command may begin later
 OUTLIERS = 2  # outline points that may differ by more: a step is a row early or late
 
@@ -33,8 +33,9 @@ OUTLIERS = 2  # outline points that may differ by more: a step is a row early or
 class CommandFingerprint(TypedDict):
     """Fingerprint of the commands of one recording.
 
-    rows: Least hashes of distinct rows, without the first row, which many motions share; seconds: time between the
-    first and the last change; outline: projection of the commands at evenly spaced times between these.
+    rows: Least hashes of distinct rows, without the first row, which many motions share; seconds:
+    time between the first and the last change; outline: projection of the commands at evenly spaced
+    times between these.
     """
 
     rows: Annotated[list[Annotated[int, Interval(ge=0, lt=2**32)]], Len(1, SAMPLED_ROWS)]
@@ -69,7 +70,8 @@ def equal_commands(fingerprints: Sequence[CommandFingerprint]) -> list[tuple[int
     pairs = set(_pairs_with_shared_rows([set(f["rows"]) for f in fingerprints]))
     outlines = np.array([f["outline"] for f in fingerprints])  # (N, OUTLINE_POINTS)
     seconds = np.array([f["seconds"] for f in fingerprints])
-    slopes, ranges = np.gradient(outlines, axis=1), np.ptp(outlines, axis=1)
+    slopes = np.gradient(outlines, axis=1)
+    ranges = np.ptp(outlines, axis=1)
     for i in np.flatnonzero(ranges > 0):
         others = (
             i
@@ -78,7 +80,8 @@ def equal_commands(fingerprints: Sequence[CommandFingerprint]) -> list[tuple[int
                 np.abs(seconds[i + 1 :] - seconds[i]) <= MAX_DURATION_DIFFERENCE * seconds[i]
             )
         )
-        difference, slope = outlines[others] - outlines[i], slopes[i]
+        difference = outlines[others] - outlines[i]
+        slope = slopes[i]
         shift = np.clip(
             difference @ slope / max(slope @ slope, 1e-12), -MAX_START_SHIFT, MAX_START_SHIFT
         )
@@ -100,7 +103,8 @@ def _pairs_with_shared_rows(samples: list[set[int]]) -> Iterator[tuple[int, int]
     )
     common = (contains @ contains.T).tocoo()
     for i, j, n in zip(common.row.tolist(), common.col.tolist(), common.data.tolist(), strict=True):
-        a, b = samples[i], samples[j]
+        a = samples[i]
+        b = samples[j]
         if i < j and (a == b or n >= max(MIN_SHARED_ROWS, MIN_SHARED_SHARE * min(len(a), len(b)))):
             least = set(sorted(a | b)[: min(len(a), len(b))])
             if len(a & b & least) >= MIN_SHARED_SHARE * len(least):

@@ -28,9 +28,8 @@ from gaponet.data.static_poses import StaticPoses
 from gaponet.data.store import KIND, Dataset, Entry
 from gaponet.robot.spec import RobotSpec
 
-MAX_HELD_BYTES = (
-    1 << 26
-)  # of samples that are held between checking and writing; a larger source is read twice
+# of samples that are held between checking and writing; a larger source is read twice
+MAX_HELD_BYTES = 1 << 26
 MIN_PIECE_S = 0.8
 UNSTATED_REPETITION = -1
 
@@ -42,7 +41,8 @@ class ImportResult:
     Attributes:
         added: Sequences that were added.
         present: Sequences of the same logs that the dataset held before.
-        offsets: Lag and static errors of the unit; None without a gravity model or with several units.
+        offsets: Lag and static errors of the unit; None without a gravity model or with several
+            units.
         cut: Rows that were cut and logs that were left out, one line each.
     """
 
@@ -70,46 +70,72 @@ class ImportResult:
         """Return the result as plain data."""
         offsets = self.offsets or {}
         return {
-            "dataset": str(self.dataset.path), "imported": [e.id for e in self.added],
-            "present": [e.id for e in self.present], "sequences": len(self.dataset),
+            "dataset": str(self.dataset.path),
+            "imported": [e.id for e in self.added],
+            "present": [e.id for e in self.present],
+            "sequences": len(self.dataset),
             "minutes": sum(e.rows * e.dt for e in self.entries) / 60,
             "rate_hz": sorted({round(1 / e.dt, 2) for e in self.entries}),
             "fast_lag_s": {joint: self.fast_lags(joint) for joint in self.robot.operated},
             "delay_s": {e.id: e.findings.get("delay_s", {}) for e in self.entries},
-            "offsets": {name: vars(joint) for name, joint in offsets.items()}, "offsets_applied": False,
+            "offsets": {name: vars(joint) for name, joint in offsets.items()},
+            "offsets_applied": False,
             "cut": list(self.cut),
-        }  # fmt: skip
+        }
 
 
 def import_logs(
-    src: str | Path, robot: RobotSpec, unit_id: str | None, payload_mass: float | None, out: str | Path, *,
-    payload_side: str | None = None, level: str | None = None, fmt: str | None = None, gravity: Gravity | None = None,
-    simulator: str = "", progress: Progress = no_progress, kp: tuple[str, ...] = (), kd: tuple[str, ...] = (),
-    skip_bad: bool = False, cut: float | None = None, **options: Any,
-) -> ImportResult:  # fmt: skip
-    """Import every recording under a path that the dataset does not hold yet. A bad recording refuses all of them.
+    src: str | Path,
+    robot: RobotSpec,
+    unit_id: str | None,
+    payload_mass: float | None,
+    out: str | Path,
+    *,
+    payload_side: str | None = None,
+    level: str | None = None,
+    fmt: str | None = None,
+    gravity: Gravity | None = None,
+    simulator: str = "",
+    progress: Progress = no_progress,
+    kp: tuple[str, ...] = (),
+    kd: tuple[str, ...] = (),
+    skip_bad: bool = False,
+    cut: float | None = None,
+    **options: Any,
+) -> ImportResult:
+    """Import every recording under a path that the dataset does not hold yet.
+
+    A bad recording refuses all of them.
 
     What was written before a full disk or a kill stays, complete, and the same call adds the rest.
 
     Args:
-        gravity: Gravity of the nominal model, to measure offsets (data.offsets); default: no offsets.
+        gravity: Gravity of the nominal model, to measure offsets (data.offsets); default: no
+            offsets.
         simulator: Hash of that model, recorded beside the offsets.
-        options: Options of data.formats.read_logs: joint_map, logs, position_unit, time_unit, rate, allow_pickle,
-            strict. All other arguments are those of gaponet.api.logs.import_logs, `fmt` its `format`.
+        options: Options of data.formats.read_logs: joint_map, logs, position_unit, time_unit, rate,
+            allow_pickle, strict. All other arguments are those of gaponet.api.logs.import_logs,
+            `fmt` its `format`.
 
     Raises:
         LogError, JointMismatchError: A recording cannot be read; the message names file and line.
         UsageError: Unit or payload are missing, or contradict what the format states.
-        DatasetError: `out` is another robot's, a recording is in the source twice, or in `out` under other labels.
+        DatasetError: `out` is another robot's, a recording is in the source twice, or in `out`
+            under other labels.
         FolderError: `out` is something else, or another process writes into it.
     """
-    src, out = Path(src), Path(out)
+    src = Path(src)
+    out = Path(out)
     if payload_side is not None:
         _require_side(robot, payload_side)
     labels = {
-        "unit_id": unit_id, "payload_mass": payload_mass, "payload_side": payload_side, "level": level,
-        "kp": _parse_gains("kp", kp, robot), "kd": _parse_gains("kd", kd, robot),
-    }  # fmt: skip
+        "unit_id": unit_id,
+        "payload_mass": payload_mass,
+        "payload_side": payload_side,
+        "level": level,
+        "kp": _parse_gains("kp", kp, robot),
+        "kd": _parse_gains("kd", kd, robot),
+    }
     labels = {name: value for name, value in labels.items() if value is not None}
     if cut is not None and not cut >= MIN_PIECE_S:
         raise UsageError(f"--cut {cut:g}: pieces are {MIN_PIECE_S} s long or more")
@@ -141,8 +167,8 @@ def import_logs(
 class _Source:
     """Logs to import, with what the user states of them.
 
-    `check` fills hashes, of the content of each recording; provenance; and held: the recordings, None if they are too
-    large to hold.
+    `check` fills hashes, of the content of each recording; provenance; and held: the recordings,
+    None if they are too large to hold.
     """
 
     src: Path
@@ -162,7 +188,8 @@ class _Source:
         duplicates: list[tuple[str, str]] = []
         size = 0
         for sequence, log in self.sequences():
-            content_hash, source = sequence.content_hash(), sequence.meta.source
+            content_hash = sequence.content_hash()
+            source = sequence.meta.source
             self.hashes.append(content_hash)
             # Pieces of one recording may be equal, where the robot rested.
             if content_hash in source_of and not (self.cut and source_of[content_hash] == source):
@@ -186,8 +213,9 @@ class _Source:
             raise LogError(f"{self.src}: no recording found")
         if duplicates:
             raise DatasetError(
-                f"{len(duplicates)} of {len(self.hashes)} recordings are there twice (same samples, unit and "
-                f"payload): {duplicates[0][0]} is {duplicates[0][1]}. Nothing was imported; leave one of them out"
+                f"{len(duplicates)} of {len(self.hashes)} recordings are there twice (same "
+                f"samples, unit and payload): {duplicates[0][0]} is {duplicates[0][1]}. Nothing "
+                "was imported; leave one of them out"
             )
 
     def write(
@@ -229,9 +257,8 @@ class _Source:
             meta = self._meta(log, motion, file_hashes[files])
             _require_side(self.robot, meta.payload_side)
             sequence = to_sequence(log, self.robot, meta)
-            if "notes" in log.meta.get(
-                "stated", {}
-            ):  # an export of ours: notes of the first import
+            # an export of ours: notes of the first import
+            if "notes" in log.meta.get("stated", {}):
                 sequence = replace(sequence, meta=meta)
             for piece in _pieces(sequence, self.cut):
                 yield piece, log
@@ -244,7 +271,8 @@ class _Source:
             if name in stated and stated[name] != value:
                 flag = "--" + name.replace("_", "-")
                 raise UsageError(
-                    f"{log.source}: {flag} {value} contradicts the file's {stated[name]}; leave it out"
+                    f"{log.source}: {flag} {value} contradicts the file's {stated[name]}; leave "
+                    "it out"
                 )
         needed = {
             "unit_id": "--unit-id NAME",
@@ -253,7 +281,8 @@ class _Source:
         missing = [flag for name, flag in needed.items() if name not in self.labels | stated]
         if missing:
             raise UsageError(
-                f"{log.source}: this format does not state unit or payload: give {' and '.join(missing)}"
+                f"{log.source}: this format does not state unit or payload: give "
+                f"{' and '.join(missing)}"
             )
         # A relative path: no home folder gets into a dataset.
         source = Path(
@@ -274,7 +303,8 @@ def _pieces(sequence: Sequence, seconds: float | None) -> Iterator[Sequence]:
         return
     rows = len(sequence) // count
     for start in range(0, count * rows, rows):
-        at, meta = round(start * sequence.dt, 3), sequence.meta
+        at = round(start * sequence.dt, 3)
+        meta = sequence.meta
         named = replace(meta, motion=f"{meta.motion}@{at:.0f}s", notes=meta.notes | {"from_s": at})
         yield replace(sequence.rows(slice(start, start + rows)), meta=named)
 
@@ -301,11 +331,11 @@ def _parse_gains(name: str, words: tuple[str, ...], robot: RobotSpec) -> tuple[f
 
 
 def measure_delays(sequence: Sequence) -> Findings:
-    """Return by joint: delay_s, lag of the state (None if the motion does not show it), and fast_speed."""
-    delay, speed = (
-        estimate_delay(sequence.ctrl, sequence.qpos, sequence.dt),
-        fast_speed(sequence.ctrl, sequence.dt),
-    )
+    """Return by joint: delay_s, lag of the state (None if the motion does not show it), and
+    fast_speed.
+    """
+    delay = estimate_delay(sequence.ctrl, sequence.qpos, sequence.dt)
+    speed = fast_speed(sequence.ctrl, sequence.dt)
     delay[[name in sequence.copied for name in sequence.joint_names]] = np.nan
     by_joint = lambda x: {  # noqa: E731
         j: round(float(v), 4) if np.isfinite(v) else None
@@ -315,8 +345,11 @@ def measure_delays(sequence: Sequence) -> Findings:
 
 
 def _refuse_relabelled(sequence: Sequence, existing: Dataset) -> None:
-    """Refuse samples that the dataset holds under another unit or payload: one of the labels is wrong."""
-    meta, same_length = sequence.meta, [e.meta for e in existing.entries if e.rows == len(sequence)]
+    """Refuse samples that the dataset holds under another unit or payload: one of the labels is
+    wrong.
+    """
+    meta = sequence.meta
+    same_length = [e.meta for e in existing.entries if e.rows == len(sequence)]
     for unit, mass, side in {(m.unit_id, m.payload_mass, m.payload_side) for m in same_length}:
         other = replace(meta, unit_id=unit, payload_mass=mass, payload_side=side)
         entry = existing.find(replace(sequence, meta=other).content_hash())
@@ -326,9 +359,10 @@ def _refuse_relabelled(sequence: Sequence, existing: Dataset) -> None:
             meta.payload_side,
         ):
             raise DatasetError(
-                f"{meta.source}: known samples under new labels: {existing.path} holds them as unit {unit}, {mass:g} "
-                f"kg ({side}), not unit {meta.unit_id}, {meta.payload_mass:g} kg ({meta.payload_side}). Nothing was "
-                f"imported; where the old label is the wrong one: gaponet data remove {existing.path} {entry.id}"
+                f"{meta.source}: known samples under new labels: {existing.path} holds them as "
+                f"unit {unit}, {mass:g} kg ({side}), not unit {meta.unit_id}, "
+                f"{meta.payload_mass:g} kg ({meta.payload_side}). Nothing was imported; where the "
+                f"old label is the wrong one: gaponet data remove {existing.path} {entry.id}"
             )
 
 

@@ -1,7 +1,8 @@
 """The journal of a dataset (sequences.jsonl): one line of JSON per sequence, only ever appended to.
 
-A line that a crash cut short does not count. Opening parses the beginning of each line (`EntryHeader`); the rest is
-parsed when it is first needed. 100,000 recordings therefore open in about a second.
+A line that a crash cut short does not count. Opening parses the beginning of each line
+(`EntryHeader`); the rest is parsed when it is first needed. 100,000 recordings therefore open in
+about a second.
 """
 
 from __future__ import annotations
@@ -26,14 +27,15 @@ from gaponet.data.sequence import ARRAYS, SequenceMeta
 FILE = "sequences.jsonl"
 HINT = "delete the line and import that log again"
 FLUSH_INTERVAL_S = 1.0
-Findings = dict[
-    str, dict[str, float | None]
-]  # measured at import: delay_s, fast_speed → joint → value
+# measured at import: delay_s, fast_speed → joint → value
+Findings = dict[str, dict[str, float | None]]
 
 
 @dataclass(frozen=True)
 class EntryHeader:
-    """The beginning of a journal line: what must be known of every sequence when a dataset is opened."""
+    """The beginning of a journal line: what must be known of every sequence when a dataset is
+    opened.
+    """
 
     id: Name
     hash: Annotated[str, Len(8, 64)]
@@ -112,7 +114,10 @@ class Entry(EntryHeader):
 
 
 class Journal:
-    """Reads and appends the lines of one journal file. The caller holds the dataset's lock while it appends."""
+    """Reads and appends the lines of one journal file.
+
+    The caller holds the dataset's lock while it appends.
+    """
 
     def __init__(self, folder: Path) -> None:
         """Nothing is read yet; the journal may not exist."""
@@ -127,7 +132,8 @@ class Journal:
         Raises:
             DatasetError: A line is damaged, or a sequence is listed twice.
         """
-        self._size, self._pending = 0, []
+        self._size = 0
+        self._pending = []
         if not self.path.is_file():
             return
         content = self.path.read_bytes()
@@ -147,7 +153,9 @@ class Journal:
         return (self.path.stat().st_size if self.path.is_file() else 0) != self._size
 
     def append(self, entry: Entry, at_once: bool = True) -> None:
-        """Add an entry whose file is complete; with at_once=False, it is written within FLUSH_INTERVAL_S."""
+        """Add an entry whose file is complete; with at_once=False, it is written within
+        FLUSH_INTERVAL_S.
+        """
         self._pending.append(entry)
         if at_once or time.monotonic() > self._next_flush:
             self.flush()
@@ -157,9 +165,8 @@ class Journal:
         if not self._pending:
             return
         lines = b"".join(entry.line + b"\n" for entry in self._pending)
-        flush_to_disk(
-            self.path.parent / "sequences"
-        )  # the names of the listed files are on the disk first
+        # the names of the listed files are on the disk first
+        flush_to_disk(self.path.parent / "sequences")
         with self.path.open("ab") as file:
             file.truncate(self._size)  # removes a line that a crash or a full disk cut short
             file.write(lines)
@@ -168,11 +175,13 @@ class Journal:
         if not self._size:
             flush_to_disk(self.path.parent)
         self._size += len(lines)
-        self._pending, self._next_flush = [], time.monotonic() + FLUSH_INTERVAL_S
+        self._pending = []
+        self._next_flush = time.monotonic() + FLUSH_INTERVAL_S
 
     def roll_back(self) -> list[Entry]:
         """Forget pending entries, and lines that a failed flush wrote; return the entries."""
-        pending, self._pending = self._pending, []
+        pending = self._pending
+        self._pending = []
         if pending and self.path.is_file():
             os.truncate(self.path, self._size)
             flush_to_disk(self.path)

@@ -1,4 +1,7 @@
-"""Log: what came off the wire. Named channels with their own timestamps; nothing interpolated, nothing corrected."""
+"""Log: what came off the wire.
+
+Named channels with their own timestamps; nothing interpolated, nothing corrected.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +16,8 @@ import numpy as np
 from gaponet.base.arrays import Array
 from gaponet.base.errors import LogError
 
-FEEDFORWARD = "feedforward_torque"  # that a controller adds to its PD torque; data.sequence makes it a position
+# that a controller adds to its PD torque; data.sequence makes it a position
+FEEDFORWARD = "feedforward_torque"
 COMMANDS = ("ctrl", FEEDFORWARD)  # channels that are held between their rows
 # Channel names and their SI units. ctrl is the commanded joint position.
 CHANNELS = {
@@ -24,7 +28,8 @@ CHANNELS = {
     "temperature": "°C",
     FEEDFORWARD: "N·m",
 }
-# What others computed from these; kept where a format states it (an exported dataset), never looked for elsewhere.
+# What others computed from these; kept where a format states it (an exported dataset), never looked
+# for elsewhere.
 DERIVED = {"qacc": "rad/s²", "tau_eq": "N·m"}
 UNITS = {"time": "s"} | CHANNELS | DERIVED
 REQUIRED = ("ctrl", "qpos")
@@ -33,7 +38,9 @@ _bad: ContextVar[list[str] | None] = ContextVar("bad", default=None)
 
 @contextmanager
 def skip_bad_rows(wanted: bool = True) -> Iterator[list[str] | None]:
-    """While this is open, a Log cuts its bad rows instead of refusing them; yields the list of what was cut."""
+    """While this is open, a Log cuts its bad rows instead of refusing them; yields the list of
+    what was cut.
+    """
     token = _bad.set([] if wanted else None)
     try:
         yield _bad.get()
@@ -61,9 +68,9 @@ MIN_PIECE_ROWS = 20  # of each of them
 class Log:
     """One recording.
 
-    Acted on of meta are: dt, the exact period of regular rows, s; kp and kd, gains of joint_names; notes, for
-    SequenceMeta; stated, fields of SequenceMeta that the format itself holds; for errors, first_line and the files by
-    channel.
+    Acted on of meta are: dt, the exact period of regular rows, s; kp and kd, gains of joint_names;
+    notes, for SequenceMeta; stated, fields of SequenceMeta that the format itself holds; for
+    errors, first_line and the files by channel.
     """
 
     robot: str
@@ -76,9 +83,10 @@ class Log:
         for name in REQUIRED:
             if name not in self.channels:
                 raise LogError(
-                    f"{self.source}: no {name} channel (it has {', '.join(self.channels) or 'none'}); "
-                    "a log needs commanded and measured joint positions; of a robot that is driven by torque say the "
-                    "position's name for ctrl too, and see gaponet identify"
+                    f"{self.source}: no {name} channel (it has "
+                    f"{', '.join(self.channels) or 'none'}); a log needs commanded and measured "
+                    "joint positions; of a robot that is driven by torque say the position's name "
+                    "for ctrl too, and see gaponet identify"
                 )
         bad = _bad.get()
         if bad is not None and not any(_starts_again(c.time) for c in self.channels.values()):
@@ -87,7 +95,9 @@ class Log:
             self._check(name, np.asarray(time), np.asarray(values))
 
     def _cut_bad_rows(self, bad: list[str]) -> None:
-        """Cut rows that are not finite or go back in time, in all channels of the same clock; they are listed."""
+        """Cut rows that are not finite or go back in time, in all channels of the same clock; they
+        are listed.
+        """
         channels: dict[str, Channel] = {}
         for name, (clock, _) in self.channels.items():
             if name in channels:
@@ -110,7 +120,8 @@ class Log:
     def _check(self, name: str, time: Array, values: Array) -> None:
         if name not in UNITS:
             raise LogError(
-                f"{self.source}: unknown channel '{name}'; known are {', '.join(CHANNELS | DERIVED)}"
+                f"{self.source}: unknown channel '{name}'; known are "
+                f"{', '.join(CHANNELS | DERIVED)}"
             )
         if values.shape != (len(time), len(self.joint_names)):
             raise LogError(
@@ -129,19 +140,21 @@ class Log:
                 joint = int(np.flatnonzero(~np.isfinite(values[row]))[0])
                 what = f"{name} of {self.joint_names[joint]}"
             raise LogError(
-                f"{self.row(name, row)}: {what} is empty or not finite; repair or cut the row (--skip-bad does)"
+                f"{self.row(name, row)}: {what} is empty or not finite; repair or cut the row "
+                "(--skip-bad does)"
             )
         back = np.flatnonzero(np.diff(time) <= 0)
         if back.size and _starts_again(time):
             raise LogError(
-                f"{self.row(name, int(back[0]) + 1)}: the clock starts again at {time[back[0] + 1]:.6g} s: several "
-                "recordings in one file; write each into a file of its own, or number them in a column episode_index"
+                f"{self.row(name, int(back[0]) + 1)}: the clock starts again at "
+                f"{time[back[0] + 1]:.6g} s: several recordings in one file; write each into a "
+                "file of its own, or number them in a column episode_index"
             )
         if back.size:
             raise LogError(
                 f"{self.row(name, int(back[0]) + 1)}: time does not increase in channel {name} "
-                f"({time[back[0]]:.6f} s, then {time[back[0] + 1]:.6f} s); sort the rows or cut the log there "
-                "(--skip-bad does)"
+                f"({time[back[0]]:.6f} s, then {time[back[0] + 1]:.6f} s); sort the rows or cut "
+                "the log there (--skip-bad does)"
             )
 
     def row(self, name: str, index: int) -> str:
@@ -151,7 +164,9 @@ class Log:
 
 
 def _starts_again(time: Array) -> bool:
-    """Return True if a clock goes back to where it began, and on as before, as where recordings follow each other."""
+    """Return True if a clock goes back to where it began, and on as before, as where recordings
+    follow each other.
+    """
     time = np.asarray(time, float)
     steps = np.diff(time)
     back = np.flatnonzero(steps < 0)

@@ -1,7 +1,8 @@
-"""Static offsets of one robot unit, measured in its static poses; recorded beside the data, not applied to it.
+"""Static offsets of one robot unit, measured in its static poses; recorded beside the data, not
+applied to it.
 
-The tracking offset is the static error beyond the gravity sag of the nominal model. It contains wrong encoder zeros and
-softer motors alike; gaponet identify separates them.
+The tracking offset is the static error beyond the gravity sag of the nominal model. It contains
+wrong encoder zeros and softer motors alike; gaponet identify separates them.
 """
 
 from __future__ import annotations
@@ -26,7 +27,8 @@ from gaponet.robot.spec import RobotSpec
 FILE = "offsets.json"
 # qpos (k, n) rad, payload_mass kg, payload_side → torques that hold the robot, (k, n) N·m
 Gravity = Callable[[Array, float, str], Array]
-# qpos, qvel, qacc (k, n) rad, rad/s, rad/s², payload_mass kg, payload_side → torques of that motion, (k, n) N·m
+# qpos, qvel, qacc (k, n) rad, rad/s, rad/s², payload_mass kg, payload_side → torques of that
+# motion, (k, n) N·m
 Dynamics = Callable[[Array, Array, Array, float, str], Array]
 
 
@@ -37,9 +39,8 @@ class JointOffset:
     rests_up: int  # static poses approached from below
     rests_down: int  # and from above
     static_error: float | None  # qpos − ctrl, mean of both approaches
-    stiction_band: (
-        float | None
-    )  # half the distance between both approaches, without nominal sag; times kp a torque
+    # half the distance between both approaches, without nominal sag; times kp a torque
+    stiction_band: float | None
     nominal_sag: float | None  # static error of the nominal model in the same poses
     tracking_offset: float | None  # static_error − nominal_sag
 
@@ -61,7 +62,8 @@ def unit_offsets(
     Args:
         known: Content hash → static poses of sequences that need not be read again.
     """
-    poses, sags = [], [np.zeros((0, len(robot.joint_names)))]
+    poses = []
+    sags = [np.zeros((0, len(robot.joint_names)))]
     for entry in dataset.entries:
         meta = entry.meta
         if meta.unit_id == unit_id:
@@ -70,10 +72,12 @@ def unit_offsets(
             torque = gravity(own.qpos, meta.payload_mass, meta.payload_side)
             poses.append(own)
             sags.append(-torque / np.where(kp > 0, kp, np.inf))
-    joined, sag = StaticPoses.joined(poses, len(robot.joint_names)), np.concatenate(sags)
+    joined = StaticPoses.joined(poses, len(robot.joint_names))
+    sag = np.concatenate(sags)
     offsets = {}
     for name, j in zip(robot.operated, robot.operated_index, strict=True):
-        error, beyond = joined.static_error(j), joined.static_error(j, sag[:, j])
+        error = joined.static_error(j)
+        beyond = joined.static_error(j, sag[:, j])
         values = (error.middle, beyond.half_band, error.middle - beyond.middle, beyond.middle)
         offsets[name] = JointOffset(
             error.up, error.down, *(round(x, 6) if math.isfinite(x) else None for x in values)
@@ -98,7 +102,8 @@ def record_offsets(
 
 
 def read_offsets(dataset: Dataset) -> dict[str, Any]:
-    """Return the content of offsets.json: {"applied": false, "units": {unit_id: {joints, simulator}}}.
+    """Return the content of offsets.json: {"applied": false, "units": {unit_id: {joints,
+    simulator}}}.
 
     Raises:
         DatasetError: The file is damaged.

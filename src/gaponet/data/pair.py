@@ -15,8 +15,8 @@ class SimulatedReplay:
 
     Attributes:
         model_hash: Hash of the simulator (sim.model.model_hash).
-        qpos, qvel, tau: (T, n) rad, rad/s, N·m; row t is the state at t·dt, tau the actuator torque at the end of
-            [t-1, t).
+        qpos, qvel, tau: (T, n) rad, rad/s, N·m; row t is the state at t·dt, tau the actuator torque
+            at the end of [t-1, t).
         ctrl: (T, n) rad, targets applied over [t, t+1) if a corrector changed them; not stored.
     """
 

@@ -1,4 +1,6 @@
-"""What the SimLifter and GAPONet paper counts of its dataset, and the same counts of a dataset here."""
+"""What the SimLifter and GAPONet paper counts of its dataset, and the same counts of a dataset
+here.
+"""
 
 from __future__ import annotations
 
@@ -15,13 +17,13 @@ from gaponet.robot.folder import load_stored_robot
 COMMAND = "ctrl"  # the input of a recording; all other channels are signals of the robot
 # The paper's own numbers do not reconcile, which a reader of both columns must know.
 NOT_RECONCILED = (
-    "The paper's own counts do not reconcile: 28.46 h at 50 Hz are 5.1 million frames, and 257,493 frames of 11,198 "
-    "sequences are 23 frames each."
+    "The paper's own counts do not reconcile: 28.46 h at 50 Hz are 5.1 million frames, and "
+    "257,493 frames of 11,198 sequences are 23 frames each."
 )
 MEANING = (
-    "The paper's robots are real: three H1-2 and an unseen fourth. Joints: those that are identified and corrected. "
-    "Repetitions: the most of one motion by one unit with one payload at one rate. Signals: channels that every "
-    "sequence stores, without the command."
+    "The paper's robots are real: three H1-2 and an unseen fourth. Joints: those that are "
+    "identified and corrected. Repetitions: the most of one motion by one unit with one payload "
+    "at one rate. Signals: channels that every sequence stores, without the command."
 )
 
 
@@ -90,7 +92,9 @@ def count_as_paper(dataset: Dataset) -> DatasetCounts:
 
 
 def common_signals(entries: Iterable[Entry]) -> tuple[str, ...]:
-    """Return the channels that every sequence stores, without the command, in the order of ARRAYS."""
+    """Return the channels that every sequence stores, without the command, in the order of
+    ARRAYS.
+    """
     stored = [set(e.channels) for e in entries]
     return tuple(name for name in ARRAYS if name != COMMAND and all(name in s for s in stored))
 

@@ -16,17 +16,20 @@ from gaponet.data.sequence import Sequence
 MAX_COMMAND_DIFFERENCE_RAD = 1e-3  # repetitions whose commands differ by more have another command
 # the same, of the command's range, on average: of commands computed twice
 MAX_COMMAND_DIFFERENCE_SHARE = 0.02
-MAX_SHIFT_ROWS, MAX_PAIRS = 5, 100  # by which clocks differ; of recordings that are compared
+# by which clocks differ; of recordings that are compared
+MAX_SHIFT_ROWS = 5
+MAX_PAIRS = 100
 MIN_PERIOD_S = 0.5  # of a periodic motion
 MIN_MOTION_RAD = 0.02  # joints that are commanded to move by less are left out
 CHANNELS = ("qpos", "qvel", "tau", "temperature")
 
 
 def repetition_difference(sequences: ListOf[Sequence], joints: ListOf[str]) -> Array:
-    """Return the RMS difference between the tracking errors of two recordings of one command, (n) rad; 0 if unknown.
+    """Return the RMS difference between the tracking errors of two recordings of one command, (n)
+    rad; 0 if unknown.
 
-    Commands count as one if they agree after a shift of MAX_SHIFT_ROWS rows at most: the clocks of two recordings may
-    differ by that.
+    Commands count as one if they agree after a shift of MAX_SHIFT_ROWS rows at most: the clocks of
+    two recordings may differ by that.
 
     Args:
         sequences: Recordings; only those of one unit, payload and rate are compared.
@@ -52,7 +55,9 @@ def repetition_difference(sequences: ListOf[Sequence], joints: ListOf[str]) -> A
 
 
 def _tracking_difference(a: Sequence, b: Sequence, columns: list[int]) -> Array | None:
-    """Return the mean squared difference of the tracking errors of two recordings, (n) rad²; None for two commands."""
+    """Return the mean squared difference of the tracking errors of two recordings, (n) rad²; None
+    for two commands.
+    """
     one, other = (
         np.concatenate([s.ctrl[:, columns], s.qpos[:, columns]], axis=1).astype(float)
         for s in (a, b)
@@ -81,7 +86,8 @@ class RepetitionResult:
 
 
 class Repetitions:
-    """Accumulates repetitions of one motion by one unit with one payload, compared row by row from the first row.
+    """Accumulates repetitions of one motion by one unit with one payload, compared row by row from
+    the first row.
 
     Attributes:
         count, other_commands: The fields of RepetitionResult so far.
@@ -98,7 +104,9 @@ class Repetitions:
         """Add a repetition (Welford's update: only sums are stored)."""
         arrays = {c: x.astype(float) for c in CHANNELS if (x := getattr(sequence, c)) is not None}
         if self.count == 0:
-            self.count, self._ctrl, self._mean = 1, sequence.ctrl, arrays
+            self.count = 1
+            self._ctrl = sequence.ctrl
+            self._mean = arrays
             self._squares = {c: np.zeros_like(x) for c, x in arrays.items()}
             return
         rows = min(len(self._ctrl), len(sequence))
@@ -108,7 +116,8 @@ class Repetitions:
         self.count += 1
         self._ctrl = self._ctrl[:rows]
         for name in [c for c in self._mean if c in arrays]:
-            mean, value = self._mean[name][:rows], arrays[name][:rows]
+            mean = self._mean[name][:rows]
+            value = arrays[name][:rows]
             step = value - mean
             self._mean[name] = mean + step / self.count
             self._squares[name] = self._squares[name][:rows] + step * (value - self._mean[name])
@@ -123,14 +132,16 @@ class Repetitions:
 
     @staticmethod
     def periods(sequence: Sequence) -> list[Sequence]:
-        """Return the periods of a periodic motion, without the first, which starts elsewhere; [] if it has none."""
+        """Return the periods of a periodic motion, without the first, which starts elsewhere; []
+        if it has none.
+        """
         ctrl = sequence.ctrl
         rows = len(ctrl)
         for period in range(max(1, round(MIN_PERIOD_S / sequence.dt)), rows // 3 + 1):
-            before, after = ctrl[:-period], ctrl[period:]
-            differences = (
-                np.abs(after[::every] - before[::every]).max() for every in (97, 1)
-            )  # a few rows first
+            before = ctrl[:-period]
+            after = ctrl[period:]
+            # a few rows first
+            differences = (np.abs(after[::every] - before[::every]).max() for every in (97, 1))
             if all(difference <= MAX_COMMAND_DIFFERENCE_RAD for difference in differences):
                 break
         else:
@@ -151,8 +162,8 @@ class Repetitions:
             joint_names: (n).
 
         Returns:
-            groups, sequences, and channels {name: {unit, mean over joints, joints {name: value}}}; without joints that
-            never moved.
+            groups, sequences, and channels {name: {unit, mean over joints, joints {name: value}}};
+            without joints that never moved.
         """
         channels = {}
         for name in CHANNELS:

@@ -21,8 +21,12 @@ from gaponet.robot.spec import GAIN_TOLERANCE, Follower, RobotSpec
 
 ARRAYS = ("ctrl", "qpos", "qvel", "qacc", "tau", "tau_eq", "temperature")
 OPTIONAL = ("qacc", "tau", "tau_eq", "temperature")
-MIN_PERIOD_S, MAX_PERIOD_S = 1e-4, 1.0  # periods, s
-MAX_GAP = 2.0  # between two samples of the state, s: what moved there is not known, and a clock that jumps is no clock
+# periods, s
+MIN_PERIOD_S = 1e-4
+MAX_PERIOD_S = 1.0
+# between two samples of the state, s: what moved there is not known, and a clock that jumps is no
+# clock
+MAX_GAP = 2.0
 MAX_UNEVEN_SHARE = 0.1  # of the median period, by which the periods of even rows differ from it
 EXACT_PERIOD_S = 2e-6  # by which the periods of a clock that does not waver differ from their mean
 MAX_GROWTH = 3  # times as many rows as were recorded: a few bursts must not set the period of all
@@ -35,8 +39,8 @@ LEVELS = ("joint", "upper_body", "whole_body")
 class SequenceMeta:
     """Where a sequence comes from. payload_mass has no default: an empty hand is said as 0.0.
 
-    kp, kd are the gains that the robot had while it was recorded, (n) N·m/rad and N·m·s/rad in the order of the
-    sequence's joints; None in recordings made before gains were kept.
+    kp, kd are the gains that the robot had while it was recorded, (n) N·m/rad and N·m·s/rad in the
+    order of the sequence's joints; None in recordings made before gains were kept.
     """
 
     robot: str
@@ -63,7 +67,8 @@ class SequenceMeta:
                 object.__setattr__(self, name, _gains(name, gains, self.source or self.motion))
         if not (np.isfinite(self.payload_mass) and 0 <= self.payload_mass <= 100):
             raise LogError(
-                f"{self.source or self.motion}: payload_mass is {self.payload_mass}; give kg, 0 when empty"
+                f"{self.source or self.motion}: payload_mass is {self.payload_mass}; give kg, 0 "
+                "when empty"
             )
         if not self.unit_id or not self.motion:
             raise LogError(f"{self.source}: unit_id and motion must be named")
@@ -83,7 +88,9 @@ class SequenceMeta:
 
     @property
     def independent_motion(self) -> str:
-        """The motion; of a piece of a longer recording (gaponet import --cut) that recording's motion."""
+        """The motion; of a piece of a longer recording (gaponet import --cut) that recording's
+        motion.
+        """
         return self.motion.rpartition("@")[0] if "from_s" in self.notes else self.motion
 
     @property
@@ -96,16 +103,16 @@ class SequenceMeta:
 class Sequence:
     """T rows at a uniform period dt, n joints by name.
 
-    Row t holds the state measured at t·dt and the command applied over [t·dt, (t+1)·dt). The error of step t therefore
-    compares states at t+1. This convention is said here and nowhere else.
+    Row t holds the state measured at t·dt and the command applied over [t·dt, (t+1)·dt). The error
+    of step t therefore compares states at t+1. This convention is said here and nowhere else.
 
     Attributes:
         joint_names: (n).
         dt: s.
         ctrl, qpos, qvel: (T, n), rad, rad, rad/s, float32.
         qacc, tau, tau_eq, temperature: (T, n) or None, rad/s², N·m, N·m, °C.
-        simulator: How the simulator in which the recording is replayed differs from the robot's own; None: not at all.
-            It is no part of the recording, and is not stored.
+        simulator: How the simulator in which the recording is replayed differs from the robot's
+            own; None: not at all. It is no part of the recording, and is not stored.
     """
 
     meta: SequenceMeta
@@ -123,7 +130,8 @@ class Sequence:
     def __post_init__(self) -> None:
         if not MIN_PERIOD_S <= self.dt <= MAX_PERIOD_S:
             raise LogError(
-                f"{self.meta.source}: dt is {self.dt} s; expected {MIN_PERIOD_S} to {MAX_PERIOD_S:g}"
+                f"{self.meta.source}: dt is {self.dt} s; expected {MIN_PERIOD_S} to "
+                f"{MAX_PERIOD_S:g}"
             )
         shape = (len(self.ctrl), len(self.joint_names))
         for name in ARRAYS:
@@ -133,14 +141,16 @@ class Sequence:
             value = np.ascontiguousarray(value, np.float32)
             if value.shape != shape or not np.isfinite(value).all():
                 raise LogError(
-                    f"{self.meta.source}: {name} has shape {value.shape} or holds NaN; expected {shape}"
+                    f"{self.meta.source}: {name} has shape {value.shape} or holds NaN; expected "
+                    f"{shape}"
                 )
             value.flags.writeable = False
             object.__setattr__(self, name, value)
         for name in ("kp", "kd"):
             if len(getattr(self.meta, name) or self.joint_names) != shape[1]:
                 raise LogError(
-                    f"{self.meta.source}: {name} must hold one number for each of the {shape[1]} joints"
+                    f"{self.meta.source}: {name} must hold one number for each of the {shape[1]} "
+                    "joints"
                 )
 
     def __len__(self) -> int:
@@ -167,7 +177,9 @@ class Sequence:
 
     @property
     def copied(self) -> dict[str, int]:
-        """Joint → by how many rows of the log its state repeats its command (describe.row_copies)."""
+        """Joint → by how many rows of the log its state repeats its command
+        (describe.row_copies).
+        """
         copies: dict[str, int] = self.meta.notes.get("copied_rows", {})
         return copies
 
@@ -177,7 +189,9 @@ class Sequence:
         return replace(self, **cut)
 
     def content_hash(self) -> str:
-        """Identity of the recording: joints, period, payload, unit and samples; not its name, path or date."""
+        """Identity of the recording: joints, period, payload, unit and samples; not its name, path
+        or date.
+        """
         digest = hashlib.sha256()
         key = (self.meta.robot, self.meta.unit_id, self.meta.payload_mass, self.meta.payload_side)
         digest.update(repr((key, self.joint_names, round(self.dt, 7))).encode())
@@ -207,10 +221,12 @@ def _gains(name: str, values: Any, where: str) -> tuple[float, ...]:
 def require_same_gains(
     metas: Iterable[SequenceMeta], joint_names: tuple[str, ...], joints: tuple[str, ...]
 ) -> None:
-    """Refuse recordings made with different gains: what one robot does with two stiffnesses is not one gap.
+    """Refuse recordings made with different gains: what one robot does with two stiffnesses is not
+    one gap.
 
     Args:
-        metas: Metadata of the recordings taken together; one that does not say its gains (an old journal) may be any.
+        metas: Metadata of the recordings taken together; one that does not say its gains (an old
+            journal) may be any.
         joint_names: Joints that their gains belong to, (n).
 
     Raises:
@@ -223,27 +239,29 @@ def require_same_gains(
                 other, where = first.setdefault((name, joint), (gain, meta))
                 if joint in joints and abs(gain - other) > GAIN_TOLERANCE * max(other, gain):
                     raise UsageError(
-                        f"{name} of {joint} was {other:g} in '{where.motion}' of {where.unit_id} and {gain:g} in "
-                        f"'{meta.motion}' of {meta.unit_id}: take recordings with one set of gains, or add "
-                        "--mixed-gains to take them together"
+                        f"{name} of {joint} was {other:g} in '{where.motion}' of {where.unit_id} "
+                        f"and {gain:g} in '{meta.motion}' of {meta.unit_id}: take recordings with "
+                        "one set of gains, or add --mixed-gains to take them together"
                     )
 
 
 def to_sequence(log: Log, robot: RobotSpec, meta: SequenceMeta) -> Sequence:
     """Put a log on a uniform grid.
 
-    Where all channels share timestamps and every period is within 10 % of the median, rows are kept as they are and dt
-    is the median period rounded to 10 µs: the robot's real rate (49.85 Hz stays 49.85 Hz); or the exact period where
-    the format states one; or the mean period. It is the first by which no row is moved by more than half a period:
-    time is never stretched. Where none is, or rows are uneven, measurements are interpolated and commands held on a
-    grid of the state's median period. The manifest says which. Refused are clocks that cannot be right: periods below
-    0.1 ms or above 1 s, a gap of more than 2 s, three times as many rows as were recorded, a stated period that the
-    timestamps contradict, states that end long before the commands.
+    Where all channels share timestamps and every period is within 10 % of the median, rows are kept
+    as they are and dt is the median period rounded to 10 µs: the robot's real rate (49.85 Hz stays
+    49.85 Hz); or the exact period where the format states one; or the mean period. It is the first
+    by which no row is moved by more than half a period: time is never stretched. Where none is, or
+    rows are uneven, measurements are interpolated and commands held on a grid of the state's median
+    period. The manifest says which. Refused are clocks that cannot be right: periods below 0.1 ms
+    or above 1 s, a gap of more than 2 s, three times as many rows as were recorded, a stated period
+    that the timestamps contradict, states that end long before the commands.
 
     Args:
-        log: The recording; its joints are reordered to the robot's, and missing ones stand where its posture (meta
-            "posture", {joint: rad}) says, else at home, which is noted.
-        robot: Decides the joint order; its gains stand where neither meta nor the log (meta "kp", "kd") says them.
+        log: The recording; its joints are reordered to the robot's, and missing ones stand where
+            its posture (meta "posture", {joint: rad}) says, else at home, which is noted.
+        robot: Decides the joint order; its gains stand where neither meta nor the log (meta "kp",
+            "kd") says them.
     """
     _require_both_ends(log)
     median = _median_period(log)
@@ -274,7 +292,8 @@ def to_sequence(log: Log, robot: RobotSpec, meta: SequenceMeta) -> Sequence:
 
 
 def _on_grid(log: Log, median: float, usual: float) -> tuple[dict[str, Array], float, bool]:
-    """Return the channels' values on one grid, its period, and whether these are the rows as they were recorded.
+    """Return the channels' values on one grid, its period, and whether these are the rows as they
+    were recorded.
 
     Args:
         median, usual: Period of the log's state, and of the robot's controller, s.
@@ -306,7 +325,9 @@ def _even_periods(log: Log, median: float) -> tuple[float, ...]:
 
 
 def _add_velocities(arrays: dict[str, Array], dt: float, log: Log, robot: RobotSpec) -> None:
-    """Compute velocities that were not recorded, or that a joint logged as a fraction has in any unit at all."""
+    """Compute velocities that were not recorded, or that a joint logged as a fraction has in any
+    unit at all.
+    """
     qvel = differentiate(arrays["qpos"], dt)
     if "qvel" not in arrays:
         arrays["qvel"] = qvel
@@ -349,14 +370,18 @@ def _feedforward_notes(further: Array, robot: RobotSpec) -> dict[str, Any]:
 
 
 def _copies(log: Log) -> dict[str, int]:
-    """Joint → by how many rows its state repeats its command; without joints whose state does not."""
+    """Joint → by how many rows its state repeats its command; without joints whose state does
+    not.
+    """
     rows = copied_rows(log.channels["ctrl"], log.channels["qpos"])
     by_joint = zip(log.joint_names, rows.tolist(), strict=True)
     return {name: int(shift) for name, shift in by_joint if np.isfinite(shift)}
 
 
 def _row_notes(log: Log, median: float, dt: float, regular: bool) -> dict[str, Any]:
-    """Notes of the clock and of what became of the rows; median: period of the log, s; dt: of the sequence."""
+    """Notes of the clock and of what became of the rows; median: period of the log, s; dt: of the
+    sequence.
+    """
     time = log.channels["qpos"].time
     period = np.diff(time)
     off = np.abs(period - median)
@@ -388,56 +413,69 @@ def _share_clock(log: Log) -> bool:
 
 
 def _require_both_ends(log: Log) -> None:
-    """Refuse states that end long before the commands do: a file that was cut at the end of a row reads well."""
-    states, commands = log.channels["qpos"].time, log.channels["ctrl"].time
+    """Refuse states that end long before the commands do: a file that was cut at the end of a row
+    reads well.
+    """
+    states = log.channels["qpos"].time
+    commands = log.channels["ctrl"].time
     missing = float(commands[-1] - states[-1])
     if commands[0] < states[-1] and missing > max(1.0, 0.1 * float(commands[-1] - commands[0])):
         raise LogError(
-            f"{log.source}: its states end {missing:.1f} s before its commands do: the file may be cut short; copy it "
-            "again, or cut the commands where the robot stopped (--skip-bad leaves the recording out)"
+            f"{log.source}: its states end {missing:.1f} s before its commands do: the file may "
+            "be cut short; copy it again, or cut the commands where the robot stopped (--skip-bad "
+            "leaves the recording out)"
         )
 
 
 def _row_period(time: Array, periods: tuple[float, ...]) -> float | None:
-    """The first period, s, by which row t is never further than half a period from where t·period puts it."""
+    """The first period, s, by which row t is never further than half a period from where t·period
+    puts it.
+    """
     rows = np.arange(len(time))
     return next((p for p in periods if np.abs(time - time[0] - p * rows).max() <= 0.5 * p), None)
 
 
 def _median_period(log: Log) -> float:
-    """Median period of the state, s; a clock that cannot be right is refused before anything is put on a grid."""
+    """Median period of the state, s; a clock that cannot be right is refused before anything is
+    put on a grid.
+    """
     time = log.channels["qpos"].time
     period = np.diff(time)
-    median, longest = float(np.median(period)), int(period.argmax())
+    median = float(np.median(period))
+    longest = int(period.argmax())
     if not MIN_PERIOD_S <= median <= MAX_PERIOD_S:
         raise LogError(
-            f"{log.source}: the median period is {median:.3g} s, expected {MIN_PERIOD_S} to {MAX_PERIOD_S:g}; is the "
-            "unit of time right (tables: --time-unit)?"
+            f"{log.source}: the median period is {median:.3g} s, expected {MIN_PERIOD_S} to "
+            f"{MAX_PERIOD_S:g}; is the unit of time right (tables: --time-unit)?"
         )
     if period[longest] > MAX_GAP:
         raise LogError(
-            f"{log.row('qpos', longest + 1)}: {period[longest]:.4g} s after the row before it; longer gaps than "
-            f"{MAX_GAP:g} s are not filled: cut the log there, or mend a clock that jumped"
+            f"{log.row('qpos', longest + 1)}: {period[longest]:.4g} s after the row before it; "
+            f"longer gaps than {MAX_GAP:g} s are not filled: cut the log there, or mend a clock "
+            "that jumped"
         )
     if time[-1] - time[0] > MAX_GROWTH * median * len(time):
         raise LogError(
-            f"{log.source}: {len(time)} rows lie in bursts over {time[-1] - time[0]:.4g} s: at their median period of "
-            f"{median * 1e3:.3g} ms there would be {(time[-1] - time[0]) / median:.0f}; mend the timestamps, or give "
-            "the rate of even rows (rate in logs.toml, --rate), which replaces the clock"
+            f"{log.source}: {len(time)} rows lie in bursts over {time[-1] - time[0]:.4g} s: at "
+            f"their median period of {median * 1e3:.3g} ms there would be "
+            f"{(time[-1] - time[0]) / median:.0f}; mend the timestamps, or give the rate of even "
+            "rows (rate in logs.toml, --rate), which replaces the clock"
         )
     stated = log.meta.get("dt", median)
     if abs(stated - median) > 0.1 * stated:
         raise LogError(
-            f"{log.source}: the period is said to be {stated:.6g} s, but the timestamps are {median:.6g} s apart; mend "
-            "one of them"
+            f"{log.source}: the period is said to be {stated:.6g} s, but the timestamps are "
+            f"{median:.6g} s apart; mend one of them"
         )
     return median
 
 
 def _loop(time: Array, median: float, usual: float) -> tuple[float | None, float]:
-    """When the loop that wrote uneven rows began, and its period, s: least squares over the rows' numbers, some of them
-    lost; or no beginning and the median period, where rows keep to no period."""
-    begin, period = float(time[0]), float(np.diff(time).mean())
+    """When the loop that wrote uneven rows began, and its period, s: least squares over the rows'
+    numbers, some of them lost; or no beginning and the median period, where rows keep to no period.
+    """
+    begin = float(time[0])
+    period = float(np.diff(time).mean())
     period = period if abs(period - median) < 0.05 * median else median
     rows = FEW
     while True:
@@ -458,36 +496,46 @@ def _loop(time: Array, median: float, usual: float) -> tuple[float | None, float
 
 
 def _resample(log: Log, dt: float, begin: float | None) -> dict[str, Array]:
-    """On a grid; of a loop that began then, a command belongs to the period that its row is nearest to."""
+    """On a grid; of a loop that began then, a command belongs to the period that its row is
+    nearest to.
+    """
     start = max(c.time[0] for c in log.channels.values())
     stop = min(c.time[-1] for c in log.channels.values())
     if stop - start < 2 * dt:
         raise LogError(
-            f"{log.source}: command and state channels overlap for {stop - start:.3f} s only; check the clocks"
+            f"{log.source}: command and state channels overlap for {stop - start:.3f} s only; "
+            "check the clocks"
         )
     if begin is None:
-        grid, near = start + dt * np.arange(int((stop - start) / dt + 1e-9) + 1), SAME_INSTANT
+        grid = start + dt * np.arange(int((stop - start) / dt + 1e-9) + 1)
+        near = SAME_INSTANT
     else:
-        grid, near = begin + dt * np.arange(round((stop - begin) / dt) + 1), 0.5
+        grid = begin + dt * np.arange(round((stop - begin) / dt) + 1)
+        near = 0.5
     grid = np.clip(grid, start, stop)
     return {
-        name: (resample_zoh(c.time, c.values, grid, near) if name in COMMANDS
-               else resample_linear(c.time, c.values, grid))
+        name: (
+            resample_zoh(c.time, c.values, grid, near)
+            if name in COMMANDS
+            else resample_linear(c.time, c.values, grid)
+        )
         for name, c in log.channels.items()
-    }  # fmt: skip
+    }
 
 
 def _feedforward_position(
     torque: Array, kp: Array, assumed: bool, log: Log, robot: RobotSpec
 ) -> Array:
-    """Return the distance of the command, (T, n) rad, that has the effect of a torque on a PD controller: torque / kp,
-    as kp (command − q) − kd q̇ + torque is kp (command + torque / kp − q) − kd q̇. `assumed`: nobody stated kp."""
+    """Return the distance of the command, (T, n) rad, that has the effect of a torque on a PD
+    controller: torque / kp, as kp (command − q) − kd q̇ + torque is kp (command + torque / kp − q)
+    − kd q̇. `assumed`: nobody stated kp.
+    """
     without = torque.any(axis=0) & (assumed | (kp == 0))
     if lacking := [name for name, x in zip(robot.joint_names, without, strict=True) if x]:
         raise LogError(
-            f"{log.source}: a {FEEDFORWARD} counts as command + torque / kp, and kp of {', '.join(lacking)} is "
-            f"{'not stated' if assumed else '0'}; give it in logs.toml (kp), or --kp; leave joints that torque alone "
-            "drives out with ignore"
+            f"{log.source}: a {FEEDFORWARD} counts as command + torque / kp, and kp of "
+            f"{', '.join(lacking)} is {'not stated' if assumed else '0'}; give it in logs.toml "
+            "(kp), or --kp; leave joints that torque alone drives out with ignore"
         )
     return torque / np.where(kp > 0, kp, 1.0)
 
@@ -502,7 +550,9 @@ def _led(log: Log, robot: RobotSpec) -> dict[str, Follower]:
 
 
 def _to_robot(channel: str, values: Array, log: Log, robot: RobotSpec) -> Array:
-    """Columns in robot order; joints the log lacks stand where its posture says or at home (positions), or at zero."""
+    """Columns in robot order; joints the log lacks stand where its posture says or at home
+    (positions), or at zero.
+    """
     out = np.zeros((len(values), len(robot.joint_names)))
     if channel in ("ctrl", "qpos"):
         out += robot.qpos_home

@@ -1,4 +1,6 @@
-"""Parquet files of a dataset: one per sequence, with time and one column per channel; each row a list of n float32."""
+"""Parquet files of a dataset: one per sequence, with time and one column per channel; each row a
+list of n float32.
+"""
 
 from __future__ import annotations
 
@@ -38,7 +40,8 @@ def write_arrays(
         arrays, schema=pa.schema(fields, {"joint_names": ",".join(joint_names), "units": units})
     )
     with atomic_write(path, named=False) as temporary:
-        # Against zstd alone: 6 % larger, read in half the time (552 rows of 27 joints, 7 channels: 1.5 ms).
+        # Against zstd alone: 6 % larger, read in half the time (552 rows of 27 joints, 7 channels:
+        # 1.5 ms).
         pq.write_table(
             table, temporary, compression="lz4", use_dictionary=False, use_byte_stream_split=True
         )

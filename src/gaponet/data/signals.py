@@ -1,4 +1,6 @@
-"""Numerical functions of time series (T, n): resampling, derivatives, delay, and responses to commands."""
+"""Numerical functions of time series (T, n): resampling, derivatives, delay, and responses to
+commands.
+"""
 
 from __future__ import annotations
 
@@ -11,14 +13,20 @@ from gaponet.base.arrays import Array
 SAME_INSTANT = 0.1  # of a period by which stamps of one instant may differ
 # fast_speed from which a lag is mostly delay; below, it is mostly stiction
 FAST_COMMAND_RAD_S = 0.3
-# Of a Response: least step; span of the command before and after the state; parts of a recording; shifts of a part.
-MIN_STEP_S, BEFORE_S, AFTER_S, SPLITS = 0.01, 0.12, 0.6, 3
+# Of a Response: least step; span of the command before and after the state; parts of a recording;
+# shifts of a part.
+MIN_STEP_S = 0.01
+BEFORE_S = 0.12
+AFTER_S = 0.6
+SPLITS = 3
 SHIFTS_S = np.arange(-0.12, 0.1201, 0.002)
 RIDGE = 1e-3
 ONSET_SHARE = 0.05
 MAX_SHARP_CORRELATION = 0.8  # of a command with itself 20 ms later, if it changes sharply
 MAX_UNEXPLAINED = 0.7  # share of the state's power, if the joint follows
-MIN_COMMAND_RAD, MIN_CORRELATION = 0.02, 0.3  # of a joint whose delay is known
+# of a joint whose delay is known
+MIN_COMMAND_RAD = 0.02
+MIN_CORRELATION = 0.3
 
 
 def resample_linear(time: Array, values: Array, grid: Array) -> Array:
@@ -38,9 +46,9 @@ def resample_linear(time: Array, values: Array, grid: Array) -> Array:
 def resample_zoh(time: Array, values: Array, grid: Array, near: float = SAME_INSTANT) -> Array:
     """Hold each command until the next one arrives.
 
-    Commands are steps: linear interpolation would invent motion that was never commanded. A command that comes shortly
-    after an instant belongs to that instant. One loop writes state and command with one stamp, and neither rounding nor
-    jitter may delay it by a whole period.
+    Commands are steps: linear interpolation would invent motion that was never commanded. A command
+    that comes shortly after an instant belongs to that instant. One loop writes state and command
+    with one stamp, and neither rounding nor jitter may delay it by a whole period.
 
     Args:
         time: Strictly increasing timestamps, (k,), s.
@@ -53,7 +61,9 @@ def resample_zoh(time: Array, values: Array, grid: Array, near: float = SAME_INS
 
 
 def differentiate(values: Array, dt: float) -> Array:
-    """Return central differences, one-sided at the ends, without phase shift; (T, n) → (T, n) per second."""
+    """Return central differences, one-sided at the ends, without phase shift; (T, n) → (T, n) per
+    second.
+    """
     return np.gradient(values, dt, axis=0)
 
 
@@ -72,10 +82,11 @@ def lowpass(values: Array, dt: float, cutoff: float) -> Array:
 
 
 def estimate_delay(ctrl: Array, qpos: Array, dt: float, max_delay: float = 0.4) -> Array:
-    """Return the lag of each joint: the shift at which its velocity correlates best with the commanded velocity.
+    """Return the lag of each joint: the shift at which its velocity correlates best with the
+    commanded velocity.
 
-    Velocities do not contain drift and sag. Parabolic interpolation around the best whole shift gives a resolution
-    below dt.
+    Velocities do not contain drift and sag. Parabolic interpolation around the best whole shift
+    gives a resolution below dt.
 
     Args:
         ctrl, qpos: (T, n), rad.
@@ -83,8 +94,8 @@ def estimate_delay(ctrl: Array, qpos: Array, dt: float, max_delay: float = 0.4) 
         max_delay: Longest lag tried, s.
 
     Returns:
-        (n,) s; NaN for a joint that is not commanded to move, does not follow, or follows best at the longest lag
-        tried, which happens in slow motions with stiction.
+        (n,) s; NaN for a joint that is not commanded to move, does not follow, or follows best at
+        the longest lag tried, which happens in slow motions with stiction.
     """
     kernel = np.hanning(7)[1:-1] / np.hanning(7).sum()
     u, v = (
@@ -111,7 +122,9 @@ def estimate_delay(ctrl: Array, qpos: Array, dt: float, max_delay: float = 0.4) 
 
 
 def range_before(values: Array, rows: int) -> Array:
-    """Return the greatest less the least value of each row and those before it, `rows` in all, (T, n)."""
+    """Return the greatest less the least value of each row and those before it, `rows` in all, (T,
+    n).
+    """
     from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
     most, least = (
@@ -128,7 +141,8 @@ def fast_speed(ctrl: Array, dt: float) -> Array:
 
 def correlation(a: Array, b: Array) -> Array:
     """Return the correlation of each row, (n, T) and (n, T) → (n); 0 where one does not change."""
-    a, b = a - a.mean(axis=1, keepdims=True), b - b.mean(axis=1, keepdims=True)
+    a = a - a.mean(axis=1, keepdims=True)
+    b = b - b.mean(axis=1, keepdims=True)
     product = lambda x, y: np.einsum("it,it->i", x, y)  # noqa: E731
     power = np.sqrt(product(a, a) * product(b, b))
     return np.asarray(product(a, b) / np.where(power > 0, power, np.inf))
@@ -141,7 +155,9 @@ def busiest_window(qpos: Array, rows: int) -> int:
 
 
 def encoder_step(recordings: list[Array]) -> float:
-    """Return the smallest step between distinct readings of one joint, rad; 0 if readings are continuous."""
+    """Return the smallest step between distinct readings of one joint, rad; 0 if readings are
+    continuous.
+    """
     values = np.unique(np.concatenate(recordings).astype(np.float64))
     steps = np.diff(values)
     steps = steps[steps > 2e-6]  # below: rounding of the stored float32
@@ -154,10 +170,12 @@ def encoder_step(recordings: list[Array]) -> float:
 
 @dataclass(frozen=True)
 class Response:
-    """Correlations of commands and states of one recording, in SPLITS parts, n joints, at lags of `step` s.
+    """Correlations of commands and states of one recording, in SPLITS parts, n joints, at lags of
+    `step` s.
 
-    They add up over recordings. The velocity of a joint is modelled as a weighted sum of earlier commanded velocities.
-    The weights show when a joint begins to move, and by how much a recording follows later than others.
+    They add up over recordings. The velocity of a joint is modelled as a weighted sum of earlier
+    commanded velocities. The weights show when a joint begins to move, and by how much a recording
+    follows later than others.
     """
 
     step: float  # s
@@ -171,14 +189,18 @@ class Response:
         """Return the correlations of ctrl and qpos (T, n)."""
         every = max(1, round(MIN_STEP_S / dt))
         step = every * dt
-        before, lags = round(BEFORE_S / step), round(BEFORE_S / step) + round(AFTER_S / step) + 1
+        before = round(BEFORE_S / step)
+        lags = round(BEFORE_S / step) + round(AFTER_S / step) + 1
         size = len(ctrl[::every]) // SPLITS
-        own, cross, power = [], [], []
+        own = []
+        cross = []
+        power = []
         for part in range(SPLITS):
             rows = slice(part * size, (part + 1) * size)
             u, v = (np.diff(x[::every][rows].astype(float), axis=0) for x in (ctrl, qpos))
             length = 1 << (2 * max(len(u), lags) - 1).bit_length()
-            a, b = np.fft.rfft(u, length, axis=0), np.fft.rfft(v, length, axis=0)
+            a = np.fft.rfft(u, length, axis=0)
+            b = np.fft.rfft(v, length, axis=0)
             own.append(np.fft.irfft(a.conj() * a, length, axis=0)[:lags].T)
             later = np.fft.irfft(a.conj() * b, length, axis=0)
             cross.append(np.concatenate([later[length - before :], later[: lags - before]]).T)
@@ -196,15 +218,20 @@ class Response:
 
     @staticmethod
     def sharp(responses: list[Response]) -> Array:
-        """Return the joints whose commands change quickly enough to show when the joint begins to move, (n) bool."""
+        """Return the joints whose commands change quickly enough to show when the joint begins to
+        move, (n) bool.
+        """
         lags = [max(round(0.02 / r.step), 1) for r in responses]
-        now, soon = (np.sum([r.own.sum(axis=0)[:, k] for r, k in zip(responses, ks, strict=True)], axis=0)
-                     for ks in ([0] * len(responses), lags))  # fmt: skip
+        now, soon = (
+            np.sum([r.own.sum(axis=0)[:, k] for r, k in zip(responses, ks, strict=True)], axis=0)
+            for ks in ([0] * len(responses), lags)
+        )
         return np.asarray(soon < MAX_SHARP_CORRELATION * now)
 
     @staticmethod
     def common(responses: list[Response], used: list[bool] | None = None) -> CommonResponse:
-        """Estimate the common response of recordings with one step, and how each recording is shifted against it.
+        """Estimate the common response of recordings with one step, and how each recording is
+        shifted against it.
 
         Args:
             used: Recordings from which the common response is estimated; all by default.
@@ -220,16 +247,15 @@ class Response:
         ]
         own, cross, power = (x[mask].sum(axis=(0, 1)) for x in parts)
         quick = Response.sharp(responses)
-        onset, early, fits = (
-            np.full(n, np.nan),
-            np.full(n, np.nan),
-            np.zeros((len(responses), SPLITS, len(SHIFTS_S))),
-        )
+        onset = np.full(n, np.nan)
+        early = np.full(n, np.nan)
+        fits = np.zeros((len(responses), SPLITS, len(SHIFTS_S)))
         for j in range(n):
             if own[j, 0] <= 0 or power[j] <= 0:
                 continue
             weights = np.linalg.solve(toeplitz(own[j]) + RIDGE * own[j, 0] * np.eye(lags), cross[j])
-            residual, now = power[j] - weights @ cross[j], round(BEFORE_S / step)
+            residual = power[j] - weights @ cross[j]
+            now = round(BEFORE_S / step)
             if residual > MAX_UNEXPLAINED * power[j] or weights.sum() < 0.3:
                 continue
             past_only = toeplitz(own[j, :-now]) + RIDGE * own[j, 0] * np.eye(lags - now)
@@ -250,9 +276,8 @@ class Response:
                 [np.interp(at - s, at, weights, left=0.0, right=0.0) for s in SHIFTS_S]
             )
             spectrum = np.fft.rfft(shifted, 2 * lags, axis=1)
-            square = np.fft.irfft(np.abs(spectrum) ** 2, 2 * lags, axis=1)[
-                :, :lags
-            ]  # of the weights with themselves
+            # of the weights with themselves
+            square = np.fft.irfft(np.abs(spectrum) ** 2, 2 * lags, axis=1)[:, :lags]
             square[:, 1:] *= 2
             fits += (parts[1][:, :, j] @ shifted.T - 0.5 * parts[0][:, :, j] @ square.T) / residual
         return CommonResponse(onset, early, _best_shifts(fits), _best_shifts(fits.sum(axis=1)))

@@ -1,9 +1,10 @@
 """Train, validation and test splits of a dataset, by a fixed rule or from a split file.
 
-By motion, every repetition, payload and unit of a motion is in one split. Motions with equal commands count as one
-motion, whatever their names (data.fingerprint). By unit or payload, the test split holds the held-out ones; validation
-holds some motions of the others. By repetition the last repetitions are for testing, by time the last pieces of each
-recording that was cut (gaponet import --cut). Splits share no recording, also not under another name, unit or payload.
+By motion, every repetition, payload and unit of a motion is in one split. Motions with equal
+commands count as one motion, whatever their names (data.fingerprint). By unit or payload, the test
+split holds the held-out ones; validation holds some motions of the others. By repetition the last
+repetitions are for testing, by time the last pieces of each recording that was cut (gaponet import
+--cut). Splits share no recording, also not under another name, unit or payload.
 """
 
 from __future__ import annotations
@@ -39,7 +40,9 @@ PROPERTIES: dict[str, Callable[[Entry], str]] = {
 }
 ORDERED = ("repetition", "time")  # properties of which the last values are held out
 MIN_MOTIONS = 3  # one for each split
-TEST_SHARE, VAL_SHARE = 0.25, 0.125  # of motions, units or payloads; at least one each
+# of motions, units or payloads; at least one each
+TEST_SHARE = 0.25
+VAL_SHARE = 0.125
 RATE_TOLERANCE = 0.02  # relative; rates are measured
 
 
@@ -56,7 +59,9 @@ class _SplitFile(TypedDict):
 
 
 def hash_order(names: Iterable[str]) -> list[str]:
-    """Return distinct names in the order of their SHA-256: shuffled, and the same on every machine."""
+    """Return distinct names in the order of their SHA-256: shuffled, and the same on every
+    machine.
+    """
     return sorted(set(names), key=lambda name: hashlib.sha256(name.encode()).hexdigest())
 
 
@@ -70,8 +75,9 @@ def resolve_splits(dataset: Dataset, split_file: str, *rule: Any) -> Splits:
         return split_entries(dataset, *rule)
     if rule != ((), (), (), 1):
         raise UsageError(
-            f"--split {split_file} says already which recordings are for training: leave out --holdout-units, "
-            "--holdout-payloads, --rates and --train-share, or make another split with gaponet data split"
+            f"--split {split_file} says already which recordings are for training: leave out "
+            "--holdout-units, --holdout-payloads, --rates and --train-share, or make another "
+            "split with gaponet data split"
         )
     return read_split(split_file, dataset)
 
@@ -85,14 +91,15 @@ def split_entries(
 ) -> Splits:
     """Split by motion with the fixed rule, the same for all rates and shares.
 
-    Where recordings hold different sets of joints, each set is split by itself. Fewer than three motions with three or
-    more repetitions are split by repetition.
+    Where recordings hold different sets of joints, each set is split by itself. Fewer than three
+    motions with three or more repetitions are split by repetition.
 
     Args:
         holdout_units: Units that appear in the test split only.
         holdout_payloads: Payloads that appear in the test split only, kg.
         rates: Rates of the recordings to use, Hz; all by default.
-        train_share: Share of the training motions to use, in hash_order: a smaller set is part of a larger one.
+        train_share: Share of the training motions to use, in hash_order: a smaller set is part of a
+            larger one.
 
     Raises:
         UsageError: A unit, payload or rate is not in the dataset, or a split would be empty.
@@ -100,7 +107,8 @@ def split_entries(
     _require_present(dataset, holdout_units, holdout_payloads, rates)
     if not 0 < train_share <= 1:
         raise UsageError(
-            f"train_share is {train_share:g}; it is a share of the training motions, above 0 and up to 1"
+            f"train_share is {train_share:g}; it is a share of the training motions, above 0 and "
+            "up to 1"
         )
     held_out = lambda e: e.meta.unit_id in holdout_units or e.meta.payload_mass in holdout_payloads  # noqa: E731
     canonical = canonical_motions(dataset)
@@ -149,17 +157,20 @@ def _require_present(
         (rates, {round(1 / e.dt, 2) for e in dataset.entries}, "at {:g} Hz", RATE_TOLERANCE),
     ):
         if missing := [x for x in wanted if not any(abs(x - k) <= tolerance * x for k in known)]:
-            present, unit = ", ".join(f"{k:g}" for k in sorted(known)), text[-2:]
+            present = ", ".join(f"{k:g}" for k in sorted(known))
+            unit = text[-2:]
             raise UsageError(
-                f"no recording {text.format(missing[0])} in {dataset.path}; it holds {present} {unit}"
+                f"no recording {text.format(missing[0])} in {dataset.path}; it holds {present} "
+                f"{unit}"
             )
 
 
 def split_by_order(dataset: Dataset, by: str) -> Splits:
-    """Split by repetition or time: the last quarter for testing, the one before for validation, the rest for training.
+    """Split by repetition or time: the last quarter for testing, the one before for validation,
+    the rest for training.
 
-    Recordings of one command are repetitions, whatever their names. Recordings with fewer than three repetitions or
-    pieces are for training.
+    Recordings of one command are repetitions, whatever their names. Recordings with fewer than
+    three repetitions or pieces are for training.
 
     Raises:
         UsageError: No recording has three.
@@ -172,8 +183,12 @@ def split_by_order(dataset: Dataset, by: str) -> Splits:
         ).append(e)
     splits: Splits = {s: [] for s in SPLITS}
     for group in groups.values():
-        place = {e.id: (e.meta.motion, e.meta.repetition) if canonical else (e.meta.notes.get("from_s", 0.0),)
-                 for e in group}  # fmt: skip
+        place = {
+            e.id: (e.meta.motion, e.meta.repetition)
+            if canonical
+            else (e.meta.notes.get("from_s", 0.0),)
+            for e in group
+        }
         places = sorted(set(place.values()), reverse=True)
         test = max(1, round(TEST_SHARE * len(places))) if len(places) >= MIN_MOTIONS else 0
         for e in group:
@@ -209,10 +224,12 @@ def make_split(dataset: Dataset, by: str, holdout: tuple[str, ...] = ()) -> Spli
     held_out = _held_out_values(dataset, by, holdout, key)
     rest = [e for e in dataset.entries if key(e) not in held_out]
     if by in ORDERED:
-        val_key, val_values = key, {max(map(key, rest), key=float)} if rest else set()
+        val_key = key
+        val_values = {max(map(key, rest), key=float)} if rest else set()
     else:
         count = max(1, round(len(set(canonical.values())) * VAL_SHARE))
-        val_key, val_values = motion_of, set(hash_order(map(motion_of, rest))[:count])
+        val_key = motion_of
+        val_values = set(hash_order(map(motion_of, rest))[:count])
     splits = {
         "train": [e for e in rest if val_key(e) not in val_values],
         "val": [e for e in rest if val_key(e) in val_values],
@@ -220,8 +237,8 @@ def make_split(dataset: Dataset, by: str, holdout: tuple[str, ...] = ()) -> Spli
     }
     if empty := [s for s in SPLITS if not splits[s]]:
         raise UsageError(
-            f"{dataset.path}: holding out {by} {', '.join(sorted(held_out))} leaves nothing for {empty[0]} "
-            f"({len(set(map(motion_of, rest)))} motion(s) remain); hold out less"
+            f"{dataset.path}: holding out {by} {', '.join(sorted(held_out))} leaves nothing for "
+            f"{empty[0]} ({len(set(map(motion_of, rest)))} motion(s) remain); hold out less"
         )
     return splits
 
@@ -239,7 +256,8 @@ def _held_out_values(
     for value in holdout:
         if value not in values:
             raise UsageError(
-                f"{dataset.path}: no {by} '{value}' to hold out; it holds {', '.join(sorted(values))}"
+                f"{dataset.path}: no {by} '{value}' to hold out; it holds "
+                f"{', '.join(sorted(values))}"
             )
     if len(values) < 2:
         raise UsageError(
@@ -248,7 +266,8 @@ def _held_out_values(
     keys = hash_order(map(key, dataset.entries))
     if len(keys) < 2:
         raise UsageError(
-            f"{dataset.path}: all {len(values)} {by}s have equal commands, so they are one: nothing to split"
+            f"{dataset.path}: all {len(values)} {by}s have equal commands, so they are one: "
+            "nothing to split"
         )
     if holdout:
         return {key(e) for e in dataset.entries if PROPERTIES[by](e) in holdout}
@@ -256,7 +275,9 @@ def _held_out_values(
 
 
 def canonical_motions(dataset: Dataset) -> dict[str, str]:
-    """Return motion → the name under which it is split: of motions with equal commands, the first in hash_order."""
+    """Return motion → the name under which it is split: of motions with equal commands, the first
+    in hash_order.
+    """
     fingerprints: dict[str, list[CommandFingerprint]] = {}
     for entry in dataset.entries:
         of_motion = fingerprints.setdefault(entry.meta.motion, [])
@@ -270,7 +291,8 @@ def canonical_motions(dataset: Dataset) -> dict[str, str]:
     owners = [name for name in names for _ in fingerprints[name]]
     group = {name: name for name in names}
     for i, j in equal_commands([one for name in names for one in fingerprints[name]]):
-        first, second = group[owners[i]], group[owners[j]]
+        first = group[owners[i]]
+        second = group[owners[j]]
         if first != second:
             group = {name: first if g == second else g for name, g in group.items()}
     canonical: dict[str, str] = {}
@@ -280,7 +302,8 @@ def canonical_motions(dataset: Dataset) -> dict[str, str]:
 
 
 def split_motions(motions: Iterable[str]) -> dict[str, list[str]]:
-    """Split names of motions by a fixed rule without a seed: hash_order, test first, then validation, then training.
+    """Split names of motions by a fixed rule without a seed: hash_order, test first, then
+    validation, then training.
 
     A motion that is added later moves few others.
 
@@ -290,8 +313,9 @@ def split_motions(motions: Iterable[str]) -> dict[str, list[str]]:
     names = hash_order(motions)
     if len(names) < MIN_MOTIONS:
         raise UsageError(
-            f"{len(names)} motion(s) ({', '.join(names)}): a split by motion needs {MIN_MOTIONS} or more; motions with "
-            "equal commands count once. Long recordings can be cut into several: gaponet import --cut 8"
+            f"{len(names)} motion(s) ({', '.join(names)}): a split by motion needs {MIN_MOTIONS} "
+            "or more; motions with equal commands count once. Long recordings can be cut into "
+            "several: gaponet import --cut 8"
         )
     test, val = (max(1, round(len(names) * share)) for share in (TEST_SHARE, VAL_SHARE))
     return {"train": names[test + val :], "val": names[test : test + val], "test": names[:test]}
@@ -317,7 +341,9 @@ def _split_by_joints(unrecorded: dict[str, frozenset[str]]) -> dict[str, list[st
 
 
 def stratified_subset(entries: ListOf[Entry], count: int) -> list[Entry]:
-    """Return at most `count` entries, taken in turn from each payload, unit and rate, with different motions."""
+    """Return at most `count` entries, taken in turn from each payload, unit and rate, with
+    different motions.
+    """
     groups: dict[tuple[object, ...], list[Entry]] = {}
     for entry in entries:
         m = entry.meta
@@ -334,13 +360,15 @@ def stratified_subset(entries: ListOf[Entry], count: int) -> list[Entry]:
 def require_distinct_samples(
     dataset: Dataset, splits: Splits, progress: Progress = no_progress
 ) -> None:
-    """Refuse splits that share samples under different units or payloads, which content hashes do not show.
+    """Refuse splits that share samples under different units or payloads, which content hashes do
+    not show.
 
     Raises:
         DatasetError: Naming both sequences.
     """
     seen: dict[str, tuple[str, Entry]] = {}
-    total, done = sum(map(len, splits.values())), 0
+    total = sum(map(len, splits.values()))
+    done = 0
     for split, entries in splits.items():
         for entry in entries:
             arrays = dataset.channels(entry, ("ctrl", "qpos"))
@@ -348,8 +376,8 @@ def require_distinct_samples(
             other_split, other = seen.setdefault(digest, (split, entry))
             if other_split != split:
                 raise DatasetError(
-                    f"{dataset.path}: '{entry.id}' ({split}) and '{other.id}' ({other_split}) hold the same samples; "
-                    "delete the line of the wrong one from sequences.jsonl"
+                    f"{dataset.path}: '{entry.id}' ({split}) and '{other.id}' ({other_split}) "
+                    "hold the same samples; delete the line of the wrong one from sequences.jsonl"
                 )
             done += 1
             progress(done, total, entry.meta.motion)
@@ -378,7 +406,8 @@ def read_split(path: str | Path, dataset: Dataset) -> Splits:
     """Return the entries of a split file, found in the dataset by content, whatever their names.
 
     Raises:
-        DatasetError: It is no split file, a sequence is not in the dataset, or two splits share one.
+        DatasetError: It is no split file, a sequence is not in the dataset, or two splits share
+            one.
     """
     file = read_json(
         _SplitFile, Path(path), DatasetError, "make one with gaponet data split", allow_extra=True
@@ -394,7 +423,8 @@ def read_split(path: str | Path, dataset: Dataset) -> Splits:
                 )
             if split_of_hash.setdefault(digest, s) != s:
                 raise DatasetError(
-                    f"{path}: '{name}' is in {split_of_hash[digest]} and in {s}; split the dataset anew"
+                    f"{path}: '{name}' is in {split_of_hash[digest]} and in {s}; split the "
+                    "dataset anew"
                 )
             splits[s].append(entry)
     return splits

@@ -1,9 +1,11 @@
-"""Static poses: moments at which a robot stood still under a constant command, with the static error that remains.
+"""Static poses: moments at which a robot stood still under a constant command, with the static
+error that remains.
 
-A joint with friction stops short of its target, on the side from which it came. Its positions lie in a band; the middle
-of the band is the position without friction. On an SO-101 the elbow's band is 75 mrad wide. A plain median of the
-static error would therefore depend on the direction of motion more than on sag. Each static pose stores the side of
-approach, and `static_error` weighs both sides equally.
+A joint with friction stops short of its target, on the side from which it came. Its positions lie
+in a band; the middle of the band is the position without friction. On an SO-101 the elbow's band is
+75 mrad wide. A plain median of the static error would therefore depend on the direction of motion
+more than on sag. Each static pose stores the side of approach, and `static_error` weighs both sides
+equally.
 """
 
 from __future__ import annotations
@@ -31,7 +33,8 @@ class StaticPoses:
 
     qpos: Array  # averaged over the window, (k, n) rad
     ctrl: Array  # (k, n) rad
-    approach: Array  # (k, n), +1 if the joint's last motion was upwards, −1 downwards, 0 if it had not moved
+    # (k, n), +1 if the joint's last motion was upwards, −1 downwards, 0 if it had not moved
+    approach: Array
     distinct: Array  # (k, n) bool; False if neither joint nor command moved since the previous pose
 
     def __len__(self) -> int:
@@ -39,17 +42,22 @@ class StaticPoses:
 
     @classmethod
     def of(cls, sequence: Sequence, joints: Array) -> StaticPoses:
-        """Return the ends of all stretches in which the joints (k indices) rest under a constant command."""
+        """Return the ends of all stretches in which the joints (k indices) rest under a constant
+        command.
+        """
         ends = _ends_of_rest(sequence, joints)
         n = sequence.qpos.shape[1]
-        qpos, ctrl = np.zeros((len(ends), n)), np.zeros((len(ends), n))
-        approach, distinct = np.zeros((len(ends), n), int), np.ones((len(ends), n), bool)
-        w, starts = _window_rows(sequence), np.arange(0, len(sequence), BLOCK_ROWS)
-        extremes = np.stack(
-            [f.reduceat(sequence.qpos, starts) for f in (np.minimum, np.maximum)]
-        )  # (2, blocks, n)
+        qpos = np.zeros((len(ends), n))
+        ctrl = np.zeros((len(ends), n))
+        approach = np.zeros((len(ends), n), int)
+        distinct = np.ones((len(ends), n), bool)
+        w = _window_rows(sequence)
+        starts = np.arange(0, len(sequence), BLOCK_ROWS)
+        # (2, blocks, n)
+        extremes = np.stack([f.reduceat(sequence.qpos, starts) for f in (np.minimum, np.maximum)])
         for i, end in enumerate(ends):
-            qpos[i], ctrl[i] = sequence.qpos[end + 1 - w : end + 1].mean(axis=0), sequence.ctrl[end]
+            qpos[i] = sequence.qpos[end + 1 - w : end + 1].mean(axis=0)
+            ctrl[i] = sequence.ctrl[end]
             approach[i] = -_last_side(sequence.qpos[: end + 1], extremes, qpos[i])
             if i:
                 moved = [np.abs(x[i] - x[i - 1]) > MIN_MOTION_RAD for x in (qpos, ctrl)]
@@ -66,19 +74,24 @@ class StaticPoses:
         return cls(*(np.concatenate([getattr(p, f) for p in (empty, *parts)]) for f in vars(empty)))
 
     def static_error(self, joint: int, expected: Array | float = 0.0) -> StaticError:
-        """Return the static error of a joint over its distinct poses, both approaches weighed equally.
+        """Return the static error of a joint over its distinct poses, both approaches weighed
+        equally.
 
         Args:
             expected: Error to subtract, (k,) rad, such as the sag of the nominal model.
         """
         error = self.qpos[:, joint] - self.ctrl[:, joint] - expected
-        distinct, side = self.distinct[:, joint], self.approach[:, joint]
-        up, down, both = error[distinct & (side > 0)], error[distinct & (side < 0)], error[distinct]
+        distinct = self.distinct[:, joint]
+        side = self.approach[:, joint]
+        up = error[distinct & (side > 0)]
+        down = error[distinct & (side < 0)]
+        both = error[distinct]
         if min(len(up), len(down)) < MIN_POSES_PER_SIDE:
             return StaticError(
                 float(np.median(both)) if len(both) else np.nan, np.nan, len(up), len(down)
             )
-        high, low = float(np.median(down)), float(np.median(up))
+        high = float(np.median(down))
+        low = float(np.median(up))
         return StaticError((high + low) / 2, max(high - low, 0.0) / 2, len(up), len(down))
 
 
@@ -86,8 +99,10 @@ class StaticPoses:
 class StaticError:
     """qpos − ctrl of one joint at rest."""
 
-    middle: float  # mean of the medians of both approaches, rad; the plain median if one side is missing
-    half_band: float  # half their distance, rad; NaN if one side is missing; times kp it is the stiction torque
+    # mean of the medians of both approaches, rad; the plain median if one side is missing
+    middle: float
+    # half their distance, rad; NaN if one side is missing; times kp it is the stiction torque
+    half_band: float
     up: int  # poses reached from below
     down: int  # poses reached from above
 
@@ -98,11 +113,13 @@ class StaticError:
 
 
 def _last_side(qpos: Array, extremes: Array, rest: Array) -> Array:
-    """Return on which side of `rest` (n) the joints of qpos (T, n) were last, (n): +1, −1, or 0 if never away."""
-    full, side = len(qpos) // BLOCK_ROWS, np.zeros(len(rest), int)
-    blocks = (np.abs(extremes[:, :full] - rest) > MIN_MOTION_RAD).any(
-        axis=0
-    )  # complete blocks, (full, n)
+    """Return on which side of `rest` (n) the joints of qpos (T, n) were last, (n): +1, −1, or 0 if
+    never away.
+    """
+    full = len(qpos) // BLOCK_ROWS
+    side = np.zeros(len(rest), int)
+    # complete blocks, (full, n)
+    blocks = (np.abs(extremes[:, :full] - rest) > MIN_MOTION_RAD).any(axis=0)
     for j, x in enumerate(rest):
         for start in (full * BLOCK_ROWS, *BLOCK_ROWS * np.flatnonzero(blocks[:, j])[:-2:-1]):
             offset = qpos[start : start + BLOCK_ROWS, j] - x
@@ -118,12 +135,17 @@ def _window_rows(sequence: Sequence) -> int:
 
 
 def _ends_of_rest(sequence: Sequence, joints: Array) -> Array:
-    """Return the last row of each stretch at rest. Time and memory grow with the rows only, not with the window."""
+    """Return the last row of each stretch at rest.
+
+    Time and memory grow with the rows only, not with the window.
+    """
     w = _window_rows(sequence)
     if len(sequence) < 2 * w:
         return np.zeros(0, int)
-    ctrl, state = sequence.ctrl[:, joints], sequence.qpos[:, joints].astype(float)
-    half, ctrl_range = w // 2, range_before(ctrl, w)[w - 1 :]
+    ctrl = sequence.ctrl[:, joints]
+    state = sequence.qpos[:, joints].astype(float)
+    half = w // 2
+    ctrl_range = range_before(ctrl, w)[w - 1 :]
     mean = _moving_mean(state, w)  # (T − w + 1, k), of the window that starts at the row
     noise = np.sqrt(np.maximum(_moving_mean(state**2, w) - mean**2, 0))
     halves = _moving_mean(state, half)

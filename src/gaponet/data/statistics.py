@@ -12,8 +12,13 @@ Statistics = dict[str, Array]  # min, max, mean, std (n) and count (1)
 def statistics(values: Array) -> Statistics:
     """Return the statistics of one recording's samples, (T, n) or (T)."""
     x = values.reshape(len(values), -1).astype(float)
-    return {"min": x.min(axis=0), "max": x.max(axis=0), "mean": x.mean(axis=0), "std": x.std(axis=0),
-            "count": np.array([len(x)])}  # fmt: skip
+    return {
+        "min": x.min(axis=0),
+        "max": x.max(axis=0),
+        "mean": x.mean(axis=0),
+        "std": x.std(axis=0),
+        "count": np.array([len(x)]),
+    }
 
 
 def pool(parts: list[Statistics]) -> Statistics:
@@ -22,5 +27,10 @@ def pool(parts: list[Statistics]) -> Statistics:
     weight = s["count"] / s["count"].sum()  # (recordings, 1)
     mean = (weight * s["mean"]).sum(axis=0)
     variance = (weight * (s["std"] ** 2 + (s["mean"] - mean) ** 2)).sum(axis=0)
-    return {"min": s["min"].min(axis=0), "max": s["max"].max(axis=0), "mean": mean, "std": np.sqrt(variance),
-            "count": s["count"].sum(axis=0).astype(int)}  # fmt: skip
+    return {
+        "min": s["min"].min(axis=0),
+        "max": s["max"].max(axis=0),
+        "mean": mean,
+        "std": np.sqrt(variance),
+        "count": s["count"].sum(axis=0).astype(int),
+    }

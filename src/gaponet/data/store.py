@@ -1,17 +1,17 @@
 """The dataset folder: Parquet files, one per sequence, and a journal that lists them.
 
     dataset.json            format version, robot, joint names, units; licence and source if stated
-    robot/                  the nominal robot: robot.toml and a self-contained MJCF (gaponet.robot.folder)
-    sequences.jsonl         one line per sequence: metadata, hash, delays (data.journal)
-    offsets.json            static offsets of each unit as measured at import (data.offsets); not applied
-    sequences/<id>.parquet  columns time, ctrl, qpos, qvel, … (data.sequence_file)
-    replays/<model>/<id>.parquet  qpos, qvel, tau of the simulator with that model hash
-    card.json, CARD.md      counts and ranges (data.card)
-    splits/<name>.json      train, validation and test sets (data.split)
+    robot/                  the nominal robot: robot.toml and a self-contained MJCF
+    (gaponet.robot.folder) sequences.jsonl         one line per sequence: metadata, hash, delays
+    (data.journal) offsets.json            static offsets of each unit as measured at import
+    (data.offsets); not applied sequences/<id>.parquet  columns time, ctrl, qpos, qvel, …
+    (data.sequence_file) replays/<model>/<id>.parquet  qpos, qvel, tau of the simulator with that
+    model hash card.json, CARD.md      counts and ranges (data.card) splits/<name>.json      train,
+    validation and test sets (data.split)
 
-A sequence is written to a temporary file, renamed, synced to the disk, and then listed. A file that is not listed does
-not count. One process writes at a time (gaponet.base.files). Reading needs no lock and changes no recording. Recorded
-data is never rewritten; replays can be computed again.
+A sequence is written to a temporary file, renamed, synced to the disk, and then listed. A file that
+is not listed does not count. One process writes at a time (gaponet.base.files). Reading needs no
+lock and changes no recording. Recorded data is never rewritten; replays can be computed again.
 """
 
 from __future__ import annotations
@@ -74,13 +74,15 @@ class Dataset:
         """Open an existing folder.
 
         Raises:
-            DatasetError: It is not a dataset, a newer version wrote it, or a listed file is missing.
+            DatasetError: It is not a dataset, a newer version wrote it, or a listed file is
+                missing.
         """
         self.path = Path(path)
         header = self.path / "dataset.json"
         if not header.is_file():
             raise DatasetError(
-                f"{self.path}: not a dataset (no dataset.json); make one with gaponet import, collect or pull"
+                f"{self.path}: not a dataset (no dataset.json); make one with gaponet import, "
+                "collect or pull"
             )
         self.header: dict[str, Any] = {**read_format(_Header, header, FORMAT, DatasetError, HINT)}
         self.robot_name: str = self.header["robot"]
@@ -98,9 +100,8 @@ class Dataset:
 
     def _read_entries(self) -> Iterator[Entry]:
         folder = self.path / "sequences"
-        files = (
-            set(os.listdir(folder)) if folder.is_dir() else set()
-        )  # one system call, not one per sequence
+        # one system call, not one per sequence
+        files = set(os.listdir(folder)) if folder.is_dir() else set()
         for entry in self.journal.read():
             if f"{entry.id}.parquet" not in files:
                 raise DatasetError(
@@ -110,7 +111,9 @@ class Dataset:
 
     @classmethod
     def create(cls, path: str | Path, robot: RobotSpec) -> Dataset:
-        """Open the robot's dataset at a path, or create an empty one. The nominal robot is stored in it.
+        """Open the robot's dataset at a path, or create an empty one.
+
+        The nominal robot is stored in it.
 
         Raises:
             DatasetError: It is another robot's.
@@ -165,7 +168,8 @@ class Dataset:
 
     @contextmanager
     def appending(self) -> Iterator[None]:
-        """Hold the lock for many calls of `append`: the journal is written once a second and at the end.
+        """Hold the lock for many calls of `append`: the journal is written once a second and at
+        the end.
 
         If the block raises, files that the journal does not list yet are removed.
         """
@@ -189,7 +193,9 @@ class Dataset:
 
     @contextmanager
     def writing_replays(self) -> Iterator[None]:
-        """Hold the lock; replays of a read-only folder go into a temporary folder, deleted with this object."""
+        """Hold the lock; replays of a read-only folder go into a temporary folder, deleted with
+        this object.
+        """
         if not self.read_only:
             with self.writing():
                 yield
@@ -206,8 +212,9 @@ class Dataset:
         """Refuse a robot whose name or joints are not the dataset's."""
         if self.robot_name != robot.name or self.joint_names != robot.joint_names:
             raise DatasetError(
-                f"{self.path}: holds robot '{self.robot_name}' ({', '.join(self.joint_names)}), not '{robot.name}' "
-                f"({', '.join(robot.joint_names)}); use --robot {self.robot_name} or another dataset folder"
+                f"{self.path}: holds robot '{self.robot_name}' ({', '.join(self.joint_names)}), "
+                f"not '{robot.name}' ({', '.join(robot.joint_names)}); use --robot "
+                f"{self.robot_name} or another dataset folder"
             )
 
     def require_sequences(self) -> None:
@@ -261,7 +268,8 @@ class Dataset:
             return self._append(sequence, findings or {}, content_hash or sequence.content_hash())
 
     def _append(self, sequence: Sequence, findings: Findings, content_hash: str) -> Entry:
-        meta, duplicate = sequence.meta, self.find(content_hash)
+        meta = sequence.meta
+        duplicate = self.find(content_hash)
         if duplicate is not None:
             raise DatasetError(
                 f"{meta.source or meta.motion}: already in {self.path} as '{duplicate.id}' "
@@ -339,7 +347,8 @@ class Dataset:
         file = self._replay_file(entry, model)
         if not file.is_file():
             raise DatasetError(
-                f"{self.path}: '{entry.id}' has no replay by simulator {model}; run gaponet gap {self.path}"
+                f"{self.path}: '{entry.id}' has no replay by simulator {model}; run gaponet gap "
+                f"{self.path}"
             )
         arrays = read_arrays(file, ("qpos", "qvel", "tau"), entry.rows, len(self.joint_names))
         return Pair(self.read(entry), SimulatedReplay(model, **arrays))
@@ -354,7 +363,9 @@ class Dataset:
 
 
 def entry_id(meta: SequenceMeta, content_hash: str) -> str:
-    """Return a sequence's name in its dataset: its labels in letters that any disk takes, and 8 digits of its hash."""
+    """Return a sequence's name in its dataset: its labels in letters that any disk takes, and 8
+    digits of its hash.
+    """
     name = f"{meta.motion}-{meta.unit_id}-{meta.payload_mass:g}kg-r{meta.repetition}"
     return re.sub(r"[^A-Za-z0-9_.-]", "_", name)[:150] + f"-{content_hash[:8]}"
 

@@ -23,10 +23,9 @@ class AlignedSim:
 
     It equals sim.replay with the model's corrector.
 
-        sim = AlignedSim(load_robot("./my_h1_2"), payload_mass=3.0)  # and GapModel.load("run"), if a model helps
-        sim.reset(qpos)
-        sim.step(target)          # for one control period
-        sim.qpos, sim.qvel
+        sim = AlignedSim(load_robot("./my_h1_2"), payload_mass=3.0)  # and GapModel.load("run"), if
+        a model helps sim.reset(qpos) sim.step(target)          # for one control period sim.qpos,
+        sim.qvel
 
     Arrays are (num_envs, n) in the order of `joint_names`; without num_envs there is one simulation
     and they are (n,).

@@ -5,8 +5,9 @@ and shows how the robot should move. Without a model, the command is u = a′. W
 with command u moves like the shadow with target u + G(u), G being the model's correction. So u +
 G(u) = a′ is solved by u ← u + γ (a′ − u − G(u)).
 
-    aim "target":     a′ = a + τ / kp. τ is the torque with which the shadow follows the targets: gravity and, with
-                      dynamics, the torque for their velocity and acceleration (feedforward.py)
+    aim "target":     a′ = a + τ / kp. τ is the torque with which the shadow follows the targets:
+                      gravity and, with dynamics, the torque for their velocity and acceleration
+                      (feedforward.py)
     aim "simulator":  a′ = a, so that the robot moves like the simulator, including sag and lag
     follow "nominal": a′ moves the shadow as the nominal simulator moves under a (follow.py);
         without a model
@@ -198,9 +199,8 @@ class Compensator:
         self.payload_mass = np.zeros(num)
         self.payload_stated = False
         self.periods = 0
-        self.offset, self.command = np.zeros(
-            (2, num, len(self.op))
-        )  # u − a′ of the iteration; last command, rad
+        # u − a′ of the iteration; last command, rad
+        self.offset, self.command = np.zeros((2, num, len(self.op)))
         self._target: Array | None = None  # last finite target; None before `reset`
         self._deviation = np.zeros((num, len(self.op)))  # of the robot from the shadow, slow, rad
         # Control periods in which a motor or the command was at its limit, (num, n).
@@ -225,8 +225,9 @@ class Compensator:
                 now = float(gains[joint_names.index(joint)])
                 if abs(now - was) > GAIN_TOLERANCE * max(was, now):
                     raise RobotError(
-                        f"{nominal.folder}: {name} of {joint} is {was:g} there, the servo has {now:.4g}; set the "
-                        "servo, or robot.toml and identify on logs made with it, or extrapolate (--extrapolate)"
+                        f"{nominal.folder}: {name} of {joint} is {was:g} there, the servo has "
+                        f"{now:.4g}; set the servo, or robot.toml and identify on logs made with "
+                        "it, or extrapolate (--extrapolate)"
                     )
 
     def reset(self, target: Array, payload_mass: Array | float | None = None) -> None:
@@ -287,8 +288,8 @@ class Compensator:
         mass = np.asarray(payload_mass, float)
         if not ((mass >= 0) & (mass <= self.config.payload_max)).all():
             raise UsageError(
-                f"payload_mass is {payload_mass}; give kg, 0 when empty, up to {self.config.payload_max:g}, or raise "
-                "payload_max (--compensation.payload-max)"
+                f"payload_mass is {payload_mass}; give kg, 0 when empty, up to "
+                f"{self.config.payload_max:g}, or raise payload_max (--compensation.payload-max)"
             )
 
     def _carry(self, payload_mass: Array) -> None:
@@ -321,7 +322,8 @@ class Compensator:
         """
         if self._target is None:
             raise UsageError(
-                "compensator: step before reset; call reset(target) once, then step every control period"
+                "compensator: step before reset; call reset(target) once, then step every control "
+                "period"
             )
         given = self._as_rows(target)
         self._target = targets = np.where(np.isfinite(given), given, self._target)
@@ -403,7 +405,8 @@ class Compensator:
         sentences = []
         if self.refused_answers:
             sentences.append(
-                f"{self.refused_answers} answers of the network were not finite; it corrected nothing there"
+                f"{self.refused_answers} answers of the network were not finite; it corrected "
+                "nothing there"
             )
         if self.limited_shares:
             shares = [f"{joint} {share:.0%}" for joint, share in self.limited_shares.items()]
@@ -491,7 +494,8 @@ class Compensator:
         shape = (self.num_envs, len(self.robot.joint_names))
         if values.shape != (shape[1:] if self.single else shape):
             raise UsageError(
-                f"compensator: arrays hold all {shape[1]} joints of {self.robot.name}, got {values.shape}"
+                f"compensator: arrays hold all {shape[1]} joints of {self.robot.name}, got "
+                f"{values.shape}"
             )
         return values.reshape(shape)
 
@@ -544,7 +548,7 @@ def _simulator_of(
         return robot
     if config.aim == "simulator":
         raise ModelError(
-            f"{model.path}: aim simulator is the simulator trained in, {model.card['simulator']}; for "
-            f"{robot.folder} train there, or give RUN/robot, or aim at the target"
+            f"{model.path}: aim simulator is the simulator trained in, {model.card['simulator']}; "
+            f"for {robot.folder} train there, or give RUN/robot, or aim at the target"
         )
     return model.simulator()

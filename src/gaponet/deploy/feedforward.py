@@ -18,7 +18,9 @@ from gaponet.sim.batch import BatchSim
 from gaponet.sim.inverse import Inertia
 from gaponet.sim.servo import friction_limit, present
 
-MAX_SPEED, MAX_ACCELERATION = 4.0, 40.0  # rad/s, rad/s²; a step of the targets would have more
+# rad/s, rad/s²; a step of the targets would have more
+MAX_SPEED = 4.0
+MAX_ACCELERATION = 40.0
 # rad/s at which three quarters of the friction are fed forward; at rest none is
 FRICTION_SPEED = 0.05
 

@@ -53,7 +53,8 @@ class TrackingEnv(gymnasium.Env):
         """
         if not sim.single:
             raise UsageError(
-                "TrackingEnv has a single simulation: leave num_envs out; gymnasium.make_vec copies it"
+                "TrackingEnv has a single simulation: leave num_envs out; gymnasium.make_vec "
+                "copies it"
             )
         if not len(references) or any(r.shape[1] != sim.n or len(r) < 3 for r in references):
             raise UsageError(f"give motions (T, {sim.n}) of at least 3 rows")

@@ -23,9 +23,9 @@ class MujocoAligner:
 
     One object per MjData.
 
-    align = MujocoAligner(load_robot("./my_h1_2"), mj_model, dt=0.02, payload_mass=3.0)  # or GapModel.load("run")
-    data.ctrl[:] = align(data, target)                    # once per control period
-    mujoco.mj_step(mj_model, data, round(0.02 / mj_model.opt.timestep))
+    align = MujocoAligner(load_robot("./my_h1_2"), mj_model, dt=0.02, payload_mass=3.0)  # or
+    GapModel.load("run") data.ctrl[:] = align(data, target)                    # once per control
+    period mujoco.mj_step(mj_model, data, round(0.02 / mj_model.opt.timestep))
 
     If the robot of the scene differs from the identified one or from the simulator of training,
     commands are transferred (deploy/transfer.py): other gains, friction, inertias, actuators, or a
@@ -69,7 +69,8 @@ class MujocoAligner:
         for name in robot.operated:
             if prefix + name not in scene_joints:
                 raise ModelError(
-                    f"{source}: moves joint '{prefix + name}', the scene has {', '.join(scene_joints)}; give prefix"
+                    f"{source}: moves joint '{prefix + name}', the scene has "
+                    f"{', '.join(scene_joints)}; give prefix"
                 )
         unchanged = not robot.has_servo_model
         if isinstance(model, GapModel):
@@ -154,6 +155,7 @@ def _actuator(scene: mujoco.MjModel, joint: str) -> int:
     actuators = np.flatnonzero(scene.actuator_trnid[:, 0] == scene.joint(joint).id)
     if len(actuators) != 1:
         raise ModelError(
-            f"joint '{joint}' has {len(actuators)} actuators in the scene; the model needs one, position"
+            f"joint '{joint}' has {len(actuators)} actuators in the scene; the model needs one, "
+            "position"
         )
     return int(actuators[0])

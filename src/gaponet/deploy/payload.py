@@ -115,7 +115,10 @@ class PayloadEstimate:
         if not self.certain[0] or abs(self.latest[0] - stated) <= self.max_mass / 2:
             return ""
         estimate = f"{self.latest[0]:.1f} kg"
-        return f"{stated:g} kg were stated, but the torques are those of about {estimate}: what is in the hand?"
+        return (
+            f"{stated:g} kg were stated, but the torques are those of about {estimate}: what is "
+            "in the hand?"
+        )
 
     def gravity(self, qpos: Array) -> Array:
         """Return the torques that hold a posture, empty and with most payload, (2, n) N·m."""

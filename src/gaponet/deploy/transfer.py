@@ -35,7 +35,8 @@ MAX_FRICTION_BAND_RAD = 0.06  # frictionloss / kp
 MAX_TIMESTEP_S = 0.0051
 MAX_EXTRA_DELAY_S = 0.005  # of the target's servos
 RANGE_TOLERANCE = 1e-6  # of the ends of these ranges
-STICTION_SPEED = 0.02  # rad/s at which three quarters of the friction act, for joints that are blocked by a contact
+# rad/s at which three quarters of the friction act, for joints that are blocked by a contact
+STICTION_SPEED = 0.02
 
 
 class Transfer:
@@ -270,6 +271,6 @@ def control_periods_of(model: GapModel, dt: float) -> int:
             return count
     rates = ", ".join(f"{1 / trained:.1f}" for trained in model.card["dt"])
     raise ModelError(
-        f"{model.path}: trained at {rates} Hz, the loop has {1 / dt:.1f} Hz; run it at a trained rate or a "
-        "whole multiple of it, or train on logs of this rate"
+        f"{model.path}: trained at {rates} Hz, the loop has {1 / dt:.1f} Hz; run it at a trained "
+        "rate or a whole multiple of it, or train on logs of this rate"
     )

@@ -42,14 +42,13 @@ PAST_S = 0.1  # beyond the longest delay
 HIDDEN = (32, 32)
 MAX_INPUT_STD = 5.0
 MAX_RECORDINGS = 40  # of each split
-ROWS, STEPS, BATCH, RATE, DECAY, NOISE = (
-    60_000,
-    2000,
-    512,
-    2e-3,
-    1.0,
-    0.4,
-)  # of the fit, as in supervised pre-training
+# of the fit, as in supervised pre-training
+ROWS = 60_000
+STEPS = 2000
+BATCH = 512
+RATE = 2e-3
+DECAY = 1.0
+NOISE = 0.4
 GAINS = (1.0, 0.5, 0.0)  # factors of kp · Δa that are tried on validation motions
 
 

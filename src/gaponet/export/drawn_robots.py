@@ -27,19 +27,23 @@ from gaponet.sysid.uncertainty import ParameterUncertainty, from_axes, to_axes
 RANGE_PERCENT = 5, 95
 Units = dict[str, Array]  # field → (units, n) in SI units; a row is one unit
 
+# in the robot folder: with the servo model, without it
 CACHES = (
     "drawn_robots.json",
     "drawn_plain_robots.json",
-)  # in the robot folder: with the servo model, without it
+)
 
-DRAWN, KEPT_SHARE = 128, 0.25  # number of units, and the share that is retained
+# number of units, and the share that is retained
+DRAWN = 128
+KEPT_SHARE = 0.25
 NEAR = 0.5  # every second unit deviates by this share of what was drawn
-WINDOWS, WINDOW_S = 8, 8.0  # rollouts that choose
+# rollouts that choose
+WINDOWS = 8
+WINDOW_S = 8.0
 JUDGED = 20  # robots of each kind whose error on validation motions is stated
-BY_HAND, BY_HAND_FIELDS = (
-    0.2,
-    ("kp", "damping", "frictionloss", "armature"),
-)  # the usual randomisation: ± 20 %
+# the usual randomisation: ± 20 %
+BY_HAND = 0.2
+BY_HAND_FIELDS = ("kp", "damping", "frictionloss", "armature")
 
 
 @dataclass(frozen=True)
@@ -66,9 +70,10 @@ class DrawnRobots:
         if self.errors["units"] > self.errors["by hand"]:
             raise NoGainError(
                 f"nothing is written: on validation motions, drawn units are "
-                f"{1e3 * self.errors['units']:.2f} mrad from the recordings, and the robot with ± 20 % on kp, damping, "
-                f"friction and armature {1e3 * self.errors['by hand']:.2f}. Randomise by ± 20 %, or record motions "
-                "that determine more (gaponet excite --for ROBOT)"
+                f"{1e3 * self.errors['units']:.2f} mrad from the recordings, and the robot with ± "
+                f"20 % on kp, damping, friction and armature {1e3 * self.errors['by hand']:.2f}. "
+                "Randomise by ± 20 %, or record motions that determine more (gaponet excite --for "
+                "ROBOT)"
             )
 
 

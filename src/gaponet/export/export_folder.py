@@ -63,16 +63,15 @@ CHECK_FILES: dict[str, dict[str, str]] = {
 }
 MJCF_TARGETS = ("mjcf", "envhub")  # an edited copy of a MuJoCo file
 WITH_TORCH = ("mjlab", "isaaclab", "torch", "actuator-net")  # engines whose helper file needs torch
-ENGINE_TERMS = {
-    "isaaclab": ("no_load_speed",)
-}  # terms of the servo model that an engine's own servos have
+# terms of the servo model that an engine's own servos have
+ENGINE_TERMS = {"isaaclab": ("no_load_speed",)}
 ACTUATORS = re.compile(r"\s*<actuator>.*?</actuator>", re.DOTALL)
 WITHOUT_TABLE = ("isaaclab", "newton")  # engines in whose scenes robot.xml's table is not
 WITHOUT_SERVO_MODEL = ("isaaclab", "newton", "urdf")
 DELAY_NOTES = {
     "newton": "Newton's joint targets have no delay: check.py has a buffer of five lines",
-    "mjcf": "delays need MuJoCo 3.5, and after each reset fill_delays of mujoco_servos.py; MJX ignores them without a "
-    "message",
+    "mjcf": "delays need MuJoCo 3.5, and after each reset fill_delays of mujoco_servos.py; MJX "
+    "ignores them without a message",
 }
 
 
@@ -150,7 +149,8 @@ class _RobotExport:
         plain = self.plain
         if other:
             self.notes.append(
-                f"inertias of {', '.join(other)} were not written: their masses in the file are others"
+                f"inertias of {', '.join(other)} were not written: their masses in the file are "
+                "others"
             )
             links = {name: link for name, link in plain.links.items() if name not in other}
             plain = replace(plain, links=links)
@@ -393,8 +393,8 @@ def export_networks(
     notes = []
     if not facts["actuator_net"]["gain"]:
         notes.append(
-            "the run's correction depends on posture, which a joint's network does not get: these are the servos "
-            "alone; try torch"
+            "the run's correction depends on posture, which a joint's network does not get: these "
+            "are the servos alone; try torch"
         )
     if facts["law"]:
         notes.append(f"the servo model ({', '.join(facts['law'])}) is not in actuator networks")

@@ -402,7 +402,10 @@ def _add_surroundings(
                 f'<geom type="sphere" size="{text_of(radius)}" mass="{mass}" '
                 'contype="0" conaffinity="0"/>'
             )
-            payload = f'<body name="{prefix}payload_{mount.side}" pos="{text_of(*mount.pos)}">{ball}</body>'
+            payload = (
+                f'<body name="{prefix}payload_{mount.side}" '
+                f'pos="{text_of(*mount.pos)}">{ball}</body>'
+            )
             source.insert(body(prefix + mount.body, "payload_mount"), payload)
     if option:
         source.append(f"option {_attributes(option)}", "")

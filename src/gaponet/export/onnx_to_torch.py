@@ -133,8 +133,8 @@ class OnnxModule(nn.Module):
         for node in graph.node:
             if node.op_type not in OPERATORS:
                 raise ModelError(
-                    f"{file}: torch exports do not know its operator {node.op_type}; export from a run folder that "
-                    "has its checkpoint.pt"
+                    f"{file}: torch exports do not know its operator {node.op_type}; export from "
+                    "a run folder that has its checkpoint.pt"
                 )
             operator = OPERATORS[node.op_type]
             names = [name for name in node.input if name]
@@ -144,9 +144,8 @@ class OnnxModule(nn.Module):
             else:
                 self.steps.append((operator, names, attributes, node.output[0]))
         used = {name for _, names, _, _ in self.steps for name in names}
-        self.sizes: dict[
-            str, list[int]
-        ] = {}  # name in the file → shape, axes, or places of a slice
+        # name in the file → shape, axes, or places of a slice
+        self.sizes: dict[str, list[int]] = {}
         self.buffer_names: dict[str, str] = {}  # name in the file → name of the buffer
         for name in sorted(used & known.keys()):
             if isinstance(known[name], list):

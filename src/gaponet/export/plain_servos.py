@@ -199,10 +199,11 @@ def stored_result(
         if stored["key"] == key:
             return validated(kind, stored["content"], file, RobotError)
     result = compute()
+    # not of gaponet, or not writable
     with (
         suppress(FolderError, OSError),
         lock_folder(file.parent, "robot"),
-    ):  # not of gaponet, or not writable
+    ):
         write_json(file, {"key": key, "content": result})
     return result
 

@@ -126,9 +126,8 @@ def sample_units(
     x = np.where(bounded, np.maximum(x, 0.0), x)
     inverse = [SERVO_FIELDS[f].axis == "inverse" for f in fields]
     optional = np.isin(fields, ("backlash", "no_load_speed"))
-    x = np.where(
-        inverse, np.maximum(x, LEAST_INVERSE * mean), x
-    )  # zero is no limit, which no range states
+    # zero is no limit, which no range states
+    x = np.where(inverse, np.maximum(x, LEAST_INVERSE * mean), x)
     x = np.where(optional & (mean == 0), 0.0, x)  # a joint without the effect gets none
     sampled = from_axes(fields, x)
     value = from_axes(fields, mean)
@@ -213,14 +212,14 @@ def _days(uncertainty: ParameterUncertainty, joints: tuple[str, ...]) -> Array:
     units = {s["unit"] for s in uncertainty.sources}
     if len(units) > 1:
         raise UsageError(
-            f"any-day: these sessions are of units {', '.join(sorted(units))}; days of one unit are needed, or --scope "
-            "any-robot with --units"
+            f"any-day: these sessions are of units {', '.join(sorted(units))}; days of one unit "
+            "are needed, or --scope any-robot with --units"
         )
     days = {s["days"] or (f"session {i}",): s for i, s in enumerate(uncertainty.sources)}
     if len(days) < 2:
         raise UsageError(
-            "any-day: this robot is known from one day; adapt it with logs of another one (gaponet adapt ROBOT "
-            "LOGS --out ROBOT_2) and export that"
+            "any-day: this robot is known from one day; adapt it with logs of another one "
+            "(gaponet adapt ROBOT LOGS --out ROBOT_2) and export that"
         )
     return np.array([[s["values"][j] for j in joints] for s in days.values()])
 
@@ -230,13 +229,15 @@ def _robots(spec: RobotSpec, fields: tuple[str, ...], others: ListOf[Path]) -> A
     robots = [spec, *(load_robot(folder) for folder in others)]
     if len(robots) < MIN_ROBOTS:
         raise UsageError(
-            f"any-robot: {len(robots)} robot(s) do not show how robots of this type differ; give --units with at least "
-            f"{MIN_ROBOTS - 1} more robot folders, each identified from its own logs"
+            f"any-robot: {len(robots)} robot(s) do not show how robots of this type differ; give "
+            f"--units with at least {MIN_ROBOTS - 1} more robot folders, each identified from its "
+            "own logs"
         )
     for robot in robots:
         if robot.operated != spec.operated:
             raise UsageError(
-                f"{robot.folder}: operates {', '.join(robot.operated)}; this robot {', '.join(spec.operated)}"
+                f"{robot.folder}: operates {', '.join(robot.operated)}; this robot "
+                f"{', '.join(spec.operated)}"
             )
     return np.stack([np.stack(list(to_axes(robot, fields).values())) for robot in robots])
 

@@ -27,8 +27,10 @@ UNITS = {"home": "rad", "range": "rad", "dt": "s", "payload_mass": "kg"} | {
 MEANING = {
     "offset": "the servo aims at command + offset",
     "zero": "the MJCF's angle is reading + zero; robot.xml has it as ref",
-    "dof_invweight0_factor": "of joints' dof_invweight0 after compilation, for stiff friction; MJCF has no such field",
-    "law": "servo model beyond PD, by joint; not in any MJCF, but in the helper file, and for mjlab in its actuators",
+    "dof_invweight0_factor": "of joints' dof_invweight0 after compilation, for stiff friction; "
+    "MJCF has no such field",
+    "law": "servo model beyond PD, by joint; not in any MJCF, but in the helper file, and for "
+    "mjlab in its actuators",
     "plain": "numbers fitted for PD servos without the servo model; equal to joints without one",
     "error_mrad": "mean |error| of joints on the motions of check.npz, in gaponet",
     "mujoco": "fields of the compiled MjModel by their names",

@@ -146,8 +146,8 @@ def delta_step(model: GapModel, run: Path, payload_mass: float = 0.0) -> DeltaSt
         )
     if model.config.observes_real_state:
         raise ModelError(
-            f"{model.path}: the recorded state is an input that torch exports lack; train without real_state, and "
-            "with predictor_inputs observation"
+            f"{model.path}: the recorded state is an input that torch exports lack; train without "
+            "real_state, and with predictor_inputs observation"
         )
     net: nn.Module
     if is_packaged_network(model.path):
@@ -193,8 +193,8 @@ def export_program(model: GapModel, run: Path, folder: Path, payload_mass: float
         difference = _largest_difference(torch.export.load(content).module(), step, model)
         if not difference <= MAX_DIFFERENCE_RAD:
             raise ModelError(
-                f"{path}: torch.export and {model.path} differ by {difference:.2e} rad; not written. "
-                "Write the artifact again with gaponet export RUN"
+                f"{path}: torch.export and {model.path} differ by {difference:.2e} rad; not "
+                "written. Write the artifact again with gaponet export RUN"
             )
     return difference
 

@@ -19,6 +19,7 @@ from gaponet.export.mjcf_edit import Source, text_of
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.model import build_model
 
+# of a joint, which a URDF lacks
 MISSING_FIELDS = (
     "kp",
     "kd",
@@ -26,7 +27,7 @@ MISSING_FIELDS = (
     "delay",
     "offset",
     "zero",
-)  # of a joint, which a URDF lacks
+)
 
 
 def edit_urdf(

@@ -1,1 +1,3 @@
-"""Simulation: MJCF to model, many simulations at once, replay of recorded commands and its errors."""
+"""Simulation: MJCF to model, many simulations at once, replay of recorded commands and its
+errors.
+"""

@@ -1,4 +1,6 @@
-"""Many simulations of one robot, one control period per step; sim/warp.py does the same on a GPU."""
+"""Many simulations of one robot, one control period per step; sim/warp.py does the same on a
+GPU.
+"""
 
 from __future__ import annotations
 
@@ -25,14 +27,16 @@ from gaponet.sim.servo import ServoModel
 class OneByOne:
     """Replacement of mujoco.batch.Batch before MuJoCo 3.17: one simulation after another, slower.
 
-    Bound fields are live (nsim, …) arrays as there. All simulations share one MjData: every bound field is written to
-    it before a call and read from it after.
+    Bound fields are live (nsim, …) arrays as there. All simulations share one MjData: every bound
+    field is written to it before a call and read from it after.
     """
 
     STATE = ("time", "qpos", "qvel", "history", "qacc_warmstart", "ctrl", "qfrc_applied")
 
     def __init__(self, model: mujoco.MjModel, nsim: int, nthread: int = 0) -> None:
-        self.nsim, self._model, self._data = nsim, copy.copy(model), mujoco.MjData(model)
+        self.nsim = nsim
+        self._model = copy.copy(model)
+        self._data = mujoco.MjData(model)
         self._bound: dict[str, Array] = {}
         self._expanded: dict[str, Array] = {}
         for name in self.STATE:
@@ -45,7 +49,9 @@ class OneByOne:
         return self._bound[name]
 
     def expand(self, name: str) -> Array:
-        """Return a field of MjModel, or opt.NAME of its options, with a value for each simulation, (nsim, …)."""
+        """Return a field of MjModel, or opt.NAME of its options, with a value for each simulation,
+        (nsim, …).
+        """
         if name not in self._expanded:
             self._expanded[name] = np.array([_field(self._model, name)] * self.nsim)
         return self._expanded[name]
@@ -59,18 +65,23 @@ class OneByOne:
         self._call(ids, lambda model, data: mujoco.mj_step(model, data, nstep))
 
     def forward(self, ids: Array | None = None, stage: int = 0) -> None:
-        """Compute the quantities that follow from positions and velocities; the only stage that is supported."""
+        """Compute the quantities that follow from positions and velocities; the only stage that is
+        supported.
+        """
         self._call(ids, mujoco.mj_step1)
 
     def get_data(self, i: int) -> mujoco.MjData:
-        """Return a copy of one simulation, with the quantities that follow from its positions and velocities."""
+        """Return a copy of one simulation, with the quantities that follow from its positions and
+        velocities.
+        """
         self._call(np.array([i]), mujoco.mj_step1)
         return copy.copy(self._data)
 
     def _call(
         self, ids: Array | None, function: Callable[[mujoco.MjModel, mujoco.MjData], None]
     ) -> None:
-        model, data = self._model, self._data
+        model = self._model
+        data = self._data
         for i in np.arange(self.nsim)[slice(None) if ids is None else ids]:
             for name, x in self._expanded.items():
                 owner, field = (model.opt, name[4:]) if name.startswith("opt.") else (model, name)
@@ -95,31 +106,36 @@ else:
         }
 
 
-MAX_RAMP_LEAD_RAD, MAX_RAMP_LEAD_S = (
-    0.05,
-    0.1,
-)  # of a ramp beyond its joint: fixed, and at the ramp's speed
+# of a ramp beyond its joint: fixed, and at the ramp's speed
+MAX_RAMP_LEAD_RAD = 0.05
+MAX_RAMP_LEAD_S = 0.1
 
 
 def ramp_start(target: Any, qpos: Any, speed: Any) -> Any:
-    """Return where a ramp towards `target` (…, n), rad, is when the joint is at qpos; numpy or torch."""
+    """Return where a ramp towards `target` (…, n), rad, is when the joint is at qpos; numpy or
+    torch.
+    """
     lead = MAX_RAMP_LEAD_RAD + MAX_RAMP_LEAD_S * speed
     return array_module(target).clip(target, qpos - lead, qpos + lead)
 
 
 def speed_limited(ctrl: Array, qpos: Array, speed: Array, dt: Array | float) -> Array:
-    """Return targets (T, …), rad, limited to `speed` (…), rad/s, from qpos (…) on; dt in s, one or (…)."""
-    limited, at = np.empty_like(ctrl), ramp_start(ctrl[0], qpos, speed)
+    """Return targets (T, …), rad, limited to `speed` (…), rad/s, from qpos (…) on; dt in s, one or
+    (…).
+    """
+    limited = np.empty_like(ctrl)
+    at = ramp_start(ctrl[0], qpos, speed)
     for t, target in enumerate(ctrl):
         limited[t] = at = np.clip(target, at - speed * dt, at + speed * dt)
     return limited
 
 
 class Condition(NamedTuple):
-    """Condition of a recording: payload, control period, and gains (n) where they are not the robot's own.
+    """Condition of a recording: payload, control period, and gains (n) where they are not the
+    robot's own.
 
-    Also the mean temperature of each joint (n), °C, if it was recorded and changes the robot's friction, and how the
-    simulator differs from the robot's own.
+    Also the mean temperature of each joint (n), °C, if it was recorded and changes the robot's
+    friction, and how the simulator differs from the robot's own.
     """
 
     payload_mass: float
@@ -133,7 +149,8 @@ class Condition(NamedTuple):
     @classmethod
     def of(cls, sequence: Sequence, robot: RobotSpec) -> Condition:
         """Return the condition of a recording of this robot."""
-        meta, gains = sequence.meta, sequence.meta.recorded_gains
+        meta = sequence.meta
+        gains = sequence.meta.recorded_gains
         other = (None, None) if robot.with_gains(*gains) is robot else gains
         warm = any(robot.friction_per_kelvin) or any(robot.damping_per_kelvin)
         return cls(
@@ -154,15 +171,20 @@ class Condition(NamedTuple):
 class BatchSim:
     """num_envs simulations of a robot; each may have its own payload, control period and gains.
 
-    `qpos` and `qvel` are live (num_envs, n) views: a write is the state at the next step. Results are bit-identical to
-    a loop of mj_step over one MjData each, at any number of threads.
+    `qpos` and `qvel` are live (num_envs, n) views: a write is the state at the next step. Results
+    are bit-identical to a loop of mj_step over one MjData each, at any number of threads.
     """
 
     def __init__(
-        self, robot: RobotSpec, conditions: list[Condition], nthread: int = 0, locked: tuple[str, ...] = (),
+        self,
+        robot: RobotSpec,
+        conditions: list[Condition],
+        nthread: int = 0,
+        locked: tuple[str, ...] = (),
         servo_model: bool = False,
-    ) -> None:  # fmt: skip
-        """Make a simulation for each of `conditions`; nthread 0 uses all cores; n counts joints that are not locked.
+    ) -> None:
+        """Make a simulation for each of `conditions`; nthread 0 uses all cores; n counts joints
+        that are not locked.
 
         With `servo_model` its terms may be written, also if the robot has none.
         """
@@ -187,7 +209,8 @@ class BatchSim:
         # Threads with fewer simulations mostly wait.
         useful = max(1, min(os.cpu_count() or 1, self.num_envs // 16))
         self.batch = Batch(first, nsim=self.num_envs, nthread=nthread or useful)
-        # Model fields that differ between conditions, each (num_envs, …): a row may be copied over another's.
+        # Model fields that differ between conditions, each (num_envs, …): a row may be copied over
+        # another's.
         self.fields = expand_differences(self.batch, models)
         bind: Callable[[str], Array] = self.batch.bind
         self.qpos = bind("qpos")
@@ -220,8 +243,8 @@ class BatchSim:
     ) -> None:
         """Put simulations `ids` into a state, (k, n) rad and rad/s.
 
-        `past` are the targets of the control periods before, newest first, (k, depth, n) rad, for servos with a delay
-        (robot.delay). The oldest counts for all before it.
+        `past` are the targets of the control periods before, newest first, (k, depth, n) rad, for
+        servos with a delay (robot.delay). The oldest counts for all before it.
         """
         self.qpos[ids] = qpos
         self.qvel[ids] = qvel
@@ -275,12 +298,13 @@ class BatchSim:
 
         Args:
             joints: k names.
-            values: kp at the robot's own gains, damping, frictionloss, armature, offset, and any of kd, effort_limit,
-                zero, target_speed, delay (up to the robot's) and SERVO_TERMS, each (num_envs, k). A damping below zero
-                is taken from the servo's own kd.
+            values: kp at the robot's own gains, damping, frictionloss, armature, offset, and any of
+                kd, effort_limit, zero, target_speed, delay (up to the robot's) and SERVO_TERMS,
+                each (num_envs, k). A damping below zero is taken from the servo's own kd.
 
         Raises:
-            UsageError: A value that these simulations cannot take, such as a delay where the robot has none.
+            UsageError: A value that these simulations cannot take, such as a delay where the robot
+                has none.
         """
         self._require_settable(values)
         model = next(iter(self.models.values()))
@@ -325,12 +349,14 @@ class BatchSim:
         refused = [f for f in fixed if f in values and np.any(values[f])]
         if refused:
             raise UsageError(
-                f"{', '.join(refused)} cannot differ between simulations of {self.robot.name}: give them to the robot "
-                "(with_servos) that BatchSim is made with"
+                f"{', '.join(refused)} cannot differ between simulations of {self.robot.name}: "
+                "give them to the robot (with_servos) that BatchSim is made with"
             )
 
     def _max_change(self, speed: Array) -> Array:
-        """Return the largest change of targets per period at `speed`, (…, n) rad/s (0: no limit), (num_envs, n) rad."""
+        """Return the largest change of targets per period at `speed`, (…, n) rad/s (0: no limit),
+        (num_envs, n) rad.
+        """
         return np.asarray(
             (self.nstep * self.timestep)[:, None] * np.where(speed > 0, speed, np.inf)
         )
@@ -361,15 +387,19 @@ def _compiled(
     locked: tuple[str, ...],
     buffer_s: float,
 ) -> dict[Condition, mujoco.MjModel]:
-    """Return the model of each condition. Conditions that differ in their simulator alone share one compilation.
+    """Return the model of each condition.
+
+    Conditions that differ in their simulator alone share one compilation.
 
     Args:
         robots: Condition → robot with its gains, at its temperature.
         joint_names: Joints that are not locked.
-        buffer_s: Every model gets buffers for servos that are so late, s; 0 for those that its robot needs.
+        buffer_s: Every model gets buffers for servos that are so late, s; 0 for those that its
+            robot needs.
 
     Raises:
-        UsageError: A changed simulator of a robot with a servo model, whose terms are not changed with it.
+        UsageError: A changed simulator of a robot with a servo model, whose terms are not changed
+            with it.
     """
     unchanged: dict[Condition, mujoco.MjModel] = {}
     models: dict[Condition, mujoco.MjModel] = {}
@@ -387,15 +417,18 @@ def _compiled(
             continue
         if robot.has_servo_model:
             raise UsageError(
-                f"{robot.name} has a servo model (friction at rest or by load, backlash, …), which other simulators do "
-                "not have: train in many simulators with the robot before identification"
+                f"{robot.name} has a servo model (friction at rest or by load, backlash, …), "
+                "which other simulators do not have: train in many simulators with the robot "
+                "before identification"
             )
         models[condition] = changed_model(unchanged[own], robot, joint_names, condition.simulator)
     return models
 
 
 def expand_differences(batch: Batch, models: list[mujoco.MjModel]) -> dict[str, Array]:
-    """Expand every model field that differs between simulations, (nsim) models, and return those fields, live."""
+    """Expand every model field that differs between simulations, (nsim) models, and return those
+    fields, live.
+    """
     unique = list({id(m): m for m in models}.values())
     place = {id(m): i for i, m in enumerate(unique)}
     rows = [place[id(m)] for m in models]
@@ -430,24 +463,30 @@ def _field(model: mujoco.MjModel, name: str) -> Any:
 
 
 class CommandHistory:
-    """MuJoCo's buffer of past commands of all simulations in a batch; the same length for all actuators.
+    """MuJoCo's buffer of past commands of all simulations in a batch; the same length for all
+    actuators.
 
-    Layout of an actuator's part: one user number, the cursor, the samples' times, the samples (mj_initCtrlHistory).
+    Layout of an actuator's part: one user number, the cursor, the samples' times, the samples
+    (mj_initCtrlHistory).
     """
 
     def __init__(self, buffer: Any, time: Any, model: mujoco.MjModel) -> None:
         """buffer: Of the batch, (nsim, nhistory), numpy or torch; time: (nsim,) s."""
-        self.buffer, self.time = buffer, time
+        self.buffer = buffer
+        self.time = time
         self.samples = int(model.actuator_history[0, 0])
         parts = buffer.reshape(len(buffer), model.nu, 2 + 2 * self.samples)  # a view
-        self.cursor, self.times = parts[..., :2], parts[..., 2 : -self.samples]
+        self.cursor = parts[..., :2]
+        self.times = parts[..., 2 : -self.samples]
         self.values = parts[..., -self.samples :]
         self.ago = array_like(time, np.arange(self.samples, 0, -1))  # oldest first
         self._newest = array_like(time, [0.0, self.samples - 1.0])
         self._each = array_like(time, np.arange(len(time))[:, None])
 
     def fill(self, ids: Any, past: Any, nstep: Any, timestep: Any) -> None:
-        """Write past targets, newest first, each held for nstep (k,) physics steps of timestep (k,) s; time is 0."""
+        """Write past targets, newest first, each held for nstep (k,) physics steps of timestep
+        (k,) s; time is 0.
+        """
         self.time[ids] = 0.0
         self.cursor[ids] = self._newest
         self.times[ids] = (-self.ago * timestep[:, None])[:, None]

@@ -1,4 +1,6 @@
-"""A compiled simulator with another simulator's gains, damping, friction, inertias, delay and mounting."""
+"""A compiled simulator with another simulator's gains, damping, friction, inertias, delay and
+mounting.
+"""
 
 from __future__ import annotations
 
@@ -16,22 +18,27 @@ from gaponet.sim.model import soften_table, stiffen_friction
 def changed_model(
     model: mujoco.MjModel, robot: RobotSpec, joint_names: tuple[str, ...], change: SimulatorChange
 ) -> mujoco.MjModel:
-    """Return a changed copy of the robot's compiled simulator. It equals a new compilation, and takes less time.
+    """Return a changed copy of the robot's compiled simulator.
+
+    It equals a new compilation, and takes less time.
 
     Args:
         model: Of `build_model`, with the joints of `joint_names`.
         change: For all joints of the robot, locked ones included.
 
     Raises:
-        UsageError: The change is for another number of joints, or delays servos in a model without buffers for it.
+        UsageError: The change is for another number of joints, or delays servos in a model without
+            buffers for it.
     """
     if not len(change.kp) == len(change.damping) == len(robot.joint_names):
         raise UsageError(
-            f"the changed simulator has {len(change.kp)} joints, {robot.name} has {len(robot.joint_names)}"
+            f"the changed simulator has {len(change.kp)} joints, {robot.name} has "
+            f"{len(robot.joint_names)}"
         )
     if change.delay and not model.nhistory:
         raise UsageError(
-            f"{robot.name}: this model has no buffer for servos that are later by {change.delay:g} s"
+            f"{robot.name}: this model has no buffer for servos that are later by "
+            f"{change.delay:g} s"
         )
     joints = robot.index(joint_names)
     kp = np.array(change.kp)[joints]

@@ -1,11 +1,13 @@
 """Context: how a simulator answers fixed probes. It tells a network which simulator this is.
 
-The robot rests at home. A null probe leaves the targets there. Another probe moves the target of one joint by
-PROBE_RAD. Each joint has eight values: the answer to the null probe, and the difference that its own probe makes, each
-as position (rad) and velocity times the control period (rad), after READ_AFTER_S.
+The robot rests at home. A null probe leaves the targets there. Another probe moves the target of
+one joint by PROBE_RAD. Each joint has eight values: the answer to the null probe, and the
+difference that its own probe makes, each as position (rad) and velocity times the control period
+(rad), after READ_AFTER_S.
 
-This is the branch input of a DeepONet (Lu et al. 2021): the input function, here the response of the simulator, at
-fixed sensors. It is measured once per simulator and is constant while the network runs.
+This is the branch input of a DeepONet (Lu et al. 2021): the input function, here the response of
+the simulator, at fixed sensors. It is measured once per simulator and is constant while the network
+runs.
 """
 
 from __future__ import annotations
@@ -33,8 +35,8 @@ def contexts(
         robot: The simulator.
         conditions: Simulations.
         nthread: Threads, 0 for all cores.
-        loaded: The hands carry the payload of the condition. Otherwise they are empty, for a network that is told the
-            payload.
+        loaded: The hands carry the payload of the condition. Otherwise they are empty, for a
+            network that is told the payload.
 
     Returns:
         (conditions, 8n) float32, rad. The joint varies fastest.
@@ -68,7 +70,9 @@ def _of_simulators(robot: RobotSpec, conditions: list[Condition], nthread: int) 
 
 
 def scene_context(scene: mujoco.MjModel, robot: RobotSpec, dt: float, prefix: str = "") -> Array:
-    """Measure the answers of a robot in a scene, (8n) rad. Contacts are off, and all other bodies start as compiled.
+    """Measure the answers of a robot in a scene, (8n) rad.
+
+    Contacts are off, and all other bodies start as compiled.
 
     Args:
         scene: With a position actuator on each operated joint.
@@ -111,7 +115,9 @@ def scene_context(scene: mujoco.MjModel, robot: RobotSpec, dt: float, prefix: st
 
 
 def _probe_targets(home: Array, operated: Array, limits: Array) -> tuple[Array, Array]:
-    """Return the targets of all probes, (1 + n, joints) rad, and the direction of each joint's own, (n) ±1."""
+    """Return the targets of all probes, (1 + n, joints) rad, and the direction of each joint's
+    own, (n) ±1.
+    """
     towards = np.where(home + PROBE_RAD <= limits[:, 1], 1.0, -1.0)[operated]
     targets = np.tile(home, (1 + len(operated), 1))  # the first is the null probe
     for probe, joint in enumerate(operated):
@@ -125,8 +131,8 @@ def _answers(
     """Return the answers (simulators, 8n) float32 of simulations under all probes.
 
     Args:
-        step: Simulates one control period, and returns positions relative to home and velocities, each
-            (simulators · (1 + n), joints), rad and rad/s.
+        step: Simulates one control period, and returns positions relative to home and velocities,
+            each (simulators · (1 + n), joints), rad and rad/s.
         dt: Control period, s.
         operated: Operated joints among these, (n).
         towards: Direction of each joint's own probe, (n) ±1.

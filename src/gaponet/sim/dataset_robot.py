@@ -14,8 +14,8 @@ def dataset_robot(data: Dataset, run: Path | None = None) -> RobotSpec:
     """Return a dataset's robot with the gains that all its recordings state.
 
     Args:
-        run: Run or robot folder that is used with the dataset. Its robot is used if the dataset stores none, and the
-            gains of the dataset's robot.toml if it was fitted with them.
+        run: Run or robot folder that is used with the dataset. Its robot is used if the dataset
+            stores none, and the gains of the dataset's robot.toml if it was fitted with them.
     """
     own: RobotSpec | None = None
     if run is not None and (run / "robot.toml").is_file():
@@ -24,10 +24,8 @@ def dataset_robot(data: Dataset, run: Path | None = None) -> RobotSpec:
         own = load_stored_robot(run, data.robot_name)
         if not has_stored_robot(data.path):
             return own
-    robot, gains = (
-        load_stored_robot(data.path, data.robot_name),
-        {e.meta.recorded_gains for e in data.entries},
-    )
+    robot = load_stored_robot(data.path, data.robot_name)
+    gains = {e.meta.recorded_gains for e in data.entries}
     recorded = robot.with_gains(*gains.pop()) if len(gains) == 1 else robot
     if recorded is robot or own is None:
         return recorded
@@ -47,7 +45,8 @@ def open_dataset(
     robot: RobotSpec | str | Path | None = None,
     run: str | Path | None = None,
 ) -> tuple[Dataset, RobotSpec]:
-    """Open a dataset for reading; return it and its robot, with the gains that all recordings state.
+    """Open a dataset for reading; return it and its robot, with the gains that all recordings
+    state.
 
     Args:
         dataset: Folder.
@@ -57,8 +56,8 @@ def open_dataset(
     Raises:
         DatasetError: There is no dataset, or it is damaged.
 
-    Datasets written before November 2026 have no robot folder. For those the run's robot is used, or else the robot of
-    that name in the package, with a warning in the log.
+    Datasets written before November 2026 have no robot folder. For those the run's robot is used,
+    or else the robot of that name in the package, with a warning in the log.
     """
     data = dataset if isinstance(dataset, Dataset) else Dataset(dataset)
     if robot is not None:

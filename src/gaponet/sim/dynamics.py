@@ -17,22 +17,30 @@ CUTOFF_HZ = 6.0  # Hz: above the joints' bandwidth, below encoder steps at 50 Hz
 
 
 def inverse_dynamics(model: mujoco.MjModel, qpos: Array, qvel: Array, qacc: Array) -> Array:
-    """Return the torque of every joint by inertia, armature, Coriolis, gravity, damping and springs.
+    """Return the torque of every joint by inertia, armature, Coriolis, gravity, damping and
+    springs.
 
     Args:
         model: Nominal simulator with its payload (sim.model.build_model).
         qpos, qvel, qacc: (T, n), rad, rad/s, rad/s².
 
     Returns:
-        (T, n), N·m, without limits, contacts and joint friction, which at rest is anything up to its limit.
+        (T, n), N·m, without limits, contacts and joint friction, which at rest is anything up to
+        its limit.
     """
     data = mujoco.MjData(model)
     flags = model.opt.disableflags
     model.opt.disableflags = flags | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
     tau = np.empty(np.shape(qpos))
-    q, v, a, out = data.qpos, data.qvel, data.qacc, data.qfrc_inverse  # views, looked up once
+    # views, looked up once
+    q = data.qpos
+    v = data.qvel
+    a = data.qacc
+    out = data.qfrc_inverse
     for t in range(len(tau)):
-        q[:], v[:], a[:] = qpos[t], qvel[t], qacc[t]
+        q[:] = qpos[t]
+        v[:] = qvel[t]
+        a[:] = qacc[t]
         mujoco.mj_inverse(model, data)
         tau[t] = out
     model.opt.disableflags = flags
@@ -46,7 +54,9 @@ def static_torque(model: mujoco.MjModel, qpos: Array) -> Array:
 
 
 def gravity_of(robot: RobotSpec) -> Callable[[Array, float, str], Array]:
-    """Return the static torque by postures, payload mass and side (data/offsets.py); it can be pickled."""
+    """Return the static torque by postures, payload mass and side (data/offsets.py); it can be
+    pickled.
+    """
     return partial(_gravity, dynamics_of(robot))
 
 
@@ -81,7 +91,9 @@ def _dynamics(
 
 
 def tips_of(robot: RobotSpec) -> Callable[[Array], Array] | None:
-    """Return the height of the lowest tip by postures (k, n), (k,) m; None if robot.toml names no tip."""
+    """Return the height of the lowest tip by postures (k, n), (k,) m; None if robot.toml names no
+    tip.
+    """
     if not robot.tips:
         return None
     return partial(
@@ -90,9 +102,13 @@ def tips_of(robot: RobotSpec) -> Callable[[Array], Array] | None:
 
 
 def _lowest_tip(model: mujoco.MjModel, tips: tuple[Tip, ...], postures: Array) -> Array:
-    data, height = mujoco.MjData(model), np.full(len(postures), np.inf)
+    data = mujoco.MjData(model)
+    height = np.full(len(postures), np.inf)
     at = [(model.body(tip.body).id, np.array(tip.pos), tip.radius) for tip in tips]
-    qpos, xpos, xmat = data.qpos, data.xpos, data.xmat  # views, looked up once
+    # views, looked up once
+    qpos = data.qpos
+    xpos = data.xpos
+    xmat = data.xmat
     for t, row in enumerate(postures):
         qpos[:] = row
         mujoco.mj_kinematics(model, data)

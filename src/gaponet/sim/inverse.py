@@ -1,9 +1,10 @@
-"""Inverse of a simulator: position targets, held for a control period, that move it along a given motion.
+"""Inverse of a simulator: position targets, held for a control period, that move it along a given
+motion.
 
 The mean torque of a period is inverse dynamics at its mean
 acceleration and at the mean state before its physics steps. A position actuator gives the mean of
-kp·(u + offset − q) − kd·v over the physics steps, each within the motor's limits. The remaining error is the variation
-of torques within a period.
+kp·(u + offset − q) − kd·v over the physics steps, each within the motor's limits. The remaining
+error is the variation of torques within a period.
 """
 
 from __future__ import annotations
@@ -20,8 +21,10 @@ from gaponet.robot.servo_fields import SERVO_TERMS
 from gaponet.sim.batch import Batch, BatchSim
 from gaponet.sim.servo import friction_limit, present, torque_range
 
-# Agreement of two simulators: largest difference of targets, and number of random motions that are compared.
-MAX_TARGET_DIFFERENCE_RAD, COMPARED_MOTIONS = 1e-4, 32
+# Agreement of two simulators: largest difference of targets, and number of random motions that are
+# compared.
+MAX_TARGET_DIFFERENCE_RAD = 1e-4
+COMPARED_MOTIONS = 32
 
 
 @dataclass(frozen=True)
@@ -31,8 +34,8 @@ class Period:
     Attributes:
         qpos, qvel: At its start, rad, rad/s.
         next_qpos, next_qvel: At its end.
-        friction: Friction against each joint's motion at the end over its limit, in [−1, 1]; of a joint at rest, its
-            place in the friction band.
+        friction: Friction against each joint's motion at the end over its limit, in [−1, 1]; of a
+            joint at rest, its place in the friction band.
     """
 
     qpos: Array
@@ -48,12 +51,13 @@ class Inertia:
     def __init__(self, batch: Batch, model: mujoco.MjModel, dof: Array) -> None:
         place = np.full(model.nv, -1)
         place[dof] = np.arange(len(dof))
-        row = place[
-            np.repeat(np.arange(model.nv), model.M_rownnz)
-        ]  # MuJoCo keeps the lower triangle, row by row
+        # MuJoCo keeps the lower triangle, row by row
+        row = place[np.repeat(np.arange(model.nv), model.M_rownnz)]
         column = place[model.M_colind]
         self._entries = np.flatnonzero((row >= 0) & (column >= 0))
-        self.row, self.column, self.n = row[self._entries], column[self._entries], len(dof)
+        self.row = row[self._entries]
+        self.column = column[self._entries]
+        self.n = len(dof)
         self.sparse: Array = batch.bind("M")
 
     def matrix(self, num: int) -> Array:
@@ -69,8 +73,10 @@ class AnalyticInverse:
     """Targets of position actuators along a motion, without contacts and joint limits.
 
     Attributes:
-        ahead: Number of control periods after the coming one that a call needs, because servos have a delay.
-        saturated: Joints whose motors cannot give the torque of the last period of a call, (num, n).
+        ahead: Number of control periods after the coming one that a call needs, because servos have
+            a delay.
+        saturated: Joints whose motors cannot give the torque of the last period of a call, (num,
+            n).
     """
 
     def __init__(
@@ -83,19 +89,21 @@ class AnalyticInverse:
     ) -> None:
         """
         Args:
-            batch: Simulations to compute in, one per robot, with `model`; payloads may differ. Nothing else may use
-                them.
+            batch: Simulations to compute in, one per robot, with `model`; payloads may differ.
+                Nothing else may use them.
             nstep, timestep: Physics steps per control period, their length in s; (num,) each.
 
         Raises:
             UsageError: A joint without exactly one position actuator.
         """
-        self.batch, self.num = batch, batch.nsim
+        self.batch = batch
+        self.num = batch.nsim
         self.at = np.array([model.joint(name).qposadr[0] for name in joints])
         self.dof = np.array([model.joint(name).dofadr[0] for name in joints])
         act = np.array([_position_actuator(model, name) for name in joints])
         bias = _own(batch, model, "actuator_biasprm")[:, act]
-        self.kp, self.kd = _own(batch, model, "actuator_gainprm")[:, act, 0], -bias[..., 2]
+        self.kp = _own(batch, model, "actuator_gainprm")[:, act, 0]
+        self.kd = -bias[..., 2]
         self.offset = bias[..., 0] / self.kp
         self.delay = _own(batch, model, "actuator_delay")[:, act]
         self.low, self.high = _most_torque(model, joints, act)
@@ -105,10 +113,10 @@ class AnalyticInverse:
         self.terms = present(
             dict(zip(SERVO_TERMS, model.actuator_user[act].T, strict=True)) if has_terms else {}
         )
-        self.explicit = (
-            model.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER
-        )  # kd takes the speed before the step
-        self.h, self.dt = timestep[:, None], (nstep * timestep)[:, None]
+        # kd takes the speed before the step
+        self.explicit = model.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER
+        self.h = timestep[:, None]
+        self.dt = (nstep * timestep)[:, None]
         self.ahead = int(np.ceil((self.delay / self.dt).max() - 1e-9))
         before, speeds = zip(
             *(self.within_period(int(n), int(nstep.max())) for n in nstep), strict=True
@@ -116,11 +124,12 @@ class AnalyticInverse:
         self.before, self.speeds = (
             np.array(x).transpose(1, 2, 0)[..., None] for x in (before, speeds)
         )
-        self.share = (
-            np.arange(nstep.max())[:, None] < nstep
-        ) / nstep  # of each physics step, (steps, num)
-        self.qpos, self.qvel = batch.bind("qpos"), batch.bind("qvel")
-        self.bias, self.passive = batch.bind("qfrc_bias"), batch.bind("qfrc_passive")
+        # of each physics step, (steps, num)
+        self.share = (np.arange(nstep.max())[:, None] < nstep) / nstep
+        self.qpos = batch.bind("qpos")
+        self.qvel = batch.bind("qvel")
+        self.bias = batch.bind("qfrc_bias")
+        self.passive = batch.bind("qfrc_passive")
         self.inertia = Inertia(batch, model, self.dof)
         self.saturated = np.zeros((self.num, len(joints)), bool)
 
@@ -133,7 +142,8 @@ class AnalyticInverse:
 
     def set_state(self, data: mujoco.MjData) -> None:
         """Copy positions and velocities of a scene, (nq,) rad and (nv,) rad/s."""
-        self.qpos[:], self.qvel[:] = data.qpos, data.qvel
+        self.qpos[:] = data.qpos
+        self.qvel[:] = data.qvel
 
     def __call__(self, periods: ListOf[Period]) -> Array:
         """Return the targets to send, (num, n) rad, not limited to any range.
@@ -151,23 +161,28 @@ class AnalyticInverse:
         return delayed
 
     def targets_in_force(self, period: Period) -> Array:
-        """Return the targets that must be in force in a period, (num, n) rad, not limited to any range."""
-        displacement, gain = period.next_qpos - period.qpos, period.next_qvel - period.qvel
+        """Return the targets that must be in force in a period, (num, n) rad, not limited to any
+        range.
+        """
+        displacement = period.next_qpos - period.qpos
+        gain = period.next_qvel - period.qvel
         ends = np.stack([self.h * period.qvel, self.h * period.next_qvel, displacement])
-        qpos = period.qpos + np.einsum(
-            "ibkx,bkj->ikj", self.before, ends
-        )  # at which physics steps begin
+        # at which physics steps begin
+        qpos = period.qpos + np.einsum("ibkx,bkj->ikj", self.before, ends)
         before = np.einsum("ibkx,bkj->ikj", self.speeds, ends) / self.h
         after = before[1:]
         mean = self._mean
         torque = self._torque(mean(qpos), mean(before[:-1]), gain / self.dt, period.friction)
         torque += self.damping * (mean(after) - mean(before[:-1]))
         back = self.kp * (qpos - self.offset) + self.kd * (before[:-1] if self.explicit else after)
-        low, high = self.low, self.high
-        mean_low, mean_high = low, high
+        low = self.low
+        high = self.high
+        mean_low = low
+        mean_high = high
         if (no_load := self.terms.get("no_load_speed")) is not None:
             low, high = torque_range(self.high, before[:-1] / no_load)
-            mean_low, mean_high = mean(low), mean(high)
+            mean_low = mean(low)
+            mean_high = mean(high)
         self.saturated = (torque < mean_low) | (torque > mean_high)
         return self._targets(np.clip(torque, mean_low, mean_high), back, low, high)
 
@@ -177,8 +192,9 @@ class AnalyticInverse:
         return mean
 
     def _targets(self, torque: Array, back: Array, low: Array, high: Array) -> Array:
-        """Return targets u (num, n) for which the mean over steps of kp·u − back, (steps, num, n), within the motors'
-        limits, (n,) or (steps, num, n), is torque (num, n)."""
+        """Return targets u (num, n) for which the mean over steps of kp·u − back, (steps, num, n),
+        within the motors' limits, (n,) or (steps, num, n), is torque (num, n).
+        """
         mean = self._mean
         out = (torque + mean(back)) / self.kp
         for _ in range(len(back)):
@@ -192,7 +208,8 @@ class AnalyticInverse:
         return result
 
     def _torque(self, qpos: Array, qvel: Array, qacc: Array, friction: Array) -> Array:
-        self.qpos[:, self.at], self.qvel[:, self.dof] = qpos, qvel
+        self.qpos[:, self.at] = qpos
+        self.qvel[:, self.dof] = qvel
         self.batch.forward(stage=mujoco.mjtStage.mjSTAGE_VEL.value)
         load = self.bias[:, self.dof]
         torque = (
@@ -206,10 +223,13 @@ class AnalyticInverse:
         return result
 
     def agrees_with(self, other: AnalyticInverse, limits: Array) -> bool:
-        """Return True if the inverses of two simulators of the same joints, limits (n, 2) rad, agree for any motion."""
+        """Return True if the inverses of two simulators of the same joints, limits (n, 2) rad,
+        agree for any motion.
+        """
         if self.ahead != other.ahead or not np.allclose(self.dt, other.dt):
             return False
-        rng, n = np.random.default_rng(0), len(limits)
+        rng = np.random.default_rng(0)
+        n = len(limits)
         for _ in range(COMPARED_MOTIONS):
             low, high = np.clip(limits, -np.pi, np.pi).T
             q = low + (high - low) * rng.random((1, n))
@@ -223,20 +243,22 @@ class AnalyticInverse:
 
     @staticmethod
     def within_period(count: int, rows: int) -> tuple[Array, Array]:
-        """Return positions before each of `count` physics steps of h, and speeds, from the states at a period's ends.
+        """Return positions before each of `count` physics steps of h, and speeds, from the states
+        at a period's ends.
 
         Speeds follow a parabola; MuJoCo's positions follow from the speeds after each step.
 
         Returns:
-            Weights of h·q̇ at the start, of h·q̇ at the end, and the way: of positions beyond the first, (rows, 3), and
-            of h·speeds from the first to that after the last step, (rows + 1, 3). Rows beyond the period are zero.
+            Weights of h·q̇ at the start, of h·q̇ at the end, and the way: of positions beyond the
+            first, (rows, 3), and of h·speeds from the first to that after the last step, (rows + 1,
+            3). Rows beyond the period are zero.
         """
         i = np.arange(count + 1.0)
-        shape = np.linalg.pinv(
-            [[count, count**2], [i.sum(), (i**2).sum()]]
-        )  # α, β of v = v_0 + α i + β i²
+        # α, β of v = v_0 + α i + β i²
+        shape = np.linalg.pinv([[count, count**2], [i.sum(), (i**2).sum()]])
         weights = shape @ [[-1.0, 1.0, 0.0], [-count, 0.0, 1.0]]
-        speeds, before = np.zeros((rows + 1, 3)), np.zeros((rows, 3))
+        speeds = np.zeros((rows + 1, 3))
+        before = np.zeros((rows, 3))
         speeds[: count + 1] = np.stack([i, i**2], axis=1) @ weights + [1.0, 0.0, 0.0]
         before[1:count] = speeds[1:count].cumsum(axis=0)
         return before, speeds
@@ -252,8 +274,10 @@ def _own(batch: Batch, model: mujoco.MjModel, name: str) -> Array:
 def _most_torque(model: mujoco.MjModel, joints: tuple[str, ...], actuators: Array) -> Array:
     """Return the least and the largest torque of motors, (2, n) N·m; ±inf without a limit."""
     at = np.array([model.joint(name).id for name in joints])
-    limits = [(model.actuator_forcelimited[actuators], model.actuator_forcerange[actuators]),
-              (model.jnt_actfrclimited[at], model.jnt_actfrcrange[at])]  # fmt: skip
+    limits = [
+        (model.actuator_forcelimited[actuators], model.actuator_forcerange[actuators]),
+        (model.jnt_actfrclimited[at], model.jnt_actfrcrange[at]),
+    ]
     low, high = zip(
         *(np.where(limited[:, None], both, [-np.inf, np.inf]).T for limited, both in limits),
         strict=True,
@@ -262,12 +286,15 @@ def _most_torque(model: mujoco.MjModel, joints: tuple[str, ...], actuators: Arra
 
 
 def _position_actuator(model: mujoco.MjModel, joint: str) -> int:
-    """Return the index of a joint's only actuator; refuses all but position actuators without gear and dynamics."""
+    """Return the index of a joint's only actuator; refuses all but position actuators without gear
+    and dynamics.
+    """
     of_joint = model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT
     mine = np.flatnonzero(of_joint & (model.actuator_trnid[:, 0] == model.joint(joint).id))
     if len(mine) != 1:
         raise UsageError(
-            f"joint '{joint}' has {len(mine)} actuators in the simulator; there must be one, position"
+            f"joint '{joint}' has {len(mine)} actuators in the simulator; there must be one, "
+            "position"
         )
     i = int(mine[0])
     kinds = (model.actuator_gaintype[i], model.actuator_biastype[i], model.actuator_dyntype[i])
@@ -284,6 +311,7 @@ def _position_actuator(model: mujoco.MjModel, joint: str) -> int:
         or model.actuator_gear[i, 0] != 1
     ):
         raise UsageError(
-            f"joint '{joint}': its actuator is no position actuator (<position>, gear 1) in the simulator"
+            f"joint '{joint}': its actuator is no position actuator (<position>, gear 1) in the "
+            "simulator"
         )
     return i

@@ -1,8 +1,9 @@
 """Masses, centres of mass and inertias of a robot's links in log-Cholesky coordinates.
 
-A link's pseudo-inertia P (4 × 4: second moments, first moment and mass) becomes U P Uᵀ with an upper triangular U: it
-scales the link's mass, and stretches, shears and shifts where the mass is. Its 10 log-Cholesky coordinates are zero for
-the robot's file and keep every link physical (Rucker and Wensing 2022). They have a Gaussian prior around zero.
+A link's pseudo-inertia P (4 × 4: second moments, first moment and mass) becomes U P Uᵀ with an
+upper triangular U: it scales the link's mass, and stretches, shears and shifts where the mass is.
+Its 10 log-Cholesky coordinates are zero for the robot's file and keep every link physical (Rucker
+and Wensing 2022). They have a Gaussian prior around zero.
 """
 
 from __future__ import annotations
@@ -18,31 +19,34 @@ from gaponet.robot.spec import Link, RobotSpec
 from gaponet.sim.model import build_model, principal_axes
 
 COORDINATES = 10  # of a link: log of mass, of stretches (3), shears (3) and shifts (3)
-MASS_LOG_STD, STRETCH_STD, SHIFT_STD = (
-    np.log(1.3),
-    0.15,
-    0.15,
-)  # of the prior; shifts relative to the link's length
+# of the prior; shifts relative to the link's length
+MASS_LOG_STD = np.log(1.3)
+STRETCH_STD = 0.15
+SHIFT_STD = 0.15
 MIN_LENGTH_M = 0.02
 MAX_STD_SHARE = 0.7  # of the prior's; a value with more is not determined
 
 
 class LinkAxes:
-    """Coordinates of links, in standard deviations of their prior, (…, L · COORDINATES); zero is the robot's file.
+    """Coordinates of links, in standard deviations of their prior, (…, L · COORDINATES); zero is
+    the robot's file.
 
-    A link is a body with a joint and those that are welded to it, without payloads. `names` are those of the bodies
-    with joints, `bodies` those of all; `scale` are the standard deviations of the prior, (L, COORDINATES).
+    A link is a body with a joint and those that are welded to it, without payloads. `names` are
+    those of the bodies with joints, `bodies` those of all; `scale` are the standard deviations of
+    the prior, (L, COORDINATES).
     """
 
     def __init__(self, robot: RobotSpec) -> None:
-        self._robot, model = robot, build_model(replace(robot, table=None))
+        self._robot = robot
+        model = build_model(replace(robot, table=None))
         data = mujoco.MjData(model)
         data.qpos[:] = model.qpos0
         mujoco.mj_kinematics(model, data)
-        self._bodies: list[
-            list[tuple[str, Array, Array]]
-        ] = []  # of each link: body, its frame in the link's, P
-        self.names, scale, self._arms = list[str](), list[Array](), list[Array]()
+        # of each link: body, its frame in the link's, P
+        self._bodies: list[list[tuple[str, Array, Array]]] = []
+        self.names = list[str]()
+        scale = list[Array]()
+        self._arms = list[Array]()
         for root in range(1, model.nbody):
             if model.body_weldid[root] == root and model.body_jntnum[root]:
                 welded = np.flatnonzero(
@@ -59,7 +63,9 @@ class LinkAxes:
         self.bodies = tuple(name for members in self._bodies for name, _, _ in members)
 
     def links(self, x: Array) -> dict[str, Link]:
-        """Return the bodies of links that x (L · COORDINATES,) changes, and those that the robot already has."""
+        """Return the bodies of links that x (L · COORDINATES,) changes, and those that the robot
+        already has.
+        """
         links = dict(self._robot.links)
         for own, bodies in zip(x.reshape(-1, COORDINATES) * self.scale, self._bodies, strict=True):
             if own.any():
@@ -69,7 +75,9 @@ class LinkAxes:
         return links
 
     def inertials(self, x: Array) -> Array:
-        """Return mass, centre of mass, principal inertia and its quaternion as MuJoCo has them, (bodies, 11)."""
+        """Return mass, centre of mass, principal inertia and its quaternion as MuJoCo has them,
+        (bodies, 11).
+        """
         links = self.links(np.where(x == 0, 1e-12, x))  # of all bodies, those of the file too
         each = [links[name] for name in self.bodies]
         return np.array(
@@ -77,13 +85,16 @@ class LinkAxes:
         )
 
     def moments(self, x: Array) -> Array:
-        """Return mass, kg, centre of mass, m from the file's, and moment about the joint, kg·m, (L, 7); body's axes."""
+        """Return mass, kg, centre of mass, m from the file's, and moment about the joint, kg·m,
+        (L, 7); body's axes.
+        """
         rows = []
         for own, bodies, arm in zip(
             x.reshape(-1, COORDINATES) * self.scale, self._bodies, self._arms, strict=True
         ):
             p = _upper(own) @ sum(p for _, _, p in bodies) @ _upper(own).T
-            mass, centre = p[3, 3], p[:3, 3] / p[3, 3]
+            mass = p[3, 3]
+            centre = p[:3, 3] / p[3, 3]
             rows.append([mass, *centre, *mass * (arm + centre)])
         return np.array(rows)
 
@@ -95,11 +106,15 @@ def _centre(model: mujoco.MjModel, data: mujoco.MjData, own: list[int]) -> Array
 def _members(
     model: mujoco.MjModel, data: mujoco.MjData, root: int, own: list[int]
 ) -> list[tuple[str, Array, Array]]:
-    """Return name, frame (4, 4) and pseudo-inertia of bodies, about their common centre of mass in the axes of root."""
+    """Return name, frame (4, 4) and pseudo-inertia of bodies, about their common centre of mass in
+    the axes of root.
+    """
     centre = _centre(model, data, own)
-    turn, members = data.xmat[root].reshape(3, 3), []
+    turn = data.xmat[root].reshape(3, 3)
+    members = []
     for b in own:
-        frame, inertial = np.eye(4), np.eye(4)
+        frame = np.eye(4)
+        inertial = np.eye(4)
         frame[:3, :3], frame[:3, 3] = (
             turn.T @ data.xmat[b].reshape(3, 3),
             turn.T @ (data.xpos[b] - centre),
@@ -108,14 +123,17 @@ def _members(
             turn.T @ data.ximat[b].reshape(3, 3),
             turn.T @ (data.xipos[b] - centre),
         )
-        moments, mass = model.body_inertia[b], model.body_mass[b]
+        moments = model.body_inertia[b]
+        mass = model.body_mass[b]
         second = np.diag([*(moments.sum() / 2 - moments), mass])
         members.append((model.body(b).name, frame, inertial @ second @ inertial.T))
     return members
 
 
 def _prior_std(model: mujoco.MjModel, data: mujoco.MjData, root: int) -> Array:
-    """Return the standard deviations of a link's coordinates; its length is that to its centre or next joint."""
+    """Return the standard deviations of a link's coordinates; its length is that to its centre or
+    next joint.
+    """
     own = model.body_weldid == root
     others = [
         data.xpos[b] for b in range(1, model.nbody) if own[model.body_parentid[b]] and not own[b]
@@ -139,9 +157,8 @@ def _link(p: Array, frame: Array) -> Link:
     p = back @ p @ back.T
     centre = p[:3, 3] / p[3, 3]
     second = p[:3, :3] - p[3, 3] * np.outer(centre, centre)
-    second += (
-        1e-6 * np.trace(second) * np.eye(3)
-    )  # a flat link stays physical when its numbers are rounded
+    # a flat link stays physical when its numbers are rounded
+    second += 1e-6 * np.trace(second) * np.eye(3)
     inertia = np.trace(second) * np.eye(3) - second
     numbers = [
         float(f"{v:.9g}")
@@ -152,18 +169,21 @@ def _link(p: Array, frame: Array) -> Link:
 
 @dataclass(frozen=True)
 class LinkResult:
-    """Fitted coordinates x (L · COORDINATES,) of links, their covariance, and values (n,) of the servos beside them."""
+    """Fitted coordinates x (L · COORDINATES,) of links, their covariance, and values (n,) of the
+    servos beside them.
+    """
 
     axes: LinkAxes
     x: Array
     covariance: Array
     values: dict[str, Array]
-    servo_slopes: dict[str, Array] = field(
-        default_factory=dict
-    )  # field → its change for one of x, (n, Q)
+    # field → its change for one of x, (n, Q)
+    servo_slopes: dict[str, Array] = field(default_factory=dict)
 
     def moments(self) -> tuple[Array, Array, Array, Array]:
-        """Return `LinkAxes.moments` before and now, their standard errors now and by the prior alone, (L, 7) each."""
+        """Return `LinkAxes.moments` before and now, their standard errors now and by the prior
+        alone, (L, 7) each.
+        """
         step = 1e-4
         now = self.axes.moments(self.x)
         ahead = [self.axes.moments(self.x + step * row) for row in np.eye(len(self.x))]
@@ -177,7 +197,9 @@ class LinkResult:
         )
 
     def sentences(self) -> list[str]:
-        """Return what is known of each link that changed, ± standard errors, and what is not determined."""
+        """Return what is known of each link that changed, ± standard errors, and what is not
+        determined.
+        """
         sentences = []
         for k, (name, before, now, std, prior) in enumerate(
             zip(self.axes.names, *self.moments(), strict=True)

@@ -1,7 +1,7 @@
 """Metrics of a simulator's rollouts against recordings, by joint, motion, payload and horizon.
 
-e = q_sim − q_real after each step, operated joints only. A motion counts as one whatever its length; a group's
-number is the mean over its sequences.
+e = q_sim − q_real after each step, operated joints only. A motion counts as one whatever its
+length; a group's number is the mean over its sequences.
 """
 
 from __future__ import annotations
@@ -28,13 +28,17 @@ _Row = dict[str, float]  # metrics of a sequence, or their means
 
 
 def standard_error(values: Array | ListOf[float]) -> float:
-    """Return the standard error of the mean of values by motion, or of paired differences; nan for a single one."""
+    """Return the standard error of the mean of values by motion, or of paired differences; nan for
+    a single one.
+    """
     values = np.asarray(values)
     return float(values.std(ddof=1) / np.sqrt(len(values))) if len(values) > 1 else float("nan")
 
 
 def by_motion(metas: Iterable[SequenceMeta], values: Array) -> Array:
-    """Return the mean of values (recordings,) over the recordings of each independent motion, (motions,)."""
+    """Return the mean of values (recordings,) over the recordings of each independent motion,
+    (motions,).
+    """
     names = np.array([m.independent_motion for m in metas])
     return np.array([values[names == name].mean() for name in dict.fromkeys(names.tolist())])
 
@@ -42,13 +46,17 @@ def by_motion(metas: Iterable[SequenceMeta], values: Array) -> Array:
 def mean_reduction(
     metas: Iterable[SequenceMeta], before: Array, after: Array
 ) -> tuple[float, float]:
-    """Return the mean of before − after, (recordings,) each, and its standard error over independent motions."""
+    """Return the mean of before − after, (recordings,) each, and its standard error over
+    independent motions.
+    """
     reduction = before - after
     return float(reduction.mean()), standard_error(by_motion(metas, reduction))
 
 
 def confidence_factor(freedom: int) -> float:
-    """Return the standard errors that a mean with so many degrees of freedom needs to be significant (Student's t)."""
+    """Return the standard errors that a mean with so many degrees of freedom needs to be
+    significant (Student's t).
+    """
     from scipy.special import stdtrit
 
     return float(stdtrit(freedom, CONFIDENCE))
@@ -59,8 +67,8 @@ class Comparison:
     """A candidate against another one by the errors of the motions that judge, (motions,) rad.
 
     Attributes:
-        equally_complex: True if the candidate has no more parameters than the other one, so that a smaller mean error
-            is enough.
+        equally_complex: True if the candidate has no more parameters than the other one, so that a
+            smaller mean error is enough.
     """
 
     name: str
@@ -76,19 +84,22 @@ class Comparison:
 
     @property
     def harmful(self) -> bool:
-        """True if the mean error rises by more than its paired standard error and by 1 %; of fewer than three motions,
-        by 10 %."""
+        """True if the mean error rises by more than its paired standard error and by 1 %; of fewer
+        than three motions, by 10 %.
+        """
         gain, error = self.gain
         least = MIN_RELATIVE_GAIN if len(self.before) > 2 else MIN_RELATIVE_GAIN_ONE_MOTION
         return bool(gain < -max(np.nan_to_num(error), least * self.before.mean()))
 
     @property
     def accepted(self) -> bool:
-        """True if the mean error falls by more than 1 % and the paired relative gain exceeds one standard error
-        (Student's t); of a single motion by more than 10 %."""
+        """True if the mean error falls by more than 1 % and the paired relative gain exceeds one
+        standard error (Student's t); of a single motion by more than 10 %.
+        """
         if self.equally_complex:
             return self.gain[0] > 0
-        freedom, least = len(self.before) - 1, MIN_RELATIVE_GAIN
+        freedom = len(self.before) - 1
+        least = MIN_RELATIVE_GAIN
         if not freedom:
             least = MIN_RELATIVE_GAIN_ONE_MOTION
         relative = (self.before - self.after) / np.maximum(self.before + self.after, 1e-12)
@@ -100,7 +111,9 @@ class Comparison:
 
 @dataclass(frozen=True)
 class Run:
-    """One simulated sequence beside its recording: real and sim positions of the operated joints, (T, n) rad."""
+    """One simulated sequence beside its recording: real and sim positions of the operated joints,
+    (T, n) rad.
+    """
 
     meta: SequenceMeta
     dt: float
@@ -126,7 +139,9 @@ class Run:
         return [i for i in self.recorded if columns is None or i in columns]
 
     def mean_error(self, columns: list[int] | None = None) -> float:
-        """Return the mean |e| over the columns, out of these (None: all), that the recording holds, rad."""
+        """Return the mean |e| over the columns, out of these (None: all), that the recording
+        holds, rad.
+        """
         return float(np.abs(self.error[:, self.holds(columns)].astype(float)).mean())
 
 
@@ -136,7 +151,8 @@ def runs(sequences: ListOf[Sequence], simulated: ListOf[Array], robot: RobotSpec
 
 
 def summary(part: Iterable[Run], robot: RobotSpec) -> dict[str, Any]:
-    """All metrics of a method: totals, and by joint, motion, payload, unit and horizon; one run in memory at a time.
+    """All metrics of a method: totals, and by joint, motion, payload, unit and horizon; one run in
+    memory at a time.
 
     Joints that no recording holds are left out of by_joint.
     """
@@ -160,7 +176,9 @@ def summary(part: Iterable[Run], robot: RobotSpec) -> dict[str, Any]:
 
 
 def _grouped_rows(run: Run, robot: RobotSpec) -> Iterator[tuple[str, str, list[_Row]]]:
-    """Yield groups, a run's name in each, and its metrics there: one row, or none if it holds no such joint."""
+    """Yield groups, a run's name in each, and its metrics there: one row, or none if it holds no
+    such joint.
+    """
     meta = run.meta
     whole = _row(run)
     # The paper's figure 3 is without wrists.
@@ -182,9 +200,10 @@ def metrics(part: ListOf[Run], columns: list[int] | None = None) -> dict[str, fl
     """Metrics averaged over sequences, over all joints or over some columns.
 
     Returns:
-        mpjae rad, rmse rad, q_dis rad·s (Δt Σ|e| per joint), static and dynamic rad (the median error; the rest),
-        iqr and range of |e| rad, large_0.05 … shares of |e| beyond a threshold, correlation, cosine, mape % (those that
-        SAGE and the paper report, tables show the first few).
+        mpjae rad, rmse rad, q_dis rad·s (Δt Σ|e| per joint), static and dynamic rad (the median
+        error; the rest), iqr and range of |e| rad, large_0.05 … shares of |e| beyond a threshold,
+        correlation, cosine, mape % (those that SAGE and the paper report, tables show the first
+        few).
     """
     return _mean([row for run in part for row in _row(run, columns)])
 
@@ -202,7 +221,8 @@ def _row(run: Run, columns: list[int] | None = None) -> list[_Row]:
         return []
     error = run.error[:, c].astype(float)
     size = np.abs(error)
-    real, sim = run.qpos_real[1:, c].astype(float), run.qpos_sim[1:, c].astype(float)
+    real = run.qpos_real[1:, c].astype(float)
+    sim = run.qpos_sim[1:, c].astype(float)
     low, high = np.percentile(size, [25, 75], axis=0)
     bias = np.median(error, axis=0)
     out = {
@@ -231,7 +251,9 @@ def _mean_correlation(real: Array, sim: Array) -> float:
 
 
 def _horizons(run: Run) -> _Row:
-    """Return the mean |error| at horizons after the start, over the last half of each, and over the whole motion."""
+    """Return the mean |error| at horizons after the start, over the last half of each, and over
+    the whole motion.
+    """
     error = np.abs(run.error[:, list(run.recorded)])
     errors = {}
     for name, seconds in zip(HORIZON_NAMES, HORIZONS_S, strict=False):

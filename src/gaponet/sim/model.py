@@ -29,9 +29,10 @@ if TYPE_CHECKING:
     from mujoco.batch import Batch
 
 
-# Joint friction loss is a soft constraint in MuJoCo: a joint that should stick creeps by (1 − d)·w·f/b rad/s, f the
-# torque it holds, b ≤ 500 1/s of solref, d ≤ 0.9999 of solimp and w the joint's mobility, dof_invweight0. A tenth of w
-# is the stiffest that the solver still meets at this tolerance.
+# Joint friction loss is a soft constraint in MuJoCo: a joint that should stick creeps by (1 −
+# d)·w·f/b rad/s, f the torque it holds, b ≤ 500 1/s of solref, d ≤ 0.9999 of solimp and w the
+# joint's mobility, dof_invweight0. A tenth of w is the stiffest that the solver still meets at this
+# tolerance.
 STIFF_SOLREF = (0.004, 1.0)
 STIFF_SOLIMP = (0.9999, 0.9999, 0.001, 0.5, 2.0)
 STIFF_MOBILITY = 0.1
@@ -51,16 +52,18 @@ def build_model(
 ) -> mujoco.MjModel:
     """Return the nominal simulator of a robot with a payload.
 
-    Position actuators with the gains and torque limits of `robot.toml` replace whatever actuators the MJCF has. Degrees
-    of freedom and actuators are in the order of `robot.joint_names`, without locked joints. The physics step is the
-    robot's, stretched a little where it does not divide dt.
+    Position actuators with the gains and torque limits of `robot.toml` replace whatever actuators
+    the MJCF has. Degrees of freedom and actuators are in the order of `robot.joint_names`, without
+    locked joints. The physics step is the robot's, stretched a little where it does not divide dt.
 
     Args:
         payload_mass: Mass in each hand named by `payload_side`, kg.
         payload_side: "both" (every mount), or the side of one mount.
         dt: Control period, s; default robot.dt.
-        locked: Joints clamped at home, without a degree of freedom (`idle_joints` finds those that change nothing).
-        physics_only: Leave out geoms that touch nothing and bodies that are locked to the world: faster, same motion.
+        locked: Joints clamped at home, without a degree of freedom (`idle_joints` finds those that
+            change nothing).
+        physics_only: Leave out geoms that touch nothing and bodies that are locked to the world:
+            faster, same motion.
 
     Raises:
         RobotError: The MJCF does not compile, or lacks a joint or body that robot.toml names.
@@ -71,8 +74,9 @@ def build_model(
     if model.nq != model.nv or model.nq != len(robot.joint_names) - len(locked):
         names = {j.name for j in spec.joints}
         raise RobotError(
-            f"{robot.mjcf}: has {model.nq} degrees of freedom ({', '.join(sorted(names))}), but robot.toml names "
-            f"{len(robot.joint_names)} hinge joints. Name each actuated joint once; weld or delete the others"
+            f"{robot.mjcf}: has {model.nq} degrees of freedom ({', '.join(sorted(names))}), but "
+            f"robot.toml names {len(robot.joint_names)} hinge joints. Name each actuated joint "
+            "once; weld or delete the others"
         )
     address = [model.joint(name).qposadr[0] for name in robot.joint_names if name not in locked]
     if address != list(range(model.nq)):
@@ -98,16 +102,17 @@ def build_spec(
     locked: tuple[str, ...] = (),
     physics_only: bool = False,
 ) -> mujoco.MjSpec:
-    """Return `build_model` before compilation, for a scene of several robots (report/view/scene.py)."""
+    """Return `build_model` before compilation, for a scene of several robots
+    (report/view/scene.py).
+    """
     spec = read_mjcf(robot.mjcf)
     names = sorted(j.name for j in spec.joints)
     if missing := [name for name in robot.joint_names if name not in names]:
         raise RobotError(
             f"{robot.mjcf}: robot.toml names joint '{missing[0]}', the MJCF has: {', '.join(names)}"
         )
-    spec.option.disableflags |= (
-        mujoco.mjtDisableBit.mjDSBL_ISLAND
-    )  # few joints, no contacts: islands cost more
+    # few joints, no contacts: islands cost more
+    spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_ISLAND
     period = robot.dt if dt is None else dt
     if not 0 < period <= 1:
         raise UsageError(
@@ -134,7 +139,8 @@ def build_spec(
 
 
 def idle_joints(robot: RobotSpec, moved: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the joints of limbs without a moving joint: on a fixed base they share no dynamics with the rest.
+    """Return the joints of limbs without a moving joint: on a fixed base they share no dynamics
+    with the rest.
 
     `moved` names the joints that a command moves, or holds away from home.
     """
@@ -151,9 +157,11 @@ def qpos_range(model: mujoco.MjModel) -> Array:
 
 
 def model_hash(robot: RobotSpec) -> str:
-    """Return 12 hex digits of the nominal simulator: every value of its compiled model that determines its motion.
+    """Return 12 hex digits of the nominal simulator: every value of its compiled model that
+    determines its motion.
 
-    Two robots with the same hash move the same, wherever their folders lie and however their MJCF is written.
+    Two robots with the same hash move the same, wherever their folders lie and however their MJCF
+    is written.
     """
     if "_model_hash" not in vars(robot):
         warm = [getattr(robot, name).tolist() for name in TERMS["temperature"]]
@@ -172,7 +180,8 @@ def model_hash(robot: RobotSpec) -> str:
 def require_stored_robot(
     holder: Path, robot: RobotSpec, error: type[GAPONetError], hint: str
 ) -> RobotSpec:
-    """Return the robot stored in a run or dataset; refuse `robot` if the nominal simulators differ, whatever the names.
+    """Return the robot stored in a run or dataset; refuse `robot` if the nominal simulators
+    differ, whatever the names.
 
     Args:
         holder: Run or dataset; `robot` itself is returned for one of a version that stored none.
@@ -190,12 +199,15 @@ def require_stored_robot(
 def require_same_robot(
     own: RobotSpec, robot: RobotSpec, folder: Path, error: type[GAPONetError], use: str
 ) -> RobotSpec:
-    """Return `own`, the robot in a folder, or raise `error` if it differs from `robot` before identification."""
-    ours, theirs = model_hash(own.before_identification), model_hash(robot.before_identification)
+    """Return `own`, the robot in a folder, or raise `error` if it differs from `robot` before
+    identification.
+    """
+    ours = model_hash(own.before_identification)
+    theirs = model_hash(robot.before_identification)
     if ours != theirs:
         raise error(
-            f"{folder}: its nominal simulator is {ours}, that of {robot.folder} is {theirs}: another robot, or other "
-            f"gains or inertias. Use {use}"
+            f"{folder}: its nominal simulator is {ours}, that of {robot.folder} is {theirs}: "
+            f"another robot, or other gains or inertias. Use {use}"
         )
     return own
 
@@ -213,10 +225,11 @@ def _set_joints(spec: mujoco.MjSpec, robot: RobotSpec) -> None:
         stops = unit * robot.stop_low[i], unit * robot.stop_high[i]
         if np.isfinite(stops).any():
             low, high = joint.range if joint.range[0] < joint.range[1] else (-np.inf, np.inf)
+            # a stop only narrows the range
             joint.range = [
                 np.fmax(low, stops[0]),
                 np.fmin(high, stops[1]),
-            ]  # a stop only narrows the range
+            ]
             joint.limited = True
         if np.isfinite(robot.damping[i]):
             joint.damping = np.concatenate(
@@ -239,18 +252,37 @@ def _set_links(spec: mujoco.MjSpec, robot: RobotSpec) -> None:
             raise RobotError(
                 f"{robot.mjcf}: an [identified_link] names body '{name}', which is missing"
             )
-        body.explicitinertial, body.mass, body.ipos = True, link.mass, link.pos
-        body.iquat, body.inertia, body.fullinertia = (1, 0, 0, 0), (0, 0, 0), link.inertia
+        body.explicitinertial = True
+        body.mass = link.mass
+        body.ipos = link.pos
+        body.iquat = (1, 0, 0, 0)
+        body.inertia = (0, 0, 0)
+        body.fullinertia = link.inertia
 
 
-# Fields of a model that follow from its links; body_sameframe is a shortcut for links whose centre is their origin.
-LINK_FIELDS = ("body_mass", "body_ipos", "body_inertia", "body_iquat", "body_sameframe", "body_subtreemass",
-               "body_invweight0", "dof_invweight0", "dof_M0", "tendon_invweight0", "pair_solref")  # fmt: skip
+# Fields of a model that follow from its links; body_sameframe is a shortcut for links whose centre
+# is their origin.
+LINK_FIELDS = (
+    "body_mass",
+    "body_ipos",
+    "body_inertia",
+    "body_iquat",
+    "body_sameframe",
+    "body_subtreemass",
+    "body_invweight0",
+    "dof_invweight0",
+    "dof_M0",
+    "tendon_invweight0",
+    "pair_solref",
+)
 
 
 def principal_axes(link: Link) -> tuple[Array, Array]:
-    """Return a link's principal moments of inertia, the largest first as compiled, and their axes as a quaternion."""
-    inertia, quat = np.array(link.inertia)[[0, 3, 4, 3, 1, 5, 4, 5, 2]].reshape(3, 3), np.zeros(4)
+    """Return a link's principal moments of inertia, the largest first as compiled, and their axes
+    as a quaternion.
+    """
+    inertia = np.array(link.inertia)[[0, 3, 4, 3, 1, 5, 4, 5, 2]].reshape(3, 3)
+    quat = np.zeros(4)
     axes = np.linalg.eigh(inertia)[1][:, ::-1].copy()
     axes[:, 0] *= np.sign(np.linalg.det(axes))
     mujoco.mju_mat2Quat(quat, axes.ravel())
@@ -258,17 +290,17 @@ def principal_axes(link: Link) -> tuple[Array, Array]:
 
 
 def with_links(model: mujoco.MjModel, robot: RobotSpec) -> mujoco.MjModel:
-    """Return a copy of a compiled model with the links of a robot, as if it were compiled with them."""
+    """Return a copy of a compiled model with the links of a robot, as if it were compiled with
+    them.
+    """
     model = copy.copy(model)
     for name, link in robot.links.items():
         if mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, name) < 0:
             continue  # of a locked limb
         body = model.body(name)
-        body.mass[:], body.ipos[:], (body.inertia[:], body.iquat[:]) = (
-            link.mass,
-            link.pos,
-            principal_axes(link),
-        )
+        body.mass[:] = link.mass
+        body.ipos[:] = link.pos
+        body.inertia[:], body.iquat[:] = principal_axes(link)
         model.body_sameframe[body.id] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
     mujoco.mj_setConst(model, mujoco.MjData(model))
     stiffen_friction(model)
@@ -291,13 +323,15 @@ def _add_actuators(spec: mujoco.MjSpec, robot: RobotSpec, locked: tuple[str, ...
         spec.delete(actuator)
     if robot.has_servo_model:
         spec.nuser_actuator = len(SERVO_TERMS)
-    # One buffer length at all control periods, so that models of one robot share a layout; none where nothing is late.
+    # One buffer length at all control periods, so that models of one robot share a layout; none
+    # where nothing is late.
     shortest = min(0.75 * robot.timestep, spec.option.timestep)
     samples = math.ceil(robot.delay.max() / shortest - 1e-9) + 1 if robot.delay.any() else 0
     for i, name in enumerate(robot.joint_names):
         if name in locked:
             continue
-        kp, limit = robot.kp[i], robot.effort_limit[i]
+        kp = robot.kp[i]
+        limit = robot.effort_limit[i]
         actuator = spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
         actuator.set_to_position(kp=kp, kv=robot.kd[i])
         actuator.biasprm[0] = kp * robot.offset[i]
@@ -306,7 +340,9 @@ def _add_actuators(spec: mujoco.MjSpec, robot: RobotSpec, locked: tuple[str, ...
         if robot.has_servo_model:
             actuator.userdata = [getattr(robot, term)[i] for term in SERVO_TERMS]
         if samples:
-            actuator.nsample, actuator.interp, actuator.delay = samples, 1, robot.delay[i]
+            actuator.nsample = samples
+            actuator.interp = 1
+            actuator.delay = robot.delay[i]
 
 
 def _add_payload(spec: mujoco.MjSpec, robot: RobotSpec, mass: float, side: str) -> None:
@@ -315,14 +351,16 @@ def _add_payload(spec: mujoco.MjSpec, robot: RobotSpec, mass: float, side: str) 
     sides = [m.side for m in robot.payload_mounts]
     if side != "both" and side not in sides:
         raise UsageError(
-            f"payload side '{side}' is unknown to {robot.name}; use both or one of {', '.join(sides)}"
+            f"payload side '{side}' is unknown to {robot.name}; use both or one of "
+            f"{', '.join(sides)}"
         )
     if mass and not sides:
         raise RobotError(
             f"{robot.name} has no [[payload_mount]]; add one to robot.toml to attach {mass} kg"
         )
     for mount in robot.payload_mounts:
-        # An empty hand carries a massless ball: all payloads share one MjData layout, so one Batch steps them together.
+        # An empty hand carries a massless ball: all payloads share one MjData layout, so one Batch
+        # steps them together.
         carried = mount.mass + (
             mass if robot.carries_payload and side in ("both", mount.side) else 0.0
         )
@@ -330,13 +368,18 @@ def _add_payload(spec: mujoco.MjSpec, robot: RobotSpec, mass: float, side: str) 
         parent = spec.body(mount.body)
         if parent is None:
             raise RobotError(
-                f"{robot.mjcf}: payload mount '{mount.side}' names body '{mount.body}', which is missing"
+                f"{robot.mjcf}: payload mount '{mount.side}' names body '{mount.body}', which is "
+                "missing"
             )
         body = parent.add_body(name=f"payload_{mount.side}", pos=mount.pos)
         body.add_geom(
-            type=mujoco.mjtGeom.mjGEOM_SPHERE, size=(radius, 0, 0), mass=carried, contype=0, conaffinity=0,
+            type=mujoco.mjtGeom.mjGEOM_SPHERE,
+            size=(radius, 0, 0),
+            mass=carried,
+            contype=0,
+            conaffinity=0,
             rgba=(0.8, 0.25, 0.2, 1),
-        )  # fmt: skip
+        )
 
 
 TABLE = "gaponet_table"
@@ -352,28 +395,44 @@ def _add_table(spec: mujoco.MjSpec, robot: RobotSpec) -> None:
     spec.option.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC  # a pyramid's stiffness depends on friction
     for geom in spec.geoms:
-        geom.contype, geom.conaffinity = 0, 0
+        geom.contype = 0
+        geom.conaffinity = 0
     for pair in list(spec.pairs):
         spec.delete(pair)
-    # With a contact type, because physics_only leaves out geoms without one; only the pairs below touch.
+    # With a contact type, because physics_only leaves out geoms without one; only the pairs below
+    # touch.
     spec.worldbody.add_geom(
-        name=TABLE, type=mujoco.mjtGeom.mjGEOM_PLANE, size=(SIZE, SIZE, 0.1), pos=(0, 0, robot.table.height),
-        contype=2, conaffinity=0, rgba=(0.55, 0.5, 0.45, 1),
-    )  # fmt: skip
+        name=TABLE,
+        type=mujoco.mjtGeom.mjGEOM_PLANE,
+        size=(SIZE, SIZE, 0.1),
+        pos=(0, 0, robot.table.height),
+        contype=2,
+        conaffinity=0,
+        rgba=(0.55, 0.5, 0.45, 1),
+    )
     for i, tip in enumerate(robot.tips):
         body = spec.body(tip.body)
         if body is None:
             raise RobotError(f"{robot.mjcf}: a [[tip]] names body '{tip.body}', which is missing")
         name = f"{TABLE}_tip_{i}"
         body.add_geom(
-            name=name, type=mujoco.mjtGeom.mjGEOM_SPHERE, size=(tip.radius, 0, 0), pos=tip.pos, mass=0.0,
-            contype=0, conaffinity=4, rgba=(0.3, 0.3, 0.3, 1),
-        )  # fmt: skip
+            name=name,
+            type=mujoco.mjtGeom.mjGEOM_SPHERE,
+            size=(tip.radius, 0, 0),
+            pos=tip.pos,
+            mass=0.0,
+            contype=0,
+            conaffinity=4,
+            rgba=(0.3, 0.3, 0.3, 1),
+        )
         slide = robot.table.friction
         spec.add_pair(
-            geomname1=name, geomname2=TABLE, condim=3, friction=(slide, slide, 0.005, 1e-4, 1e-4),
+            geomname1=name,
+            geomname2=TABLE,
+            condim=3,
+            friction=(slide, slide, 0.005, 1e-4, 1e-4),
             solimp=(IMPEDANCE, IMPEDANCE, 0.001, 0.5, 2.0),
-        )  # fmt: skip
+        )
 
 
 def soften_table(model: mujoco.MjModel, robot: RobotSpec) -> None:
@@ -385,7 +444,9 @@ def soften_table(model: mujoco.MjModel, robot: RobotSpec) -> None:
 def write_table(
     batch: Batch, model: mujoco.MjModel, height: Array, friction: Array, stiffness: Array
 ) -> None:
-    """Give every simulation of a batch a table of its own, (nsim,) m, 1 and N/m; their model has one."""
+    """Give every simulation of a batch a table of its own, (nsim,) m, 1 and N/m; their model has
+    one.
+    """
     batch.expand("geom_pos")[:, model.geom(TABLE).id, 2] = height
     batch.expand("pair_friction")[:, :, :2] = friction[:, None, None]
     batch.expand("pair_solref")[:] = _solref(model, stiffness)
@@ -394,7 +455,8 @@ def write_table(
 def _solref(model: mujoco.MjModel, stiffness: Array) -> Array:
     """The pairs' direct solref for stiffnesses (…) in N/m, (…, npair, 2).
 
-    A contact at rest pushes with d²k/((1 − d)·w) N per metre, w the mobility of the bodies that touch.
+    A contact at rest pushes with d²k/((1 − d)·w) N per metre, w the mobility of the bodies that
+    touch.
     """
     bodies = model.geom_bodyid[np.stack([model.pair_geom1, model.pair_geom2])]
     mobility = model.body_invweight0[bodies, 0].sum(axis=0)

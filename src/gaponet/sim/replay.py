@@ -37,7 +37,9 @@ class Corrector(Protocol):
         """Begin one rollout per sequence, simulation i at row 0 of start[i]."""
 
     def correct(self, t: int, target: Array, qpos: Array, qvel: Array) -> Array:
-        """Return the targets to apply over [t, t+1), for commanded ones and the simulated state; all (k, n), rad."""
+        """Return the targets to apply over [t, t+1), for commanded ones and the simulated state;
+        all (k, n), rad.
+        """
 
 
 def replay(
@@ -57,7 +59,8 @@ def replay(
         corrector: Corrects targets.
         nthread: Threads, 0 for all cores.
         progress: Called with control steps done and in all.
-        lock_idle: Clamp limbs that no command moves at home: faster, and equal up to rounding for others.
+        lock_idle: Clamp limbs that no command moves at home: faster, and equal up to rounding for
+            others.
         creeps: Use MuJoCo's own friction, which creeps.
     """
     idle: list[tuple[str, ...]] = [()] * len(sequences)
@@ -95,7 +98,9 @@ def _simulations(
 
 
 def _replay_hash(robot: RobotSpec, creeps: bool) -> str:
-    """Return the hash under which replays are kept: the simulator's, and whether friction creeps as MuJoCo's own."""
+    """Return the hash under which replays are kept: the simulator's, and whether friction creeps
+    as MuJoCo's own.
+    """
     return f"{model_hash(robot)}-creeps" if creeps else model_hash(robot)
 
 
@@ -106,7 +111,8 @@ def kept_replays(
     progress: Progress = no_progress,
     creeps: bool = False,
 ) -> list[SimulatedReplay]:
-    """Return `replay` of a dataset's recordings with idle limbs locked, out of the dataset where it keeps them.
+    """Return `replay` of a dataset's recordings with idle limbs locked, out of the dataset where
+    it keeps them.
 
     What it lacks is simulated and kept by the simulator's hash.
     """
@@ -121,7 +127,9 @@ def rollout_errors(
     nthread: int = 0,
     corrector: Corrector | None = None,
 ) -> Array:
-    """Return the mean |error| of each sequence's rollout, of the operated joints that it holds, (sequences,) rad."""
+    """Return the mean |error| of each sequence's rollout, of the operated joints that it holds,
+    (sequences,) rad.
+    """
     replays = replay(sequences, robot, corrector, nthread, lock_idle=True)
     errors = [run.mean_error() for run in runs(sequences, [r.qpos for r in replays], robot)]
     result: Array = np.nan_to_num(np.array(errors), nan=np.pi)
@@ -129,12 +137,16 @@ def rollout_errors(
 
 
 def motion_errors(sequences: ListOf[Sequence], robot: RobotSpec) -> Array:
-    """Return `rollout_errors` averaged over the sequences of each independent motion, (motions,) rad."""
+    """Return `rollout_errors` averaged over the sequences of each independent motion, (motions,)
+    rad.
+    """
     return by_motion([s.meta for s in sequences], rollout_errors(sequences, robot))
 
 
 def idle_limbs(sequences: ListOf[Sequence], robot: RobotSpec) -> tuple[str, ...]:
-    """Return the joints of limbs that no command of these sequences moves and that have no operated joint."""
+    """Return the joints of limbs that no command of these sequences moves and that have no
+    operated joint.
+    """
     return tuple(
         sorted(
             set.intersection(*map(set, _idle_limbs(sequences, robot))), key=robot.joint_names.index
@@ -143,8 +155,9 @@ def idle_limbs(sequences: ListOf[Sequence], robot: RobotSpec) -> tuple[str, ...]
 
 
 def _held(sequence: Sequence, robot: RobotSpec, idle: tuple[str, ...]) -> Clamped:
-    """Return the joints that are clamped in a rollout, and where, rad: idle limbs at home, unrecorded joints where the
-    recording says that they stood."""
+    """Return the joints that are clamped in a rollout, and where, rad: idle limbs at home,
+    unrecorded joints where the recording says that they stood.
+    """
     unknown = sequence.meta.unrecorded
     angles = zip(robot.joint_names, sequence.qpos[0], robot.qpos_home, strict=True)
     at = {j: float(seen if j in unknown else home) for j, seen, home in angles}
@@ -160,7 +173,9 @@ def _idle_limbs(sequences: ListOf[Sequence], robot: RobotSpec) -> list[tuple[str
 
 
 def _chunks(sequences: ListOf[Sequence], locked: list[Clamped]) -> Iterator[list[int]]:
-    """Yield indices of sequences with the same locked joints and similar lengths, so that few wait for a long one."""
+    """Yield indices of sequences with the same locked joints and similar lengths, so that few wait
+    for a long one.
+    """
     for limbs in dict.fromkeys(locked):
         group = [i for i, mine in enumerate(locked) if mine == limbs]
         group.sort(key=lambda i: -len(sequences[i]))
@@ -175,14 +190,16 @@ def rollout(
     progress: Callable[[int], None] = lambda done: None,
     touch: Array | None = None,
 ) -> Array:
-    """Step a batch, one simulation per sequence, from the recorded start under the recorded commands.
+    """Step a batch, one simulation per sequence, from the recorded start under the recorded
+    commands.
 
-    A simulation goes on from the recording after the rows of `touch`, (T, k). `progress` is called with the control
-    steps done.
+    A simulation goes on from the recording after the rows of `touch`, (T, k). `progress` is called
+    with the control steps done.
 
     Returns:
-        qpos, qvel, torque and target by row, (4, T, k, n of all joints): rad, rad/s, N·m, rad. Locked joints stand at
-        sim.robot.qpos_home. Rows after the end of a sequence have no meaning.
+        qpos, qvel, torque and target by row, (4, T, k, n of all joints): rad, rad/s, N·m, rad.
+        Locked joints stand at sim.robot.qpos_home. Rows after the end of a sequence have no
+        meaning.
     """
     lengths = np.array([len(s) for s in sequences])
     free = sim.robot.index(sim.joint_names)
@@ -236,10 +253,12 @@ def pair_dataset(
     executor: str | Executor = LOCAL,
     creeps: bool = False,
 ) -> int:
-    """Replay the sequences that have no replay by this simulator yet, and store the replays; return their number.
+    """Replay the sequences that have no replay by this simulator yet, and store the replays;
+    return their number.
 
-    All sequences, or only some; `lock_idle` and `creeps` as in replay. Locally on threads of this process, else on an
-    executor. Replays are stored per simulator hash: a changed gain makes new ones and leaves the old.
+    All sequences, or only some; `lock_idle` and `creeps` as in replay. Locally on threads of this
+    process, else on an executor. Replays are stored per simulator hash: a changed gain makes new
+    ones and leaves the old.
     """
     dataset.require_robot(robot)
     digest = _replay_hash(robot, creeps)
@@ -249,12 +268,11 @@ def pair_dataset(
     )
     if not todo:
         return 0
-    total, done = sum(e.rows - 1 for e in todo), 0
+    total = sum(e.rows - 1 for e in todo)
+    done = 0
     parts = [todo[start : start + BATCH] for start in range(0, len(todo), BATCH)]
-    sequences, work = (
-        map(dataset.sequences, parts),
-        partial(replay, robot=robot, lock_idle=lock_idle, creeps=creeps),
-    )
+    sequences = map(dataset.sequences, parts)
+    work = partial(replay, robot=robot, lock_idle=lock_idle, creeps=creeps)
     with dataset.writing_replays(), ExitStack() as stack:
         if executor == LOCAL:
             replayed: Iterator[list[SimulatedReplay]] = (

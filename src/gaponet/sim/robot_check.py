@@ -1,4 +1,7 @@
-"""Checks for robot files that compile and are probably wrong. Each finding says which value to change."""
+"""Checks for robot files that compile and are probably wrong.
+
+Each finding says which value to change.
+"""
 
 from __future__ import annotations
 
@@ -18,9 +21,13 @@ from gaponet.sim.batch import BatchSim, Condition
 from gaponet.sim.dynamics import static_torque
 from gaponet.sim.model import build_model
 
-HOLD_S, HOLD_START_RAD = 60.0, 0.01  # of a hold at home, and distance from home at its start
+# of a hold at home, and distance from home at its start
+HOLD_S = 60.0
+HOLD_START_RAD = 0.01
 MAX_REST_SPEED = 0.05  # rad/s in the last ten seconds of the hold
-MAX_CREEP_RAD, MAX_SAG_RAD = 1e-3, 0.1  # in the second half of the hold; at its end
+# in the second half of the hold; at its end
+MAX_CREEP_RAD = 1e-3
+MAX_SAG_RAD = 0.1
 MAX_GROWTH = 1e-3  # relative, of a small motion in one physics step
 # phase per step: an unstable step oscillates, a joint that falls does not
 MIN_OSCILLATION_RAD = 0.1
@@ -30,7 +37,9 @@ MIN_PENETRATION_M = 1e-4  # of links that collide
 
 
 class _Growth(NamedTuple):
-    """Factor by which a small motion grows in a physics step, the joint that moves most, and if it oscillates."""
+    """Factor by which a small motion grows in a physics step, the joint that moves most, and if it
+    oscillates.
+    """
 
     factor: float
     joint: int
@@ -62,13 +71,20 @@ def check_robot(
         else postures
     )
     findings = [
-        *_joints(robot), *_loads(robot, models), *_limits(robot, model), *_couplings(robot, model),
-        *_contacts(robot, places, postures is not None), *_steps(robot, models, places),
-    ]  # fmt: skip
+        *_joints(robot),
+        *_loads(robot, models),
+        *_limits(robot, model),
+        *_couplings(robot, model),
+        *_contacts(robot, places, postures is not None),
+        *_steps(robot, models, places),
+    ]
     if not any(f.level == "error" for f in findings):
         findings += _hold(robot, payloads)
     if not robot.payload_mounts:
-        text = "no [[payload_mount]]: payloads other than 0 will be refused; add one to robot.toml if it carries any"
+        text = (
+            "no [[payload_mount]]: payloads other than 0 will be refused; add one to robot.toml "
+            "if it carries any"
+        )
         findings.append(Finding("warning", "payload", text))
     return sorted(findings, key=lambda f: -LEVELS.index(f.level))
 
@@ -77,18 +93,30 @@ def _joints(robot: RobotSpec) -> Iterator[Finding]:
     for i, name in enumerate(robot.joint_names):
         low, high = robot.qpos_range[i]
         if name not in robot.followers and robot.kp[i] <= 0:
-            text = f"{name}: kp is {robot.kp[i]:g}; a position-controlled joint needs kp > 0 in robot.toml"
+            text = (
+                f"{name}: kp is {robot.kp[i]:g}; a position-controlled joint needs kp > 0 in "
+                "robot.toml"
+            )
             yield Finding("warning", "gains", text, (name,))
         if not low <= robot.qpos_home[i] <= high:
-            text = f"{name}: home {robot.qpos_home[i]:g} lies outside its range [{low:.2f}, {high:.2f}]: write home"
+            text = (
+                f"{name}: home {robot.qpos_home[i]:g} lies outside its range [{low:.2f}, "
+                f"{high:.2f}]: write home"
+            )
             yield Finding(
                 "warning", "home", f"{text} in robot.toml, or range in robot.xml", (name,)
             )
         if not np.isfinite(low):
-            text = f"{name}: has no range in the MJCF; commands are not clipped and doctor cannot judge positions"
+            text = (
+                f"{name}: has no range in the MJCF; commands are not clipped and doctor cannot "
+                "judge positions"
+            )
             yield Finding("warning", "range", f"{text}: write range in robot.xml", (name,))
         elif not 0.1 <= high - low <= 40.0:  # 6°, 6 turns
-            text = f"{name}: its range is {low:.3g} to {high:.3g} rad: are these degrees? Correct it in robot.xml"
+            text = (
+                f"{name}: its range is {low:.3g} to {high:.3g} rad: are these degrees? Correct it "
+                "in robot.xml"
+            )
             yield Finding("warning", "range", text, (name,))
 
 
@@ -99,8 +127,9 @@ def _loads(robot: RobotSpec, models: dict[float, mujoco.MjModel]) -> Iterator[Fi
         for i in np.flatnonzero(load > robot.effort_limit):
             carrying = f" with {mass:g} kg" if mass else ""
             text = (
-                f"{robot.joint_names[i]}: needs {load[i]:.3g} N·m to hold its home{carrying}, its limit is "
-                f"{robot.effort_limit[i]:g}: check effort_limit in robot.toml, masses and home"
+                f"{robot.joint_names[i]}: needs {load[i]:.3g} N·m to hold its home{carrying}, its "
+                f"limit is {robot.effort_limit[i]:g}: check effort_limit in robot.toml, masses "
+                "and home"
             )
             yield Finding(
                 "warning",
@@ -118,8 +147,9 @@ def _limits(robot: RobotSpec, model: mujoco.MjModel) -> Iterator[Finding]:
         most = np.abs(model.jnt_actfrcrange[j]).min() if model.jnt_actfrclimited[j] else np.inf
         if most < 0.999 * robot.effort_limit[i]:
             text = (
-                f"{name}: actuatorfrcrange in robot.xml stops the motor at {most:g} N·m, before effort_limit = "
-                f"{robot.effort_limit[i]:g} in robot.toml does: delete one, or write the right figure at both"
+                f"{name}: actuatorfrcrange in robot.xml stops the motor at {most:g} N·m, before "
+                f"effort_limit = {robot.effort_limit[i]:g} in robot.toml does: delete one, or "
+                "write the right figure at both"
             )
             yield Finding("warning", "limits", text, (name,), {"actuatorfrcrange": most})
 
@@ -129,7 +159,10 @@ def _couplings(robot: RobotSpec, model: mujoco.MjModel) -> Iterator[Finding]:
     names = np.array(robot.joint_names)
     for count, kind in ((model.neq, "equality"), (model.ntendon, "tendon")):
         if count:
-            text = f"robot.xml has {count} <{kind}> constraint(s): the simulator obeys them; delete what is no part"
+            text = (
+                f"robot.xml has {count} <{kind}> constraint(s): the simulator obeys them; delete "
+                "what is no part"
+            )
             yield Finding("note", "couplings", f"{text} of the robot")
     springs = names[model.jnt_stiffness > 0].tolist()
     if springs:
@@ -140,24 +173,31 @@ def _couplings(robot: RobotSpec, model: mujoco.MjModel) -> Iterator[Finding]:
             tuple(springs),
         )
     if abs(np.linalg.norm(model.opt.gravity) - 9.81) > 0.1:
-        text = f"gravity in robot.xml is {model.opt.gravity.tolist()} m/s²: write gravity in <option> if that is not so"
+        text = (
+            f"gravity in robot.xml is {model.opt.gravity.tolist()} m/s²: write gravity in "
+            "<option> if that is not so"
+        )
         yield Finding("warning", "couplings", text)
     if (model.body_gravcomp != 0).any():
-        text = "gravcomp in robot.xml takes weight off bodies: right where the controller compensates gravity; else "
+        text = (
+            "gravcomp in robot.xml takes weight off bodies: right where the controller "
+            "compensates gravity; else "
+        )
         yield Finding("note", "couplings", f"{text}delete it")
     light = names[model.dof_armature < MIN_ARMATURE]
     if len(light):
         text = (
-            f"no armature at {abbreviate(light.tolist())}: geared motors have 0.001 to 0.5 kg·m² (rotor inertia times "
-            "ratio squared); write armature in robot.xml, gaponet identify finds it"
+            f"no armature at {abbreviate(light.tolist())}: geared motors have 0.001 to 0.5 kg·m² "
+            "(rotor inertia times ratio squared); write armature in robot.xml, gaponet identify "
+            "finds it"
         )
         yield Finding("note", "inertia", text, tuple(light))
     led = np.isin(names, list(robot.followers))
     free = names[(model.dof_damping + robot.kd < 1e-9) & (model.dof_frictionloss < 1e-9) & ~led]
     if len(free):
         text = (
-            f"no damping, kd or friction at {abbreviate(free.tolist())}: it swings for ever; write kd in robot.toml, "
-            "or damping and frictionloss in robot.xml"
+            f"no damping, kd or friction at {abbreviate(free.tolist())}: it swings for ever; "
+            "write kd in robot.toml, or damping and frictionloss in robot.xml"
         )
         yield Finding("warning", "damping", text, tuple(free))
 
@@ -208,7 +248,10 @@ def _lasting_contact(robot: RobotSpec, pairs: list[str]) -> Finding:
     effect = "they do not touch: contacts are off in robot.toml"
     if robot.contacts:
         level = "warning"
-        effect = "joints carry that for ever: write <exclude> in robot.xml, or contacts = false in robot.toml"
+        effect = (
+            "joints carry that for ever: write <exclude> in robot.xml, or contacts = false in "
+            "robot.toml"
+        )
     text = f"at home {abbreviate(pairs)} lie inside each other; {effect}"
     return Finding(level, "contacts", text, values={"pairs": pairs})
 
@@ -227,7 +270,9 @@ def _passing_contact(robot: RobotSpec, pairs: list[str], share: float, *, logged
 def _steps(
     robot: RobotSpec, models: dict[float, mujoco.MjModel], postures: Array
 ) -> Iterator[Finding]:
-    """Find small motions that grow under gains, inertias and physics step; friction, which hides them, is left out."""
+    """Find small motions that grow under gains, inertias and physics step; friction, which hides
+    them, is left out.
+    """
     thin = [robot.qpos_home, *postures[:: max(1, len(postures) // MAX_POSTURES)][:MAX_POSTURES]]
     cases = [(mass, model, q) for mass, model in models.items() for q in thin]
     each = [(_growth(model, q), mass) for mass, model, q in cases]
@@ -240,8 +285,8 @@ def _steps(
     elif not oscillates:
         load = f" with {mass:g} kg" if mass else ""
         text = (
-            f"{name}: kp {robot.kp[joint]:g} is too little to hold it up{load}: it falls away from its target; check "
-            "kp in robot.toml"
+            f"{name}: kp {robot.kp[joint]:g} is too little to hold it up{load}: it falls away "
+            "from its target; check kp in robot.toml"
         )
         yield Finding("warning", "step", text, (name,), {"growth": growth})
     else:
@@ -251,7 +296,9 @@ def _steps(
 def _unstable_step(
     robot: RobotSpec, cases: list[tuple[float, mujoco.MjModel, Array]], joint: int, growth: float
 ) -> Finding:
-    """Return the finding about a joint that is unstable in the robot's physics steps, with what would cure it."""
+    """Return the finding about a joint that is unstable in the robot's physics steps, with what
+    would cure it.
+    """
 
     def is_stable(timestep: float, armature: float) -> bool:
         growths = (_growth(model, q, timestep, armature).factor for _, model, q in cases)
@@ -269,8 +316,8 @@ def _unstable_step(
     cures.append("a smaller kp")
     name = robot.joint_names[joint]
     text = (
-        f"{name}: kp {robot.kp[joint]:g} and kd {robot.kd[joint]:g} on so little inertia are unstable in physics "
-        f"steps of {robot.timestep * 1e3:g} ms: write {' or '.join(cures)}"
+        f"{name}: kp {robot.kp[joint]:g} and kd {robot.kd[joint]:g} on so little inertia are "
+        f"unstable in physics steps of {robot.timestep * 1e3:g} ms: write {' or '.join(cures)}"
     )
     values = {"growth": growth, "timestep": step, "armature": armature}
     return Finding("error", "step", text, (name,), values)
@@ -279,7 +326,9 @@ def _unstable_step(
 def _growth(
     model: mujoco.MjModel, q: Array, timestep: float | None = None, armature: float = 0.0
 ) -> _Growth:
-    """Return the growth of the worst small motion about a posture that targets hold against gravity."""
+    """Return the growth of the worst small motion about a posture that targets hold against
+    gravity.
+    """
     model = copy(model)
     model.opt.timestep = timestep or model.opt.timestep
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
@@ -347,10 +396,14 @@ def _hold_limits(hold: _Hold) -> list[_HoldLimit]:
     swings = "check kp and kd; write more damping in robot.xml"
     if (hold.saturated & (hold.speed > MAX_REST_SPEED)).any():
         swings = (
-            "its motor gives all it can, one way and the other, and MuJoCo's motors brake no more then: write kd as "
-            "damping in robot.xml and kd = 0 in robot.toml, a shorter timestep, or armature"
+            "its motor gives all it can, one way and the other, and MuJoCo's motors brake no more "
+            "then: write kd as damping in robot.xml and kd = 0 in robot.toml, a shorter timestep, "
+            "or armature"
         )
-    creeps = "friction gives way where its armature is small: write armature = 0.003 or more in robot.xml"
+    creeps = (
+        "friction gives way where its armature is small: write armature = 0.003 or more in "
+        "robot.xml"
+    )
     return [
         _HoldLimit(
             "does not come to rest: {:.2g} rad/s after a minute",
@@ -394,7 +447,9 @@ def _hold(robot: RobotSpec, payloads: tuple[float, ...]) -> Iterator[Finding]:
 def _hold_finding(
     robot: RobotSpec, payloads: tuple[float, ...], limit: _HoldLimit, wrong: Array
 ) -> Finding:
-    """Return the finding about a limit that is exceeded at `wrong`, rows of payload and joint, (k, 2)."""
+    """Return the finding about a limit that is exceeded at `wrong`, rows of payload and joint, (k,
+    2).
+    """
     amount = np.nan_to_num(limit.amount, nan=np.inf)
     payload, joint = max(wrong, key=lambda place: float(amount[*place]))
     names = tuple(dict.fromkeys(robot.joint_names[i] for _, i in wrong))

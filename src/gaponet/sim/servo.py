@@ -1,15 +1,18 @@
-"""Servo model: terms beyond MuJoCo's position actuator and friction loss, set before every physics step.
+"""Servo model: terms beyond MuJoCo's position actuator and friction loss, set before every physics
+step.
 
-The encoder counts in steps. A motor that turns at all has a least torque (minimum PWM). Its largest torque falls with
-its speed to zero at the no-load speed (back-EMF). Friction is larger at rest (Stribeck) and grows with the torque that
-the gear transmits (load-dependent as in BAM, Duclusaud et al. 2024). MuJoCo integrates: the model only changes the
-actuator's bias, its torque limits and the limit of friction, so friction sticks as MuJoCo's does.
-A gear with backlash parts the motor (armature, damping, friction) from the link while its gap is open.
+The encoder counts in steps. A motor that turns at all has a least torque (minimum PWM). Its largest
+torque falls with its speed to zero at the no-load speed (back-EMF). Friction is larger at rest
+(Stribeck) and grows with the torque that the gear transmits (load-dependent as in BAM, Duclusaud et
+al. 2024). MuJoCo integrates: the model only changes the actuator's bias, its torque limits and the
+limit of friction, so friction sticks as MuJoCo's does. A gear with backlash parts the motor
+(armature, damping, friction) from the link while its gap is open.
 
-The model stands here twice. `servo_torque`, `torque_limits` and `friction_limit` take arrays of numpy or torch, for
-exports and inverses. `requested_torque`, `motor_limits` and `joint_friction` take one servo with fields by name, for
-numba and Warp, which are faster. Simulations (`set_servos`) and the fit of single joints (`simulate_joints`) share the
-latter. A MuJoCo model's actuator_user holds the parameters; without, nothing here runs.
+The model stands here twice. `servo_torque`, `torque_limits` and `friction_limit` take arrays of
+numpy or torch, for exports and inverses. `requested_torque`, `motor_limits` and `joint_friction`
+take one servo with fields by name, for numba and Warp, which are faster. Simulations (`set_servos`)
+and the fit of single joints (`simulate_joints`) share the latter. A MuJoCo model's actuator_user
+holds the parameters; without, nothing here runs.
 """
 
 from __future__ import annotations
@@ -24,9 +27,8 @@ import numpy as np
 from gaponet.base.arrays import Array, array_module
 from gaponet.robot.servo_fields import SERVO_TERMS as SERVO_TERMS
 
-ServoTerms = dict[
-    str, Any
-]  # name of SERVO_TERMS → values that broadcast to the simulations' joints, numpy or torch
+# name of SERVO_TERMS → values that broadcast to the simulations' joints, numpy or torch
+ServoTerms = dict[str, Any]
 
 SLOWEST = 1e-3  # rad/s: of stribeck_speed
 FINEST = 1e-9  # rad: of encoder_step
@@ -36,7 +38,10 @@ DEADBAND_STEPS = 0.5
 
 
 def present(terms: ServoTerms) -> ServoTerms:
-    """Return the terms that are not zero everywhere; others are not computed. No division by these speeds fails."""
+    """Return the terms that are not zero everywhere; others are not computed.
+
+    No division by these speeds fails.
+    """
     active = {name: x for name, x in terms.items() if x.any()}
     if "stribeck" in active and "stribeck_speed" in terms:
         active["stribeck_speed"] = terms["stribeck_speed"].clip(min=SLOWEST)
@@ -47,11 +52,12 @@ def present(terms: ServoTerms) -> ServoTerms:
 
 
 def torque_range(limit: Any, ratio: Any) -> Any:
-    """Return the least and the largest torque of a motor, N·m, at a ratio of its speed to the no-load speed.
+    """Return the least and the largest torque of a motor, N·m, at a ratio of its speed to the
+    no-load speed.
 
-    The largest is limit · (1 − ratio), between −limit and limit: beyond the no-load speed the motor brakes. MuJoCo's
-    <dcmotor> has this range at ± its largest voltage with forcerange as current limit; so have the DC motors of Isaac
-    Lab and mjlab with saturation_effort = effort_limit.
+    The largest is limit · (1 − ratio), between −limit and limit: beyond the no-load speed the motor
+    brakes. MuJoCo's <dcmotor> has this range at ± its largest voltage with forcerange as current
+    limit; so have the DC motors of Isaac Lab and mjlab with saturation_effort = effort_limit.
     """
     inside = abs(ratio)
     return 0.5 * limit * (inside - abs(2.0 + ratio)), 0.5 * limit * (abs(2.0 - ratio) - inside)
@@ -73,10 +79,13 @@ def resting_friction(stribeck: Any, speed: Any, qvel: Any) -> Any:
 
 
 def friction_limit(terms: ServoTerms, frictionloss: Any, qvel: Any, torque: Any, load: Any) -> Any:
-    """Return the limit of friction, N·m, at a speed, under the motor's torque and gravity's; terms as of `present`."""
+    """Return the limit of friction, N·m, at a speed, under the motor's torque and gravity's; terms
+    as of `present`.
+    """
     limit = frictionloss
     if "friction_motor" in terms or "friction_external" in terms:
-        by_motor, by_load = terms.get("friction_motor", 0.0), terms.get("friction_external", 0.0)
+        by_motor = terms.get("friction_motor", 0.0)
+        by_load = terms.get("friction_external", 0.0)
         limit = limit + passing_friction(by_motor, by_load, torque, load)
     if "stribeck" in terms:
         limit = limit + resting_friction(
@@ -86,7 +95,9 @@ def friction_limit(terms: ServoTerms, frictionloss: Any, qvel: Any, torque: Any,
 
 
 def servo_torque(terms: ServoTerms, kp: Any, aim: Any, qpos: Any) -> Any:
-    """Return the torque that the servo requests, N·m, for an angle (rad) that it reads in its encoder's steps."""
+    """Return the torque that the servo requests, N·m, for an angle (rad) that it reads in its
+    encoder's steps.
+    """
     xp = array_module(qpos)
     read = qpos
     deadband = 0.0
@@ -104,21 +115,27 @@ def servo_torque(terms: ServoTerms, kp: Any, aim: Any, qpos: Any) -> Any:
 
 
 def servo_bias(terms: ServoTerms, kp: Any, bias: Any, ctrl: Any, qpos: Any) -> Any:
-    """Return the bias, N·m, with which an actuator of gain kp and its own bias requests `servo_torque`."""
+    """Return the bias, N·m, with which an actuator of gain kp and its own bias requests
+    `servo_torque`.
+    """
     if "encoder_step" not in terms and "min_torque" not in terms:
         return bias
     return servo_torque(terms, kp, ctrl + bias / kp, qpos) - kp * (ctrl - qpos)
 
 
-# A servo as numba and Warp read it: a record whose fields are those of SERVO_FIELDS that the model computes.
+# A servo as numba and Warp read it: a record whose fields are those of SERVO_FIELDS that the model
+# computes.
 SERVO_RECORD = np.dtype([(f, np.float64) for f in ("frictionloss", "effort_limit", *SERVO_TERMS)])
-# A joint by itself: its servo, and what MuJoCo computes elsewhere. kd is the servo's, damping the joint's.
+# A joint by itself: its servo, and what MuJoCo computes elsewhere. kd is the servo's, damping the
+# joint's.
 JOINT_FIELDS = ("kp", "kd", "damping", "armature", "offset", "delay")
 JOINT_RECORD = np.dtype([*SERVO_RECORD.descr, *((f, np.float64) for f in JOINT_FIELDS)])
 
 
 def requested_torque(servo: Any, kp: Any, aim: Any, qpos: Any) -> Any:
-    """Return `servo_torque` of a servo with the fields of SERVO_RECORD, in N·m, for numba and Warp."""
+    """Return `servo_torque` of a servo with the fields of SERVO_RECORD, in N·m, for numba and
+    Warp.
+    """
     step = servo.encoder_step
     least = servo.min_torque
     read = qpos
@@ -133,7 +150,9 @@ def requested_torque(servo: Any, kp: Any, aim: Any, qpos: Any) -> Any:
 
 
 def motor_limits(servo: Any, qvel: Any) -> Any:
-    """Return the least and the largest torque of a servo at a joint speed, rad/s, in N·m, for numba and Warp."""
+    """Return the least and the largest torque of a servo at a joint speed, rad/s, in N·m, for
+    numba and Warp.
+    """
     least = -servo.effort_limit
     most = servo.effort_limit
     if servo.no_load_speed > 0.0:
@@ -163,7 +182,8 @@ def crossed(
     mass: Any,
     h: Any,
 ) -> tuple[Any, Any]:
-    """Return the gaps (motor ahead of link), rad, and the motors' speeds, rad/s, after a step of h s; numpy arrays.
+    """Return the gaps (motor ahead of link), rad, and the motors' speeds, rad/s, after a step of h
+    s; numpy arrays.
 
     A motor that is not pressed against its link is a free rotor with dry friction of `most` N·m.
     """
@@ -174,36 +194,40 @@ def crossed(
 
 
 class Play:
-    """Backlash of servos in MuJoCo, numpy arrays of one shape: parts motors from links where the gaps are open.
+    """Backlash of servos in MuJoCo, numpy arrays of one shape: parts motors from links where the
+    gaps are open.
 
     Attributes:
         gap: Motor ahead of link, rad.
-        rotor: Speed of the motor, rad/s. Where it differs in a closed gap, the next step transmits the impact.
-        seen: Speed of the link after the last step, rad/s; a speed that was written since then moves the motor too.
+        rotor: Speed of the motor, rad/s. Where it differs in a closed gap, the next step transmits
+            the impact.
+        seen: Speed of the link after the last step, rad/s; a speed that was written since then
+            moves the motor too.
     """
 
     def __init__(
         self, width: Any, armature: Any, damping: Any, kd: Any, load: Any, qvel: Any
     ) -> None:
         """Begin on the side that carries `load`, N·m; armature, damping and kd are the motor's."""
-        self.half, self._own, self._kd = width / 2, (armature, damping), kd
-        self.gap, self.rotor, self.seen = (
-            np.where(load < 0, -self.half, self.half),
-            qvel.copy(),
-            qvel.copy(),
-        )
+        self.half = width / 2
+        self._own = (armature, damping)
+        self._kd = kd
+        self.gap = np.where(load < 0, -self.half, self.half)
+        self.rotor = qvel.copy()
+        self.seen = qvel.copy()
 
     def before(self, limit: Any, kp: Any, qpos: Any, qvel: Any, h: Any) -> tuple[Any, ...]:
-        """Return friction limit, armature, damping, applied torque and gear of the links for the next step of h s, and
-        what an actuator without gear needs as bias: its torque does not reach the link then."""
-        (armature, damping), closed = self._own, abs(self.gap) >= self.half
+        """Return friction limit, armature, damping, applied torque and gear of the links for the
+        next step of h s, and what an actuator without gear needs as bias: its torque does not reach
+        the link then.
+        """
+        armature, damping = self._own
+        closed = abs(self.gap) >= self.half
         self.rotor += qvel - self.seen
         self.seen[:] = qvel
-        self._limit, self._qvel, self._impact = (
-            limit.copy(),
-            qvel.copy(),
-            armature * (self.rotor - qvel) / h,
-        )
+        self._limit = limit.copy()
+        self._qvel = qvel.copy()
+        self._impact = armature * (self.rotor - qvel) / h
         bias = np.where(closed, 0.0, -kp * qpos - self._kd * qvel)
         return (
             limit * closed,
@@ -217,30 +241,44 @@ class Play:
     def after(
         self, qvel: Any, torque: Any, constraint: Any, h: Any, rows: Any = slice(None)
     ) -> None:
-        """Advance the gaps of rows, from speeds, the servos' torques and the constraints' torques after a step."""
-        (armature, damping), closed, change = (
-            self._own,
-            abs(self.gap) >= self.half,
-            qvel - self._qvel,
-        )
-        # A contact counts as friction, up to the limit of friction: under contact the gap is only approximate.
+        """Advance the gaps of rows, from speeds, the servos' torques and the constraints' torques
+        after a step.
+        """
+        armature, damping = self._own
+        closed = abs(self.gap) >= self.half
+        change = qvel - self._qvel
+        # A contact counts as friction, up to the limit of friction: under contact the gap is only
+        # approximate.
         force = torque + self._impact - damping * qvel - (self._kd + armature / h) * change
         force = force + np.clip(constraint, -self._limit, self._limit)
         gap, rotor = crossed(
             self.half, self.gap, self.rotor, closed, qvel, torque, damping, self._limit, armature, h
         )
         gap = np.where(closed & (force * gap < 0), OPENED * gap, gap)
-        self.gap[rows], self.rotor[rows], self.seen[rows] = gap[rows], rotor[rows], qvel[rows]
+        self.gap[rows] = gap[rows]
+        self.rotor[rows] = rotor[rows]
+        self.seen[rows] = qvel[rows]
 
 
 def cross_gap(
-    half: float, gap: float, rotor: float, before: float, speed: float, inertia: float, load: float, torque: float,
-    damping: float, most: float, mass: float, h: float,
-) -> tuple[float, float, float]:  # fmt: skip
-    """Return the speeds of link and motor and the gap of one joint after a step, as `crossed` does, for numba.
+    half: float,
+    gap: float,
+    rotor: float,
+    before: float,
+    speed: float,
+    inertia: float,
+    load: float,
+    torque: float,
+    damping: float,
+    most: float,
+    mass: float,
+    h: float,
+) -> tuple[float, float, float]:
+    """Return the speeds of link and motor and the gap of one joint after a step, as `crossed`
+    does, for numba.
 
-    Pressed, both move as one body, from `before` to `speed`, until the motor would have to pull the link. They meet
-    without rebound.
+    Pressed, both move as one body, from `before` to `speed`, until the motor would have to pull the
+    link. They meet without rebound.
     """
     if abs(gap) >= half and (inertia * (speed - before) / h + load) * gap >= 0.0:
         return speed, speed, gap
@@ -272,9 +310,11 @@ def set_servos(servos: Any, state: Any, biasprm: Any, friction: Any, force_range
     Args:
         servos: SERVO_RECORD, (nsim, nu).
         state: ActuatorState.
-        biasprm: MuJoCo's actuator_biasprm, (nsim, nu, 10), whose first number is set where a term changes the torque.
+        biasprm: MuJoCo's actuator_biasprm, (nsim, nu, 10), whose first number is set where a term
+            changes the torque.
         friction: MuJoCo's dof_frictionloss, (nsim, nu) N·m.
-        force_range: MuJoCo's actuator_forcerange, (nsim, nu, 2) N·m, set where a servo has a no-load speed.
+        force_range: MuJoCo's actuator_forcerange, (nsim, nu, 2) N·m, set where a servo has a
+            no-load speed.
     """
     simulations, actuators = state.qpos.shape
     for i in range(simulations):
@@ -298,8 +338,9 @@ class Windows(NamedTuple):
     """Windows of recordings beside which n joints move by themselves.
 
     Attributes:
-        loads: Inertia without armature, kg·m²; gravity's torque at an angle of zero, N·m; torque of the other joints'
-            accelerations, N·m; slope of gravity's torque, N·m/rad: (4, n, windows, rows).
+        loads: Inertia without armature, kg·m²; gravity's torque at an angle of zero, N·m; torque of
+            the other joints' accelerations, N·m; slope of gravity's torque, N·m/rad: (4, n,
+            windows, rows).
         ctrl, qpos, qvel: Commands and states, (n, windows, rows) rad and rad/s.
         touch: Rows from which a rollout goes on from the recording, (windows, rows).
         lengths: Rows of each window, (windows,).
@@ -324,8 +365,8 @@ class Windows(NamedTuple):
 def step_joint(
     joint: Any, aim: Any, q: Any, w: Any, inertia: Any, load: Any, pull: Any, h: Any
 ) -> Any:
-    """Return the speed, rad/s, of a joint without backlash after a step of h s, the servo's torque and the limit of
-    friction, N·m; as MuJoCo steps it.
+    """Return the speed, rad/s, of a joint without backlash after a step of h s, the servo's torque
+    and the limit of friction, N·m; as MuJoCo steps it.
 
     Args:
         joint: With the fields of JOINT_RECORD.
@@ -348,8 +389,9 @@ def step_joint(
 
 
 def command_rows(joints: Any, period: Any, steps: Any) -> Any:
-    """Return the row, from that of the period, whose command is in force in each physics step of a period, and the
-    share of the next row's, where it changes on the way: (steps, candidates) each."""
+    """Return the row, from that of the period, whose command is in force in each physics step of a
+    period, and the share of the next row's, where it changes on the way: (steps, candidates) each.
+    """
     rows = np.empty((steps, len(joints)), np.int64)
     shares = np.empty((steps, len(joints)))
     for part in range(steps):
@@ -361,14 +403,16 @@ def command_rows(joints: Any, period: Any, steps: Any) -> Any:
 
 
 def simulate_joints(first: int, last: int, joints: Any, windows: Any, out: Any) -> None:
-    """Fill out[:, first:last], (candidates, joints · windows, rows), with q_sim − q_real, rad; numba compiles it.
+    """Fill out[:, first:last], (candidates, joints · windows, rows), with q_sim − q_real, rad;
+    numba compiles it.
 
-    Candidates take each step side by side, so that none waits for its own last one. The function stands in this file
-    because numba compiles it again only when its own file changes.
+    Candidates take each step side by side, so that none waits for its own last one. The function
+    stands in this file because numba compiles it again only when its own file changes.
 
     Args:
         first, last: Joints · windows that are simulated; the window varies fastest.
-        joints: JOINT_RECORD, (joints · windows, candidates), with the gains of the window's recording.
+        joints: JOINT_RECORD, (joints · windows, candidates), with the gains of the window's
+            recording.
         windows: Windows.
     """
     steps = windows.steps
@@ -406,9 +450,19 @@ def simulate_joints(first: int, last: int, joints: Any, windows: Any, out: Any) 
                     )
                     if half[c] > 0.0:
                         speed, rotor[c], gap[c] = cross_gap(
-                            half[c], gap[c], rotor[c], w[c], speed, inertia, load + pull, torque, one.damping, friction,
-                            one.armature, h,
-                        )  # fmt: skip
+                            half[c],
+                            gap[c],
+                            rotor[c],
+                            w[c],
+                            speed,
+                            inertia,
+                            load + pull,
+                            torque,
+                            one.damping,
+                            friction,
+                            one.armature,
+                            h,
+                        )
                     w[c] = speed
                     q[c] += h * w[c]
                     if q[c] < low:
@@ -462,15 +516,17 @@ class ServoModel:
     Attributes:
         values: Name of SERVO_TERMS → (nsim, nu); may be written.
         active: The terms that are present since the last reset.
-        frictionloss, bias, effort, armature, damping: The MuJoCo model's own, without the servo model, (nsim, nu); may
-            be written.
+        frictionloss, bias, effort, armature, damping: The MuJoCo model's own, without the servo
+            model, (nsim, nu); may be written.
         play: Backlash; None where no servo has any.
-        torque, load: Torque of the actuators in the last physics step, and of gravity and Coriolis forces, (nsim, nu)
-            N·m. The next step follows from these and the batch's own state.
+        torque, load: Torque of the actuators in the last physics step, and of gravity and Coriolis
+            forces, (nsim, nu) N·m. The next step follows from these and the batch's own state.
     """
 
     def __init__(self, batch: Any, model: mujoco.MjModel) -> None:
-        """Take the MuJoCo model's parameters for all simulations of a Batch, or of an object with its methods."""
+        """Take the MuJoCo model's parameters for all simulations of a Batch, or of an object with
+        its methods.
+        """
         self.batch = batch
         self.model = model
         user = np.zeros((model.nu, len(SERVO_TERMS)))
@@ -530,7 +586,9 @@ class ServoModel:
             self._servos[name] = values
 
     def set_servos(self, at: Array, values: dict[str, Array]) -> None:
-        """Set the joints `at` (k,) of all simulations to values (nsim, k), as of BatchSim.set_servos."""
+        """Set the joints `at` (k,) of all simulations to values (nsim, k), as of
+        BatchSim.set_servos.
+        """
         self.frictionloss[:, at] = values["frictionloss"]
         self.armature[:, at] = values["armature"]
         self.damping[:, at] = np.maximum(values["damping"], 0.0)
@@ -548,7 +606,9 @@ class ServoModel:
         return records
 
     def reset(self, ids: Array, target: Array) -> None:
-        """Begin again for simulations `ids`, which were put into a state, under position targets (k, nu) rad."""
+        """Begin again for simulations `ids`, which were put into a state, under position targets
+        (k, nu) rad.
+        """
         self._take_terms()
         requested = self._gain[ids][..., 0] * (target - self._qpos[ids]) + self.bias[ids]
         self.torque[ids] = requested.clip(-self.effort[ids], self.effort[ids])
@@ -558,10 +618,15 @@ class ServoModel:
             self._reset_play(ids)
 
     def _reset_play(self, ids: Array) -> None:
-        expand, bind, step = self.batch.expand, self.batch.bind, self.batch.expanded("opt.timestep")
+        expand = self.batch.expand
+        bind = self.batch.bind
+        step = self.batch.expanded("opt.timestep")
         self._links = (
-            expand("dof_armature"), expand("dof_damping"), bind("qfrc_applied"), expand("actuator_gear")[..., 0],
-        )  # fmt: skip
+            expand("dof_armature"),
+            expand("dof_damping"),
+            bind("qfrc_applied"),
+            expand("actuator_gear")[..., 0],
+        )
         self._constraint = bind("qfrc_constraint")
         self._h = self.model.opt.timestep if step is None else np.array(step).reshape(-1, 1)
         play = Play(
@@ -585,7 +650,8 @@ class ServoModel:
     def before(self) -> None:
         """Set bias, torque limits and friction for the next physics step.
 
-        MuJoCo delays ctrl after this: the least torque of a late servo follows the target that is under way.
+        MuJoCo delays ctrl after this: the least torque of a late servo follows the target that is
+        under way.
         """
         bias = self._bias[:, :, 0]
         if self.play is not None:
@@ -601,6 +667,7 @@ class ServoModel:
     def after(self, ids: Any = None) -> None:
         """Store torque and load after a physics step of these simulations."""
         moved = slice(None) if ids is None else ids
-        self.torque[moved], self.load[moved] = self._force[moved], self._passing[moved]
+        self.torque[moved] = self._force[moved]
+        self.load[moved] = self._passing[moved]
         if self.play is not None:
             self.play.after(self._qvel, self.torque, self._constraint, self._h, moved)

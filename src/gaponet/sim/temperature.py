@@ -1,7 +1,9 @@
-"""Friction and damping by recorded temperature: whether recordings show it, and what identification says of it.
+"""Friction and damping by recorded temperature: whether recordings show it, and what
+identification says of it.
 
-Friction is frictionloss · (1 + c (T − T₀)) and damping is damping + d (T − T₀), with the mean temperature T of a
-recording. A simulation without recorded temperatures is at the reference T₀, the mean of the fitted recordings.
+Friction is frictionloss · (1 + c (T − T₀)) and damping is damping + d (T − T₀), with the mean
+temperature T of a recording. A simulation without recorded temperatures is at the reference T₀, the
+mean of the fitted recordings.
 """
 
 from __future__ import annotations
@@ -22,13 +24,17 @@ MAX_CONFOUNDED = 0.5  # share of the temperature's variance that gains and paylo
 
 
 def recorded_temperatures(parts: ListOf[Sequence], op: Array) -> Array:
-    """Return the mean temperature of joints `op` in each recording, (recordings, n) °C; NaN where it is unknown."""
+    """Return the mean temperature of joints `op` in each recording, (recordings, n) °C; NaN where
+    it is unknown.
+    """
     none = np.full(len(parts[0].joint_names), np.nan)
     return np.array([none if p.temperatures is None else p.temperatures for p in parts])[:, op]
 
 
 def warm_values(values: Mapping[str, Array], temperature: Array) -> tuple[Array, Array]:
-    """Return damping and friction of candidates (k, n) at temperatures (n, windows) °C, (k, n, windows) each."""
+    """Return damping and friction of candidates (k, n) at temperatures (n, windows) °C, (k, n,
+    windows) each.
+    """
     zero = np.zeros_like(values["kp"])[..., None]
     names = ("damping", "frictionloss", *TERMS["temperature"])
     *now, reference = (values[f][..., None] if f in values else zero for f in names)
@@ -37,8 +43,9 @@ def warm_values(values: Mapping[str, Array], temperature: Array) -> tuple[Array,
 
 
 def temperature_spread(sequences: ListOf[Sequence], robot: RobotSpec) -> Array:
-    """Return the standard deviation of each operated joint's temperature in all recordings, and among those with equal
-    gains and payload, (2, n) K; zero where a recording lacks it."""
+    """Return the standard deviation of each operated joint's temperature in all recordings, and
+    among those with equal gains and payload, (2, n) K; zero where a recording lacks it.
+    """
     warm = recorded_temperatures(sequences, robot.operated_index)
     alike = [(s.meta.recorded_gains, s.meta.payload_mass, s.meta.payload_side) for s in sequences]
     among = warm.copy()
@@ -50,7 +57,9 @@ def temperature_spread(sequences: ListOf[Sequence], robot: RobotSpec) -> Array:
 
 
 def temperature_varies(sequences: ListOf[Sequence], robot: RobotSpec) -> Array:
-    """Return the operated joints, (n,), whose temperature varies enough, and not with gains or payload."""
+    """Return the operated joints, (n,), whose temperature varies enough, and not with gains or
+    payload.
+    """
     whole, among = temperature_spread(sequences, robot)
     result: Array = (among > MIN_STD_K) & (among**2 > (1 - MAX_CONFOUNDED) * whole**2)
     return result
@@ -59,30 +68,31 @@ def temperature_varies(sequences: ListOf[Sequence], robot: RobotSpec) -> Array:
 def temperature_findings(
     sequences: ListOf[Sequence], robot: RobotSpec, std: Mapping[str, Mapping[str, float]]
 ) -> tuple[str, ...]:
-    """Return a sentence for each joint with friction by temperature, or whose temperature varies with another factor.
+    """Return a sentence for each joint with friction by temperature, or whose temperature varies
+    with another factor.
 
     Args:
         sequences: The fitted recordings.
         std: Joint → field → standard error.
     """
-    sentences, warm = [], recorded_temperatures(sequences, robot.operated_index)
+    sentences = []
+    warm = recorded_temperatures(sequences, robot.operated_index)
     whole, among = temperature_spread(sequences, robot)
     for i, (joint, at) in enumerate(zip(robot.operated, robot.operated_index, strict=True)):
-        per_kelvin, error = (
-            robot.friction_per_kelvin[at],
-            std[joint].get("friction_per_kelvin", 0.0),
-        )
+        per_kelvin = robot.friction_per_kelvin[at]
+        error = std[joint].get("friction_per_kelvin", 0.0)
         between = f"{warm[:, i].min():.0f} to {warm[:, i].max():.0f} °C"
         if per_kelvin:
             change = "rises" if per_kelvin > 0 else "falls"
             size = format_uncertainty(1e2 * abs(per_kelvin), 1e2 * error)
             sentences.append(
-                f"{joint}: friction {change} by {size} % per K, recorded at {between}; the stated value is that at "
-                f"{robot.friction_temperature[at]:.0f} °C"
+                f"{joint}: friction {change} by {size} % per K, recorded at {between}; the stated "
+                f"value is that at {robot.friction_temperature[at]:.0f} °C"
             )
         elif whole[i] > MIN_STD_K and among[i] ** 2 <= (1 - MAX_CONFOUNDED) * whole[i] ** 2:
             sentences.append(
-                f"{joint}: the temperature, {between}, varies with gains or payload, so its effect cannot be told from "
-                "theirs; record one motion cold and warm with the same gains and payload"
+                f"{joint}: the temperature, {between}, varies with gains or payload, so its "
+                "effect cannot be told from theirs; record one motion cold and warm with the same "
+                "gains and payload"
             )
     return tuple(sentences)

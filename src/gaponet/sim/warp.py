@@ -1,7 +1,7 @@
 """Simulations of a BatchSim by mujoco_warp, thousands at once on a GPU; on the CPU for tests.
 
-Arrays are float32 torch tensors on the device. They serve training; scores and identification use C MuJoCo, from which
-these simulations deviate by about 1e-6 rad in a second.
+Arrays are float32 torch tensors on the device. They serve training; scores and identification use C
+MuJoCo, from which these simulations deviate by about 1e-6 rad in a second.
 """
 
 from __future__ import annotations
@@ -22,12 +22,15 @@ from gaponet.base.errors import UsageError
 from gaponet.sim import servo
 from gaponet.sim.batch import BatchSim, CommandHistory, ramp_start
 
-MAX_CONTACTS, CONSTRAINTS_PER_CONTACT = 48, 4  # of a simulation whose links collide
+# of a simulation whose links collide
+MAX_CONTACTS = 48
+CONSTRAINTS_PER_CONTACT = 4
+# field of Data → name in BatchSim.state
 STATE = {
     "qpos": "qpos",
     "qvel": "qvel",
     "qacc_warmstart": "warmstart",
-}  # field of Data → name in BatchSim.state
+}
 HISTORY = {"history": "history", "time": "time"}
 SERVO = {"actuator_force": "servo_torque", "qfrc_bias": "servo_load"}
 TARGET = {"ctrl": "ctrl"}
@@ -66,10 +69,20 @@ _friction = _warp_function(
 
 @warp.kernel(enable_backward=False)  # type: ignore[untyped-decorator]
 def _set_servos(
-    servos: _Servos, offset: _Floats, gain: _Parameters, ctrl: _Floats, qpos: _Floats, qvel: _Floats, torque: _Floats,
-    load: _Floats, bias: _Parameters, friction: _Floats, force: _Pairs,
-) -> None:  # fmt: skip
-    """Set bias, torque limits and friction of servo j of world i for the next physics step, as servo.set_servos does.
+    servos: _Servos,
+    offset: _Floats,
+    gain: _Parameters,
+    ctrl: _Floats,
+    qpos: _Floats,
+    qvel: _Floats,
+    torque: _Floats,
+    load: _Floats,
+    bias: _Parameters,
+    friction: _Floats,
+    force: _Pairs,
+) -> None:
+    """Set bias, torque limits and friction of servo j of world i for the next physics step, as
+    servo.set_servos does.
 
     Where a servo has a no-load speed, every world has its own torque limits `force`.
     """
@@ -90,11 +103,9 @@ class _Worlds:
     """Simulations of one control period: mujoco_warp steps all of its worlds, equally often."""
 
     def __init__(self, sim: BatchSim, rows: np.ndarray, device: str) -> None:
-        self.device, self.nstep, self._graphs = (
-            warp.get_device(device),
-            int(sim.nstep[rows[0]]),
-            dict[Any, Any](),
-        )
+        self.device = warp.get_device(device)
+        self.nstep = int(sim.nstep[rows[0]])
+        self._graphs = dict[Any, Any]()
         model = next(iter(sim.models.values()))
         own = {
             name: x[rows]
@@ -113,15 +124,15 @@ class _Worlds:
                 self.model = mujoco_warp.put_model(model, batch_sizes=dict.fromkeys(own, len(rows)))
             except (NotImplementedError, ValueError) as error:
                 raise UsageError(
-                    f"{sim.robot.name}: mujoco_warp does not support its model ({error}); use --device cpu"
+                    f"{sim.robot.name}: mujoco_warp does not support its model ({error}); use "
+                    "--device cpu"
                 ) from None
             self.data = mujoco_warp.put_data(
                 model, mujoco.MjData(model), len(rows), contacts or None, njmax=constraints
             )
             self.model.opt.timestep = warp.array(timestep, dtype=float)
-            self.model.opt.tolerance = warp.array(
-                [model.opt.tolerance], dtype=float
-            )  # put_model's is 1e-6 at least
+            # put_model's is 1e-6 at least
+            self.model.opt.tolerance = warp.array([model.opt.tolerance], dtype=float)
             # float32 seldom reaches that tolerance: no message each time, as in C MuJoCo.
             self.model.opt.warn_overflow &= ~mujoco_warp.OverflowType.ITERATIONS
             self._servo_inputs = (
@@ -162,12 +173,16 @@ class _Worlds:
             mujoco_warp.step(self.model, self.data)
 
     def bias_forces(self) -> None:
-        """Compute gravity's and Coriolis forces from positions and velocities: a small part of a physics step."""
+        """Compute gravity's and Coriolis forces from positions and velocities: a small part of a
+        physics step.
+        """
         for part in (mujoco_warp.fwd_kinematics, mujoco_warp.com_vel, mujoco_warp.rne):
             part(self.model, self.data)
 
     def launch(self, kernels: Callable[[], None]) -> None:
-        """Launch the kernels of `period` or `bias_forces`; on a GPU as one CUDA graph, on torch's stream."""
+        """Launch the kernels of `period` or `bias_forces`; on a GPU as one CUDA graph, on torch's
+        stream.
+        """
         with warp.ScopedDevice(self.device):
             if self.device.is_cuda:
                 graph = self._graphs[kernels] = self._graphs.get(kernels) or self._captured(kernels)
@@ -195,19 +210,21 @@ class _Worlds:
 class WarpSim:
     """Copy of a BatchSim on a device, with its payloads, control periods, servos and state.
 
-    `qpos`, `qvel`, `ctrl` and `torque` are live (num_envs, n) float32 tensors on the device: a write is the state at
-    the next step.
+    `qpos`, `qvel`, `ctrl` and `torque` are live (num_envs, n) float32 tensors on the device: a
+    write is the state at the next step.
     """
 
     def __init__(self, sim: BatchSim, device: str = "cuda") -> None:
-        """device: "cuda", torch's present GPU (of several processes each has its own), or "warp-cpu", Warp's CPU.
+        """device: "cuda", torch's present GPU (of several processes each has its own), or
+        "warp-cpu", Warp's CPU.
 
         Raises:
             UsageError: No such device, or servos with backlash.
         """
         if sim.servo_model is not None and sim.servo_model.values["backlash"].any():
             raise UsageError(
-                f"{sim.robot.name}: no GPU simulates its backlash; use --device cpu, or backlash = 0"
+                f"{sim.robot.name}: no GPU simulates its backlash; use --device cpu, or backlash "
+                "= 0"
             )
         warp.config.log_level = warp.LOG_WARNING if device == "cuda" else warp.LOG_ERROR
         device = f"cuda:{torch.cuda.current_device()}" if device == "cuda" else "cpu"
@@ -217,8 +234,11 @@ class WarpSim:
             raise UsageError(
                 f"device {device}: Warp has no such device ({error}); use cpu"
             ) from None
-        self.robot, self.joint_names, self.num_envs = sim.robot, sim.joint_names, sim.num_envs
-        self.n, self.range = sim.n, sim.range
+        self.robot = sim.robot
+        self.joint_names = sim.joint_names
+        self.num_envs = sim.num_envs
+        self.n = sim.n
+        self.range = sim.range
         rates = [np.flatnonzero(sim.nstep == n) for n in np.unique(sim.nstep)]
         self._worlds = [_Worlds(sim, rows, device) for rows in rates]
         self._delayed = next(iter(sim.models.values())).nhistory > 0
@@ -240,7 +260,8 @@ class WarpSim:
         self._low, self._high = self.array(self.range.T)
         self._max_change = None if sim.max_change is None else self.array(sim.max_change)
         if sim.servo_model:
-            gain, servos = sim.batch.expand("actuator_gainprm")[..., 0], sim.servo_model
+            gain = sim.batch.expand("actuator_gainprm")[..., 0]
+            servos = sim.servo_model
             self._gain, self._bias, self._effort = map(
                 self.array, (gain, servos.bias, servos.effort)
             )
@@ -281,14 +302,17 @@ class WarpSim:
             ahead = 0.0 if past is None else self.array(past)[:, 0] - self.qpos[ids]
             most = self._effort[ids]
             self.torque[ids] = torch.clamp(self._gain[ids] * ahead + self._bias[ids], -most, most)
-            load, before = self._all["qfrc_bias"], self._all["qfrc_bias"].clone()
+            load = self._all["qfrc_bias"]
+            before = self._all["qfrc_bias"].clone()
             for worlds in self._each_rate():
                 worlds.launch(worlds.bias_forces)
             before[ids] = load[ids]
             load.copy_(before)
 
     def _each_rate(self) -> Iterator[_Worlds]:
-        """Yield the worlds of each control period with their simulations' state, and copy it back."""
+        """Yield the worlds of each control period with their simulations' state, and copy it
+        back.
+        """
         for worlds, views, rows in zip(self._worlds, self._views, self._ids, strict=True):
             if views is not self._all:
                 for name, x in views.items():
@@ -300,7 +324,8 @@ class WarpSim:
 
     def step(self, ctrl: Any, ids: Any = None) -> None:
         """Step as BatchSim.step does: all are stepped, and the others are restored."""
-        before, ctrl = {} if ids is None else self.state(), self.array(ctrl)
+        before = {} if ids is None else self.state()
+        ctrl = self.array(ctrl)
         if self._max_change is not None:
             ctrl = torch.clamp(ctrl, self.ctrl - self._max_change, self.ctrl + self._max_change)
         torch.clamp(ctrl, self._low, self._high, out=self.ctrl)

@@ -1,1 +1,3 @@
-"""System identification: fit, adaptation, torque, uncertainty, drift, and motions worth recording."""
+"""System identification: fit, adaptation, torque, uncertainty, drift, and motions worth
+recording.
+"""

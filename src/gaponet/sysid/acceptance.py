@@ -22,12 +22,12 @@ from gaponet.sysid.table_contact import TableFit, tip_heights
 
 Std = dict[str, dict[str, float]]  # joint → field → standard error
 Links = dict[str, Link]  # MJCF body → mass, centre of mass and inertia
-Covariance = dict[
-    str, tuple[list[str], Array]
-]  # joint → fields (P), (P, P) on the axes of uncertainty.py
+# joint → fields (P), (P, P) on the axes of uncertainty.py
+Covariance = dict[str, tuple[list[str], Array]]
 
 MIN_CROSS_VALIDATED = 4  # motions; a fit to two of three says little about a fit to all
-MIN_JUDGES = 3  # motions of each set of recorded joints; fewer are too few to validate without cross-validation
+# motions of each set of recorded joints; fewer are too few to validate without cross-validation
+MIN_JUDGES = 3
 
 
 class HeldOut(NamedTuple):
@@ -38,7 +38,9 @@ class HeldOut(NamedTuple):
 
 
 def held_out_errors(folds: Iterable[HeldOut]) -> Array:
-    """Return the mean |error| of each motion in rollouts of the robot that was fitted without it, (motions,) rad."""
+    """Return the mean |error| of each motion in rollouts of the robot that was fitted without it,
+    (motions,) rad.
+    """
     return np.concatenate([motion_errors(sequences, robot) for sequences, robot in folds])
 
 
@@ -58,9 +60,11 @@ Split = tuple[list[Sequence], list[Sequence]]  # recordings to fit, recordings t
 def cross_validation(
     sequences: ListOf[Sequence], validation: ListOf[Sequence], folds: int
 ) -> list[Split]:
-    """Return folds by motion, or the given split if at least MIN_JUDGES motions validate each set of recorded joints.
+    """Return folds by motion, or the given split if at least MIN_JUDGES motions validate each set
+    of recorded joints.
 
-    Motions of one set of joints are dealt out to the folds. A set with a single motion is fitted in every fold.
+    Motions of one set of joints are dealt out to the folds. A set with a single motion is fitted in
+    every fold.
     """
     every = [*sequences, *validation]
     motions = _motions(every)
@@ -81,7 +85,9 @@ def cross_validation(
 def _split(
     sequences: ListOf[Sequence], fold: dict[tuple[tuple[str, ...], str], int], number: int
 ) -> Split:
-    """Return the recordings outside and inside a fold; `fold` has its number by unrecorded joints and motion."""
+    """Return the recordings outside and inside a fold; `fold` has its number by unrecorded joints
+    and motion.
+    """
     fitted: list[Sequence] = []
     held_out: list[Sequence] = []
     for s in sequences:
@@ -91,7 +97,9 @@ def _split(
 
 
 def _motions(sequences: ListOf[Sequence]) -> dict[tuple[str, ...], list[str]]:
-    """Return joints that recordings do not hold → names of their independent motions, in the order of their hashes."""
+    """Return joints that recordings do not hold → names of their independent motions, in the order
+    of their hashes.
+    """
     names: dict[tuple[str, ...], list[str]] = {}
     for s in sequences:
         names.setdefault(s.meta.unrecorded, []).append(s.meta.independent_motion)
@@ -105,21 +113,26 @@ class Identified:
     Attributes:
         robot: The robot with identified parameters; the given robot if no candidate was better.
         before, after: Mean |error| of the motions that judge, rad: of the given robot, of this one.
-        chosen: Best candidate: given, joints (each by itself), whole (all together), limbs (kinematic chains), mixed,
-            torque or ramp.
-        warnings: Parameters at a bound, what to check, and what the recordings do not determine (last).
+        chosen: Best candidate: given, joints (each by itself), whole (all together), limbs
+            (kinematic chains), mixed, torque or ramp.
+        warnings: Parameters at a bound, what to check, and what the recordings do not determine
+            (last).
         std: Joint → field → standard error.
-        comparisons: Terms of the servo model in the order in which they were fitted; then torque and speed limits.
+        comparisons: Terms of the servo model in the order in which they were fitted; then torque
+            and speed limits.
         table_fit: Result for the table; None if no tip may touch anything.
         by_joint: Joint → mean |error| before and after, rad.
         covariance: Joint → fields and their covariance.
-        undetermined: Joint → fields that the recordings do not determine; all of a joint that is never moved.
-        held_out: Recordings that were not fitted and the robot that was fitted without them, one pair for each fold of
-            a cross-validation; `robot` itself where nothing was fitted to them afterwards.
-        findings: A sentence about each joint that may have backlash, and about each link that changed.
+        undetermined: Joint → fields that the recordings do not determine; all of a joint that is
+            never moved.
+        held_out: Recordings that were not fitted and the robot that was fitted without them, one
+            pair for each fold of a cross-validation; `robot` itself where nothing was fitted to
+            them afterwards.
+        findings: A sentence about each joint that may have backlash, and about each link that
+            changed.
         links: Masses and inertias, if they were fitted and accepted.
-        without_terms: The best fit without terms of the servo model, if the robot has some: what engines without such
-            terms can play.
+        without_terms: The best fit without terms of the servo model, if the robot has some: what
+            engines without such terms can play.
     """
 
     robot: RobotSpec
@@ -144,31 +157,37 @@ class Identified:
         return self.chosen != "given" or bool(self.table_fit and self.table_fit.accepted)
 
     def no_gain_message(self, robot: RobotSpec, given: Array, fitted: Array) -> str:
-        """Explain why nothing is written, and what to record; errors of the given and the fitted robot, rad."""
+        """Explain why nothing is written, and what to record; errors of the given and the fitted
+        robot, rad.
+        """
         worst = sorted(self.by_joint, key=lambda joint: -self.by_joint[joint][0])[:3]
         joints = ", ".join(f"{joint} {1e3 * self.by_joint[joint][0]:.2f}" for joint in worst)
         why = f"; {self.warnings[0]}" if self.warnings else ""
         return (
-            f"nothing is written: no fit follows the {len(given)} validation motion(s) better than {robot.name} as it "
-            f"is ({1e3 * given.mean():.2f} mrad, best fit {1e3 * fitted.mean():.2f}; worst {joints}). Record gaponet "
-            f"excite's motions, every joint over its range, slow and fast, and look at gaponet doctor{why}"
+            f"nothing is written: no fit follows the {len(given)} validation motion(s) better "
+            f"than {robot.name} as it is ({1e3 * given.mean():.2f} mrad, best fit "
+            f"{1e3 * fitted.mean():.2f}; worst {joints}). Record gaponet excite's motions, every "
+            f"joint over its range, slow and fast, and look at gaponet doctor{why}"
         )
 
 
 class Judge:
-    """Errors of candidates on whole motions that they were not fitted to, in the simulator of the whole robot.
+    """Errors of candidates on whole motions that they were not fitted to, in the simulator of the
+    whole robot.
 
-    A candidate is a list of values (n,): one for each fold, fitted without its motions; then perhaps one that was
-    fitted to all recordings, which no motion judges. Repetitions of a motion count as one.
+    A candidate is a list of values (n,): one for each fold, fitted without its motions; then
+    perhaps one that was fitted to all recordings, which no motion judges. Repetitions of a motion
+    count as one.
     """
 
     def __init__(
         self, folds: ListOf[ListOf[Sequence]], robot: RobotSpec, contact_height: float, nthread: int
     ) -> None:
-        """Take the recordings that judge, fold by fold; rows with a tip below `contact_height`, m, do not count."""
-        self._folds: list[
-            tuple[RobotRollouts, list[Array]]
-        ] = []  # rollouts, and the rows of each motion
+        """Take the recordings that judge, fold by fold; rows with a tip below `contact_height`, m,
+        do not count.
+        """
+        # rollouts, and the rows of each motion
+        self._folds: list[tuple[RobotRollouts, list[Array]]] = []
         names = []
         for sequences in folds:
             touch = _contact_rows(sequences, robot, contact_height)
@@ -190,8 +209,11 @@ class Judge:
         self._sums_of: dict[tuple[int, bytes], Array] = {}
 
     def _sums(self, candidate: ListOf[Values], links: ListOf[Links] = ()) -> tuple[Array, Array]:
-        """Return the sums of |error| over counted rows, rad, and their numbers, by motion and joint, (motions, n)."""
-        totals, counts = [], []
+        """Return the sums of |error| over counted rows, rad, and their numbers, by motion and
+        joint, (motions, n).
+        """
+        totals = []
+        counts = []
         for k, ((rollouts, motions), values) in enumerate(
             zip(self._folds, candidate, strict=False)
         ):
@@ -209,7 +231,9 @@ class Judge:
         return np.concatenate(totals), np.stack(counts)
 
     def errors(self, candidate: ListOf[Values], links: ListOf[Links] = ()) -> Array:
-        """Return the mean |error| of each motion, (motions,) rad; `links` of each fold, if they are not the robot's."""
+        """Return the mean |error| of each motion, (motions,) rad; `links` of each fold, if they
+        are not the robot's.
+        """
         total, count = self._sums(candidate, links)
         return np.asarray(total.sum(axis=1) / np.maximum(count.sum(axis=1), 1))
 
@@ -229,13 +253,14 @@ class Judge:
         )
 
     def best_by_joint(self, candidates: dict[str, list[Values]]) -> tuple[str, list[Values]]:
-        """Return name and values of the first candidate, with another one's values at joints whose motions accept them.
+        """Return name and values of the first candidate, with another one's values at joints whose
+        motions accept them.
 
-        Units and payloads of a motion count as one, since a robot that is identified already needs evidence to change.
+        Units and payloads of a motion count as one, since a robot that is identified already needs
+        evidence to change.
         """
-        errors = {
-            name: self._joint_errors(v) for name, v in candidates.items()
-        }  # (motions, n), NaN: not held
+        # (motions, n), NaN: not held
+        errors = {name: self._joint_errors(v) for name, v in candidates.items()}
         given, *others = errors
         winner = np.zeros(errors[given].shape[1], int)
         for i in range(len(winner)):
@@ -250,7 +275,9 @@ class Judge:
         return ("mixed", mixed) if winner.any() else (given, candidates[given])
 
     def _joint_errors(self, candidate: ListOf[Values]) -> Array:
-        """Return the mean |error| of each motion and joint, (motions, n) rad; NaN where a motion does not hold it."""
+        """Return the mean |error| of each motion and joint, (motions, n) rad; NaN where a motion
+        does not hold it.
+        """
         total, count = self._sums(candidate)
         with np.errstate(invalid="ignore"):
             same = [self.names == name for name in dict.fromkeys(self.names)]
@@ -259,9 +286,10 @@ class Judge:
     def best(self, candidates: dict[str, list[Values]]) -> tuple[str, list[Values]]:
         """Return name and values of the best candidate.
 
-        The second candidate is the default. Another one replaces it if it is accepted by `Comparison`, or better by
-        10 %. The best values joint by joint ("mixed") replace it only if they are accepted. The first candidate, the
-        given robot, is returned if no fit is better by 1 %.
+        The second candidate is the default. Another one replaces it if it is accepted by
+        `Comparison`, or better by 10 %. The best values joint by joint ("mixed") replace it only if
+        they are accepted. The first candidate, the given robot, is returned if no fit is better by
+        1 %.
         """
         given, default, *others = candidates
         joints = np.array([self.errors_by_joint(v) for v in candidates.values()])
@@ -269,7 +297,8 @@ class Judge:
         if len(set(winner.tolist())) > 1:
             mixed = [_by_joint(each, winner) for each in zip(*candidates.values(), strict=True)]
             candidates = candidates | {"mixed": mixed}
-        errors, name = {name: self.errors(v) for name, v in candidates.items()}, default
+        errors = {name: self.errors(v) for name, v in candidates.items()}
+        name = default
         for other in (*others, *(candidates.keys() & {"mixed"})):
             limit = (1 - MIN_RELATIVE_GAIN_ONE_MOTION) * errors[name].mean()
             much_better = other != "mixed" and errors[other].mean() < limit

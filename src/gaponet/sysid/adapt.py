@@ -1,8 +1,8 @@
 """Adaptation of a robot's servo parameters to one robot id or day, from half a minute of its log.
 
-A prior keeps parameters that so little log does not determine at the robot's values; with a corrector, the fit is made
-under it. Half a minute has more information about all joints together than about one. So a change that all joints share
-costs less than a change of one joint.
+A prior keeps parameters that so little log does not determine at the robot's values; with a
+corrector, the fit is made under it. Half a minute has more information about all joints together
+than about one. So a change that all joints share costs less than a change of one joint.
 """
 
 from __future__ import annotations
@@ -29,12 +29,15 @@ FIELDS: tuple[Field, ...] = get_args(Field)
 PRIOR_RAD = 0.3  # price of a large change of one joint
 # the same where all joints change by the same share: a cold day, a slow bus
 SHARED_PRIOR_RATIO = 0.05
+# such a day moves no zeros and softens no gains
 SHARED_FIELDS = (
     "damping",
     "frictionloss",
     "delay",
-)  # such a day moves no zeros and softens no gains
-ITERATIONS, MIN_DECREASE = 4, 1e-3  # at most; relative decrease of the cost for another one
+)
+# at most; relative decrease of the cost for another one
+ITERATIONS = 4
+MIN_DECREASE = 1e-3
 MAX_FOLDS = 4  # of motions that judge
 MAX_SHORT_WINDOW_S = 4.0  # too short to validate another window
 START_DELAY_S = 0.005  # a delay of zero has no slope
@@ -47,9 +50,11 @@ class Adapted:
     Attributes:
         robot: The robot with fitted parameters.
         before, after: RMS error of the windows, rad.
-        judged: Mean |error| of motions before, and with the fit to the other motions, (motions,) rad.
-        accepted: True if the windows improve by 1 % and those motions do not become worse (`Comparison.harmful`); False
-            for one short motion per joint. The prior weighs the evidence.
+        judged: Mean |error| of motions before, and with the fit to the other motions, (motions,)
+            rad.
+        accepted: True if the windows improve by 1 % and those motions do not become worse
+            (`Comparison.harmful`); False for one short motion per joint. The prior weighs the
+            evidence.
     """
 
     robot: RobotSpec
@@ -75,7 +80,8 @@ def adapt(
         seconds: Duration of the windows together.
         corrector: Corrects the targets, as in replay.
         progress: Called with iterations done, at most, and the present RMS error in rad.
-        judge: Judge by motions that are not fitted; joints with one short motion keep their values then.
+        judge: Judge by motions that are not fitted; joints with one short motion keep their values
+            then.
     """
     parts = cut(sequences, max(1, round(seconds / WINDOW_S)))
     judged = _cross_validated(parts, robot, corrector) if judge else (np.zeros(0), np.zeros(0))
@@ -95,9 +101,15 @@ def adapt(
         progress(done, ITERATIONS, ERROR_SCALE_RAD * float(np.sqrt(2 * cost[0] / problem.size)))
 
     x, _ = descend(
-        problem.changes.start(START_DELAY_S).reshape(1, 1, -1), problem.low, problem.high, problem.errors, ITERATIONS,
-        report, min_decrease=MIN_DECREASE, derive=problem.slopes,
-    )  # fmt: skip
+        problem.changes.start(START_DELAY_S).reshape(1, 1, -1),
+        problem.low,
+        problem.high,
+        problem.errors,
+        ITERATIONS,
+        report,
+        min_decrease=MIN_DECREASE,
+        derive=problem.slopes,
+    )
     before, after = (problem.rms(p) for p in (np.zeros_like(x[0, 0]), x[0, 0]))
     accepted = accepted and not (judge and after > (1 - MIN_RELATIVE_GAIN) * before)
     values = problem.values(x[0])
@@ -109,8 +121,8 @@ def adapt(
 def _motions_that_judge(parts: list[Sequence]) -> list[list[list[int]]]:
     """Return the windows of each motion, for each set of joints that is recorded together.
 
-    A single motion of a set is divided into its windows where these are long. Else it is left out, since nothing else
-    can judge it.
+    A single motion of a set is divided into its windows where these are long. Else it is left out,
+    since nothing else can judge it.
     """
     groups: dict[tuple[str, ...], dict[str, list[int]]] = {}
     for i, p in enumerate(parts):
@@ -126,8 +138,11 @@ def _motions_that_judge(parts: list[Sequence]) -> list[list[list[int]]]:
 def _cross_validated(
     parts: list[Sequence], robot: RobotSpec, corrector: Corrector | None
 ) -> tuple[Array, Array]:
-    """Return the mean |error| of motions, of the robot and of the fit to the other motions, (motions,) rad."""
-    every, errors = _motions_that_judge(parts), list[tuple[float, ...]]()
+    """Return the mean |error| of motions, of the robot and of the fit to the other motions,
+    (motions,) rad.
+    """
+    every = _motions_that_judge(parts)
+    errors = list[tuple[float, ...]]()
     for k in range(min(MAX_FOLDS, max(map(len, every), default=0))):
         test = [motion for motions in every for motion in motions[k::MAX_FOLDS]]
         rest = [
@@ -147,19 +162,23 @@ def _cross_validated(
 
 
 class _Problem:
-    """All joints as one problem: x (P,) is the change of each field, joint by joint, in large changes.
+    """All joints as one problem: x (P,) is the change of each field, joint by joint, in large
+    changes.
 
-    A servo's parameters act on its own joint first; on others they act less by the ratio of the inertias. So one
-    simulation changes a field of all joints, and each joint's error counts for its own parameter: six simulations give
-    all derivatives, however many joints.
+    A servo's parameters act on its own joint first; on others they act less by the ratio of the
+    inertias. So one simulation changes a field of all joints, and each joint's error counts for its
+    own parameter: six simulations give all derivatives, however many joints.
     """
 
     def __init__(self, rollouts: RobotRollouts, first: Values, kd_slack: Array) -> None:
-        self.rollouts, self.n = rollouts, rollouts.n
-        self.size, self.changes = int(rollouts.rows.sum()), Changes(first, FIELDS, kd_slack)
+        self.rollouts = rollouts
+        self.n = rollouts.n
+        self.size = int(rollouts.rows.sum())
+        self.changes = Changes(first, FIELDS, kd_slack)
         self.low, self.high = self.changes.low.reshape(1, -1), self.changes.high.reshape(1, -1)
         price = PRIOR_RAD / ERROR_SCALE_RAD
-        single, common = price * np.eye(self.n), price * (1 - SHARED_PRIOR_RATIO) / self.n
+        single = price * np.eye(self.n)
+        common = price * (1 - SHARED_PRIOR_RATIO) / self.n
         self.prior = np.zeros((self.low.size, self.low.size))  # errors of the prior over x
         for i, f in enumerate(FIELDS):
             here = np.arange(self.n) * len(FIELDS) + i
@@ -175,13 +194,16 @@ class _Problem:
         return ERROR_SCALE_RAD * float(np.sqrt(np.square(self._errors(x[None])).mean()))
 
     def errors(self, xs: Array) -> Array:
-        """Return errors of candidates (k, 1, P), (k, 1, rows) in ERROR_SCALE_RAD: of all joints, then of the prior."""
+        """Return errors of candidates (k, 1, P), (k, 1, rows) in ERROR_SCALE_RAD: of all joints,
+        then of the prior.
+        """
         own = self._errors(xs[:, 0]).reshape(len(xs), -1)
         return np.concatenate([own, xs[:, 0] @ self.prior.T], axis=1)[:, None]
 
     def slopes(self, x: Array, high: Array, errors: Errors) -> tuple[Array, Array]:
         """Return what least_squares.slopes does, for one start, by fewer candidates."""
-        here, count = x[0, 0], len(FIELDS)
+        here = x[0, 0]
+        count = len(FIELDS)
         field = np.tile(np.arange(count), self.n)
         step = np.where(here + DIFFERENCE_STEP > high[0], -DIFFERENCE_STEP, DIFFERENCE_STEP)
         tried = here + np.concatenate(

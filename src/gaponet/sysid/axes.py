@@ -1,7 +1,9 @@
-"""Axes of a search: servo parameters in units in which a change of one is large, inside their bounds.
+"""Axes of a search: servo parameters in units in which a change of one is large, inside their
+bounds.
 
-A motion shows torques divided by kp, whatever kp is. So torques are searched as multiples of kp, damping as a time, and
-armature as a time squared, with bounds that hold for any motor. The gains of a robot file only start a search.
+A motion shows torques divided by kp, whatever kp is. So torques are searched as multiples of kp,
+damping as a time, and armature as a time squared, with bounds that hold for any motor. The gains of
+a robot file only start a search.
 """
 
 from __future__ import annotations
@@ -27,24 +29,25 @@ WARM = TERMS["temperature"]
 MIN_PER_KELVIN = 1e-3  # 1/K, of friction by temperature and of damping; less counts as none
 START_DELAY_S = 0.02  # a start without delay has no slope over it
 MIN_STEPS_PER_RADIAN = 5.0  # physics steps in a radian of the stiffest oscillation of a start
-MAX_KP_LOG_CHANGE, LARGE_KP_LOG_CHANGE, MAX_ARMATURE_TIME_S = 5.0, 0.2, 0.3
+MAX_KP_LOG_CHANGE = 5.0
+LARGE_KP_LOG_CHANGE = 0.2
+MAX_ARMATURE_TIME_S = 0.3
 MAX_ON_AXIS = {f.name: f.bounds[1] for f in SERVO_FIELDS.values() if f.bounds}
 MIN_EXCITATION_RAD = 0.01  # commands that differ by less do not excite a joint
+# of an unexcited joint, fitted as others move it
 UNEXCITED_FIELDS = (
     "kp",
     "offset",
     "damping",
     "frictionloss",
-)  # of an unexcited joint, fitted as others move it
+)
 MIN_INVERSE = 1e-5  # on an inverse axis; less counts as none
-MIN_LINE, LARGE_LINE_CHANGE = (
-    0.2,
-    0.1,
-)  # share of the torque that a motor has lost at a joint's greatest speed
-SPEED_QUANTILE, MIN_SPEED = (
-    0.995,
-    0.1,
-)  # of a joint's recorded speeds, and rad/s: the greatest is at least this
+# share of the torque that a motor has lost at a joint's greatest speed
+MIN_LINE = 0.2
+LARGE_LINE_CHANGE = 0.1
+# of a joint's recorded speeds, and rad/s: the greatest is at least this
+SPEED_QUANTILE = 0.995
+MIN_SPEED = 0.1
 BOUND_TOLERANCE = 0.02  # of a large change: a value as near to its bound is at it
 
 
@@ -70,7 +73,9 @@ def from_axis(x: dict[str, Array], kp: Array | None = None) -> Values:
 
 
 def greatest_speeds(sequences: ListOf[Sequence], robot: RobotSpec) -> Array:
-    """Return the greatest recorded speed of each operated joint, at least MIN_SPEED, (n,) rad/s; without outliers."""
+    """Return the greatest recorded speed of each operated joint, at least MIN_SPEED, (n,) rad/s;
+    without outliers.
+    """
     speeds = [
         np.quantile(np.abs(s.qvel[:, robot.operated_index]), SPEED_QUANTILE, axis=0)
         for s in sequences
@@ -79,8 +84,12 @@ def greatest_speeds(sequences: ListOf[Sequence], robot: RobotSpec) -> Array:
 
 
 def first_values(robot: RobotSpec) -> Values:
-    """Return the robot's own values, (n,) each. Damping is the MJCF's; below zero it is taken from the servo's kd."""
-    model, op = build_model(replace(robot, table=None)), robot.operated_index
+    """Return the robot's own values, (n,) each.
+
+    Damping is the MJCF's; below zero it is taken from the servo's kd.
+    """
+    model = build_model(replace(robot, table=None))
+    op = robot.operated_index
     passive = {
         f: np.array(getattr(model, f"dof_{f}")[op]) for f in ("damping", "frictionloss", "armature")
     }
@@ -91,21 +100,28 @@ def first_values(robot: RobotSpec) -> Values:
 
 
 def identified_joints(robot: RobotSpec) -> set[str]:
-    """Return the operated joints whose classic fields differ from those of the robot before identification."""
-    now, then = first_values(robot), first_values(robot.before_identification)
+    """Return the operated joints whose classic fields differ from those of the robot before
+    identification.
+    """
+    now = first_values(robot)
+    then = first_values(robot.before_identification)
     moved = np.any([~np.isclose(now[f], then[f], rtol=1e-3, atol=1e-6) for f in CLASSIC], axis=0)
     return {joint for joint, by in zip(robot.operated, moved, strict=True) if by}
 
 
 def with_values(robot: RobotSpec, values: Mapping[str, Array]) -> RobotSpec:
     """Return the robot with values (n,) of its operated joints, rounded to 6 digits."""
-    return robot.with_servos({
-        j: {f: float(f"{v[i]:.6g}") for f, v in values.items()} for i, j in enumerate(robot.operated)
-    })  # fmt: skip
+    return robot.with_servos(
+        {
+            j: {f: float(f"{v[i]:.6g}") for f, v in values.items()}
+            for i, j in enumerate(robot.operated)
+        }
+    )
 
 
 class Changes:
-    """Changes x (…, n, P) of P fields of a robot's own values, in large changes; of kp by its logarithm.
+    """Changes x (…, n, P) of P fields of a robot's own values, in large changes; of kp by its
+    logarithm.
 
     Attributes:
         fields: The P fields, out of CLASSIC.
@@ -113,9 +129,13 @@ class Changes:
     """
 
     def __init__(self, first: Values, fields: ListOf[str], kd_slack: Array | float = 0.0) -> None:
-        """first: Own values, (n,); kd_slack: kd that damping may take from the servos, N·m·s/rad."""
-        self.fields, self._first = tuple(fields), first
-        kp, one = first["kp"], np.ones_like(first["kp"])
+        """first: Own values, (n,); kd_slack: kd that damping may take from the servos,
+        N·m·s/rad.
+        """
+        self.fields = tuple(fields)
+        self._first = first
+        kp = first["kp"]
+        one = np.ones_like(first["kp"])
         damping, friction, armature, delay = (
             first[f] for f in ("damping", "frictionloss", "armature", "delay")
         )
@@ -133,7 +153,8 @@ class Changes:
             "delay": (0.02 * one, -delay, MAX_ON_AXIS["delay"] - delay),
         }
         self._large, low, high = (np.stack([ends[f][i] for f in fields], axis=1) for i in range(3))
-        self.low, self.high = low / self._large, high / self._large
+        self.low = low / self._large
+        self.high = high / self._large
 
     def start(self, delay: float) -> Array:
         """Return no change, but for a delay of at least so many seconds, (n, P)."""
@@ -141,7 +162,10 @@ class Changes:
         return np.asarray(more / self._large * (np.array(self.fields) == "delay"))
 
     def values(self, x: Array) -> Values:
-        """Return the values of x; fields that are not changed stay. A bound of zero is met exactly."""
+        """Return the values of x; fields that are not changed stay.
+
+        A bound of zero is met exactly.
+        """
         moved = dict(zip(self.fields, np.moveaxis(x * self._large, -1, 0), strict=True))
         rest = {f: np.broadcast_to(v, x.shape[:-1]) for f, v in self._first.items()}
         values = {
@@ -161,20 +185,25 @@ class Bounds:
 
     Attributes:
         first: The given robot's own values.
-        start: Start of a search: with a delay, and with as much armature as the physics step resolves.
+        start: Start of a search: with a delay, and with as much armature as the physics step
+            resolves.
         stated: Whether all recordings state their kp.
         inertia: Inertia of the links at the MJCF's reference pose, without armature, (n,) kg·m².
-        kd: The servos' kd, (n,) N·m·s/rad. Damping may take from it, stated or not: firmware filters the velocity.
+        kd: The servos' kd, (n,) N·m·s/rad. Damping may take from it, stated or not: firmware
+            filters the velocity.
         unexcited: Joints that no command moves, (n,).
         limits: Field → lowest, highest, a large change, (n,) each, in the axes' units.
         guess: First value of a field of the servo model.
     """
 
     def __init__(self, robot: RobotSpec, sequences: ListOf[Sequence]) -> None:
-        op, self.n = robot.operated_index, len(robot.operated)
-        self._joints, self.kd = robot.operated, robot.kd[op]
+        op = robot.operated_index
+        self.n = len(robot.operated)
+        self._joints = robot.operated
+        self.kd = robot.kd[op]
         model = build_model(replace(robot, table=None))
-        kp, limit = robot.kp[op], robot.effort_limit[op]
+        kp = robot.kp[op]
+        limit = robot.effort_limit[op]
         self.first = first_values(robot)
         self.stated = all(s.meta.recorded_gains[0] is not None for s in sequences)
         excitation = np.max([np.ptp(s.ctrl[:, op], axis=0) for s in sequences], axis=0)
@@ -237,7 +266,9 @@ class Bounds:
         return limits
 
     def _guess(self, kp: Array, varies: Array) -> Values:
-        """Return the first values of fields with a guess on their axis, (n,) each; arguments as of `_limits`."""
+        """Return the first values of fields with a guess on their axis, (n,) each; arguments as of
+        `_limits`.
+        """
         guess = {}
         for f in SERVO_FIELDS.values():
             if f.guess is not None:
@@ -245,8 +276,9 @@ class Bounds:
         return from_axis(guess, kp)
 
     def visible(self, field: str, values: Values) -> Array:
-        """Return a field of values (n,), 0 where it is a torque-speed line of less than MIN_LINE, or of friction and
-        damping that change by less than MIN_PER_KELVIN."""
+        """Return a field of values (n,), 0 where it is a torque-speed line of less than MIN_LINE,
+        or of friction and damping that change by less than MIN_PER_KELVIN.
+        """
         if field == WARM[0]:
             total = np.maximum(values["damping"] + self.kd, 0.0)
             slow = np.abs(values[WARM[1]]) < MIN_PER_KELVIN * total
@@ -258,13 +290,16 @@ class Bounds:
         return np.where(line < least, 0.0, values[field])
 
     def warnings(self, values: Values, names: ListOf[str]) -> tuple[str, ...]:
-        """Return a sentence for each field of values (n,) at its bound; no friction, armature or delay is ordinary."""
+        """Return a sentence for each field of values (n,) at its bound; no friction, armature or
+        delay is ordinary.
+        """
         axes = Axes(self, names, values)
         x = axes.normalize(values)
         warnings = []
         for i, joint in enumerate(self._joints):
             for k, f in enumerate(names):
-                low, high = axes.low[i, k], axes.high[i, k]
+                low = axes.low[i, k]
+                high = axes.high[i, k]
                 without = f == "stribeck_speed" and not values["stribeck"][i]
                 if low == high or without:
                     continue
@@ -295,14 +330,18 @@ class Axes:
     """
 
     def __init__(self, bounds: Bounds, fields: ListOf[str], rest: Values) -> None:
-        self.names, self.rest, self._kd_slack = list(dict.fromkeys(fields)), rest, bounds.kd
+        self.names = list(dict.fromkeys(fields))
+        self.rest = rest
+        self._kd_slack = bounds.kd
         low, high, self.unit = (
             np.stack([bounds.limits[f][i] for f in self.names], axis=1) for i in range(3)
         )
-        self.low, self.high = low / self.unit, high / self.unit
+        self.low = low / self.unit
+        self.high = high / self.unit
         here = self._unclipped(rest)
         fixed = bounds.unexcited[:, None] & ~np.isin(self.names, UNEXCITED_FIELDS)
-        self.low, self.high = np.where(fixed, here, self.low), np.where(fixed, here, self.high)
+        self.low = np.where(fixed, here, self.low)
+        self.high = np.where(fixed, here, self.high)
 
     def normalize(self, values: Values) -> Array:
         """Return values (…, n) on the axes, inside the bounds."""

@@ -1,16 +1,20 @@
-"""Identification: the servo parameters with which rollouts of the simulator follow the recordings best.
+"""Identification: the servo parameters with which rollouts of the simulator follow the recordings
+best.
 
-Per operated joint these are kp, total damping, dry friction, armature, zero offset and command delay, then what
-validation motions accept: terms of the servo model (sim/servo.py) and, on request, links. `identify` goes this way:
+Per operated joint these are kp, total damping, dry friction, armature, zero offset and command
+delay, then what validation motions accept: terms of the servo model (sim/servo.py) and, on request,
+links. `identify` goes this way:
 
-1. Fit the classic fields, every joint by itself and then all together where that helps (steps/classic.py).
-2. Propose one step after the other: terms (steps/servo_term.py), links (steps/link_masses.py). Each is fitted to
-   the same recordings; motions that were not fitted accept or reject it (`Judge`).
+1. Fit the classic fields, every joint by itself and then all together where that helps
+(steps/classic.py).
+2. Propose one step after the other: terms (steps/servo_term.py), links (steps/link_masses.py). Each
+   is fitted to the same recordings; motions that were not fitted accept or reject it (`Judge`).
 3. Fit the table under the tips (table_contact.py), and estimate standard errors (problem.py).
-4. Compare with a fit that begins with recorded torque (steps/recorded_torque.py), and with speed-limited targets
-   (steps/speed_limits.py).
+4. Compare with a fit that begins with recorded torque (steps/recorded_torque.py), and with
+   speed-limited targets (steps/speed_limits.py).
 
-Where few motions validate, all of this is done for folds of a cross-validation side by side, and for all recordings.
+Where few motions validate, all of this is done for folds of a cross-validation side by side, and
+for all recordings.
 """
 
 from __future__ import annotations
@@ -74,7 +78,9 @@ class Recordings:
 
     @property
     def fitted_sets(self) -> list[list[Sequence]]:
-        """What is fitted: the recordings of each fold, and all of them last if there are several folds."""
+        """What is fitted: the recordings of each fold, and all of them last if there are several
+        folds.
+        """
         sets = [train for train, _ in self.splits]
         if len(self.splits) > 1:
             sets.append([*self.fitted, *self.validation])
@@ -90,12 +96,13 @@ def identify(
 ) -> Identified:
     """Fit the parameters of all operated joints.
 
-    Where fewer than three motions validate a set of joints, all recordings are fitted in the end, and cross-validation
-    over their motions chooses among candidates.
+    Where fewer than three motions validate a set of joints, all recordings are fitted in the end,
+    and cross-validation over their motions chooses among candidates.
 
     Args:
         sequences: Recordings to fit; validation and test motions stay out.
-        robot: Start of the fit; its payload masses are taken as true, its gains where recordings state them.
+        robot: Start of the fit; its payload masses are taken as true, its gains where recordings
+            state them.
         validation: Recordings that choose among candidates; without them the fitted windows do.
         options: Default: IdentifyOptions().
         progress: Called with iterations done, in all, and what is fitted.
@@ -118,7 +125,9 @@ def identify(
 def _identify(
     recordings: Recordings, robot: RobotSpec, options: IdentifyOptions, progress: Progress
 ) -> Identified:
-    """Fit to positions, and then from recorded torque, with the speed limits that the robot's servos have."""
+    """Fit to positions, and then from recorded torque, with the speed limits that the robot's
+    servos have.
+    """
     began = time.monotonic()
     fitted = _fit_positions(recordings, robot, options, progress)
     if not recordings.validation:
@@ -195,7 +204,9 @@ def _fits(
     progress: Progress,
     contact: float,
 ) -> Fits:
-    """Return the fits of all sets, and their judge; `contact` is the height under which a tip may touch, m."""
+    """Return the fits of all sets, and their judge; `contact` is the height under which a tip may
+    touch, m.
+    """
     sets = recordings.fitted_sets
     steps = len(options.terms or ()) + options.masses
     shown = SearchProgress(options.seconds, steps, len(sets), progress)
@@ -221,7 +232,9 @@ def _steps(fits: Fits, options: IdentifyOptions) -> list[Step]:
 def with_steps(
     steps: ListOf[Step], fits: Fits, state: FitState
 ) -> tuple[FitState, tuple[Comparison, ...], list[str]]:
-    """Return the state with the steps that the judge accepts, its comparisons, and names of steps without time."""
+    """Return the state with the steps that the judge accepts, its comparisons, and names of steps
+    without time.
+    """
     comparisons: list[Comparison] = []
     untried: list[str] = []
     for step in steps:
@@ -279,7 +292,9 @@ def _fitted(
 
 
 def _without_terms(fits: Fits, classic: FitState, fitted: RobotSpec) -> RobotSpec | None:
-    """Return the classic fit with the table, zeros and stops of `fitted`, which has terms of the servo model."""
+    """Return the classic fit with the table, zeros and stops of `fitted`, which has terms of the
+    servo model.
+    """
     if not fitted.has_servo_model or fitted.links != fits.given.links or fits.given.has_servo_model:
         return None
     return replace(
@@ -307,7 +322,9 @@ def _held_out(
 def _errors_by_joint(
     fits: Fits, first: FitState, state: FitState
 ) -> dict[str, tuple[float, float]]:
-    """Return joint → mean |error| on motions that judge, of the given robot and of the fitted one, rad."""
+    """Return joint → mean |error| on motions that judge, of the given robot and of the fitted one,
+    rad.
+    """
     before = fits.judge.errors_by_joint(first.values).tolist()
     after = fits.judge.errors_by_joint(state.values, state.links).tolist()
     return dict(zip(fits.given.operated, zip(before, after, strict=True), strict=True))

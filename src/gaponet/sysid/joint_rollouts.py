@@ -1,9 +1,11 @@
-"""Rollouts of every joint by itself beside recordings, the others moving as recorded: many candidates at once.
+"""Rollouts of every joint by itself beside recordings, the others moving as recorded: many
+candidates at once.
 
-A servo's parameters act on its own joint first, and change the path of others by a few milliradians. So inertia,
-gravity and the torque by the other joints' accelerations are computed along the recording once. A joint is then one
-equation, stepped as MuJoCo steps it (implicit damping, friction that stops within a step). That takes a hundredth of
-the time of the robot's simulator; errors by joint agree to a few per cent (tests/sysid/test_joint_rollouts.py).
+A servo's parameters act on its own joint first, and change the path of others by a few
+milliradians. So inertia, gravity and the torque by the other joints' accelerations are computed
+along the recording once. A joint is then one equation, stepped as MuJoCo steps it (implicit
+damping, friction that stops within a step). That takes a hundredth of the time of the robot's
+simulator; errors by joint agree to a few per cent (tests/sysid/test_joint_rollouts.py).
 """
 
 from __future__ import annotations
@@ -32,17 +34,19 @@ ERROR_SCALE_RAD = 0.01
 ROW_PERIOD_S = 0.01  # between rows that are compared
 SETTLE_S = 0.1  # after a window's start, where velocities are measured ones
 UNLIMITED_STOP_RAD = 7.0  # stops of a joint without any
-MAX_REGRESSION_ROWS, MAX_REGRESSION_DELAY_S = 20_000, 0.1
+MAX_REGRESSION_ROWS = 20_000
+MAX_REGRESSION_DELAY_S = 0.1
 SLIP_SPEED = 0.02  # rad/s, of the regression: at which friction is whole
 CUTOFF_HZ = 10.0  # of the other joints' accelerations: above the arms' bandwidth
-GRAVITY_STEP_RAD, GRAVITY_ROWS = (
-    0.02,
-    5,
-)  # of the derivative of gravity's torque; rows that share one
+# of the derivative of gravity's torque; rows that share one
+GRAVITY_STEP_RAD = 0.02
+GRAVITY_ROWS = 5
 
 
 class JointRollouts:
-    """Rollouts of windows of recordings, n operated joints; rows in which a tip may touch something do not count."""
+    """Rollouts of windows of recordings, n operated joints; rows in which a tip may touch
+    something do not count.
+    """
 
     def __init__(
         self,
@@ -66,7 +70,8 @@ class JointRollouts:
         # Physics steps of every period, so that windows step side by side.
         self.count = robot.steps_per(self.dt)
         self.thin = max(1, round(ROW_PERIOD_S / self.dt))
-        # Rows of each window from one that is compared to the next, (windows,): multiples of `thin`.
+        # Rows of each window from one that is compared to the next, (windows,): multiples of
+        # `thin`.
         thins = np.round(ROW_PERIOD_S / self.periods / self.thin)
         self._thins = self.thin * np.maximum(1, thins).astype(int)
         self.lengths = np.array([len(p) for p in parts])
@@ -88,13 +93,17 @@ class JointRollouts:
         self.temperature = recorded_temperatures(parts, self.op).T  # (n, windows) °C
 
     def _stacked(self, windows: list[Array]) -> Array:
-        """Return arrays (rows, n) of each window as (n, windows, rows); the last row of a shorter one is repeated."""
+        """Return arrays (rows, n) of each window as (n, windows, rows); the last row of a shorter
+        one is repeated.
+        """
         rows = int(self.lengths.max())
         extended = np.stack([_extended(x, rows) for x in windows])
         return extended.transpose(2, 0, 1).astype(np.float32)
 
     def _commands(self) -> Array:
-        """Return the commands inside the joints' ranges, as servos with a speed limit ramp them, (n, windows, rows)."""
+        """Return the commands inside the joints' ranges, as servos with a speed limit ramp them,
+        (n, windows, rows).
+        """
         low, high = self.robot.qpos_range[self.op].T
         ctrl = self._stacked([np.clip(p.ctrl[:, self.op], low, high) for p in self.parts])
         speed = self.robot.target_speed[self.op]
@@ -105,7 +114,9 @@ class JointRollouts:
         return np.ascontiguousarray(np.moveaxis(limited, 0, -1))
 
     def _loads(self) -> Array:
-        """Return the loads along the recordings in the middle of each period, as `Windows.loads`."""
+        """Return the loads along the recordings in the middle of each period, as
+        `Windows.loads`.
+        """
         payloads = [(p.meta.payload_mass, p.meta.payload_side) for p in self.parts]
         models = {
             x: build_model(self.robot, *x, self.dt, physics_only=True)
@@ -122,7 +133,9 @@ class JointRollouts:
         return np.stack([inertia, weight - slope * _at_middle(self.qpos), pull, slope])
 
     def _stops(self) -> Array:
-        """Return the ends of each joint's range, or of the recordings, so that no rollout diverges, (n, 2) rad."""
+        """Return the ends of each joint's range, or of the recordings, so that no rollout
+        diverges, (n, 2) rad.
+        """
         low, high = self.robot.qpos_range[self.op].T
         lowest = np.where(np.isfinite(low), low, -UNLIMITED_STOP_RAD)
         highest = np.where(np.isfinite(high), high, UNLIMITED_STOP_RAD)
@@ -142,15 +155,19 @@ class JointRollouts:
         return np.asarray(each < contact_height)
 
     def _counted(self) -> Array:
-        """Return the rows that count, (windows, rows): after the start has settled, away from contacts."""
-        rows, after = self.touch.shape[1], np.round(SETTLE_S / self.periods).astype(int)
+        """Return the rows that count, (windows, rows): after the start has settled, away from
+        contacts.
+        """
+        rows = self.touch.shape[1]
+        after = np.round(SETTLE_S / self.periods).astype(int)
         near = np.array(
             [
                 np.convolve(t, np.ones(k + 1))[:rows] > 0.5
                 for t, k in zip(self.touch, after, strict=True)
             ]
         )
-        time, thin = np.arange(rows), self._thins[:, None]
+        time = np.arange(rows)
+        thin = self._thins[:, None]
         counted = (
             (time > np.maximum(after, 1)[:, None])
             & (time < self.lengths[:, None])
@@ -170,7 +187,9 @@ class JointRollouts:
         return np.asarray((self.counted & self.recorded[..., None]).sum(axis=(1, 2)))
 
     def shortened(self, seconds: float) -> JointRollouts:
-        """Return the same windows, put back on the recording every `seconds`: a smoother surface to descend on."""
+        """Return the same windows, put back on the recording every `seconds`: a smoother surface
+        to descend on.
+        """
         short = copy.copy(self)
         short.touch = self.touch.copy()
         for touch, period in zip(short.touch, self.periods, strict=True):
@@ -179,10 +198,11 @@ class JointRollouts:
         return short
 
     def regressed(self) -> dict[str, Array]:
-        """Return kp, total damping, dry friction, armature, offset and delay that balance the recorded accelerations.
+        """Return kp, total damping, dry friction, armature, offset and delay that balance the
+        recorded accelerations.
 
-        The regression is linear but for the delay, biased by noise, and independent of any file's gains. (n,) each; kp
-        is 0 where it fails.
+        The regression is linear but for the delay, biased by noise, and independent of any file's
+        gains. (n,) each; kp is 0 where it fails.
         """
         n = len(self.op)
         best = {
@@ -192,15 +212,19 @@ class JointRollouts:
         window = np.repeat(np.arange(len(self.lengths)), self.lengths)
         some = slice(None, None, max(1, len(row) // MAX_REGRESSION_ROWS))
         for j in range(n):
-            smooth = [lowpass(self.qpos[j, w, :k, None].astype(float), self.periods[w], CUTOFF_HZ)[:, 0]
-                      for w, k in enumerate(self.lengths)]  # fmt: skip
+            smooth = [
+                lowpass(self.qpos[j, w, :k, None].astype(float), self.periods[w], CUTOFF_HZ)[:, 0]
+                for w, k in enumerate(self.lengths)
+            ]
             speed = [np.gradient(x, dt) for x, dt in zip(smooth, self.periods, strict=True)]
-            q, v = np.concatenate(smooth), np.concatenate(speed)
+            q = np.concatenate(smooth)
+            v = np.concatenate(speed)
             a = np.concatenate(
                 [np.gradient(x, dt) for x, dt in zip(speed, self.periods, strict=True)]
             )
             inertia, weight, pull, slope = self.tables[:, j, window, row]
-            torque, least = inertia * a + weight + slope * q + pull, np.inf
+            torque = inertia * a + weight + slope * q + pull
+            least = np.inf
             for delay in np.arange(0.0, MAX_REGRESSION_DELAY_S, max(self.dt / 2, 5e-3)):
                 late = row - delay / self.periods[window]
                 whole = np.floor(late).astype(int)
@@ -223,12 +247,13 @@ class JointRollouts:
         return best
 
     def errors(self, values: dict[str, Array]) -> Array:
-        """Return q_sim − q_real of k candidates, (k, n, windows, rows) rad; zero where rows do not count.
+        """Return q_sim − q_real of k candidates, (k, n, windows, rows) rad; zero where rows do not
+        count.
 
         Args:
-            values: kp at the robot's own gains, damping, frictionloss, armature, offset, delay, and any of
-                effort_limit, SERVO_TERMS and those of temperature, (k, n) each. A damping below zero is taken from the
-                servo's own kd.
+            values: kp at the robot's own gains, damping, frictionloss, armature, offset, delay, and
+                any of effort_limit, SERVO_TERMS and those of temperature, (k, n) each. A damping
+                below zero is taken from the servo's own kd.
         """
         k = len(values["kp"])
         n = len(self.op)
@@ -253,7 +278,9 @@ class JointRollouts:
         return errors.reshape(*errors.shape[:2], -1)
 
     def _joints(self, values: dict[str, Array]) -> Array:
-        """Return candidates beside each window, JOINT_RECORD (n · windows, k); values (k, n) as of `errors`."""
+        """Return candidates beside each window, JOINT_RECORD (n · windows, k); values (k, n) as of
+        `errors`.
+        """
         damping, frictionloss = warm_values(values, self.temperature)  # (k, n, windows)
         k, n, windows = damping.shape
         own = {"effort_limit": self.robot.effort_limit[self.op]} | values
@@ -284,18 +311,20 @@ class JointRollouts:
 
 
 def _loads_along(part: Sequence, model: mujoco.MjModel, op: Array, thin: int) -> Array:
-    """Return the loads of joints `op` along a recording, computed every `thin` rows and interpolated, (4, rows, n).
+    """Return the loads of joints `op` along a recording, computed every `thin` rows and
+    interpolated, (4, rows, n).
 
-    These are inertia without armature, kg·m²; torque by gravity and Coriolis forces, N·m; torque by the other joints'
-    accelerations, N·m; slope of the second over the joint's angle, N·m/rad.
+    These are inertia without armature, kg·m²; torque by gravity and Coriolis forces, N·m; torque by
+    the other joints' accelerations, N·m; slope of the second over the joint's angle, N·m/rad.
     """
-    data, full = mujoco.MjData(model), np.empty((model.nv, model.nv))
-    model.opt.disableflags |= (
-        mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
-    )  # no forces of servos and of a table
+    data = mujoco.MjData(model)
+    full = np.empty((model.nv, model.nv))
+    # no forces of servos and of a table
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
 
     def bias(qpos: Array, qvel: Array) -> Array:
-        data.qpos[:], data.qvel[:] = qpos, qvel
+        data.qpos[:] = qpos
+        data.qvel[:] = qvel
         mujoco.mj_fwdPosition(model, data)
         mujoco.mj_fwdVelocity(model, data)
         return data.qfrc_bias.copy()
@@ -309,7 +338,8 @@ def _loads_along(part: Sequence, model: mujoco.MjModel, op: Array, thin: int) ->
         mujoco.mj_fullM(model, data, full)
         own = full.diagonal().copy()
         inertia[i] = (own - model.dof_armature)[op]
-        weight[i], pull[i] = here[op], (full @ qacc[t] - own * qacc[t])[op]
+        weight[i] = here[op]
+        pull[i] = (full @ qacc[t] - own * qacc[t])[op]
         if i % GRAVITY_ROWS == 0:
             for k, j in enumerate(op):
                 turned = part.qpos[t].astype(float)

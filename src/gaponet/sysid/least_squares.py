@@ -1,8 +1,9 @@
 """Levenberg-Marquardt for several small problems at once, each from several starts.
 
-One simulation evaluates a candidate of every problem: each joint's parameters are judged by the joint's own error.
-Rollouts with friction that sticks have many shallow minima. Starts far apart, of which the better half goes on, find
-deeper minima than one path does; derivatives find the end of a valley that random candidates miss.
+One simulation evaluates a candidate of every problem: each joint's parameters are judged by the
+joint's own error. Rollouts with friction that sticks have many shallow minima. Starts far apart, of
+which the better half goes on, find deeper minima than one path does; derivatives find the end of a
+valley that random candidates miss.
 """
 
 from __future__ import annotations
@@ -18,9 +19,8 @@ DAMPING_FACTORS = np.array([1e-3, 0.1, 1.0, 30.0])  # of the last best damping, 
 MIN_RELATIVE_DECREASE = 1e-4  # of the cost, for another iteration
 
 Progress = Callable[[Array], object]  # a true answer ends the search
-Errors = Callable[
-    [Array], Array
-]  # candidates (k, n, P) → errors (k, n, m), 1 where they begin to count linearly
+# candidates (k, n, P) → errors (k, n, m), 1 where they begin to count linearly
+Errors = Callable[[Array], Array]
 
 
 def descend(
@@ -33,23 +33,26 @@ def descend(
     min_decrease: float = MIN_RELATIVE_DECREASE,
     derive: Callable[[Array, Array, Errors], tuple[Array, Array]] | None = None,
 ) -> tuple[Array, Array]:
-    """Minimise the soft L1 costs of n problems from S starts; return the points (S, n, P) and their costs (S, n).
+    """Minimise the soft L1 costs of n problems from S starts; return the points (S, n, P) and
+    their costs (S, n).
 
-    Problems may disturb each other a little. Where a start became worse in the sum over problems, its best earlier
-    point is returned.
+    Problems may disturb each other a little. Where a start became worse in the sum over problems,
+    its best earlier point is returned.
 
     Args:
         x: Starts, (S, n, P), in units in which a change of one is a large one.
         low, high: Bounds, (n, P).
         errors: Function of candidates.
         iterations: At most; each evaluates S·(P + 1 + len(DAMPING_FACTORS)) candidates.
-        progress: Called after each iteration with the least cost of every problem, (n,); True ends the search.
+        progress: Called after each iteration with the least cost of every problem, (n,); True ends
+            the search.
         min_decrease: Ends the search when the relative decrease of every cost is smaller.
         derive: Replaces `slopes`, where it takes fewer candidates than P + 1.
     """
     damping = np.full(x.shape[:2], 1e-2)
     best = np.full(x.shape[:2], np.inf)
-    best_x, best_total = x, np.full(x.shape[:2], np.inf)
+    best_x = x
+    best_total = np.full(x.shape[:2], np.inf)
     for _ in range(iterations):
         here, jac = (derive or slopes)(x, high, errors)
         weight = 1 / np.sqrt(1 + here**2)
@@ -66,7 +69,8 @@ def descend(
             + x
         )
         costs = soft_l1(_evaluated(errors, tried))
-        choice, least = costs.argmin(axis=0), costs.min(axis=0)
+        choice = costs.argmin(axis=0)
+        least = costs.min(axis=0)
         lower = least < best
         x = np.where(
             lower[..., None], np.take_along_axis(tried, choice[None, ..., None], axis=0)[0], x
@@ -84,7 +88,9 @@ def descend(
 
 
 def slopes(x: Array, high: Array, errors: Errors) -> tuple[Array, Array]:
-    """Return errors (S, n, m) at x (S, n, P), and their forward differences over x, (S, n, m, P)."""
+    """Return errors (S, n, m) at x (S, n, P), and their forward differences over x, (S, n, m,
+    P).
+    """
     steps = np.where(x + DIFFERENCE_STEP > high, -DIFFERENCE_STEP, DIFFERENCE_STEP)
     tried = np.concatenate(
         [x[None], x + np.moveaxis(steps[..., None] * np.eye(x.shape[-1]), -1, 0)]
@@ -95,9 +101,11 @@ def slopes(x: Array, high: Array, errors: Errors) -> tuple[Array, Array]:
 
 
 def agreed_slopes(x: Array, low: Array, high: Array, errors: Errors) -> tuple[Array, Array]:
-    """Return errors and differences that both sides agree on: the smaller one, 0 where their signs differ.
+    """Return errors and differences that both sides agree on: the smaller one, 0 where their signs
+    differ.
 
-    A joint that rests at the edge of breaking loose moves far for a step to one side; that is no derivative.
+    A joint that rests at the edge of breaking loose moves far for a step to one side; that is no
+    derivative.
     """
     ends = (high, np.where(x - DIFFERENCE_STEP < low, high, x))
     (here, ahead), (_, behind) = (slopes(x, end, errors) for end in ends)
@@ -107,13 +115,15 @@ def agreed_slopes(x: Array, low: Array, high: Array, errors: Errors) -> tuple[Ar
 
 
 def step(normal: Array, gradient: Array, low: Array, high: Array, damping: Array) -> Array:
-    """Return the minima of damped quadratics inside boxes, (…, P): parameters that leave a box are fixed at its edge,
-    and the others are solved again."""
+    """Return the minima of damped quadratics inside boxes, (…, P): parameters that leave a box are
+    fixed at its edge, and the others are solved again.
+    """
     size = gradient.shape[-1]
     own = np.einsum("...ii->...i", normal)
     extra = damping[..., None] * (own + 1e-3 * own.mean(axis=-1, keepdims=True)) + 1e-12
     full = normal + extra[..., None] * np.eye(size)
-    fixed, moved = np.zeros(gradient.shape, bool), np.zeros(gradient.shape)
+    fixed = np.zeros(gradient.shape, bool)
+    moved = np.zeros(gradient.shape)
     for _ in range(size):
         free = ~fixed
         system = np.where(free[..., :, None] & free[..., None, :], full, np.eye(size))

@@ -15,7 +15,8 @@ class IdentifyOptions:
     """Number of rollouts of 8 s of single joints, taken evenly from the recordings."""
 
     terms: tuple[Term, ...] | None = None
-    """Terms of the servo model, in the order in which they are fitted; default: motion_limits.default_terms."""
+    """Terms of the servo model, in the order in which they are fitted; default:
+    motion_limits.default_terms."""
 
     table: bool = True
     """Fit a table under the robot's tips."""
@@ -33,8 +34,8 @@ class IdentifyOptions:
     """Folds of the cross-validation, at most; 1 for none."""
 
     seconds: float | None = None
-    """Time for the searches. A search that has begun ends, and what does not fit into the time is left out. Results
-    are the same on every machine only without a limit."""
+    """Time for the searches. A search that has begun ends, and what does not fit into the time is
+    left out. Results are the same on every machine only without a limit."""
 
     nthread: int = 0
     """Threads; 0 for all cores."""

@@ -1,4 +1,6 @@
-"""Fitting problem of servo parameters: errors of rollouts and of a prior, searches, and standard errors."""
+"""Fitting problem of servo parameters: errors of rollouts and of a prior, searches, and standard
+errors.
+"""
 
 from __future__ import annotations
 
@@ -21,33 +23,39 @@ from gaponet.sysid.least_squares import Errors, Progress, agreed_slopes, better_
 from gaponet.sysid.robot_rollouts import RobotRollouts
 
 ROBOT_WINDOWS = 8  # windows of the fit in the robot's simulator
-STARTS, START_STD = 4, 2.0  # of each joint's search, and their standard deviation in large changes
+# of each joint's search, and their standard deviation in large changes
+STARTS = 4
+START_STD = 2.0
 SHORT_WINDOW_S = 0.5  # a search begins with windows this short
+# of all starts on short windows, of all on whole windows, of the better half
 SEARCH_ITERATIONS = (
     10,
     8,
     15,
-)  # of all starts on short windows, of all on whole windows, of the better half
-CHAIN_ITERATIONS, CHAIN_CANDIDATES = 8, 160  # at most
-MIN_COST_DECREASE, MIN_CHAIN_COST_DECREASE = (
-    2e-3,
-    2e-4,
-)  # relative, for another iteration in the robot's simulator
+)
+# at most
+CHAIN_ITERATIONS = 8
+CHAIN_CANDIDATES = 160
+# relative, for another iteration in the robot's simulator
+MIN_COST_DECREASE = 2e-3
+MIN_CHAIN_COST_DECREASE = 2e-4
 MIN_CLUSTERS = 24  # parts of the recordings that count as independent of each other
 CORRELATION_TIME_BOUNDS_S = (1.0, 4.0)  # least, and the value before it is estimated
 MIN_CORRELATION = 0.05  # of an error with itself later; less counts as none
+# of the robot file's values; damping with kd
 PRIOR_LOG_STD = {
     "kp": 0.5,
     "armature": 1.5,
     "damping": 1.0,
-}  # of the robot file's values; damping with kd
+}
 PRIORS = len(PRIOR_LOG_STD)
 MIN_SHARE = 1e-3  # of the file's value; less counts as this
 MAX_GAIN_RATIO = (
     2.7  # to the file's gain, one standard deviation of damping's prior; more is doubted
 )
 STATED_KP_LOG_STD = 0.1  # of a kp that recordings state
-RELATIVE_GAP_STD = 0.06  # of backlash, by the physics step and by what else crosses the gap (benchmarks/backlash.py)
+# of backlash, by the physics step and by what else crosses the gap (benchmarks/backlash.py)
+RELATIVE_GAP_STD = 0.06
 UNIFORM_STD = 0.29  # of what is uniformly distributed over one step
 MIN_SLOPE = (
     3e-5  # of all rows together over a parameter, errors a large change; less counts as none
@@ -60,7 +68,8 @@ MAX_RELATIVE_STD = 0.15  # of a value and of its scale; beyond it the parameter 
 class _GainPrior:
     """Prior of kp, armature and damping around the robot file's values.
 
-    Its weight decreases with the residual of the best fit and increases with the residual's correlation time.
+    Its weight decreases with the residual of the best fit and increases with the residual's
+    correlation time.
 
     Attributes:
         log_std: Field → standard deviation of its logarithm, also by joint (n,).
@@ -80,7 +89,9 @@ class _GainPrior:
         self._given = {f: np.where(v > 0, v, np.nan) for f, v in given.items()}
 
     def error_std(self) -> Array:
-        """Return the standard deviation that one row's error has beside the prior, (n,) in ERROR_SCALE_RAD."""
+        """Return the standard deviation that one row's error has beside the prior, (n,) in
+        ERROR_SCALE_RAD.
+        """
         return np.asarray(
             self.residual / ERROR_SCALE_RAD * np.sqrt(self.correlation_time / self._row_period)
         )
@@ -128,7 +139,9 @@ class FitProblem:
     physics_step: float  # s
 
     def errors(self, values: Values, rollouts: JointRollouts | None = None) -> Array:
-        """Return errors of candidates (k, n), (k, n, rows + PRIORS) in ERROR_SCALE_RAD; the last are the prior's."""
+        """Return errors of candidates (k, n), (k, n, rows + PRIORS) in ERROR_SCALE_RAD; the last
+        are the prior's.
+        """
         errors = (rollouts or self.rollouts).flat_errors(values)
         return np.concatenate(
             [errors / np.float32(ERROR_SCALE_RAD), self.prior.errors(values)],
@@ -151,8 +164,12 @@ class JointFit(FitProblem):
         super().__init__(rollouts, robot, bounds, _GainPrior(bounds, rollouts.dt), step)
 
     def regressed(self) -> list[Values]:
-        """Return starts that balance the recorded accelerations, with their own and with the file's kp."""
-        own, first, balanced = self.bounds.start, self.bounds.first["kp"], self.rollouts.regressed()
+        """Return starts that balance the recorded accelerations, with their own and with the
+        file's kp.
+        """
+        own = self.bounds.start
+        first = self.bounds.first["kp"]
+        balanced = self.rollouts.regressed()
         valid = balanced["kp"] > 0
         ratio = np.divide(first, balanced["kp"], out=np.ones(self.bounds.n), where=valid)
         scaled = {f: x if f in ("offset", "delay") else x * ratio for f, x in balanced.items()}
@@ -173,7 +190,8 @@ class JointFit(FitProblem):
         only: bool = False,
         report: Progress = lambda cost: None,
     ) -> Values:
-        """Fit the fields, the classic ones and those of the servo model that `start` has; return values (n,).
+        """Fit the fields, the classic ones and those of the servo model that `start` has; return
+        values (n,).
 
         Args:
             fields: Fields beside those of `start`; with `only` no others are fitted.
@@ -199,7 +217,9 @@ class JointFit(FitProblem):
         return {f: v[0].copy() for f, v in axes.values(x[:1]).items()}
 
     def robot_fit(self, nthread: int) -> RobotFit:
-        """Return the fit of the same robot in its simulator, with fewer windows; its prior begins as this one's."""
+        """Return the fit of the same robot in its simulator, with fewer windows; its prior begins
+        as this one's.
+        """
         parts = self.rollouts.parts
         some = np.unique(np.arange(ROBOT_WINDOWS) * len(parts) // ROBOT_WINDOWS)
         rollouts = RobotRollouts(
@@ -214,28 +234,31 @@ class RobotFit(FitProblem):
     rollouts: RobotRollouts
 
     def search(self, fields: ListOf[str], rest: Values, starts: ListOf[Values]) -> RobotSearch:
-        """Return a search for fields from starts (n,); fields of `rest` that are not fitted stay."""
+        """Return a search for fields from starts (n,); fields of `rest` that are not fitted
+        stay.
+        """
         return RobotSearch(self, Axes(self.bounds, fields, rest), starts)
 
     def descend_chains(
         self, values: Values, report: Callable[[tuple[str, ...], Array], Progress]
     ) -> Values:
-        """Fit values (n,) once more, with a joint's parameters judged by all joints of its kinematic chain.
+        """Fit values (n,) once more, with a joint's parameters judged by all joints of its
+        kinematic chain.
 
-        `report` makes the function that is called in each iteration, from names and row counts of the chains.
+        `report` makes the function that is called in each iteration, from names and row counts of
+        the chains.
         """
-        axes, chains = Axes(self.bounds, robot_fields(values), values), KinematicChains(self.robot)
+        axes = Axes(self.bounds, robot_fields(values), values)
+        chains = KinematicChains(self.robot)
 
         def errors(x: Array) -> Array:
             return chains.pack(self.errors(axes.values(chains.unpack(x))))
 
         rows = chains.pack(self.rollouts.rows[:, None]).sum(axis=1)
         names = tuple(self.robot.operated[i] for i in chains.joints[:, 0])
-        x, low, high = (
-            chains.pack(axes.normalize(values)[None]),
-            chains.pack(axes.low),
-            chains.pack(axes.high),
-        )
+        x = chains.pack(axes.normalize(values)[None])
+        low = chains.pack(axes.low)
+        high = chains.pack(axes.high)
         iterations = max(1, min(CHAIN_ITERATIONS, CHAIN_CANDIDATES // (x.shape[-1] + 5)))
         x, _ = descend(
             x, low, high, errors, iterations, report(names, rows), MIN_CHAIN_COST_DECREASE
@@ -244,7 +267,8 @@ class RobotFit(FitProblem):
 
 
 class RobotSearch:
-    """A search for parameters of all joints together, which may stop after any iterations and go on later.
+    """A search for parameters of all joints together, which may stop after any iterations and go
+    on later.
 
     A joint's parameters are judged by the joint's own error.
     """
@@ -265,7 +289,9 @@ class RobotSearch:
         self._fit.prior.update_residual(self._cost.min(axis=0), self._fit.rollouts.rows)
 
     def keep_better_starts(self) -> None:
-        """Keep the better start of every joint, and the start that is better in the sum over joints if it differs."""
+        """Keep the better start of every joint, and the start that is better in the sum over
+        joints if it differs.
+        """
         x = better_half(self._x, self._cost)[:1]
         cost = self._cost.min(axis=0)[None]
         of_robot = self._least()
@@ -282,12 +308,15 @@ class RobotSearch:
         return {f: v[0].copy() for f, v in self._axes.values(best).items()}
 
     def _least(self) -> list[int]:
-        """Return the number of the start with the least cost in the sum over joints, alone in a list."""
+        """Return the number of the start with the least cost in the sum over joints, alone in a
+        list.
+        """
         return [int(self._cost.sum(axis=1).argmin())]
 
 
 class KinematicChains:
-    """Joints that move each other: arrays of joints (…, n, P) as arrays of chains (…, chains, most · P).
+    """Joints that move each other: arrays of joints (…, n, P) as arrays of chains (…, chains, most
+    · P).
 
     Attributes:
         joints: Joints of each chain, (chains, most); −1 for none.
@@ -314,7 +343,9 @@ class KinematicChains:
 
 
 def fitted_fields(values: dict[str, object] | Values, encoder: bool = False) -> list[str]:
-    """Return the fields among values that a joint's search changes, in order; encoder_step if `encoder`."""
+    """Return the fields among values that a joint's search changes, in order; encoder_step if
+    `encoder`.
+    """
     every = (*CLASSIC, "effort_limit", *SERVO_TERMS, *WARM[:2])
     return [f for f in every if f in values and (encoder or f != "encoder_step")]
 
@@ -335,7 +366,8 @@ class StandardErrors:
     Attributes:
         std: Joint → field → standard error in SI units.
         covariance: Joint → fields and their covariance on the axes of uncertainty.py.
-        undetermined: Joint → fields that the recordings do not determine; all fields of unexcited joints.
+        undetermined: Joint → fields that the recordings do not determine; all fields of unexcited
+            joints.
         sentences: A sentence for each of these joints.
     """
 
@@ -346,7 +378,9 @@ class StandardErrors:
 
 
 def standard_errors(problem: FitProblem, values: Values) -> StandardErrors:
-    """Estimate the standard errors of values (n,): on the axes by `_covariance`, then in SI units."""
+    """Estimate the standard errors of values (n,): on the axes by `_covariance`, then in SI
+    units.
+    """
     names = fitted_fields(values)
     joints = problem.robot.operated
     axes = Axes(problem.bounds, names, values)
@@ -372,13 +406,15 @@ def standard_errors(problem: FitProblem, values: Values) -> StandardErrors:
 
 
 def _covariance(problem: FitProblem, axes: Axes, x: Array) -> tuple[Array, Array]:
-    """Return the covariance of values x (n, P) in large changes, (n, P, P), and which no row depends on, (n, P).
+    """Return the covariance of values x (n, P) in large changes, (n, P, P), and which no row
+    depends on, (n, P).
 
-    This is the sandwich estimator with windows as clusters (Huber 1967; Liang and Zeger 1986): errors within a window
-    are not independent, so the spread of the windows' gradients stands between two inverse curvatures. C clusters of P
-    parameters are few, so the spread is multiplied by (C / (C − P))², the jackknife's correction at average leverage
-    (MacKinnon and White 1985). The prior adds its own width where it holds a value. The square of a further
-    Gauss-Newton step is added, since a search may end before the minimum.
+    This is the sandwich estimator with windows as clusters (Huber 1967; Liang and Zeger 1986):
+    errors within a window are not independent, so the spread of the windows' gradients stands
+    between two inverse curvatures. C clusters of P parameters are few, so the spread is multiplied
+    by (C / (C − P))², the jackknife's correction at average leverage (MacKinnon and White 1985).
+    The prior adds its own width where it holds a value. The square of a further Gauss-Newton step
+    is added, since a search may end before the minimum.
     """
     starts = agreed_slopes(x[None], axes.low, axes.high, problem.of_axes(axes))
     here = starts[0][0]  # errors, (n, rows + PRIORS)
@@ -401,7 +437,9 @@ def _covariance(problem: FitProblem, axes: Axes, x: Array) -> tuple[Array, Array
 
 
 def _std_in_si(axes: Axes, x: Array, values: Values, covariance: Array, lost: Array) -> Values:
-    """Return the standard errors of fields in SI units, (n,), by the delta method; arguments as of `_covariance`."""
+    """Return the standard errors of fields in SI units, (n,), by the delta method; arguments as of
+    `_covariance`.
+    """
     ahead = [axes.values(x + DERIVATIVE_STEP * row) for row in np.eye(len(axes.names))]
     std = {}
     for field in axes.names:
@@ -414,10 +452,11 @@ def _std_in_si(axes: Axes, x: Array, values: Values, covariance: Array, lost: Ar
 
 
 def contradicted_gains(bounds: Bounds, values: Values, std: Std) -> list[str]:
-    """Return a sentence for each gain of the robot's file from which the recordings are far, for sure.
+    """Return a sentence for each gain of the robot's file from which the recordings are far, for
+    sure.
 
-    Damping counts with kd, since a motion shows their sum. A gain of zero says nothing, and so does a joint that no
-    command moves.
+    Damping counts with kd, since a motion shows their sum. A gain of zero says nothing, and so does
+    a joint that no command moves.
 
     Args:
         values: Fitted values, (n,).
@@ -440,20 +479,23 @@ def contradicted_gains(bounds: Bounds, values: Values, std: Std) -> list[str]:
             surely = abs(found - given) > 2 * error
             if surely and not 1 / MAX_GAIN_RATIO < far < MAX_GAIN_RATIO:
                 sentences.append(
-                    f"{joint}: {name} of the file, {given:.3g} {unit}, contradicts the recordings, which show "
-                    f"{format_uncertainty(found, error)}; check what the servo was set to"
+                    f"{joint}: {name} of the file, {given:.3g} {unit}, contradicts the "
+                    f"recordings, which show {format_uncertainty(found, error)}; check what the "
+                    "servo was set to"
                 )
     return sentences
 
 
 def cluster_sums(x: Array, window: Array) -> tuple[Array, Array]:
-    """Return sums over clusters of rows (n, rows, …), (n, C, …), and the window of each cluster, (C,).
+    """Return sums over clusters of rows (n, rows, …), (n, C, …), and the window of each cluster,
+    (C,).
 
     Clusters are windows (rows,), or parts of them where there are fewer than MIN_CLUSTERS.
     """
     count = int(window.max()) + 1
     parts = max(1, -(-MIN_CLUSTERS // count))
-    order, turn = np.argsort(window, kind="stable"), np.zeros(len(window), int)
+    order = np.argsort(window, kind="stable")
+    turn = np.zeros(len(window), int)
     turn[order] = np.concatenate(
         [np.arange(c) * parts // c for c in np.unique(window, return_counts=True)[1]]
     )
@@ -464,7 +506,9 @@ def cluster_sums(x: Array, window: Array) -> tuple[Array, Array]:
 
 
 def _discretisation_std(problem: FitProblem, values: Values) -> Values:
-    """Return standard errors of damping, armature, delay, no-load speed and backlash by the physics step, (n,)."""
+    """Return standard errors of damping, armature, delay, no-load speed and backlash by the
+    physics step, (n,).
+    """
     h = UNIFORM_STD * problem.physics_step
     total = values["damping"] + problem.robot.kd[problem.robot.operated_index]
     std = {"damping": h * values["kp"], "armature": h * total, "delay": np.full(len(total), h)}
@@ -479,7 +523,9 @@ def _discretisation_std(problem: FitProblem, values: Values) -> Values:
 
 
 def _inverse(normal: Array, size: Array) -> Array:
-    """Return inverses of (…, P, P) by their diagonals' roots (…, P); 0 for parameters whose size is infinite."""
+    """Return inverses of (…, P, P) by their diagonals' roots (…, P); 0 for parameters whose size
+    is infinite.
+    """
     each = size[..., :, None] * size[..., None, :]
     fixed = np.eye(size.shape[-1]) * np.isinf(size)[..., None]
     return np.asarray(np.linalg.pinv(normal / each + fixed, rcond=1e-10, hermitian=True) / each)
@@ -488,18 +534,20 @@ def _inverse(normal: Array, size: Array) -> Array:
 def _undetermined(
     problem: FitProblem, values: Values, axes: Axes, std: Values, width: Array
 ) -> dict[str, tuple[tuple[str, ...], str]]:
-    """Return joint → fields that the recordings do not determine, and a sentence; all fields of unexcited joints.
+    """Return joint → fields that the recordings do not determine, and a sentence; all fields of
+    unexcited joints.
 
-    std: Standard errors in SI units, (n,); width: those on the axes, (n, P), where torques are divided by kp.
+    std: Standard errors in SI units, (n,); width: those on the axes, (n, P), where torques are
+    divided by kp.
     """
     bounds = problem.bounds
     unknown = {}
     for i, joint in enumerate(problem.robot.operated):
         if bounds.unexcited[i]:
             why = (
-                f"{joint}: not determined by these logs: no command moves it by {MIN_EXCITATION_RAD:g} rad; it keeps "
-                "the file's values but for what others that move it show (kp, damping, friction, offset); record its "
-                "motion"
+                f"{joint}: not determined by these logs: no command moves it by "
+                f"{MIN_EXCITATION_RAD:g} rad; it keeps the file's values but for what others that "
+                "move it show (kp, damping, friction, offset); record its motion"
             )
             unknown[joint] = tuple(axes.names), why
             continue
@@ -517,7 +565,8 @@ def _undetermined(
 def _wide_fields(
     values: Values, axes: Axes, std: Values, width: Array, joint: int
 ) -> tuple[list[str], list[str]]:
-    """Return the fields of a joint that the recordings do not determine, and which of them not even over kp.
+    """Return the fields of a joint that the recordings do not determine, and which of them not
+    even over kp.
 
     Arguments as of `_undetermined`. A speed without its friction or line says nothing.
     """

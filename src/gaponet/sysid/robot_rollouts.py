@@ -1,4 +1,6 @@
-"""Rollouts of many candidates for a robot's servos beside recordings, the whole robot in one batch."""
+"""Rollouts of many candidates for a robot's servos beside recordings, the whole robot in one
+batch.
+"""
 
 from __future__ import annotations
 
@@ -43,7 +45,8 @@ def cut(sequences: ListOf[Sequence], count: int) -> list[Sequence]:
 
 
 class RobotRollouts:
-    """Rollouts of windows of recordings, n operated joints; rows in which a tip may touch something do not count.
+    """Rollouts of windows of recordings, n operated joints; rows in which a tip may touch
+    something do not count.
 
     Attributes:
         window: Window of each row that counts, (rows,).
@@ -61,7 +64,8 @@ class RobotRollouts:
     ) -> None:
         """Take windows of recordings, and a robot whose own values hold where candidates give none.
 
-        Rollouts go on from the recording in the rows of `touch`, (windows, rows), in which a tip may touch something.
+        Rollouts go on from the recording in the rows of `touch`, (windows, rows), in which a tip
+        may touch something.
         """
         self.parts = parts
         self.robot = robot
@@ -85,7 +89,9 @@ class RobotRollouts:
         self._standing = self._standing_joints()
 
     def _counted(self) -> Array:
-        """Return the rows that count: after the start has settled, every ROW_PERIOD_S, away from contacts."""
+        """Return the rows that count: after the start has settled, every ROW_PERIOD_S, away from
+        contacts.
+        """
         rows = len(self.touch)
         after = max(1, round(SETTLE_S / max(p.dt for p in self.parts)))
         near = np.array([self.touch[max(0, t - after) : t + 1].any(axis=0) for t in range(rows)])
@@ -98,7 +104,9 @@ class RobotRollouts:
         return np.asarray(np.array(counted).T[1:] & ~near[1:])
 
     def _standing_joints(self) -> list[tuple[int, int]]:
-        """Return window and number of each joint that a window does not hold: it stands where the window says."""
+        """Return window and number of each joint that a window does not hold: it stands where the
+        window says.
+        """
         free = [joint for joint in self.robot.joint_names if joint not in self.locked]
         standing = []
         for window, part in enumerate(self.parts):
@@ -106,7 +114,9 @@ class RobotRollouts:
         return standing
 
     def flat_errors(self, values: dict[str, Array], links: ListOf[dict[str, Link]] = ()) -> Array:
-        """Return q_sim − q_real in the rows that count, (k, n, rows) rad; values (k, n), `links` (k,)."""
+        """Return q_sim − q_real in the rows that count, (k, n, rows) rad; values (k, n), `links`
+        (k,).
+        """
         sim, conditions = self._simulations(values)
         sim.set_servos(self.robot.operated, self._beside_windows(values))
         self._hold_standing_joints(sim)
@@ -162,7 +172,9 @@ class RobotRollouts:
                 sim.batch.expand(name)[:] = rows
 
     def simulated_errors(self, sim: BatchSim) -> Array:
-        """Return q_sim − q_real in the rows that count, (k, n, rows) rad, of simulations of k times the windows."""
+        """Return q_sim − q_real in the rows that count, (k, n, rows) rad, of simulations of k
+        times the windows.
+        """
         windows = len(self.parts)
         k = sim.num_envs // windows
         channels = rollout(sim, self.parts * k, self.corrector, touch=np.tile(self.touch, k))

@@ -43,7 +43,8 @@ class SearchProgress:
         shares = [JOINTS_TIME_SHARE] * fits
         shares += [ROBOT_TIME_SHARE * fits]
         shares += [step_share] * (fits * steps)
-        # Of the time that is left when a search begins: as much as of one more step stays for the table.
+        # Of the time that is left when a search begins: as much as of one more step stays for the
+        # table.
         self._shares = [
             share / (sum(shares[i:]) + fits * step_share) for i, share in enumerate(shares)
         ]
@@ -83,7 +84,9 @@ class SearchProgress:
             self._end = self._seconds
 
     def report_table(self, error: float) -> bool:
-        """Report an iteration of the table's search and its RMS error, rad; return whether the time is over."""
+        """Report an iteration of the table's search and its RMS error, rad; return whether the
+        time is over.
+        """
         self.show_iteration(f"table: {1e3 * error:.2f} mrad RMS on fitted windows")
         return self.search_is_over()
 
@@ -105,7 +108,8 @@ class SearchProgress:
         return self._seconds is not None and time.monotonic() - self._began > self._seconds
 
     def reporter(self, what: str, joints: tuple[str, ...], rows: Array) -> Callable[[Array], bool]:
-        """Return a function of the costs (n,) of problems of so many rows (n,), which says whether to end the search.
+        """Return a function of the costs (n,) of problems of so many rows (n,), which says whether
+        to end the search.
 
         It is called in each iteration.
         """
@@ -114,7 +118,8 @@ class SearchProgress:
             each = 1e3 * ERROR_SCALE_RAD * np.sqrt(2 * cost / np.maximum(rows, 1))
             worst = int(each.argmax())
             self.show_iteration(
-                f"{what}: {each.mean():.2f} mrad on fitted windows, {joints[worst]} {each[worst]:.2f}"
+                f"{what}: {each.mean():.2f} mrad on fitted windows, {joints[worst]} "
+                f"{each[worst]:.2f}"
             )
             return self.search_is_over()
 

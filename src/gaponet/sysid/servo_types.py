@@ -1,4 +1,6 @@
-"""Servos taken over from another identified robot; servo types measured on robots, and comparison with them."""
+"""Servos taken over from another identified robot; servo types measured on robots, and comparison
+with them.
+"""
 
 from __future__ import annotations
 
@@ -25,11 +27,13 @@ NORMAL_QUANTILES = norm.ppf((np.arange(400) + 0.5) / 400)
 
 
 def servos_like(robot: RobotSpec, like: RobotSpec) -> tuple[RobotSpec, dict[str, str]]:
-    """Return the robot with the identified servos of another one, and joint → joint that its values come from.
+    """Return the robot with the identified servos of another one, and joint → joint that its
+    values come from.
 
-    A joint takes the values of the identified joint of its name, else of its mirror image (left and right), else of
-    the first joint with its type of servo. Zero offsets and what else belongs to a joint's mounting stay; kp keeps its
-    ratio to the nominal kp. Of the same robot the payload's place is taken over too.
+    A joint takes the values of the identified joint of its name, else of its mirror image (left and
+    right), else of the first joint with its type of servo. Zero offsets and what else belongs to a
+    joint's mounting stay; kp keeps its ratio to the nominal kp. Of the same robot the payload's
+    place is taken over too.
 
     Raises:
         UsageError: No joint corresponds.
@@ -37,8 +41,8 @@ def servos_like(robot: RobotSpec, like: RobotSpec) -> tuple[RobotSpec, dict[str,
     sources = _sources(robot, like)
     if not sources:
         raise UsageError(
-            f"{like.folder}: no identified joint of it has the name, the mirrored name or the type of servo of a joint "
-            f"of {robot.name}"
+            f"{like.folder}: no identified joint of it has the name, the mirrored name or the "
+            f"type of servo of a joint of {robot.name}"
         )
     before = like.before_identification
     taken = [f.name for f in SERVO_FIELDS.values() if f.shared or f.name == "delay"]
@@ -87,17 +91,20 @@ def mirrored(joint: str) -> str:
 
 
 def far_from_servo_type(robot: RobotSpec) -> list[str]:
-    """Return a sentence for each value an order of magnitude outside the interval of a joint's servo type."""
+    """Return a sentence for each value an order of magnitude outside the interval of a joint's
+    servo type.
+    """
     sentences = []
     for i in robot.operated_index:
         servo = robot.servos[i]
         for f in PASSIVE_FIELDS if servo else ():
-            value, usual = float(getattr(robot, f)[i]), servo.measured.get(f) if servo else None
+            value = float(getattr(robot, f)[i])
+            usual = servo.measured.get(f) if servo else None
             nearest = float(np.clip(value, usual.low, usual.high)) if usual else 0.0
             if servo and nearest > 0 and max(value, nearest) > MAX_RATIO * min(value, nearest):
                 sentences.append(
-                    f"{robot.joint_names[i]}: {f} {value:.3g} is {value / nearest:.2g} times the {nearest:.3g} of the "
-                    f"{servo.name} ({servo.source})"
+                    f"{robot.joint_names[i]}: {f} {value:.3g} is {value / nearest:.2g} times the "
+                    f"{nearest:.3g} of the {servo.name} ({servo.source})"
                 )
     return sentences
 
@@ -105,9 +112,10 @@ def far_from_servo_type(robot: RobotSpec) -> list[str]:
 def measured_types(robots: ListOf[RobotSpec], source: str, licence: str) -> list[ServoType]:
     """Return the servo types of identified joints with their measured values.
 
-    A value is the median of its joints. Its interval holds 5 to 95 % of the joints' estimates, each a normal
-    distribution with its standard error; without uncertainty.json the estimates alone. A value that stayed at the
-    nominal one is no estimate. Source and licence are those of the recordings.
+    A value is the median of its joints. Its interval holds 5 to 95 % of the joints' estimates, each
+    a normal distribution with its standard error; without uncertainty.json the estimates alone. A
+    value that stayed at the nominal one is no estimate. Source and licence are those of the
+    recordings.
 
     Raises:
         UsageError: No identified joint names a servo type.
@@ -117,7 +125,8 @@ def measured_types(robots: ListOf[RobotSpec], source: str, licence: str) -> list
         joints += _measured_servos(number, robot)
     if not joints:
         raise UsageError(
-            "no identified joint names a servo type; write servo = into the [[joint]] of its robot.toml"
+            "no identified joint names a servo type; write servo = into the [[joint]] of its "
+            "robot.toml"
         )
     types = []
     for servo in {joint.servo.name: joint.servo for joint in joints}.values():
@@ -132,7 +141,9 @@ def measured_types(robots: ListOf[RobotSpec], source: str, licence: str) -> list
 
 
 class _MeasuredServo(NamedTuple):
-    """The servo of an identified joint: its type, the units recorded, and field → value and its standard error."""
+    """The servo of an identified joint: its type, the units recorded, and field → value and its
+    standard error.
+    """
 
     servo: ServoType
     units: set[tuple[int, str]]
@@ -140,7 +151,9 @@ class _MeasuredServo(NamedTuple):
 
 
 def _measured_servos(number: int, robot: RobotSpec) -> list[_MeasuredServo]:
-    """Return the servos of a robot's identified joints whose type is known; `number` tells robots apart."""
+    """Return the servos of a robot's identified joints whose type is known; `number` tells robots
+    apart.
+    """
     nominal = robot.before_identification
     known = ParameterUncertainty.load(robot)
     op = robot.operated_index
@@ -165,7 +178,9 @@ def _measured_servos(number: int, robot: RobotSpec) -> list[_MeasuredServo]:
 
 
 def _spread(field: str, estimates: list[tuple[float, float]]) -> Spread | None:
-    """Return the spread of values with standard errors, to 3 digits; None if no joint was fitted."""
+    """Return the spread of values with standard errors, to 3 digits; None if no joint was
+    fitted.
+    """
     if not np.any(estimates):
         return None
     values, errors = np.array(estimates).T

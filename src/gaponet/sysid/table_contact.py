@@ -1,7 +1,9 @@
-"""Table under a robot's tips: heights by forward kinematics, and the table that explains the recordings best.
+"""Table under a robot's tips: heights by forward kinematics, and the table that explains the
+recordings best.
 
-A zero offset of every joint's encoder is fitted with it, near zero. Zeros, the tip's place and the table's height trade
-against each other, so give a measured height ([table] in robot.toml) where there is one.
+A zero offset of every joint's encoder is fitted with it, near zero. Zeros, the tip's place and the
+table's height trade against each other, so give a measured height ([table] in robot.toml) where
+there is one.
 """
 
 from __future__ import annotations
@@ -27,8 +29,11 @@ from gaponet.sysid.robot_rollouts import RobotRollouts
 # above the lowest tip, or the table, in which a joint's zero may hide a contact
 CONTACT_CLEARANCE_M = 0.045
 WINDOW_S = 2.5  # of a rollout; longer ones cost more and do not find a better table
-MAX_WINDOWS, MAX_WINDOWS_PER_MOTION = 14, 2
-START_HEIGHTS, START_HEIGHT_STEP_M = 10, 0.005  # from below the lowest tip upwards
+MAX_WINDOWS = 14
+MAX_WINDOWS_PER_MOTION = 2
+# from below the lowest tip upwards
+START_HEIGHTS = 10
+START_HEIGHT_STEP_M = 0.005
 ITERATIONS = 6  # of the search from one start
 # iterations after which a start goes on only if no other start cost less by then
 FIRST_COMPARISON = 2
@@ -39,8 +44,10 @@ ZERO_CHANGE_RAD = 0.01  # a large change
 MAX_ZERO_RAD = 0.1
 ZERO_DECIMALS = 6  # of rad; a joint that turns no tip keeps a zero of exactly 0
 ZERO_PRICE = 2e-3  # cost of a zero of ZERO_STD_RAD, per row
-PRIOR_ROWS = 1000  # into which the price of the zeros is divided, so that its soft L1 cost is nearly quadratic
-# Table's friction, and logarithm of its stiffness in N/m: lowest, highest, a large change, first guess.
+# into which the price of the zeros is divided, so that its soft L1 cost is nearly quadratic
+PRIOR_ROWS = 1000
+# Table's friction, and logarithm of its stiffness in N/m: lowest, highest, a large change, first
+# guess.
 FRICTION = (0.0, 1.5, 0.15, 0.3)
 STIFFNESS = (np.log(100.0), np.log(1e5), 0.7, np.log(2000.0))
 START_LOG_STIFFNESS = tuple(np.log((500.0, 8000.0)))  # of searches by themselves
@@ -52,7 +59,8 @@ class TableFit:
 
     Attributes:
         robot: The robot, with the table and the zeros if they are accepted.
-        accepted: Whether they explain the windows' motions significantly better than no table (`Comparison`).
+        accepted: Whether they explain the windows' motions significantly better than no table
+            (`Comparison`).
         before, after: Mean |error| of the windows without and with table, (windows,) rad.
         motions: Motions in which a tip comes near.
     """
@@ -65,7 +73,9 @@ class TableFit:
 
 
 def tip_heights(sequences: ListOf[Sequence], robot: RobotSpec) -> list[Array]:
-    """Return the height of the lowest tip in every row, (rows,) m each; nothing if robot.toml names no tip."""
+    """Return the height of the lowest tip in every row, (rows,) m each; nothing if robot.toml
+    names no tip.
+    """
     heights = tips_of(robot)
     return [heights(s.qpos) for s in sequences] if heights else []
 
@@ -73,7 +83,8 @@ def tip_heights(sequences: ListOf[Sequence], robot: RobotSpec) -> list[Array]:
 def contact_height(robot: RobotSpec, heights: ListOf[Array]) -> float:
     """Return the height under which a tip may touch something, m.
 
-    At most half of the rows are lower, so that rows to fit remain for motions close to the table or to nothing.
+    At most half of the rows are lower, so that rows to fit remain for motions close to the table or
+    to nothing.
     """
     if not robot.tips or not heights:
         return -np.inf
@@ -101,7 +112,9 @@ def low_windows(
 
 
 def _most_wrong(scene: _TableRollouts, away: Array) -> list[Sequence]:
-    """Return at most MAX_WINDOWS, MAX_WINDOWS_PER_MOTION of a motion, whose rollouts with a table `away` are worst."""
+    """Return at most MAX_WINDOWS, MAX_WINDOWS_PER_MOTION of a motion, whose rollouts with a table
+    `away` are worst.
+    """
     order = np.argsort(-scene.mean(away[0]))
     taken: dict[str, list[int]] = {}
     for i in order.tolist():
@@ -111,17 +124,24 @@ def _most_wrong(scene: _TableRollouts, away: Array) -> list[Sequence]:
 
 
 def fit_table(
-    parts: list[Sequence], robot: RobotSpec, lowest: float, nthread: int, report: Callable[[float], object],
+    parts: list[Sequence],
+    robot: RobotSpec,
+    lowest: float,
+    nthread: int,
+    report: Callable[[float], object],
     validation: ListOf[Sequence] = (),
-) -> TableFit:  # fmt: skip
+) -> TableFit:
     """Fit height, friction and stiffness of the table and the zeros, from several starts.
 
     Args:
-        parts: Windows in which a tip is low; those with the largest errors without a table are fitted.
+        parts: Windows in which a tip is low; those with the largest errors without a table are
+            fitted.
         robot: The robot with fitted servos; if it has a table, the height is taken as measured.
         lowest: Least height of a tip in the windows, m.
-        report: Called in each iteration with the root mean square error, rad; a true answer ends the search.
-        validation: Whole recordings that choose among the starts' results; without them the windows do.
+        report: Called in each iteration with the root mean square error, rad; a true answer ends
+            the search.
+        validation: Whole recordings that choose among the starts' results; without them the windows
+            do.
     """
     if not parts:
         return TableFit(robot, False, np.zeros(0), np.zeros(0), ())
@@ -150,7 +170,9 @@ def fit_table(
 
 
 def _starts(scene: _TableRollouts, away: Array, heights: Array) -> Array:
-    """Return a start for each of START_LOG_STIFFNESS at its best height, the best first, (starts, 3 + n)."""
+    """Return a start for each of START_LOG_STIFFNESS at its best height, the best first, (starts,
+    3 + n).
+    """
     stiffnesses = np.array(START_LOG_STIFFNESS)
     guesses = np.tile(away, (len(stiffnesses), len(heights), 1))
     guesses[..., 0] = heights
@@ -164,7 +186,9 @@ def _starts(scene: _TableRollouts, away: Array, heights: Array) -> Array:
 def _searches(
     scene: _TableRollouts, starts: Array, report: Callable[[float], object], *, measured: bool
 ) -> list[tuple[Array, float]]:
-    """Return the best tables near starts (k, 3 + n), as of `_searched`, until `report` says that the time is over."""
+    """Return the best tables near starts (k, 3 + n), as of `_searched`, until `report` says that
+    the time is over.
+    """
     over = False
     pace = [np.inf]
 
@@ -187,9 +211,12 @@ def _searched(
     report: Callable[[float], bool],
     pace: list[float],
 ) -> tuple[Array, float]:
-    """Return the best table and zeros (3 + n,) near a start, and their cost. A measured height stays.
+    """Return the best table and zeros (3 + n,) near a start, and their cost.
 
-    The search ends after FIRST_COMPARISON iterations if another start cost less by then; `pace` lists such costs.
+    A measured height stays.
+
+    The search ends after FIRST_COMPARISON iterations if another start cost less by then; `pace`
+    lists such costs.
     """
     rows = len(scene.window) * scene.n
     large_change = np.array(
@@ -202,14 +229,18 @@ def _searched(
     costs: list[float] = []
 
     def errors(changes: Array) -> Array:
-        """Return errors and the price of the zeros, (k, 1, …), of changes (k, 1, 3 + n) in large changes."""
+        """Return errors and the price of the zeros, (k, 1, …), of changes (k, 1, 3 + n) in large
+        changes.
+        """
         xs = start + large_change * changes[:, 0]
         priced = np.repeat(price_of_zero * xs[:, 3:], PRIOR_ROWS, axis=1)
         both = np.concatenate([scene.soft_errors(xs), priced], axis=1)
         return both[:, None].astype(np.float32)
 
     def ends(cost: Array) -> bool:
-        """Show the error, and return whether the time is over, or another start was better after as many iterations."""
+        """Show the error, and return whether the time is over, or another start was better after
+        as many iterations.
+        """
         costs.append(float(cost.sum()))
         over = report(ERROR_SCALE_RAD * float(np.sqrt(2 * costs[-1] / rows)))
         if len(costs) != FIRST_COMPARISON:
@@ -241,7 +272,9 @@ def _with_table(robot: RobotSpec, x: Array) -> RobotSpec:
 
 
 class _TableRollouts(RobotRollouts):
-    """Rollouts of windows with candidates of the table: rows of [height m, friction, log stiffness, zeros rad]."""
+    """Rollouts of windows with candidates of the table: rows of [height m, friction, log
+    stiffness, zeros rad].
+    """
 
     def errors(self, xs: Array) -> Array:
         """Return q_sim − q_real of candidates (k, 3 + n), (k, n, rows) rad."""

@@ -1,8 +1,10 @@
-"""Identification from recorded torque, for windows so short that positions do not separate a gain from a load.
+"""Identification from recorded torque, for windows so short that positions do not separate a gain
+from a load.
 
-A servo's torque is kp (command − position) − kd velocity, which gives its gains. The torque that the model does not
-explain gives the payload's place and the mass of a hand that the model lacks, by least squares. Positions give damping,
-friction, armature, zero and delay, near those values. Validation motions choose how near, and which parts are used.
+A servo's torque is kp (command − position) − kd velocity, which gives its gains. The torque that
+the model does not explain gives the payload's place and the mass of a hand that the model lacks, by
+least squares. Positions give damping, friction, armature, zero and delay, near those values.
+Validation motions choose how near, and which parts are used.
 """
 
 from __future__ import annotations
@@ -29,19 +31,24 @@ from gaponet.sysid.least_squares import descend
 from gaponet.sysid.robot_rollouts import cut
 
 MAX_WINDOWS = 80  # more than elsewhere, since they may be short
-ROW_STEP, MAX_ROWS = 5, 6000  # between rows for the payload's place, and how many
+# between rows for the payload's place, and how many
+ROW_STEP = 5
+MAX_ROWS = 6000
 MOUNT_PRIOR_NM_PER_M = 3.0  # price of moving the payload
 MIN_MOVE_RAD = 0.05  # of a command that excites a joint
 MIN_EXPLAINED = 0.9  # of a torque's variance, from which its gains are used
 INSTRUMENTS = 12  # periods whose commands are instruments for measured position and speed
 MAX_LATE = 3  # periods between a command and its torque
-START_DELAY, ITERATIONS = 0.25, 10  # in 20 ms; of the fit of positions
+# in 20 ms; of the fit of positions
+START_DELAY = 0.25
+ITERATIONS = 10
 MAX_HAND_MASS = 5.0  # kg
 
 
 class TorqueOptions(NamedTuple):
-    """Options of a fit from torque: payload's place from torque, friction as well, and the prior of the positions' fit
-    around it, rad per large change."""
+    """Options of a fit from torque: payload's place from torque, friction as well, and the prior
+    of the positions' fit around it, rad per large change.
+    """
 
     place: bool
     friction: bool
@@ -49,9 +56,11 @@ class TorqueOptions(NamedTuple):
 
 
 OPTIONS = (
-    TorqueOptions(True, False, 2.0), TorqueOptions(True, False, PRIOR_RAD), TorqueOptions(True, True, 2.0),
+    TorqueOptions(True, False, 2.0),
+    TorqueOptions(True, False, PRIOR_RAD),
+    TorqueOptions(True, True, 2.0),
     TorqueOptions(False, False, PRIOR_RAD),
-)  # fmt: skip
+)
 
 
 class Gains(NamedTuple):
@@ -69,17 +78,21 @@ class Gains(NamedTuple):
 
 
 def servo_gains(recordings: ListOf[Array], last: int = 0, late: int = 1) -> Gains:
-    """Estimate a servo's gains: torque = kp (command so many periods before − position) − kd velocity.
+    """Estimate a servo's gains: torque = kp (command so many periods before − position) − kd
+    velocity.
 
-    Rows are means of five. Noise of measured position and speed would lower the gains, so two-stage least squares take
-    the commands of INSTRUMENTS periods as instruments (Janot, Vandanjon & Gautier 2014).
+    Rows are means of five. Noise of measured position and speed would lower the gains, so two-stage
+    least squares take the commands of INSTRUMENTS periods as instruments (Janot, Vandanjon &
+    Gautier 2014).
 
     Args:
         recordings: Command, position, velocity and torque of the joint, (4, T) each.
-        last: Only so many rows at the end of each count, as their mean, by plain least squares; 0 for all.
+        last: Only so many rows at the end of each count, as their mean, by plain least squares; 0
+            for all.
         late: Periods.
     """
-    sums, rows = [], []
+    sums = []
+    rows = []
     for ctrl, qpos, qvel, tau in recordings:
         t = np.arange(len(tau) - late)
         past = [ctrl[np.maximum(t - k, 0)] for k in range(INSTRUMENTS)]
@@ -88,9 +101,11 @@ def servo_gains(recordings: ListOf[Array], last: int = 0, late: int = 1) -> Gain
             np.convolve(x, np.ones(5) / 5, "valid") for x in np.array(channels, float)
         )
         one = np.ones_like(torque)
-        x, z = np.stack([error, speed, one], axis=1), np.stack([*commands, one], axis=1)
+        x = np.stack([error, speed, one], axis=1)
+        z = np.stack([*commands, one], axis=1)
         if last:
-            x, torque = x[-last:].mean(axis=0, keepdims=True), torque[-last:].mean(keepdims=True)
+            x = x[-last:].mean(axis=0, keepdims=True)
+            torque = torque[-last:].mean(keepdims=True)
             z = x
         sums.append(np.concatenate([z.T @ z, z.T @ x, z.T @ torque[:, None]], axis=1))
         rows.append(np.concatenate([x, torque[:, None]], axis=1))
@@ -99,7 +114,8 @@ def servo_gains(recordings: ListOf[Array], last: int = 0, late: int = 1) -> Gain
         first = np.linalg.lstsq(s[:, :-4], s[:, -4:-1])[0]
         return np.asarray(np.linalg.lstsq(first.T @ s[:, -4:-1], first.T @ s[:, -1])[0])
 
-    every, n = np.concatenate(rows), len(sums)
+    every = np.concatenate(rows)
+    n = len(sums)
     kp, kd, constant = solved(np.sum(sums, axis=0))
     without = np.array([solved(np.sum(sums, axis=0) - one)[0] for one in sums])
     left = every[:, 3] - every[:, :3] @ [kp, kd, constant]
@@ -114,11 +130,14 @@ class TorqueFit:
     Attributes:
         robot: The robot with gains from torque.
         known: Joint → gains that follow from its torque; none unless all recordings have torque.
-        several_payloads: Whether recordings have several payloads, which determine where these hang.
+        several_payloads: Whether recordings have several payloads, which determine where these
+            hang.
     """
 
     def __init__(self, sequences: ListOf[Sequence], robot: RobotSpec) -> None:
-        """Recordings whose gains are stated are left out; the robot's payload masses are taken as true."""
+        """Recordings whose gains are stated are left out; the robot's payload masses are taken as
+        true.
+        """
         self.robot = robot
         self.sequences = [
             s for s in sequences if s.tau is not None and s.meta.recorded_gains[0] is None
@@ -148,13 +167,15 @@ class TorqueFit:
         }
 
     def payload_placed(self, friction: bool = False) -> RobotSpec:
-        """Return the robot with the payload's place and the mass of the hand, by least squares on recorded torque.
+        """Return the robot with the payload's place and the mass of the hand, by least squares on
+        recorded torque.
 
-        A joint's torque is that of the model, that of (payload + hand) at the mount, and that of the joint's own
-        friction, armature and damping, which the robot takes over with `friction`. Every mount is moved alike, mirrored
-        to the other side.
+        A joint's torque is that of the model, that of (payload + hand) at the mount, and that of
+        the joint's own friction, armature and damping, which the robot takes over with `friction`.
+        Every mount is moved alike, mirrored to the other side.
         """
-        robot, mount = self.robot, self.robot.payload_mounts[0]
+        robot = self.robot
+        mount = self.robot.payload_mounts[0]
         joints, column, tau, qacc, qvel, required = self._balance()
         own = np.stack([np.tanh(qvel / SLIP_SPEED), qacc, qvel])  # friction, armature, damping
         n = 3 * len(joints)
@@ -168,10 +189,8 @@ class TorqueFit:
             mine = (x[4:].reshape(3, -1)[:, column] * own).sum(axis=0)
             return np.r_[required(x) + mine - tau, MOUNT_PRIOR_NM_PER_M * (x[:3] - start[:3])]
 
-        scale, first = (
-            np.r_[0.1 * np.ones(3), 1.0, np.ones(n)],
-            np.clip(start, low + 1e-6, high - 1e-6),
-        )
+        scale = np.r_[0.1 * np.ones(3), 1.0, np.ones(n)]
+        first = np.clip(start, low + 1e-6, high - 1e-6)
         solution = least_squares(
             residual, first, bounds=(low, high), x_scale=scale, loss="soft_l1"
         ).x
@@ -192,8 +211,9 @@ class TorqueFit:
         return replace(robot.with_servos(servos if friction else {}), payload_mounts=mounts)
 
     def _balance(self) -> tuple[list[int], Array, Array, Array, Array, Callable[[Array], Array]]:
-        """Return the joints; joint, torque, acceleration and speed of each row; and the torque that inverse dynamics
-        require for a payload's place and hand x, (4,) m and kg."""
+        """Return the joints; joint, torque, acceleration and speed of each row; and the torque
+        that inverse dynamics require for a payload's place and hand x, (4,) m and kg.
+        """
         rows = []
         mounts = self.robot.payload_mounts
         empty = tuple(replace(m, mass=0.0) for m in mounts)
@@ -209,7 +229,8 @@ class TorqueFit:
 
         def required(x: Array) -> Array:
             place = np.array([_place(i, x[:3]) for i in range(len(mounts))])
-            # How far each payload moves for a radian, (k, mounts, 3) m: 0 for a joint that does not carry it.
+            # How far each payload moves for a radian, (k, mounts, 3) m: 0 for a joint that does not
+            # carry it.
             point = motion[:, :, 0] + np.cross(
                 motion[:, :, 1], np.einsum("kmij,mj->kmi", frame, place)
             )
@@ -221,8 +242,10 @@ class TorqueFit:
     def _balance_rows(
         self, s: Sequence, model: mujoco.MjModel, every: int
     ) -> list[tuple[Any, ...]]:
-        """Return a row for each moved joint in every so many rows of a recording: its number; payload in each mount,
-        kg; torque without payloads, N·m; Jacobian and frame of each mount's body; torque, N·m; acceleration; speed."""
+        """Return a row for each moved joint in every so many rows of a recording: its number;
+        payload in each mount, kg; torque without payloads, N·m; Jacobian and frame of each mount's
+        body; torque, N·m; acceleration; speed.
+        """
         assert s.tau is not None
         moved = _moved(s, self.robot)
         if not moved:

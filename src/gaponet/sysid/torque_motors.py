@@ -1,9 +1,10 @@
-"""Identification of robots that are driven by torque or current: friction, inertia and delay of the joints.
+"""Identification of robots that are driven by torque or current: friction, inertia and delay of
+the joints.
 
-The recorded torque exceeds that of inverse dynamics by armature · q̈ + damping · q̇ + friction · sign(q̇); a current is
-also scaled by N·m per ampere. All columns pass one filter, which keeps sums. The delay is the shift of the torque with
-the least residual. The fit is judged forwards on rows that were not fitted: the simulator starts in a recorded state
-and is driven by the recorded torque.
+The recorded torque exceeds that of inverse dynamics by armature · q̈ + damping · q̇ + friction ·
+sign(q̇); a current is also scaled by N·m per ampere. All columns pass one filter, which keeps sums.
+The delay is the shift of the torque with the least residual. The fit is judged forwards on rows
+that were not fitted: the simulator starts in a recorded state and is driven by the recorded torque.
 """
 
 from __future__ import annotations
@@ -26,17 +27,18 @@ from gaponet.robot.spec import RobotSpec
 from gaponet.sim.dynamics import inverse_dynamics
 from gaponet.sim.model import build_model
 
-DIFFERENTIATION_CUTOFF_HZ, CUTOFF_HZ = 25.0, 8.0  # before differentiating; of every column
+# before differentiating; of every column
+DIFFERENTIATION_CUTOFF_HZ = 25.0
+CUTOFF_HZ = 8.0
 MIN_SPEED = 0.05  # rad/s of rows that show friction
 DELAYS_S = np.arange(0.0, 0.0405, 0.001)
 JACKKNIFE_BLOCKS = 10  # of the rows, each left out once
 HORIZONS_S = (0.1, 0.5, 1.0)
 PART_S = 4.0  # of recordings that fit and judge in turn
 MIN_ROWS = 20  # of a regression
-HUBER_SCALE, HUBER_ROUNDS = (
-    1.345,
-    10,
-)  # in standard deviations, beyond which a row counts less: somebody pushed
+# in standard deviations, beyond which a row counts less: somebody pushed
+HUBER_SCALE = 1.345
+HUBER_ROUNDS = 10
 
 
 class _Rows(NamedTuple):
@@ -59,9 +61,10 @@ class TorqueDrivenFit:
         constant: N·m per unit of the recorded torque; 1 if it is taken as N·m.
         bias: Mean residual, N·m: gravity that the file lacks, or the sensor's.
         std: Joint → field → standard error.
-        torque: Median |residual| of rows that were not fitted, N·m: of the file, of the robot. A median, so that a push
-            by hand has no effect.
-        angle: Horizon, s → median |error| when driven by the torque, rad: of the file, of the robot.
+        torque: Median |residual| of rows that were not fitted, N·m: of the file, of the robot. A
+            median, so that a push by hand has no effect.
+        angle: Horizon, s → median |error| when driven by the torque, rad: of the file, of the
+            robot.
         windows: Number of starts of these rollouts.
     """
 
@@ -80,7 +83,8 @@ def fit_torque_driven(
     """Fit the joints one by one, and judge all together.
 
     Args:
-        train, judging: Recordings with torque; if they are one list, parts of PART_S fit and judge in turn.
+        train, judging: Recordings with torque; if they are one list, parts of PART_S fit and judge
+            in turn.
         robot: Its file gives inertias and gravity; payloads are taken as true.
         constant: Fit N·m per unit of the torque, as of a current.
 
@@ -154,14 +158,16 @@ def _parts_in_turn(sequences: ListOf[Sequence]) -> tuple[list[Sequence], list[Se
 
 
 def _rows(s: Sequence, robot: RobotSpec) -> _Rows:
-    op, dt = robot.operated_index, s.dt
+    op = robot.operated_index
+    dt = s.dt
     model = build_model(robot, s.meta.payload_mass, s.meta.payload_side)
     model.dof_armature[op] = model.dof_damping[op] = 0.0
     smooth = lowpass(s.qpos.astype(float), dt, DIFFERENTIATION_CUTOFF_HZ)
     v = differentiate(smooth, dt)
     a = differentiate(v, dt)
     assert s.tau is not None
-    time, tau = np.arange(len(s)) * dt, s.tau[:, op].astype(float)
+    time = np.arange(len(s)) * dt
+    tau = s.tau[:, op].astype(float)
     late = [np.stack([np.interp(time - d, time, x) for x in tau.T], axis=1) for d in DELAYS_S]
     columns = (
         inverse_dynamics(model, smooth, v, a)[:, op],
@@ -175,11 +181,14 @@ def _rows(s: Sequence, robot: RobotSpec) -> _Rows:
 
 
 def _system(rows: ListOf[_Rows], j: int, constant: bool, lag: int) -> tuple[Array, Array]:
-    """Return the regression's columns armature, damping, friction, bias and constant, and its right-hand side."""
+    """Return the regression's columns armature, damping, friction, bias and constant, and its
+    right-hand side.
+    """
     parts = []
     for r in rows:
         use = r.moving[:, j]
-        torque, required = r.torque[lag][use, j], r.required[use, j]
+        torque = r.torque[lag][use, j]
+        required = r.required[use, j]
         columns = [r.acceleration[use, j], r.velocity[use, j], r.sign[use, j], np.ones_like(torque)]
         columns += [-torque] if constant else []
         parts.append((np.stack(columns, axis=1), -required if constant else torque - required))
@@ -187,7 +196,9 @@ def _system(rows: ListOf[_Rows], j: int, constant: bool, lag: int) -> tuple[Arra
 
 
 def _solved(a: Array, y: Array) -> tuple[Array, float]:
-    """Return armature, damping, friction ≥ 0, bias and constant, and the robust squared residual."""
+    """Return armature, damping, friction ≥ 0, bias and constant, and the robust squared
+    residual.
+    """
     low = np.array([0.0, 0.0, 0.0, -np.inf, 1e-9])[: a.shape[1]]
     if len(y) < MIN_ROWS:
         return np.array([0.0, 0.0, 0.0, 0.0, 1.0]), np.inf
@@ -233,20 +244,26 @@ def _starts(s: Sequence) -> Array:
 
 
 def _ahead(sequences: ListOf[Sequence], robot: RobotSpec, constant: Array) -> dict[float, Array]:
-    """Return horizon → median |error| of the operated joints, driven by the torque from recorded states, (n,) rad."""
-    op, errors = robot.operated_index, dict[float, list[Array]]()
+    """Return horizon → median |error| of the operated joints, driven by the torque from recorded
+    states, (n,) rad.
+    """
+    op = robot.operated_index
+    errors = dict[float, list[Array]]()
     for s in sequences:
         model = build_model(robot, s.meta.payload_mass, s.meta.payload_side, dt=s.dt)
         model.actuator_gainprm[:] = model.actuator_biasprm[:] = 0.0
-        data, steps = mujoco.MjData(model), round(s.dt / model.opt.timestep)
+        data = mujoco.MjData(model)
+        steps = round(s.dt / model.opt.timestep)
         assert s.tau is not None
-        time, tau = np.arange(len(s)) * s.dt, s.tau.astype(float)
+        time = np.arange(len(s)) * s.dt
+        tau = s.tau.astype(float)
         for j, i in enumerate(op):
             tau[:, i] = constant[j] * np.interp(time - robot.delay[i], time, tau[:, i])
         v = differentiate(lowpass(s.qpos.astype(float), s.dt, DIFFERENTIATION_CUTOFF_HZ), s.dt)
         for start in _starts(s):
             mujoco.mj_resetData(model, data)
-            data.qpos[:], data.qvel[:] = s.qpos[start], v[start]
+            data.qpos[:] = s.qpos[start]
+            data.qvel[:] = v[start]
             for before, h in pairwise((0.0, *HORIZONS_S)):
                 first, last = (start + round(x / s.dt) for x in (before, h))
                 for torque in tau[first:last]:

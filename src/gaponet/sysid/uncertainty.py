@@ -1,8 +1,9 @@
 """Uncertainty of a robot's fitted parameters, stored as uncertainty.json in its folder.
 
-The parameters are Gaussian on axes that do not depend on a motor's gain: the logarithms of kp and stribeck_speed;
-torques, damping and armature divided by kp; 1 / no_load_speed; other fields in SI units. The file also holds what the
-recordings showed by themselves, for comparison with later ones, and the error of motions that were not fitted.
+The parameters are Gaussian on axes that do not depend on a motor's gain: the logarithms of kp and
+stribeck_speed; torques, damping and armature divided by kp; 1 / no_load_speed; other fields in SI
+units. The file also holds what the recordings showed by themselves, for comparison with later ones,
+and the error of motions that were not fitted.
 """
 
 from __future__ import annotations
@@ -28,24 +29,31 @@ from gaponet.robot.spec import RobotSpec
 from gaponet.sim.links import LinkAxes, LinkResult
 from gaponet.sysid.axes import Values, first_values, from_axis, to_axis
 
-PLAY = "play"  # of gear or motor, rad: no parameter of the simulator, but a change that later recordings may show
+# of gear or motor, rad: no parameter of the simulator, but a change that later recordings may show
+PLAY = "play"
+# from which no effect was seen: of a value of zero, of another
 UNOBSERVED_RELATIVE_ERROR = (
     1.0,
     3.0,
-)  # from which no effect was seen: of a value of zero, of another
-MIN_SET_CORRELATION, MIN_SET_RELATIVE_ERROR = (
-    0.9,
-    0.03,
-)  # from which parameters are known only as a set
+)
+# from which parameters are known only as a set
+MIN_SET_CORRELATION = 0.9
+MIN_SET_RELATIVE_ERROR = 0.03
 OLD_KEYS = {  # of known.json → of uncertainty.json
-    "step": "gauss_newton_step", "step_covariance": "gauss_newton_covariance", "scatter": "overdispersion",
-    "predicted": "parameter_rms", "left": "residual_rms", "band": "residual_p90", "held": "validated",
-}  # fmt: skip
+    "step": "gauss_newton_step",
+    "step_covariance": "gauss_newton_covariance",
+    "scatter": "overdispersion",
+    "predicted": "parameter_rms",
+    "left": "residual_rms",
+    "band": "residual_p90",
+    "held": "validated",
+}
 
 
 class Provenance(TypedDict):
-    """Origin of numbers: command, recording days, robot id, name → SHA-256 of each log, total seconds; the values on
-    the axes that were fitted then, by joint, and their covariance."""
+    """Origin of numbers: command, recording days, robot id, name → SHA-256 of each log, total
+    seconds; the values on the axes that were fitted then, by joint, and their covariance.
+    """
 
     made_by: str
     days: tuple[str, ...]
@@ -63,13 +71,16 @@ class JointUncertainty:
     Attributes:
         values: Fitted values, (P,).
         covariance: (P, P).
-        gauss_newton_step: Gauss-Newton step of fields and play that the recordings ask for by themselves, (P + 1,).
+        gauss_newton_step: Gauss-Newton step of fields and play that the recordings ask for by
+            themselves, (P + 1,).
         gauss_newton_covariance: Its covariance, (P + 1, P + 1).
-        overdispersion: Variance of the recordings' gradients over that of independent rows, (P + 1,).
+        overdispersion: Variance of the recordings' gradients over that of independent rows, (P +
+            1,).
         parameter_rms: RMS position error that the covariance alone predicts, rad.
         residual_rms: RMS position error of motions that were not fitted, rad.
         residual_p90: Bound of 90 % of the position errors of other motions, rad.
-        repeatability: RMS difference between the tracking errors of two recordings of one command, rad; 0 if unknown.
+        repeatability: RMS difference between the tracking errors of two recordings of one command,
+            rad; 0 if unknown.
     """
 
     values: tuple[float, ...]
@@ -85,7 +96,8 @@ class JointUncertainty:
 
 @dataclass(frozen=True)
 class LinkUncertainty:
-    """Uncertainty of fitted links in Q coordinates (sim/links.py), and slopes (P, Q) of each joint's values over them.
+    """Uncertainty of fitted links in Q coordinates (sim/links.py), and slopes (P, Q) of each
+    joint's values over them.
 
     The covariances of the joints are for the links as fitted.
     """
@@ -98,7 +110,9 @@ class LinkUncertainty:
     def of(
         cls, result: LinkResult | None, robot: RobotSpec, fields: ListOf[str]
     ) -> LinkUncertainty | None:
-        """Return the uncertainty of a fit that began with the file's links, if the robot has the fitted ones."""
+        """Return the uncertainty of a fit that began with the file's links, if the robot has the
+        fitted ones.
+        """
         if (
             result is None
             or result.axes.links(0 * result.x)
@@ -132,12 +146,16 @@ class ParameterUncertainty:
 
     @classmethod
     def load(cls, robot: RobotSpec) -> ParameterUncertainty | None:
-        """Read uncertainty.json, or known.json of older versions, of the robot's folder; None if there is neither.
+        """Read uncertainty.json, or known.json of older versions, of the robot's folder; None if
+        there is neither.
 
         Raises:
             RobotError: The file is damaged, or its values are not those of robot.toml.
         """
-        hint = "identify or adapt again, or remove the file: the robot then has values without uncertainty"
+        hint = (
+            "identify or adapt again, or remove the file: the robot then has values without "
+            "uncertainty"
+        )
         files = (robot.folder / name for name in (UNCERTAINTY_FILE, OLD_UNCERTAINTY_FILE))
         if (file := next((f for f in files if f.is_file()), None)) is None:
             return None
@@ -163,7 +181,8 @@ class ParameterUncertainty:
         """Return `load`; refuse a robot whose folder has no uncertainty."""
         if (uncertainty := cls.load(robot)) is None:
             raise UsageError(
-                f"{robot.folder}: keeps only values (no {UNCERTAINTY_FILE}); identify or adapt it again"
+                f"{robot.folder}: keeps only values (no {UNCERTAINTY_FILE}); identify or adapt it "
+                "again"
             )
         return uncertainty
 
@@ -183,7 +202,8 @@ class ParameterUncertainty:
 
         `covariance` (P, P) on the axes replaces the joint's own.
         """
-        x, step = self.array(joint, "values"), 1e-6
+        x = self.array(joint, "values")
+        step = 1e-6
         here = from_axes(self.fields, x)
         ahead = from_axes(self.fields, x + step * np.eye(len(x)))
         jac = np.stack([(ahead[f] - here[f]) / step for f in self.fields])  # (P, axes)
@@ -223,7 +243,9 @@ def prior_std(fields: ListOf[str], x: Array) -> Array:
 
 @dataclass(frozen=True)
 class JointSummary:
-    """Values of a joint in SI units by field, their standard errors, and the sets that are only known together."""
+    """Values of a joint in SI units by field, their standard errors, and the sets that are only
+    known together.
+    """
 
     values: dict[str, float]
     errors: dict[str, float]
@@ -236,11 +258,11 @@ class JointSummary:
         )
 
     def cell(self, field: str) -> str:
-        """Return the value with its uncertainty as text; no uncertainty where the logs say nothing."""
-        value, relative = (
-            self.values[field] * SERVO_FIELDS[field].factor,
-            self.relative_error(field),
-        )
+        """Return the value with its uncertainty as text; no uncertainty where the logs say
+        nothing.
+        """
+        value = self.values[field] * SERVO_FIELDS[field].factor
+        relative = self.relative_error(field)
         if relative > UNOBSERVED_RELATIVE_ERROR[value != 0]:
             return f"{value:.3g} (no log shows it)" if value else "none seen"
         return format_uncertainty(value, self.errors[field] * SERVO_FIELDS[field].factor)
@@ -284,7 +306,9 @@ def table_rows(uncertainty: ParameterUncertainty, fields: tuple[str, ...]) -> li
 
 
 def sentences(uncertainty: ParameterUncertainty) -> list[str]:
-    """Return the recordings, the parameters that are only known together, and the residual error, in sentences."""
+    """Return the recordings, the parameters that are only known together, and the residual error,
+    in sentences.
+    """
     lines = []
     for s in uncertainty.sources:
         days = ", ".join(s["days"]) or "date unknown"
@@ -293,7 +317,8 @@ def sentences(uncertainty: ParameterUncertainty) -> list[str]:
     for joint in uncertainty.joints:
         for *some, last in summarize(uncertainty, joint).sets:
             lines.append(
-                f"{joint}: the logs determine only {', '.join(some)} and {last} together; change none alone"
+                f"{joint}: the logs determine only {', '.join(some)} and {last} together; change "
+                "none alone"
             )
     joints = uncertainty.joints
     worst = max(joints, key=lambda j: joints[j].residual_rms)
@@ -301,9 +326,11 @@ def sentences(uncertainty: ParameterUncertainty) -> list[str]:
         "were not fitted" if uncertainty.validated else "were fitted, since no others were there"
     )
     lines.append(
-        f"the RMS error of motions that {judges} is {_root_mean_square(j.residual_rms for j in joints.values()):.2f} "
-        f"mrad ({worst} {1e3 * joints[worst].residual_rms:.2f}). The standard errors predict "
-        f"{_root_mean_square(j.parameter_rms for j in joints.values()):.2f}; more than that is due to the servo model"
+        f"the RMS error of motions that {judges} is "
+        f"{_root_mean_square(j.residual_rms for j in joints.values()):.2f} mrad ({worst} "
+        f"{1e3 * joints[worst].residual_rms:.2f}). The standard errors predict "
+        f"{_root_mean_square(j.parameter_rms for j in joints.values()):.2f}; more than that is "
+        "due to the servo model"
     )
     return lines
 

@@ -1,7 +1,8 @@
 """Checks of a dataset, judged from the surveys of its sequences.
 
-A check takes the surveys and the robot, and yields findings; if it yields none, its finding is `ok_message`. CHECKS are
-run on every dataset. The gravity and static checks need a gravity model too (data.doctor).
+A check takes the surveys and the robot, and yields findings; if it yields none, its finding is
+`ok_message`. CHECKS are run on every dataset. The gravity and static checks need a gravity model
+too (data.doctor).
 """
 
 from __future__ import annotations
@@ -15,16 +16,19 @@ from gaponet.robot.finding import Finding
 from gaponet.robot.spec import RobotSpec
 
 CHECKS: tuple[Check, ...] = (*wiring.CHECKS, *timing.CHECKS, *completeness.CHECKS, *motor.CHECKS)
+# their errors name exchanged, mirrored or mis-scaled joints
 WRONG_JOINT_CHECKS = (
     "order",
     "sign",
     "unit",
-)  # their errors name exchanged, mirrored or mis-scaled joints
+)
 CONSEQUENCES = ("blocked", "stuck", "sag")  # checks that such a joint fails too
 
 
 def run_checks(checks: Iterable[Check], surveys: list[Survey], robot: RobotSpec) -> list[Finding]:
-    """Return the findings of checks, without those that an exchanged, mirrored or mis-scaled joint explains."""
+    """Return the findings of checks, without those that an exchanged, mirrored or mis-scaled joint
+    explains.
+    """
     findings = list[Finding]()
     by_torque = wiring.driven_by_torque(surveys)
     for check in checks:

@@ -1,9 +1,10 @@
 """Check: do the joints stand under their own names, in command and state alike?
 
-Columns that are exchanged in both agree with each other, so that only physics can tell: the torques that the model
-needs for the recorded motion, and the ranges of its joints. The torque of each joint, recorded or from the servo's
-distance to its command, is fitted by the model's inverse dynamics beside an offset, damping, friction and armature of
-any size. What is left speaks of gravity and of the other joints' accelerations, which other names would change.
+Columns that are exchanged in both agree with each other, so that only physics can tell: the torques
+that the model needs for the recorded motion, and the ranges of its joints. The torque of each
+joint, recorded or from the servo's distance to its command, is fitted by the model's inverse
+dynamics beside an offset, damping, friction and armature of any size. What is left speaks of
+gravity and of the other joints' accelerations, which other names would change.
 """
 
 from __future__ import annotations
@@ -26,9 +27,9 @@ MAX_ROWS = 360  # of all recordings, for which inverse dynamics are computed som
 MIN_ROWS = 50
 MIN_MOTION_RAD = 0.05  # of a joint that is judged
 MIN_STEP = 0.1  # of evidence, by which one more exchange must fit better
-# Evidence is the sum over joints of ln(unexplained as logged / unexplained otherwise). Of eight real sets as they were
-# logged, the model explains at most 0.21 of the torques where evidence is above 0.05 (G1: 2.2); of Go2's with left and
-# right exchanged 0.51, with an evidence of 0.8.
+# Evidence is the sum over joints of ln(unexplained as logged / unexplained otherwise). Of eight
+# real sets as they were logged, the model explains at most 0.21 of the torques where evidence is
+# above 0.05 (G1: 2.2); of Go2's with left and right exchanged 0.51, with an evidence of 0.8.
 MIN_EVIDENCE = 0.3
 MIN_EXPLAINED = 0.3  # mean share of the torque's square, with the exchange
 FLOOR = 0.01  # of a share that is unexplained: no model is better
@@ -42,7 +43,9 @@ MAX_INSIDE_RAD = 0.02  # beyond a range, with the exchange
 
 @dataclass(frozen=True)
 class _Exchange:
-    """One way in which names may be exchanged: column order[i] of the log belongs to joint i, (n)."""
+    """One way in which names may be exchanged: column order[i] of the log belongs to joint i,
+    (n).
+    """
 
     words: str
     order: Array
@@ -83,10 +86,12 @@ class _Motion:
         self.imitations = [self._imitation(j, further) for j in range(rows.shape[2])]
 
     def _imitation(self, column: int, further: list[Array]) -> Array:
-        """Return an orthonormal basis of offset, damping, friction and armature of one joint, (k, 4 to 6).
+        """Return an orthonormal basis of offset, damping, friction and armature of one joint, (k,
+        4 to 6).
 
         Args:
-            further: Velocity and acceleration of the command, (k, n) each, which a lag that is not quite known adds.
+            further: Velocity and acceleration of the command, (k, n) each, which a lag that is not
+                quite known adds.
         """
         speed = self.qvel[:, column]
         friction = np.tanh(speed / FRICTION_RAD_S)
@@ -113,7 +118,9 @@ class _Motion:
         return columns
 
     def unexplained(self, torque: Array) -> Array:
-        """Return the share of the square of each judged column's torque that the model does not explain, (judged)."""
+        """Return the share of the square of each judged column's torque that the model does not
+        explain, (judged).
+        """
         shares = []
         for j in self.judged:
             basis = self.imitations[j]
@@ -122,7 +129,8 @@ class _Motion:
             power = float(own @ own) * float(measured @ measured)
             agreement = max(float(own @ measured), 0.0)
             if own @ own < MIN_OWN_SHARE * (torque[:, j] @ torque[:, j]) or power == 0:
-                agreement, power = 0.0, 1.0
+                agreement = 0.0
+                power = 1.0
             shares.append(1 - agreement**2 / power + FLOOR)
         return np.array(shares)
 
@@ -147,15 +155,18 @@ def arrangement(surveys: list[Survey], robot: RobotSpec, model: Dynamics) -> Ite
     if _one_joint_explains(motion, robot, as_logged, evidence):
         return  # the gravity check names it
     text = (
-        f"with {found.words} the motors' torques fit the model's motion better ({explained:.0%}) than as logged "
-        f"({1 - as_logged.mean():.0%}): names of joints are exchanged in command and state alike, where neither shows "
-        "it; check the order of the columns"
+        f"with {found.words} the motors' torques fit the model's motion better ({explained:.0%}) "
+        f"than as logged ({1 - as_logged.mean():.0%}): names of joints are exchanged in command "
+        "and state alike, where neither shows it; check the order of the columns"
     )
     yield _finding(text, found.order, robot, {"evidence": evidence})
 
 
 def _evidence(as_logged: Array, otherwise: Array) -> float:
-    """Return how much better an exchange explains the torques. Both: unexplained shares of the joints."""
+    """Return how much better an exchange explains the torques.
+
+    Both: unexplained shares of the joints.
+    """
     return float(np.log(as_logged / otherwise).sum())
 
 
@@ -165,8 +176,8 @@ def _not_told(as_logged: Array, exchanges: list[tuple[_Exchange, Array]]) -> Fin
     if not alike:
         return Finding("ok", "order", "the torques of motion fit no other order of the joints")
     text = (
-        f"gravity and inertia do not tell whether these are exchanged in command and state alike: {abbreviate(alike)}. "
-        "Be sure of the order of the columns"
+        "gravity and inertia do not tell whether these are exchanged in command and state alike: "
+        f"{abbreviate(alike)}. Be sure of the order of the columns"
     )
     return Finding("note", "order", text)
 
@@ -196,7 +207,9 @@ def _search(
 
 
 def _exchanges(judged: list[int], robot: RobotSpec) -> Iterator[_Exchange]:
-    """Yield left and right, front and rear exchanged; pairs; all moved by one place, or reversed."""
+    """Yield left and right, front and rear exchanged; pairs; all moved by one place, or
+    reversed.
+    """
     same = np.arange(len(robot.joint_names))
     for words, partners in mirrored_joints(robot.joint_names).items():
         order = same.copy()
@@ -256,8 +269,8 @@ def _by_range(surveys: list[Survey], robot: RobotSpec) -> list[Finding]:
         name for name, x in zip(robot.joint_names, beyond, strict=True) if x > MAX_INSIDE_RAD
     ]
     text = (
-        f"{abbreviate(outside)} is up to {beyond.max():.2f} rad outside of its range, and with {fitting[0].words} no "
-        "joint is"
+        f"{abbreviate(outside)} is up to {beyond.max():.2f} rad outside of its range, and with "
+        f"{fitting[0].words} no joint is"
     )
     if len(fitting) > 1:
         text += f" (nor with {len(fitting) - 1} other exchanges)"
@@ -268,7 +281,9 @@ def _by_range(surveys: list[Survey], robot: RobotSpec) -> list[Finding]:
 
 
 def _beyond(low: Array, high: Array, order: Array, robot: RobotSpec) -> Array:
-    """Return by how much positions lie outside of the ranges of the joints that they would belong to, (n) rad."""
+    """Return by how much positions lie outside of the ranges of the joints that they would belong
+    to, (n) rad.
+    """
     ranges = robot.qpos_range
     return np.maximum(ranges[:, 0] - low[order], high[order] - ranges[:, 1]).clip(0.0)
 

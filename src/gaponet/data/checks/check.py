@@ -11,7 +11,9 @@ from gaponet.robot.spec import RobotSpec
 
 
 class Check(NamedTuple):
-    """A function that yields findings of surveys, and what is reported if there is none: `name: ok_message`."""
+    """A function that yields findings of surveys, and what is reported if there is none: `name:
+    ok_message`.
+    """
 
     function: Callable[[list[Survey], RobotSpec], Iterator[Finding]]
     name: str

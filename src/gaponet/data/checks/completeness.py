@@ -1,4 +1,6 @@
-"""Is the recording complete: rate, jitter, gaps, blocked joints, saturated torque, channels without values?"""
+"""Is the recording complete: rate, jitter, gaps, blocked joints, saturated torque, channels
+without values?
+"""
 
 from __future__ import annotations
 
@@ -14,12 +16,16 @@ from gaponet.robot.finding import Finding, abbreviate, masked_names
 from gaponet.robot.spec import RobotSpec
 
 MAX_JITTER = (0.1, 0.5)  # of a period, up to which jitter is ok and a note
-MIN_BLOCKED_S, MIN_STANDSTILL_S, MIN_REPEATED_S = 0.5, 1.0, 0.25
+MIN_BLOCKED_S = 0.5
+MIN_STANDSTILL_S = 1.0
+MIN_REPEATED_S = 0.25
 MAX_CUT_SHARE = 0.02  # of the rows that are left, from which cut rows are told
 MIN_COMMANDED_RAD = 0.1  # range of a command that moves a joint
 MAX_RESOLUTION_RAD = 3e-3  # step between positions; twice as much is a warning
 RESOLUTION_TOLERANCE = 0.02  # relative difference of an encoder's steps
-MIN_FLAT_ROWS, MIN_FLAT_SHARE = 20, 0.01  # of torque cut off at one value; of the torque limit
+# of torque cut off at one value; of the torque limit
+MIN_FLAT_ROWS = 20
+MIN_FLAT_SHARE = 0.01
 
 
 def _motions(surveys: list[Survey]) -> str:
@@ -69,7 +75,10 @@ def _regularity(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     where = f" ({worst.motion})" if worst.jitter_ms else ""
     text = f"periods deviate from their median by at most {worst.jitter_ms:.2f} ms{where}"
     if level == "warning" and (unknown := 2 * max(s.uneven_ms for s in surveys)):
-        text += f". Delays shorter than {unknown:.0f} ms cannot be told between such rows; log at an even rate"
+        text += (
+            f". Delays shorter than {unknown:.0f} ms cannot be told between such rows; log at an "
+            "even rate"
+        )
     yield Finding(level, "jitter", text, values={"jitter_ms": worst.jitter_ms})
     longest = max(surveys, key=lambda s: s.longest_gap_ms)
     gaps = [s for s in surveys if s.missing_samples]
@@ -79,8 +88,8 @@ def _regularity(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
         )
         return
     text = (
-        f"{len(gaps)} sequence(s) miss samples, at worst {longest.longest_gap_ms:.0f} ms ({longest.motion}): the state "
-        "there is interpolated; cut the log at long gaps"
+        f"{len(gaps)} sequence(s) miss samples, at worst {longest.longest_gap_ms:.0f} ms "
+        f"({longest.motion}): the state there is interpolated; cut the log at long gaps"
     )
     yield Finding("warning", "gaps", text, values={"longest_gap_ms": longest.longest_gap_ms})
 
@@ -92,16 +101,17 @@ def _jumps(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
         if hit:
             rows = sum(int(s.jump_rows[i]) for s in hit)
             text = (
-                f"{name} jumps and comes back faster than any motor in {rows} rows of {_motions(hit)}: a misread "
-                "sample or a wrap of the encoder; repair or cut these rows"
+                f"{name} jumps and comes back faster than any motor in {rows} rows of "
+                f"{_motions(hit)}: a misread sample or a wrap of the encoder; repair or cut these "
+                "rows"
             )
             yield Finding("warning", "jumps", text, (name,), {"rows": rows})
     dropped = [s for s in surveys if s.zero_rows]
     if dropped:
         rows = sum(s.zero_rows for s in dropped)
         text = (
-            f"all joints are exactly 0 for {rows} rows of {_motions(dropped)}, and far from it a row before or after: "
-            "nothing was read there; repair or cut these rows"
+            f"all joints are exactly 0 for {rows} rows of {_motions(dropped)}, and far from it a "
+            "row before or after: nothing was read there; repair or cut these rows"
         )
         yield Finding("warning", "jumps", text, values={"rows": rows})
 
@@ -114,14 +124,13 @@ def _nonsense(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
             by_channel[channel].append(s)
     for channel, hit in by_channel.items():
         notes = [s.entry.meta.notes["nonsense"][channel] for s in hit]
-        rows, done = (
-            sum(n["rows"] for n in notes),
-            ", ".join(dict.fromkeys(n["done"] for n in notes)),
-        )
+        rows = sum(n["rows"] for n in notes)
+        done = ", ".join(dict.fromkeys(n["done"] for n in notes))
         joints = tuple(dict.fromkeys(j for n in notes for j in n["joints"]))
         text = (
-            f"{channel} of {abbreviate(list(joints))} was what no joint does (first {notes[0]['worst']:.4g}) in {rows} "
-            f"rows of {_motions(hit)}, a counter or a bad read: there it is {done}"
+            f"{channel} of {abbreviate(list(joints))} was what no joint does (first "
+            f"{notes[0]['worst']:.4g}) in {rows} rows of {_motions(hit)}, a counter or a bad "
+            f"read: there it is {done}"
         )
         yield Finding("warning", "nonsense", text, joints, {"rows": rows})
 
@@ -133,8 +142,8 @@ def _repeated_rows(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]
         return
     rows = sum(s.entry.meta.notes["repeated"]["rows"] for s in hit)
     text = (
-        f"{rows} rows of {_motions(hit)} repeat the row before within a fraction of a period: the logger wrote them "
-        "twice, and they were left out at import"
+        f"{rows} rows of {_motions(hit)} repeat the row before within a fraction of a period: the "
+        "logger wrote them twice, and they were left out at import"
     )
     yield Finding("note", "repeated", text, values={"rows": rows})
 
@@ -152,8 +161,9 @@ def _as_logged(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     if cut:
         rows = sum(s.entry.meta.notes["rows_cut"] for s in cut)
         text = (
-            f"--skip-bad cut {rows} rows of {_motions(cut)}, and left {sum(s.entry.rows for s in cut)}: what moved "
-            "there is interpolated. Look at the lines that import listed, and repair their cause"
+            f"--skip-bad cut {rows} rows of {_motions(cut)}, and left "
+            f"{sum(s.entry.rows for s in cut)}: what moved there is interpolated. Look at the "
+            "lines that import listed, and repair their cause"
         )
         yield Finding("warning", "cut", text, values={"rows": rows})
 
@@ -163,21 +173,27 @@ def _slower(channel: str, hit: list[Survey]) -> Finding:
     filled = "held" if channel in COMMANDS else "interpolated"
     rows = sum(n["rows"] for n in notes)
     text = (
-        f"{channel} stands in {rows} of {sum(n['of'] for n in notes)} rows of {_motions(hit)}: it is {filled} between "
-        "them"
+        f"{channel} stands in {rows} of {sum(n['of'] for n in notes)} rows of {_motions(hit)}: it "
+        f"is {filled} between them"
     )
     return Finding("note", "slower", text)
 
 
 def _absent(channel: str, hit: list[Survey]) -> Finding:
     joints = tuple(dict.fromkeys(j for s in hit for j in s.entry.meta.notes["absent"][channel]))
-    text = f"{channel} of {abbreviate(list(joints))} is empty in all rows of {_motions(hit)}: {channel} is left out"
+    text = (
+        f"{channel} of {abbreviate(list(joints))} is empty in all rows of {_motions(hit)}: "
+        f"{channel} is left out"
+    )
     return Finding("note", "absent", text, joints)
 
 
 def _turns(joint: str, hit: list[Survey]) -> Finding:
     notes = [s.entry.meta.notes["turns"][joint] for s in hit]
-    text = f"{joint} turns on: {sum(n['wraps'] for n in notes)} jumps by a whole turn in {_motions(hit)} were continued"
+    text = (
+        f"{joint} turns on: {sum(n['wraps'] for n in notes)} jumps by a whole turn in "
+        f"{_motions(hit)} were continued"
+    )
     if any(n["turns"] for n in notes):
         text += ", and its state was moved by whole turns to its command"
     return Finding("note", "turns", text, (joint,))
@@ -189,8 +205,8 @@ def _blocked(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     if held:
         seconds = max(s.standstill_s for s in held)
         text = (
-            f"all joints stand still for up to {seconds:.1f} s while their commands move on in {_motions(held)}: an "
-            "emergency stop, brakes, or drives that were off; cut it out"
+            f"all joints stand still for up to {seconds:.1f} s while their commands move on in "
+            f"{_motions(held)}: an emergency stop, brakes, or drives that were off; cut it out"
         )
         yield Finding("warning", "stop", text, (), {"seconds": seconds})
     for i, name in enumerate(robot.joint_names):
@@ -198,8 +214,9 @@ def _blocked(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
         if hit:
             worst = max(hit, key=lambda s: s.blocked_s[i])
             text = (
-                f"{name} stood at {worst.blocked_at[i]:.2f} rad for {worst.blocked_s[i]:.1f} s, far from its command, "
-                f"in {_motions(hit)}: a stop, an obstacle, too little torque, or not read; leave it out or cut it"
+                f"{name} stood at {worst.blocked_at[i]:.2f} rad for {worst.blocked_s[i]:.1f} s, "
+                f"far from its command, in {_motions(hit)}: a stop, an obstacle, too little "
+                "torque, or not read; leave it out or cut it"
             )
             values = {"at_rad": float(worst.blocked_at[i]), "seconds": float(worst.blocked_s[i])}
             yield Finding(
@@ -208,13 +225,13 @@ def _blocked(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
 
 
 def unsigned_torque(recorded: list[tuple[Survey, Torque]], robot: RobotSpec) -> tuple[str, ...]:
-    """Return the joints with a changing torque if none of these torques is ever negative: magnitudes, no torques."""
+    """Return the joints with a changing torque if none of these torques is ever negative:
+    magnitudes, no torques.
+    """
     if not recorded:
         return ()
-    low, high = (
-        np.min([t.low for _, t in recorded], axis=0),
-        np.max([t.high for _, t in recorded], axis=0),
-    )
+    low = np.min([t.low for _, t in recorded], axis=0)
+    high = np.max([t.high for _, t in recorded], axis=0)
     alive = (np.max([s.qpos_range for s, _ in recorded], axis=0) > 0.05) & (low < high)
     return () if (alive & (low < 0)).any() else masked_names(robot, alive)
 
@@ -236,9 +253,9 @@ def _saturation(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     i = int((worst / robot.effort_limit).argmax())
     rows = sum(int(t.over_limit.sum()) for _, t in over)
     text = (
-        f"torque beyond the limit of robot.toml in {rows} rows of {_motions([s for s, _ in over])}; worst "
-        f"{worst[i]:.2f} N·m on {robot.joint_names[i]} (limit {robot.effort_limit[i]:.2f}): a collision, a "
-        "spike or a wrong limit"
+        f"torque beyond the limit of robot.toml in {rows} rows of "
+        f"{_motions([s for s, _ in over])}; worst {worst[i]:.2f} N·m on {robot.joint_names[i]} "
+        f"(limit {robot.effort_limit[i]:.2f}): a collision, a spike or a wrong limit"
     )
     yield Finding(
         "warning",
@@ -257,9 +274,9 @@ def _flat_torque(recorded: list[tuple[Survey, Torque]], robot: RobotSpec) -> Ite
         rows = sum(int(t.flat[i]) for _, t in near)
         if top > MIN_FLAT_SHARE * robot.effort_limit[i] and rows >= MIN_FLAT_ROWS:
             text = (
-                f"torque of {name} is cut off flat at {top:.3g} N·m in {rows} rows of {_motions([s for s, _ in near])}:"
-                f" the motor or its driver gives no more. Write effort_limit = {top:.3g} in robot.toml, or leave "
-                "these recordings out"
+                f"torque of {name} is cut off flat at {top:.3g} N·m in {rows} rows of "
+                f"{_motions([s for s, _ in near])}: the motor or its driver gives no more. Write "
+                f"effort_limit = {top:.3g} in robot.toml, or leave these recordings out"
             )
             yield Finding("warning", "saturation", text, (name,), {"rows": rows, "limit": top})
 
@@ -270,7 +287,10 @@ def _resolution(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     ratio = np.radians(step) / np.median(step[step > 0]) if step.any() else np.zeros_like(step)
     degrees = masked_names(robot, np.abs(ratio - 1) < RESOLUTION_TOLERANCE)
     if degrees and len(degrees) < (step > 0).sum() / 2:
-        text = f"{', '.join(degrees)} has steps 57.3 times as coarse as other joints: degrees beside radians?"
+        text = (
+            f"{', '.join(degrees)} has steps 57.3 times as coarse as other joints: degrees beside "
+            "radians?"
+        )
         yield Finding("warning", "unit", f"{text} Import again with the right unit", degrees)
     coarse = [
         (float(x), name)
@@ -284,9 +304,9 @@ def _resolution(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
         return
     worst, name = max(coarse)
     text = (
-        f"positions of {abbreviate([name for _, name in coarse])} come in steps of up to {worst * 1e3:.1f} mrad "
-        f"({name}): rounded when logged, or a coarse encoder (12 bits: 1.5 mrad). No error below half of that can be "
-        "seen; log more digits"
+        f"positions of {abbreviate([name for _, name in coarse])} come in steps of up to "
+        f"{worst * 1e3:.1f} mrad ({name}): rounded when logged, or a coarse encoder (12 bits: 1.5 "
+        "mrad). No error below half of that can be seen; log more digits"
     )
     level = "warning" if worst > 2 * MAX_RESOLUTION_RAD else "note"
     yield Finding(level, "resolution", text, tuple(name for _, name in coarse), {"step": worst})
@@ -301,8 +321,8 @@ def _stuck(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
         ]
         if still:
             text = (
-                f"{name} does not move when commanded in {_motions(still)}: unplugged, torque off or not read; leave "
-                "these out"
+                f"{name} does not move when commanded in {_motions(still)}: unplugged, torque off "
+                "or not read; leave these out"
             )
             yield Finding(
                 "error" if len(still) == len(moved) else "warning", "stuck", text, (name,)
@@ -314,21 +334,24 @@ def _stuck(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
         if repeated and not any(s.all_repeated_s > MIN_REPEATED_S for s in repeated):
             seconds = max(s.repeated_s[i] for s in repeated)
             text = (
-                f"{name} repeats one number for up to {seconds:.2f} s while its command moves on in "
-                f"{_motions(repeated)}: it was not read; cut these logs there"
+                f"{name} repeats one number for up to {seconds:.2f} s while its command moves on "
+                f"in {_motions(repeated)}: it was not read; cut these logs there"
             )
             yield Finding("warning", "stuck", text, (name,))
     frozen = [s for s in surveys if s.all_repeated_s > MIN_REPEATED_S and not _all_blocked(s)]
     if frozen:
         text = (
-            f"the whole state repeats itself for up to {max(s.all_repeated_s for s in frozen):.2f} s while the command "
-            f"moves in {_motions(frozen)}: samples were lost; cut the logs there"
+            "the whole state repeats itself for up to "
+            f"{max(s.all_repeated_s for s in frozen):.2f} s while the command moves in "
+            f"{_motions(frozen)}: samples were lost; cut the logs there"
         )
         yield Finding("warning", "stuck", text)
 
 
 def _all_blocked(survey: Survey) -> bool:
-    """True if every joint that is commanded ran into a stop, where an encoder with coarse steps repeats one number."""
+    """True if every joint that is commanded ran into a stop, where an encoder with coarse steps
+    repeats one number.
+    """
     commanded = survey.ctrl_range > MIN_COMMANDED_RAD
     coarse = survey.resolution[commanded] > 0
     return bool((coarse & (survey.blocked_s[commanded] > 0)).all())

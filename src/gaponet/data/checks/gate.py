@@ -1,7 +1,9 @@
-"""Gate: nothing is learned from recordings in which the doctor finds an error, unless a person insists.
+"""Gate: nothing is learned from recordings in which the doctor finds an error, unless a person
+insists.
 
-identify, adapt and train pass it before they fit; `gaponet start` and the page stop at the same findings of the whole
-doctor. Nothing is stored: the recordings are examined each time, since they may have changed.
+identify, adapt and train pass it before they fit; `gaponet start` and the page stop at the same
+findings of the whole doctor. Nothing is stored: the recordings are examined each time, since they
+may have changed.
 """
 
 from __future__ import annotations
@@ -60,7 +62,8 @@ class GateReport:
 def used_recordings(dataset: Dataset, splits: Mapping[str, ListOf[Entry]]) -> list[Entry]:
     """Return all recordings of the units that train or validate.
 
-    Their test motions count, so that the gate judges what the doctor judges; a unit that is held out does not.
+    Their test motions count, so that the gate judges what the doctor judges; a unit that is held
+    out does not.
     """
     units = {entry.meta.unit_id for entry in (*splits["train"], *splits["val"])}
     return [entry for entry in dataset.entries if entry.meta.unit_id in units]

@@ -1,9 +1,10 @@
 """Do the torques carry the arm that the joint angles describe?
 
-A zero or a sign that is wrong in command and state alike shows in neither of them. It shows in the torque, because an
-arm carries its own weight, which depends on its pose. Recorded torques, where they are signed, and the servo's torque
-at rest, kp (ctrl − qpos), are compared with the gravity of the nominal model: at the angles as logged, and with one
-joint turned or mirrored, or with joints in another order. A mirrored joint with equal weight on both sides is not seen.
+A zero or a sign that is wrong in command and state alike shows in neither of them. It shows in the
+torque, because an arm carries its own weight, which depends on its pose. Recorded torques, where
+they are signed, and the servo's torque at rest, kp (ctrl − qpos), are compared with the gravity of
+the nominal model: at the angles as logged, and with one joint turned or mirrored, or with joints in
+another order. A mirrored joint with equal weight on both sides is not seen.
 """
 
 from __future__ import annotations
@@ -34,8 +35,11 @@ JOINT_FAULTS = [
 ]
 MAX_ROWS = 120  # gravity is evaluated some fifteen times for each joint
 MIN_ROWS = 20
-MIN_EVIDENCE = 0.4  # sum over joints of ln(unexplained as logged / unexplained otherwise); correct recordings: < 0.1
-MIN_EXPLAINED, MIN_IMPROVEMENT = 0.5, 0.03  # mean share of the torque's square
+# sum over joints of ln(unexplained as logged / unexplained otherwise); correct recordings: < 0.1
+MIN_EVIDENCE = 0.4
+# mean share of the torque's square
+MIN_EXPLAINED = 0.5
+MIN_IMPROVEMENT = 0.03
 MIN_LOAD = 0.01  # of the torque limit: a joint that gravity loads less shows nothing
 
 
@@ -62,7 +66,9 @@ class _Hypothesis(NamedTuple):
 
 
 class _Best(NamedTuple):
-    """The best hypothesis, its evidence, and the mean shares of torque explained as logged and with it."""
+    """The best hypothesis, its evidence, and the mean shares of torque explained as logged and
+    with it.
+    """
 
     evidence: float
     hypothesis: _Hypothesis | None
@@ -74,9 +80,12 @@ def gravity(surveys: list[Survey], robot: RobotSpec, model: Gravity) -> Iterator
     """Are zero, sign and order of the joints those of the model?"""
     results = [
         _best(loads, robot, model, centred)
-        for loads, centred in ((_recorded_torques(surveys), False), (_servo_torques(surveys, robot), True))
+        for loads, centred in (
+            (_recorded_torques(surveys), False),
+            (_servo_torques(surveys, robot), True),
+        )
         if sum(len(qpos) for qpos, _ in loads.values()) >= MIN_ROWS
-    ]  # fmt: skip
+    ]
     if not results:
         yield Finding(
             "ok",
@@ -94,9 +103,9 @@ def gravity(surveys: list[Survey], robot: RobotSpec, model: Gravity) -> Iterator
     if best.hypothesis is not None and significant:
         joints = tuple(robot.joint_names[j] for j in best.hypothesis.joints)
         text = (
-            f"with {best.hypothesis.words} the torques fit the weight of the arm better ({best.otherwise:.0%}) "
-            f"than as logged ({best.as_logged:.0%}): wrong in command and state alike, where neither shows it; check "
-            "it against the model"
+            f"with {best.hypothesis.words} the torques fit the weight of the arm better "
+            f"({best.otherwise:.0%}) than as logged ({best.as_logged:.0%}): wrong in command and "
+            "state alike, where neither shows it; check it against the model"
         )
         yield Finding(
             "warning", "gravity", text, joints, {"evidence": best.evidence}, best.hypothesis.mend
@@ -108,7 +117,9 @@ def gravity(surveys: list[Survey], robot: RobotSpec, model: Gravity) -> Iterator
 
 
 def _best(loads: Loads, robot: RobotSpec, model: Gravity, centred: bool) -> _Best:
-    """Return the hypothesis that explains the torques best; `centred` ignores a constant of each joint."""
+    """Return the hypothesis that explains the torques best; `centred` ignores a constant of each
+    joint.
+    """
     step = max(1, sum(len(qpos) for qpos, _ in loads.values()) // MAX_ROWS)
     loads = {
         k: (q[::step].astype(float), t[::step].astype(float))
@@ -145,7 +156,9 @@ def _joint_faults(robot: RobotSpec, loaded: Array) -> Iterator[_Hypothesis]:
 
 
 def _order_faults(robot: RobotSpec) -> Iterator[_Hypothesis]:
-    """Yield hypotheses with two operated joints swapped, or all of them moved by one place, or reversed."""
+    """Yield hypotheses with two operated joints swapped, or all of them moved by one place, or
+    reversed.
+    """
     op = robot.operated_index
     orders = [
         ((a, b), [b, a], f"{robot.joint_names[a]} and {robot.joint_names[b]} in each other's place")
@@ -154,9 +167,11 @@ def _order_faults(robot: RobotSpec) -> Iterator[_Hypothesis]:
     orders += [
         (tuple(op.tolist()), order.tolist(), f"the order of joints {words}")
         for order, words in (
-            (np.roll(op, 1), "one place on"), (np.roll(op, -1), "one place back"), (op[::-1], "backwards"),
+            (np.roll(op, 1), "one place on"),
+            (np.roll(op, -1), "one place back"),
+            (op[::-1], "backwards"),
         )
-    ]  # fmt: skip
+    ]
     for joints, replaced, words in orders:
         order = np.arange(len(robot.joint_names))
         order[list(joints)] = replaced
@@ -177,7 +192,7 @@ def _servo_torques(surveys: list[Survey], robot: RobotSpec) -> Loads:
     poses = [s.static_poses for s in surveys]
     return _by_payload(
         (s, p.qpos, kp * (p.ctrl - p.qpos)) for s, p, kp in zip(surveys, poses, kps, strict=True)
-    )  # fmt: skip
+    )
 
 
 def _by_payload(samples: Iterable[tuple[Survey, Array, Array]]) -> Loads:
@@ -193,10 +208,13 @@ def _by_payload(samples: Iterable[tuple[Survey, Array, Array]]) -> Loads:
 def _unexplained(
     gravity: dict[Payload, Array], loads: Loads, loaded: Array, centred: bool
 ) -> Array:
-    """Return the share of the torques' square that gravity, times a scale ≥ 0 per joint, does not explain, (loaded)."""
+    """Return the share of the torques' square that gravity, times a scale ≥ 0 per joint, does not
+    explain, (loaded).
+    """
     x = np.concatenate([gravity[key][:, loaded] for key in loads])
     y = np.concatenate([torque[:, loaded] for _, torque in loads.values()])
     if centred:
-        x, y = x - x.mean(axis=0), y - y.mean(axis=0)
+        x = x - x.mean(axis=0)
+        y = y - y.mean(axis=0)
     power = (x**2).sum(axis=0) * (y**2).sum(axis=0)
     return 1 - np.maximum((x * y).sum(axis=0), 0) ** 2 / np.where(power > 0, power, np.inf) + 1e-4

@@ -16,7 +16,9 @@ from gaponet.robot.finding import Finding, abbreviate, masked_names
 from gaponet.robot.spec import RobotSpec
 
 MIN_SAG_RAD = 0.02  # static error that is reported
-MAX_DEAD_TIME_S, MAX_EXTRA_LAG_S = 0.15, 0.05  # of all joints; of one joint beyond the others
+# of all joints; of one joint beyond the others
+MAX_DEAD_TIME_S = 0.15
+MAX_EXTRA_LAG_S = 0.05
 DEAD_TIMES = (  # up to s, verdict
     (0.015, "as good as none"), (0.06, "usual for a bus and a servo's firmware"),
     (MAX_DEAD_TIME_S, "long, as of hobby servos and slow buses"),
@@ -31,15 +33,20 @@ def _lag(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
         yield Finding("ok", "lag", "a command that repeats the state shows no lag")
         return
     if not lags:
-        text = f"nothing is commanded faster than {FAST_COMMAND_RAD_S} rad/s: lag and stiction cannot be separated"
+        text = (
+            f"nothing is commanded faster than {FAST_COMMAND_RAD_S} rad/s: lag and stiction "
+            "cannot be separated"
+        )
         yield Finding("note", "lag", f"{text}; add fast motions")
         return
     every = np.concatenate(list(lags.values()))
     period = float(np.median([1 / s.rate_hz for s in surveys]))
-    low, high = every.min(), every.max()
+    low = every.min()
+    high = every.max()
     text = (
-        f"state follows command after {np.median(every) * 1e3:.0f} ms ({low * 1e3:.0f}–{high * 1e3:.0f} over joints and"
-        f" motions at {FAST_COMMAND_RAD_S} rad/s or faster), {low / period:.0f} to {high / period:.0f} periods"
+        f"state follows command after {np.median(every) * 1e3:.0f} ms "
+        f"({low * 1e3:.0f}–{high * 1e3:.0f} over joints and motions at {FAST_COMMAND_RAD_S} rad/s "
+        f"or faster), {low / period:.0f} to {high / period:.0f} periods"
     )
     expected = _expected_lag(robot)
     sharp = dict(zip(robot.operated, Response.sharp([s.response for s in surveys]), strict=True))
@@ -50,8 +57,8 @@ def _lag(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     if dead_time:
         verdict = next(words for limit, words in DEAD_TIMES if usual <= limit)
         text += (
-            f". kp and damping do not explain {usual * 1e3:.0f} ms of it: dead time, friction or inertia (gaponet "
-            f"identify separates them). As a dead time this is {verdict}"
+            f". kp and damping do not explain {usual * 1e3:.0f} ms of it: dead time, friction or "
+            f"inertia (gaponet identify separates them). As a dead time this is {verdict}"
         )
     level = "warning" if usual > MAX_DEAD_TIME_S else "note" if np.median(every) > period else "ok"
     yield Finding(
@@ -61,21 +68,24 @@ def _lag(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
         slow, near = expected[name]
         if len(dead_time) > 2 and late - usual > MAX_EXTRA_LAG_S and late > max(2 * slow, near):
             text = (
-                f"{name} lags {(late - usual) * 1e3:.0f} ms longer than the other joints: its channel is read late, "
-                "filtered or from another bus, or it moves stiffly"
+                f"{name} lags {(late - usual) * 1e3:.0f} ms longer than the other joints: its "
+                "channel is read late, filtered or from another bus, or it moves stiffly"
             )
             yield Finding("warning", "lag", text, (name,), {"extra_s": late - usual})
 
 
 def _expected_lag(robot: RobotSpec) -> dict[str, tuple[float, float]]:
-    """Return the lag of a slow motion that kp, kd and the MJCF's damping explain, and the lag that the inertia at home
-    adds at the servo's own frequency √(kp / inertia), a quarter of a period; by joint, s."""
+    """Return the lag of a slow motion that kp, kd and the MJCF's damping explain, and the lag that
+    the inertia at home adds at the servo's own frequency √(kp / inertia), a quarter of a period; by
+    joint, s.
+    """
     import mujoco
 
     from gaponet.robot.mjcf import compile_spec, read_mjcf
 
     model = compile_spec(read_mjcf(robot.mjcf), robot.mjcf)
-    data, full = mujoco.MjData(model), np.empty((model.nv, model.nv))
+    data = mujoco.MjData(model)
+    full = np.empty((model.nv, model.nv))
     mujoco.mj_forward(model, data)
     mujoco.mj_fullM(model, data, full)
     dofs = [model.joint(name).dofadr[0] for name in robot.joint_names]
@@ -115,15 +125,18 @@ def _sag(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
             else ""
         )
         text = (
-            f"state − command at rest, mrad: {by_payload}{more}: sag under load, or an offset. Within ± "
-            "(stiction) a joint can stop anywhere"
+            f"state − command at rest, mrad: {by_payload}{more}: sag under load, or an offset. "
+            "Within ± (stiction) a joint can stop anywhere"
         )
         values = {
             f"{p:g} kg": {name: e[name].middle for name in sagging} for p, e in errors.items()
         }
         yield Finding("note", "sag", text, tuple(sagging), values)
     elif all(e.up + e.down == 0 for by_joint in errors.values() for e in by_joint.values()):
-        text = "the robot never rests under a constant command: sag and offsets are not determined; add holds"
+        text = (
+            "the robot never rests under a constant command: sag and offsets are not determined; "
+            "add holds"
+        )
         yield Finding("note", "sag", text)
 
 
@@ -135,34 +148,37 @@ def _torque(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
             "note", "torque", "no torque recorded; equivalent torque comes from inverse dynamics"
         )
         return
-    low, high = (
-        np.min([t.low for _, t in recorded], axis=0),
-        np.max([t.high for _, t in recorded], axis=0),
-    )
+    low = np.min([t.low for _, t in recorded], axis=0)
+    high = np.max([t.high for _, t in recorded], axis=0)
     used = np.max([s.qpos_range for s, _ in recorded], axis=0) > 0.05
-    constant, unsigned = masked_names(robot, used & (low == high)), unsigned_torque(recorded, robot)
+    constant = masked_names(robot, used & (low == high))
+    unsigned = unsigned_torque(recorded, robot)
     if constant:
         text = f"torque of {', '.join(constant)} never changes; ignore it"
         yield Finding("warning", "torque", text, constant)
     if unsigned:
-        text = "torque is unsigned (never negative, though joints move both ways): a current's magnitude; do not fit it"
+        text = (
+            "torque is unsigned (never negative, though joints move both ways): a current's "
+            "magnitude; do not fit it"
+        )
         yield Finding("warning", "torque", text, unsigned)
     if spiky := [(s, t) for s, t in recorded if t.spikes.any()]:
-        height = np.array(
-            [np.maximum(-t.low, t.high) * (t.spikes > 0) for _, t in spiky]
-        )  # (sequences, n) N·m
+        # (sequences, n) N·m
+        height = np.array([np.maximum(-t.low, t.high) * (t.spikes > 0) for _, t in spiky])
         k, i = np.unravel_index(height.argmax(), height.shape)
         samples = sum(int(t.spikes.sum()) for _, t in spiky)
         text = (
-            f"torque spikes: {samples} samples in {abbreviate([s.motion for s, _ in spiky])}; worst {height[k, i]:.2f} "
-            f"N·m on {robot.joint_names[i]} in {spiky[k][0].motion}"
+            f"torque spikes: {samples} samples in {abbreviate([s.motion for s, _ in spiky])}; "
+            f"worst {height[k, i]:.2f} N·m on {robot.joint_names[i]} in {spiky[k][0].motion}"
         )
         values = {"samples": samples, "worst": height[k, i]}
         yield Finding("warning", "torque", text, (robot.joint_names[i],), values)
 
 
 def fast_lags(surveys: list[Survey], robot: RobotSpec) -> dict[str, Array]:
-    """Return joint → lags in motions that command it at FAST_COMMAND_RAD_S or more, s; only joints that have any."""
+    """Return joint → lags in motions that command it at FAST_COMMAND_RAD_S or more, s; only joints
+    that have any.
+    """
     lags = {
         name: np.array(
             [

@@ -1,4 +1,6 @@
-"""Left and right, front and rear: which joints of a robot are each other's counterpart, by their names."""
+"""Left and right, front and rear: which joints of a robot are each other's counterpart, by their
+names.
+"""
 
 from __future__ import annotations
 
@@ -7,10 +9,17 @@ import re
 # Words of names, and their counterparts.
 SIDES = {
     "left and right": {
-        "left": "right", "l": "r", "fl": "fr", "rl": "rr", "hl": "hr", "bl": "br", "lf": "rf", "lh": "rh",
+        "left": "right",
+        "l": "r",
+        "fl": "fr",
+        "rl": "rr",
+        "hl": "hr",
+        "bl": "br",
+        "lf": "rf",
+        "lh": "rh",
     },
     "front and rear": {"front": "rear", "fl": "rl", "fr": "rr", "lf": "lh", "rf": "rh"},
-}  # fmt: skip
+}
 
 
 def mirrored_joints(names: tuple[str, ...]) -> dict[str, dict[int, int]]:

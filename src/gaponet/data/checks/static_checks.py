@@ -1,13 +1,15 @@
-"""Checks of static poses against gravity and the stated gains: offsets, scales, gains, payload labels, mixed robots.
+"""Checks of static poses against gravity and the stated gains: offsets, scales, gains, payload
+labels, mixed robots.
 
-At rest, a servo's distance from its command is qpos − ctrl = offset + (scale − 1)·ctrl − softness·G(qpos)/kp −
-stiction·approach. G is the gravity torque of the nominal model with the labelled payload. The four coefficients of a
-joint are fitted to all poses, and also without some of the sequences: for standard errors (jackknife), and to judge a
-sequence by the others.
+At rest, a servo's distance from its command is qpos − ctrl = offset + (scale − 1)·ctrl −
+softness·G(qpos)/kp − stiction·approach. G is the gravity torque of the nominal model with the
+labelled payload. The four coefficients of a joint are fitted to all poses, and also without some of
+the sequences: for standard errors (jackknife), and to judge a sequence by the others.
 
-A PD controller's torque is kp (command − position) at rest; with a feed-forward torque it is that and a share of the
-weight, and the joint sags less than kp says. Recorded torque at rest is fitted to both. Behind backlash, or in a sensor
-behind the gears, the torque seems to be the weight alone, but the joint sags as kp says.
+A PD controller's torque is kp (command − position) at rest; with a feed-forward torque it is that
+and a share of the weight, and the joint sags less than kp says. Recorded torque at rest is fitted
+to both. Behind backlash, or in a sensor behind the gears, the torque seems to be the weight alone,
+but the joint sags as kp says.
 """
 
 from __future__ import annotations
@@ -28,35 +30,40 @@ from gaponet.robot.spec import RobotSpec
 MIN_POSES = 12  # of a joint
 MAX_FOLDS = 20  # of the sequences
 SIGNIFICANCE = 4.0  # standard errors
-MIN_OFFSET_RAD, FAR_OFFSET_RAD = 0.015, 0.05  # a note, a warning
+# a note, a warning
+MIN_OFFSET_RAD = 0.015
+FAR_OFFSET_RAD = 0.05
 MIN_SCALE_ERROR = 0.1
 SOFTNESS_BOUNDS = (0.5, 1.8)
 MIN_SAG_RAD = 0.01  # rms of the nominal sag, below which softness is unknown
 MIN_UNIT_DISTANCE_RAD = 0.03  # between sequences of one robot
-MIN_MASS, MIN_MASS_SHARE = (
-    0.25,
-    0.5,
-)  # of the heaviest label (or kg); of the misfit that another mass must explain
+# of the heaviest label (or kg); of the misfit that another mass must explain
+MIN_MASS = 0.25
+MIN_MASS_SHARE = 0.5
 MIN_LOAD_CHANGE_RAD = 1e-3  # by which a joint rests elsewhere with another label
 MIN_EVIDENCE = 10.0  # for other labels: poses times the logarithm by which their scatter falls
-MIN_GROUP_DISTANCE_RAD, MIN_GROUP_SCATTERS = 0.006, 6.0  # between two groups of recordings
+# between two groups of recordings
+MIN_GROUP_DISTANCE_RAD = 0.006
+MIN_GROUP_SCATTERS = 6.0
 PRIOR = np.array([0.0, 0.0, 1.0, 0.0])  # offset, scale − 1, softness, stiction of a motor as stated
 PRIOR_STD = np.array([0.5, 0.5, 1.0, 0.1])
-MIN_SCATTER_RAD, MAX_ITERATIONS = 5e-4, 12  # of the robust fit
+# of the robust fit
+MIN_SCATTER_RAD = 5e-4
+MAX_ITERATIONS = 12
 SOFTNESS = 2  # index of the coefficient
 MAX_ODD_SEQUENCES = 10  # that are reported
 # Of a torque that is fed forward:
 MIN_RECORDINGS = 3
 MIN_LOAD = 0.01  # of the torque limit, by which the weight on a joint changes
 MIN_SHARE = 0.3  # of the weight that the command does not hold
-MIN_UNEXPLAINED, MIN_IMPROVEMENT = (
-    0.02,
-    8.0,
-)  # share of the torque that PD does not explain; times as much as with it
+# share of the torque that PD does not explain; times as much as with it
+MIN_UNEXPLAINED = 0.02
+MIN_IMPROVEMENT = 8.0
+# of the sag that kp and the weight give: at a share of 1, and more per share below
 MAX_SAG = (
     0.25,
     2.5,
-)  # of the sag that kp and the weight give: at a share of 1, and more per share below
+)
 MIN_JOINTS_SHARE = 1 / 3  # of the joints that are judged
 
 
@@ -86,7 +93,9 @@ class _Poses:
 
 @dataclass(frozen=True)
 class _Fit:
-    """Coefficients of a joint (4), their standard errors, scatter (rad), and the coefficients without each sequence."""
+    """Coefficients of a joint (4), their standard errors, scatter (rad), and the coefficients
+    without each sequence.
+    """
 
     x: Array
     std: Array
@@ -122,12 +131,14 @@ def static_checks(surveys: list[Survey], robot: RobotSpec, model: Gravity) -> It
     findings = findings or _two_units(surveys, robot, poses, judged, min_size=1, min_joints=3)
     softness: dict[str, float] = {}
     for j in judged:
-        name, own = robot.joint_names[j], poses.of_joint(j)
+        name = robot.joint_names[j]
+        own = poses.of_joint(j)
         if len(own) < MIN_POSES:
             continue
         fit = _fit(own)
         findings += _offset_and_scale(name, fit)
-        sag, soft = float(np.sqrt(np.mean(own.columns[:, SOFTNESS] ** 2))), float(fit.x[SOFTNESS])
+        sag = float(np.sqrt(np.mean(own.columns[:, SOFTNESS] ** 2)))
+        soft = float(fit.x[SOFTNESS])
         if sag > MIN_SAG_RAD and fit.significant[SOFTNESS] and soft > -SOFTNESS_BOUNDS[0]:
             softness |= {} if SOFTNESS_BOUNDS[0] < soft < SOFTNESS_BOUNDS[1] else {name: soft}
     if softness:
@@ -136,8 +147,9 @@ def static_checks(surveys: list[Survey], robot: RobotSpec, model: Gravity) -> It
             "" if median > 1 else ", or was a torque fed forward (feedforward_torque in logs.toml)"
         )
         text = (
-            f"{abbreviate(list(softness))} sag {median:.2f} times as far as the stated kp says: were these logs made "
-            f"at other gains, or with another payload than their label{fed}? Import again with --kp or --payload-mass"
+            f"{abbreviate(list(softness))} sag {median:.2f} times as far as the stated kp says: "
+            f"were these logs made at other gains, or with another payload than their label{fed}? "
+            "Import again with --kp or --payload-mass"
         )
         findings.append(Finding("warning", "gains", text, tuple(softness), {"softness": softness}))
     yield from findings or [
@@ -148,7 +160,8 @@ def static_checks(surveys: list[Survey], robot: RobotSpec, model: Gravity) -> It
 def _collect(surveys: list[Survey], robot: RobotSpec, model: Gravity) -> _Poses:
     parts = [(np.zeros(0, int), np.zeros(0, int), np.zeros(0), np.zeros((0, 4)), np.zeros(0))]
     for number, s in enumerate(surveys):
-        meta, poses = s.entry.meta, s.static_poses
+        meta = s.entry.meta
+        poses = s.static_poses
         if not len(poses):
             continue
         kp = np.where(robot.kp > 0, robot.with_gains(*meta.recorded_gains).kp, np.inf)
@@ -185,8 +198,13 @@ def _fit(poses: _Poses) -> _Fit:
 def _solve(
     columns: Array, error: Array, expected: Array = PRIOR, expected_std: Array = PRIOR_STD
 ) -> tuple[Array, Array, float]:
-    """Return robust least-squares coefficients, their formal standard errors, and the scatter of the residuals."""
-    x, scatter, weight, prior = expected, 0.01, np.ones(len(error)), np.diag(1 / expected_std)
+    """Return robust least-squares coefficients, their formal standard errors, and the scatter of
+    the residuals.
+    """
+    x = expected
+    scatter = 0.01
+    weight = np.ones(len(error))
+    prior = np.diag(1 / expected_std)
     a = prior
     for _ in range(MAX_ITERATIONS):
         a = np.concatenate([columns * (weight / scatter)[:, None], prior])
@@ -202,11 +220,12 @@ def _solve(
 
 
 def _offset_and_scale(name: str, fit: _Fit) -> Iterator[Finding]:
-    offset, scale = float(fit.x[0]), float(1 + fit.x[1])
+    offset = float(fit.x[0])
+    scale = float(1 + fit.x[1])
     if fit.significant[1] and abs(scale - 1) > MIN_SCALE_ERROR:
         text = (
-            f"{name} goes {scale:.2f} rad where its command goes 1 rad, sag taken off: another gear ratio, range or "
-            "ticks a turn in one of them; import again with the right scale"
+            f"{name} goes {scale:.2f} rad where its command goes 1 rad, sag taken off: another "
+            "gear ratio, range or ticks a turn in one of them; import again with the right scale"
         )
         yield Finding("warning", "scale", text, (name,), {"scale": scale})
     elif fit.significant[0] and abs(offset) > MIN_OFFSET_RAD:
@@ -217,8 +236,9 @@ def _offset_and_scale(name: str, fit: _Fit) -> Iterator[Finding]:
             else "as assembly leaves it"
         )
         text = (
-            f"{name} rests {offset * 1e3:+.0f} ± {fit.std[0] * 1e3:.0f} mrad off its command, sag and stiction "
-            f"taken off: a constant offset, {verdict}; gaponet identify finds it, or take it off at import"
+            f"{name} rests {offset * 1e3:+.0f} ± {fit.std[0] * 1e3:.0f} mrad off its command, sag "
+            f"and stiction taken off: a constant offset, {verdict}; gaponet identify finds it, or "
+            "take it off at import"
         )
         yield Finding("warning" if far else "note", "offset", text, (name,), {"offset": offset})
 
@@ -245,7 +265,10 @@ def _swapped_labels(surveys: list[Survey], poses: _Poses, judged: list[int]) -> 
     swaps = ", ".join(
         f"{a:g} kg rests as {b:g} kg" for a, b in zip(labels, best[1], strict=True) if a != b
     )
-    text = f"what is labelled {swaps}: payload labels in each other's place? Import again with the right --payload-mass"
+    text = (
+        f"what is labelled {swaps}: payload labels in each other's place? Import again with the "
+        "right --payload-mass"
+    )
     return [Finding("warning", "payload", text, (), {"labels": labels, "rests_as": best[1]})]
 
 
@@ -257,10 +280,11 @@ def _two_units(
     min_size: int = 2,
     min_joints: int = 2,
 ) -> list[Finding]:
-    """Do the recordings form two groups of `min_size` or more that rest apart in `min_joints` or more joints?"""
-    median = np.full(
-        (len(surveys), len(judged)), np.nan
-    )  # residual of each sequence and joint, rad
+    """Do the recordings form two groups of `min_size` or more that rest apart in `min_joints` or
+    more joints?
+    """
+    # residual of each sequence and joint, rad
+    median = np.full((len(surveys), len(judged)), np.nan)
     for column, j in enumerate(judged):
         own = poses.of_joint(j)
         residual = own.error - own.columns @ _solve(own.columns, own.error)[0]
@@ -273,7 +297,8 @@ def _two_units(
         order = known[np.argsort(median[known, column])]
         cuts = np.arange(min_size, len(order) + 1 - min_size)
         centred = median[order] - median[order].mean(axis=0)  # their sum is zero, (N, judged)
-        sums, per = centred.cumsum(axis=0)[cuts - 1], (1 / cuts + 1 / (len(order) - cuts))[:, None]
+        sums = centred.cumsum(axis=0)[cuts - 1]
+        per = (1 / cuts + 1 / (len(order) - cuts))[:, None]
         within = np.sqrt(np.maximum((centred**2).sum(axis=0) - sums**2 * per, 0) / (len(order) - 2))
         gaps = np.abs(sums) * per
         far = (gaps > MIN_GROUP_DISTANCE_RAD) & (
@@ -289,9 +314,9 @@ def _two_units(
         [surveys[i].motion for i in known if (i in best[3]) == side] for side in (True, False)
     ]
     text = (
-        f"{abbreviate(motions[0])} rest up to {best[1] * 1e3:.0f} mrad from where {abbreviate(motions[1])} do "
-        f"({abbreviate(best[2])}): two robots under one name, or zeros set in between? Import one part with another "
-        "--unit-id"
+        f"{abbreviate(motions[0])} rest up to {best[1] * 1e3:.0f} mrad from where "
+        f"{abbreviate(motions[1])} do ({abbreviate(best[2])}): two robots under one name, or "
+        "zeros set in between? Import one part with another --unit-id"
     )
     return [
         Finding(
@@ -303,13 +328,17 @@ def _two_units(
 def _odd_sequence(
     surveys: list[Survey], robot: RobotSpec, poses: _Poses, judged: list[int]
 ) -> tuple[int, Finding] | None:
-    """Return the sequence that rests furthest from where the others say, with its finding, if any is far."""
+    """Return the sequence that rests furthest from where the others say, with its finding, if any
+    is far.
+    """
     by_joint = {j: poses.of_joint(j) for j in judged}
     fits = {j: _fit(own) for j, own in by_joint.items() if len(own) >= MIN_POSES}
     heaviest = max(s.entry.meta.payload_mass for s in surveys) or 1.0
     odd: tuple[float, int, Finding] | None = None
     for number in sorted(set(poses.sequence.tolist())):
-        residuals, slopes, apart = [], [], {}
+        residuals = []
+        slopes = []
+        apart = {}
         for j, fit in fits.items():
             own = by_joint[j].only(by_joint[j].of_sequence(number))
             if len(own) < 3 or len(by_joint[j]) - len(own) < MIN_POSES:
@@ -333,7 +362,8 @@ def _odd_sequence(
 def _judge_sequence(
     s: Survey, heaviest: float, residuals: list[Array], slopes: list[Array], apart: dict[str, float]
 ) -> tuple[float, Finding] | None:
-    """Return the mean square of a sequence's residuals and its finding, if another mass or unit explains them.
+    """Return the mean square of a sequence's residuals and its finding, if another mass or unit
+    explains them.
 
     Args:
         residuals, slopes: One array per joint, in scatters, and in scatters per kg of payload.
@@ -341,25 +371,29 @@ def _judge_sequence(
     """
     if not residuals:
         return None
-    r, slope, meta = np.concatenate(residuals), np.concatenate(slopes), s.entry.meta
-    mean_square, power = float(r @ r) / len(r), float(slope @ slope)
+    r = np.concatenate(residuals)
+    slope = np.concatenate(slopes)
+    meta = s.entry.meta
+    mean_square = float(r @ r) / len(r)
+    power = float(slope @ slope)
     more = float(slope @ r) / power if power > 0 else 0.0  # kg
     explained = more**2 * power
     unexplained = max(1.0, mean_square - explained / len(r))
     significant = explained > max(MIN_MASS_SHARE * float(r @ r), SIGNIFICANCE**2 * unexplained)
     if significant and abs(more) > MIN_MASS * heaviest:
         text = (
-            f"{meta.motion} rests as with {max(meta.payload_mass + more, 0.0):.2g} kg, its label says "
-            f"{meta.payload_mass:g} kg: a wrong payload label? Import it again with --payload-mass"
+            f"{meta.motion} rests as with {max(meta.payload_mass + more, 0.0):.2g} kg, its label "
+            f"says {meta.payload_mass:g} kg: a wrong payload label? Import it again with "
+            "--payload-mass"
         )
         values = {"motion": meta.motion, "mass": meta.payload_mass + more}
         return mean_square, Finding("warning", "payload", text, (), values)
     if apart:
         worst = max(apart, key=lambda name: abs(apart[name]))
         text = (
-            f"{meta.motion} rests {apart[worst] * 1e3:+.0f} mrad from where the other recordings of unit "
-            f"{meta.unit_id} say ({abbreviate(list(apart))}): another robot, or zeros set in between? Import it with "
-            "another --unit-id"
+            f"{meta.motion} rests {apart[worst] * 1e3:+.0f} mrad from where the other recordings "
+            f"of unit {meta.unit_id} say ({abbreviate(list(apart))}): another robot, or zeros set "
+            "in between? Import it with another --unit-id"
         )
         return mean_square, Finding(
             "warning", "unit_id", text, tuple(apart), {"motion": meta.motion, "apart": apart}
@@ -388,10 +422,11 @@ def feedforward(surveys: list[Survey], robot: RobotSpec, model: Gravity) -> Iter
         return
     share, alone, both = np.clip(np.median(list(fed.values()), axis=0), 0, 1)
     text = (
-        f"at rest the commands of {abbreviate(list(fed))} hold only {1 - share:.0%} of the weight: kp times their "
-        f"distance explains {alone:.0%} of the torque, with the rest of the weight {both:.0%} (recordings not "
-        "fitted). A torque is fed forward beside the command, such as gravity compensation, or an integral term holds "
-        "the joint. Name its column in logs.toml (feedforward_torque); without it, gaponet identify takes the missing "
+        f"at rest the commands of {abbreviate(list(fed))} hold only {1 - share:.0%} of the "
+        f"weight: kp times their distance explains {alone:.0%} of the torque, with the rest of "
+        f"the weight {both:.0%} (recordings not fitted). A torque is fed forward beside the "
+        "command, such as gravity compensation, or an integral term holds the joint. Name its "
+        "column in logs.toml (feedforward_torque); without it, gaponet identify takes the missing "
         "sag for stiffer motors, and a simulator needs the same torque"
     )
     yield Finding(
@@ -402,16 +437,16 @@ def feedforward(surveys: list[Survey], robot: RobotSpec, model: Gravity) -> Iter
 def _shares(
     surveys: list[Survey], robot: RobotSpec, model: Gravity, joint: int
 ) -> tuple[float, float, float] | None:
-    """Return the share of a joint's weight that is fed forward (0 if it may be none), and the shares of its torque that
-    PD alone and both explain; None with too few holds, or without a weight that changes."""
+    """Return the share of a joint's weight that is fed forward (0 if it may be none), and the
+    shares of its torque that PD alone and both explain; None with too few holds, or without a
+    weight that changes.
+    """
     parts = [np.zeros((0, 5))]
     for number, s in enumerate(surveys):
         if s.holds is not None and (s.holds[:, 0] == joint).any():
             own = s.holds[s.holds[:, 0] == joint]
-            meta, kp = (
-                s.entry.meta,
-                max(float(robot.with_gains(*s.entry.meta.recorded_gains).kp[joint]), 1e-9),
-            )
+            meta = s.entry.meta
+            kp = max(float(robot.with_gains(*s.entry.meta.recorded_gains).kp[joint]), 1e-9)
             weight = model(own[:, 3:], meta.payload_mass, meta.payload_side)[:, joint]
             columns = (
                 np.full(len(own), number),
@@ -428,9 +463,8 @@ def _shares(
         return None
     fold = fold % MAX_FOLDS
     sag, _, _ = _explained(error, fold, weight)
-    _, _, alone = _explained(
-        torque, fold, error, qpos
-    )  # qpos: command and state may differ in scale
+    # qpos: command and state may differ in scale
+    _, _, alone = _explained(torque, fold, error, qpos)
     share, std, both = _explained(torque, fold, weight, error, qpos)
     significant = share > max(MIN_SHARE, SIGNIFICANCE * std) and sag < MAX_SAG[0] + MAX_SAG[
         1
@@ -440,10 +474,12 @@ def _shares(
 
 
 def _explained(values: Array, fold: Array, *columns: Array) -> tuple[float, float, float]:
-    """Return the robust coefficient of the first column, its standard error, and the share of the variance of the
-    values that fits to the other folds explain."""
+    """Return the robust coefficient of the first column, its standard error, and the share of the
+    variance of the values that fits to the other folds explain.
+    """
     x = np.stack([*columns, np.ones_like(values)], axis=1)
-    start, free = np.zeros(x.shape[1]), np.full(x.shape[1], 1e3)
+    start = np.zeros(x.shape[1])
+    free = np.full(x.shape[1], 1e3)
     folds = np.unique(fold)
     each = np.array([_solve(x[fold != f], values[fold != f], start, free)[0] for f in folds])
     left = values - np.einsum("kc,kc->k", x, each[np.searchsorted(folds, fold)])

@@ -1,4 +1,5 @@
-"""Survey: measurements of one sequence about its own recording, without judgement (data.checks judges).
+"""Survey: measurements of one sequence about its own recording, without judgement (data.checks
+judges).
 
 `survey_all` measures the sequences of a dataset, in several processes if there are many.
 """
@@ -35,37 +36,44 @@ from gaponet.data.store import Dataset, Entry
 from gaponet.robot.spec import RobotSpec
 
 MAX_LAG_S = 0.4
-STANDSTILL_S, STANDSTILL_RAD = 0.2, 0.005  # a joint that moves less in this time stands still
+# a joint that moves less in this time stands still
+STANDSTILL_S = 0.2
+STANDSTILL_RAD = 0.005
 # distance of a blocked joint from its command; a loaded joint may be as far,
 BLOCKED_ERROR_RAD = 0.15
 BLOCKED_COMMAND_RAD = 0.1  # so that its command must also move by this
 REPEATED_COMMAND_RAD = 0.1  # the command must move by this while the state repeats itself
 SLOPE_MIN_RANGE_RAD = 0.2  # of the command; below, sag and stiction decide the slope
 SLOW_HZ = 0.3  # faster, a servo's resonance changes the slope
-GRAVITY_SAMPLES, SLOW_RAD_S = (
-    60,
-    0.5,
-)  # rows in which torque is compared with gravity, and the highest speed there
+# rows in which torque is compared with gravity, and the highest speed there
+GRAVITY_SAMPLES = 60
+SLOW_RAD_S = 0.5
 MOTION_HZ = 4.0  # above it, noise and a servo's resonance outweigh the weight of the links
-MOTION_ROWS, MIN_MOTION_ROWS = 60, 10  # of a recording in which motion is compared with the model
+# of a recording in which motion is compared with the model
+MOTION_ROWS = 60
+MIN_MOTION_ROWS = 10
 MOTION_MARGIN_S = 0.2  # at both ends, where smoothing is poor
-HOLD_S, HELD_COMMAND_RAD = 0.4, 2e-3  # time and range of a command that stands still
+# time and range of a command that stands still
+HOLD_S = 0.4
+HELD_COMMAND_RAD = 2e-3
 TORQUE_TOLERANCE = 0.05  # share of the torque limit by which a reading may exceed it
-JUMP_RAD, JUMP_RAD_S2 = (
-    0.1,
-    1000.0,
-)  # distance from the line between the neighbouring rows that no joint reaches
+# distance from the line between the neighbouring rows that no joint reaches
+JUMP_RAD = 0.1
+JUMP_RAD_S2 = 1000.0
 ZERO_JUMP_RAD = 0.05  # step from a row of zeros to the next row
 COMMAND_STEP_RAD = 0.05  # step of a command; the torque may follow it
-SPIKE_WINDOW_S, SPIKE_SHARE = 0.3, 0.3  # above the running median by this share of the torque limit
+# above the running median by this share of the torque limit
+SPIKE_WINDOW_S = 0.3
+SPIKE_SHARE = 0.3
 SPECTRUM_HZ = np.arange(0.5, 60, 0.1)
 MOVING_RAD = 0.05
-JOB_ROWS, MIN_PARALLEL_ROWS = 40_000, 600_000  # of one job; from which starting processes pays
+# of one job; from which starting processes pays
+JOB_ROWS = 40_000
+MIN_PARALLEL_ROWS = 600_000
 OVERHEAD_ROWS = 1500  # rows that take as long as the fixed costs of a recording
-LEVELS, LEVEL_TOLERANCE = (
-    8,
-    0.1,
-)  # distinct positions from which a step is known; deviation in steps
+# distinct positions from which a step is known; deviation in steps
+LEVELS = 8
+LEVEL_TOLERANCE = 0.1
 
 
 class Torque(NamedTuple):
@@ -82,8 +90,9 @@ class Torque(NamedTuple):
 class Survey:
     """Measurements of one sequence; n joints in robot order.
 
-    follows and opposes [i, j] are the greatest correlation of commanded velocity i with measured velocity j, and with
-    its negative, at lags up to MAX_LAG_S; 0 where one does not move. Periodic motion shows both.
+    follows and opposes [i, j] are the greatest correlation of commanded velocity i with measured
+    velocity j, and with its negative, at lags up to MAX_LAG_S; 0 where one does not move. Periodic
+    motion shows both.
     """
 
     entry: Entry
@@ -99,8 +108,10 @@ class Survey:
     lead: Array  # of the state before the command, (n) s; NaN where there is none
     follows: Array  # (n, n)
     opposes: Array
-    slope: Array  # motion of the state per motion of the command, (n); NaN where the motion does not show it
-    copied_rows: Array  # rows by which the state repeats the command (describe.row_copies), (n); NaN where it does not
+    # motion of the state per motion of the command, (n); NaN where the motion does not show it
+    slope: Array
+    # rows by which the state repeats the command (describe.row_copies), (n); NaN where it does not
+    copied_rows: Array
     jump_rows: Array  # rows with a position that no joint can reach and leave in a period, (n)
     zero_rows: int  # rows in which every joint is exactly 0, far from the rows around
     qvel_ratio: (
@@ -122,21 +133,19 @@ class Survey:
     static_poses: StaticPoses
     response: Response  # of the operated joints
     spectra: Array  # log power of command and state at SPECTRUM_HZ, (2, H)
-    command_distance: Array  # nearest state to the command of up to MAX_LAG_S before, in standard deviations of the
+    # nearest state to the command of up to MAX_LAG_S before, in standard deviations of the
+    command_distance: Array
     # state, (n); NaN where the joint does not move
     velocity_correlation: Array  # of the command with the measured velocity, (n)
     torque_correlation: Array  # of the command with the measured torque, (n)
-    gravity_samples: (
-        Array | None
-    )  # positions and torques in slow rows, (2, k, n); None if no torque was recorded
-    movement: (
-        Array | None
-    )  # rows of smoothed motion: position, velocity, acceleration, torque (NaN if none was
-    # recorded), command − position (its lag taken off), and the command's velocity and acceleration, (7, k, n) in SI;
-    # None if the recording is too short
-    holds: (
-        Array | None
-    )  # of single joints that rest under a constant command: joint, command − position (rad), torque,
+    # positions and torques in slow rows, (2, k, n); None if no torque was recorded
+    gravity_samples: Array | None
+    # rows of smoothed motion: position, velocity, acceleration, torque (NaN if none was
+    movement: Array | None
+    # recorded), command − position (its lag taken off), and the command's velocity and
+    # acceleration, (7, k, n) in SI; None if the recording is too short of single joints that rest
+    # under a constant command: joint, command − position (rad), torque,
+    holds: Array | None
     # and positions of all joints, (k, 3 + n); None if no torque was recorded
 
     @property
@@ -162,22 +171,17 @@ class Survey:
     @classmethod
     def of(cls, entry: Entry, sequence: Sequence, robot: RobotSpec) -> Survey:
         """Measure one sequence."""
-        ctrl, qpos, dt, notes, op = (
-            sequence.ctrl,
-            sequence.qpos,
-            sequence.dt,
-            entry.meta.notes,
-            robot.operated_index,
-        )
+        ctrl = sequence.ctrl
+        qpos = sequence.qpos
+        dt = sequence.dt
+        notes = entry.meta.notes
+        op = robot.operated_index
         blocked_s, blocked_at = _blocked(ctrl, qpos, dt)
         follows, opposes = _correlations(ctrl, qpos, dt)
-        delay, lead = (
-            estimate_delay(ctrl, qpos, dt, MAX_LAG_S),
-            estimate_delay(qpos, ctrl, dt, MAX_LAG_S),
-        )
-        apart = np.abs(
-            qpos[1:-1] - (qpos[:-2] + qpos[2:]) / 2
-        )  # from the line between the neighbouring rows
+        delay = estimate_delay(ctrl, qpos, dt, MAX_LAG_S)
+        lead = estimate_delay(qpos, ctrl, dt, MAX_LAG_S)
+        # from the line between the neighbouring rows
+        apart = np.abs(qpos[1:-1] - (qpos[:-2] + qpos[2:]) / 2)
         return Survey(
             entry=entry,
             samples=hashlib.sha256(ctrl.tobytes() + qpos.tobytes()).hexdigest(),
@@ -217,7 +221,8 @@ class Survey:
 def survey_all(
     dataset: Dataset, robot: RobotSpec, progress: Progress, executor: str | Executor
 ) -> list[Survey]:
-    """Return one survey per sequence, in the order of the dataset's entries; many are measured by the executor.
+    """Return one survey per sequence, in the order of the dataset's entries; many are measured by
+    the executor.
 
     Raises:
         WorkerError: Workers of the executor died.
@@ -230,10 +235,13 @@ def survey_all(
 
 
 def _measure(dataset: Dataset, robot: RobotSpec, executor: str | Executor) -> Iterator[Survey]:
-    jobs, rows, total = list[list[Entry]](), JOB_ROWS, 0
+    jobs = list[list[Entry]]()
+    rows = JOB_ROWS
+    total = 0
     for entry in dataset.entries:
         if rows + entry.rows > JOB_ROWS:
-            jobs, rows = [*jobs, []], 0
+            jobs = [*jobs, []]
+            rows = 0
         jobs[-1].append(entry)
         rows += entry.rows + OVERHEAD_ROWS
         total += entry.rows + OVERHEAD_ROWS
@@ -252,32 +260,43 @@ def _survey_job(job: list[tuple[Entry, Sequence]], robot: RobotSpec) -> list[Sur
 
 
 def _correlations(ctrl: Array, qpos: Array, dt: float) -> tuple[Array, Array]:
-    """Return `follows` and `opposes`: velocities over about 60 ms, at lags in steps of about 40 ms."""
-    span, stride = max(1, round(0.06 / dt)), max(1, round(0.04 / dt))
-    u, v = ctrl[span:] - ctrl[:-span], qpos[span:] - qpos[:-span]
+    """Return `follows` and `opposes`: velocities over about 60 ms, at lags in steps of about 40
+    ms.
+    """
+    span = max(1, round(0.06 / dt))
+    stride = max(1, round(0.04 / dt))
+    u = ctrl[span:] - ctrl[:-span]
+    v = qpos[span:] - qpos[:-span]
     most, least = np.zeros((2, ctrl.shape[1], ctrl.shape[1]))
     for lag in range(0, min(round(MAX_LAG_S / dt), len(u) // 2) + 1, stride):
-        a, b = u[: len(u) - lag], v[lag:]
-        a, b = a - a.mean(axis=0), b - b.mean(axis=0)
+        a = u[: len(u) - lag]
+        b = v[lag:]
+        a = a - a.mean(axis=0)
+        b = b - b.mean(axis=0)
         scale = np.sqrt(np.outer((a**2).sum(axis=0), (b**2).sum(axis=0)))
         coefficients = (a.T @ b) / np.where(scale > 0, scale, np.inf)
-        most, least = np.maximum(most, coefficients), np.minimum(least, coefficients)
+        most = np.maximum(most, coefficients)
+        least = np.minimum(least, coefficients)
     return most, -least
 
 
 def _slope(ctrl: Array, qpos: Array, dt: float, lag: Array, speed: Array) -> Array:
-    """Return the slope of the state over the command of `lag` rows before; NaN for a fast joint with unknown lag."""
+    """Return the slope of the state over the command of `lag` rows before; NaN for a fast joint
+    with unknown lag.
+    """
     slope = np.full(len(lag), np.nan)
     slow = [lowpass(x, dt, SLOW_HZ) for x in (ctrl, qpos)] if len(ctrl) * dt > 3 / SLOW_HZ else None
     for j in np.flatnonzero(
         (np.ptp(ctrl, axis=0) > SLOPE_MIN_RANGE_RAD) & ((lag > 0) | (speed < FAST_COMMAND_RAD_S))
     ):
-        steps, candidates = round(float(lag[j])), []
+        steps = round(float(lag[j]))
+        candidates = []
         for a, b in (
             (ctrl, qpos),
             *([slow] if slow and np.ptp(slow[0][:, j]) > SLOPE_MIN_RANGE_RAD else []),
         ):
-            u, v = a[: len(a) - steps, j].astype(float), b[steps:, j].astype(float)
+            u = a[: len(a) - steps, j].astype(float)
+            v = b[steps:, j].astype(float)
             u = u - u.mean()
             candidates.append(float(u @ v / (u @ u)))
         slope[j] = min(candidates, key=lambda x: abs(x - 1))  # a resonance changes one of them
@@ -287,24 +306,25 @@ def _slope(ctrl: Array, qpos: Array, dt: float, lag: Array, speed: Array) -> Arr
 def _kind_of_command(sequence: Sequence) -> dict[str, Array]:
     """Compare the command with the position soon after, with the velocity, and with the torque."""
     every = max(1, round(0.02 / sequence.dt))
-    ctrl, qpos = (
-        np.ascontiguousarray(x[::every].T, float) for x in (sequence.ctrl, sequence.qpos)
-    )  # (n, T)
-    rows, speed = qpos.shape[1], np.gradient(qpos, axis=1)
-    distances, velocity = [], []
+    # (n, T)
+    ctrl, qpos = (np.ascontiguousarray(x[::every].T, float) for x in (sequence.ctrl, sequence.qpos))
+    rows = qpos.shape[1]
+    speed = np.gradient(qpos, axis=1)
+    distances = []
+    velocity = []
     for lag in range(0, min(round(MAX_LAG_S / 0.02), rows // 2), 2):
-        u, q = ctrl[:, : rows - lag], qpos[:, lag:]
+        u = ctrl[:, : rows - lag]
+        q = qpos[:, lag:]
         product = np.abs(u @ q.T) / (rows - lag)  # (n, n)
-        u_power, q_power, variance = (
-            (u**2).mean(axis=1)[:, None],
-            (q**2).mean(axis=1),
-            np.maximum(q.var(axis=1), 1e-12),
-        )
+        u_power = (u**2).mean(axis=1)[:, None]
+        q_power = (q**2).mean(axis=1)
+        variance = np.maximum(q.var(axis=1), 1e-12)
+        # other checks judge units, signs and names
         for scale in (
             1.0,
             np.degrees(1),
             np.radians(1),
-        ):  # other checks judge units, signs and names
+        ):
             square = scale**2 * u_power + q_power - 2 * scale * product
             distances.append((np.maximum(square, 0) / variance).min(axis=1))
         velocity.append(correlation(u, speed[:, lag:]))
@@ -330,7 +350,9 @@ def _standing(qpos: Array, dt: float) -> Array:
 
 
 def _standstill(ctrl: Array, qpos: Array, dt: float) -> float:
-    """Return the longest standstill of all joints (brakes on, drives off) while at least two commands move, s."""
+    """Return the longest standstill of all joints (brakes on, drives off) while at least two
+    commands move, s.
+    """
     commanded = max(2.0, 0.5 * (np.ptp(ctrl, axis=0) > BLOCKED_COMMAND_RAD).sum())
     late = round(MAX_LAG_S / dt)
     standing = np.asarray(_standing(qpos, dt).all(axis=1))
@@ -354,12 +376,15 @@ def _blocked(ctrl: Array, qpos: Array, dt: float) -> tuple[Array, Array]:
         runs = [r for r in _runs(mask) if np.ptp(ctrl[r, j]) > BLOCKED_COMMAND_RAD]
         if runs:
             longest = max(runs, key=lambda r: r.stop - r.start)
-            seconds[j], places[j] = (longest.stop - longest.start) * dt, qpos[longest.start, j]
+            seconds[j] = (longest.stop - longest.start) * dt
+            places[j] = qpos[longest.start, j]
     return seconds, places
 
 
 def _zero_rows(sequence: Sequence, notes: dict[str, Any], robot: RobotSpec) -> int:
-    """Count rows of zeros of the joints that were logged in rad or deg; one joint alone may well pass through zero."""
+    """Count rows of zeros of the joints that were logged in rad or deg; one joint alone may well
+    pass through zero.
+    """
     converted = (joint for joint, unit in notes.get("converted_from", {}).items() if unit != "deg")
     excluded = {*notes.get("held_at_home", ()), *converted}
     logged = [i for i, name in enumerate(robot.joint_names) if name not in excluded]
@@ -388,7 +413,10 @@ def _gravity_samples(sequence: Sequence) -> Array | None:
 
 
 def _movement(sequence: Sequence, delay: Array) -> Array | None:
-    """Return rows of smoothed motion (Survey.movement). delay: of the state, (n) s; NaN where it is not known."""
+    """Return rows of smoothed motion (Survey.movement).
+
+    delay: of the state, (n) s; NaN where it is not known.
+    """
     dt = sequence.dt
     margin = max(2, round(MOTION_MARGIN_S / dt))
     rows = np.arange(margin, len(sequence) - margin)
@@ -415,7 +443,8 @@ def _movement(sequence: Sequence, delay: Array) -> Array | None:
 def _holds(sequence: Sequence) -> Array | None:
     if sequence.tau is None:
         return None
-    rows, least = max(2, round(HOLD_S / sequence.dt)), HOLD_S / 2 / sequence.dt
+    rows = max(2, round(HOLD_S / sequence.dt))
+    least = HOLD_S / 2 / sequence.dt
     rests = range_before(sequence.ctrl, rows) < HELD_COMMAND_RAD
     rests &= range_before(sequence.qpos, max(2, rows // 4)) < STANDSTILL_RAD
     rests[:rows] = False
@@ -446,7 +475,9 @@ def _qvel_ratio(sequence: Sequence) -> Array:
 
 
 def _all_repeated(sequence: Sequence) -> float:
-    """A resting robot repeats its positions; if every signal repeats while the command moves, nothing was read."""
+    """A resting robot repeats its positions; if every signal repeats while the command moves,
+    nothing was read.
+    """
     state = [getattr(sequence, name) for name in ("qpos", "qvel", "tau", "temperature")]
     same = np.all([(np.diff(x, axis=0) == 0).all(axis=1) for x in state if x is not None], axis=0)
     late = round(MAX_LAG_S / 2 / sequence.dt)
@@ -458,7 +489,9 @@ def _all_repeated(sequence: Sequence) -> float:
 
 
 def _repeated(ctrl: Array, qpos: Array, dt: float) -> Array:
-    """A loaded or stuck joint stands still, but noise and encoder steps change its number, and it moves at last."""
+    """A loaded or stuck joint stands still, but noise and encoder steps change its number, and it
+    moves at last.
+    """
     late = round(MAX_LAG_S / 2 / dt)
     seconds = np.zeros(qpos.shape[1])
     for j, same in enumerate((np.diff(qpos, axis=0) == 0).T):
@@ -470,7 +503,9 @@ def _repeated(ctrl: Array, qpos: Array, dt: float) -> Array:
 
 
 def _resolution(qpos: Array) -> Array:
-    """Return the step of which all differences of positions are multiples, where there are few distinct positions."""
+    """Return the step of which all differences of positions are multiples, where there are few
+    distinct positions.
+    """
     steps = np.zeros(qpos.shape[1])
     for j, column in enumerate(qpos.T):
         levels = np.unique(column.astype(float))
@@ -512,7 +547,9 @@ def _torque(sequence: Sequence, robot: RobotSpec) -> Torque | None:
 
 
 def _spectrum(qpos: Array, dt: float) -> Array:
-    """Return the mean logarithm of the power of the velocities at SPECTRUM_HZ, (H); NaN above half the rate."""
+    """Return the mean logarithm of the power of the velocities at SPECTRUM_HZ, (H); NaN above half
+    the rate.
+    """
     moved = qpos[:, np.ptp(qpos, axis=0) > 0.02].astype(float)
     if not moved.size or len(moved) < 100:
         return np.full(len(SPECTRUM_HZ), np.nan)

@@ -16,25 +16,31 @@ from gaponet.robot.spec import RobotSpec
 
 MAX_ITERATIONS = 6  # of estimating shifts and the common response in turn
 MIN_RECORDINGS = 4  # from which one of them can be compared with the others
-MIN_SHIFT_S, SHIFT_SCATTERS = (
-    0.012,
-    4.0,
-)  # by which a recording follows later than the others; times their scatter
+# by which a recording follows later than the others; times their scatter
+MIN_SHIFT_S = 0.012
+SHIFT_SCATTERS = 4.0
 MIN_SHIFT_PERIODS = 0.75  # of the rows, by which it must follow later
 MIN_AGREEMENT = 0.5  # of such a shift that the delays of single joints must show
-UNEVEN_ROWS_SHARE = 2.0  # of the unevenness of rows: a command may be that late, and an interpolated state that early
+# of the unevenness of rows: a command may be that late, and an interpolated state that early
+UNEVEN_ROWS_SHARE = 2.0
 MIN_LEAD_S = 0.015  # by which joints begin to move before their commands
-MIN_EARLY_RATIO = 1.08  # unexplained motion without future commands over that with them, if joints move before them
-MAX_DEAD_TIME_S, MAX_EXTRA_LAG_S = 0.1, 0.05  # of all joints; of one joint beyond the others
+# unexplained motion without future commands over that with them, if joints move before them
+MIN_EARLY_RATIO = 1.08
+# of all joints; of one joint beyond the others
+MAX_DEAD_TIME_S = 0.1
+MAX_EXTRA_LAG_S = 0.05
 DEAD_TIMES = (  # up to s, verdict
-    (0.035, "as good as no dead time"), (MAX_DEAD_TIME_S, "usual for a bus, a servo's firmware and its inertia"),
-    (np.inf, "long; hobby servos have it: look for a buffer, a filter, or clocks of command and state that are apart"),
+    (0.035, "as good as no dead time"), (MAX_DEAD_TIME_S, "usual for a bus, a servo's firmware "
+                                                          "and its inertia"),
+    (np.inf, "long; hobby servos have it: look for a buffer, a filter, or clocks of command and "
+             "state that are apart"),
 )  # fmt: skip
-MIN_DRIFT, MIN_DRIFT_ERRORS = 3e-4, 4.5  # s/s; standard errors
-MOTION_SHARE, MIN_DRIFT_DURATION_S = (
-    0.7,
-    10.0,
-)  # of the scatter that motions explain; recordings that show a drift
+# s/s; standard errors
+MIN_DRIFT = 3e-4
+MIN_DRIFT_ERRORS = 4.5
+# of the scatter that motions explain; recordings that show a drift
+MOTION_SHARE = 0.7
+MIN_DRIFT_DURATION_S = 10.0
 MIN_NOTCH_DEPTH = 1.5  # natural logarithm of power
 AVERAGING_WIDTHS_S = np.geomspace(0.04, 0.4, 150)
 
@@ -57,8 +63,8 @@ def _timing(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     onset = _usual_onset(common)
     if _moves_early(common, onset, unknown, step):
         text = (
-            f"joints begin to move {-onset * 1e3:.0f} ms before their commands: are command and state swapped, or are "
-            "their clocks apart? Shift one of them at import"
+            f"joints begin to move {-onset * 1e3:.0f} ms before their commands: are command and "
+            "state swapped, or are their clocks apart? Shift one of them at import"
         )
         findings.append(Finding("error", "copied", text, (), {"onset_s": onset}))
     elif np.isfinite(onset):
@@ -108,8 +114,9 @@ def _late_joints(common: CommonResponse, onset: float, robot: RobotSpec) -> Iter
     for name, extra in zip(robot.operated, common.onset - onset, strict=True):
         if extra > MAX_EXTRA_LAG_S:
             text = (
-                f"{name} begins to move {extra * 1e3:.0f} ms later than the other joints: its channel is read late, "
-                "filtered or from another bus, or it moves stiffly; shift it at import if the time of reading is known"
+                f"{name} begins to move {extra * 1e3:.0f} ms later than the other joints: its "
+                "channel is read late, filtered or from another bus, or it moves stiffly; shift "
+                "it at import if the time of reading is known"
             )
             yield Finding("warning", "lag", text, (name,), {"extra_s": float(extra)})
 
@@ -120,19 +127,21 @@ def _averaged(surveys: list[Survey]) -> Iterator[Finding]:
     width, depth = _averaging(moved)
     if depth <= MIN_NOTCH_DEPTH:
         return
-    in_commands = _averaging(commanded, np.array([width]))[
-        1
-    ]  # steps at a regular pace have notches too
+    # steps at a regular pace have notches too
+    in_commands = _averaging(commanded, np.array([width]))[1]
     if in_commands < depth / 3:
         text = (
-            f"states never move at the multiples of {1 / width:.1f} Hz, as averages over {width * 1e3:.0f} ms: log the "
-            "encoder itself; what is averaged is late, and fast motions are lost"
+            f"states never move at the multiples of {1 / width:.1f} Hz, as averages over "
+            f"{width * 1e3:.0f} ms: log the encoder itself; what is averaged is late, and fast "
+            "motions are lost"
         )
         yield Finding("warning", "averaged", text, (), {"width_s": width})
 
 
 def _standard_error(deviations: Array) -> float:
-    """Return the standard error of a median from the deviations of the values; unknown ones do not count."""
+    """Return the standard error of a median from the deviations of the values; unknown ones do not
+    count.
+    """
     known = np.abs(deviations[np.isfinite(deviations)])
     return 1.48 * float(np.median(known)) / np.sqrt(len(known)) if len(known) else np.inf
 
@@ -140,7 +149,8 @@ def _standard_error(deviations: Array) -> float:
 def _shifts(responses: list[Response]) -> Array:
     """Return how much later each recording follows than all do, (recordings) s.
 
-    Shifts and the common response are estimated in turn, since a late recording changes the common response.
+    Shifts and the common response are estimated in turn, since a late recording changes the common
+    response.
     """
     more = Response.common(responses).whole
     shifts = np.where(np.isfinite(more), 0.0, np.nan)
@@ -182,9 +192,9 @@ def _late_recordings(surveys: list[Survey], unknown: float) -> Iterator[Finding]
             ms = sorted(abs(late) * 1e3 for _, late in part)
             by = f"{ms[0]:.0f} ms" if single else f"{ms[0]:.0f} to {ms[-1]:.0f} ms"
             text = (
-                f"{abbreviate(labels)} {'follows its' if single else 'follow their'} commands {by} {word} than the "
-                "other recordings: clocks of command and state that are apart, or another servo; leave them out if it "
-                "is the clocks"
+                f"{abbreviate(labels)} {'follows its' if single else 'follow their'} commands "
+                f"{by} {word} than the other recordings: clocks of command and state that are "
+                "apart, or another servo; leave them out if it is the clocks"
             )
             values = {
                 "recordings": [s.entry.id for s, _ in part],
@@ -194,7 +204,8 @@ def _late_recordings(surveys: list[Survey], unknown: float) -> Iterator[Finding]
 
 
 def _relative_delays(surveys: list[Survey]) -> Array:
-    """Return how much longer the measured delays of each recording are than those of the same joints in all, (N) s.
+    """Return how much longer the measured delays of each recording are than those of the same
+    joints in all, (N) s.
 
     NaN where no joint's delay is known.
     """
@@ -210,7 +221,9 @@ def _relative_delays(surveys: list[Survey]) -> Array:
 
 
 def _agree(late: float, delay: float) -> bool:
-    """Return True if the delays that the same page shows do not contradict a shift; both relative to the others, s."""
+    """Return True if the delays that the same page shows do not contradict a shift; both relative
+    to the others, s.
+    """
     if np.isnan(delay):
         return abs(late) < SHIFTS_S[-1]
     return delay * late > 0 and abs(delay) >= min(MIN_AGREEMENT * abs(late), MIN_SHIFT_S)
@@ -221,12 +234,14 @@ def _drift(surveys: list[Survey], shifts: Array, unknown: float = 0.0) -> Iterat
     duration = np.array([s.response.duration for s in surveys])
     long = duration >= MIN_DRIFT_DURATION_S  # in shorter recordings friction changes the shift
     between = duration[long] * (1 - 1 / shifts.shape[1])
-    first, middle, last = shifts[long, 0], shifts[long, 1:-1].mean(axis=1), shifts[long, -1]
-    slope, curvature = (last - first) / between, (last + first - 2 * middle) / between / np.sqrt(3)
-    slope, curvature = (
-        slope[np.isfinite(slope)],
-        curvature[np.isfinite(curvature)],
-    )  # a drift has no curvature
+    first = shifts[long, 0]
+    middle = shifts[long, 1:-1].mean(axis=1)
+    last = shifts[long, -1]
+    slope = (last - first) / between
+    curvature = (last + first - 2 * middle) / between / np.sqrt(3)
+    # a drift has no curvature
+    slope = slope[np.isfinite(slope)]
+    curvature = curvature[np.isfinite(curvature)]
     if len(slope) < MIN_RECORDINGS:
         return
     drift = float(np.median(slope))
@@ -237,13 +252,16 @@ def _drift(surveys: list[Survey], shifts: Array, unknown: float = 0.0) -> Iterat
     if abs(drift) > max(MIN_DRIFT, MIN_DRIFT_ERRORS * error, unknown / float(between.max())):
         text = (
             f"to its end each recording follows its commands {'later' if drift > 0 else 'sooner'} "
-            f"({abs(drift) * 1e6:.0f} ± {error * 1e6:.0f} ppm): the clocks of both drift apart; log them with one"
+            f"({abs(drift) * 1e6:.0f} ± {error * 1e6:.0f} ppm): the clocks of both drift apart; "
+            "log them with one"
         )
         yield Finding("error", "clock", text, (), {"drift": drift})
 
 
 def _averaging(levels: Array, widths: Array = AVERAGING_WIDTHS_S) -> tuple[float, float]:
-    """Return the width, s, of the moving average that best explains notches in a spectrum (H), and their depth."""
+    """Return the width, s, of the moving average that best explains notches in a spectrum (H), and
+    their depth.
+    """
     best = (0.0, 0.0)
     known = SPECTRUM_HZ[np.isfinite(levels)]
     if not len(known):

@@ -14,24 +14,27 @@ from gaponet.robot.finding import Finding, abbreviate
 from gaponet.robot.spec import RobotSpec
 
 MIN_COMMAND_RAD = 0.05  # a joint with a smaller command range shows neither order, sign nor unit
+# a loaded joint falls short of its command, or passes it if its load is on top
 SLOPE_BOUNDS = (
     0.5,
     1.25,
-)  # a loaded joint falls short of its command, or passes it if its load is on top
-MAX_OWN_CORRELATION, MIN_OTHER_CORRELATION, MIN_MOTIONS = (
-    0.8,
-    0.95,
-    3,
-)  # of a swap that shows in several motions
+)
+# of a swap that shows in several motions
+MAX_OWN_CORRELATION = 0.8
+MIN_OTHER_CORRELATION = 0.95
+MIN_MOTIONS = 3
 MAX_DISTANCE = 0.7  # of positions from position commands, in standard deviations of the positions
 MIN_KIND_CORRELATION = 0.7  # of the command with what else it may be
-MIN_FOLLOWING = 0.75  # correlation of velocities, from which commands are positions that a weak motor does not reach
+# correlation of velocities, from which commands are positions that a weak motor does not reach
+MIN_FOLLOWING = 0.75
+# measured over commanded range; between 0.03 and 0.1 a joint may be stuck
 RATIO_BOUNDS = (
     0.03,
     10.0,
-)  # measured over commanded range; between 0.03 and 0.1 a joint may be stuck
+)
 QVEL_RATIO_BOUNDS = (0.5, 2.0)
-MIN_WIDEST_COMMAND_RAD, MAX_READ_AS_DEGREES_RAD = 0.12, np.radians(3.3)
+MIN_WIDEST_COMMAND_RAD = 0.12
+MAX_READ_AS_DEGREES_RAD = np.radians(3.3)
 
 
 def _moved(surveys: list[Survey], joint: int) -> list[Survey]:
@@ -39,7 +42,9 @@ def _moved(surveys: list[Survey], joint: int) -> list[Survey]:
 
 
 def _follow_small_commands(survey: Survey) -> Array:
-    """Return which joints move far with a small command, as where state and command have different units, (n)."""
+    """Return which joints move far with a small command, as where state and command have different
+    units, (n).
+    """
     follow = np.diag(survey.follows) > MIN_FOLLOWING
     return follow & (
         survey.qpos_range > np.maximum(MIN_COMMAND_RAD, RATIO_BOUNDS[1] * survey.ctrl_range)
@@ -67,10 +72,12 @@ def _order(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
         if 2 * len(evidence) >= motions[pair[0]]
     }
     for (own, other), correlations in swapped.items():
-        a, b = robot.joint_names[own], robot.joint_names[other]
+        a = robot.joint_names[own]
+        b = robot.joint_names[other]
         text = (
-            f"the command of {a} moves {b}, not {a} (correlation {np.median(correlations):.2f}, {len(correlations)} of "
-            f"{motions[own]} motions): the columns of command and state are in different orders; name the command's "
+            f"the command of {a} moves {b}, not {a} (correlation {np.median(correlations):.2f}, "
+            f"{len(correlations)} of {motions[own]} motions): the columns of command and state "
+            "are in different orders; name the command's "
             f'columns in logs.toml ([columns] "ctrl.{b}" = "what is ctrl.{a} now") and import again'
         )
         yield Finding("error", "order", text, (a, b))
@@ -89,7 +96,9 @@ def _order(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
 
 
 def _swapped_pairs(surveys: list[Survey], motions: Array) -> dict[tuple[int, int], list[float]]:
-    """Return swapped joints over several motions; in one motion, joints that move together look alike."""
+    """Return swapped joints over several motions; in one motion, joints that move together look
+    alike.
+    """
     follows = np.array([s.follows for s in surveys])  # (sequences, n, n)
     own = np.median(np.diagonal(follows, axis1=1, axis2=2), axis=0)
     cross = np.median(follows, axis=0)
@@ -126,11 +135,17 @@ def _command(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     }
     kind = f"they are most like {words[best]} (correlation {correlation[best]:.2f})"
     kind = kind if correlation[best] > MIN_KIND_CORRELATION else "are they torques?"
-    text = f"states are {np.median(distance[judged]):.2f} times as far from their commands as from their own mean"
+    text = (
+        f"states are {np.median(distance[judged]):.2f} times as far from their commands as from "
+        "their own mean"
+    )
     follows = np.stack([np.diag(s.follows) for s in surveys])[:, robot.operated_index]
     alike = max(np.nan_to_num(list(correlation.values()))) >= MIN_KIND_CORRELATION
     if not alike and np.median(follows[judged]) > MIN_FOLLOWING:
-        text += ", though they move with them: motors too weak for their load, or a wrong kp; check payload and kp"
+        text += (
+            ", though they move with them: motors too weak for their load, or a wrong kp; check "
+            "payload and kp"
+        )
         yield Finding("warning", "command", text, (), correlation)
         return
     text += f": these are no position targets; {kind}. Log the targets of the position controller"
@@ -144,8 +159,8 @@ def _sign(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
         against = [s for s in moved if s.opposes[i, i] > 0.6 and s.follows[i, i] < 0.3]
         if against and 2 * len(against) >= len(moved):
             text = (
-                f"{name} moves against its command in {len(against)} of {len(moved)} motions: command and state have "
-                "opposite signs; negate one of them and import again"
+                f"{name} moves against its command in {len(against)} of {len(moved)} motions: "
+                "command and state have opposite signs; negate one of them and import again"
             )
             yield Finding("error", "sign", text, (name,))
 
@@ -154,9 +169,9 @@ def _copied(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     """Are command and state two signals, and does the command come first?"""
     if driven_by_torque(surveys):
         text = (
-            "command and position are the same numbers, and torque is recorded: taken as driven by torque or current. "
-            "gaponet identify fits armature, friction and delay; gap and train need position commands. If positions "
-            "were commanded, log what the servo was sent"
+            "command and position are the same numbers, and torque is recorded: taken as driven "
+            "by torque or current. gaponet identify fits armature, friction and delay; gap and "
+            "train need position commands. If positions were commanded, log what the servo was sent"
         )
         yield Finding("warning", "copied", text)
         return
@@ -174,8 +189,8 @@ def _copied(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
         if len(leads) > 0.5 * len(moved):
             lead = float(np.median(leads))
             text = (
-                f"{name} moves {lead * 1e3:.0f} ms before its command in {len(leads)} of {len(moved)} motions: are "
-                "command and state swapped, or their clocks apart?"
+                f"{name} moves {lead * 1e3:.0f} ms before its command in {len(leads)} of "
+                f"{len(moved)} motions: are command and state swapped, or their clocks apart?"
             )
             yield Finding("error", "copied", text, (name,), {"lead_s": lead})
         else:
@@ -183,8 +198,9 @@ def _copied(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     early = [s for s in surveys if _moves_first(s, usual)]
     if early:
         text = (
-            f"joints move before their commands in {abbreviate([s.motion for s in early])}, not in other recordings: "
-            "command and state are swapped there; leave these out, or import them with the columns exchanged"
+            f"joints move before their commands in {abbreviate([s.motion for s in early])}, not "
+            "in other recordings: command and state are swapped there; leave these out, or import "
+            "them with the columns exchanged"
         )
         yield Finding("error", "copied", text, (), {"recordings": [s.entry.id for s in early]})
     with_torque = all(s.torque is not None for s in surveys)
@@ -193,7 +209,9 @@ def _copied(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
 
 
 def driven_by_torque(surveys: list[Survey]) -> bool:
-    """True if no position was commanded: each command is the joint's position, and torque is recorded."""
+    """True if no position was commanded: each command is the joint's position, and torque is
+    recorded.
+    """
     for s in surveys:
         moves = s.qpos_range > MIN_COMMAND_RAD
         if s.torque is None or not moves.any() or (s.copied_rows[moves] != 0).any():
@@ -202,24 +220,28 @@ def driven_by_torque(surveys: list[Survey]) -> bool:
 
 
 def _copy(rows: int, motions: dict[str, list[str]], with_torque: bool) -> Finding:
-    """Return the error that the state repeats the command by so many rows. motions: joint → motions."""
+    """Return the error that the state repeats the command by so many rows.
+
+    motions: joint → motions.
+    """
     joints = abbreviate(list(motions))
     where = abbreviate([motion for of_joint in motions.values() for motion in of_joint])
     count = f"{abs(rows)} row{'s' * (abs(rows) > 1)}"
     if rows == 0:
         text = (
-            f"command and state of {joints} are the same numbers in {where}: one was logged as both; log the command "
-            "that the servo was sent"
+            f"command and state of {joints} are the same numbers in {where}: one was logged as "
+            "both; log the command that the servo was sent"
         )
     elif rows > 0:
         text = (
-            f"the command of {joints} is the recorded position {count} later, to the last digit, in {where}: what was "
-            "sent to the servos is not in this log. Record the goal positions that the robot was sent"
+            f"the command of {joints} is the recorded position {count} later, to the last digit, "
+            f"in {where}: what was sent to the servos is not in this log. Record the goal "
+            "positions that the robot was sent"
         )
     else:
         text = (
-            f"the position of {joints} is the command {count} later, to the last digit, in {where}: the state was not "
-            "measured. Record the positions of the encoders"
+            f"the position of {joints} is the command {count} later, to the last digit, in "
+            f"{where}: the state was not measured. Record the positions of the encoders"
         )
     if with_torque:
         text += ". Of a robot that is driven by torque or current: gaponet identify --current"
@@ -227,7 +249,9 @@ def _copy(rows: int, motions: dict[str, list[str]], with_torque: bool) -> Findin
 
 
 def _moves_first(survey: Survey, joints: list[int]) -> bool:
-    """True if several of the joints move before their commands in a recording, and most of those that move."""
+    """True if several of the joints move before their commands in a recording, and most of those
+    that move.
+    """
     leads = [
         bool(np.isfinite(survey.lead[i])) for i in joints if survey.ctrl_range[i] > MIN_COMMAND_RAD
     ]
@@ -243,15 +267,16 @@ def _unit(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
         ratio = median([s.qpos_range[i] / s.ctrl_range[i] for s in commanded])
         if ratio > RATIO_BOUNDS[1] or 0 < ratio < RATIO_BOUNDS[0]:
             text = (
-                f"{name} moves {ratio:.3g} times as far as commanded (57.3 and 0.0175 are degrees beside radians): "
-                "convert the command or the state in the logs, and import again"
+                f"{name} moves {ratio:.3g} times as far as commanded (57.3 and 0.0175 are degrees "
+                "beside radians): convert the command or the state in the logs, and import again"
             )
             wrong.append(Finding("error", "unit", text, (name,), {"ratio": ratio}))
         slope = median([s.slope[i] for s in surveys if np.isfinite(s.slope[i])])
         if not wrong and (slope > SLOPE_BOUNDS[1] or 0.1 < slope < SLOPE_BOUNDS[0]):
             text = (
-                f"{name} goes {slope:.2f} rad where its command goes 1 rad: another scale (a gear, a range, ticks a "
-                "turn), or a motor that does not reach its targets; check both at a right angle"
+                f"{name} goes {slope:.2f} rad where its command goes 1 rad: another scale (a "
+                "gear, a range, ticks a turn), or a motor that does not reach its targets; check "
+                "both at a right angle"
             )
             wrong.append(Finding("warning", "unit", text, (name,), {"slope": slope}))
         moved = [
@@ -262,8 +287,8 @@ def _unit(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
         ratio = median([s.qvel_ratio[i] for s in moved])
         if not QVEL_RATIO_BOUNDS[0] < ratio < QVEL_RATIO_BOUNDS[1]:
             text = (
-                f"recorded velocity of {name} is {ratio:.3g} times the derivative of its position: not rad/s; leave "
-                "the velocity out at import, it is then computed"
+                f"recorded velocity of {name} is {ratio:.3g} times the derivative of its "
+                "position: not rad/s; leave the velocity out at import, it is then computed"
             )
             wrong.append(Finding("warning", "unit", text, (name,), {"ratio": ratio}))
     small = [s.motion for s in surveys if np.abs(s.ctrl_limits).max() < MAX_READ_AS_DEGREES_RAD]
@@ -273,8 +298,9 @@ def _unit(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
         wrong.append(Finding("warning", "unit", text))
     elif small and _read_as_degrees(surveys):
         text = (
-            f"no command of {abbreviate(small)} is further than {np.degrees(MAX_READ_AS_DEGREES_RAD):.1f}° from zero: "
-            "radians that were read as degrees, beside logs in degrees? Import them by themselves, with their unit"
+            f"no command of {abbreviate(small)} is further than "
+            f"{np.degrees(MAX_READ_AS_DEGREES_RAD):.1f}° from zero: radians that were read as "
+            "degrees, beside logs in degrees? Import them by themselves, with their unit"
         )
         wrong.append(Finding("error", "unit", text))
     yield from _converted(surveys, robot)
@@ -301,7 +327,10 @@ def _converted(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
         )
     for name in (name for name, unit in _units(surveys).items() if unit == "fraction"):
         low, high = robot.qpos_range[robot.joint_names.index(name)]
-        text = f"{name} is logged as 0..1, not in rad: mapped to its range [{low:.2f}, {high:.2f}], velocity computed"
+        text = (
+            f"{name} is logged as 0..1, not in rad: mapped to its range [{low:.2f}, {high:.2f}], "
+            "velocity computed"
+        )
         yield Finding("note", "unit", text, (name,))
 
 
@@ -317,9 +346,10 @@ def _limits(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
             if (beyond > tolerance).any():
                 clips = ", and the simulator clips there" if kind == "commanded" else ""
                 text = (
-                    f"{name} is {kind} up to {beyond.max():.3f} rad beyond [{low:.2f}, {high:.2f}] in "
-                    f"{(beyond > tolerance).sum()} sequence(s), worst {surveys[int(beyond.argmax())].motion}{clips}: "
-                    "check its zero, or its range in robot.xml"
+                    f"{name} is {kind} up to {beyond.max():.3f} rad beyond [{low:.2f}, "
+                    f"{high:.2f}] in {(beyond > tolerance).sum()} sequence(s), worst "
+                    f"{surveys[int(beyond.argmax())].motion}{clips}: check its zero, or its range "
+                    "in robot.xml"
                 )
                 yield Finding(level, "range", text, (name,), {"beyond_rad": float(beyond.max())})
 
@@ -327,7 +357,10 @@ def _limits(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
 def _labels(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     """Is one recording filed under two payloads or units, and were all made with the same gains?"""
     if (kinds := len({(s.entry.meta.kp, s.entry.meta.kd) for s in surveys})) > 1:
-        text = f"{kinds} sets of kp and kd while recording: each recording is simulated with its own; is that meant?"
+        text = (
+            f"{kinds} sets of kp and kd while recording: each recording is simulated with its "
+            "own; is that meant?"
+        )
         yield Finding("note", "labels", text)
     ids: dict[str, list[str]] = defaultdict(list)
     for s in surveys:

@@ -39,7 +39,8 @@ AXES = {
 }
 SPEED_WORDS = {"vel", "velocity", "speed", "twist"}
 NO_TARGETS = (
-    "gaponet needs the joint positions that the servos were sent. If another feature or column holds them, say "
+    "gaponet needs the joint positions that the servos were sent. If another feature or column "
+    "holds them, say "
     'ctrl = "ITS NAME" in logs.toml; else record them'
 )
 

@@ -12,9 +12,33 @@ from gaponet.base.errors import LogError
 from gaponet.data.describe.joints import ignored
 
 CLOCK_WORDS = {
-    "t", "ts", "time", "timestamp", "timestamps", "stamp", "clock", "elapsed", "uptime", "epoch", "wall", "tick",
-    "s", "sec", "secs", "second", "seconds", "ms", "msec", "millis", "us", "usec", "micros", "ns", "nsec", "nanos",
-}  # fmt: skip
+    "t",
+    "ts",
+    "time",
+    "timestamp",
+    "timestamps",
+    "stamp",
+    "clock",
+    "elapsed",
+    "uptime",
+    "epoch",
+    "wall",
+    "tick",
+    "s",
+    "sec",
+    "secs",
+    "second",
+    "seconds",
+    "ms",
+    "msec",
+    "millis",
+    "us",
+    "usec",
+    "micros",
+    "ns",
+    "nsec",
+    "nanos",
+}
 CLOCK_ENDS = ("time", "stamp", "clock")  # of words such as realtime
 ROWS = 4000  # that are looked at
 MIN_ROWS = 20
@@ -27,7 +51,8 @@ MAX_RATE_DIFFERENCE = (
 def clock_periods(
     signals: Mapping[str, Sequence[str]], load: Callable[[list[str]], dict[str, Any]]
 ) -> dict[str, float]:
-    """Return the columns that run like clocks → mean distance of their rows, in the column's own unit.
+    """Return the columns that run like clocks → mean distance of their rows, in the column's own
+    unit.
 
     Args:
         signals, load: Of a RawRecording.
@@ -62,7 +87,9 @@ def _runs(values: np.ndarray) -> bool:
 
 
 def rate_ratio(period: float, other: float) -> float:
-    """Return how many times as long the other period is, without a factor of thousands: 0.004 and 8 → 2."""
+    """Return how many times as long the other period is, without a factor of thousands: 0.004 and
+    8 → 2.
+    """
     ratio = other / period
     thousands = np.round(np.log10(ratio) / 3)
     return float(ratio / 1000.0**thousands)
@@ -92,7 +119,9 @@ def require_one_rate(
         if abs(ratio - 1) > MAX_RATE_DIFFERENCE:
             raise LogError(
                 f"{where}: two columns run like clocks and contradict each other: "
-                f"{clock}, {periods[clock]:.4g} a row, and {other}, {period:.4g} a row, {ratio:.3g} times as much. A "
-                "lag measured with the wrong one is wrong by this factor. Say which is right in logs.toml: "
-                f'time = "{clock}" and ignore = ["{other}"], or time = "{other}" and ignore = ["{clock}"]'
+                f"{clock}, {periods[clock]:.4g} a row, and {other}, {period:.4g} a row, "
+                f"{ratio:.3g} times as much. A lag measured with the wrong one is wrong by this "
+                "factor. Say which is right in logs.toml: "
+                f'time = "{clock}" and ignore = ["{other}"], or time = "{other}" and ignore = '
+                f'["{clock}"]'
             )

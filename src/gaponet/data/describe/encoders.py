@@ -1,9 +1,12 @@
-"""Encoders of an arm as LeRobot calibrates them: a JSON file that turns ticks and percent into angles.
+"""Encoders of an arm as LeRobot calibrates them: a JSON file that turns ticks and percent into
+angles.
 
-    {"shoulder_pan": {"id": 1, "drive_mode": 0, "homing_offset": -1365, "range_min": 746, "range_max": 3477}, …}
+    {"shoulder_pan": {"id": 1, "drive_mode": 0, "homing_offset": -1365, "range_min": 746,
+    "range_max": 3477}, …}
 
-An angle is (reading − middle of the range) · 2π / 4095, as LeRobot's degrees are. homing_offset lies in the servo,
-whose readings have it already. Percent are −100..100 of the range, of a gripper 0..100.
+An angle is (reading − middle of the range) · 2π / 4095, as LeRobot's degrees are. homing_offset
+lies in the servo, whose readings have it already. Percent are −100..100 of the range, of a gripper
+0..100.
 """
 
 from __future__ import annotations
@@ -77,7 +80,10 @@ def read_encoders(
     Raises:
         UsageError: The file is missing, or is no calibration of LeRobot.
     """
-    hint = "give the calibration file of the follower arm (~/.cache/huggingface/lerobot/calibration/robots/…)"
+    hint = (
+        "give the calibration file of the follower arm "
+        "(~/.cache/huggingface/lerobot/calibration/robots/…)"
+    )
     motors = read_json(dict[str, _Motor], file, UsageError, hint, allow_extra=True)
     encoders = {}
     for name, motor in motors.items():

@@ -1,4 +1,6 @@
-"""A logs.toml for strange logs, filled in as far as names and numbers show it; what is a guess is marked as one."""
+"""A logs.toml for strange logs, filled in as far as names and numbers show it; what is a guess is
+marked as one.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +26,8 @@ from gaponet.data.describe.raw_recording import SECONDS, RawRecording
 from gaponet.data.log import FEEDFORWARD
 from gaponet.robot.spec import RobotSpec
 
-# Words by which the world calls them; a name with a word of an earlier line is not looked for in a later one.
+# Words by which the world calls them; a name with a word of an earlier line is not looked for in a
+# later one.
 WORDS = {
     FEEDFORWARD: ("ff", "feedforward", "ffwd"),
     "ctrl": ("ctrl", "cmd", "command", "commands", "commanded", "des", "desired", "d", "target", "targets", "goal",
@@ -58,7 +61,8 @@ def guess_logs(
     """The text of a logs.toml.
 
     Args:
-        recordings: Some of one kind; the first is looked at, and what the names of all have in common.
+        recordings: Some of one kind; the first is looked at, and what the names of all have in
+            common.
         known: What is said already (a logs.toml, the format's own), which is kept.
     """
     if not recordings:
@@ -78,8 +82,12 @@ def guess_logs(
         return _guess_two_files(topics, files, robot, fmt, known)
     first = recordings[0]
     specified = dict(known) | {k: v for k, v in first.default.items() if k not in known}
-    lines = [f"# {fmt}; the first recording: {first.where or first.source}",
-             f"# its columns: {first.shown(40)}", "# Lines with a ? are guesses: look at them.", ""]  # fmt: skip
+    lines = [
+        f"# {fmt}; the first recording: {first.where or first.source}",
+        f"# its columns: {first.shown(40)}",
+        "# Lines with a ? are guesses: look at them.",
+        "",
+    ]
     stated = {
         c: specified[c]
         for c in WORDS
@@ -96,16 +104,23 @@ def guess_logs(
     lines += _names(channels, joints, robot)
     lines += _names_of_commands(_joints(first, channels, "ctrl"), joints, robot)
     repeated = _repeated(recordings, channels.get("ctrl", ""))
-    lines += ["", "# What the names of the recordings say, or a sheet (file, motion, payload, unit, rep):",
-              f"# names here: {', '.join(r.name for r in recordings[:5])}{', …' if len(recordings) > 5 else ''}",
-              f"motion = {_text(_pattern([r.name for r in recordings], repeated))}",
-              '# manifest = "sheet.csv"', '# unit = "…"', "# payload = 0.0        # kg",
-              "# kp = …               # N·m/rad while recording; default: robot.toml's"]  # fmt: skip
+    lines += [
+        "",
+        "# What the names of the recordings say, or a sheet (file, motion, payload, unit, rep):",
+        "# names here: "
+        f"{', '.join(r.name for r in recordings[:5])}{', …' if len(recordings) > 5 else ''}",
+        f"motion = {_text(_pattern([r.name for r in recordings], repeated))}",
+        '# manifest = "sheet.csv"',
+        '# unit = "…"',
+        "# payload = 0.0        # kg",
+        "# kp = …               # N·m/rad while recording; default: robot.toml's",
+    ]
     return "\n".join(lines) + "\n"
 
 
 def _family(files: list[str]) -> dict[str, str]:
-    """Return channel or "time" → pattern of its files, where each recording has a file for each: {name}_desired.csv.
+    """Return channel or "time" → pattern of its files, where each recording has a file for each:
+    {name}_desired.csv.
 
     Empty where files are recordings of their own.
     """
@@ -125,9 +140,8 @@ def _family(files: list[str]) -> dict[str, str]:
         names[name][kind] = f"{pattern}.{suffix}"
     families = list(names.values())
     kinds = families[0]
-    alike = all(
-        family.keys() == kinds.keys() for family in families[:-1]
-    )  # the last may be cut off
+    # the last may be cut off
+    alike = all(family.keys() == kinds.keys() for family in families[:-1])
     return kinds if alike and "qpos" in kinds and len(kinds) > 1 else {}
 
 
@@ -144,9 +158,12 @@ def _guess_family(
     joints = list(state.columns)
     values = np.stack([state.load([c])[c].values[:ROWS] for c in state.signals], axis=1)
     span = float(np.nanmax(np.abs(values)))
-    lines = [f"# {fmt}; files that belong together: {', '.join(family.values())}",
-             "# Lines with a ? are guesses: look at them.", "",
-             f"state_file = {_text(family['qpos'])}  # ?"]  # fmt: skip
+    lines = [
+        f"# {fmt}; files that belong together: {', '.join(family.values())}",
+        "# Lines with a ? are guesses: look at them.",
+        "",
+        f"state_file = {_text(family['qpos'])}  # ?",
+    ]
     if "ctrl" in family:
         lines.append(f"command_file = {_text(family['ctrl'])}  # ?")
     if "time" in family:
@@ -182,7 +199,9 @@ def _channel_line(channel: str, name: str, lines: list[str]) -> str:
 
 
 def _state_and_command(recordings: list[RawRecording]) -> dict[str, RawRecording] | None:
-    """Return state and command where there are two files, called like joint_states.csv and command.csv."""
+    """Return state and command where there are two files, called like joint_states.csv and
+    command.csv.
+    """
     by_kind = {_kind(Path(r.source).stem) or "": r for r in recordings}
     if len(recordings) != 2 or by_kind.keys() != {"qpos", "ctrl"}:
         return None
@@ -293,7 +312,8 @@ def _channels(recording: RawRecording, robot: RobotSpec) -> dict[str, str]:
 
 
 def _best_pattern(joints_of: dict[str, set[str]], joints: set[str], robot: RobotSpec) -> str:
-    """Return the pattern with these joints, with most joints, with those of the robot, and that says most.
+    """Return the pattern with these joints, with most joints, with those of the robot, and that
+    says most.
 
     Args:
         joints_of: Pattern → joints of the columns that fit.
@@ -319,7 +339,8 @@ def _is_joint(name: str, robot: RobotSpec) -> bool:
 def _patterns(name: str) -> list[tuple[str, str]]:
     """Each way to read a name as joint and words, with the joint.
 
-    shoulder_pan_des → {joint}_des; q_des_1 → q_des_{joint}; tau_J[0] → tau_J[{joint}]; q1_ref → q{joint}_ref.
+    shoulder_pan_des → {joint}_des; q_des_1 → q_des_{joint}; tau_J[0] → tau_J[{joint}]; q1_ref →
+    q{joint}_ref.
     """
     words = list(re.finditer(r"[A-Za-z0-9]+", name))
     matches = []
@@ -429,7 +450,8 @@ def _which_clock(clock: str, period: float, others: dict[str, float]) -> list[st
         return [line]
     factors = ", ".join(f"{rate_ratio(period, others[name]):.3g}" for name in apart)
     return [
-        f"# {clock} and {', '.join(apart)} run like clocks and differ by a factor of {factors}: choose one",
+        f"# {clock} and {', '.join(apart)} run like clocks and differ by a factor of {factors}: "
+        "choose one",
         f"# for time, and leave the other out: ignore = {json.dumps(apart)}",
         line,
     ]
@@ -469,7 +491,9 @@ def _positions(recording: RawRecording, channels: dict[str, str]) -> list[str]:
 
 
 def _repeated(recordings: list[RawRecording], ctrl: str) -> bool:
-    """Return True if the first two recordings have equal commands: a final number in their names counts repetitions."""
+    """Return True if the first two recordings have equal commands: a final number in their names
+    counts repetitions.
+    """
     commands = [_values(recording, ctrl) for recording in recordings[:2]]
     if len(commands) < 2 or any(x is None for x in commands):
         return True

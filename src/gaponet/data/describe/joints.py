@@ -13,7 +13,8 @@ from gaponet.robot.spec import RobotSpec, load_robot, packaged_robots
 def resolve_all(
     names: Sequence[str], robot: RobotSpec, where: str, joint_map: dict[str, str] | None
 ) -> list[str]:
-    """The robot's joint of each name in a log, in the same order; one error for all that it does not have.
+    """The robot's joint of each name in a log, in the same order; one error for all that it does
+    not have.
 
     Args:
         names: Joint names as the log writes them; /robot/link/joint is reduced to its last part.
@@ -23,7 +24,8 @@ def resolve_all(
     Raises:
         JointMismatchError: A name is no joint of this robot, or two names are one joint.
     """
-    matched, strange = [], []
+    matched = []
+    strange = []
     for name in names:
         try:
             matched.append(robot.resolve(name, where, joint_map))
@@ -36,8 +38,8 @@ def resolve_all(
     )
     if strange and kin:
         raise JointMismatchError(
-            f"{where} names joints {', '.join(names)}: no joint of robot '{robot.name}', all of robot '{kin[0]}': "
-            f"give that one (import --robot {kin[0]}; start {kin[0]} LOGS)"
+            f"{where} names joints {', '.join(names)}: no joint of robot '{robot.name}', all of "
+            f"robot '{kin[0]}': give that one (import --robot {kin[0]}; start {kin[0]} LOGS)"
         )
     if strange:
         free = [j for j in robot.joint_names if j not in matched]
@@ -52,8 +54,8 @@ def resolve_all(
             else ""
         )
         raise JointMismatchError(
-            f"{where} names joints {', '.join(n for n, _ in strange)}, which robot '{robot.name}' does not have. "
-            f"Map them with {' '.join(maps)}{left}, or under [names] in logs.toml; "
+            f"{where} names joints {', '.join(n for n, _ in strange)}, which robot '{robot.name}' "
+            f"does not have. Map them with {' '.join(maps)}{left}, or under [names] in logs.toml; "
             'what is no joint of this robot is left out by ignore = ["NAME", …] there'
         )
     if len(set(matched)) != len(matched):

@@ -1,4 +1,6 @@
-"""logs.toml: what a lab's logs mean, said once. It lies in the folder of the logs, or is given with --logs.
+"""logs.toml: what a lab's logs mean, said once.
+
+It lies in the folder of the logs, or is given with --logs.
 
 docs/logs.md shows examples.
 """
@@ -26,7 +28,8 @@ Text = Annotated[str, Len(1, 300)]
 Gain = Annotated[float, Interval(ge=0, le=1e6)]
 Sign = Annotated[int, Interval(ge=-1, le=1)]
 Offset = Annotated[float, Interval(ge=-10, le=10)]
-# What a name or a sheet may say of a recording: its word here → field of SequenceMeta, and what it looks like.
+# What a name or a sheet may say of a recording: its word here → field of SequenceMeta, and what it
+# looks like.
 FIELDS = {
     "motion": ("motion", r".+"), "unit": ("unit_id", r".+"), "side": ("payload_side", r"[^_/]+"),
     "payload": ("payload_mass", r"\d+(?:[.p]\d+)?"), "rep": ("repetition", r"\d+"),
@@ -34,7 +37,9 @@ FIELDS = {
     "kp": ("kp", r"\d+(?:[.p]\d+)?"), "kd": ("kd", r"\d+(?:[.p]\d+)?"), "estimated": ("estimated", r".+"),
     "leave_out": ("leave_out", r"yes|no"), "": ("", r".+?"),
 }  # fmt: skip
-MOST_LOOSE = 3  # of a pattern's words that match anything: each more makes a name that does not fit slower to refuse
+# of a pattern's words that match anything: each more makes a name that does not fit slower to
+# refuse
+MOST_LOOSE = 3
 NUMBERS = ("payload_mass", "repetition", "kp", "kd")
 
 
@@ -42,8 +47,12 @@ class LogsFile(TypedDict, total=False):
     """The fields of logs.toml, all optional."""
 
     format: Text  # where it cannot be seen
-    motion: Text  # pattern of the recordings' names, or with a slash of their paths: "{motion}_{payload:g}kg_{rep}"
-    manifest: Text  # or a table: file, motion, unit, payload, side, rep, level, virtual, kp, kd, kp.<joint>, estimated
+    # pattern of the recordings' names, or with a slash of their paths:
+    # "{motion}_{payload:g}kg_{rep}"
+    motion: Text
+    # or a table: file, motion, unit, payload, side, rep, level, virtual, kp, kd, kp.<joint>,
+    # estimated
+    manifest: Text
     # (which of these are no more than that), leave_out (yes or no)
     unit: Text  # of all recordings, like payload (kg) and side
     payload: Annotated[float, Interval(ge=0, le=100)]
@@ -64,20 +73,19 @@ class LogsFile(TypedDict, total=False):
     tau: Text
     temperature: Text
     feedforward_torque: Text  # N·m that the controller added to its PD torque
-    # where a recording's signals lie in files of their own: "{name}_measured.csv"; {name}: default the state file's
+    # where a recording's signals lie in files of their own: "{name}_measured.csv"; {name}: default
+    # the state file's
     state_file: Text
     command_file: Text
     time_file: Text
     header: Annotated[list[str], Len(1, 2000)]  # names of the columns of a table that has none
-    joints: Annotated[
-        list[str], Len(1, 500)
-    ]  # of the columns of an array that does not name them, in its order
+    # of the columns of an array that does not name them, in its order
+    joints: Annotated[list[str], Len(1, 500)]
     ignore: list[str]  # columns that are no joints of this robot; "" in joints does the same
     # ctrl is a policy's action: target = home + scale · action
     action_scale: Annotated[float, Interval(ge=1e-6, le=1e3)]
-    kp: (
-        Gain | dict[str, Gain] | Text
-    )  # while recording, N·m/rad: of all joints, by joint, or an array's name
+    # while recording, N·m/rad: of all joints, by joint, or an array's name
+    kp: Gain | dict[str, Gain] | Text
     kd: Gain | dict[str, Gain] | Text  # N·m·s/rad
     columns: dict[str, str]  # single columns, ours = the log's: "ctrl.elbow" = "cmd_1"
     names: dict[str, str]  # the log's joint = the robot's
@@ -85,9 +93,8 @@ class LogsFile(TypedDict, total=False):
     signs: dict[str, Sign]  # −1: the log counts the other way round
     offsets: dict[str, Offset]  # rad to add to positions, after unit and sign
     posture: dict[str, Offset]  # rad at which a joint stood that the log does not hold
-    clock: dict[
-        Literal["ctrl", "qpos", "qvel", "tau", "temperature", "feedforward_torque"], str
-    ]  # ctrl = "t_cmd"
+    # ctrl = "t_cmd"
+    clock: dict[Literal["ctrl", "qpos", "qvel", "tau", "temperature", "feedforward_torque"], str]
 
 
 def read_logs_file(src: Path, given: str | Path | None = None) -> tuple[LogsFile, Path | None]:
@@ -111,7 +118,8 @@ class Naming:
         self.text = specified.get("motion", "")
         if Path(specified.get("manifest", "")).name != specified.get("manifest", ""):
             raise UsageError(
-                f'{self.where}: manifest = "{specified["manifest"]}": it lies beside logs.toml; give its name'
+                f'{self.where}: manifest = "{specified["manifest"]}": it lies beside logs.toml; '
+                "give its name"
             )
         self.sheet = (
             _read_sheet((where or Path()).parent / specified["manifest"])
@@ -130,12 +138,14 @@ class Naming:
 
     def of(self, name: str, path: str) -> dict[str, Any]:
         """Fields of SequenceMeta for a recording called `name` at a path relative to the logs."""
-        facts, path = dict(self.all), "#".join(map(_stem, path.split("#")))
+        facts = dict(self.all)
+        path = "#".join(map(_stem, path.split("#")))
         if self.pattern:
             match = self.pattern.fullmatch(path if self.by_path else name)
             if not match:
                 raise LogError(
-                    f'{path}: its name does not look like motion = "{self.text}" of {self.where}; rename it, or list '
+                    f'{path}: its name does not look like motion = "{self.text}" of {self.where}; '
+                    "rename it, or list "
                     "the recordings in a manifest"
                 )
             facts |= _agreeing(
@@ -143,13 +153,17 @@ class Naming:
             )
         if self.sheet is not None:
             rows = [
-                i for i, row in enumerate(self.sheet)
-                if any(fnmatchcase(word, _stem(row["file"])) for word in (name, path, path.split("#")[0]))
-            ]  # fmt: skip
+                i
+                for i, row in enumerate(self.sheet)
+                if any(
+                    fnmatchcase(word, _stem(row["file"]))
+                    for word in (name, path, path.split("#")[0])
+                )
+            ]
             if len(rows) != 1:
                 raise LogError(
-                    f"{path}: {len(rows) or 'no'} rows of the manifest of {self.where} name it; one must: write "
-                    f"{name} under file"
+                    f"{path}: {len(rows) or 'no'} rows of the manifest of {self.where} name it; "
+                    f"one must: write {name} under file"
                 )
             self.unused -= set(rows)
             row = _fields({k: v for k, v in self.sheet[rows[0]].items() if k != "file"}, path)
@@ -157,18 +171,24 @@ class Naming:
         return facts
 
     def require_all_used(self) -> None:
-        """Refuse rows of the sheet that name no recording: one that is missing, or a name with a slip."""
+        """Refuse rows of the sheet that name no recording: one that is missing, or a name with a
+        slip.
+        """
         if self.sheet and self.unused:
             names = ", ".join(self.sheet[i]["file"] for i in sorted(self.unused))
             raise LogError(
-                f"the manifest of {self.where} names recordings that are not there: {names}; mend the names"
+                f"the manifest of {self.where} names recordings that are not there: {names}; mend "
+                "the names"
             )
 
 
 def _agreeing(facts: dict[str, Any], more: dict[str, Any], path: str, both: str) -> dict[str, Any]:
-    """Return `more`, which may say gains of single joints beside those of all, but contradict no other fact."""
+    """Return `more`, which may say gains of single joints beside those of all, but contradict no
+    other fact.
+    """
     for field in facts.keys() & more.keys():
-        first, second = facts[field], more[field]
+        first = facts[field]
+        second = more[field]
         if isinstance(second, dict):
             more[field] = (first if isinstance(first, dict) else {"": first}) | second
         elif second != first:
@@ -182,7 +202,9 @@ def _pattern(text: str | None, where: str) -> tuple[re.Pattern[str] | None, bool
     """The regular expression of "{motion}_{payload:g}kg", and whether it is of the path."""
     if text is None:
         return None, False
-    parts, seen, loose = [], set(), 0
+    parts = []
+    seen = set()
+    loose = 0
     for literal, word, brace in re.findall(r"([^{}]+)|\{(\w*)(?::[^{}]*)?\}|([{}])", text):
         if brace or (not literal and (word not in FIELDS or (word and word in seen))):
             known = ", ".join("{" + k + "}" for k in FIELDS)
@@ -198,13 +220,16 @@ def _pattern(text: str | None, where: str) -> tuple[re.Pattern[str] | None, bool
         )
     if loose > MOST_LOOSE:
         raise UsageError(
-            f'{where}: motion = "{text}": at most {MOST_LOOSE} words may be of any text; use a manifest'
+            f'{where}: motion = "{text}": at most {MOST_LOOSE} words may be of any text; use a '
+            "manifest"
         )
     return re.compile("".join(parts)), "/" in text
 
 
 def _fields(stated: dict[str, str], where: str) -> dict[str, Any]:
-    """Words and their texts → fields of SequenceMeta; kp.<joint> becomes {"kp": {joint: number}}."""
+    """Words and their texts → fields of SequenceMeta; kp.<joint> becomes {"kp": {joint:
+    number}}.
+    """
     facts: dict[str, Any] = {}
     for word, text in stated.items():
         if text is None or not text.strip():
@@ -263,7 +288,8 @@ def _read_sheet(file: Path) -> list[dict[str, str]]:
             raise UsageError(f"{file}: column '{name}': write {near or name}, once")
     if long := [row["file"] for row in rows if any(row.get(None, ()))]:
         raise UsageError(
-            f"{file}: the row of {long[0]} has more cells than the header; is a decimal comma in it?"
+            f"{file}: the row of {long[0]} has more cells than the header; is a decimal comma in "
+            "it?"
         )
     return [
         {c: row[c] or "" for c in columns if row.get(c) is not None}
@@ -273,5 +299,12 @@ def _read_sheet(file: Path) -> list[dict[str, str]]:
 
 
 def _known(columns: Iterable[Any]) -> list[str]:
-    return [c for c in columns if isinstance(c, str) and c and c.partition(".")[0] in FIELDS and c.count(".") <= 1
-            and ("." not in c or c.partition(".")[0] in ("kp", "kd"))]  # fmt: skip
+    return [
+        c
+        for c in columns
+        if isinstance(c, str)
+        and c
+        and c.partition(".")[0] in FIELDS
+        and c.count(".") <= 1
+        and ("." not in c or c.partition(".")[0] in ("kp", "kd"))
+    ]

@@ -1,4 +1,6 @@
-"""Plausibility of logs: units become SI, and values that no joint of this robot reaches are refused."""
+"""Plausibility of logs: units become SI, and values that no joint of this robot reaches are
+refused.
+"""
 
 from __future__ import annotations
 
@@ -14,17 +16,19 @@ from gaponet.data.describe.encoders import Encoder
 from gaponet.data.log import FEEDFORWARD, UNITS, Channel, Log
 from gaponet.robot.spec import RobotSpec
 
-# Beyond these nothing was measured: 9,500 turns a minute; what differentiation and inverse dynamics make of noise.
+# Beyond these nothing was measured: 9,500 turns a minute; what differentiation and inverse dynamics
+# make of noise.
 MOST = {"qpos": 1e3, "qvel": 1e3, "temperature": 400.0, "qacc": 1e6, "tau_eq": 1e6}
 FASTER = 50.0  # rad/s beyond ten times as fast as the positions ever move
 MOSTLY = 0.2  # of a joint's rows: more nonsense than this, and nothing of the channel is believed
 UNASKED = 1.0  # rad that no joint moves of itself while all are told to stand still
 TICKS_PER_TURN = 4096  # of the encoders of Feetech and Dynamixel servos
+# start, span
 FRACTIONS = {
     "fraction": (0.0, 1.0),
     "percent": (0.0, 100.0),
     "signed_percent": (-100.0, 200.0),
-}  # start, span
+}
 FULL_PERCENT = 100.0
 LARGEST_DEG = 360.0  # larger positions of a limb are no degrees
 
@@ -40,13 +44,15 @@ def to_radians(
     """Positions or velocities in the unit of the log → rad or rad/s.
 
     Args:
-        name: Channel: an offset applies to positions (ctrl, qpos) only; torques and temperatures pass untouched.
+        name: Channel: an offset applies to positions (ctrl, qpos) only; torques and temperatures
+            pass untouched.
         values: (k, n), columns in the order of joint_names.
         joint_names: The robot's own names, (n).
         units: Unit of each joint, (n), one of LOG_UNITS.
         robot: The robot whose joint ranges give a fraction its meaning.
-        encoders: The arm's calibration, which gives ticks and percent their meaning. Without it, ticks are 4096 a turn
-            and 2048 at zero, as Feetech and Dynamixel servos count, and percent are of the robot's joint range.
+        encoders: The arm's calibration, which gives ticks and percent their meaning. Without it,
+            ticks are 4096 a turn and 2048 at zero, as Feetech and Dynamixel servos count, and
+            percent are of the robot's joint range.
     """
     if name not in ("ctrl", "qpos", "qvel") or set(units) == {"rad"}:
         return values
@@ -83,19 +89,21 @@ def _angles(
 def require_plausible(log: Log, robot: RobotSpec, strict: bool = False) -> Log:
     """Return the log without what no joint does, or refuse it.
 
-    Positions that can only be degrees (or another joint's) refuse it. Where velocity, torque or temperature is
-    nonsense, a counter for a speed, that channel is made up for in those rows and the log notes it (notes, "nonsense"):
-    velocity from positions, others from the rows around them; a channel that is mostly nonsense is left out. `strict`
-    refuses it.
-    A sensor may read more torque than the motor has, not 20 times as much.
+    Positions that can only be degrees (or another joint's) refuse it. Where velocity, torque or
+    temperature is nonsense, a counter for a speed, that channel is made up for in those rows and
+    the log notes it (notes, "nonsense"): velocity from positions, others from the rows around them;
+    a channel that is mostly nonsense is left out. `strict` refuses it. A sensor may read more
+    torque than the motor has, not 20 times as much.
     """
     still, moved = (np.ptp(log.channels[name].values, axis=0).max() for name in ("ctrl", "qpos"))
     if still == 0 and moved > UNASKED:
         raise LogError(
-            f"{log.source}: every commanded position stands still while the joints move by up to {moved:.3g} rad: a "
-            "robot driven by torques, by velocities or by hand; such commands are no position targets to learn from"
+            f"{log.source}: every commanded position stands still while the joints move by up to "
+            f"{moved:.3g} rad: a robot driven by torques, by velocities or by hand; such commands "
+            "are no position targets to learn from"
         )
-    channels, replaced = dict(log.channels), {}
+    channels = dict(log.channels)
+    replaced = {}
     for name in (n for n in UNITS if n in log.channels):
         values = log.channels[name].values
         if name in ("ctrl", "qpos"):
@@ -105,17 +113,24 @@ def require_plausible(log: Log, robot: RobotSpec, strict: bool = False) -> Log:
         if (strict or name == FEEDFORWARD) and wrong.any():  # commands are never made up
             row, column = np.argwhere(wrong)[0]
             raise LogError(
-                f"{log.row(name, int(row))}: {name} of {log.joint_names[column]} is {values[row, column]:.4g} "
-                f"{UNITS[name]}: no joint does that; repair or cut the row, or leave the column out"
+                f"{log.row(name, int(row))}: {name} of {log.joint_names[column]} is "
+                f"{values[row, column]:.4g} {UNITS[name]}: no joint does that; repair or cut the "
+                "row, or leave the column out"
             )
         if wrong.any():
             tolerable = wrong.mean(axis=0).max() <= MOSTLY
             source = "from positions" if name == "qvel" else "from the rows around them"
             replaced[name] = {
-                "rows": int(wrong.any(axis=1).sum()), "of": len(values), "worst": float(values[wrong][0]),
-                "joints": [j for j, bad in zip(log.joint_names, np.ravel(wrong.any(axis=0)), strict=True) if bad],
+                "rows": int(wrong.any(axis=1).sum()),
+                "of": len(values),
+                "worst": float(values[wrong][0]),
+                "joints": [
+                    j
+                    for j, bad in zip(log.joint_names, np.ravel(wrong.any(axis=0)), strict=True)
+                    if bad
+                ],
                 "done": source if tolerable else "left out",
-            }  # fmt: skip
+            }
             channels.pop(name)
             channels |= (
                 {name: Channel(log.channels[name].time, _made_up(name, log, wrong))}
@@ -147,7 +162,8 @@ def _nonsense(name: str, log: Log, robot: RobotSpec) -> Array:
 
 def _made_up(name: str, log: Log, wrong: Array) -> Array:
     """A channel whose wrong values, (k, n), come from positions or from the rows around them."""
-    (at, qpos), (time, values) = log.channels["qpos"], log.channels[name]
+    at, qpos = log.channels["qpos"]
+    time, values = log.channels[name]
     out = np.array(values, float)
     for j in np.flatnonzero(wrong.any(axis=0)):
         bad = wrong[:, j]
@@ -165,13 +181,15 @@ def _place(log: Log, name: str, row: int) -> str:
 def require_radians(
     values: Array, joint_names: tuple[str, ...], robot: RobotSpec, where: Callable[[int], str]
 ) -> None:
-    """Refuse positions (k, n) that can only be degrees, or another joint's; where: what to call a row in the error.
+    """Refuse positions (k, n) that can only be degrees, or another joint's; where: what to call a
+    row in the error.
 
     A real joint may pass its MJCF limit by a calibration offset, not by a radian and half a turn.
     """
     for column, joint in enumerate(joint_names):
         row = int(abs(values[:, column]).argmax())
-        value, (low, high) = values[row, column], robot.qpos_range[robot.joint_names.index(joint)]
+        value = values[row, column]
+        low, high = robot.qpos_range[robot.joint_names.index(joint)]
         if abs(value) > 3.3 and (not low - 1.0 <= value <= high + 1.0 or abs(value) > MOST["qpos"]):
             look_like = "degrees; logs state them with --position-unit deg"
             stated_as_degrees = np.round(np.degrees(values[:, column]), 6)
@@ -182,12 +200,13 @@ def require_radians(
                 )
             elif look_like_percent(values[:, column]):
                 look_like = (
-                    "degrees, or LeRobot's −100..100 of the range; logs state them with --position-unit deg or "
-                    "signed_percent"
+                    "degrees, or LeRobot's −100..100 of the range; logs state them with "
+                    "--position-unit deg or signed_percent"
                 )
             raise LogError(
-                f"{where(row)} of {joint} is {value:.3f}, outside its range [{low:.2f}, {high:.2f}] rad; positions "
-                f"must be in radians: these look like {look_like}, or for one joint with [joint_units]"
+                f"{where(row)} of {joint} is {value:.3f}, outside its range [{low:.2f}, "
+                f"{high:.2f}] rad; positions must be in radians: these look like {look_like}, or "
+                "for one joint with [joint_units]"
             )
 
 

@@ -1,4 +1,6 @@
-"""Logs that nobody described yet: read as they lie there, or by a logs.toml that is guessed from them."""
+"""Logs that nobody described yet: read as they lie there, or by a logs.toml that is guessed from
+them.
+"""
 
 from __future__ import annotations
 
@@ -14,13 +16,14 @@ from gaponet.data.formats import find_logs, look, read_logs
 from gaponet.data.log import Log, skip_bad_rows
 from gaponet.robot.spec import RobotSpec
 
-NAMED = re.compile(
-    r"^(\[names\]|joints = )", re.MULTILINE
-)  # lines of a logs.toml by which joints are told apart
+# lines of a logs.toml by which joints are told apart
+NAMED = re.compile(r"^(\[names\]|joints = )", re.MULTILINE)
 
 
 class DescriptionNeededError(LogError):
-    """A person has to look at `text`, a logs.toml: logs cannot be read by it, or it guesses which joint is which."""
+    """A person has to look at `text`, a logs.toml: logs cannot be read by it, or it guesses which
+    joint is which.
+    """
 
     def __init__(self, why: str, text: str) -> None:
         super().__init__(why)
@@ -35,7 +38,8 @@ def read_first_recording(
     skip_bad: bool = False,
     **options: Any,
 ) -> tuple[Log, int, str]:
-    """The first recording, how many there are, and the logs.toml that was guessed; "" where none was needed.
+    """The first recording, how many there are, and the logs.toml that was guessed; "" where none
+    was needed.
 
     Args:
         logs: File or folder.

@@ -1,4 +1,7 @@
-"""A recording as it lies in a file: named signals, of which logs.toml says what they are. `to_log` is the way on."""
+"""A recording as it lies in a file: named signals, of which logs.toml says what they are.
+
+`to_log` is the way on.
+"""
 
 from __future__ import annotations
 
@@ -31,9 +34,9 @@ SAY_UNITS = "--position-unit rad --time-unit s (or position_unit and time_unit i
 COMMAND = "command:"  # before the names of signals that lie in a command_file
 TIME = "time:"  # and in a time_file
 NO_COMMANDS = (
-    "without commanded positions there is no gap to measure. Record the position controller's targets beside the "
-    "state, or play the recorded positions again (gaponet run) and record both. If torque or current is the command: "
-    "docs/logs.md, 'Driven by torque or current'"
+    "without commanded positions there is no gap to measure. Record the position controller's "
+    "targets beside the state, or play the recorded positions again (gaponet run) and record "
+    "both. If torque or current is the command: docs/logs.md, 'Driven by torque or current'"
 )
 
 
@@ -52,7 +55,8 @@ class Signal(NamedTuple):
 class RawRecording:
     """One recording.
 
-    A signal's columns are named by digits where the file does not name them, and by () for a single column.
+    A signal's columns are named by digits where the file does not name them, and by () for a single
+    column.
     """
 
     name: str  # motion, unless logs.toml states another
@@ -67,7 +71,9 @@ class RawRecording:
 
     @property
     def columns(self) -> dict[str, tuple[str, int | None]]:
-        """Every column by the name that logs.toml may call it: "signal" or "signal[label]" → (signal, which)."""
+        """Every column by the name that logs.toml may call it: "signal" or "signal[label]" →
+        (signal, which).
+        """
         return {
             f"{name}[{label}]" if labels else name: (name, i if labels else None)
             for name, labels in self.signals.items()
@@ -82,7 +88,9 @@ class RawRecording:
         return ", ".join(names[:most]) + (", …" if len(names) > most else "")
 
     def beside(self, other: RawRecording, prefix: str = COMMAND) -> RawRecording:
-        """This recording with the signals of another file, whose names begin with the prefix here."""
+        """This recording with the signals of another file, whose names begin with the prefix
+        here.
+        """
 
         def load(names: list[str]) -> dict[str, Signal]:
             theirs = [n.removeprefix(prefix) for n in names if n.startswith(prefix)]
@@ -94,10 +102,16 @@ class RawRecording:
 
     @classmethod
     def of_arrays(
-        cls, file: Path, arrays: dict[str, Any], names: tuple[str, ...] = (), name: str = "", part: str = "",
+        cls,
+        file: Path,
+        arrays: dict[str, Any],
+        names: tuple[str, ...] = (),
+        name: str = "",
+        part: str = "",
         **more: Any,
-    ) -> RawRecording:  # fmt: skip
-        """A recording of arrays in memory; those that are not one row of numbers per sample are left alone.
+    ) -> RawRecording:
+        """A recording of arrays in memory; those that are not one row of numbers per sample are
+        left alone.
 
         Args:
             names: The names of columns, for arrays that have so many.
@@ -112,9 +126,12 @@ class RawRecording:
         numeric = {
             n: a
             for n, a in arrays.items()
-            if isinstance(a, np.ndarray) and a.dtype.kind in "fiu" and len(a.shape) in (1, 2) and len(a) > 1
+            if isinstance(a, np.ndarray)
+            and a.dtype.kind in "fiu"
+            and len(a.shape) in (1, 2)
+            and len(a) > 1
             and (a.ndim == 1 or 0 < a.shape[1] <= WIDEST)
-        }  # fmt: skip
+        }
         signals = {
             n: ()
             if a.ndim == 1
@@ -130,13 +147,16 @@ class RawRecording:
     def to_log(
         self, robot: RobotSpec, specified: LogsFile, joint_map: dict[str, str] | None
     ) -> Log:
-        """The columns that `specified` calls ctrl, qpos, …, in SI and on one time axis; channels keep their clocks."""
+        """The columns that `specified` calls ctrl, qpos, …, in SI and on one time axis; channels
+        keep their clocks.
+        """
         stated = specified
         specified = self.default | stated
         chosen = _choose(self, robot, specified, joint_map)
         if FEEDFORWARD in stated and FEEDFORWARD not in chosen:
             raise LogError(
-                f"{self.where or self.source}: no column holds {FEEDFORWARD}; there are: {self.shown()}"
+                f"{self.where or self.source}: no column holds {FEEDFORWARD}; there are: "
+                f"{self.shown()}"
             )
         clocks = _clocks(specified, chosen)
         self._require_one_clock(clocks, specified)
@@ -198,7 +218,8 @@ class RawRecording:
 def rows_first(arrays: dict[str, Any]) -> tuple[dict[str, Any], list[str]]:
     """Return arrays with a row per sample, and the names of those that had a column per sample.
 
-    The clock tells the number of samples. Without one, arrays that are all far wider than high are taken as transposed.
+    The clock tells the number of samples. Without one, arrays that are all far wider than high are
+    taken as transposed.
     """
     tables = {n: a for n, a in arrays.items() if isinstance(a, np.ndarray) and a.ndim == 2}
     flat = {n: a for n, a in tables.items() if 1 in a.shape and named_like_a_clock(n)}
@@ -231,8 +252,8 @@ def require_content(file: Path) -> None:
         beginning = stream.read(len(GIT_LFS_POINTER))
     if beginning == GIT_LFS_POINTER:
         raise LogError(
-            f"{file}: is a Git LFS pointer of some bytes, not the recording; run 'git lfs pull' in its repository, or "
-            "download the file itself"
+            f"{file}: is a Git LFS pointer of some bytes, not the recording; run 'git lfs pull' "
+            "in its repository, or download the file itself"
         )
 
 
@@ -254,10 +275,11 @@ def reading(file: Path, what: str) -> Iterator[None]:
         raise LogError(f"{file}: not a readable {what} ({reason}); {hint}") from None
 
 
+# how files begin → how those that are whole end
 ENDS = {
     b"\x89MCAP0\r\n": b"\x89MCAP0\r\n",
     b"PAR1": b"PAR1",
-}  # how files begin → how those that are whole end
+}
 
 
 def _cut_short(file: Path, error: Exception) -> bool:
@@ -274,8 +296,10 @@ def _cut_short(file: Path, error: Exception) -> bool:
         stop = stream.read(8)
     if start.startswith(b"PK\x03\x04"):
         return not zipfile.is_zipfile(file)
-    return any(start == begin[: len(start)] or (start.startswith(begin) and not stop.endswith(end))
-               for begin, end in ENDS.items())  # fmt: skip
+    return any(
+        start == begin[: len(start)] or (start.startswith(begin) and not stop.endswith(end))
+        for begin, end in ENDS.items()
+    )
 
 
 Columns = dict[str, tuple[str, int | None]]  # joint → (signal, column)
@@ -334,7 +358,8 @@ def _choose(
     recording: RawRecording, robot: RobotSpec, specified: LogsFile, joint_map: dict[str, str] | None
 ) -> Chosen:
     """Which column holds what."""
-    where, columns = recording.where or recording.source, recording.columns
+    where = recording.where or recording.source
+    columns = recording.columns
     single = specified.get("columns", {})
     for ours, theirs in single.items():
         if ours.partition(".")[0] not in CHANNELS or "." not in ours:
@@ -343,7 +368,8 @@ def _choose(
             )
         if theirs not in columns:
             raise LogError(
-                f"{where}: column '{theirs}' (for {ours}) is missing; there are: {recording.shown()}"
+                f"{where}: column '{theirs}' (for {ours}) is missing; there are: "
+                f"{recording.shown()}"
             )
     chosen: Chosen = {}
     for channel in (*CHANNELS, *DERIVED):
@@ -408,8 +434,8 @@ def _columns_of_array(
         if given is None or len(given) != len(labels):
             explanation = f"joints has {len(given)}" if given else "nothing names them"
             raise LogError(
-                f"{recording.where or recording.source}: {array} has {len(labels)} columns and {explanation}; "
-                f"write joints = [{len(labels)} names, in its order] into logs.toml"
+                f"{recording.where or recording.source}: {array} has {len(labels)} columns and "
+                f"{explanation}; write joints = [{len(labels)} names, in its order] into logs.toml"
             )
         names = given
     columns = [f"{array}[{label}]" for label in own] or [array]
@@ -417,7 +443,9 @@ def _columns_of_array(
 
 
 def _longer_patterns(specified: LogsFile, pattern: str) -> list[str]:
-    """Return patterns that say more of a column's name: q_{joint} reads q_des_1 as well, which is q_des_{joint}'s."""
+    """Return patterns that say more of a column's name: q_{joint} reads q_des_1 as well, which is
+    q_des_{joint}'s.
+    """
     patterns = [str(specified.get(channel, "")) for channel in CHANNELS]
     return [p for p in patterns if "{joint}" in p and len(p) > len(pattern)]
 
@@ -430,14 +458,17 @@ def _column_pattern(pattern: str) -> re.Pattern[str]:
 def _gain_columns(
     recording: RawRecording, specified: LogsFile, name: str, ctrl: Columns
 ) -> Columns:
-    """joint → column, where logs.toml says that an array holds the gains; it has the columns of the command's."""
+    """joint → column, where logs.toml says that an array holds the gains; it has the columns of
+    the command's.
+    """
     array = specified.get(name)
     if not isinstance(array, str):
         return {}
     widths = {len(recording.signals[signal]) for signal, _ in ctrl.values()}
     if array not in recording.signals or widths != {len(recording.signals[array])}:
         raise LogError(
-            f'{recording.where or recording.source}: {name} = "{array}" is no array like the command\'s; '
+            f'{recording.where or recording.source}: {name} = "{array}" is no array like the '
+            "command's; "
             f"there are: {recording.shown()}"
         )
     return {joint: (array, index) for joint, (_, index) in ctrl.items()}
@@ -447,8 +478,8 @@ def _constant(recording: RawRecording, name: str, values: Array) -> float:
     """A gain that stood still."""
     if np.ptp(values) > 1e-3 * max(abs(float(values[0])), 1e-9):
         raise LogError(
-            f"{recording.source}: {name} changes from {values.min():g} to {values.max():g} while it is "
-            "recorded; cut the log where it does"
+            f"{recording.source}: {name} changes from {values.min():g} to {values.max():g} while "
+            "it is recorded; cut the log where it does"
         )
     return float(values[0])
 
@@ -461,7 +492,8 @@ def _require_complete(columns: Chosen, recording: RawRecording, specified: LogsF
         explanation = f' (expected "{specified[need]}")' if need in specified else ""  # type: ignore[literal-required]
         why = f": {NO_COMMANDS}" if need == "ctrl" else ""
         raise LogError(
-            f'{where}: no column holds {need}.<joint>{explanation}; there are: {recording.shown()}. Say {need} = "…" '
+            f"{where}: no column holds {need}.<joint>{explanation}; there are: "
+            f'{recording.shown()}. Say {need} = "…" '
             f"in logs.toml ({HINT}){why}"
         )
     for kind in columns:
@@ -469,7 +501,8 @@ def _require_complete(columns: Chosen, recording: RawRecording, specified: LogsF
         if odd:
             other = kind if odd[0] in columns["ctrl"] else "ctrl"
             raise LogError(
-                f"{where}: column '{other}.{odd[0]}' is missing: every channel needs the same joints"
+                f"{where}: column '{other}.{odd[0]}' is missing: every channel needs the same "
+                "joints"
             )
 
 
@@ -497,9 +530,13 @@ def _units(
 
 
 def _time(
-    recording: RawRecording, specified: LogsFile, loaded: dict[str, Signal], clock: str | None, channel: str,
+    recording: RawRecording,
+    specified: LogsFile,
+    loaded: dict[str, Signal],
+    clock: str | None,
+    channel: str,
     columns: Columns,
-) -> Array:  # fmt: skip
+) -> Array:
     """The time stamps of a channel, s, from any start."""
     where = recording.where or recording.source
     own = next(loaded[signal] for signal, _ in columns.values())
@@ -514,13 +551,15 @@ def _time(
         # in no unit of time
         if periods > 0 and min(abs(periods * unit - 1) for unit in SECONDS.values()) > 0.1:
             raise LogError(
-                f"{where}: '{clock}' is not at rate = {specified['rate']:g} Hz; leave out one of them"
+                f"{where}: '{clock}' is not at rate = {specified['rate']:g} Hz; leave out one of "
+                "them"
             )
         return np.arange(len(own.values)) / specified["rate"]
     if clock not in recording.signals:
         explanation = f"'{clock or 'time'}' (the clock of {channel})"
         raise LogError(
-            f'{where}: column {explanation} is missing; there are: {recording.shown()}. Say time = "…" in logs.toml, '
+            f"{where}: column {explanation} is missing; there are: {recording.shown()}. Say time "
+            '= "…" in logs.toml, '
             f"or rate = 50.0 (Hz) where the log has no clock ({HINT})"
         )
     time = np.asarray(loaded[clock].values, float)

@@ -16,8 +16,8 @@ MAX_PERIOD_SHARE = 0.2  # of the usual period, after which a row can be a repeti
 def without_repeated_rows(log: Log) -> Log:
     """Return the log without rows that repeat the one before within a small part of a period.
 
-    Some drivers write each row twice, some tenths of a millisecond apart. The log then notes it (notes, "repeated"). A
-    robot that rests repeats its numbers too, but at its usual period.
+    Some drivers write each row twice, some tenths of a millisecond apart. The log then notes it
+    (notes, "repeated"). A robot that rests repeats its numbers too, but at its usual period.
     """
     channels = dict(log.channels)
     dropped = 0

@@ -1,7 +1,8 @@
-"""Is the command a copy of the state? Judged on the rows as they were logged: resampling hides copies.
+"""Is the command a copy of the state? Judged on the rows as they were logged: resampling hides
+copies.
 
-Converters write such tables: the command of a row is the recorded position of that row or of the next one. What was
-sent to the servos is then not in the log.
+Converters write such tables: the command of a row is the recorded position of that row or of the
+next one. What was sent to the servos is then not in the log.
 """
 
 from __future__ import annotations
@@ -14,11 +15,14 @@ from gaponet.data.signals import encoder_step
 
 MAX_COPIED_ROWS = 3  # in both directions
 MIN_COPIED_CHANGES = 20  # of the command; fewer can be equal by chance
-FINE_STEPS = 10  # steps of the readings that a joint passes from row to row, from which chance repeats few of them
-# Share of the changes that a copy repeats. Rows may be missing. A stiff servo with a coarse encoder repeats most of a
-# slow motion.
-FINE_SHARE, COARSE_SHARE = 0.7, 0.99
-# Steps of rounded readings, coarse first: decimals of rad and deg, and turns divided by powers of two.
+# steps of the readings that a joint passes from row to row, from which chance repeats few of them
+FINE_STEPS = 10
+# Share of the changes that a copy repeats. Rows may be missing. A stiff servo with a coarse encoder
+# repeats most of a slow motion.
+FINE_SHARE = 0.7
+COARSE_SHARE = 0.99
+# Steps of rounded readings, coarse first: decimals of rad and deg, and turns divided by powers of
+# two.
 USUAL_STEPS_RAD = sorted(
     [
         *(10.0**-k for k in range(1, 7)),
@@ -32,13 +36,14 @@ NO_DIGIT_RAD = 1.01e-6  # closer readings are the same one, in another precision
 
 
 def copied_rows(command: Channel, state: Channel) -> Array:
-    """Return by how many rows the state repeats the command, (n); 0: in the same row; NaN where it does not.
+    """Return by how many rows the state repeats the command, (n); 0: in the same row; NaN where it
+    does not.
 
     "Repeats" means to the last digit, or to the step of the coarser of both.
 
     Args:
-        command: Commands (k, n); only those that differ from the one before are compared, since a joint at rest is
-            where it was told to be.
+        command: Commands (k, n); only those that differ from the one before are compared, since a
+            joint at rest is where it was told to be.
         state: Positions (m, n) of the same joints, with any clock.
     """
     rows, nearest = _pairs(command.time, state.time)
@@ -62,7 +67,9 @@ def copied_rows(command: Channel, state: Channel) -> Array:
 
 
 def _pairs(command: Array, state: Array) -> tuple[Array, Array]:
-    """Return rows of the command, and the row of the state nearest in time to each; of the slower of both, each row."""
+    """Return rows of the command, and the row of the state nearest in time to each; of the slower
+    of both, each row.
+    """
     if len(command) == len(state) and np.array_equal(command, state):
         rows = np.arange(len(command))
         return rows, rows

@@ -1,4 +1,6 @@
-"""Channels that were sampled more slowly than their table has rows: empty cells between their samples."""
+"""Channels that were sampled more slowly than their table has rows: empty cells between their
+samples.
+"""
 
 from __future__ import annotations
 
@@ -18,8 +20,8 @@ def sampled_channels(
 ) -> tuple[dict[str, Channel], dict[str, Any]]:
     """Return channels with the rows in which they were sampled, and notes of what was empty.
 
-    Empty cells are NaN. A command that stands in every fifth row is held until the next one. Torque, velocity or
-    temperature that is empty in all rows is left out.
+    Empty cells are NaN. A command that stands in every fifth row is held until the next one.
+    Torque, velocity or temperature that is empty in all rows is left out.
 
     Raises:
         LogError: Command or position of a joint is empty in all rows.
@@ -35,8 +37,8 @@ def sampled_channels(
         if empty and name in REQUIRED:
             names = ", ".join(f'"{joint}"' for joint in empty)
             raise LogError(
-                f"{where}: {name} of {', '.join(empty)} is empty in all rows; leave out what was not recorded: "
-                f"ignore = [{names}] in logs.toml"
+                f"{where}: {name} of {', '.join(empty)} is empty in all rows; leave out what was "
+                f"not recorded: ignore = [{names}] in logs.toml"
             )
         if empty:
             absent[name] = empty
@@ -67,7 +69,9 @@ def _sampled(name: str, channel: Channel, present: Array) -> Channel:
 
 
 def _between_samples(name: str, time: Array, values: Array, present: Array) -> Array:
-    """Return one joint's values in all rows: commands held, states interpolated; NaN before the first sample."""
+    """Return one joint's values in all rows: commands held, states interpolated; NaN before the
+    first sample.
+    """
     samples = np.flatnonzero(present)
     if name in COMMANDS:
         last = np.searchsorted(samples, np.arange(len(values)), side="right") - 1

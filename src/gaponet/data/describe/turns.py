@@ -17,8 +17,8 @@ MAX_STEP_RAD = 1.0  # that a joint moves beside the jump, from one row to the ne
 def continued_turns(log: Log, robot: RobotSpec) -> Log:
     """Return the log with joints whose readings wrap at the end of a turn continued beyond it.
 
-    A joint without a range whose state lies whole turns from its command is moved by these turns. The log notes both
-    (notes, "turns").
+    A joint without a range whose state lies whole turns from its command is moved by these turns.
+    The log notes both (notes, "turns").
     """
     positions = {name: np.array(log.channels[name].values, float) for name in ("ctrl", "qpos")}
     turned = {}

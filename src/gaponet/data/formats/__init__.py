@@ -1,24 +1,30 @@
-"""Log formats: one module each, imported when its format is asked for; heavy libraries are imported when it reads.
+"""Log formats: one module each, imported when its format is asked for; heavy libraries are
+imported when it reads.
 
-The first line of a format's docstring says what the format is. A format whose columns logs.toml explains has
+The first line of a format's docstring says what the format is. A format whose columns logs.toml
+explains has
 
     recordings(path, specified)  yields RawRecordings (data.describe.raw_recording)
-    DEFAULT                 content of logs.toml unless the recording or the user states something else; default nothing
+    DEFAULT                 content of logs.toml unless the recording or the user states something
+    else; default nothing
 
 and a format that says itself what its columns are has
 
-    read(path, robot, joint_map, **options)    yields (motion name, function that reads its Log), in the order of find
-    OPTIONS                 fields of logs.toml that it acts on beside ALWAYS; default none
+    read(path, robot, joint_map, **options)    yields (motion name, function that reads its Log), in
+    the order of find OPTIONS                 fields of logs.toml that it acts on beside ALWAYS;
+    default none
 
 Both have SUFFIXES, of files that are recordings, at or below a folder; or, if that is not enough,
 
-    detects(path)           whether a file, or the files directly in a folder, look like it; default: find returns any
-    find(path)              the recordings under a path: files or folders, sorted; default: files with SUFFIXES
+    detects(path)           whether a file, or the files directly in a folder, look like it;
+    default: find returns any find(path)              the recordings under a path: files or folders,
+    sorted; default: files with SUFFIXES
 
 and, if it needs an extra of the package, EXTRA.
 
-A field of logs.toml that is neither in ALWAYS nor in OPTIONS is refused: the format fixes it. A file that another
-format detects is no `table`. The shortest readers to copy are pace.py (`recordings`) and bam.py (`read`).
+A field of logs.toml that is neither in ALWAYS nor in OPTIONS is refused: the format fixes it. A
+file that another format detects is no `table`. The shortest readers to copy are pace.py
+(`recordings`) and bam.py (`read`).
 """
 
 from __future__ import annotations
@@ -51,8 +57,21 @@ FORMATS = {
 }
 FILES = {"state_file", "command_file", "time_file"}
 LOOK = 20  # recordings that are looked at before they are described
-ALWAYS = ("names", "ignore", "signs", "offsets", "posture", "motion", "manifest", "unit", "payload", "side", "kp", "kd",
-          "format")  # fmt: skip
+ALWAYS = (
+    "names",
+    "ignore",
+    "signs",
+    "offsets",
+    "posture",
+    "motion",
+    "manifest",
+    "unit",
+    "payload",
+    "side",
+    "kp",
+    "kd",
+    "format",
+)
 DESCRIBED = tuple(k for k in LogsFile.__annotations__ if k not in ALWAYS)
 
 
@@ -77,7 +96,9 @@ def about(fmt: str) -> str:
 
 
 def extra_of(fmt: str) -> str | None:
-    """Return the extra of the package that a format needs, "" for none; None if its module cannot be loaded."""
+    """Return the extra of the package that a format needs, "" for none; None if its module cannot
+    be loaded.
+    """
     return attempt(formats()[fmt], lambda: str(getattr(module(fmt), "EXTRA", "")), None)
 
 
@@ -86,7 +107,9 @@ def _options(reader: ModuleType) -> tuple[str, ...]:
 
 
 def files_under(path: Path, suffixes: Iterable[str]) -> list[Path]:
-    """The file, or those with these suffixes in a folder and below it; hidden ones are left alone."""
+    """The file, or those with these suffixes in a folder and below it; hidden ones are left
+    alone.
+    """
     if path.is_file():
         return [path] if path.suffix.lower() in suffixes else []
     return sorted(f for f in files_below(path) if f.suffix.lower() in suffixes)
@@ -131,7 +154,8 @@ def detect(path: Path) -> str:
                 f"{path}: is a dataset of gaponet, not logs; go on with gaponet doctor {path}"
             )
         raise LogError(
-            f"{path}: no log of {', '.join(formats())} (gaponet import --formats explains them){_json_hint(path)}"
+            f"{path}: no log of {', '.join(formats())} (gaponet import --formats explains "
+            f"them){_json_hint(path)}"
         )
     return matches[0]
 
@@ -142,8 +166,10 @@ def _json_hint(path: Path) -> str:
     if not files:
         return ""
     return (
-        f'. {files[0].name} is JSON: make a table of it: python -c "import pandas; pandas.read_json('
-        f"'{files[0].name}', lines={files[0].suffix != '.json'}).to_parquet('{files[0].stem}.parquet')\""
+        f'. {files[0].name} is JSON: make a table of it: python -c "import pandas; '
+        "pandas.read_json("
+        f"'{files[0].name}', "
+        f"lines={files[0].suffix != '.json'}).to_parquet('{files[0].stem}.parquet')\""
     )
 
 
@@ -162,15 +188,23 @@ def find_logs(path: Path, fmt: str | None = None) -> list[Path]:
 
 
 def read_logs(
-    path: Path, robot: RobotSpec, fmt: str | None = None, joint_map: dict[str, str] | None = None,
-    logs: str | Path | None = None, position_unit: str | None = None, time_unit: str | None = None,
-    allow_pickle: bool = False, rate: float | None = None, strict: bool = False,
-) -> Iterator[tuple[str, Log]]:  # fmt: skip
-    """Yield (motion name, Log) for every recording under a path; arguments and errors as of gaponet.api.import_logs.
+    path: Path,
+    robot: RobotSpec,
+    fmt: str | None = None,
+    joint_map: dict[str, str] | None = None,
+    logs: str | Path | None = None,
+    position_unit: str | None = None,
+    time_unit: str | None = None,
+    allow_pickle: bool = False,
+    rate: float | None = None,
+    strict: bool = False,
+) -> Iterator[tuple[str, Log]]:
+    """Yield (motion name, Log) for every recording under a path; arguments and errors as of
+    gaponet.api.import_logs.
 
-    While data.log.skip_bad_rows is open, bad rows are cut, recordings that cannot be read are left out, and both are
-    listed there. joint_map, position_unit, time_unit and rate win over logs.toml; the last three are refused where the
-    format itself fixes them.
+    While data.log.skip_bad_rows is open, bad rows are cut, recordings that cannot be read are left
+    out, and both are listed there. joint_map, position_unit, time_unit and rate win over logs.toml;
+    the last three are refused where the format itself fixes them.
     """
     specified, file = read_logs_file(path, logs)
     reader = _reader(path, fmt or specified.get("format"))
@@ -188,7 +222,8 @@ def read_logs(
                 f"{option} means nothing to the {kind} format, which fixes it itself; leave it out"
             )
     names = specified.get("names", {}) | (joint_map or {})
-    naming, root = Naming(specified, file), path if path.is_dir() else path.parent
+    naming = Naming(specified, file)
+    root = path if path.is_dir() else path.parent
     bad = skipped_rows()
     for name, load in _loaders(reader, path, robot, specified, names):
         try:
@@ -212,7 +247,9 @@ def read_logs(
 def look(
     path: Path, fmt: str | None = None, logs: str | Path | None = None, allow_pickle: bool = False
 ) -> tuple[str, LogsFile, list[RawRecording]]:
-    """The format, what is said of it already, and the first recordings as they lie there; arguments as of read_logs."""
+    """The format, what is said of it already, and the first recordings as they lie there;
+    arguments as of read_logs.
+    """
     specified, _ = read_logs_file(path, logs)
     reader = _reader(path, fmt or specified.get("format"))
     kind = _require_allowed(reader, path, allow_pickle)
@@ -226,8 +263,8 @@ def _require_allowed(reader: ModuleType, path: Path, allow_pickle: bool) -> str:
     kind = reader.__name__.rsplit(".", 1)[-1]
     if getattr(reader, "PICKLED", False) and not allow_pickle:
         raise UsageError(
-            f"{path}: {kind} files are Python pickles, which can hold anything; add --allow-pickle to open them with "
-            "an unpickler that makes arrays, numbers and text only"
+            f"{path}: {kind} files are Python pickles, which can hold anything; add "
+            "--allow-pickle to open them with an unpickler that makes arrays, numbers and text only"
         )
     return kind
 
@@ -259,7 +296,10 @@ def _loaders(
 
 
 def _recordings(reader: ModuleType, path: Path, specified: LogsFile) -> Iterator[RawRecording]:
-    """Read the logs. Values of the format apply unless the recording or `specified` states others."""
+    """Read the logs.
+
+    Values of the format apply unless the recording or `specified` states others.
+    """
     for recording in reader.recordings(path, _defaults(reader) | specified):
         yield replace(recording, default=_defaults(reader) | recording.default)
 
@@ -269,7 +309,9 @@ def _defaults(reader: ModuleType) -> LogsFile:
 
 
 def _with_prefixes(full: LogsFile, specified: LogsFile) -> LogsFile:
-    """Return logs.toml where signals of other files than the state's have their prefix; full: with the defaults."""
+    """Return logs.toml where signals of other files than the state's have their prefix; full: with
+    the defaults.
+    """
     changes: dict[str, Any] = {}
     if "command_file" in specified:
         commands = tuple(c for c in COMMANDS if c == "ctrl" or c in specified)
@@ -282,7 +324,9 @@ def _with_prefixes(full: LogsFile, specified: LogsFile) -> LogsFile:
 
 
 def _with_files(recordings: list[RawRecording], specified: LogsFile) -> Iterator[RawRecording]:
-    """Join each state file with its command_file and time_file, which are then no recordings of their own."""
+    """Join each state file with its command_file and time_file, which are then no recordings of
+    their own.
+    """
     by_file = {Path(r.source).name: r for r in recordings}
     states = {file: Path(file).stem for file in by_file}
     if "state_file" in specified:
@@ -317,7 +361,9 @@ def _files_beside(states: dict[str, str], pattern: str | None) -> dict[str, str]
 
 
 def _named_by(pattern: str, files: Iterable[str]) -> dict[str, str]:
-    """Return file → its {name} in the pattern, or its stem where the pattern has none; files that fit."""
+    """Return file → its {name} in the pattern, or its stem where the pattern has none; files that
+    fit.
+    """
     before, _, after = pattern.partition("{name}")
     named = {}
     for file in files:
@@ -340,15 +386,19 @@ def _beside_clock(specified: LogsFile, commands: tuple[str, ...]) -> dict[str, s
 
 
 def _corrected(log: Log, robot: RobotSpec, specified: LogsFile, names: dict[str, str]) -> Log:
-    """Signs and offsets, where logs.toml says some, noted; and where joints stood that the log does not hold."""
+    """Signs and offsets, where logs.toml says some, noted; and where joints stood that the log
+    does not hold.
+    """
     stood = {
         robot.resolve(j, "[posture] of logs.toml", names): v
         for j, v in specified.get("posture", {}).items()
     }
     if stood:
         log = replace(log, meta=log.meta | {"posture": stood})
-    signs, offsets = ({robot.resolve(j, f"[{t}] of logs.toml", names): v for j, v in specified.get(t, {}).items()}  # type: ignore[attr-defined]
-                      for t in ("signs", "offsets"))  # fmt: skip
+    signs, offsets = (
+        {robot.resolve(j, f"[{t}] of logs.toml", names): v for j, v in specified.get(t, {}).items()}  # type: ignore[attr-defined]
+        for t in ("signs", "offsets")
+    )
     if not signs and not offsets:
         return log
     if 0 in signs.values():
@@ -371,8 +421,11 @@ def _corrected(log: Log, robot: RobotSpec, specified: LogsFile, names: dict[str,
 
 
 def _named(log: Log, option: dict[str, Any], robot: RobotSpec, names: dict[str, str]) -> Log:
-    """The log with what its name and logs.toml say of it; what the format itself says must not contradict."""
-    meta, stated = dict(log.meta), dict(log.meta.get("stated", {}))
+    """The log with what its name and logs.toml say of it; what the format itself says must not
+    contradict.
+    """
+    meta = dict(log.meta)
+    stated = dict(log.meta.get("stated", {}))
     for name in ("kp", "kd"):
         if name in option:
             meta[name] = _gains(name, option.pop(name), log, robot, names)
@@ -381,7 +434,8 @@ def _named(log: Log, option: dict[str, Any], robot: RobotSpec, names: dict[str, 
     for name, value in option.items():
         if stated.get(name) not in (None, value):
             raise UsageError(
-                f"{log.source}: {name} is {stated[name]} in the file and {value} in logs.toml; mend one"
+                f"{log.source}: {name} is {stated[name]} in the file and {value} in logs.toml; "
+                "mend one"
             )
         stated[name] = value
     return replace(log, meta=meta | ({"stated": stated} if stated else {}))
@@ -390,7 +444,9 @@ def _named(log: Log, option: dict[str, Any], robot: RobotSpec, names: dict[str, 
 def _gains(
     name: str, option: Any, log: Log, robot: RobotSpec, names: dict[str, str]
 ) -> list[float]:
-    """One number for all joints, or {joint: number} with the robot's own for the others ("": for all others)."""
+    """One number for all joints, or {joint: number} with the robot's own for the others ("": for
+    all others).
+    """
     if not isinstance(option, dict):
         return [option] * len(log.joint_names)
     given = {

@@ -1,8 +1,8 @@
 """ASAP's motion pickle (.pkl): {motion: {dof, action, fps, …}}; opened with --allow-pickle only.
 
-`action` is the policy's: the target is default position + action_scale · action, 0.25 in ASAP's configuration.
-logs.toml says action_scale, and home in robot.toml is the default position. Joints have no names in it: logs.toml
-lists them. Opened as formats.pickles says: nothing runs.
+`action` is the policy's: the target is default position + action_scale · action, 0.25 in ASAP's
+configuration. logs.toml says action_scale, and home in robot.toml is the default position. Joints
+have no names in it: logs.toml lists them. Opened as formats.pickles says: nothing runs.
 """
 
 from __future__ import annotations
@@ -39,7 +39,8 @@ def recordings(path: Path, specified: LogsFile) -> Iterator[RawRecording]:
         motions = {str(k): v for k, v in motions.items() if isinstance(v, dict) and "dof" in v}
         if not motions:
             raise LogError(
-                f"{file}: no motion with dof in it; an ASAP file is {{motion: {{dof, action, fps}}}}"
+                f"{file}: no motion with dof in it; an ASAP file is {{motion: {{dof, action, "
+                f"fps}}}}"
             )
         for name, motion in motions.items():
             yield _recording(file, name, motion)

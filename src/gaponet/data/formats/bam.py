@@ -2,9 +2,10 @@
 
 github.com/Rhoban/bam: one servo on a pendulum, {mass, length, kp, vin, motor, trajectory, entries}.
 
-The mass at the arm's end is the payload, and the arm's length says at which mount: `--robot xl330_bench` has one for
-each. kp is the firmware's: what it means in N·m/rad is the gain of the joint's [[servo]] in robot.toml. A recording
-ends where torque is switched off: from there on nothing is commanded.
+The mass at the arm's end is the payload, and the arm's length says at which mount: `--robot
+xl330_bench` has one for each. kp is the firmware's: what it means in N·m/rad is the gain of the
+joint's [[servo]] in robot.toml. A recording ends where torque is switched off: from there on
+nothing is commanded.
 """
 
 from __future__ import annotations
@@ -80,7 +81,9 @@ def find(path: Path) -> list[Path]:
 def read(
     path: Path, robot: RobotSpec, joint_map: dict[str, str] | None = None
 ) -> Iterator[tuple[str, Callable[[], Log]]]:
-    """Yield (trajectory, what reads its Log) for every recording; the motor's name stands for the joint."""
+    """Yield (trajectory, what reads its Log) for every recording; the motor's name stands for the
+    joint.
+    """
     files = find(path)
     if not files:
         raise LogError(f"{path}: no recording of BAM (JSON with trajectory and entries)")
@@ -96,8 +99,9 @@ def _log(file: Path, log_data: BamFile, robot: RobotSpec, joint_map: dict[str, s
     servo = robot.servos[robot.index([joint])[0]]
     if servo is None or servo.gain is None:
         raise LogError(
-            f"{file}: motor is '{log_data['motor']}': what its kp {log_data['kp']:g} means in N·m/rad is not known; "
-            f"write gain (and gain_volts) into the [[servo]] of {joint} in the robot.toml of {robot.name}"
+            f"{file}: motor is '{log_data['motor']}': what its kp {log_data['kp']:g} means in "
+            f"N·m/rad is not known; write gain (and gain_volts) into the [[servo]] of {joint} in "
+            f"the robot.toml of {robot.name}"
         )
     on = log_data["entries"]
     off = next(
@@ -114,9 +118,12 @@ def _log(file: Path, log_data: BamFile, robot: RobotSpec, joint_map: dict[str, s
     volts = float(np.median([e.get("input_volts", log_data["vin"]) for e in on]))
     if abs(volts - log_data["vin"]) > MAX_VOLTS_RATIO * log_data["vin"]:
         logging.getLogger("gaponet").warning(
-            "%s: vin says %g V, the servo measured %g V: the gain is taken at vin; correct the file if that is wrong",
-            file, log_data["vin"], volts,
-        )  # fmt: skip
+            "%s: vin says %g V, the servo measured %g V: the gain is taken at vin; correct the "
+            "file if that is wrong",
+            file,
+            log_data["vin"],
+            volts,
+        )
     gain = (
         log_data["kp"]
         * servo.gain

@@ -39,7 +39,8 @@ def to_seconds(cells: Sequence[str | None], where: str) -> Array:
             at = _parse(text)
         except ValueError:
             raise LogError(
-                f"{where}: the clock's cell '{text[:40]}' in row {i + 1} is no date and time as 2026-03-01T12:00:00.125"
+                f"{where}: the clock's cell '{text[:40]}' in row {i + 1} is no date and time as "
+                "2026-03-01T12:00:00.125"
             ) from None
         first = first or at
         seconds[i] = (at - first).total_seconds()

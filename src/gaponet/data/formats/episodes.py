@@ -13,23 +13,38 @@ from gaponet.base.errors import LogError
 from gaponet.data.describe.raw_recording import RawRecording, Signal
 
 COLUMNS = (
-    "episode_index", "episode", "episode_id", "episode_idx", "episode_number", "ep", "traj_id", "trajectory_id",
-    "trajectory_index", "demo_id", "demo_index", "rollout_id", "rollout_index", "run_id",
-)  # fmt: skip
+    "episode_index",
+    "episode",
+    "episode_id",
+    "episode_idx",
+    "episode_number",
+    "ep",
+    "traj_id",
+    "trajectory_id",
+    "trajectory_index",
+    "demo_id",
+    "demo_index",
+    "rollout_id",
+    "rollout_index",
+    "run_id",
+)
+# that begin again with each episode
 FRAME_COLUMNS = (
     "frame_index",
     "frame",
     "step_index",
     "step",
     "timestep",
-)  # that begin again with each episode
+)
 MAX_EPISODES = 100_000
 
 
 def episodes(recording: RawRecording) -> Iterator[RawRecording]:
-    """Yield a recording for each episode of a table; the table itself if it has one, or does not number them.
+    """Yield a recording for each episode of a table; the table itself if it has one, or does not
+    number them.
 
-    Rows of one episode need not stand together. Between episodes the robot was reset, which is no motion.
+    Rows of one episode need not stand together. Between episodes the robot was reset, which is no
+    motion.
     """
     numbers = _whole_numbers(recording, COLUMNS)
     if numbers is None:
@@ -55,7 +70,9 @@ def episodes(recording: RawRecording) -> Iterator[RawRecording]:
 
 
 def _whole_numbers(recording: RawRecording, columns: tuple[str, ...]) -> Array | None:
-    """Return the first of these columns, (k,); None if there is none, or it does not hold whole numbers."""
+    """Return the first of these columns, (k,); None if there is none, or it does not hold whole
+    numbers.
+    """
     column = next((name for name in recording.signals if name.lower() in columns), None)
     if column is None or recording.signals[column]:
         return None

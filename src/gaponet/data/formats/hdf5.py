@@ -1,9 +1,10 @@
 """HDF5 file, or a folder of them: ALOHA, robomimic, or any with arrays of one row per sample.
 
-Signals are called by their path in the file: action, observations/qpos, … ALOHA's names are known; it has no clock, so
-logs.toml says rate = 50.0, and joints, as its columns have no names. A file with several demonstrations (robomimic's
-data/demo_0, …) holds one recording in each; robomimic's actions are mostly steps of the hand, not joint positions, so
-logs.toml must say which array is the command. Images are not read.
+Signals are called by their path in the file: action, observations/qpos, … ALOHA's names are known;
+it has no clock, so logs.toml says rate = 50.0, and joints, as its columns have no names. A file
+with several demonstrations (robomimic's data/demo_0, …) holds one recording in each; robomimic's
+actions are mostly steps of the hand, not joint positions, so logs.toml must say which array is the
+command. Images are not read.
 """
 
 from __future__ import annotations
@@ -27,10 +28,15 @@ from gaponet.data.formats import files_under
 SUFFIXES = (".h5", ".hdf5")
 EXTRA = "hdf5"
 ALOHA: LogsFile = {
-    "ctrl": "action", "qpos": "observations/qpos", "qvel": "observations/qvel", "tau": "observations/effort",
+    "ctrl": "action",
+    "qpos": "observations/qpos",
+    "qvel": "observations/qvel",
+    "tau": "observations/effort",
     "position_unit": "rad",
-}  # fmt: skip
-DEEPEST, MOST = 6, 5000  # groups in groups; arrays in a file
+}
+# groups in groups; arrays in a file
+DEEPEST = 6
+MOST = 5000
 
 
 def recordings(path: Path, specified: LogsFile) -> Iterator[RawRecording]:
@@ -54,9 +60,14 @@ def recordings(path: Path, specified: LogsFile) -> Iterator[RawRecording]:
                 else {}
             )
             yield RawRecording(
-                name, f"{file}#{part}" if part else str(file), members, partial(_load, file, demo), str(file),
-                (str(file),), default=cast("LogsFile", default),
-            )  # fmt: skip
+                name,
+                f"{file}#{part}" if part else str(file),
+                members,
+                partial(_load, file, demo),
+                str(file),
+                (str(file),),
+                default=cast("LogsFile", default),
+            )
 
 
 @contextmanager
@@ -70,7 +81,10 @@ def _opened(file: Path) -> Iterator[Any]:
 
 @sandboxed(LogError, "h5py")
 def _listed(file: Path) -> dict[str, tuple[str, ...]]:
-    """Arrays of numbers with one row per sample, by path, and names of their columns. Links are not followed."""
+    """Arrays of numbers with one row per sample, by path, and names of their columns.
+
+    Links are not followed.
+    """
     import h5py
 
     arrays: dict[str, tuple[str, ...]] = {}

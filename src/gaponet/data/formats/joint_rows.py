@@ -1,4 +1,6 @@
-"""Tables with a row per joint and time: columns `time`, `joint` (names), and one column per signal."""
+"""Tables with a row per joint and time: columns `time`, `joint` (names), and one column per
+signal.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +25,9 @@ TIME_COLUMNS = ("time", "t", "timestamp", "stamp")
 
 
 def joint_column(names: list[str], logs: LogsFile) -> str | None:
-    """Return the column with the joints' names; None if the table has none, or has a column of commands per joint."""
+    """Return the column with the joints' names; None if the table has none, or has a column of
+    commands per joint.
+    """
     before, pattern, after = str(logs.get("ctrl", "ctrl.{joint}")).partition("{joint}")
     if pattern and any(
         n.startswith(before) and n.endswith(after) and len(n) > len(before + after) for n in names
@@ -33,7 +37,8 @@ def joint_column(names: list[str], logs: LogsFile) -> str | None:
 
 
 def recording(file: Path, names: list[str], joint: str, logs: LogsFile) -> RawRecording:
-    """Return a table with a row per joint and time as a recording whose signals have a column per joint.
+    """Return a table with a row per joint and time as a recording whose signals have a column per
+    joint.
 
     Args:
         joint: The column with the joints' names.

@@ -5,15 +5,18 @@ One folder, many episodes; what gaponet exports, and stock sets of position-cont
     meta/info.json                          codebase_version "v3.0", fps, features, data_path
     meta/tasks.parquet                      task, task_index
     meta/episodes/chunk-000/file-000.parquet    one row per episode: length, where its rows are
-    data/chunk-000/file-000.parquet         one row per frame: action, observation.state, timestamp, frame_index, …
+    data/chunk-000/file-000.parquet         one row per frame: action, observation.state, timestamp,
+    frame_index, …
 
-Of v2.1, one data file an episode and meta/episodes.jsonl, the episodes whose files are there are read.
+Of v2.1, one data file an episode and meta/episodes.jsonl, the episodes whose files are there are
+read.
 
-Stock sets hold positions alone: action is the command, observation.state the joints (row t as in data.sequence). Their
-unit is not written in them: SO-101 sets are degrees, older ones −100..100 of the calibrated range; --position-unit says
-which. A joint that the robot's log_unit calls a fraction (a gripper) is 0..100 in both. What gaponet.data exported says
-its units, periods and metadata itself. Images and videos are left alone. Actions that are poses of the hand, steps or
-speeds are refused by the names of their values; logs.toml may name other features that hold joint targets.
+Stock sets hold positions alone: action is the command, observation.state the joints (row t as in
+data.sequence). Their unit is not written in them: SO-101 sets are degrees, older ones −100..100 of
+the calibrated range; --position-unit says which. A joint that the robot's log_unit calls a fraction
+(a gripper) is 0..100 in both. What gaponet.data exported says its units, periods and metadata
+itself. Images and videos are left alone. Actions that are poses of the hand, steps or speeds are
+refused by the names of their values; logs.toml may name other features that hold joint targets.
 """
 
 from __future__ import annotations
@@ -98,7 +101,8 @@ def read(
 
     Args:
         joint_map: The set's name of a joint → the robot's.
-        said: OPTIONS that logs.toml states. position_unit is not for what gaponet exported, which says rad itself.
+        said: OPTIONS that logs.toml states. position_unit is not for what gaponet exported, which
+            says rad itself.
     """
     encoders = None
     if "calibration" in said:
@@ -118,7 +122,8 @@ def read(
                 "%s: %d episodes that meta/episodes lists are missing", part.path, part.absent
             )
         tasks = tasks_of(part)
-        open_file, table = Path(), None
+        open_file = Path()
+        table = None
         for episode in part.episodes:
             file = part.data_file(episode)
             if file != open_file:
@@ -129,7 +134,9 @@ def read(
 
 
 def read_episodes(part: Set, episodes: list[dict[str, Any]], robot: RobotSpec) -> Iterator[Log]:
-    """Yield the Logs of episodes of what gaponet exported; a data file is read once for its episodes in a row."""
+    """Yield the Logs of episodes of what gaponet exported; a data file is read once for its
+    episodes in a row.
+    """
     frames = None
     for episode in episodes:
         file = part.data_file(episode)
@@ -140,8 +147,11 @@ def read_episodes(part: Set, episodes: list[dict[str, Any]], robot: RobotSpec) -
 
 def _unit(part: Set, given: str | None) -> str:
     """The unit of positions: stated by an export, else by the user."""
-    stated = [(part.features[f].get("info") or {}).get("unit") for f in ("action", "observation.state")
-              if f in part.features]  # fmt: skip
+    stated = [
+        (part.features[f].get("info") or {}).get("unit")
+        for f in ("action", "observation.state")
+        if f in part.features
+    ]
     if part.ours and stated == ["rad", "rad"]:
         if given not in (None, "rad"):
             raise UsageError(
@@ -155,8 +165,8 @@ def _unit(part: Set, given: str | None) -> str:
             else "is not written in the set"
         )
         raise UsageError(
-            f"{part.path}: the unit of positions {explanation}; say --position-unit deg (SO-101 sets), signed_percent "
-            "(older ones, −100..100) or rad"
+            f"{part.path}: the unit of positions {explanation}; say --position-unit deg (SO-101 "
+            "sets), signed_percent (older ones, −100..100) or rad"
         )
     return given
 
@@ -176,8 +186,8 @@ class _Frames:
             odd = sorted(set(theirs) - {""} ^ set(self.joints))
             if odd:
                 raise JointMismatchError(
-                    f"{part.path}/meta/info.json: joint '{odd[0]}' is not in both {self.features['ctrl']} and "
-                    f"{self.features[channel]}"
+                    f"{part.path}/meta/info.json: joint '{odd[0]}' is not in both "
+                    f"{self.features['ctrl']} and {self.features[channel]}"
                 )
         self.units = [self._unit_of(joint) for joint in self.joints]
         table = read_table(file, (*self.features.values(), *INDEX))
@@ -192,7 +202,8 @@ class _Frames:
 
     def _features(self) -> dict[str, Feature]:
         """Choose the feature of each channel, and return what info.json says of them."""
-        part, known = self.part, dict(self.part.features)
+        part = self.part
+        known = dict(self.part.features)
         self.features = {ours: theirs for ours, theirs in FEATURES.items() if theirs in known}
         info = f"{part.path}/meta/info.json"
         for channel, name in self.options.features.items():
@@ -208,14 +219,18 @@ class _Frames:
         for need in ("ctrl", "qpos"):
             if need not in self.features:
                 raise LogError(
-                    f"{info}: no feature '{FEATURES[need]}'; it has {', '.join(part.info['features'])}. Say "
+                    f"{info}: no feature '{FEATURES[need]}'; it has "
+                    f"{', '.join(part.info['features'])}. Say "
                     f'{need} = "…" in logs.toml if another one holds it'
                 )
         return known
 
     def _unit_of(self, joint: str) -> str:
-        """The unit of a joint: a gripper is 0..100 of its range wherever the other joints are not SI."""
-        robot, unit = self.options.robot, self.options.unit
+        """The unit of a joint: a gripper is 0..100 of its range wherever the other joints are not
+        SI.
+        """
+        robot = self.options.robot
+        unit = self.options.unit
         in_range = robot.log_units[robot.joint_names.index(joint)] == "fraction"
         raw = unit == "ticks" and self.options.encoders is not None
         return "percent" if in_range and unit in NO_SI and not raw else unit
@@ -229,20 +244,22 @@ class _Frames:
             where = f"{self.file}: {joint}"
             if self.units[column] == "signed_percent" and size.max() > MAX_PERCENT:
                 raise LogError(
-                    f"{where} is up to {size.max():.4g}, beyond −100..100 of a range: these are degrees or ticks; say "
-                    "--position-unit deg (or ticks)"
+                    f"{where} is up to {size.max():.4g}, beyond −100..100 of a range: these are "
+                    "degrees or ticks; say --position-unit deg (or ticks)"
                 )
             at_end = int((size == FULL_PERCENT).sum())
             if self.units[column] == "deg" and at_end >= MIN_AT_END and size.max() == FULL_PERCENT:
                 raise LogError(
-                    f"{where} ends at exactly 100 in {at_end} values: these are LeRobot's −100..100 of the calibrated "
-                    "range, not degrees; say --position-unit signed_percent, and calibration in logs.toml"
+                    f"{where} ends at exactly 100 in {at_end} values: these are LeRobot's "
+                    "−100..100 of the calibrated range, not degrees; say --position-unit "
+                    "signed_percent, and calibration in logs.toml"
                 )
 
     def _joints(self, channel: str, feature: str, spec: Feature) -> list[str]:
         """The robot's own joint of each column, "" where it is said to be none."""
         options = self.options
-        names, where = spec["names"], f"{self.part.path}/meta/info.json: {feature}"
+        names = spec["names"]
+        where = f"{self.part.path}/meta/info.json: {feature}"
         if isinstance(names, dict):
             names = next((v for v in names.values() if isinstance(v, list)), None)
         if names and isinstance(names[0], list):
@@ -250,8 +267,8 @@ class _Frames:
         names = names or options.joints
         if not names or len(names) != int(np.prod(spec["shape"])):
             raise LogError(
-                f"{where} does not name its {spec['shape']} values; write joints = [their names, in order] into "
-                "logs.toml beside the set"
+                f"{where} does not name its {spec['shape']} values; write joints = [their names, "
+                "in order] into logs.toml beside the set"
             )
         short = [str(name).removesuffix(".pos") for name in names]
         kept = [name for name in short if not ignored(name, options.ignore)]
@@ -261,8 +278,11 @@ class _Frames:
         return ["" if ignored(n, options.ignore) else next(ours) for n in short]
 
     def _require_joints(self, names: list[str], where: str) -> None:
-        """Refuse poses of the hand, steps and speeds, where no value is a joint; joints among them are told."""
-        joints, strange = [], []
+        """Refuse poses of the hand, steps and speeds, where no value is a joint; joints among them
+        are told.
+        """
+        joints = []
+        strange = []
         for name in names:
             try:
                 joints.append(self.options.robot.resolve(name, where, self.options.joint_map))
@@ -275,8 +295,8 @@ class _Frames:
         if len(joints) > 1:
             patterns = ", ".join(f'"{name}"' for name in strange)
             raise LogError(
-                f"{where} holds joint positions ({', '.join(joints)}), and {held} ({shown}); leave these out: "
-                f"ignore = [{patterns}] in logs.toml"
+                f"{where} holds joint positions ({', '.join(joints)}), and {held} ({shown}); "
+                f"leave these out: ignore = [{patterns}] in logs.toml"
             )
         others = [
             name
@@ -288,12 +308,13 @@ class _Frames:
 
     def episode(self, row: dict[str, Any]) -> Log:
         """The frames of an episode as a Log, in SI."""
-        index, length = int(row["episode_index"]), int(row["length"])
+        index = int(row["episode_index"])
+        length = int(row["length"])
         where = np.flatnonzero(self.episodes == index)
         if len(where) != length or not np.array_equal(self.frame[where], np.arange(length)):
             raise LogError(
-                f"{self.file}: episode {index} has {len(where)} frames here, meta/episodes says {length} in a row; "
-                "download or export the set again"
+                f"{self.file}: episode {index} has {len(where)} frames here, meta/episodes says "
+                f"{length} in a row; download or export the set again"
             )
         time = self._time(where)
         channels = {
@@ -316,7 +337,9 @@ class _Frames:
         return Log(self.options.robot.name, self.joints, channels, f"{self.file}#{index}", meta)
 
     def _time(self, where: Array) -> Array:
-        """Frames are a period apart; their timestamps, float32, lose digits and are believed only where they differ."""
+        """Frames are a period apart; their timestamps, float32, lose digits and are believed only
+        where they differ.
+        """
         regular = np.arange(len(where)) * self.part.dt
         since_start = self.timestamp[where] - self.timestamp[where[0]]
         return (
@@ -334,7 +357,9 @@ class _Frames:
 
 
 def _motion(episode: dict[str, Any], tasks: dict[int, str]) -> str:
-    """The motion's own name in an export; in a stock set, whose episodes are not repetitions, task and number."""
+    """The motion's own name in an export; in a stock set, whose episodes are not repetitions, task
+    and number.
+    """
     if "stated" in episode:
         return str(episode["stated"]["motion"])
     since_start = episode.get("tasks") or list(tasks.values())[:1] or ["episode"]
@@ -347,12 +372,14 @@ def _matrix(file: Path, table: Any, feature: str, n: int) -> Array:
     import pyarrow as pa
     import pyarrow.compute as pc
 
-    column, kind = table[feature].combine_chunks(), table.schema.field(feature).type
+    column = table[feature].combine_chunks()
+    kind = table.schema.field(feature).type
     lists = pa.types.is_list(kind) or pa.types.is_fixed_size_list(kind)
     kind = kind.value_type if lists else kind
     if not (pa.types.is_integer(kind) or pa.types.is_floating(kind)) or not (lists or n == 1):
         raise LogError(
-            f"{file}: {feature} is {table.schema.field(feature).type}, not {n} numbers a row; {AGAIN}"
+            f"{file}: {feature} is {table.schema.field(feature).type}, not {n} numbers a row; "
+            f"{AGAIN}"
         )
     wrong = column.is_null().to_numpy(False)
     if lists and not wrong.any():

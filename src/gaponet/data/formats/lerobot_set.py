@@ -31,15 +31,13 @@ FEATURES = {
     "temperature": "observation.temperature",
 }
 OURS = "gaponet.json"  # beside info.json in an export: dt, and that the episodes' metadata are ours
-STATED = tuple(
-    f for f in SequenceMeta.__dataclass_fields__ if f != "robot"
-)  # columns of our meta/episodes
+# columns of our meta/episodes
+STATED = tuple(f for f in SequenceMeta.__dataclass_fields__ if f != "robot")
 GAINS = ("kp", "kd")
 AGAIN = "download or export it again"
 
-Findings = dict[
-    str, dict[str, float | None]
-]  # of a recording; none in sets from before they were written
+# of a recording; none in sets from before they were written
+Findings = dict[str, dict[str, float | None]]
 Name = Annotated[str, Len(1, 200)]
 Count = Annotated[int, Interval(ge=0, le=10**9)]
 Chunk = Annotated[int, Interval(ge=0, le=10**6)]
@@ -56,7 +54,9 @@ class Info(TypedDict):
 
 
 class Feature(TypedDict):
-    """One feature of a set; names are a list, one in a list or in a dictionary, often with .pos behind each."""
+    """One feature of a set; names are a list, one in a list or in a dictionary, often with .pos
+    behind each.
+    """
 
     shape: Annotated[list[Annotated[int, Interval(ge=1, le=1000)]], Len(1, 2)]
     names: list[Any] | dict[str, Any] | None
@@ -64,17 +64,23 @@ class Feature(TypedDict):
 
 
 # One row of meta/episodes; beside it, in what gaponet exported, the fields of SequenceMeta.
-Episode = TypedDict("Episode", {
-    "episode_index": Count, "length": Annotated[int, Interval(ge=1, le=10**8)],
-    "data/chunk_index": Chunk, "data/file_index": Chunk, "tasks": NotRequired[list[str] | None],
-})  # fmt: skip
+Episode = TypedDict(
+    "Episode",
+    {
+        "episode_index": Count,
+        "length": Annotated[int, Interval(ge=1, le=10**8)],
+        "data/chunk_index": Chunk,
+        "data/file_index": Chunk,
+        "tasks": NotRequired[list[str] | None],
+    },
+)
 
 
 # One line of meta/episodes.jsonl, v2.1.
 class Listed(TypedDict):
     episode_index: Count
     length: Annotated[int, Interval(ge=1, le=10**8)]
-    tasks: NotRequired[list[str] | None]  # fmt: skip
+    tasks: NotRequired[list[str] | None]
 
 
 NEEDED = tuple(k for k in Episode.__annotations__ if k != "tasks")
@@ -96,8 +102,9 @@ class Ours(TypedDict):
 
 @dataclass(frozen=True)
 class Set:
-    """One LeRobot folder: its info.json, its features that are read, its episodes and how many more it lists that are
-    not there; ours is None for a stock set."""
+    """One LeRobot folder: its info.json, its features that are read, its episodes and how many
+    more it lists that are not there; ours is None for a stock set.
+    """
 
     path: Path
     info: Info
@@ -114,14 +121,18 @@ class Set:
     def data_file(self, episode: dict[str, Any]) -> Path:
         """Where the frames of an episode are; never outside the set."""
         given = self.info["data_path"]
-        which = {"chunk_index": "data/chunk_index", "file_index": "data/file_index",
-                 "episode_chunk": "data/chunk_index", "episode_index": "episode_index"}  # fmt: skip
+        which = {
+            "chunk_index": "data/chunk_index",
+            "file_index": "data/file_index",
+            "episode_chunk": "data/chunk_index",
+            "episode_index": "episode_index",
+        }
         number = lambda m: f"{episode[which[m[1]]]:0{m[2] or 0}d}"  # noqa: E731
         place = os.path.normpath(re.sub(rf"\{{({'|'.join(which)})(?::0?(\d))?d?\}}", number, given))
         if re.search(r"[{}\0]", place) or os.path.isabs(place) or place.startswith(".."):
             raise LogError(
-                f"{self.path}/meta/info.json: data_path '{given}' is not a path inside the set with "
-                f"{{chunk_index:03d}} and {{file_index:03d}}; {AGAIN}"
+                f"{self.path}/meta/info.json: data_path '{given}' is not a path inside the set "
+                f"with {{chunk_index:03d}} and {{file_index:03d}}; {AGAIN}"
             )
         return self.path / place
 
@@ -141,10 +152,11 @@ def _open(file: Path) -> Set:
     version = info["codebase_version"]
     if version.split(".")[0] not in VERSIONS:
         raise LogError(
-            f"{file}: codebase_version is {version}, this reads {' and '.join(VERSIONS)}; convert the set with "
-            "lerobot's own scripts"
+            f"{file}: codebase_version is {version}, this reads {' and '.join(VERSIONS)}; convert "
+            "the set with lerobot's own scripts"
         )
-    root, features = file.parents[1], info["features"]
+    root = file.parents[1]
+    features = info["features"]
     ours = file.with_name(OURS)
     stated = (
         read_json(
@@ -179,9 +191,8 @@ def _open(file: Path) -> Set:
     part = Set(root, info, known, episodes, stated)
     if not listed.is_file():
         return part
-    here = [
-        e for e in episodes if part.data_file(e).is_file()
-    ]  # v2: one file an episode, and often only some of them
+    # v2: one file an episode, and often only some of them
+    here = [e for e in episodes if part.data_file(e).is_file()]
     if not here:
         raise LogError(
             f"{root}: none of the {len(episodes)} episodes' data files is there; {AGAIN}"
@@ -251,7 +262,9 @@ def read_table(
     also: tuple[str, ...] = (),
     hint: str = AGAIN,
 ) -> Any:
-    """The columns `need`, each once, and those of `also` that are there, in this order, of a Parquet file."""
+    """The columns `need`, each once, and those of `also` that are there, in this order, of a
+    Parquet file.
+    """
     there = parquet.header(file)[0]
     for name in need:
         if there.count(name) != 1:

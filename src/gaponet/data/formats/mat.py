@@ -1,6 +1,7 @@
 """MATLAB .mat (up to v7; v7.3 is HDF5), or a folder of them: arrays of one row per sample.
 
-Signals are called by the names of the variables; a field of a struct is STRUCT.FIELD. logs.toml says which is what.
+Signals are called by the names of the variables; a field of a struct is STRUCT.FIELD. logs.toml
+says which is what.
 """
 
 from __future__ import annotations

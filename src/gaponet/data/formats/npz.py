@@ -1,10 +1,12 @@
-"""NumPy .npz, or a folder of them: GAPONet's motion files, ASAP's, or any with arrays of one row per sample.
+"""NumPy .npz, or a folder of them: GAPONet's motion files, ASAP's, or any with arrays of one row
+per sample.
 
 GAPONet's files hold many motions in one: real_dof_positions_cmd,
-real_dof_positions, real_dof_velocities, real_dof_torques (motions, rows, joints), padded with zero rows, or one array
-per motion; joint_sequence; payloads; or windows in which one joint moves, (windows, rows), with that joint's name in
-joint_sequence, (windows,). They have no clock: logs.toml says rate = 50.0, or --rate 50 does. In plain files logs.toml
-says which array is what; text in joint_names names the columns. Arrays of objects: gaponet.data.formats.pickles.
+real_dof_positions, real_dof_velocities, real_dof_torques (motions, rows, joints), padded with zero
+rows, or one array per motion; joint_sequence; payloads; or windows in which one joint moves,
+(windows, rows), with that joint's name in joint_sequence, (windows,). They have no clock: logs.toml
+says rate = 50.0, or --rate 50 does. In plain files logs.toml says which array is what; text in
+joint_names names the columns. Arrays of objects: gaponet.data.formats.pickles.
 """
 
 from __future__ import annotations
@@ -25,9 +27,13 @@ from gaponet.data.formats import files_under, pickles
 SUFFIXES = (".npz",)
 DEFAULT: LogsFile = {"time": "time"}
 GAPONET: LogsFile = {
-    "ctrl": "real_dof_positions_cmd", "qpos": "real_dof_positions", "qvel": "real_dof_velocities",
-    "tau": "real_dof_torques", "position_unit": "rad", "time_unit": "s",
-}  # fmt: skip
+    "ctrl": "real_dof_positions_cmd",
+    "qpos": "real_dof_positions",
+    "qvel": "real_dof_velocities",
+    "tau": "real_dof_torques",
+    "position_unit": "rad",
+    "time_unit": "s",
+}
 NAMES = ("joint_names", "joint_sequence", "dof_names")
 
 

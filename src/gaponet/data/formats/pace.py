@@ -1,8 +1,10 @@
-"""PACE's .pt, or a folder of them: time, dof_pos, des_dof_pos as tensors or NumPy arrays, gains where it states them.
+"""PACE's .pt, or a folder of them: time, dof_pos, des_dof_pos as tensors or NumPy arrays, gains
+where it states them.
 
-Nothing pickled runs and torch is not needed (formats.pickles). The file does not name its joints; without joints
-in logs.toml the robot's own order is not assumed either. kp and kd, one number a joint or one for all, are the gains
-while recording. Files of other names work as well: logs.toml says which tensor is what.
+Nothing pickled runs and torch is not needed (formats.pickles). The file does not name its joints;
+without joints in logs.toml the robot's own order is not assumed either. kp and kd, one number a
+joint or one for all, are the gains while recording. Files of other names work as well: logs.toml
+says which tensor is what.
 """
 
 from __future__ import annotations
@@ -21,9 +23,14 @@ from gaponet.data.formats import files_under, pickles
 
 SUFFIXES = (".pt",)
 DEFAULT: LogsFile = {
-    "time": "time", "time_unit": "s", "position_unit": "rad", "ctrl": "des_dof_pos", "qpos": "dof_pos",
-    "qvel": "dof_vel", "tau": "dof_torque",
-}  # fmt: skip
+    "time": "time",
+    "time_unit": "s",
+    "position_unit": "rad",
+    "ctrl": "des_dof_pos",
+    "qpos": "dof_pos",
+    "qvel": "dof_vel",
+    "tau": "dof_torque",
+}
 GAINS = ("kp", "kd")
 
 
@@ -39,7 +46,8 @@ def recordings(path: Path, specified: LogsFile) -> Iterator[RawRecording]:
                 joints = int(np.prod(qpos.shape[1:]))
                 if stated.size not in (1, joints):
                     raise LogError(
-                        f"{file}: {name} has {stated.size} values; give 1 or one for each of {joints} joints"
+                        f"{file}: {name} has {stated.size} values; give 1 or one for each of "
+                        f"{joints} joints"
                     )
                 arrays[name] = np.broadcast_to(stated.ravel(), qpos.shape)
                 gains[name] = name  # type: ignore[literal-required]
@@ -55,7 +63,8 @@ def _read(file: Path) -> dict[str, Any]:
         )
         if top is None:
             raise LogError(
-                f"{file}: a zip file without data.pkl, so not what torch.save writes; is it the right file?"
+                f"{file}: a zip file without data.pkl, so not what torch.save writes; is it the "
+                "right file?"
             )
         if f"{top}byteorder" in packed.namelist() and packed.read(f"{top}byteorder") != b"little":
             raise LogError(

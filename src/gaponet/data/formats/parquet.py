@@ -1,4 +1,6 @@
-"""Parquet files of strangers: read in the sandbox, and what they say that they hold is counted first."""
+"""Parquet files of strangers: read in the sandbox, and what they say that they hold is counted
+first.
+"""
 
 from __future__ import annotations
 
@@ -63,7 +65,8 @@ def read(file: Path, wanted: list[str]) -> pa.Table:
     """These columns.
 
     Raises:
-        LogError: No Parquet file, a column is missing, or there is more than MAX_ARRAYS_BYTES in them.
+        LogError: No Parquet file, a column is missing, or there is more than MAX_ARRAYS_BYTES in
+            them.
     """
     import pyarrow.parquet as pq
 
@@ -74,7 +77,8 @@ def read(file: Path, wanted: list[str]) -> pa.Table:
         values = sum(c.num_values for c in chunks if c.path_in_schema.split(".")[0] in wanted)
         if 8 * values > MAX_ARRAYS_BYTES:
             raise LogError(
-                f"{file}: {source.metadata.num_rows:,} rows of {len(wanted)} columns are {values:,} values, more than "
-                f"{MAX_ARRAYS_BYTES >> 20} MiB; cut the log into shorter ones"
+                f"{file}: {source.metadata.num_rows:,} rows of {len(wanted)} columns are "
+                f"{values:,} values, more than {MAX_ARRAYS_BYTES >> 20} MiB; cut the log into "
+                "shorter ones"
             )
         return source.read(columns=wanted, use_threads=False).select(wanted)

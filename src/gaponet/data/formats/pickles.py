@@ -1,8 +1,9 @@
-"""Strangers' pickles, opened without running anything: numbers, text, lists, dictionaries, arrays and tensors come out.
+"""Strangers' pickles, opened without running anything: numbers, text, lists, dictionaries, arrays
+and tensors come out.
 
-A pickle names functions to call. Here each name that is not on a short list is refused, and those on it are not NumPy's
-or torch's own functions but stand-ins that note what was meant; arrays are made of that afterwards, with type and size
-checked.
+A pickle names functions to call. Here each name that is not on a short list is refused, and those
+on it are not NumPy's or torch's own functions but stand-ins that note what was meant; arrays are
+made of that afterwards, with type and size checked.
 """
 
 from __future__ import annotations
@@ -24,8 +25,18 @@ from gaponet.base.structure import MAX_ARRAYS_BYTES
 from gaponet.data.describe.raw_recording import reading
 
 KINDS = "biufUS"  # of dtypes: numbers and text of fixed size
-STORAGES = {"Float": "f4", "Double": "f8", "Half": "f2", "Long": "i8", "Int": "i4", "Short": "i2", "Char": "i1",
-            "Byte": "u1", "Bool": "b1"}  # torch's name → dtype  # fmt: skip
+# torch's name → dtype
+STORAGES = {
+    "Float": "f4",
+    "Double": "f8",
+    "Half": "f2",
+    "Long": "i8",
+    "Int": "i4",
+    "Short": "i2",
+    "Char": "i1",
+    "Byte": "u1",
+    "Bool": "b1",
+}
 MOST_STEPS = 1 << 20  # values of a tree that is walked; shared ones count each time
 
 
@@ -39,7 +50,8 @@ def open_zip(file: Path, what: str) -> Iterator[zipfile.ZipFile]:
     with reading(file, what), zipfile.ZipFile(file) as packed:
         if sum(part.file_size for part in packed.infolist()) > MAX_ARRAYS_BYTES:
             raise LogError(
-                f"{file}: unpacks to more than {MAX_ARRAYS_BYTES >> 20} MiB; cut it into shorter logs"
+                f"{file}: unpacks to more than {MAX_ARRAYS_BYTES >> 20} MiB; cut it into shorter "
+                "logs"
             )
         yield packed
 
@@ -52,7 +64,8 @@ class _Type:
     """A dtype that was meant."""
 
     def __init__(self, text: Any = "", *_: Any) -> None:
-        self.text, self.order = str(text), ""
+        self.text = str(text)
+        self.order = ""
 
     def __setstate__(self, state: Any) -> None:
         self.order = (
@@ -99,7 +112,8 @@ class _Wrapped:
         self.array: Any = None
 
     def read(self, state: Any, stream: io.BytesIO) -> None:
-        kind, shape = state.get("dtype"), state.get("shape")
+        kind = state.get("dtype")
+        shape = state.get("shape")
         if (
             not isinstance(kind, _Type)
             or kind.real().kind not in KINDS
@@ -126,7 +140,8 @@ def _frombuffer(data: Any, kind: Any, shape: Any, order: Any = "C") -> _Array:
 
 class _Scalar:
     def __init__(self, kind: Any, data: Any = b"") -> None:
-        self.kind, self.data = kind, data
+        self.kind = kind
+        self.data = data
 
     def real(self, made: Any) -> Any:
         return np.frombuffer(self.data, self.kind.real())[0]
@@ -149,10 +164,10 @@ class _Tensor:
         last = offset + sum((n - 1) * step for n, step in zip(size, stride, strict=True))
         if math.prod(size) and last >= len(storage):
             raise _RefusedError(f"a tensor of size {size} in a storage of {len(storage)}")
-        steps, self.array = [n * storage.itemsize for n in stride], None
-        if math.prod(size) <= len(
-            storage
-        ):  # one may claim to be large by repeating one number: it is left alone
+        steps = [n * storage.itemsize for n in stride]
+        self.array = None
+        # one may claim to be large by repeating one number: it is left alone
+        if math.prod(size) <= len(storage):
             self.array = np.lib.stride_tricks.as_strided(
                 storage[offset:], size, steps, writeable=False
             ).copy()
@@ -166,23 +181,29 @@ def _codec(text: Any, encoding: Any) -> bytes:
 
 
 MEANT = {
-    ("numpy", "ndarray"): _Array, ("numpy", "dtype"): _Type,
+    ("numpy", "ndarray"): _Array,
+    ("numpy", "dtype"): _Type,
     **{(f"numpy.{core}.multiarray", "_reconstruct"): _Array for core in ("core", "_core")},
     **{(f"numpy.{core}.multiarray", "scalar"): _Scalar for core in ("core", "_core")},
     **{(f"numpy.{core}.numeric", "_frombuffer"): _frombuffer for core in ("core", "_core")},
-    ("joblib.numpy_pickle", "NumpyArrayWrapper"): _Wrapped, ("_codecs", "encode"): _codec,
-    ("collections", "OrderedDict"): dict, ("builtins", "bytearray"): bytearray,
+    ("joblib.numpy_pickle", "NumpyArrayWrapper"): _Wrapped,
+    ("_codecs", "encode"): _codec,
+    ("collections", "OrderedDict"): dict,
+    ("builtins", "bytearray"): bytearray,
     ("torch._utils", "_rebuild_tensor_v2"): _Tensor,
     **{("torch", f"{name}Storage"): kind for name, kind in STORAGES.items()},
-}  # fmt: skip
+}
 
 
 class _Unpickler(pickle._Unpickler):
-    """Python's own, slow one: what it keeps is bounded by what it has read, and BUILD can be seen."""
+    """Python's own, slow one: what it keeps is bounded by what it has read, and BUILD can be
+    seen.
+    """
 
     def __init__(self, stream: io.BytesIO, storage: Callable[[str], bytes] | None) -> None:
         super().__init__(stream)
-        self.stream, self.storage = stream, storage
+        self.stream = stream
+        self.storage = storage
 
     def find_class(self, module: str, name: str) -> Any:
         if (module, name) not in MEANT:
@@ -202,7 +223,8 @@ class _Unpickler(pickle._Unpickler):
 
     def load_build(self) -> None:
         stack = self.stack  # type: ignore[attr-defined]
-        state, what = stack.pop(), stack[-1]
+        state = stack.pop()
+        what = stack[-1]
         if isinstance(what, _Wrapped) and isinstance(state, dict):
             what.read(state, self.stream)
         elif isinstance(what, (_Array, _Type)):
@@ -217,7 +239,8 @@ def load(data: bytes, where: str, storage: Callable[[str], bytes] | None = None)
     """Return the contents of a pickle, or of an uncompressed or zlib joblib file.
 
     Args:
-        storage: The storages of a file of torch's: key → the bytes of a storage of tensors, little-endian.
+        storage: The storages of a file of torch's: key → the bytes of a storage of tensors,
+            little-endian.
 
     Raises:
         LogError: It names anything else, is damaged, or too large.

@@ -1,13 +1,16 @@
-"""ROS 2 bag (.db3, .mcap, or their folder), or ROS 1 .bag: command and state topics, joined in time.
+"""ROS 2 bag (.db3, .mcap, or their folder), or ROS 1 .bag: command and state topics, joined in
+time.
 
-Signals are called TOPIC.field[joint]: every array of numbers of any message whose definition is in the bag, or known
-(JointState's TOPIC.position, Float64MultiArray's TOPIC.data, TOPIC.motors.q of a message that holds a list of motors);
-joints have the names of a list of texts that is as long, or numbers. Read in their own way are JointTrajectory with one
-point a message, JointTrajectoryControllerState (TOPIC.reference.position, …) and Unitree's LowState and LowCmd (.q,
-.dq, .tau_est, .kp; motors by number). Where a bag has one topic with states and one with commands, these are taken;
-else logs.toml says which: ctrl = "/arm/commands.data". A topic has the clock of its header's stamps, and the recorder's
-where it has none. Stamps that run away from the recorder's clock, or from those of the other topic, are moved onto it
-by a straight line; that, and repeated messages that were dropped, stand in the notes.
+Signals are called TOPIC.field[joint]: every array of numbers of any message whose definition is in
+the bag, or known (JointState's TOPIC.position, Float64MultiArray's TOPIC.data, TOPIC.motors.q of a
+message that holds a list of motors); joints have the names of a list of texts that is as long, or
+numbers. Read in their own way are JointTrajectory with one point a message,
+JointTrajectoryControllerState (TOPIC.reference.position, …) and Unitree's LowState and LowCmd (.q,
+.dq, .tau_est, .kp; motors by number). Where a bag has one topic with states and one with commands,
+these are taken; else logs.toml says which: ctrl = "/arm/commands.data". A topic has the clock of
+its header's stamps, and the recorder's where it has none. Stamps that run away from the recorder's
+clock, or from those of the other topic, are moved onto it by a straight line; that, and repeated
+messages that were dropped, stand in the notes.
 """
 
 from __future__ import annotations
@@ -32,22 +35,28 @@ SUFFIXES = (".db3", ".mcap", ".bag")
 EXTRA = "ros"
 DEFAULT: LogsFile = {"time_unit": "s", "position_unit": "rad"}
 PEEK = 200  # messages of a topic in which all its joints are named
-LATENCY = 0.1  # s that a stamp may lie before the recorder's clock, and by which topics may differ in that
+# s that a stamp may lie before the recorder's clock, and by which topics may differ in that
+LATENCY = 0.1
 DRIFT = 0.005  # s by which a stamp may run away from the recorder's clock during a recording
 COMMANDS = ("command", "cmd", "desired", "target", "goal", "reference", "setpoint")
-# Unitree's hg messages, for bags that do not hold the definitions of their messages; fields as in its public IDL.
+# Unitree's hg messages, for bags that do not hold the definitions of their messages; fields as in
+# its public IDL.
 HG = {
-    "MotorCmd": "uint8 mode\nfloat32 q\nfloat32 dq\nfloat32 tau\nfloat32 kp\nfloat32 kd\nuint32 reserve",
-    "LowCmd": "uint8 mode_pr\nuint8 mode_machine\nMotorCmd[35] motor_cmd\nuint32[4] reserve\nuint32 crc",
-    "MotorState": "uint8 mode\nfloat32 q\nfloat32 dq\nfloat32 ddq\nfloat32 tau_est\nint16[2] temperature\nfloat32 vol\n"
-    "uint32[2] sensor\nuint32 motorstate\nuint32[4] reserve",
-    "IMUState": "float32[4] quaternion\nfloat32[3] gyroscope\nfloat32[3] accelerometer\nfloat32[3] rpy\n"
-    "int16 temperature",
-    "LowState": "uint32[2] version\nuint8 mode_pr\nuint8 mode_machine\nuint32 tick\nIMUState imu_state\n"
-    "MotorState[35] motor_state\nuint8[40] wireless_remote\nuint32[4] reserve\nuint32 crc",
-}  # fmt: skip
+    "MotorCmd": "uint8 mode\nfloat32 q\nfloat32 dq\nfloat32 tau\nfloat32 kp\nfloat32 kd\nuint32 "
+    "reserve",
+    "LowCmd": "uint8 mode_pr\nuint8 mode_machine\nMotorCmd[35] motor_cmd\nuint32[4] "
+    "reserve\nuint32 crc",
+    "MotorState": "uint8 mode\nfloat32 q\nfloat32 dq\nfloat32 ddq\nfloat32 tau_est\nint16[2] "
+    "temperature\nfloat32 vol\nuint32[2] sensor\nuint32 motorstate\nuint32[4] reserve",
+    "IMUState": "float32[4] quaternion\nfloat32[3] gyroscope\nfloat32[3] "
+    "accelerometer\nfloat32[3] rpy\nint16 temperature",
+    "LowState": "uint32[2] version\nuint8 mode_pr\nuint8 mode_machine\nuint32 tick\nIMUState "
+    "imu_state\nMotorState[35] motor_state\nuint8[40] wireless_remote\nuint32[4] reserve\nuint32 "
+    "crc",
+}
 POINT = "trajectory_msgs/JointTrajectoryPoint"
-NOT_JOINTS = re.compile(  # packages and messages of what is seen, of bodies and of the system itself
+# packages and messages of what is seen, of bodies and of the system itself
+NOT_JOINTS = re.compile(
     r"(sensor_msgs/msg/(?!JointState$)|nav_msgs|tf2?_msgs|geometry_msgs|visualization_msgs|rosgraph_msgs|rcl_interfaces|"
     r"diagnostic_msgs|stereo_msgs|vision_msgs|action_msgs|lifecycle_msgs|statistics_msgs|std_msgs/msg/U?Int8).*"
 )
@@ -58,7 +67,8 @@ CONTROLLER = (
 )
 INTERFACES = {
     "InterfaceValue": "string[] interface_names\nfloat64[] values",
-    "DynamicJointState": "std_msgs/Header header\nstring[] joint_names\ncontrol_msgs/InterfaceValue[] interface_values",
+    "DynamicJointState": "std_msgs/Header header\nstring[] "
+    "joint_names\ncontrol_msgs/InterfaceValue[] interface_values",
 }
 Fields = dict[str, tuple[tuple[str, ...], Any]]  # field → (names of its columns, its numbers)
 
@@ -128,8 +138,9 @@ def _usual(signals: dict[str, tuple[str, ...]]) -> LogsFile:
 def _best_command(
     signals: dict[str, tuple[str, ...]], commands: list[str], states: list[str]
 ) -> str | None:
-    """Return the command signal, where one can be told: it names the state's joints, and a controller's reference says
-    more than the goals that it was sent."""
+    """Return the command signal, where one can be told: it names the state's joints, and a
+    controller's reference says more than the goals that it was sent.
+    """
     if len(states) == 1:
         joints = set(signals[states[0]])
         fitting = [
@@ -203,7 +214,8 @@ def _peeked(bag: Path) -> dict[str, dict[str, tuple[str, ...]]]:
 
 
 def _peek(bag: Path, reader: Any) -> dict[str, dict[str, tuple[str, ...]]]:
-    """topic → field → names of its columns, of all messages together: several publishers may tell of some joints each.
+    """topic → field → names of its columns, of all messages together: several publishers may tell
+    of some joints each.
 
     Arrays without names that have another length are a field of TOPIC#2.
     """
@@ -253,9 +265,8 @@ class _Row(NamedTuple):
     received: float  # by the recorder's clock, s
     stamp: float  # by its header, s; the recorder's where it has none
     stamped: bool
-    values: list[
-        list[float]
-    ]  # by field, in the order of its columns; NaN for those of which it tells nothing
+    # by field, in the order of its columns; NaN for those of which it tells nothing
+    values: list[list[float]]
 
 
 Wanted = dict[str, dict[str, tuple[str, ...]]]  # topic → field → names of its columns
@@ -300,7 +311,9 @@ def _wanted(topics: Wanted, names: list[str]) -> Wanted:
 
 
 def _collect(reader: Any, wanted: Wanted) -> tuple[dict[str, list[_Row]], set[str]]:
-    """Return the rows of each topic, and the topics whose messages tell of some of their joints each."""
+    """Return the rows of each topic, and the topics whose messages tell of some of their joints
+    each.
+    """
     rows: dict[str, list[_Row]] = {topic: [] for topic in wanted}
     partial = set[str]()
     used = {topic.split("#")[0] for topic in wanted}
@@ -338,7 +351,9 @@ def _tells_all(told: Fields, known: dict[str, tuple[str, ...]]) -> bool:
 
 
 def _in_order(told: tuple[tuple[str, ...], Any] | None, labels: tuple[str, ...]) -> list[float]:
-    """Return the numbers of a message in the order of labels; NaN for joints of which it tells nothing."""
+    """Return the numbers of a message in the order of labels; NaN for joints of which it tells
+    nothing.
+    """
     if told is None:
         return [np.nan] * len(labels)
     own, numbers = told
@@ -349,7 +364,9 @@ def _in_order(told: tuple[tuple[str, ...], Any] | None, labels: tuple[str, ...])
 
 
 def _together(time: Array, columns: list[Array]) -> tuple[Array, list[Array]]:
-    """Return rows in the order of time; messages of one instant that tell of some joints each are one row."""
+    """Return rows in the order of time; messages of one instant that tell of some joints each are
+    one row.
+    """
     order = np.argsort(time, kind="stable")
     time = time[order]
     columns = [values[order] for values in columns]
@@ -376,7 +393,9 @@ def _fresh(time: Array, values: list[Array]) -> Array:
 
 
 def _clocks(stamps: dict[str, Array], notes: dict[str, Any]) -> dict[str, Array]:
-    """Time of the rows of each topic, from columns received, stamp, whether stamped; all on one clock."""
+    """Time of the rows of each topic, from columns received, stamp, whether stamped; all on one
+    clock.
+    """
     off = {}
     for topic, (received, stamp, stamped) in ((t, s.T) for t, s in stamps.items()):
         if len(stamp) > 1 and stamped.all():
@@ -387,7 +406,8 @@ def _clocks(stamps: dict[str, Array], notes: dict[str, Any]) -> dict[str, Array]
     drifts = any(abs(a) * span[t] > DRIFT for t, (a, _) in off.items())
     times = {}
     for topic, table in stamps.items():
-        received, stamp = table[:, 0], table[:, 1]
+        received = table[:, 0]
+        stamp = table[:, 1]
         if topic not in off:
             times[topic] = received
             notes.setdefault("clock", {})[topic] = "the recorder's: no stamps"
@@ -403,7 +423,9 @@ def _clocks(stamps: dict[str, Array], notes: dict[str, Any]) -> dict[str, Array]
 
 
 def _numbers(topic: str, m: Any) -> Fields:
-    """Numbers of any message: its arrays of numbers, and a number of each part where it holds a list of parts."""
+    """Numbers of any message: its arrays of numbers, and a number of each part where it holds a
+    list of parts.
+    """
     messages: Fields = {}
     texts: list[tuple[str, ...]] = []
     for name in m.__dataclass_fields__:
@@ -433,7 +455,8 @@ def _numbers(topic: str, m: Any) -> Fields:
 
 
 def _controller(topic: str, m: Any) -> Fields:
-    names, messages = tuple(m.joint_names), {}
+    names = tuple(m.joint_names)
+    messages = {}
     for part in ("reference", "desired", "feedback", "actual"):
         point = getattr(m, part, None)
         for theirs, ours in (
@@ -447,7 +470,9 @@ def _controller(topic: str, m: Any) -> Fields:
 
 
 def _dynamic(topic: str, m: Any) -> Fields:
-    """Interfaces of DynamicJointState, such as position and effort, each with the joints that have it."""
+    """Interfaces of DynamicJointState, such as position and effort, each with the joints that have
+    it.
+    """
     found: dict[str, dict[str, float]] = {}
     for joint, part in zip(m.joint_names, m.interface_values, strict=True):
         for interface, value in zip(part.interface_names, part.values, strict=True):
@@ -458,7 +483,8 @@ def _dynamic(topic: str, m: Any) -> Fields:
 def _trajectory(topic: str, m: Any) -> Fields:
     if len(m.points) > 1:
         raise LogError(
-            f"{topic} sends whole trajectories ({len(m.points)} points); what the controller made of them stands in "
+            f"{topic} sends whole trajectories ({len(m.points)} points); what the controller made "
+            "of them stands in "
             'its state topic (…/controller_state): record that, and say ctrl = "…" in logs.toml'
         )
     return {"point": (tuple(m.joint_names), m.points[0].positions)} if m.points else {}
@@ -473,14 +499,14 @@ def _motors(field: str, names: tuple[str, ...]) -> Callable[[str, Any], Fields]:
     return fields
 
 
-STATE, COMMAND = (
-    _motors("motor_state", ("q", "dq", "tau_est")),
-    _motors("motor_cmd", ("q", "dq", "tau", "kp", "kd")),
-)
+STATE = _motors("motor_state", ("q", "dq", "tau_est"))
+COMMAND = _motors("motor_cmd", ("q", "dq", "tau", "kp", "kd"))
 KINDS: dict[str, Callable[[str, Any], Fields]] = {
     "trajectory_msgs/msg/JointTrajectory": _trajectory,
     "control_msgs/msg/JointTrajectoryControllerState": _controller,
     "control_msgs/msg/DynamicJointState": _dynamic,
-    "unitree_hg/msg/LowState": STATE, "unitree_go/msg/LowState": STATE,
-    "unitree_hg/msg/LowCmd": COMMAND, "unitree_go/msg/LowCmd": COMMAND,
-}  # fmt: skip
+    "unitree_hg/msg/LowState": STATE,
+    "unitree_go/msg/LowState": STATE,
+    "unitree_hg/msg/LowCmd": COMMAND,
+    "unitree_go/msg/LowCmd": COMMAND,
+}

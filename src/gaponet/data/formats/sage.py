@@ -1,9 +1,10 @@
 """SAGE folder: control.csv and state_motor.csv beside each other.
 
-{real,sim}/{robot}/{source}/{motion}/{control,state_motor}.csv and joint_list.txt; event.csv is not read.
-Rows are TYPE,timestamp,"[...]"; the case of TYPE differs between recordings. Real timestamps are microseconds,
-simulated ones seconds; the reader decides by the period and refuses one that is neither. Joints stand in the unit that
-the robot's `log_unit` says (SO-101's gripper: 0..1 of its range).
+{real,sim}/{robot}/{source}/{motion}/{control,state_motor}.csv and joint_list.txt; event.csv is not
+read. Rows are TYPE,timestamp,"[...]"; the case of TYPE differs between recordings. Real timestamps
+are microseconds, simulated ones seconds; the reader decides by the period and refuses one that is
+neither. Joints stand in the unit that the robot's `log_unit` says (SO-101's gripper: 0..1 of its
+range).
 """
 
 from __future__ import annotations
@@ -72,7 +73,8 @@ def _read_motion(folder: Path, robot: RobotSpec, joint_map: dict[str, str] | Non
     if not raw_names:
         raise LogError(f"{list_file}: empty; one joint name a line, in the order of the columns")
     names = tuple(resolve_all(raw_names, robot, str(list_file), joint_map))
-    control, state = folder / "control.csv", folder / "state_motor.csv"
+    control = folder / "control.csv"
+    state = folder / "state_motor.csv"
     ctrl_time, ctrl = _read_csv(control, len(names), "control")
     state_time, values = _read_csv(state, len(names), "state_motor")
     units = [robot.log_units[robot.joint_names.index(name)] for name in names]
@@ -107,7 +109,8 @@ def _read_csv(file: Path, n: int, kind: str) -> tuple[Array, dict[str, Array]]:
         )
     if len(set(columns)) != len(columns):
         raise LogError(
-            f"{file}:1: a column stands twice in the header {', '.join(columns)}; delete or rename one"
+            f"{file}:1: a column stands twice in the header {', '.join(columns)}; delete or "
+            "rename one"
         )
     if "positions" not in lists:
         raise LogError(
@@ -122,7 +125,10 @@ def _read_csv(file: Path, n: int, kind: str) -> tuple[Array, dict[str, Array]]:
 
 
 def _parse(file: Path, body: bytes, n: int, k: int, kind: str) -> Array:
-    """Numbers of all rows, (rows, 1 + k n). The whole body is looked at once; lines singly only to name a bad one."""
+    """Numbers of all rows, (rows, 1 + k n).
+
+    The whole body is looked at once; lines singly only to name a bad one.
+    """
     import pyarrow as pa
     import pyarrow.csv as csv
 
@@ -151,20 +157,23 @@ def _parse(file: Path, body: bytes, n: int, k: int, kind: str) -> Array:
 
 
 def _refuse_row(file: Path, body: bytes, n: int, k: int, kind: str) -> None:
-    """Raise for the first line that is not TYPE,time and k lists of n numbers, or of another type than `kind`."""
+    """Raise for the first line that is not TYPE,time and k lists of n numbers, or of another type
+    than `kind`.
+    """
     row = re.compile(
         rf'([A-Za-z_]+),{NUMBER}(?:,"\[{NUMBER}(?:,{NUMBER}){{{n - 1}}}\]"){{{k}}}', re.IGNORECASE
     )
     for i, line in enumerate(body.decode("utf-8", errors="replace").split("\n")):
         if (match := row.fullmatch(line.rstrip("\r"))) and match[1].lower() != kind:
             raise LogError(
-                f"{file}:{i + 2}: a row of type '{match[1]}', not {kind.upper()}: are the files swapped or mixed?"
+                f"{file}:{i + 2}: a row of type '{match[1]}', not {kind.upper()}: are the files "
+                "swapped or mixed?"
             )
         if not match:
             shown = line if len(line) < 60 else line[:57] + "..."
             raise LogError(
-                f"{file}:{i + 2}: expected TYPE,timestamp and {k} list(s) of {n} numbers, got '{shown}'; "
-                "the file may be cut short: remove the row or record the motion again"
+                f"{file}:{i + 2}: expected TYPE,timestamp and {k} list(s) of {n} numbers, got "
+                f"'{shown}'; the file may be cut short: remove the row or record the motion again"
             )
 
 
@@ -178,5 +187,6 @@ def _seconds(file: Path, time: Array) -> float:
     if not period > 0:
         return 1e-6  # Log refuses the row where time goes back or is not a number
     raise LogError(
-        f"{file}: the median period is {period:g}, neither microseconds nor seconds; mend the timestamps"
+        f"{file}: the median period is {period:g}, neither microseconds nor seconds; mend the "
+        "timestamps"
     )

@@ -1,10 +1,11 @@
 """CSV, text or Parquet, a file or a folder of files: a column per signal.
 
-Columns are called `time`, `ctrl.<joint>`, `qpos.<joint>` and, where the robot says more, `qvel.<joint>`, `tau.<joint>`,
-`temperature.<joint>`; others are left alone. A logs.toml (data.describe.logs_file) says other names, the units, and the
-names of the columns where the file has none. A column with the number of the episode (formats.episodes) makes several
-recordings of a file. Torques are N·m and temperatures °C. Units have no default: a wrong guess
-looks like a sim-to-real gap. A table with a column `joint` has a row per joint and time (formats.joint_rows).
+Columns are called `time`, `ctrl.<joint>`, `qpos.<joint>` and, where the robot says more,
+`qvel.<joint>`, `tau.<joint>`, `temperature.<joint>`; others are left alone. A logs.toml
+(data.describe.logs_file) says other names, the units, and the names of the columns where the file
+has none. A column with the number of the episode (formats.episodes) makes several recordings of a
+file. Torques are N·m and temperatures °C. Units have no default: a wrong guess looks like a
+sim-to-real gap. A table with a column `joint` has a row per joint and time (formats.joint_rows).
 """
 
 from __future__ import annotations
@@ -44,7 +45,9 @@ DEFAULT: LogsFile = {"time": "time"} | {c: c + ".{joint}" for c in CHANNELS}  # 
 
 
 def detects(path: Path) -> bool:
-    """A table, or a folder with tables directly in it (text files only if asked for: a folder may have a readme)."""
+    """A table, or a folder with tables directly in it (text files only if asked for: a folder may
+    have a readme).
+    """
     if path.is_file():
         return path.suffix.lower() in SUFFIXES
     return any(f.suffix.lower() in (".csv", ".tsv", ".parquet") for f in find(path))
@@ -73,12 +76,14 @@ def recordings(path: Path, specified: LogsFile) -> Iterator[RawRecording]:
         line = 1
         signals: dict[str, tuple[str, ...]] = {}
         if file.suffix.lower() == ".parquet":
-            names, load = _parquet_header(file), partial(_read_parquet, file)
+            names = _parquet_header(file)
+            load = partial(_read_parquet, file)
             lists = parquet.list_widths(file).items()
             signals = {name: tuple(map(str, range(width))) for name, width in lists}
         else:
             names, first = _csv_header(file, specified.get("header"))
-            load, line = partial(_read_csv, file, names, first), first + 1
+            load = partial(_read_csv, file, names, first)
+            line = first + 1
         _refuse_twice(file, names, [name for name in names if name.split(".")[0] in DEFAULT])
         load = partial(_load_once, file, names, load)
         if joint := joint_rows.joint_column(names, specified):
@@ -132,7 +137,9 @@ def _delimiter(line: str) -> str:
 
 
 def _has_decimal_commas(body: bytes, delimiter: str) -> bool:
-    """Return True if the numbers of a table have decimal commas, as spreadsheets of many countries write them."""
+    """Return True if the numbers of a table have decimal commas, as spreadsheets of many countries
+    write them.
+    """
     if delimiter == ",":
         return False
     first_rows = body[:DECIMAL_SAMPLE_BYTES]
@@ -183,15 +190,20 @@ def _refuse_transposed(file: Path, first: list[str]) -> None:
         rows = sum(1 for _ in lines)
     if named or rows * MIN_TRANSPOSED_CELLS < len(first):
         raise LogError(
-            f"{file}:1: the table is transposed: {rows} rows with a signal each, and {len(first)} columns with an "
-            'instant each. A row must be an instant. Turn it: python -c "import pandas; pandas.read_csv('
-            f"'{file.name}', header=None, index_col={0 if named else None}).T.to_csv('{file.name}', index=False"
+            f"{file}:1: the table is transposed: {rows} rows with a signal each, and {len(first)} "
+            "columns with an "
+            'instant each. A row must be an instant. Turn it: python -c "import pandas; '
+            "pandas.read_csv("
+            f"'{file.name}', header=None, "
+            f"index_col={0 if named else None}).T.to_csv('{file.name}', index=False"
             f'{"" if named else ", header=False"})"'
         )
 
 
 def _read_csv(file: Path, names: list[str], first: int, wanted: list[str]) -> dict[str, Signal]:
-    """{column: (k,)}; an empty cell is NaN, a short row or an unreadable cell too where rows are cut, else refused."""
+    """{column: (k,)}; an empty cell is NaN, a short row or an unreadable cell too where rows are
+    cut, else refused.
+    """
     import pyarrow as pa
     import pyarrow.csv as pc
 
@@ -250,8 +262,11 @@ def _signal(file: Path, column: pa.ChunkedArray, dates: bool) -> Signal:
 def _read_slowly(
     file: Path, body: str, names: list[str], wanted: list[str], delimiter: str, first: int
 ) -> list[list[float]]:
-    """Line by line: raises for the first with too few cells or a cell that is no number; NaN where rows are cut."""
-    places, bad = {name: names.index(name) for name in wanted}, skipped_rows()
+    """Line by line: raises for the first with too few cells or a cell that is no number; NaN where
+    rows are cut.
+    """
+    places = {name: names.index(name) for name in wanted}
+    bad = skipped_rows()
     numbers: list[list[float]] = []
     if _has_decimal_commas(body.encode(), delimiter):
         body = body.replace(",", ".")
@@ -285,7 +300,8 @@ def _parquet_header(file: Path) -> list[str]:
     names, metadata = parquet.header(file)
     if reason := metadata.get(NOT_OBEYED):
         raise LogError(
-            f"{file}: no data, the robot did not do what it was told ({reason[:300]}); leave it out, or --skip-bad does"
+            f"{file}: no data, the robot did not do what it was told ({reason[:300]}); leave it "
+            "out, or --skip-bad does"
         )
     return names
 
@@ -322,6 +338,7 @@ def _matrix(file: Path, name: str, column: pa.ChunkedArray, width: int) -> Array
     lists = column.combine_chunks()
     if lists.null_count or any(len(cell) != width for cell in lists):
         raise LogError(
-            f"{file}: the lists in column '{name}' are not all {width} numbers long; repair or cut the rows"
+            f"{file}: the lists in column '{name}' are not all {width} numbers long; repair or "
+            "cut the rows"
         )
     return np.asarray(lists.flatten().to_numpy(zero_copy_only=False), float).reshape(-1, width)

@@ -1,15 +1,18 @@
-"""Dataset → LeRobotDataset v3.0, so that it comes back from data.formats.lerobot with the same content hashes.
+"""Dataset → LeRobotDataset v3.0, so that it comes back from data.formats.lerobot with the same
+content hashes.
 
-A LeRobot set has one rate and the same features in every frame; a dataset with several rates or choices of channels
-becomes several sets, in folders of their own. One Parquet row group per episode. Where a file ends, the content hash
-of its last episode says: files of 2 MB in the mean, of a 2,000th of what lies before them where that is more. Some
-data files share a file of meta/episodes. No file depends on episodes that come after it, so that a dataset that grew
-has its earlier files again, byte by byte, and a push sends the others only (share/push_pull.py).
+A LeRobot set has one rate and the same features in every frame; a dataset with several rates or
+choices of channels becomes several sets, in folders of their own. One Parquet row group per
+episode. Where a file ends, the content hash of its last episode says: files of 2 MB in the mean, of
+a 2,000th of what lies before them where that is more. Some data files share a file of
+meta/episodes. No file depends on episodes that come after it, so that a dataset that grew has its
+earlier files again, byte by byte, and a push sends the others only (share/push_pull.py).
 
-    beyond the standard     features observation.velocity, .acceleration, .torque, .equivalent_torque, .temperature
-                            features.<name>.info.unit: SI
-                            columns of meta/episodes: unit_id, payload_mass, level, repetition, virtual, findings, …
-                            meta/gaponet.json: exact period, robot, joint names, licence, source
+    beyond the standard     features observation.velocity, .acceleration, .torque,
+                            .equivalent_torque, .temperature features.<name>.info.unit: SI columns
+                            of meta/episodes: unit_id, payload_mass, level, repetition, virtual,
+                            findings, … meta/gaponet.json: exact period, robot, joint names,
+                            licence, source
 
 A reader that knows none of these finds an ordinary set. Simulated replays are not in it.
 """
@@ -40,14 +43,22 @@ Group = tuple[float, tuple[str, ...]]  # dt, channels
 Tell = Callable[[str], None]  # called with the motion of each recording
 FeatureStatistics = dict[str, Statistics]  # feature → of its samples
 
-FILE_MB, CHUNK_FILES = 100, 1000  # LeRobot's own defaults, at most
-USUAL_MB, SHARE = 2.0, 1 / 2000  # of a file, and of all bytes before it
-BLOCK_MB, BLOCK_EPISODES = (
-    32.0,
-    64,
-)  # a block ends with a file, once it holds as much of both together
-INDEX = {"timestamp": "float32", "frame_index": "int64", "episode_index": "int64", "index": "int64",
-         "task_index": "int64"}  # fmt: skip
+# LeRobot's own defaults, at most
+FILE_MB = 100
+CHUNK_FILES = 1000
+# of a file, and of all bytes before it
+USUAL_MB = 2.0
+SHARE = 1 / 2000
+# a block ends with a file, once it holds as much of both together
+BLOCK_MB = 32.0
+BLOCK_EPISODES = 64
+INDEX = {
+    "timestamp": "float32",
+    "frame_index": "int64",
+    "episode_index": "int64",
+    "index": "int64",
+    "task_index": "int64",
+}
 PLACE = "chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 
 
@@ -73,7 +84,8 @@ class Written:
 
 
 def write(dataset: Dataset, folder: Path, tell: Tell) -> list[Written]:
-    """Write LeRobot sets: into the folder itself where one will do, else into folders named after rate.
+    """Write LeRobot sets: into the folder itself where one will do, else into folders named after
+    rate.
 
     Raises:
         DatasetError: A recording is damaged.
@@ -112,13 +124,11 @@ class _Set:
         channels: tuple[str, ...],
         entries: list[Entry],
     ) -> None:
-        self.dataset, self.folder, self.dt, self.channels, self.entries = (
-            dataset,
-            folder,
-            dt,
-            channels,
-            entries,
-        )
+        self.dataset = dataset
+        self.folder = folder
+        self.dt = dt
+        self.channels = channels
+        self.entries = entries
         self.n = len(dataset.joint_names)
         self.tasks: dict[str, int] = {}
         self.frames = 0
@@ -130,27 +140,31 @@ class _Set:
         )
 
     def _blocks(self) -> Iterator[list[_Placed]]:
-        """Episodes of whole data files that one file of meta/episodes lists; the journal alone decides the ends."""
+        """Episodes of whole data files that one file of meta/episodes lists; the journal alone
+        decides the ends.
+        """
         row = 4 * self.n * len(self.channels) + sum(
             np.dtype(kind).itemsize for kind in INDEX.values()
         )
         block: list[_Placed] = []
         file = size = total = 0
-        fill, ended = 0.0, False  # of the block; whether a file ended with the last episode
+        # of the block; whether a file ended with the last episode
+        fill = 0.0
+        ended = False
         for index, entry in enumerate(self.entries):
             more = entry.rows * row
             if ended or (size and size + more > FILE_MB * 1e6):
-                file, size = file + 1, 0
+                file = file + 1
+                size = 0
                 if fill >= 1:
                     yield block
-                    block, fill = [], 0.0
+                    block = []
+                    fill = 0.0
             task = self.tasks.setdefault(entry.meta.motion, len(self.tasks))
             block.append(_Placed(entry, index, self.frames, task, file))
-            size, total, fill = (
-                size + more,
-                total + more,
-                fill + more / (BLOCK_MB * 1e6) + 1 / BLOCK_EPISODES,
-            )
+            size = size + more
+            total = total + more
+            fill = fill + more / (BLOCK_MB * 1e6) + 1 / BLOCK_EPISODES
             self.frames += entry.rows
             ended = int(entry.hash[:8], 16) / 2**32 < more / max(USUAL_MB * 1e6, SHARE * total)
         yield block
@@ -165,12 +179,16 @@ class _Set:
         return place
 
     def _write_block(self, number: int, episodes: list[_Placed], tell: Tell) -> FeatureStatistics:
-        """Write data files and the file of meta/episodes; returns the statistics of their frames."""
+        """Write data files and the file of meta/episodes; returns the statistics of their
+        frames.
+        """
         import pyarrow as pa
         import pyarrow.parquet as pq
 
         rows: list[dict[str, Any]] = []
-        stats, writer, file = [], None, -1
+        stats = []
+        writer = None
+        file = -1
         try:
             for episode in episodes:
                 columns = self._columns(self._read(episode.entry), episode)
@@ -201,16 +219,16 @@ class _Set:
         sequence = self.dataset.read(entry)
         if sequence.content_hash() != entry.hash:
             raise DatasetError(
-                f"{self.dataset.path}: '{entry.id}' is not what was recorded, by its hash; restore it first"
+                f"{self.dataset.path}: '{entry.id}' is not what was recorded, by its hash; "
+                "restore it first"
             )
         return sequence
 
     def _schema(self) -> pa.Schema:
         import pyarrow as pa
 
-        vector = (
-            pa.list_(pa.float32(), self.n) if self.n > 1 else pa.float32()
-        )  # one value is no list in LeRobot
+        # one value is no list in LeRobot
+        vector = pa.list_(pa.float32(), self.n) if self.n > 1 else pa.float32()
         fields = [(FEATURES[c], vector) for c in self.channels]
         return pa.schema(fields + [(name, pa.type_for_alias(kind)) for name, kind in INDEX.items()])
 
@@ -230,9 +248,10 @@ class _Set:
         schema = self._schema()
         arrays = [
             pa.FixedSizeListArray.from_arrays(pa.array(x.ravel()), type=field.type)
-            if pa.types.is_fixed_size_list(field.type) else pa.array(x.ravel(), field.type)
+            if pa.types.is_fixed_size_list(field.type)
+            else pa.array(x.ravel(), field.type)
             for field, x in zip(schema, columns.values(), strict=True)
-        ]  # fmt: skip
+        ]
         return pa.table(arrays, schema=schema)
 
     def _write_meta(self, stats: FeatureStatistics) -> None:
@@ -246,11 +265,18 @@ class _Set:
         header = {
             k: self.dataset.header[k] for k in ("licence", "source") if k in self.dataset.header
         }
-        write_json(meta / OURS, {
-            "format": 1, "robot": self.dataset.robot_name, "joint_names": self.dataset.joint_names, "dt": self.dt,
-            "dataset_hash": dataset_hash(self.entries), "virtual": any(e.meta.virtual for e in self.entries),
-            "dataset": header,
-        })  # fmt: skip
+        write_json(
+            meta / OURS,
+            {
+                "format": 1,
+                "robot": self.dataset.robot_name,
+                "joint_names": self.dataset.joint_names,
+                "dt": self.dt,
+                "dataset_hash": dataset_hash(self.entries),
+                "virtual": any(e.meta.virtual for e in self.entries),
+                "dataset": header,
+            },
+        )
 
     def _info(self) -> dict[str, Any]:
         names = list(self.dataset.joint_names)
@@ -267,12 +293,20 @@ class _Set:
             name: {"dtype": kind, "shape": [1], "names": None} for name, kind in INDEX.items()
         }
         return {
-            "codebase_version": VERSION, "robot_type": self.dataset.robot_name,
-            "total_episodes": len(self.entries), "total_frames": self.frames, "total_tasks": len(self.tasks),
-            "chunks_size": CHUNK_FILES, "data_files_size_in_mb": FILE_MB, "video_files_size_in_mb": 200,
-            "fps": _fps(self.dt), "splits": {"train": f"0:{len(self.entries)}"},
-            "data_path": "data/" + PLACE, "video_path": None, "features": features,
-        }  # fmt: skip
+            "codebase_version": VERSION,
+            "robot_type": self.dataset.robot_name,
+            "total_episodes": len(self.entries),
+            "total_frames": self.frames,
+            "total_tasks": len(self.tasks),
+            "chunks_size": CHUNK_FILES,
+            "data_files_size_in_mb": FILE_MB,
+            "video_files_size_in_mb": 200,
+            "fps": _fps(self.dt),
+            "splits": {"train": f"0:{len(self.entries)}"},
+            "data_path": "data/" + PLACE,
+            "video_path": None,
+            "features": features,
+        }
 
 
 def _pooled(parts: list[FeatureStatistics]) -> FeatureStatistics:
@@ -281,21 +315,31 @@ def _pooled(parts: list[FeatureStatistics]) -> FeatureStatistics:
 
 def _row(episode: _Placed, number: int, stats: FeatureStatistics) -> dict[str, Any]:
     """The episode's row in the file of meta/episodes that has this number."""
-    entry, meta = episode.entry, asdict(episode.entry.meta)
+    entry = episode.entry
+    meta = asdict(episode.entry.meta)
     return {
-        "episode_index": episode.index, "tasks": [entry.meta.motion], "length": entry.rows,
-        "dataset_from_index": episode.first, "dataset_to_index": episode.first + entry.rows,
-        "data/chunk_index": episode.file // CHUNK_FILES, "data/file_index": episode.file % CHUNK_FILES,
-        "meta/episodes/chunk_index": number // CHUNK_FILES, "meta/episodes/file_index": number % CHUNK_FILES,
-        **{name: meta[name] for name in STATED}, "payload_mass": float(entry.meta.payload_mass),
+        "episode_index": episode.index,
+        "tasks": [entry.meta.motion],
+        "length": entry.rows,
+        "dataset_from_index": episode.first,
+        "dataset_to_index": episode.first + entry.rows,
+        "data/chunk_index": episode.file // CHUNK_FILES,
+        "data/file_index": episode.file % CHUNK_FILES,
+        "meta/episodes/chunk_index": number // CHUNK_FILES,
+        "meta/episodes/file_index": number % CHUNK_FILES,
+        **{name: meta[name] for name in STATED},
+        "payload_mass": float(entry.meta.payload_mass),
         **{name: json.dumps(meta[name], ensure_ascii=False) for name in ("notes", *GAINS)},
-        "findings": json.dumps(entry.findings, ensure_ascii=False), "content_hash": entry.hash,
+        "findings": json.dumps(entry.findings, ensure_ascii=False),
+        "content_hash": entry.hash,
         **{f"stats/{f}/{k}": v.tolist() for f, values in stats.items() for k, v in values.items()},
-    }  # fmt: skip
+    }
 
 
 def _task_table(tasks: dict[str, int]) -> pa.Table:
-    """Return task_index by task; the metadata make pandas take the text for the index, as LeRobot expects."""
+    """Return task_index by task; the metadata make pandas take the text for the index, as LeRobot
+    expects.
+    """
     import pyarrow as pa
 
     kinds = {"task_index": ("int64", "int64"), "task": ("unicode", "object")}

@@ -2,7 +2,8 @@
 
 python check.py
 
-python check.py randomization.json ROW     # the same with a unit of gaponet export ROBOT --to randomization
+python check.py randomization.json ROW     # the same with a unit of gaponet export ROBOT --to
+randomization
 
 In an export of actuator networks mjlab's learned actuators play them.
 """

@@ -85,9 +85,8 @@ def start(motions: dict[int, Motion], ctrl: Any) -> None:
         errors = history.drive_state.pos_error_history.numpy()
         places = actuator.pos_indices.numpy()
         fresh = [i for i, place in enumerate(places) if place // q.shape[1] in motions]
-        errors[:, fresh] = (target.ravel() - q.ravel())[
-            places[fresh]
-        ]  # as if the command had always been in force
+        # as if the command had always been in force
+        errors[:, fresh] = (target.ravel() - q.ravel())[places[fresh]]
         history.drive_state.pos_error_history.assign(errors)
 
 

@@ -2,8 +2,9 @@
 
 It needs no gaponet.
 
-envs = lerobot.envs.factory.make_env("USER/NAME", n_envs=4, trust_remote_code=True)   # this folder, on the Hub
-envs = make_env(n_envs=4)                                                             # this file, without LeRobot
+envs = lerobot.envs.factory.make_env("USER/NAME", n_envs=4, trust_remote_code=True)   # this folder,
+on the Hub envs = make_env(n_envs=4)                                                             #
+this file, without LeRobot
 
 The task is to bring the joints to angles that are drawn for each episode, and to keep them there.
 Values are LeRobot's: degrees, and 0..100 for a joint whose unit in facts.json is percent.

@@ -2,8 +2,9 @@
 
 This file is copied into exports; it needs torch, not gaponet.
 
-gaponet export RUN --to torch --out FOLDER     # FOLDER: gaponet_action.py (this file), delta.pt2, facts.json, …
-gaponet export ROBOT --to mjlab --out FOLDER   # the identified servos without a network (and --to isaaclab)
+gaponet export RUN --to torch --out FOLDER     # FOLDER: gaponet_action.py (this file), delta.pt2,
+facts.json, … gaponet export ROBOT --to mjlab --out FOLDER   # the identified servos without a
+network (and --to isaaclab)
 
 mjlab:      cfg.scene.entities["robot"] = mjlab_entity(FOLDER)
             cfg.sim.mujoco, cfg.decimation = mjlab_options(FOLDER)
@@ -68,9 +69,8 @@ class Past:
 
     def reset(self, ids: Any = None) -> None:
         """Restart worlds (indices, a mask, a slice; None for all) with the next state."""
-        self.fresh = (
-            self.fresh.clone()
-        )  # inference tensors cannot be written to outside inference mode
+        # inference tensors cannot be written to outside inference mode
+        self.fresh = self.fresh.clone()
         self.fresh[slice(None) if ids is None else ids] = True
 
     def delta(self, qpos: Tensor, qvel: Tensor, ctrl: Tensor, payload_mass: Tensor) -> Tensor:
@@ -199,9 +199,8 @@ class AlignedAction:
         data = self._aligned.data
         ids = self._columns
         q, v = (tensor(x)[:, ids] for x in (data.joint_pos, data.joint_vel))
-        bias = (
-            data.encoder_bias[:, ids] if hasattr(data, "encoder_bias") else 0.0
-        )  # mjlab subtracts it again
+        # mjlab subtracts it again
+        bias = data.encoder_bias[:, ids] if hasattr(data, "encoder_bias") else 0.0
         self.restart(q, q if self.standing_command is None else self.standing_command)
         self._processed_actions = (
             self.aligner(q, v, self._processed_actions - bias) + bias + self.servo_offset
@@ -223,9 +222,8 @@ class CheckPlayer:
 
     def __init__(self, check: Check) -> None:
         self.check = check
-        self.start = torch.zeros(
-            2, check.worlds, len(check.names)
-        )  # qpos and qvel in which worlds start
+        # qpos and qvel in which worlds start
+        self.start = torch.zeros(2, check.worlds, len(check.names))
 
     def reset_event(self) -> Any:
         """Return the function of an event term in mode "reset".
@@ -450,7 +448,8 @@ def _isaaclab_term() -> Any:
             law = ", ".join(term for term in facts["law"] if term != "no_load_speed")
             if cfg.check and law and "model" in facts:
                 raise ValueError(
-                    f"{cfg.folder}: trained with a servo model ({law}), which Isaac Lab lacks; or give check=False"
+                    f"{cfg.folder}: trained with a servo model ({law}), which Isaac Lab lacks; or "
+                    "give check=False"
                 )
             self.align(
                 self._asset,

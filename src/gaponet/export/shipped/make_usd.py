@@ -1,7 +1,8 @@
 """Make two USDs of robot.xml by mujoco-usd-converter: python make_usd.py
 
-usd/         The robot without servos, for a scene that configures actuators (robot_cfg.py, or the action term).
-usd_servos/  The same with each servo as a NewtonActuator prim, for programs that read these: Newton, and Isaac Lab for
+usd/         The robot without servos, for a scene that configures actuators (robot_cfg.py, or the
+action term). usd_servos/  The same with each servo as a NewtonActuator prim, for programs that read
+these: Newton, and Isaac Lab for
              joints without a configuration.
 """
 

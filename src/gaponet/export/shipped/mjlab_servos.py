@@ -132,7 +132,8 @@ class WorldServos:
         """Write friction, torque limits and bias."""
         if self.num_envs > 1 and model.dof_frictionloss.stride(0) == 0:
             raise ValueError(
-                "all worlds share one friction: cfg.events.update(mjlab_events(FOLDER)) gives each its own"
+                "all worlds share one friction: cfg.events.update(mjlab_events(FOLDER)) gives "
+                "each its own"
             )
         dof = self.addresses.dof
         servo = self.addresses.servo
@@ -211,9 +212,8 @@ def _servo_class() -> Any:
 
         def edit_spec(self, spec: Any, target_names: list[str]) -> None:
             super().edit_spec(spec, target_names)
-            for (
-                servo
-            ) in self._mjs_actuators:  # `servos` has the delays; mjlab's reset keeps MuJoCo's
+            # `servos` has the delays; mjlab's reset keeps MuJoCo's
+            for servo in self._mjs_actuators:
                 servo.nsample = 0
                 servo.delay = 0.0
 

@@ -2,9 +2,9 @@
 
 This file is copied into exports; it needs MuJoCo and numpy, not gaponet.
 
-servos = Servos(model, read("facts.json"))     # once; prefix="left/" where the robot was attached to a scene
-data.ctrl[...] = …; fill_delays(model, data)   # after each reset
-data.ctrl[...] = …; servos.before(data); mujoco.mj_step(model, data)     # mj_forward after a change of state
+servos = Servos(model, read("facts.json"))     # once; prefix="left/" where the robot was attached
+to a scene data.ctrl[...] = …; fill_delays(model, data)   # after each reset data.ctrl[...] = …;
+servos.before(data); mujoco.mj_step(model, data)     # mj_forward after a change of state
 """
 
 from __future__ import annotations
@@ -76,9 +76,8 @@ class Servos:
         if model.nhistory:
             model.actuator_delay[self.servo] = column["delay"]
         mujoco.mj_setConst(model, mujoco.MjData(model))
-        model.dof_invweight0[self.dof] *= facts[
-            "dof_invweight0_factor"
-        ]  # stiff friction, which no MJCF can express
+        # stiff friction, which no MJCF can express
+        model.dof_invweight0[self.dof] *= facts["dof_invweight0_factor"]
         self.terms = present({name: column[name] for name in SERVO_TERMS if name in column})
 
     def before(self, data: Any) -> None:
@@ -213,8 +212,9 @@ def play(
 def delay_weights(delay: Any, step: float) -> Any:
     """Return weights of past commands, for engines whose actuators have no delay.
 
-    past = np.concatenate([ctrl[None], past[:-1]])   # (depth, n), newest first; at the start the first command repeated
-    target = (weights * past).sum(0)                 # same as MuJoCo's delay with interp="linear"
+    past = np.concatenate([ctrl[None], past[:-1]])   # (depth, n), newest first; at the start the
+    first command repeated target = (weights * past).sum(0)                 # same as MuJoCo's delay
+    with interp="linear"
 
     Args:
         delay: (n,) s.

@@ -15,13 +15,33 @@ from gaponet.export.shipped.mujoco_servos import read
 RELATIVE_TOLERANCE = 1e-5
 FREE_FLAGS = {"contact", "island"}  # flags in which a scene may differ
 FIELDS = (
-    "dof_armature", "dof_damping", "dof_frictionloss", "dof_solref", "dof_solimp", "jnt_range", "jnt_stiffness",
-    "actuator_gainprm", "actuator_biasprm", "actuator_forcerange", "actuator_delay", "actuator_history",
-)  # fmt: skip
+    "dof_armature",
+    "dof_damping",
+    "dof_frictionloss",
+    "dof_solref",
+    "dof_solimp",
+    "jnt_range",
+    "jnt_stiffness",
+    "actuator_gainprm",
+    "actuator_biasprm",
+    "actuator_forcerange",
+    "actuator_delay",
+    "actuator_history",
+)
 OPTIONS = (
-    "timestep", "gravity", "impratio", "iterations", "tolerance", "ls_iterations", "ls_tolerance", "ccd_iterations",
-    "noslip_iterations", "density", "viscosity", "wind",
-)  # fmt: skip
+    "timestep",
+    "gravity",
+    "impratio",
+    "iterations",
+    "tolerance",
+    "ls_iterations",
+    "ls_tolerance",
+    "ccd_iterations",
+    "noslip_iterations",
+    "density",
+    "viscosity",
+    "wind",
+)
 
 
 def require_scene(

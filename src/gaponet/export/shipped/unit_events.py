@@ -3,7 +3,8 @@
 This file is copied into exports; it needs torch, not gaponet. A unit is a row of the file.
 
 mjlab:      EventTermCfg(func=mjlab_units(FILE), mode="reset")
-Isaac Lab:  EventTermCfg(func=apply_units, mode="reset", params={"asset_cfg": SceneEntityCfg("robot"), "file": FILE})
+Isaac Lab:  EventTermCfg(func=apply_units, mode="reset", params={"asset_cfg":
+SceneEntityCfg("robot"), "file": FILE})
 
 FILE is the path of randomization.json. Mode "reset" draws a unit for each episode, "startup" one
 for each world.
@@ -22,8 +23,13 @@ import torch
 from torch import Tensor
 
 MODEL_FIELDS = (
-    "dof_armature", "dof_frictionloss", "dof_damping", "actuator_gainprm", "actuator_biasprm", "actuator_forcerange",
-)  # fmt: skip
+    "dof_armature",
+    "dof_frictionloss",
+    "dof_damping",
+    "actuator_gainprm",
+    "actuator_biasprm",
+    "actuator_forcerange",
+)
 BODY_FIELDS = "body_mass", "body_ipos", "body_inertia", "body_iquat", "body_subtreemass"
 DELAY_BUFFERS = "positions_delay_buffer", "velocities_delay_buffer", "efforts_delay_buffer"
 Units = dict[str, Tensor]  # field → (worlds, joints), SI units
@@ -196,9 +202,8 @@ def apply_units(
             f"action term '{term}' has no delays and offsets; use isaaclab_action, or term=None"
         )
     _write(robot, "armature", columns, ids, units["armature"])
-    both = any(
-        name.startswith("write_joint_dynamic_friction") for name in dir(robot)
-    )  # PhysX, where rest ≥ motion
+    # PhysX, where rest ≥ motion
+    both = any(name.startswith("write_joint_dynamic_friction") for name in dir(robot))
     friction = units["frictionloss"], units["frictionloss"] if both else None, units["damping"]
     _write(robot, "friction_coefficient", columns, ids, *friction)
     implicit = [
@@ -250,7 +255,8 @@ def _speed_lines(
         ]
         if not motors and (speed > 0).any():
             raise ValueError(
-                f"joint '{joint}' needs a torque-speed line: take isaaclab_actuators, or a DCMotorCfg"
+                f"joint '{joint}' needs a torque-speed line: take isaaclab_actuators, or a "
+                "DCMotorCfg"
             )
         for motor in motors:
             column = list(motor.joint_names).index(joint)

@@ -1,8 +1,10 @@
-"""Drift of a robot since its identification: which parameters changed, joint by joint, and by how much.
+"""Drift of a robot since its identification: which parameters changed, joint by joint, and by how
+much.
 
-At the robot's own values every cluster of the recordings has a gradient of the cost. On the day of the identification
-these gradients balanced, but for the stored Gauss-Newton step. A remaining gradient beyond the scatter of recordings is
-a change. As few parameters as possible explain it, the one that explains most first: a joint's fields, or play.
+At the robot's own values every cluster of the recordings has a gradient of the cost. On the day of
+the identification these gradients balanced, but for the stored Gauss-Newton step. A remaining
+gradient beyond the scatter of recordings is a change. As few parameters as possible explain it, the
+one that explains most first: a joint's fields, or play.
 """
 
 from __future__ import annotations
@@ -68,13 +70,17 @@ class ParameterChange:
 
     @property
     def sigmas(self) -> float:
-        """Change over its standard error, which includes noise, model errors and the overdispersion of recordings."""
+        """Change over its standard error, which includes noise, model errors and the
+        overdispersion of recordings.
+        """
         return self.by / self.error
 
 
 @dataclass(frozen=True)
 class Contradiction:
-    """Recording that contradicts the others: a joint's field, the difference on its axis, in standard errors."""
+    """Recording that contradicts the others: a joint's field, the difference on its axis, in
+    standard errors.
+    """
 
     recording: str
     joint: str
@@ -91,8 +97,8 @@ class Drift:
         verdict: same, drifted or contradictory.
         moved: Significant changes.
         largest: Joint → its largest change, significant or not.
-        min_effect: Joint → least effect on its path that counts, rad: a share of the model's error, and at least the
-            RMS difference between two recordings of one command.
+        min_effect: Joint → least effect on its path that counts, rad: a share of the model's error,
+            and at least the RMS difference between two recordings of one command.
         against: Recordings that were set aside since they contradict the others.
         advice: What to do.
         threshold: Standard errors from which a change is significant.
@@ -117,7 +123,8 @@ def drift(
     sequences: ListOf[Sequence],
     nthread: int = 0,
 ) -> Drift:
-    """Compare recordings of a robot that should be the same with the stored uncertainty of an identified robot.
+    """Compare recordings of a robot that should be the same with the stored uncertainty of an
+    identified robot.
 
     Raises:
         UsageError: The recordings are too short, or move no joint that was identified.
@@ -125,7 +132,8 @@ def drift(
     own = evidence(robot, sequences, uncertainty.fields, nthread=nthread)
     if not own.rows.any():
         raise UsageError(
-            "no recording moves an operated joint away from what it may touch; record gaponet excite's"
+            "no recording moves an operated joint away from what it may touch; record gaponet "
+            "excite's"
         )
     joints = robot.operated
     _require_identified(robot, own)
@@ -164,17 +172,19 @@ def _require_identified(robot: RobotSpec, own: Evidence) -> None:
     held = {j for j, rows in zip(robot.operated, own.rows, strict=True) if rows}
     if not held & identified_joints(robot):
         raise UsageError(
-            f"{robot.folder}: these recordings hold only joints that were never identified: {', '.join(sorted(held))}. "
-            "Identify these joints first"
+            f"{robot.folder}: these recordings hold only joints that were never identified: "
+            f"{', '.join(sorted(held))}. Identify these joints first"
         )
 
 
 def _repeatability(
     uncertainty: ParameterUncertainty, sequences: ListOf[Sequence], joints: ListOf[str]
 ) -> dict[str, float]:
-    """Return joint → RMS difference between two recordings of one command, rad: that of the identification.
+    """Return joint → RMS difference between two recordings of one command, rad: that of the
+    identification.
 
-    Where that had no repetitions, these recordings' own difference counts, which may itself have become worse.
+    Where that had no repetitions, these recordings' own difference counts, which may itself have
+    become worse.
     """
     today = repetition_difference(sequences, joints)
     differences = {}
@@ -202,7 +212,9 @@ def _far_joints(
 def _contradictions(
     own: Evidence, overdispersion: Array, uncertainty: ParameterUncertainty, joints: ListOf[str]
 ) -> list[Contradiction]:
-    """Return the recordings that contradict the others, the farthest first; each is left out of the others."""
+    """Return the recordings that contradict the others, the farthest first; each is left out of
+    the others.
+    """
     against: list[Contradiction] = []
     rest = own.by_recording()
     fields = (*uncertainty.fields, PLAY)
@@ -222,10 +234,12 @@ def _gradients_to_explain(
     joints: ListOf[str],
     repeatability: Mapping[str, float],
 ) -> tuple[list[_Joint], float]:
-    """Return the gradients of the joints, and the number of standard errors from which a change is significant.
+    """Return the gradients of the joints, and the number of standard errors from which a change is
+    significant.
 
-    The identification's overdispersion counts as that of MAX_PRIOR_CLUSTERS clusters at most, beside those of these
-    recordings; Student's t has their degrees of freedom, and all parameters together raise FALSE_ALARM_RATE.
+    The identification's overdispersion counts as that of MAX_PRIOR_CLUSTERS clusters at most,
+    beside those of these recordings; Student's t has their degrees of freedom, and all parameters
+    together raise FALSE_ALARM_RATE.
     """
     grouped = own.by_recording() if len(own.names) > 1 else own
     clusters = grouped.gradients.shape[1]
@@ -256,7 +270,9 @@ def _gradients_to_explain(
 def _changes(
     each: ListOf[_Joint], threshold: float
 ) -> tuple[list[ParameterChange], dict[str, ParameterChange]]:
-    """Return the significant changes, and joint → its largest change: first those that all joints share."""
+    """Return the significant changes, and joint → its largest change: first those that all joints
+    share.
+    """
     moved: list[ParameterChange] = []
     fields = each[0].fields
     for field in COMMON_FIELDS if len(each) > 1 else ():
@@ -284,12 +300,19 @@ class _Joint:
     """
 
     def __init__(
-        self, name: str, uncertainty: ParameterUncertainty, information: Array, gradient: Array, scatter: Array,
-        rows: int, repeatability: float,
-    ) -> None:  # fmt: skip
-        self.name, self.fields = name, (*uncertainty.fields, PLAY)
-        # Change of the axes and play by a change of one parameter in SI units, column by column: a softer motor has the
-        # friction that it had, so its friction over kp is larger.
+        self,
+        name: str,
+        uncertainty: ParameterUncertainty,
+        information: Array,
+        gradient: Array,
+        scatter: Array,
+        rows: int,
+        repeatability: float,
+    ) -> None:
+        self.name = name
+        self.fields = (*uncertainty.fields, PLAY)
+        # Change of the axes and play by a change of one parameter in SI units, column by column: a
+        # softer motor has the friction that it had, so its friction over kp is larger.
         by_field = np.eye(len(self.fields))
         over_kp = [SERVO_FIELDS[f].axis == "over kp" for f in uncertainty.fields]
         by_field[:-1, self.fields.index("kp")] -= uncertainty.array(name, "values") * over_kp
@@ -308,11 +331,14 @@ class _Joint:
         self.columns = information @ by_field
 
     def explained(self, threshold: float) -> tuple[list[ParameterChange], ParameterChange | None]:
-        """Return the significant changes with enough effect, and the largest change of one parameter alone."""
+        """Return the significant changes with enough effect, and the largest change of one
+        parameter alone.
+        """
         changes: list[ParameterChange] = []
         first: ParameterChange | None = None
         while len(changes) < MAX_CHANGES_PER_JOINT:
-            chosen, what = [self.fields.index(m.field) for m in changes], list[ParameterChange]()
+            chosen = [self.fields.index(m.field) for m in changes]
+            what = list[ParameterChange]()
             for k in np.flatnonzero(self.effect > 0).tolist():
                 if k not in chosen:
                     tried = self._moved([*chosen, k])
@@ -336,12 +362,14 @@ class _Joint:
 
 
 def _together(joints: ListOf[_Joint], number: int, threshold: float) -> ParameterChange | None:
-    """Return a parameter that changed in every joint by the same, if that is more significant than the joints' own
-    changes; it is then taken out of their gradients."""
+    """Return a parameter that changed in every joint by the same, if that is more significant than
+    the joints' own changes; it is then taken out of their gradients.
+    """
     information = np.array([j.columns[:, number] @ j.weight @ j.columns[:, number] for j in joints])
     pulls = np.array([j.columns[:, number] @ j.weight @ j.gradient for j in joints])
     total = max(information.sum(), 1e-300)
-    by, error = float(pulls.sum() / total), float(total**-0.5)
+    by = float(pulls.sum() / total)
+    error = float(total**-0.5)
     moves = float(np.sqrt(np.mean([(by * j.effect[number]) ** 2 for j in joints])))
     change = ParameterChange(EVERY_JOINT, joints[0].fields[number], by, error, moves)
     alone = max((abs(m.sigmas) for j in joints if (m := j.explained(np.inf)[1])), default=0.0)
@@ -367,14 +395,19 @@ def _farthest(
     joints: ListOf[str],
     fields: ListOf[str],
 ) -> Contradiction | None:
-    """Return the recording that differs most from the others, by more than recordings scatter, and its field."""
-    count, worst = len(own.names), None
+    """Return the recording that differs most from the others, by more than recordings scatter, and
+    its field.
+    """
+    count = len(own.names)
+    worst = None
     rate = FALSE_CONTRADICTION_RATE / (count * len(joints) * len(fields))
     limit = float(student.isf(rate / 2, min(uncertainty.clusters, MAX_PRIOR_CLUSTERS)))
     for i, joint in enumerate(joints):
-        information, gradient = own.information[i].sum(axis=0), own.gradients[i].sum(axis=0)
+        information = own.information[i].sum(axis=0)
+        gradient = own.gradients[i].sum(axis=0)
         for r in range(count):
-            mine, rest = own.information[i, r], information - own.information[i, r]
+            mine = own.information[i, r]
+            rest = information - own.information[i, r]
             carried = mine @ inverted(rest[None])[0]
             difference = carried @ (gradient - own.gradients[i, r]) - own.gradients[i, r]
             variance = (
@@ -399,23 +432,27 @@ def _farthest(
 
 
 def _advice(
-    verdict: Verdict, moved: ListOf[ParameterChange], against: ListOf[Contradiction], joints: ListOf[str],
+    verdict: Verdict,
+    moved: ListOf[ParameterChange],
+    against: ListOf[Contradiction],
+    joints: ListOf[str],
     far: Mapping[str, float],
-) -> str:  # fmt: skip
+) -> str:
     """Return what to do."""
     if verdict == "same":
         return "nothing to do"
     if verdict == "contradictory":
         names = ", ".join(dict.fromkeys(a.recording for a in against))
         return (
-            f"these recordings contradict each other ({names}): another robot's are among them, or something changed "
-            "on the way; check them apart, adapt with none of this"
+            f"these recordings contradict each other ({names}): another robot's are among them, "
+            "or something changed on the way; check them apart, adapt with none of this"
         )
     if not moved:
         times = ", ".join(f"{j} {by:.1f} times" for j, by in far.items())
         return (
-            f"no number explains how far these logs are from the model ({times} the residual): another robot, payload "
-            "or controller, or a part that gives way; look at it, then identify again"
+            f"no number explains how far these logs are from the model ({times} the residual): "
+            "another robot, payload or controller, or a part that gives way; look at it, then "
+            "identify again"
         )
     return (
         _another_robot_advice(moved, joints)
@@ -431,8 +468,9 @@ def _another_robot_advice(moved: ListOf[ParameterChange], joints: ListOf[str]) -
     if len(odd) <= MAX_CHANGED_JOINTS * len(joints) or len(odd) == 1:
         return ""
     return (
-        f"{len(odd)} of {len(joints)} joints have another stiffness or several other numbers: is this the same "
-        "robot, with the same gains and payload? If so, identify again; an adaptation is not enough"
+        f"{len(odd)} of {len(joints)} joints have another stiffness or several other numbers: is "
+        "this the same robot, with the same gains and payload? If so, identify again; an "
+        "adaptation is not enough"
     )
 
 
@@ -441,11 +479,16 @@ def _gearbox_advice(moved: ListOf[ParameterChange]) -> str:
     play = sorted({m.joint for m in moved if m.field == PLAY and m.by > 0})
     if not play:
         return ""
-    return f"look at the gearbox and the screws of {', '.join(play)}: play that was not there; then identify again"
+    return (
+        f"look at the gearbox and the screws of {', '.join(play)}: play that was not there; then "
+        "identify again"
+    )
 
 
 def _is_odd(changes: ListOf[ParameterChange]) -> bool:
-    """Return whether a joint's changes are rather another robot's: several, or one of its stiffness."""
+    """Return whether a joint's changes are rather another robot's: several, or one of its
+    stiffness.
+    """
     return len(changes) > 1 or any(m.field == "kp" for m in changes)
 
 

@@ -76,7 +76,9 @@ def widened(information: Array, overdispersion: Array) -> Array:
 
 
 def gradient_covariance(gradients: Array) -> Array:
-    """Return the covariance of the sum of gradients (n, C, Q) from their scatter over clusters, (n, Q, Q)."""
+    """Return the covariance of the sum of gradients (n, C, Q) from their scatter over clusters,
+    (n, Q, Q).
+    """
     each = gradients - gradients.mean(axis=1, keepdims=True)
     return np.asarray(
         np.swapaxes(each, -1, -2) @ each * (gradients.shape[1] / max(gradients.shape[1] - 1, 1))
@@ -100,10 +102,13 @@ def evidence(
     windows: int = WINDOWS,
     nthread: int = 0,
 ) -> Evidence:
-    """Compute the evidence of recordings by rollouts of every joint by itself, at the robot's own values."""
+    """Compute the evidence of recordings by rollouts of every joint by itself, at the robot's own
+    values.
+    """
     contact = contact_height(robot, tip_heights(sequences, robot))
     parts = cut(sequences, windows)
-    rollouts, bounds = JointRollouts(parts, robot, contact, nthread), Bounds(robot, sequences)
+    rollouts = JointRollouts(parts, robot, contact, nthread)
+    bounds = Bounds(robot, sequences)
     axes = Axes(bounds, fields, bounds.first)
     x = axes.normalize(bounds.first)
     scaled_errors = lambda xs: rollouts.flat_errors(axes.values(xs)) / np.float32(ERROR_SCALE_RAD)  # noqa: E731
@@ -145,16 +150,17 @@ def estimate_uncertainty(
     held_out: ListOf[HeldOut] = (),
     nthread: int = 0,
 ) -> ParameterUncertainty:
-    """Estimate the parameter uncertainty of a robot with the values that were fitted to recordings of one robot.
+    """Estimate the parameter uncertainty of a robot with the values that were fitted to recordings
+    of one robot.
 
     Args:
         judges: Recordings that were not fitted, for the residual; without any, the fitted ones.
-        covariances: Joint → fields and their covariance on the axes; of other joints it follows from the recordings and
-            from `before`.
-        before: Uncertainty of the robot that the fit began from. Its variance grows by how far the values moved beyond
-            what both uncertainties explain.
-        held_out: Recordings and the robots that were fitted without them, instead of `judges`, if `robot` was fitted to
-            them as well.
+        covariances: Joint → fields and their covariance on the axes; of other joints it follows
+            from the recordings and from `before`.
+        before: Uncertainty of the robot that the fit began from. Its variance grows by how far the
+            values moved beyond what both uncertainties explain.
+        held_out: Recordings and the robots that were fitted without them, instead of `judges`, if
+            `robot` was fitted to them as well.
     """
     fields = before.fields if before else _fitted_fields(robot)
     own = evidence(robot, sequences, fields, nthread=nthread)
@@ -204,7 +210,8 @@ def _no_better(
 ) -> JointUncertainty:
     """Return a joint's uncertainty with repetitions that differ no less than before.
 
-    Errors of recordings that were fitted are too small, so they are no less than those of motions that were not.
+    Errors of recordings that were fitted are too small, so they are no less than those of motions
+    that were not.
     """
     repeatability = max(today.repeatability, old.repeatability)
     if not errors_are_of_fit:
@@ -235,7 +242,8 @@ def _provenance(
 def _overdispersion(
     own: Evidence, before: ParameterUncertainty | None, joints: ListOf[str]
 ) -> tuple[int, Array]:
-    """Return the number of clusters, and the variance of their gradients over that of independent rows, (n, Q).
+    """Return the number of clusters, and the variance of their gradients over that of independent
+    rows, (n, Q).
 
     It is averaged with that of `before`, in proportion to the clusters of both.
     """
@@ -287,8 +295,11 @@ def _log_name(sequence: Sequence) -> str:
 
 
 def _errors_by_joint(folds: ListOf[HeldOut], nthread: int) -> dict[str, list[Array]]:
-    """Return joint → |error| of each rollout that holds it, rad; the worst joint's for joints that none holds."""
-    pairs, robot = [], folds[0].robot
+    """Return joint → |error| of each rollout that holds it, rad; the worst joint's for joints that
+    none holds.
+    """
+    pairs = []
+    robot = folds[0].robot
     for sequences, judged in folds:
         replays = replay(sequences, judged, nthread=nthread, lock_idle=True)
         pairs += [
@@ -307,12 +318,11 @@ def _errors_by_joint(folds: ListOf[HeldOut], nthread: int) -> dict[str, list[Arr
 def _error_bound(motions: ListOf[Array]) -> float:
     """Return the bound of 90 % of other motions' samples, from |error| of some, rad.
 
-    It is wider than the bound of these by one standard error (Student's t) of the mean of their RMS errors.
+    It is wider than the bound of these by one standard error (Student's t) of the mean of their RMS
+    errors.
     """
-    rms, freedom = (
-        np.array([np.sqrt(np.square(error).mean()) for error in motions]),
-        len(motions) - 1,
-    )
+    rms = np.array([np.sqrt(np.square(error).mean()) for error in motions])
+    freedom = len(motions) - 1
     wider = 0.0
     if freedom:
         wider = confidence_factor(freedom) * standard_error(rms) / max(float(rms.mean()), 1e-12)

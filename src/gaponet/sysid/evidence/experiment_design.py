@@ -1,10 +1,11 @@
 """Choice of the motions whose recordings would reduce a robot's parameter uncertainty most.
 
-Every candidate is played in the identified simulator. The derivative of its path by a servo parameter is the
-information that a recording of it would hold. The overdispersion of this robot's recordings (uncertainty.json) accounts
-for model errors that last. The chosen motions minimise the sum of the logarithms of the standard errors, each parameter
-by itself, since parameters that are only known together are to be separated. It is a greedy design with exchanges
-(Pukelsheim, Optimal Design of Experiments, 2006).
+Every candidate is played in the identified simulator. The derivative of its path by a servo
+parameter is the information that a recording of it would hold. The overdispersion of this robot's
+recordings (uncertainty.json) accounts for model errors that last. The chosen motions minimise the
+sum of the logarithms of the standard errors, each parameter by itself, since parameters that are
+only known together are to be separated. It is a greedy design with exchanges (Pukelsheim, Optimal
+Design of Experiments, 2006).
 """
 
 from __future__ import annotations
@@ -27,23 +28,23 @@ from gaponet.sim.replay import replay
 from gaponet.sysid.evidence.evidence import evidence
 from gaponet.sysid.uncertainty import ParameterUncertainty
 
-MOTIONS_OF_ALL_JOINTS, VARIANTS = (
-    24,
-    4,
-)  # candidates with a signal in every joint; of tours and the like
+# candidates with a signal in every joint; of tours and the like
+MOTIONS_OF_ALL_JOINTS = 24
+VARIANTS = 4
 MAX_SINGLE_JOINTS = 8  # of a robot with more, no joint moves by itself
 RANGE_SHARE = 0.5  # of a joint's interval, from home, beside others
-WORTH_INTERVAL_S, MIN_WORTH = (
-    30.0,
-    0.05,
-)  # time that must reduce the errors by this share to be worth playing
+# time that must reduce the errors by this share to be worth playing
+WORTH_INTERVAL_S = 30.0
+MIN_WORTH = 0.05
 MAX_KP_ERROR = 0.1  # relative, after all motions; more means that they do not determine it
 EPSILON = 1e-9
 
 
 @dataclass(frozen=True)
 class ExperimentDesign:
-    """Information that R recordings would hold about n joints' P parameters, on the axes of sysid/uncertainty.py."""
+    """Information that R recordings would hold about n joints' P parameters, on the axes of
+    sysid/uncertainty.py.
+    """
 
     information: Array  # Gauss-Newton information of each recording, (n, R, P, P)
     seconds: Array  # durations, (R,)
@@ -82,12 +83,16 @@ class ExperimentDesign:
         return np.asarray(np.linalg.inv(np.linalg.inv(self.covariance) + added))
 
     def _mean_log_error(self, normal: Array) -> Array:
-        """Return the mean over joints and parameters of the logarithm of the standard error then, (…,)."""
+        """Return the mean over joints and parameters of the logarithm of the standard error then,
+        (…,).
+        """
         variance = np.einsum("...ii->...i", self._covariance_with(normal))
         return np.asarray(0.5 * np.log(variance).mean(axis=(-2, -1)))
 
     def choose(self, seconds: float) -> list[int]:
-        """Return the best recordings in so much time, s: greedily by gain per second, then by exchanges."""
+        """Return the best recordings in so much time, s: greedily by gain per second, then by
+        exchanges.
+        """
         picks = [i for i, _ in self.greedy(seconds)]
         best = (
             float(self._mean_log_error(self.information[:, picks].sum(axis=1))) if picks else np.inf
@@ -111,7 +116,9 @@ class ExperimentDesign:
         return picks
 
     def greedy(self, seconds: float = np.inf) -> Iterator[tuple[int, float]]:
-        """Yield the recording with the largest gain per second, one after another, and the mean log error after it."""
+        """Yield the recording with the largest gain per second, one after another, and the mean
+        log error after it.
+        """
         picks = list[int]()
         now = float(self._mean_log_error(np.zeros_like(self.information[:, 0])))
         while len(
@@ -121,7 +128,8 @@ class ExperimentDesign:
         ):
             then = self._with(picks, fits)
             best = int(((now - then) / self.seconds[fits]).argmax())
-            picks, now = [*picks, int(fits[best])], float(then[best])
+            picks = [*picks, int(fits[best])]
+            now = float(then[best])
             yield picks[-1], now
 
     def _with(self, picks: ListOf[int], more: Array) -> Array:
@@ -130,17 +138,23 @@ class ExperimentDesign:
         return self._mean_log_error(here + np.swapaxes(self.information[:, more], 0, 1))
 
     def worth(self) -> float:
-        """Return the seconds after which WORTH_INTERVAL_S more reduce the errors by less than MIN_WORTH, on average."""
-        played, before = 0.0, float(self._mean_log_error(np.zeros_like(self.information[:, 0])))
+        """Return the seconds after which WORTH_INTERVAL_S more reduce the errors by less than
+        MIN_WORTH, on average.
+        """
+        played = 0.0
+        before = float(self._mean_log_error(np.zeros_like(self.information[:, 0])))
         for i, now in self.greedy():
             if (before - now) * WORTH_INTERVAL_S / self.seconds[i] < MIN_WORTH:
                 return played
-            played, before = played + float(self.seconds[i]), now
+            played = played + float(self.seconds[i])
+            before = now
         return played
 
 
 def candidate_motions(library: Library, progress: Progress = no_progress) -> list[Motion]:
-    """Return motions within a robot's limits: single joints, tours, and all joints at once with a signal each."""
+    """Return motions within a robot's limits: single joints, tours, and all joints at once with a
+    signal each.
+    """
     robot = library.robot
     single = robot.operated if len(robot.operated) <= MAX_SINGLE_JOINTS else ()
     names = [
@@ -158,18 +172,23 @@ def candidate_motions(library: Library, progress: Progress = no_progress) -> lis
             continue
     if not motions:
         raise UsageError(
-            f"{robot.name}: no motion fits its limits; lighten --payloads, or look at collision.toml"
+            f"{robot.name}: no motion fits its limits; lighten --payloads, or look at "
+            "collision.toml"
         )
     return motions
 
 
 def _at_once(library: Library, variant: int) -> Motion:
-    """Return a motion in which every operated joint plays a signal of its own around the ready posture."""
-    robot, rng = library.robot, np.random.default_rng([library.seed, 5, variant])
+    """Return a motion in which every operated joint plays a signal of its own around the ready
+    posture.
+    """
+    robot = library.robot
+    rng = np.random.default_rng([library.seed, 5, variant])
     kinds = list(SIGNALS.values())
     columns = {}
     for joint in robot.operated:
-        i, there = robot.index([joint])[0], library.excitation_range(joint)
+        i = robot.index([joint])[0]
+        there = library.excitation_range(joint)
         ready = library.kit.ready[i]
         low, high = sorted(ready + RANGE_SHARE * (end - ready) for end in (there.low, there.high))
         columns[i] = kinds[rng.integers(len(kinds))](low, high, rng, GRID)
@@ -200,12 +219,16 @@ def simulated_recordings(
 def undetermined_gains(
     uncertainty: ParameterUncertainty, design: ExperimentDesign
 ) -> dict[str, str]:
-    """Return joint → advice for joints whose kp all recordings of the design together do not determine."""
-    kp, after = uncertainty.fields.index("kp"), design.after(range(len(design.seconds)))
+    """Return joint → advice for joints whose kp all recordings of the design together do not
+    determine.
+    """
+    kp = uncertainty.fields.index("kp")
+    after = design.after(range(len(design.seconds)))
     errors = dict(zip(uncertainty.joints, np.sqrt(after[:, kp, kp]).tolist(), strict=True))
     return {
-        joint: f"nothing loads it, so no motion separates kp from friction and damping (± {error:.0%} after all of "
-        "them); take its numbers as a set, or load it: weigh a payload, --payloads 0 KG"
+        joint: "nothing loads it, so no motion separates kp from friction and damping (± "
+        f"{error:.0%} after all of them); take its numbers as a set, or load it: weigh a payload, "
+        "--payloads 0 KG"
         for joint, error in errors.items()
         if error > MAX_KP_ERROR
     }

@@ -1,7 +1,8 @@
-"""Backlash beside friction: whether a search for it is worth its time, and how probable it is, joint by joint.
+"""Backlash beside friction: whether a search for it is worth its time, and how probable it is,
+joint by joint.
 
-A constant load presses motor and link together and hides the gap. Where the load changes its sign, the link crosses the
-gap by itself. No friction does that, so the two can be told apart.
+A constant load presses motor and link together and hides the gap. Where the load changes its sign,
+the link crosses the gap by itself. No friction does that, so the two can be told apart.
 """
 
 from __future__ import annotations
@@ -24,7 +25,9 @@ MIN_WIDTH_RAD = 5e-4  # of a gap that is reported though it is not probable
 
 
 def worth_a_search(fit: JointFit, values: Values) -> bool:
-    """Return whether a gap of SCREENED_WIDTHS_RAD makes some joint's rollouts better, at values (n,) otherwise."""
+    """Return whether a gap of SCREENED_WIDTHS_RAD makes some joint's rollouts better, at values
+    (n,) otherwise.
+    """
     widths = np.array([0.0, *SCREENED_WIDTHS_RAD])
     candidates = {f: np.repeat(v[None], len(widths), axis=0) for f, v in values.items()}
     candidates["backlash"] = np.repeat(widths[:, None], fit.bounds.n, axis=1)
@@ -33,15 +36,18 @@ def worth_a_search(fit: JointFit, values: Values) -> bool:
 
 
 def probability(fit: JointFit, without: Values, values: Values) -> Array:
-    """Return the probability of backlash by the Bayesian information criterion, (n,); both odds are equal before.
+    """Return the probability of backlash by the Bayesian information criterion, (n,); both odds
+    are equal before.
 
     Parts of the recordings as long as the errors' correlation time count as independent.
 
     Args:
         without, values: Best values (n,) without and with backlash, of the same search.
     """
-    square = [np.square(fit.rollouts.flat_errors({f: v[None] for f, v in one.items()})[0]).sum(axis=1)
-              for one in (without, values)]  # fmt: skip
+    square = [
+        np.square(fit.rollouts.flat_errors({f: v[None] for f, v in one.items()})[0]).sum(axis=1)
+        for one in (without, values)
+    ]
     seconds = fit.rollouts.rows * fit.rollouts.dt * fit.rollouts.thin
     clusters = np.maximum(seconds / fit.prior.correlation_time, 1.0)
     gain = np.log(np.maximum(square[0], 1e-12) / np.maximum(square[1], 1e-12))
@@ -49,7 +55,9 @@ def probability(fit: JointFit, without: Values, values: Values) -> Array:
 
 
 def only_probable(without: ListOf[Values], values: ListOf[Values], chance: Array) -> list[Values]:
-    """Return values (n,) with backlash at the joints where it is probable, and the others' without."""
+    """Return values (n,) with backlash at the joints where it is probable, and the others'
+    without.
+    """
     pairs = zip(without, values, strict=True)
     return [
         {f: np.where(chance >= MIN_PROBABILITY, v, a.get(f, 0.0)) for f, v in b.items()}
@@ -74,11 +82,12 @@ def findings(
             sentences.append(f"{joint}: backlash {size} mrad (probability {chance_of_it})")
         elif p >= MIN_PROBABILITY:
             sentences.append(
-                f"{joint}: validation motions do not show a gap of {1e3 * gap:.1f} mrad that fits suggest"
+                f"{joint}: validation motions do not show a gap of {1e3 * gap:.1f} mrad that fits "
+                "suggest"
             )
         elif gap > MIN_WIDTH_RAD:
             sentences.append(
-                f"{joint}: backlash of {1e3 * gap:.1f} mrad is not distinguishable from static friction (probability "
-                f"{p:.2f}); play the creep motions of gaponet excite to tell"
+                f"{joint}: backlash of {1e3 * gap:.1f} mrad is not distinguishable from static "
+                f"friction (probability {p:.2f}); play the creep motions of gaponet excite to tell"
             )
     return tuple(sentences)

@@ -16,12 +16,15 @@ from gaponet.sysid.search_progress import (
 from gaponet.sysid.steps.step import Fits, FitState
 
 MAX_LOSS_OF_FIRST_ITERATIONS = 0.05  # share of the error; see `robot_candidates`
-# In the judge's order: the given robot, then the default, which others replace only where they are clearly better.
+# In the judge's order: the given robot, then the default, which others replace only where they are
+# clearly better.
 CANDIDATES = ("given", "limbs", "joints", "whole", "delay and offset")
 
 
 def fit_classic(fits: Fits, *, joints_alone: bool) -> FitState:
-    """Fit the classic fields, joints by themselves and then together, and choose among the candidates."""
+    """Fit the classic fields, joints by themselves and then together, and choose among the
+    candidates.
+    """
     each = [_joint_candidates(joints, fits.progress) for joints in fits.joints]
     robots = [joints.robot_fit(fits.nthread) for joints in fits.joints]
     candidates = {name: [one[name] for one in each] for name in each[0]}
@@ -42,7 +45,9 @@ def fit_classic(fits: Fits, *, joints_alone: bool) -> FitState:
 
 
 def _joint_candidates(joints: JointFit, progress: SearchProgress) -> dict[str, Values]:
-    """Fit each joint by itself; return the given values, a delay and an offset, and the classic fields."""
+    """Fit each joint by itself; return the given values, a delay and an offset, and the classic
+    fields.
+    """
     bounds = joints.bounds
     residual = joints.prior.residual
     given = {f: bounds.first[f] for f in bounds.start}  # without terms that the robot does not have
@@ -60,11 +65,12 @@ def _joint_candidates(joints: JointFit, progress: SearchProgress) -> dict[str, V
 def robot_candidates(
     fits: Fits, robots: list[RobotFit], alone: list[Values]
 ) -> dict[str, list[Values]]:
-    """Fit all joints together, from their own fits and from the robot's file; return nothing if that does not help.
+    """Fit all joints together, from their own fits and from the robot's file; return nothing if
+    that does not help.
 
-    The first iterations decide by the motions that were not fitted, if there are enough of them. On real robots they
-    lose either up to 1 % of the error, which later iterations and the chains win back (G1, SO-101 on another day), or
-    a third of it, which nothing wins back (SO-101).
+    The first iterations decide by the motions that were not fitted, if there are enough of them. On
+    real robots they lose either up to 1 % of the error, which later iterations and the chains win
+    back (G1, SO-101 on another day), or a third of it, which nothing wins back (SO-101).
     """
     judge = fits.judge
     if not _has_time_for_iterations(fits, robots, alone):
@@ -97,7 +103,8 @@ def robot_candidates(
 def _has_time_for_iterations(fits: Fits, robots: list[RobotFit], alone: list[Values]) -> bool:
     """Return whether the time is enough for the first iterations of all joints together.
 
-    What they take follows from the time that the judge's motions take, which are simulated once in any case.
+    What they take follows from the time that the judge's motions take, which are simulated once in
+    any case.
     """
     if not fits.progress.is_limited:
         return True

@@ -1,7 +1,8 @@
 """Fit of a robot's links together with its servos, in the simulator of the whole robot.
 
-Only directions of the links' coordinates that recordings determine better than the prior are fitted; what is at right
-angles to them stays. Without payloads, nothing shows whether all masses and all gains are larger alike, and both stay.
+Only directions of the links' coordinates that recordings determine better than the prior are
+fitted; what is at right angles to them stays. Without payloads, nothing shows whether all masses
+and all gains are larger alike, and both stay.
 """
 
 from __future__ import annotations
@@ -23,35 +24,39 @@ from gaponet.sysid.least_squares import DIFFERENCE_STEP, Progress
 from gaponet.sysid.problem import MIN_COST_DECREASE, PRIOR_LOG_STD, PRIORS, RobotFit, cluster_sums
 
 ROWS = 400  # of recordings, whose torques choose directions
-MIN_INFORMATION, MAX_DIRECTIONS = (
-    1.0,
-    12,
-)  # of a direction over the prior's, and how many are fitted
+# of a direction over the prior's, and how many are fitted
+MIN_INFORMATION = 1.0
+MAX_DIRECTIONS = 12
 MIN_KP_LOG_STD = 0.05  # of a kp from recorded torque, whose scale is a motor constant
 ITERATIONS = (1, 2)  # with the first residual, and with what that leaves
 FIRST_RESIDUAL_SHARE = 0.25  # of the servos' residual, which wrong links may have caused
-MAX_SERVO_NUMBERS, FEW_FIELDS = (
-    36,
-    ("kp", "armature"),
-)  # fitted with the links; of robots with more, these fields
-MIN_CHANGE, MAX_CHANGE = (
-    0.1,
-    6.0,
-)  # of a link's coordinates, in standard deviations of the prior; less is none
+# fitted with the links; of robots with more, these fields
+MAX_SERVO_NUMBERS = 36
+FEW_FIELDS = ("kp", "armature")
+# of a link's coordinates, in standard deviations of the prior; less is none
+MIN_CHANGE = 0.1
+MAX_CHANGE = 6.0
 ENCODER_ZERO_STD_RAD = 0.006  # a third of a degree, as a joint's zero at its stop is set by hand
 MIN_SIGNIFICANCE = 2.0  # standard errors, of the change along some direction; else all links stay
 
 
 class LinkFit:
-    """Fit of links and servos; `directions` are orthonormal columns (L · COORDINATES, K) that recordings determine."""
+    """Fit of links and servos; `directions` are orthonormal columns (L · COORDINATES, K) that
+    recordings determine.
+    """
 
     def __init__(
         self, whole: RobotFit, values: Values, torque_kp: dict[str, tuple[float, float]]
     ) -> None:
-        """Take a fit of servos, its values (n,), and joint → kp from torque and its standard error."""
+        """Take a fit of servos, its values (n,), and joint → kp from torque and its standard
+        error.
+        """
         fields = CLASSIC if whole.bounds.n * len(CLASSIC) <= MAX_SERVO_NUMBERS else FEW_FIELDS
-        self.whole, self._servos = whole, Axes(whole.bounds, fields, values)
-        self._first, self.axes, self._n = values, LinkAxes(whole.robot), whole.bounds.n
+        self.whole = whole
+        self._servos = Axes(whole.bounds, fields, values)
+        self._first = values
+        self.axes = LinkAxes(whole.robot)
+        self._n = whole.bounds.n
         self._prior = copy.copy(whole.prior)
         self._prior.log_std = dict(PRIOR_LOG_STD)  # a stated kp would shift all masses
         kp, error = np.array([torque_kp.get(j, (np.nan, np.nan)) for j in whole.robot.operated]).T
@@ -63,25 +68,29 @@ class LinkFit:
         self.directions, self._rest = self._determined() if self.axes.names else (none, none)
 
     def _weigh(self) -> None:
-        """Weigh each joint's errors by its residual; the prior weighs as much as errors of the mean residual."""
+        """Weigh each joint's errors by its residual; the prior weighs as much as errors of the
+        mean residual.
+        """
         std = self._prior.error_std()
         self._level = float(np.sqrt(np.mean(std**2)))
         self._weight = np.clip(self._level / std, 0.3, 3.0)
 
     def _determined(self) -> tuple[Array, Array]:
-        """Return directions with more information than the prior's, and the covariance along others, (10 L, 10 L).
+        """Return directions with more information than the prior's, and the covariance along
+        others, (10 L, 10 L).
 
-        They come from inverse dynamics. A change of torque moves a joint by itself over kp. What gains, offsets,
-        damping, friction and armature of the joint explain as well does not count, so without payloads or recorded
-        torque all masses do not change together.
+        They come from inverse dynamics. A change of torque moves a joint by itself over kp. What
+        gains, offsets, damping, friction and armature of the joint explain as well does not count,
+        so without payloads or recorded torque all masses do not change together.
         """
-        robot, parts, op = (
-            replace(self.whole.robot, table=None),
-            self.whole.rollouts.parts,
-            self.whole.rollouts.op,
-        )
-        every, size = max(1, sum(map(len, parts)) // ROWS), self.axes.scale.size
-        motions, torques, slopes = list[Array](), list[Array](), list[Array]()
+        robot = replace(self.whole.robot, table=None)
+        parts = self.whole.rollouts.parts
+        op = self.whole.rollouts.op
+        every = max(1, sum(map(len, parts)) // ROWS)
+        size = self.axes.scale.size
+        motions = list[Array]()
+        torques = list[Array]()
+        slopes = list[Array]()
         for payload in dict.fromkeys((s.meta.payload_mass, s.meta.payload_side) for s in parts):
             rows = []
             for s in parts:
@@ -92,16 +101,24 @@ class LinkFit:
             motions.append(np.concatenate(rows, axis=1))
             model = build_model(robot, *payload)
             torques.append(inverse_dynamics(model, *motions[-1])[:, op])
-            slopes.append(np.array([
-                inverse_dynamics(with_links(model, replace(robot, links=self.axes.links(x))), *motions[-1])[:, op]
-                for x in DIFFERENCE_STEP * np.eye(size)
-            ]) - torques[-1])  # fmt: skip
-        torque, (_, v, a) = np.concatenate(torques), np.concatenate(motions, axis=1)
+            slopes.append(
+                np.array(
+                    [
+                        inverse_dynamics(
+                            with_links(model, replace(robot, links=self.axes.links(x))),
+                            *motions[-1],
+                        )[:, op]
+                        for x in DIFFERENCE_STEP * np.eye(size)
+                    ]
+                )
+                - torques[-1]
+            )
+        torque = np.concatenate(torques)
+        _, v, a = np.concatenate(motions, axis=1)
         kp = self._first["kp"]
         moved = np.concatenate(slopes, axis=1) / DIFFERENCE_STEP / kp  # (10 L, rows, n) rad
-        count = (
-            sum(s.duration for s in parts) / self._prior.correlation_time
-        )  # independent measurements, (n,)
+        # independent measurements, (n,)
+        count = sum(s.duration for s in parts) / self._prior.correlation_time
         information = np.zeros((size, size))
         for i, j in enumerate(op):
             servo = np.stack(
@@ -115,7 +132,8 @@ class LinkFit:
                 axis=1,
             )
             weight = np.sqrt(count[i] / len(v)) / self._prior.residual[i]
-            d, s = weight * moved[:, :, i].T, weight * servo
+            d = weight * moved[:, :, i].T
+            s = weight * servo
             stated = np.diag([np.nan_to_num(self._kp_std[i] ** -2), 0, 0, 0, 0])
             information += d.T @ d - d.T @ s @ np.linalg.pinv(s.T @ s + stated) @ s.T @ d
         strength, vectors = np.linalg.eigh(information)
@@ -129,7 +147,9 @@ class LinkFit:
         return self._servos.values(servos.reshape(len(x), self._n, -1)), list(z @ self.directions.T)
 
     def errors(self, x: Array, **other: Array) -> Array:
-        """Return errors of candidates (k, 1, P), (k, 1, n · (rows + PRIORS) + K) in ERROR_SCALE_RAD."""
+        """Return errors of candidates (k, 1, P), (k, 1, n · (rows + PRIORS) + K) in
+        ERROR_SCALE_RAD.
+        """
         values, links = self._unpacked(x)
         errors = (
             self.whole.rollouts.flat_errors(values | other, [self.axes.links(c) for c in links])
@@ -148,11 +168,10 @@ class LinkFit:
             return LinkResult(
                 self.axes, np.zeros(self.axes.scale.size), np.eye(self.axes.scale.size), self._first
             )
-        x, ends = first[None, None], np.full(self.directions.shape[1], MAX_CHANGE)
-        low, high = (
-            np.r_[self._servos.low.ravel(), -ends][None],
-            np.r_[self._servos.high.ravel(), ends][None],
-        )
+        x = first[None, None]
+        ends = np.full(self.directions.shape[1], MAX_CHANGE)
+        low = np.r_[self._servos.low.ravel(), -ends][None]
+        high = np.r_[self._servos.high.ravel(), ends][None]
         for i, count in enumerate(ITERATIONS):
             if i:
                 values, coordinates = self._unpacked(x[0][None])
@@ -166,10 +185,8 @@ class LinkFit:
                 x, low, high, self.errors, count, report, MIN_COST_DECREASE
             )
         values, coordinates = self._unpacked(x[0][None])
-        own, (by_noise, by_zeros) = (
-            coordinates[0].reshape(-1, COORDINATES),
-            self._covariances(x[0, 0]),
-        )
+        own = coordinates[0].reshape(-1, COORDINATES)
+        by_noise, by_zeros = self._covariances(x[0, 0])
         z = coordinates[0] @ self.directions
         small = np.abs(own).max(axis=1, keepdims=True) < MIN_CHANGE
         none = (np.abs(z) <= MIN_SIGNIFICANCE * np.sqrt(np.diag(by_noise))).all()
@@ -185,11 +202,15 @@ class LinkFit:
         return here[0, 0], jac[0, 0]
 
     def _covariances(self, x: Array) -> tuple[Array, Array]:
-        """Return covariances along the directions at x (P,), (K, K): by noise and prior, and by the encoders' zeros.
+        """Return covariances along the directions at x (P,), (K, K): by noise and prior, and by
+        the encoders' zeros.
 
-        A wrong zero turns gravity as another centre of mass does, and no recorded position shows which it is.
+        A wrong zero turns gravity as another centre of mass does, and no recorded position shows
+        which it is.
         """
-        (here, jac), count, n = self._slopes(x), self.directions.shape[1], self._n
+        here, jac = self._slopes(x)
+        count = self.directions.shape[1]
+        n = self._n
         zeros = self.whole.robot.zero[self.whole.rollouts.op] + ENCODER_ZERO_STD_RAD * np.eye(n)
         by_zero = self.errors(np.repeat(x[None, None], n, axis=0), zero=zeros)[:, 0] - here
         weighted = jac / np.sqrt(1 + here**2)[:, None]
@@ -209,8 +230,11 @@ class LinkFit:
         return (inverse @ scatter @ inverse)[-count:, -count:], shifted @ shifted.T
 
     def servo_slopes(self, result: LinkResult) -> dict[str, Array]:
-        """Return how the servos follow the links: field → its change on its axis for one of x, (n, L · COORDINATES)."""
-        whole, count = copy.copy(self), self._servos.unit.size
+        """Return how the servos follow the links: field → its change on its axis for one of x, (n,
+        L · COORDINATES).
+        """
+        whole = copy.copy(self)
+        count = self._servos.unit.size
         whole.directions = np.eye(len(result.x))
         here, jac = whole._slopes(np.r_[self._servos.normalize(result.values).ravel(), result.x])
         normal = jac.T @ (jac / np.sqrt(1 + here**2)[:, None])

@@ -22,8 +22,8 @@ def with_torque(
 ) -> Identified:
     """Return the fit from torque if motions that were not fitted accept it, else `fitted`.
 
-    An accepted fit is repeated with all recordings. Without cross-validation it is kept only if the validation motions
-    are followed no worse. `given` is the robot that both fits start from.
+    An accepted fit is repeated with all recordings. Without cross-validation it is kept only if the
+    validation motions are followed no worse. `given` is the robot that both fits start from.
     """
     torques = [TorqueFit(train, given) for train, _ in splits]
     if not all(t.known for t in torques):
@@ -65,7 +65,9 @@ def with_torque(
 def _best_options(
     torques: ListOf[TorqueFit], splits: ListOf[Split]
 ) -> tuple[TorqueOptions, tuple[HeldOut, ...]]:
-    """Return the options with the least error on motions that were not fitted, and the robot of each fold."""
+    """Return the options with the least error on motions that were not fitted, and the robot of
+    each fold.
+    """
     tried = {}
     for options in OPTIONS:
         if options.place and not all(t.several_payloads for t in torques):

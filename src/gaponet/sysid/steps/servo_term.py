@@ -13,7 +13,9 @@ from gaponet.sysid.steps.step import Fits, FitState
 
 
 class ServoTerm:
-    """Fit of a term with all that the base has: each joint alone, then all together where that helps."""
+    """Fit of a term with all that the base has: each joint alone, then all together where that
+    helps.
+    """
 
     def __init__(self, term: Term, fits: Fits) -> None:
         self.name = str(term)
@@ -33,7 +35,9 @@ class ServoTerm:
         return [self._fit_joints(*one) for one in zip(self._fits.joints, state.base, strict=True)]
 
     def _fitted(self, state: FitState, alone: list[Values]) -> list[Values]:
-        """Return values from fits of single joints, polished in the whole robot's simulator where that helps."""
+        """Return values from fits of single joints, polished in the whole robot's simulator where
+        that helps.
+        """
         values = alone
         single = any(SERVO_FIELDS[f].single_joint for f in TERMS[self._term])
         if state.together and not single and not self._fits.progress.search_is_over():
@@ -48,7 +52,10 @@ class ServoTerm:
         ]
 
     def _with_values(self, state: FitState, values: list[Values]) -> FitState:
-        """Return the state with values. A term that is zero in every joint only gave the others more iterations."""
+        """Return the state with values.
+
+        A term that is zero in every joint only gave the others more iterations.
+        """
         fields = TERMS[self._term]
         if not any(v[fields[0]].any() for v in values):
             values = [{f: x for f, x in v.items() if f not in fields} for v in values]
@@ -73,7 +80,9 @@ class ServoTerm:
 
 
 class Backlash(ServoTerm):
-    """Backlash that the robot lacks, where a gap makes rollouts better at otherwise equal values."""
+    """Backlash that the robot lacks, where a gap makes rollouts better at otherwise equal
+    values.
+    """
 
     def __init__(self, fits: Fits) -> None:
         super().__init__("backlash", fits)

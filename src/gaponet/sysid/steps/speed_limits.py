@@ -15,7 +15,9 @@ SpeedLimits = dict[str, dict[str, float]]  # joint → target_speed, rad/s
 
 
 def seen_speed_limits(sequences: ListOf[Sequence], robot: RobotSpec) -> SpeedLimits:
-    """Return the speed limits that recordings show; none of a robot that has some, since these are taken as true."""
+    """Return the speed limits that recordings show; none of a robot that has some, since these are
+    taken as true.
+    """
     if robot.target_speed.any():
         return {}
     speeds = dict(zip(robot.operated, target_speeds(sequences, robot), strict=True))
@@ -23,7 +25,9 @@ def seen_speed_limits(sequences: ListOf[Sequence], robot: RobotSpec) -> SpeedLim
 
 
 def better_of(plain: Identified, limited: Identified, limits: SpeedLimits) -> Identified:
-    """Return the fit with speed limits if motions that were not fitted accept it, else the one without."""
+    """Return the fit with speed limits if motions that were not fitted accept it, else the one
+    without.
+    """
     comparison = Comparison(
         "ramp", held_out_errors(plain.held_out), held_out_errors(limited.held_out)
     )
@@ -31,8 +35,9 @@ def better_of(plain: Identified, limited: Identified, limits: SpeedLimits) -> Id
         return replace(plain, comparisons=(*plain.comparisons, comparison))
     listed = ", ".join(f"{joint} {v['target_speed']:.3g}" for joint, v in limits.items())
     warning = (
-        f"servos limit the speed of their targets, rad/s: {listed}. That is a setting of theirs (profile velocity, "
-        "goal speed). The simulator has it, so record and run with the same one; engines that load an export do not"
+        f"servos limit the speed of their targets, rad/s: {listed}. That is a setting of theirs "
+        "(profile velocity, goal speed). The simulator has it, so record and run with the same "
+        "one; engines that load an export do not"
     )
     return replace(
         limited,

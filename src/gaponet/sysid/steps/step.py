@@ -44,12 +44,14 @@ class FitState:
     Attributes:
         chosen: Name of the classic candidate that the judge chose.
         values: Its values with the steps that were accepted, (n,) each.
-        base: Values from which the next step is fitted; those of the best fit where the given robot was chosen.
+        base: Values from which the next step is fitted; those of the best fit where the given robot
+            was chosen.
         robots: Fits in the simulator of the whole robot; their prior is that of the joints' fits.
         together: Whether a fit of all joints together helps.
         links: Links, if they were fitted and accepted; nothing else.
         link_fit: Fit of the links to the last set, and its result.
-        gaps: Widths of backlash, rad, and their probabilities, (n,) each, if it was fitted; accepted or not.
+        gaps: Widths of backlash, rad, and their probabilities, (n,) each, if it was fitted;
+            accepted or not.
     """
 
     chosen: str
@@ -62,7 +64,9 @@ class FitState:
     gaps: tuple[Array, Array] | None = None
 
     def after(self, proposed: FitState, *, accepted: bool) -> FitState:
-        """Return the proposed state if it is accepted, else this one; what was seen of backlash stays known."""
+        """Return the proposed state if it is accepted, else this one; what was seen of backlash
+        stays known.
+        """
         return proposed if accepted else replace(self, gaps=proposed.gaps)
 
 
