@@ -67,8 +67,9 @@ def record_motions(
 
     Args:
         motions: Names or files.
-        request: Robot, driver and options. `options.payload_mass` and, of a real robot, `options.unit_id` are
-            stated; the seed of a virtual robot's noise rises by one with each recording.
+        request: Robot, driver and options. `options.payload_mass` and, of a real robot,
+            `options.unit_id` are stated; the seed of a virtual robot's noise rises by one with each
+            recording.
         out: Dataset folder; created or appended to. Full recordings go to OUT/recordings.
         repetitions: Number of times that each motion is played.
         report: Shows plan, notes and phases; default on standard error.
@@ -146,8 +147,8 @@ def _add(
     stem = recording.save(folder / RECORDINGS, stem).stem
     if recording.fault:
         raise UsageError(
-            f"'{played.name}' was stopped ({recording.fault.text}); it was not added to {folder}, its recording is "
-            f"{folder / RECORDINGS / stem}.*; {added} motions were added before it"
+            f"'{played.name}' was stopped ({recording.fault.text}); it was not added to {folder}, "
+            f"its recording is {folder / RECORDINGS / stem}.*; {added} motions were added before it"
         )
     meta = SequenceMeta(
         run.robot.name,

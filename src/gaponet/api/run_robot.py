@@ -52,7 +52,9 @@ DEFAULT_ROBOT = "h1_2"
 
 
 def known_drivers() -> tuple[str, ...]:
-    """Return the names of all drivers: virtual, those of the package and of installed extensions."""
+    """Return the names of all drivers: virtual, those of the package and of installed
+    extensions.
+    """
     return (VIRTUAL, *driver_names())
 
 

@@ -448,7 +448,9 @@ class StartRecord:
 
 
 def hash_logs(logs: Path, out: Path) -> dict[str, str]:
-    """Return file → SHA-256 of all logs, and of the logs.toml in `out`, which may lie among them."""
+    """Return file → SHA-256 of all logs, and of the logs.toml in `out`, which may lie among
+    them.
+    """
     root = logs if logs.is_dir() else logs.parent
     paths = logs.rglob("*") if logs.is_dir() else [logs]
     files = {}

@@ -122,8 +122,8 @@ def _show_run(screen: Out, made: AdaptResult, dataset: str) -> None:
     """Print what the adaptation of a run gave, and the next command."""
     _show_servos(screen, made)
     screen.say(
-        f"window RMS {mrad(made.before)} → {mrad(made.after)} mrad of the fitted windows; stored in "
-        f"{made.folder}"
+        f"window RMS {mrad(made.before)} → {mrad(made.after)} mrad of the fitted windows; stored "
+        f"in {made.folder}"
     )
     screen.next(f"gaponet eval {made.folder} {dataset}")
 

@@ -62,14 +62,14 @@ class ExportArgs:
     """What is exported and where to; each target uses some of the options."""
 
     to: RobotTarget | NetworkTarget | Literal["randomization", "lerobot"] = "onnx"
-    """Simulator of a robot or a run: mjcf (plain MuJoCo), envhub (an environment of LeRobot's EnvHub
-    in MuJoCo), mjlab, isaaclab and newton, each with a check.py that needs no gaponet; urdf
-    (damping, friction, effort limits); json (the numbers).
-    Network of a run: onnx (model.onnx and card.json), torch (delta.pt2 with simulator and action
-    term for mjlab and Isaac Lab), actuator-net (one network per joint; its inputs are past target −
-    position and speed, its output is the torque). randomization: sets of a robot's parameters
-    ("units") for training. lerobot: add the correction to the LeRobot policy in --into; LeRobot
-    finds it through the plug-in lerobot_robot_gaponet."""
+    """Simulator of a robot or a run: mjcf (plain MuJoCo), envhub (an environment of LeRobot's
+    EnvHub in MuJoCo), mjlab, isaaclab and newton, each with a check.py that needs no gaponet; urdf
+    (damping, friction, effort limits); json (the numbers). Network of a run: onnx (model.onnx and
+    card.json), torch (delta.pt2 with simulator and action term for mjlab and Isaac Lab),
+    actuator-net (one network per joint; its inputs are past target − position and speed, its output
+    is the torque). randomization: sets of a robot's parameters ("units") for training. lerobot: add
+    the correction to the LeRobot policy in --into; LeRobot finds it through the plug-in
+    lerobot_robot_gaponet."""
     out: Path | None = None
     """Folder; default one with that name in the robot or run."""
     data: str | None = None
@@ -77,8 +77,9 @@ class ExportArgs:
     default the one that the robot was identified from, and without any the robot's own simulated
     motions."""
     into: Path | None = None
-    """For mjcf, envhub and urdf: a file of your own; an edited copy is written (but for urdf, default
-    the robot's). For lerobot: folder of a policy (pretrained_model) that holds policy_postprocessor.json."""
+    """For mjcf, envhub and urdf: a file of your own; an edited copy is written (but for urdf,
+    default the robot's). For lerobot: folder of a policy (pretrained_model) that holds
+    policy_postprocessor.json."""
     prefix: str = ""
     """Prefix of joint names in that file."""
     payload_mass: float = 0.0

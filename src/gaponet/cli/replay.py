@@ -63,8 +63,8 @@ def replay(
     _show_joints(screen, made)
     if made.differ:
         screen.say(
-            f"The robot would not do what the simulator did: {', '.join(made.differ)}. Train in the "
-            f"identified robot (gaponet export {robot} --to …), or compensate on the robot "
+            f"The robot would not do what the simulator did: {', '.join(made.differ)}. Train in "
+            f"the identified robot (gaponet export {robot} --to …), or compensate on the robot "
             "(gaponet run --compensate)"
         )
     else:

@@ -527,18 +527,12 @@ def _spec(table: RobotTable, mjcf: Path, folder: Path) -> RobotSpec:
 def _nominal(table: RobotTable, mjcf: Path, folder: Path) -> RobotSpec:
     """Return the robot of a robot.toml without its identified values."""
     joints = table.joint
-    aliases = {}
+    aliases: dict[str, str] = {}
     followers = {}
-    servos: list[ServoType | None] = []
     for joint in joints:
-        for alias in joint.aliases:
-            aliases[alias] = joint.name
+        aliases.update(dict.fromkeys(joint.aliases, joint.name))
         if joint.follows:
             followers[joint.name] = Follower(joint.follows, joint.ratio, joint.at_zero)
-        servo = None
-        if joint.servo:
-            servo = servo_type(joint.servo, f"joint '{joint.name}'", table.servo)
-        servos.append(servo)
     robot = RobotSpec(
         name=table.name,
         description=table.description or table.name,
@@ -556,13 +550,24 @@ def _nominal(table: RobotTable, mjcf: Path, folder: Path) -> RobotSpec:
         payload_mounts=table.payload_mount,
         dt=table.dt,
         timestep=table.timestep,
-        servos=tuple(servos),
+        servos=_servos(table),
         tips=table.tip,
         table=table.table,
         contacts=table.contacts,
         carries_payload=table.carries_payload,
     )
     return robot.with_gain_scale(table.gain_scale)
+
+
+def _servos(table: RobotTable) -> tuple[ServoType | None, ...]:
+    """Return the servo type of each joint; None where robot.toml names none."""
+    servos: list[ServoType | None] = []
+    for joint in table.joint:
+        servo = None
+        if joint.servo:
+            servo = servo_type(joint.servo, f"joint '{joint.name}'", table.servo)
+        servos.append(servo)
+    return tuple(servos)
 
 
 def _require_known_names(table: RobotTable) -> None:
