@@ -27,6 +27,7 @@ from gaponet.export.helper_file import (
 from gaponet.export.mjcf_edit import MUJOCO_HAS_RAMPS, edit_mjcf
 from gaponet.export.newton_config import newton_config
 from gaponet.export.plain_servos import (
+    check_error,
     check_motions,
     comparable,
     fit_plain_servos,
@@ -178,7 +179,7 @@ class _RobotExport:
         config = isaaclab_config.robot_config(name, servos, self.step, form.lines())
         write_text(self.out / CONFIG, config)
         self.facts["native"] = servos
-        self.facts["error_mrad"]["native"] = 1e3 * rollout_error(self.checked, form.robot)
+        self.facts["error_mrad"]["native"] = 1e3 * check_error(self.checked, form.robot)
         readme = isaaclab_config.readme(name, form, self.facts["error_mrad"])
         write_text(self.out / "README.md", readme)
         *_, last = form.losses.values()
@@ -237,8 +238,8 @@ def export_robot(
         facts["lerobot_units"] = envhub.lerobot_units(robot)
     played_there = replace(plain, table=None) if to in WITHOUT_TABLE else plain
     facts["error_mrad"] = {
-        "joints": 1e3 * rollout_error(checked, robot),
-        "plain": 1e3 * rollout_error(checked, played_there),
+        "joints": 1e3 * check_error(checked, robot),
+        "plain": 1e3 * check_error(checked, played_there),
     }
     errors = {"in gaponet": rollout_error(validation, robot)}
     if robot.has_servo_model:

@@ -30,7 +30,7 @@ from gaponet.robot.servo_fields import SERVO_FIELDS, SERVO_TERMS
 from gaponet.robot.spec import RobotSpec, load_robot
 from gaponet.sim.batch import Condition, speed_limited
 from gaponet.sim.model import model_hash
-from gaponet.sim.replay import replay
+from gaponet.sim.replay import replay, rollout_errors
 from gaponet.sysid.identify import identify
 from gaponet.sysid.options import IdentifyOptions
 
@@ -245,17 +245,19 @@ def comparable(
 
 
 def rollout_error(recordings: ListOf[Sequence], robot: RobotSpec) -> float:
-    """Return the mean |error| of operated joints over rollouts of recordings, rad."""
+    """Return the mean |error| over rollouts of recordings, of the operated joints that each holds, rad."""
+    return float(rollout_errors(recordings, robot).mean())
+
+
+def check_error(motions: ListOf[Sequence], robot: RobotSpec) -> float:
+    """Return the mean |error| of all operated joints over motions of check.npz, rad: what check.py
+    computes.
+    """
     op = robot.operated_index
-    rollouts = replay(recordings, robot, lock_idle=True)
-    return float(
-        np.mean(
-            [
-                mean_error(s.qpos[:, op], r.qpos[:, op])
-                for s, r in zip(recordings, rollouts, strict=True)
-            ]
-        )
-    )
+    errors = []
+    for motion, played in zip(motions, replay(motions, robot, lock_idle=True), strict=True):
+        errors.append(mean_error(motion.qpos[:, op], played.qpos[:, op]))
+    return float(np.mean(errors))
 
 
 def mean_error(recorded: np.ndarray, played: np.ndarray) -> float:
