@@ -80,6 +80,6 @@ def test_the_temperature_is_the_last_cause_of_the_joint_itself(tmp_path):
         {"turn": SERVO | {"frictionloss": 0.04} | TRUE}
     )
     steps = cause_steps(robot)
-    assert [name for name, _ in steps] == ["friction", "creep", "temperature"]
-    assert steps[1][1].friction_per_kelvin[0] == 0
+    assert [step.name for step in steps] == ["friction", "creep", "temperature"]
+    assert steps[1].simulator.friction_per_kelvin[0] == 0
     assert identified_joints(robot) == {"turn"}

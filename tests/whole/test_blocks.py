@@ -56,6 +56,7 @@ NOT_RUN = {
     'driver="so101"': "moves a real arm; tests/api/test_run_robot.py",
     'follow="nominal"': "runs beside a robot without end; tests/deploy/test_follow.py",
     "gp.RemoteRobot()": "needs a run that takes live targets; tests/hw/targets",
+    "from lerobot.envs.factory": "needs LeRobot and the Hub; tests/export/test_envhub.py",
 }
 # First words of console lines that are not gaponet's → why they are not run here.
 OTHERS = {
