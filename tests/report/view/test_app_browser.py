@@ -237,7 +237,7 @@ def test_from_real_logs_to_an_export_that_agrees(page, sage_so101, tmp_path):
         at.click("Read the logs")
         at.sees("4 recordings")
         at.tab("5 Identify")
-        at.sees("Check the recordings first")
+        at.sees("Check the recordings in step 3 first")
         assert first.value(f"{FIND.format(repr('button'), repr('Identify'))}[0].disabled")
         at.tab("3 Check")
         at.click("Check the recordings")

@@ -146,12 +146,12 @@ def test_where_escaping_is_forgotten_the_policy_of_the_page_holds(tmp_path, list
     page = App(tmp_path, 0)
     script = listener.script()
     try:
-        page.gui.add_html(
+        page.server.gui.add_html(
             f"{script}<img src='{listener.address}1'><iframe src='{listener.address}2'></iframe>"
         )
-        page.gui.add_markdown(f"{script} ![x]({listener.address}3)")
+        page.server.gui.add_markdown(f"{script} ![x]({listener.address}3)")
         style = f"<style>body {{background: url('{listener.address}4')}}</style>"
-        page.gui.add_html(f"{style}<form id=f action='{listener.address}5'></form>MARK")
+        page.server.gui.add_html(f"{style}<form id=f action='{listener.address}5'></form>MARK")
         with Browser() as browser:
             browser.ask("Page.navigate", url=page.address)
             wait(lambda: "MARK" in browser.value("document.body.innerText || ''"))
