@@ -14,8 +14,9 @@ from servos import Servos, on_port
 from wild_model import wild_model
 
 import gaponet as gp
+from gaponet.api.record import record_motions
 from gaponet.api.run_report import SilentReporter, describe_plan
-from gaponet.api.run_robot import Compensation
+from gaponet.api.run_robot import Compensation, RunRequest
 from gaponet.base.errors import RobotError, UsageError
 from gaponet.cli.main import main
 from gaponet.deploy.compensator import CompensatorConfig
@@ -127,6 +128,13 @@ def test_the_plan_is_shown_on_standard_error_unless_a_reporter_is_given(arm, cap
     assert "Plan: sway" in shown.err
     assert "at the end it goes back" in shown.err
     assert shown.out == ""
+
+
+def test_nothing_is_recorded_before_the_payload_is_stated(arm, tmp_path):
+    request = RunRequest(arm, options=FAST)
+    with pytest.raises(UsageError, match="--payload-mass"):
+        record_motions(("sway",), request, out=tmp_path / "set", report=SilentReporter())
+    assert not (tmp_path / "set").exists()
 
 
 def test_a_recording_is_written_where_out_says(arm, tmp_path):

@@ -39,6 +39,16 @@ def test_a_mistyped_command_is_told_its_neighbour(capsys):
     )
 
 
+def test_the_help_of_an_option_has_no_line_breaks_of_the_source(monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", "400")
+    with pytest.raises(SystemExit):
+        main(["identify", "--help"])
+    (line,) = [
+        line for line in capsys.readouterr().out.splitlines() if "servo model to try" in line
+    ]
+    assert "at equal gains and payload" in line
+
+
 def test_a_fault_that_a_virtual_robot_does_not_have_is_refused(capsys):
     assert main(["virtual", "serve", "--robot", "so101", "--fault", "stop"]) == 2
     assert "--fault stop: only h1_2 has faults" in capsys.readouterr().err

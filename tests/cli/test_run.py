@@ -99,7 +99,9 @@ def test_a_stopped_run_says_so_and_is_not_added(arm, motion, tmp_path, capsys):
     ]
     command += ["--robot", str(arm.mjcf.parent), *FAST, "--safety.temperature", "20"]
     assert main(command) == 2
-    assert "it was not added" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "it was not added" in said
+    assert "age of state" in said, "what the run measured is shown before the error"
     assert not (out / "dataset.json").exists()
     assert main([*command[:-2]]) == 0, "the next one makes it"
     assert len(Dataset(out)) == 1

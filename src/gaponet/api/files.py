@@ -90,7 +90,9 @@ def export_robot(
     )
     require_out(holder, out)
     if prefix and into is None:
-        raise UsageError(f"prefix '{prefix}' is of joints in a file of yours: give it with into")
+        raise UsageError(
+            f"--prefix {prefix}: is of joints in a file of yours; give that file with --into"
+        )
     spec = load_robot(simulator_folder(holder))
     source = None if into is None else files.Source(Path(into), prefix)
     recordings = read_recordings(simulator_folder(holder), data, spec)

@@ -61,7 +61,7 @@ def record_motions(
     repetitions: int = 1,
     report: RunReporter | None = None,
     consent: Consent | None = None,
-    on_recorded: Callable[[Recorded], None] = lambda made: None,
+    on_played: Callable[[RunResult, Recorded | None], None] = lambda run, made: None,
 ) -> RecordResult:
     """Play motions one after the other, without correction, and add each to a dataset.
 
@@ -74,15 +74,18 @@ def record_motions(
         repetitions: Number of times that each motion is played.
         report: Shows plan, notes and phases; default on standard error.
         consent: As of `run_robot`.
-        on_recorded: Called after each motion.
+        on_played: Called after each motion with its run, and with what was added; None if a fault
+            ended it.
 
     Raises:
-        UsageError: The unit is not named, or a run ended with a fault, which is not added.
+        UsageError: Unit or payload is not stated, or a run ended with a fault, which is not added.
         DatasetError: The dataset is another robot's; nothing has moved then.
     """
     folder = Path(out)
     if repetitions < 1:
         raise UsageError(f"--repetitions {repetitions}: give 1 or more, or nothing is recorded")
+    if request.options.payload_mass is None:
+        raise UsageError("say what each hand carries: --payload-mass KG, 0 when empty")
     options = replace(request.options, unit_id=_unit_id(request), out=folder / RECORDINGS)
     first = replace(request, motion=motions[0], options=options)
     known = require_robot_of_folder(folder, resolve_robot(first))  # before anything moves
@@ -92,9 +95,11 @@ def record_motions(
         for _ in range(repetitions):
             turn = replace(first, motion=motion, options=replace(options, seed=seed))
             run = execute(turn, report or StderrReporter(), consent)
+            if run.recording.fault:
+                on_played(run, None)
             known, entry, sequence = _add(turn, run, folder, known, len(recorded))
             made = Recorded(run=run, id=entry.id, rows=len(sequence), rate=sequence.rate)
-            on_recorded(made)
+            on_played(run, made)
             recorded.append(made)
             seed += 1
     return RecordResult(folder=folder, recorded=tuple(recorded))

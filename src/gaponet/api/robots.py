@@ -404,7 +404,7 @@ def _draw_parameters(robot: RobotSpec, uncertainty: ParameterUncertainty, file: 
 
     if file.suffix not in PICTURE_SUFFIXES:
         raise UsageError(f"--out {file}: a picture is a .png or an .svg")
-    figure = draw_uncertainty(uncertainty, f"{robot.name}: parameters and standard errors")
+    figure = draw_uncertainty(uncertainty, f"{robot.name}: parameters with 90 % intervals")
     with atomic_write(file) as temporary:
         figure.savefig(temporary, format=file.suffix[1:], dpi=200)
 

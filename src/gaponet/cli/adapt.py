@@ -46,9 +46,9 @@ def adapt(
 ) -> None:
     """Adapt an identified robot to another unit or day with short logs.
 
-    For a robot folder, a new robot folder is written: gaponet adapt ./my_robot LOGS --out
-    ./my_robot_today. For a run, the trained model stays unchanged, and gaponet eval then shows the
-    unit without and with its adaptation.
+    For a robot folder, a new robot folder is written:
+    gaponet adapt ./my_robot LOGS --out ./my_robot_today. For a run, the trained model stays
+    unchanged, and gaponet eval then shows the unit without and with its adaptation.
 
     Args:
         out: Robot folder to write; required for a robot folder.

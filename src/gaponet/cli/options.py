@@ -5,13 +5,16 @@ from __future__ import annotations
 import inspect
 import re
 from collections.abc import Callable
+from dataclasses import is_dataclass
 from pathlib import Path
-from typing import Annotated, Any, TypeVar, Union
+from typing import Annotated, Any, TypeVar, Union, get_type_hints
 
 import tyro
+from docstring_parser import parse_from_object
 
 Command = TypeVar("Command", bound=Callable[..., Any])
 
+ATTRIBUTES = "Attributes:"  # heading in a docstring, as docstring_parser reads it
 Folder = tyro.conf.Positional[Path]
 Logs = Annotated[Folder, tyro.conf.arg(metavar="LOGS")]
 Model = Annotated[Folder, tyro.conf.arg(metavar="MODEL")]
@@ -39,11 +42,32 @@ Json = Annotated[Flag, tyro.conf.arg(help="One JSON object on stdout.")]
 
 
 def join_lines(command: Callable[..., Any]) -> None:
-    """Join the lines of each argument in the docstring of a command: tyro would show the line
-    breaks.
+    """Join the lines of each option's explanation: tyro would show the line breaks.
+
+    It stands in the docstring of the command, or below the field of a dataclass that it takes.
     """
     command = inspect.unwrap(command)
     command.__doc__ = re.sub(r"\n {8,}", " ", inspect.getdoc(command) or "")
+    for kind in get_type_hints(command).values():
+        _join_lines_of_fields(kind)
+
+
+def _join_lines_of_fields(kind: Any) -> None:
+    """Write the explanations of a dataclass's fields into its docstring, each on one line."""
+    if not (isinstance(kind, type) and is_dataclass(kind)):
+        return
+    for base in kind.__mro__:
+        fields = parse_from_object(base).params if is_dataclass(base) else []
+        about = inspect.cleandoc(base.__doc__ or "")
+        if not fields or ATTRIBUTES in about:
+            continue
+        lines = []
+        for field in fields:
+            words = (field.description or "").split()
+            lines.append(f"    {field.arg_name}: {' '.join(words)}")
+        base.__doc__ = "\n".join([about, "", ATTRIBUTES, *lines])
+    for nested in get_type_hints(kind).values():
+        _join_lines_of_fields(nested)
 
 
 def like(function: Callable[..., Any]) -> Callable[[Command], Command]:

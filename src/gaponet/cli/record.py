@@ -9,6 +9,7 @@ from typing import Annotated
 import tyro
 
 from gaponet.api.record import Recorded, record_motions
+from gaponet.api.results import RunResult
 from gaponet.api.run_options import ControlOptions, RunOptions
 from gaponet.api.run_robot import RunRequest
 from gaponet.cli.options import Json
@@ -43,9 +44,10 @@ def record(
     """
     screen = Out(json)
 
-    def show(made: Recorded) -> None:
-        show_result(screen, made.run)
-        screen.say(f"added to {out}: {made.id}, {made.rows} rows at {made.rate:.2f} Hz")
+    def show(run: RunResult, made: Recorded | None) -> None:
+        show_result(screen, run)
+        if made is not None:
+            screen.say(f"added to {out}: {made.id}, {made.rows} rows at {made.rate:.2f} Hz")
 
     shared = {field.name: getattr(args, field.name) for field in fields(ControlOptions)}
     options = RunOptions(**shared, payload_mass=payload_mass, unit_id=unit_id, seed=seed)
@@ -55,6 +57,6 @@ def record(
         out=out,
         repetitions=repetitions,
         report=ScreenReporter(screen),
-        on_recorded=show,
+        on_played=show,
     )
     screen.result(made.to_dict())

@@ -76,8 +76,8 @@ class RobotSpec:
         kp, kd: PD gains, (n), N·m/rad and N·m·s/rad.
         effort_limit: Torque limit, (n), N·m.
         qpos_home: Rest position, (n), rad.
-        log_units: Unit of each joint in public logs, (n): rad, deg, or fraction (0..1 of the MJCF
-            range).
+        log_units: Unit of each joint in public logs, (n), one of LOG_UNITS; a fraction is 0..1 of
+            the MJCF range.
         aliases: Other names of a joint in logs → its name here.
         payload_mounts: Places where payloads are attached.
         dt: Control period, s.
@@ -369,9 +369,8 @@ class RobotSpec:
         if len(matches) != 1:
             message, nearest = self._unknown(short, where)
             raise JointMismatchError(
-                f"{message}. Map it with --map {short}={nearest}, or leave it out with ignore = "
-                f'["{short}"] in '
-                "logs.toml (--logs)"
+                f"{message}. Map it with --map {short}={nearest}, or leave it out with "
+                f'ignore = ["{short}"] in logs.toml (--logs)'
             )
         return matches[0]
 
