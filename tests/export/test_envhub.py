@@ -112,6 +112,10 @@ def test_the_folder_needs_no_gaponet(folder):
     subprocess.run([sys.executable, "-c", blocked], cwd=folder, check=True)
 
 
+def test_the_card_calls_motions_of_no_real_robot_virtual(folder):
+    assert "VIRTUAL" in (folder / "README.md").read_text()
+
+
 def test_a_robot_without_uncertainty_has_no_drawn_servos(folder, tmp_path, monkeypatch):
     robot = load_robot("so101")
     motions = [s.rows(slice(0, 20)) for s in own_motions(robot, count=1)]
@@ -121,3 +125,4 @@ def test_a_robot_without_uncertainty_has_no_drawn_servos(folder, tmp_path, monke
     with pytest.raises(ValueError, match="uncertainty"):
         module.RobotEnv("drawn")
     assert not (tmp_path / "out" / "randomization.json").exists()
+    assert "identified servos" not in (tmp_path / "out" / "README.md").read_text()

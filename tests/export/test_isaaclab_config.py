@@ -120,6 +120,7 @@ def test_the_readme_states_both_forms_and_facts_have_the_native_servos(arm, tmp_
     facts = json.loads((folder / "facts.json").read_text())
     assert facts["native"]["elbow"]["delay_steps"] == 2
     readme = (folder / "README.md").read_text()
+    assert "VIRTUAL" in readme
     for form in ("native", "plain"):
         assert f"{facts['error_mrad'][form]:.2f}" in readme
     assert exported.errors["in Isaac Lab's own classes"] > 0

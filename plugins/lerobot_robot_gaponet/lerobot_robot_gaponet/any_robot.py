@@ -107,6 +107,7 @@ class GaponetRobot(Robot):
     def connect(self, calibrate: bool = True) -> None:
         self.robot.connect(calibrate)
         self.corrector.restart()
+        self._measured = None
 
     def get_observation(self) -> dict[str, Any]:
         observation = self.robot.get_observation()

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence as ListOf
 from pathlib import Path
+from typing import Any
 
 from gaponet.base.files import write_text
 from gaponet.base.progress import Progress
@@ -22,10 +23,10 @@ library_name: lerobot
 tags: [lerobot, robotics, simulation, mujoco]
 ---
 
-# {robot} with identified servos, in MuJoCo
+# {robot} with {kind} servos, in MuJoCo
 
-An environment of LeRobot's EnvHub. The servos move as those of the real robot did: friction, delay, offset and gains
-were identified from its logs by gaponet. Mean |error| of the joints on the motions of `check.npz`: {error:.2f} mrad.
+An environment of LeRobot's EnvHub. {origin}
+Mean |error| of the joints on the {motions} of `check.npz`: {error:.2f} mrad.{meaning}
 
 ```console
 hf upload USER/NAME . --repo-type model     # in this folder
@@ -43,11 +44,14 @@ envs = make_env("USER/NAME", n_envs=4, trust_remote_code=True)
 | `environment_state` | the goal, in the same values |
 | rate | {rate:.4g} Hz |
 | success | every operated joint within 0.05 rad of the goal for 10 control periods |
-| servos | identified; {drawn} |
+| servos | {kind}; {drawn} |
 
 `env.py` needs gymnasium, MuJoCo 3.5 or newer and numpy; it fetches the other files of this repository.
-`python check.py` plays recorded motions and prints the error.
+`python check.py` plays the motions of `check.npz` and prints the error.
 """
+IDENTIFIED = "Friction, delay, offset and gains of its servos were identified from logs by gaponet."
+NOMINAL = "Its servos are nominal: nothing was identified from logs."
+OF_VIRTUAL = " No real robot made them: the error shows that the files are complete, not how near they are to a robot."
 
 
 def lerobot_units(robot: RobotSpec) -> dict[str, str]:
@@ -76,21 +80,25 @@ def write_units(
     return True
 
 
-def write_readme(robot: RobotSpec, dt: float, error: float, has_units: bool, folder: Path) -> None:
+def write_readme(robot: RobotSpec, facts: dict[str, Any], has_units: bool, folder: Path) -> None:
     """Write the model card.
 
     Args:
-        dt: Control period, s.
-        error: Of the form with the servo model, mrad.
+        facts: facts.json.
+        has_units: Whether units were written that can be drawn.
     """
     units = lerobot_units(robot)
     percent = [name for name in robot.joint_names if units[name] == "percent"]
     drawn = 'drawn from their uncertainty with `make_env(..., servos="drawn")`, or `cfg.task`'
     text = README.format(
         robot=robot.name,
-        error=error,
+        kind="identified" if robot.is_identified else "nominal",
+        origin=IDENTIFIED if robot.is_identified else NOMINAL,
+        motions="VIRTUAL motions" if facts["virtual"] else "recorded motions",
+        meaning=OF_VIRTUAL if facts["virtual"] else "",
+        error=facts["error_mrad"]["joints"],
         percent=", ".join(percent) or "no joint",
-        rate=1 / dt,
+        rate=1 / facts["dt"],
         drawn=drawn if has_units else "their uncertainty is not known, so none are drawn",
     )
     write_text(folder / "README.md", text)

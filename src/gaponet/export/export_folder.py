@@ -176,11 +176,12 @@ class _RobotExport:
         name = self.robot.name
         form = isaaclab_config.native_form(self.robot, self.plain, self.step, self.validation)
         servos = form.servos(self.payload_mass, self.facts["dt"])
-        config = isaaclab_config.robot_config(name, servos, self.step, form.lines())
+        motions = "VIRTUAL motions" if self.facts["virtual"] else "validation motions"
+        config = isaaclab_config.robot_config(name, servos, self.step, form.lines(), motions)
         write_text(self.out / CONFIG, config)
         self.facts["native"] = servos
         self.facts["error_mrad"]["native"] = 1e3 * check_error(self.checked, form.robot)
-        readme = isaaclab_config.readme(name, form, self.facts["error_mrad"])
+        readme = isaaclab_config.readme(name, form, self.facts["error_mrad"], motions)
         write_text(self.out / "README.md", readme)
         *_, last = form.losses.values()
         self.errors["in Isaac Lab's own classes"] = last
@@ -260,7 +261,7 @@ def export_robot(
         _write_shipped(out, to, facts)
     if to == "envhub":
         has_units = envhub.write_units(robot, out, recordings, progress)
-        envhub.write_readme(robot, facts["dt"], facts["error_mrad"]["joints"], has_units, out)
+        envhub.write_readme(robot, facts, has_units, out)
     return ExportedFolder(file, errors, len(validation), is_virtual, tuple(notes))
 
 

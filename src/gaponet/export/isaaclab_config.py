@@ -29,7 +29,7 @@ FIELDS = {
 }
 HEAD = '''"""Servos of {robot} as identified, in the configuration classes of Isaac Lab 3; SI units.
 
-The file needs no other one. Mean |error| of the joints in gaponet, on the validation motions:
+The file needs no other one. Mean |error| of the joints in gaponet, on the {motions}:
 {errors}
 """
 
@@ -43,8 +43,8 @@ OFFSETS = {offsets}
 '''
 README = """# {robot} for Isaac Lab 3
 
-The same servos in two forms. The errors are means over the joints on the motions of `check.npz`, in gaponet, without a
-table.
+The same servos in two forms. The errors are means over the joints on the motions of `check.npz`, which are
+{motions}, in gaponet, without a table.
 
 | form | files | mrad |
 | --- | --- | --: |
@@ -57,7 +57,7 @@ other form.
 **The action term** has delays in parts of a physics step and drawn units, and it carries a network. It needs
 `use_newton_actuators=False`, which Isaac Lab calls deprecated.
 
-From the identified robot to Isaac Lab's own classes, one loss after the other, on all validation motions:
+From the identified robot to Isaac Lab's own classes, one loss after the other, on all {motions}:
 
 {errors}
 
@@ -134,7 +134,9 @@ def native_form(
     return NativeForm(native, steps.tolist(), losses)
 
 
-def robot_config(robot: str, servos: dict[str, dict[str, Any]], step: float, errors: str) -> str:
+def robot_config(
+    robot: str, servos: dict[str, dict[str, Any]], step: float, errors: str, motions: str
+) -> str:
     """Return robot_cfg.py.
 
     Args:
@@ -142,10 +144,12 @@ def robot_config(robot: str, servos: dict[str, dict[str, Any]], step: float, err
         servos: Servos of `NativeForm.servos`.
         step: Physics step, s.
         errors: Text of `NativeForm.lines`.
+        motions: What kind of motions the errors are measured on.
     """
     head = HEAD.format(
         robot=robot,
         errors=errors,
+        motions=motions,
         step=step,
         home=_column(servos, "home"),
         offsets=_column(servos, "offset"),
@@ -176,7 +180,7 @@ def _actuator(joint: str, servo: dict[str, Any]) -> str:
     return opening + "".join(lines) + "    ),\n"
 
 
-def readme(robot: str, form: NativeForm, errors_mrad: dict[str, float]) -> str:
+def readme(robot: str, form: NativeForm, errors_mrad: dict[str, float], motions: str) -> str:
     """Return the README of the export.
 
     errors_mrad: form of the robot → error on the motions of check.npz.
@@ -185,5 +189,6 @@ def readme(robot: str, form: NativeForm, errors_mrad: dict[str, float]) -> str:
         robot=robot,
         native=errors_mrad["native"],
         action=errors_mrad["plain"],
+        motions=motions,
         errors="\n".join(f"- {line.strip()}" for line in form.lines().splitlines()),
     )

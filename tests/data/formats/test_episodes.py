@@ -47,6 +47,11 @@ def test_each_episode_is_a_recording(tmp_path, arm, name, column):
     }  # fmt: skip
 
 
+def test_numbers_that_no_float_counts_are_no_episodes(tmp_path, arm):
+    write(tmp_path / "log.csv", arm_columns(60) | {"episode": np.repeat([1e300, 2.0], 30)})
+    assert [motion for motion, _ in read_logs(tmp_path / "log.csv", arm, **SI)] == ["log"]
+
+
 def test_a_reset_between_episodes_is_no_motion(tmp_path, arm):
     write(tmp_path / "log.csv", joined(episode_index=numbers([0, 1, 2])))
     dataset = import_logs(tmp_path / "log.csv", arm, "u", 0.0, tmp_path / "data", **SI).dataset

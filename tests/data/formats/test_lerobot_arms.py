@@ -145,3 +145,13 @@ def test_steps_under_the_names_of_joints_are_no_position_targets_to_the_doctor(s
     dataset = read(folder, so101, tmp_path / "data", position_unit="deg")
     findings = DoctorResult.of(dataset, so101).findings
     assert [f for f in findings if f.level == "error" and "deltas" in f.message]
+
+
+def test_a_calibration_may_lie_in_the_home_folder(so101, tmp_path, monkeypatch):
+    folder, ticks = of_ticks(tmp_path)
+    monkeypatch.setenv("HOME", str(tmp_path))
+    (folder / "arm.json").rename(tmp_path / "arm.json")
+    (folder / "logs.toml").write_text('calibration = "~/arm.json"\nposition_unit = "ticks"\n')
+    dataset = read(folder, so101, tmp_path / "data")
+    ctrl = dataset.read(dataset.entries[0]).ctrl
+    assert ctrl[0, 0] == pytest.approx((ticks[0, 0] - 2000) * PER_TICK, abs=1e-6)

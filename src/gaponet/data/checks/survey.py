@@ -39,9 +39,10 @@ MAX_LAG_S = 0.4
 # a joint that moves less in this time stands still
 STANDSTILL_S = 0.2
 STANDSTILL_RAD = 0.005
-# distance of a blocked joint from its command; a loaded joint may be as far,
+# distance of a blocked joint from its command; a loaded joint may be as far, so that its command
+# must also move
 BLOCKED_ERROR_RAD = 0.15
-BLOCKED_COMMAND_RAD = 0.1  # so that its command must also move by this
+BLOCKED_COMMAND_RAD = 0.1
 REPEATED_COMMAND_RAD = 0.1  # the command must move by this while the state repeats itself
 SLOPE_MIN_RANGE_RAD = 0.2  # of the command; below, sag and stiction decide the slope
 SLOW_HZ = 0.3  # faster, a servo's resonance changes the slope
@@ -133,20 +134,20 @@ class Survey:
     static_poses: StaticPoses
     response: Response  # of the operated joints
     spectra: Array  # log power of command and state at SPECTRUM_HZ, (2, H)
-    # nearest state to the command of up to MAX_LAG_S before, in standard deviations of the
+    # nearest state to the command of up to MAX_LAG_S before, in standard deviations of the state,
+    # (n); NaN where the joint does not move
     command_distance: Array
-    # state, (n); NaN where the joint does not move
     velocity_correlation: Array  # of the command with the measured velocity, (n)
     torque_correlation: Array  # of the command with the measured torque, (n)
     # positions and torques in slow rows, (2, k, n); None if no torque was recorded
     gravity_samples: Array | None
-    # rows of smoothed motion: position, velocity, acceleration, torque (NaN if none was
+    # rows of smoothed motion: position, velocity, acceleration, torque (NaN if none was recorded),
+    # command − position (its lag taken off), and the command's velocity and acceleration,
+    # (7, k, n) in SI; None if the recording is too short
     movement: Array | None
-    # recorded), command − position (its lag taken off), and the command's velocity and
-    # acceleration, (7, k, n) in SI; None if the recording is too short of single joints that rest
-    # under a constant command: joint, command − position (rad), torque,
-    holds: Array | None
+    # of single joints that rest under a constant command: joint, command − position (rad), torque,
     # and positions of all joints, (k, 3 + n); None if no torque was recorded
+    holds: Array | None
 
     @property
     def motion(self) -> str:

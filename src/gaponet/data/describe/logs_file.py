@@ -51,22 +51,19 @@ class LogsFile(TypedDict, total=False):
     # "{motion}_{payload:g}kg_{rep}"
     motion: Text
     # or a table: file, motion, unit, payload, side, rep, level, virtual, kp, kd, kp.<joint>,
-    # estimated
+    # estimated (which of these are no more than that), leave_out (yes or no)
     manifest: Text
-    # (which of these are no more than that), leave_out (yes or no)
     unit: Text  # of all recordings, like payload (kg) and side
     payload: Annotated[float, Interval(ge=0, le=100)]
     side: Text
     time: Text  # column of the clock
     rate: Annotated[float, Interval(ge=1, le=10_000)]  # Hz, where the log has no clock
     time_unit: Text  # s, ms, us, ns
-    position_unit: (
-        Text  # rad, deg, ticks (4096 a turn); fraction (0..1), percent (0..100) or signed_percent
-    )
+    # rad, deg, ticks (4096 a turn); fraction (0..1), percent (0..100) or signed_percent
     # (−100..100) of the joint's range; velocities: per s
-    calibration: (
-        Text  # LeRobot's calibration file of the arm, beside logs.toml: what ticks and percent mean
-    )
+    position_unit: Text
+    # LeRobot's calibration file of the arm, beside logs.toml: what ticks and percent mean
+    calibration: Text
     ctrl: Text  # columns of commanded positions, as "{joint}_des", or the name of an array
     qpos: Text
     qvel: Text
@@ -105,7 +102,7 @@ def read_logs_file(src: Path, given: str | Path | None = None) -> tuple[LogsFile
         return LogsFile(), None
     specified = read_toml(LogsFile, file, UsageError, f"docs/logs.md lists the fields; {HINT}")
     if "calibration" in specified:
-        specified["calibration"] = str(file.parent / specified["calibration"])
+        specified["calibration"] = str(file.parent / Path(specified["calibration"]).expanduser())
     return specified, file
 
 

@@ -447,7 +447,7 @@ def _longer_patterns(specified: LogsFile, pattern: str) -> list[str]:
     q_des_{joint}'s.
     """
     patterns = [str(specified.get(channel, "")) for channel in CHANNELS]
-    return [p for p in patterns if "{joint}" in p and len(p) > len(pattern)]
+    return [p for p in patterns if p.count("{joint}") == 1 and len(p) > len(pattern)]
 
 
 def _column_pattern(pattern: str) -> re.Pattern[str]:

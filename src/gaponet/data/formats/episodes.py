@@ -37,6 +37,7 @@ FRAME_COLUMNS = (
     "timestep",
 )
 MAX_EPISODES = 100_000
+MAX_NUMBER = 2**53  # beyond which a float is not one whole number
 
 
 def episodes(recording: RawRecording) -> Iterator[RawRecording]:
@@ -80,7 +81,8 @@ def _whole_numbers(recording: RawRecording, columns: tuple[str, ...]) -> Array |
         values = recording.load([column])[column].values
     except LogError:  # text
         return None
-    if not np.isfinite(values).all() or (values != np.round(values)).any():
+    whole = np.isfinite(values).all() and (values == np.round(values)).all()
+    if not whole or np.abs(values).max(initial=0.0) > MAX_NUMBER:
         return None
     return values
 
