@@ -194,9 +194,7 @@ def _printed(row: str | None) -> str:
 
 
 def sensor_table(results: Results) -> ResultTable:
-    """Return what the Sensor Predictor costs and saves: one training each, everything else
-    equal.
-    """
+    """Return what the Sensor Predictor costs and saves, everything else equal."""
     rows = []
     for label, name in (
         ("predicted sensors (the paper's)", "payload out"),
