@@ -6,7 +6,7 @@ import functools
 import inspect
 import json
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar, cast
@@ -18,6 +18,7 @@ from rich.text import Text
 from gaponet.base.files import json_compatible, lock_folder
 from gaponet.base.result_table import ResultTable as ResultTable
 from gaponet.base.text import escape
+from gaponet.base.wide_table import BORDER, TableCells
 
 if TYPE_CHECKING:
     from gaponet.robot.finding import Finding
@@ -26,10 +27,6 @@ Command = TypeVar("Command", bound=Callable[..., Any])
 
 COLOURS = {"ok": "green", "note": "cyan", "warning": "yellow", "error": "bold red"}
 WIDTH = 120  # letters of a line in a file or a pipe
-# letters: labels and numbers longer than that are wrapped
-LABEL = 30
-NUMBER = 22
-BORDER = 3  # letters between two cells
 
 
 class _Console(Console):
@@ -69,7 +66,7 @@ class Out:
         The first column and long cells are text; the others are right-aligned numbers, which are
         never cut or wrapped.
         """
-        cells = _Cells(columns, rows)
+        cells = TableCells(columns, rows)
         for count, part in enumerate(cells.parts(self.console.width)):
             more = ", continued" if count else ""
             table = Table(
@@ -106,67 +103,6 @@ class Out:
         if self.as_json:
             json.dump(json_compatible(value), sys.stdout, ensure_ascii=False, allow_nan=False)
             sys.stdout.write("\n")
-
-
-class _Cells:
-    """Heads and cells of a table, and how wide its columns are.
-
-    Attributes:
-        heads: Headings of the columns.
-        lines: Cells of each row.
-        longest: Letters of the longest cell of each column.
-        least: Letters that each column and its border need.
-    """
-
-    def __init__(self, columns: list[str], rows: Iterable[list[str]]) -> None:
-        self.heads = [escape(column) for column in columns]
-        self.lines = [[escape(cell) for cell in row] for row in rows]
-        self.longest: list[int] = []
-        self.least: list[int] = []
-        for i, head in enumerate(self.heads):
-            cells = [line[i] for line in self.lines]
-            self.longest.append(max(map(len, cells), default=0))
-            self.least.append(_least_width(head, cells))
-
-    def is_text(self, i: int) -> bool:
-        """Return True for a column of text."""
-        return i == 0 or self.longest[i] > NUMBER
-
-    def parts(self, room: int) -> Iterator[list[int]]:
-        """Yield columns that fit beside each other into the room, in letters; each with the
-        first."""
-        count = len(self.heads)
-        if count == 1:
-            yield [0]
-        start = 1
-        while start < count:
-            stop = start + 1
-            while stop < count and self.least[0] + 1 + sum(self.least[start : stop + 1]) <= room:
-                stop += 1
-            yield [0, *range(start, stop)]
-            start = stop
-
-    def width(self, part: list[int]) -> int:
-        """Return the letters that columns need if nothing is wrapped."""
-        return 1 + sum(BORDER + max(len(self.heads[i]), self.longest[i]) for i in part)
-
-    def lines_of(self, part: list[int]) -> Iterator[list[str]]:
-        """Yield the rows that are not blank in these columns, beside the first."""
-        others = part[1:]
-        for line in self.lines:
-            if not others or any(line[i] for i in others):
-                yield line
-
-
-def _least_width(head: str, cells: list[str]) -> int:
-    """Letters that a column and its border need: cells are wrapped only where they are long, heads
-    at any space.
-    """
-    whole = [cell for cell in cells if len(cell) <= NUMBER]
-    words = [word for text in (head, *cells) for word in text.split()]
-    return BORDER + max(
-        max(map(len, whole), default=1), min(max(map(len, words), default=1), NUMBER)
-    )
 
 
 def holds_folder(out: Path | None, kind: str) -> AbstractContextManager[object]:

@@ -158,12 +158,12 @@ def test_the_next_step_is_offered_once_a_step_is_done(page):
     assert page.onwards["import"].disabled
 
 
-def test_a_quick_identification_is_bounded_in_rollouts_and_terms(page):
+def test_an_identification_is_bounded_in_rollouts_and_tries_all_terms(page):
     for step in ("robot", "import"):
         finish(page.jobs, step, {}, ("robot", "check", "so101"))
     finish(page.jobs, "doctor", {"findings": []})
-    page.identify.effort.value = "quick: gains, friction and delay alone"
-    assert page.identify.words()[4:] == ["--windows", "12", "--terms"]
+    page.identify.windows.value = 12
+    assert page.identify.words()[4:] == ["--windows", "12"]
 
 
 def test_identification_is_locked_while_the_check_finds_an_error(page):
@@ -199,6 +199,17 @@ def test_what_a_command_prints_is_shown_as_a_table_and_names_stay_text(page):
     assert "note" not in text
     assert "sign" not in text
     assert text.endswith(": gaponet gap data")
+
+
+def test_a_wide_table_is_divided_and_each_part_has_the_first_column(page):
+    names = ["joint", *(f"number {i}" for i in range(9))]
+    values = ["elbow", *(f"{i}.0 ± 0.1" for i in range(9))]
+    lines = ["┏━━┓", f"┃ {' ┃ '.join(names)} ┃", "┡━━┩", f"│ {' │ '.join(values)} │", "└──┘"]
+    text = report(SimpleNamespace(command="gaponet identify data", lines=lines))
+    shown = [line for line in text.splitlines() if line.startswith("| elbow")]
+    assert max(map(len, shown)) <= 66
+    found = [cell.strip() for line in shown for cell in line.strip("|").split("|")]
+    assert [cell for cell in found if cell != "elbow"] == values[1:]
 
 
 def test_a_name_in_the_form_is_no_option_of_the_command(page):

@@ -12,12 +12,14 @@ from pathlib import Path
 
 from gaponet.base.errors import UsageError
 from gaponet.base.text import escape_markdown
+from gaponet.base.wide_table import TableCells
 from gaponet.report.view.inside import read_inside
 from gaponet.report.view.jobs import PROGRESS_LINE, Job
 from gaponet.report.view.run_job import BY_ITSELF, CANCELLED, WITH_SERVER
 
 # How commands print what they find: the level, two spaces, the name of the check, a sentence.
 FINDING_LINE = re.compile(r" *(error|warning)  \S")
+PANEL_LETTERS = 66  # of a table beside each other, in the panel of a window 1280 px wide
 UNCHANGED = "what was there before is unchanged."
 
 
@@ -47,28 +49,80 @@ def _reason(job: Job) -> str:
 
 def report(job: Job) -> str:
     """Return what a command printed, in Markdown, and the command."""
-    lines = list[str]()
+    shown = list[str]()
+    table = _Table()
     for line in job.lines:
-        lines += _report_line(line)
+        if table.take(line):
+            continue
+        shown += table.markdown()
+        table = _Table()
+        shown += _paragraph(line)
+    shown += table.markdown()
     repeat = f"To repeat it in the folder of this page: {escape_markdown(job.command)}"
-    return "\n".join([*lines, "", repeat])
+    return "\n".join([*shown, "", repeat])
 
 
-def _report_line(line: str) -> list[str]:
-    """Return a line that a command printed as lines of Markdown.
-
-    A table of rich becomes one of Markdown.
-    """
-    text = re.sub("[┃│]", "|", escape_markdown(line.strip()))
-    if line.startswith("┡"):
-        return [f"| --- |{' ---: |' * line.count('╇')}"]
-    if line.startswith(("┃", "│")):
-        return [text]
-    if not text or line.startswith(("┏", "└", "     ok ")) or PROGRESS_LINE.match(line):
+def _paragraph(line: str) -> list[str]:
+    """Return a line that a command printed as lines of Markdown."""
+    text = escape_markdown(line.strip())
+    if not text or line.startswith("     ok ") or PROGRESS_LINE.match(line):
         return []
     if FINDING_LINE.match(line):
         return ["", f"**{text}**"]
     return ["", text]
+
+
+class _Table:
+    """A table that a command drew with lines.
+
+    Attributes:
+        heads: Headings of its columns.
+        rows: Its cells.
+    """
+
+    def __init__(self) -> None:
+        self.heads: list[str] = []
+        self.rows: list[list[str]] = []
+
+    def take(self, line: str) -> bool:
+        """Take a line of a table. Return False for any other line, and for the next table."""
+        if line.startswith("┏"):
+            return not self.heads
+        if line.startswith("┃"):
+            self.heads = _cells(line, "┃")
+        elif line.startswith("│") and self.heads:
+            cells = _cells(line, "│", at_most=len(self.heads))
+            missing = len(self.heads) - len(cells)
+            self.rows.append(cells + [""] * missing)
+        return line.startswith(("┃", "│", "┡", "└"))
+
+    def markdown(self) -> list[str]:
+        """Return the table as lines of Markdown, in as many parts as the panel is narrow."""
+        lines = list[str]()
+        if not self.heads:
+            return lines
+        table = TableCells(self.heads, self.rows)
+        for part in table.parts(PANEL_LETTERS):
+            lines += ["", _markdown_row([table.heads[i] for i in part])]
+            lines.append(f"| --- |{' ---: |' * (len(part) - 1)}")
+            for row in table.lines_of(part):
+                lines.append(_markdown_row([row[i] for i in part]))
+        return lines
+
+
+def _cells(line: str, border: str, at_most: int | None = None) -> list[str]:
+    """Return the cells between the borders. A cell may hold a border too, if it is the last."""
+    inside = line.strip().strip(border)
+    if at_most is None:
+        cells = inside.split(border)
+    else:
+        cells = inside.split(border, at_most - 1)
+    return [cell.strip() for cell in cells]
+
+
+def _markdown_row(cells: list[str]) -> str:
+    escaped = [escape_markdown(cell) for cell in cells]
+    return f"| {' | '.join(escaped)} |"
 
 
 def picture(folder: Path, name: str) -> str:

@@ -24,6 +24,7 @@ from gaponet.report.view.uploads import Uploads
 from gaponet.robot.finding import Finding, errors_of
 from gaponet.robot.spec import RobotSpec, load_robot, packaged_robots
 from gaponet.sim.dataset_robot import dataset_robot
+from gaponet.sysid.options import IdentifyOptions
 
 MODEL_SUFFIXES = (".xml", ".mjcf", ".urdf")
 POSITION_UNITS = ("as the logs state", "rad", "deg", "fraction", "ticks", "signed_percent")
@@ -31,14 +32,7 @@ TARGETS = ("mjcf", "urdf", "mjlab", "isaaclab", "newton", "json")
 NETWORK_TARGETS = ("onnx", "torch")  # of a trained network
 # Target → engine that applies parameter sets; others read a file.
 ENGINES = {"mjcf": "mujoco", "mjlab": "mjlab", "isaaclab": "isaaclab"}
-# How thorough an identification is → options of `gaponet identify`. Limits of time would make the
-# result depend on the machine.
-QUICK_WINDOWS = 12
-EFFORTS = {
-    "all terms": (),
-    "quick: gains, friction and delay alone": ("--windows", str(QUICK_WINDOWS), "--terms"),
-}
-
+FEWEST_WINDOWS = 4  # of an identification
 Play = Callable[[SideBySide], None]  # shows motions in the page
 
 
@@ -291,7 +285,14 @@ class IdentifyStep:
     def __init__(self, controls: Controls) -> None:
         self.controls = controls
         gui = controls.gui
-        self.effort = gui.add_dropdown("effort", tuple(EFFORTS))
+        # Not a limit of time, which would make the result depend on the machine.
+        self.windows = gui.add_number(
+            "rollouts",
+            IdentifyOptions.windows,
+            min=FEWEST_WINDOWS,
+            step=1,
+            hint="of 8 s, that are fitted; fewer are quicker and less exact",
+        )
         self.table = gui.add_checkbox("look for a table under the robot", True)
         self.button = controls.add_command("Identify", "identify", self.words)
         controls.add_place("identify", "Identify the robot.")
@@ -307,7 +308,7 @@ class IdentifyStep:
         if reason:
             raise UsageError(reason)
         words = ["identify", self.controls.need("import").out, "--out", OUT]
-        words += EFFORTS.get(str(self.effort.value), ())
+        words += ["--windows", str(int(self.windows.value))]
         if not self.table.value:
             words.append("--no-table")
         return words
