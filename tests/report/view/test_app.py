@@ -207,7 +207,7 @@ def test_a_wide_table_is_divided_and_each_part_has_the_first_column(page):
     lines = ["┏━━┓", f"┃ {' ┃ '.join(names)} ┃", "┡━━┩", f"│ {' │ '.join(values)} │", "└──┘"]
     text = report(SimpleNamespace(command="gaponet identify data", lines=lines))
     shown = [line for line in text.splitlines() if line.startswith("| elbow")]
-    assert max(map(len, shown)) <= 66
+    assert max(map(len, shown)) <= 80
     found = [cell.strip() for line in shown for cell in line.strip("|").split("|")]
     assert [cell for cell in found if cell != "elbow"] == values[1:]
 

@@ -19,7 +19,7 @@ from gaponet.report.view.run_job import BY_ITSELF, CANCELLED, WITH_SERVER
 
 # How commands print what they find: the level, two spaces, the name of the check, a sentence.
 FINDING_LINE = re.compile(r" *(error|warning)  \S")
-PANEL_LETTERS = 66  # of a table beside each other, in the panel of a window 1280 px wide
+PANEL_LETTERS = 80  # of a table beside each other, in the panel of a window 1280 px wide
 UNCHANGED = "what was there before is unchanged."
 
 
