@@ -66,6 +66,15 @@ def test_a_position_that_is_the_rounded_command_is_a_copy(tmp_path, arm):
     assert error.check == "copied"
 
 
+def test_a_long_recording_is_judged_by_a_part_of_its_rows():
+    rows = 60_000
+    told = np.random.default_rng(0).normal(size=(rows, 1)).cumsum(axis=0) * 1e-3
+    time = 0.02 * np.arange(rows)
+    assert copied_rows(Channel(time, told), Channel(time, np.roll(told, 2, axis=0))) == 2
+    followed = Channel(time, 0.99 * np.roll(told, 2, axis=0))
+    assert np.isnan(copied_rows(Channel(time, told), followed)).all()
+
+
 @pytest.mark.parametrize("step", [1e-9, 1e-4, TICK, 1e-2])
 def test_a_simulated_servo_repeats_no_command(arm, step):
     for sequence in recordings(arm, 3):

@@ -11,15 +11,33 @@ import json
 import shutil
 import sys
 import tempfile
+import time
 from collections import Counter
 from dataclasses import asdict
 from pathlib import Path
+from typing import TextIO
 
 from fuzzing import readers, structures
 from fuzzing.harness import WHY, AbsurdError, Failure, run
 from gaponet.base.errors import GAPONetError
 
 GROUPS = {"readers": readers.TARGETS, "structures": structures.TARGETS}
+
+
+class Counted:
+    """Shows how many mutants were tried: on a terminal in place, in a pipe a line every ten seconds."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self.stream = stream
+        self.next_line = 0.0
+
+    def show(self, done: int, failed: int) -> None:
+        text = f"{done} done, {failed} failed"
+        if self.stream.isatty():
+            print(f"\r{text}", end="", file=self.stream, flush=True)
+        elif time.monotonic() >= self.next_line:
+            print(text, file=self.stream, flush=True)
+            self.next_line = time.monotonic() + 10.0
 
 
 def grouped(failures: list[Failure]) -> list[tuple[str, int, Failure]]:
@@ -69,15 +87,8 @@ def main() -> int:
         return replay(args.replay)
     known = {t.name: (t,) for group in GROUPS.values() for t in group} | GROUPS
     chosen = [t for name in (args.only or ",".join(GROUPS)).split(",") for t in known[name]]
-    shown = lambda done, failed: print(f"\r{done} done, {failed} failed", end="", file=sys.stderr)  # noqa: E731
-    result = run(
-        chosen,
-        args.mutants,
-        args.seed,
-        args.workers,
-        args.keep,
-        *([shown] if sys.stderr.isatty() else []),
-    )
+    counter = Counted(sys.stderr)
+    result = run(chosen, args.mutants, args.seed, args.workers, args.keep, counter.show)
     for text, count, failure in grouped(result.failures):
         print(
             f"{count:6d}  {text}\n        first: {failure.target} {failure.number}", file=sys.stderr

@@ -126,6 +126,15 @@ def test_signs_and_offsets_come_after_units_and_are_noted(tmp_path, arm):
     assert log.meta["notes"] == {"signs": {"elbow": -1}, "offsets": {"elbow": 0.1}}
 
 
+def test_the_clock_is_no_joint_where_columns_are_called_as_joints_are(tmp_path, arm):
+    columns = {name.removesuffix("_pos"): values for name, values in theirs().items()}
+    folder = write(
+        tmp_path, 'time = "t"\nctrl = "{joint}_des"\nqpos = "{joint}"\n', columns=columns
+    )
+    ((_, log),) = read_logs(folder, arm)
+    assert log.joint_names == ("shoulder", "elbow")
+
+
 def test_strange_joints_are_all_named_at_once_and_ignored_where_that_is_said(tmp_path, arm):
     columns = theirs() | {f"{j}_{w}": np.zeros(60) for j in ("hip", "knee") for w in ("des", "pos")}
     folder = write(tmp_path / "logs", NAMES, columns=columns)

@@ -206,7 +206,8 @@ class RawRecording:
     def _require_one_clock(self, clocks: dict[str, str | None], specified: LogsFile) -> None:
         """Refuse clocks of channels that another column contradicts."""
         chosen = {clock for clock in clocks.values() if clock in self.signals}
-        if "rate" in specified or not chosen:
+        rivals = [name for name in self.signals if named_like_a_clock(name)]
+        if "rate" in specified or not chosen or len(rivals) < 2:
             return
         periods = clock_periods(self.signals, self.load)
         used = list(specified.get("clock", {}).values())
@@ -372,8 +373,9 @@ def _choose(
                 f"{recording.shown()}"
             )
     chosen: Chosen = {}
+    taken = {*single.values(), specified.get("time", "")}  # no pattern finds these columns
     for channel in (*CHANNELS, *DERIVED):
-        named = _matching(recording, specified, channel, set(single.values()))
+        named = _matching(recording, specified, channel, taken)
         named += [
             (ours.partition(".")[2], theirs)
             for ours, theirs in single.items()

@@ -15,6 +15,7 @@ from gaponet.data.signals import encoder_step
 
 MAX_COPIED_ROWS = 3  # in both directions
 MIN_COPIED_CHANGES = 20  # of the command; fewer can be equal by chance
+MAX_COMPARED_CHANGES = 20_000  # of a long recording, evenly chosen; more tell nothing new
 # steps of the readings that a joint passes from row to row, from which chance repeats few of them
 FINE_STEPS = 10
 # Share of the changes that a copy repeats. Rows may be missing. A stiff servo with a coarse encoder
@@ -60,9 +61,12 @@ def copied_rows(command: Channel, state: Channel) -> Array:
         changes = np.flatnonzero(np.diff(told)) + 1
         if len(changes) < MIN_COPIED_CHANGES:
             continue
+        if len(changes) > MAX_COMPARED_CHANGES:
+            evenly = np.linspace(0, len(changes) - 1, MAX_COMPARED_CHANGES).round()
+            changes = changes[evenly.astype(int)]
+        usual_change = float(np.median(np.abs(told[changes] - told[changes - 1])))
         later = reading[nearest[changes][:, None] + shifts]  # (changes, shifts)
-        distance = np.abs(later - told[changes][:, None])
-        result[joint] = _shift(distance, shifts, told, reading)
+        result[joint] = _shift(told[changes], later, shifts, usual_change)
     return result
 
 
@@ -85,16 +89,21 @@ def _nearest(time: Array, at: Array) -> Array:
     return right - before_is_nearer
 
 
-def _shift(distance: Array, shifts: Array, told: Array, reading: Array) -> float:
-    """Return the shift of one joint's copy; NaN if it is none. distance: (changes, shifts) rad."""
-    steps = [_step(told), _step(reading)]
+def _shift(told: Array, later: Array, shifts: Array, usual_change: float) -> float:
+    """Return the shift of one joint's copy; NaN if it is none.
+
+    Args:
+        told: Commands, (changes) rad.
+        later: States of the rows around each, (changes, shifts) rad.
+        shifts: Rows from the command to the state, (shifts).
+        usual_change: Of the command from one row to the next, rad.
+    """
+    steps = [_step(told), _step(later[:, MAX_COPIED_ROWS])]
     coarse = max(steps)
     tolerance = NO_DIGIT_RAD
     if min(steps) < 0.9 * coarse:  # one of them was rounded
         tolerance = max(0.501 * coarse, NO_DIGIT_RAD)
-    equal = distance <= tolerance
-    passed = np.abs(np.diff(told))
-    usual_change = float(np.median(passed[passed > 0]))
+    equal = np.abs(later - told[:, None]) <= tolerance
     if usual_change >= FINE_STEPS * coarse:
         if equal.any(axis=1).mean() < FINE_SHARE:
             return np.nan

@@ -208,9 +208,10 @@ def _read_csv(file: Path, names: list[str], first: int, wanted: list[str]) -> di
     import pyarrow.csv as pc
 
     body = read_limited(file, LogError, "cut the log into shorter ones", MAX_ARRAYS_BYTES)
-    line, _, rest = body.partition(b"\n")
+    line = _first_line(body)
     delimiter = _delimiter(line.decode("utf-8", "replace"))
-    body = (rest if first else body.removeprefix(b"\xef\xbb\xbf")).rstrip()
+    before = len(line) + 1 if first else 0
+    body = body[before:].removeprefix(b"\xef\xbb\xbf").rstrip()
     if not body:
         raise LogError(f"{file}: holds a header and no rows; delete it or record again")
     if delimiter == " ":
@@ -244,9 +245,15 @@ def _read_csv(file: Path, names: list[str], first: int, wanted: list[str]) -> di
     }
 
 
+def _first_line(body: bytes) -> bytes:
+    """Return the first line, without its end."""
+    end = body.find(b"\n")
+    return body if end < 0 else body[:end]
+
+
 def _date_columns(body: bytes, names: list[str], wanted: list[str], delimiter: str) -> list[str]:
     """Return the wanted columns whose first cell is a date and time."""
-    line = body.partition(b"\n")[0].decode("utf-8", "replace")
+    line = _first_line(body).decode("utf-8", "replace")
     cells = next(csv.reader([line], delimiter=delimiter), [])
     if len(cells) != len(names):
         return []
