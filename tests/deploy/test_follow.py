@@ -118,6 +118,19 @@ def test_a_motor_at_its_torque_limit_is_named_with_its_share_of_the_time(robot):
     assert "shoulder" in follower.doubt
 
 
+def test_a_robot_with_a_weaker_motor_than_identified_is_named(robot):
+    """It hangs 0.3 rad below the arm stretched out, and no feedback lifts it."""
+    known = identified(robot)
+    target = np.array([0.0, 0.0])
+    follower = Compensator(known, config=NOW, follow="nominal")
+    follower.reset(target, 0.0)
+
+    for _ in range(600):
+        follower.step(target, target - [0.3, 0.0])
+
+    assert list(follower.limited_shares) == ["shoulder"]
+
+
 def test_after_a_torque_limit_the_robot_follows_again(robot):
     """The jump asks for more than the motors have; the motion after it does not."""
     weak = identified(robot, effort_limit=2.0, frictionloss=0.02)

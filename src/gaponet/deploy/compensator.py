@@ -419,8 +419,9 @@ class Compensator:
     def limited_shares(self) -> dict[str, float]:
         """Joint → share of the periods in which it could not do what was asked of it.
 
-        Its command was at a limit or, where the nominal simulator is followed, its motor. Joints
-        with a share below MIN_LIMITED_SHARE are left out; of several robots the mean counts.
+        Its command or its feedback was at a limit or, where the nominal simulator is followed, its
+        motor. Joints with a share below MIN_LIMITED_SHARE are left out; of several robots the mean
+        counts.
         """
         shares = self.limited_periods.mean(axis=0) / max(self.periods, 1)
         named = zip(self.robot.operated, shares.tolist(), strict=True)
@@ -438,7 +439,10 @@ class Compensator:
 
     def _at_limit(self) -> Array:
         """Return which commands, or motors that follow, are at their limits, (num_envs, n)."""
-        at_limit: Array = self.feedback.saturation != 0
+        # A motor that is weaker than the identified one cannot follow, whatever the feedback adds.
+        feedback_limit = self.config.feedback_limit
+        exhausted = (feedback_limit > 0) & (np.abs(self.feedback.integral) >= feedback_limit)
+        at_limit: Array = (self.feedback.saturation != 0) | exhausted
         if self.follower is not None:
             at_limit = at_limit | self.follower.saturated[:, self.operated]
         return at_limit
