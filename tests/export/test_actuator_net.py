@@ -69,23 +69,38 @@ def test_a_network_adds_no_more_torque_than_the_runs_largest_correction():
     assert net(at_rest).item() == pytest.approx(20.0 * 0.3)
 
 
-def test_networks_play_the_run_in_plain_mujoco_and_say_what_they_leave(run, tmp_path, monkeypatch):
-    monkeypatch.setattr(actuator_net, "STEPS", 300)
-    assert main(["export", str(run), "--to", "actuator-net", "--out", str(tmp_path)]) == 0
-    facts = read(tmp_path / "facts.json")
+@pytest.fixture(scope="module")
+def exported(run, tmp_path_factory):
+    """The folder of `gaponet export`, after a short fit."""
+    folder = tmp_path_factory.mktemp("networks") / "out"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(actuator_net, "STEPS", 300)
+        assert main(["export", str(run), "--to", "actuator-net", "--out", str(folder)]) == 0
+    return folder
+
+
+def test_the_check_for_newton_needs_no_torch(exported):
+    used = ("check_newton.py", "mujoco_servos.py")
+    text = "".join((exported / name).read_text() for name in used)
+    assert "torch" not in re.findall(r"^(?:import|from) (\w+)", text, re.MULTILINE)
+    assert "gaponet_action" not in text
+
+
+def test_networks_play_the_run_in_plain_mujoco_and_say_what_they_leave(exported):
+    facts = read(exported / "facts.json")
     left = facts["error_mrad"]
     assert left["the run, in gaponet"] < 1
     assert left["actuator networks"] < 5 < 40 < left["of these the servo alone"]
     assert facts["actuator_net"]["gain"] == 1.0
     x = torch.randn(5, 2 * facts["actuator_net"]["length"])
-    script = torch.jit.load(tmp_path / "elbow.pt")(x)
+    script = torch.jit.load(exported / "elbow.pt")(x)
     told = {"metadata.json": ""}
-    program = torch.export.load(tmp_path / "elbow.pt2", extra_files=told).module()(x)
+    program = torch.export.load(exported / "elbow.pt2", extra_files=told).module()(x)
     torch.testing.assert_close(program, script)
     onnx, onnxruntime = pytest.importorskip("onnx"), pytest.importorskip("onnxruntime")
-    session = onnxruntime.InferenceSession(str(tmp_path / "elbow.onnx"))
+    session = onnxruntime.InferenceSession(str(exported / "elbow.onnx"))
     np.testing.assert_allclose(session.run(None, {"past": x.numpy()})[0], script.numpy(), atol=1e-4)
-    props = {p.key: p.value for p in onnx.load(tmp_path / "elbow.onnx").metadata_props}
+    props = {p.key: p.value for p in onnx.load(exported / "elbow.onnx").metadata_props}
     assert props["metadata"] == told["metadata.json"]
     assert json.loads(props["metadata"])["input_order"] == "pos_vel"
 

@@ -46,6 +46,7 @@ FACTS = "facts.json"
 ROBOT = "robot.xml"
 CHECK = "check.npz"
 CONFIG = "robot_cfg.py"  # servos in the classes of Isaac Lab or Newton
+NEWTON_CHECK = "check_newton.py"
 # Engine → name in the export folder → file in SHIPPED; beside the helper file.
 CHECK_FILES: dict[str, dict[str, str]] = {
     "mjcf": {"check.py": "check_mjcf.py"},
@@ -53,12 +54,12 @@ CHECK_FILES: dict[str, dict[str, str]] = {
     "urdf": {},
     "mjlab": {"check.py": "check_mjlab.py"},
     "isaaclab": {"check.py": "check_isaaclab.py", "make_usd.py": "make_usd.py"},
-    "newton": {"check.py": "check_newton.py"},
+    "newton": {"check.py": NEWTON_CHECK},
     "json": {},
     "torch": {},
     "actuator-net": {
         "check.py": "check_mjlab.py",
-        "check_newton.py": "check_newton.py",
+        "check_newton.py": NEWTON_CHECK,
         "actuators.py": "actuators.py",
     },
 }
@@ -430,10 +431,16 @@ def _write_motions(file: Path, motions: ListOf[Sequence]) -> None:
 def _write_shipped(folder: Path, to: str, facts: dict[str, Any]) -> None:
     """Write facts.json, the helper file and the check of an engine; none of them needs gaponet."""
     helper = TORCH_HELPER if to in WITH_TORCH else MUJOCO_HELPER
-    write_text(folder / f"{helper}.py", helper_text(helper))
+    helpers = {helper}
     for name, file in CHECK_FILES[to].items():
+        of_file = helper
+        if file == NEWTON_CHECK:  # Newton's environment has no torch
+            of_file = MUJOCO_HELPER
+        helpers.add(of_file)
         text = (SHIPPED / file).read_text(encoding="utf-8")
-        write_text(folder / name, without_gaponet(text, helper))
+        write_text(folder / name, without_gaponet(text, of_file))
+    for name in helpers:
+        write_text(folder / f"{name}.py", helper_text(name))
     write_text(folder / FACTS, json.dumps(facts, indent=1, ensure_ascii=False) + "\n")
 
 
