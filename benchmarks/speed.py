@@ -21,7 +21,7 @@ import numpy as np
 import torch
 
 from gaponet.base.arrays import Array
-from gaponet.deploy.aligned_sim import AlignedSim
+from gaponet.deploy.aligned_sim import AlignedSim, AlignedSimOptions
 from gaponet.nn.artifact import GapModel
 from gaponet.nn.onnx_export import trained_network
 from gaponet.robot.folder import load_stored_robot
@@ -73,7 +73,8 @@ def bench_aligned(run: Path, num_envs: int, rounds: int) -> dict[str, dict[str, 
     robot = load_stored_robot(run, model.card["robot"])
     locked = idle_joints(robot, robot.operated)
     nominal = BatchSim(robot, [Condition(0.0, "both", robot.dt)] * num_envs, 0, locked)
-    aligned = AlignedSim(robot, model, 0.0, num_envs=num_envs, locked=locked)
+    options = AlignedSimOptions(locked=locked)
+    aligned = AlignedSim(robot, model, num_envs=num_envs, options=options)
     phase = np.random.default_rng(0).uniform(0, 2 * np.pi, (num_envs, nominal.n))
     targets = [
         aligned.qpos_home + 0.3 * np.sin(phase + np.pi * robot.dt * t) for t in range(TURN_STEPS)

@@ -30,7 +30,7 @@ from rsl_rl.env import VecEnv
 from rsl_rl.runners import OnPolicyRunner
 from tensordict import TensorDict
 
-from gaponet.deploy.aligned_sim import AlignedSim
+from gaponet.deploy.aligned_sim import AlignedSim, AlignedSimOptions
 from gaponet.motion.library import Library
 from gaponet.nn.artifact import GapModel
 from gaponet.robot.spec import RobotSpec, load_robot
@@ -342,12 +342,11 @@ def main(
         np.resize(np.linspace(0, heaviest, 4), num_envs),
         np.repeat([0.0, heaviest], len(unseen.first)),
     )
+    options = AlignedSimOptions(locked=task.locked)
     plants: dict[str, AlignedSim | Unit] = {
-        "nominal simulator": AlignedSim(
-            robot, None, tried, num_envs=len(tried), locked=task.locked
-        ),
+        "nominal simulator": AlignedSim(robot, None, tried, num_envs=len(tried), options=options),
         "aligned simulator": AlignedSim(
-            corrected, model, tried, num_envs=len(tried), locked=task.locked
+            corrected, model, tried, num_envs=len(tried), options=options
         ),
         unit: Unit(robot, unseen, unit, tried),
     }
@@ -366,14 +365,14 @@ def main(
     for seed in seeds:
         torch.manual_seed(seed)
         env = TrackingEnv(
-            task, AlignedSim(robot, None, mass, num_envs=num_envs, locked=task.locked), seed
+            task, AlignedSim(robot, None, mass, num_envs=num_envs, options=options), seed
         )
         policy = train("nominal", make_runner(env), env, first)
         evaluate("policy, nominal", policy)
         env.error = []
         longer = make_runner(env, policy)
         aligned = TrackingEnv(
-            task, AlignedSim(corrected, model, mass, num_envs=num_envs, locked=task.locked), seed
+            task, AlignedSim(corrected, model, mass, num_envs=num_envs, options=options), seed
         )
         evaluate(
             "policy, fine-tuned", train("fine-tuning", make_runner(aligned, policy), aligned, more)

@@ -30,7 +30,7 @@ from finetune_policy import Task, TrackingEnv, Unit, follow, make_runner, motion
 from tensordict import TensorDict
 
 from gaponet.cli.main import main as gaponet
-from gaponet.deploy.aligned_sim import AlignedSim
+from gaponet.deploy.aligned_sim import AlignedSim, AlignedSimOptions
 from gaponet.deploy.compensator import Compensator
 from gaponet.export.drawn_robots import robots_of
 from gaponet.robot.spec import RobotSpec, load_robot
@@ -51,8 +51,9 @@ class Several:
 
     def __init__(self, robots: list[RobotSpec], num_envs: int, locked: tuple[str, ...]) -> None:
         self.ids = np.array_split(np.arange(num_envs), len(robots))
+        options = AlignedSimOptions(locked=locked)
         self.sims = [
-            AlignedSim(robot, None, np.zeros(len(ids)), num_envs=len(ids), locked=locked)
+            AlignedSim(robot, num_envs=len(ids), options=options)
             for robot, ids in zip(robots, self.ids, strict=True)
         ]
         self.num_envs, self.dt, self.payload_mass = num_envs, self.sims[0].dt, np.zeros(num_envs)
@@ -186,10 +187,8 @@ def drawn(known: Path, work: Path) -> list[RobotSpec]:
 
 def rollout(task: Task, robot: RobotSpec, policy: Any, file: Path) -> Array:
     """Simulate the first motion with the policy and write it as a log; returns its targets, (T, free) rad."""
-    sim, actor = (
-        AlignedSim(robot, None, np.zeros(1), num_envs=1, locked=task.locked),
-        policy.get_inference_policy(),
-    )
+    sim = AlignedSim(robot, num_envs=1, options=AlignedSimOptions(locked=task.locked))
+    actor = policy.get_inference_policy()
     row, last, action = task.first[:1].copy(), task.last[:1], np.zeros((1, task.n))
     sim.reset(task.reference[row])
     states, targets = [], []

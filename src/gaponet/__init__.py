@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from gaponet.data.importer import ImportResult as ImportResult
     from gaponet.data.store import Dataset as Dataset
     from gaponet.deploy.aligned_sim import AlignedSim as AlignedSim
+    from gaponet.deploy.aligned_sim import AlignedSimOptions as AlignedSimOptions
     from gaponet.deploy.compensator import Compensator as Compensator
     from gaponet.deploy.mujoco_loop import MujocoAligner as MujocoAligner
     from gaponet.experiments.paper.experiment import PaperResult as PaperResult
@@ -81,6 +82,7 @@ else:
         "GapModel": "gaponet.nn.artifact",
         "NetworkCard": "gaponet.nn.network_card",
         "AlignedSim": "gaponet.deploy.aligned_sim",
+        "AlignedSimOptions": "gaponet.deploy.aligned_sim",
         "MujocoAligner": "gaponet.deploy.mujoco_loop",
         "Compensator": "gaponet.deploy.compensator",
         "apply": "gaponet.export.scene",

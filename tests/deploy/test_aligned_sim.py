@@ -9,7 +9,7 @@ from arm import TOML, commands, recordings, write_arm
 from runs import small_model
 
 from gaponet.base.errors import ModelError, UsageError
-from gaponet.deploy.aligned_sim import AlignedSim
+from gaponet.deploy.aligned_sim import AlignedSim, AlignedSimOptions
 from gaponet.deploy.mujoco_loop import MujocoAligner
 from gaponet.robot.folder import save_robot
 from gaponet.sim.model import build_model
@@ -115,7 +115,7 @@ def test_other_rates_simulators_and_locked_joints_are_refused(robot, model, tmp_
     with pytest.raises(ModelError, match="which does not lie beside it"):
         AlignedSim(other, bare)
     with pytest.raises(UsageError, match="'elbow' is corrected by the model and cannot be locked"):
-        AlignedSim(robot, model, locked=("elbow",))
+        AlignedSim(robot, model, options=AlignedSimOptions(locked=("elbow",)))
 
 
 def test_a_scene_that_does_not_fit_is_refused(robot, model):

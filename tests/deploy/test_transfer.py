@@ -9,7 +9,7 @@ from arm import TOML, XML, commands, write_arm
 from runs import corrects_by
 
 from gaponet.base.errors import ModelError
-from gaponet.deploy.aligned_sim import AlignedSim
+from gaponet.deploy.aligned_sim import AlignedSim, AlignedSimOptions
 from gaponet.deploy.compensator import Compensator, CompensatorConfig
 from gaponet.deploy.mujoco_loop import MujocoAligner
 from gaponet.robot.spec import Table, Tip
@@ -104,7 +104,7 @@ def test_jumps_that_saturate_motors_cause_no_windup(tmp_path):
 
 def test_a_payload_that_the_simulator_does_not_know_of(robot, model):
     there = follow(AlignedSim(robot, model, 0.2))
-    sim = AlignedSim(robot, model, 0.2, simulator_payload=0.0)
+    sim = AlignedSim(robot, model, 0.2, options=AlignedSimOptions(simulator_payload=0.0))
     assert np.abs(follow(sim) - there).mean() < 0.001
     assert np.abs(follow(AlignedSim(robot, model, 0.0)) - there).mean() > 0.01
 

@@ -9,10 +9,11 @@ import pytest
 import torch
 from arm import commands, write_arm
 
-from gaponet.deploy.aligned_sim import AlignedSim
+from gaponet.deploy.aligned_sim import AlignedSim, AlignedSimOptions
 
 FILE = Path(__file__).parents[2] / "examples" / "finetune_policy.py"
 SPEC = importlib.util.spec_from_file_location("finetune_policy", FILE)
+ONE_THREAD = AlignedSimOptions(nthread=1)
 example = importlib.util.module_from_spec(SPEC)
 SPEC.loader.exec_module(example)
 
@@ -38,7 +39,7 @@ class Reader:
 
 
 def test_the_feed_forward_it_is_told_is_right_for_the_nominal_simulator(robot, task):
-    sim = AlignedSim(robot, None, np.array([0.0, 0.4]), num_envs=2, nthread=1)
+    sim = AlignedSim(robot, None, np.array([0.0, 0.4]), num_envs=2, options=ONE_THREAD)
     alone, fed = example.follow(task, sim, None), example.follow(task, sim, Reader(task))
     assert (fed < 0.35 * alone).all()
 
@@ -51,7 +52,7 @@ def test_it_is_as_good_on_a_robot_that_is_like_the_simulator(robot, task, monkey
         example, "load_fleet", lambda *_: Fleet("none", 0, (), {"unit": neutral(2)})
     )
     unit = example.Unit(robot, task, "unit", np.array([0.0, 0.4]))
-    sim = AlignedSim(robot, None, np.array([0.0, 0.4]), num_envs=2, nthread=1)
+    sim = AlignedSim(robot, None, np.array([0.0, 0.4]), num_envs=2, options=ONE_THREAD)
     on_unit, in_sim = (example.follow(task, plant, Reader(task)) for plant in (unit, sim))
     np.testing.assert_allclose(on_unit, in_sim, atol=2e-3)
 
@@ -59,11 +60,15 @@ def test_it_is_as_good_on_a_robot_that_is_like_the_simulator(robot, task, monkey
 def test_ppo_learns_to_hold_the_arm_up_and_hands_its_policy_on(robot, task):
     torch.manual_seed(0)
     mass = np.full(32, 0.4)
-    env = example.TrackingEnv(task, AlignedSim(robot, None, mass, num_envs=32, nthread=1), seed=0)
+    env = example.TrackingEnv(
+        task, AlignedSim(robot, None, mass, num_envs=32, options=ONE_THREAD), seed=0
+    )
     policy = example.train("nominal", example.make_runner(env), env, 20)
-    sim = AlignedSim(robot, None, np.array([0.4, 0.4]), num_envs=2, nthread=1)
+    sim = AlignedSim(robot, None, np.array([0.4, 0.4]), num_envs=2, options=ONE_THREAD)
     learnt = example.follow(task, sim, policy)
     assert learnt.mean() < 0.9 * example.follow(task, sim, None).mean()
-    weaker = AlignedSim(replace(robot, kp=0.8 * robot.kp), None, mass, num_envs=32, nthread=1)
+    weaker = AlignedSim(
+        replace(robot, kp=0.8 * robot.kp), None, mass, num_envs=32, options=ONE_THREAD
+    )
     on = example.make_runner(example.TrackingEnv(task, weaker, seed=0), policy)
     np.testing.assert_array_equal(example.follow(task, sim, on), learnt)

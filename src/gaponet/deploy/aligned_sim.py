@@ -7,15 +7,32 @@ simulator, commands are transferred so that it moves like the corrected one (dep
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from gaponet.base.arrays import Array
 from gaponet.base.errors import ModelError, UsageError
 from gaponet.deploy.transfer import Reference, Transfer, control_periods_of, own_context
 from gaponet.nn.artifact import GapModel
+from gaponet.nn.loop import DeltaLoop
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.batch import BatchSim, Condition
 from gaponet.sim.inverse import AnalyticInverse
+
+
+@dataclass(frozen=True, kw_only=True)
+class AlignedSimOptions:
+    """Settings of an AlignedSim that few programs change."""
+
+    payload_side: str = "both"
+    """Hands that carry the payload: "both", or the side of one mount."""
+    simulator_payload: Array | float | None = None
+    """kg that the simulator has in its hands, where it does not know of payload_mass."""
+    locked: tuple[str, ...] = ()
+    """Joints clamped at home (sim.model.idle_joints): quicker; arrays are without them."""
+    nthread: int = 0
+    """Threads, 0 for all cores."""
 
 
 class AlignedSim:
@@ -23,9 +40,11 @@ class AlignedSim:
 
     It equals sim.replay with the model's corrector.
 
-        sim = AlignedSim(load_robot("./my_h1_2"), payload_mass=3.0)  # and GapModel.load("run"), if
-        a model helps sim.reset(qpos) sim.step(target)          # for one control period sim.qpos,
-        sim.qvel
+        model = GapModel.load("run")  # if a model helps
+        sim = AlignedSim(load_robot("./my_h1_2"), model, payload_mass=3.0)
+        sim.reset(qpos)
+        sim.step(target)  # for one control period
+        print(sim.qpos, sim.qvel)
 
     Arrays are (num_envs, n) in the order of `joint_names`; without num_envs there is one simulation
     and they are (n,).
@@ -36,13 +55,11 @@ class AlignedSim:
         robot: RobotSpec,
         model: Reference | None = None,
         payload_mass: Array | float = 0.0,
-        payload_side: str = "both",
+        *,
         dt: float | None = None,
         num_envs: int | None = None,
-        nthread: int = 0,
-        locked: tuple[str, ...] = (),
         extrapolate: bool = False,
-        simulator_payload: Array | float | None = None,
+        options: AlignedSimOptions = AlignedSimOptions(),
     ) -> None:
         """
         Args:
@@ -51,68 +68,88 @@ class AlignedSim:
                 fixed probes (`transfer` is None).
             model: A trained model, or an identified robot that the simulator then moves like; None
                 for the simulator without correction.
-            payload_mass: kg in each hand of payload_side, one number or one per simulation.
-            payload_side: "both", or the side of one mount.
+            payload_mass: kg in each hand of options.payload_side, one number or one per simulation.
             dt: Control period, s; default the robot's.
             num_envs: Simulations side by side; None for one, with arrays (n,).
-            nthread: Threads, 0 for all cores.
-            locked: Joints clamped at home (sim.model.idle_joints): quicker; arrays are without
-                them.
             extrapolate: Take payloads beyond those trained on, and simulators beyond those
                 measured.
-            simulator_payload: kg that the simulator has in its hands, where it does not know of
-                payload_mass.
+            options: The side of the payload, locked joints and threads.
+
+        Raises:
+            ModelError: The robot, the control period or the payload does not fit the model.
+            UsageError: A joint that the model corrects is locked.
         """
-        self.dt = robot.dt if dt is None else dt
         if isinstance(model, GapModel):
             model.require_payload(payload_mass, extrapolate)
+        for name in robot.operated:
+            if name in options.locked:
+                raise UsageError(f"joint '{name}' is corrected by the model and cannot be locked")
         self.robot = robot
         self.model = model
+        self.options = options
+        self.dt = robot.dt if dt is None else dt
         self.single = num_envs is None
         self.num_envs = 1 if num_envs is None else num_envs
-        self.payload_mass = np.array(
-            np.broadcast_to(np.asarray(payload_mass, float), self.num_envs)
-        )
-        conditions = [Condition(float(mass), payload_side, self.dt) for mass in self.payload_mass]
-        own = conditions
-        other_payload = simulator_payload is not None
-        if other_payload:
-            masses = np.broadcast_to(np.asarray(simulator_payload, float), self.num_envs)
-            own = [
-                c._replace(payload_mass=float(m)) for c, m in zip(conditions, masses, strict=True)
-            ]
-        self.sim = BatchSim(robot, own, nthread, locked)
+        self.payload_mass = np.array(np.broadcast_to(payload_mass, self.num_envs), float)
+        stated = self._conditions(self.payload_mass)
+        carried = stated
+        if options.simulator_payload is not None:
+            carried = self._conditions(np.broadcast_to(options.simulator_payload, self.num_envs))
+        self.sim = BatchSim(robot, carried, options.nthread, options.locked)
         self.joint_names = self.sim.joint_names
         self.n = self.sim.n
-        free = robot.index(self.joint_names)
-        self.qpos_home = robot.qpos_home[free]
+        self.qpos_home = robot.qpos_home[robot.index(self.joint_names)]
         self.qpos_range = self.sim.range
-        missing = [name for name in robot.operated if name in locked]
-        if missing:
-            raise UsageError(f"joint '{missing[0]}' is corrected by the model and cannot be locked")
         self.op = np.array([self.joint_names.index(name) for name in robot.operated])
-        self.loop = None
-        self.transfer = None
-        trained = model if isinstance(model, GapModel) and not other_payload else None
-        if (
-            trained is not None
-            and trained.is_trained_in(robot)
-            and control_periods_of(trained, self.dt) == 1
-        ):
-            self.loop = trained.loop(self.num_envs, own_context(trained, robot, conditions))
-        elif model is not None:
-            inverse = AnalyticInverse.of(BatchSim(robot, own, nthread, locked))
-            try:
-                self.transfer = Transfer(model, inverse, conditions, locked, nthread, extrapolate)
-            except ModelError:
-                if trained is None or not trained.knows(robot, self.dt):
-                    raise
-                if control_periods_of(trained, self.dt) != 1:
-                    raise
-                self.loop = trained.loop(self.num_envs, trained.contexts_of(robot, own))
+        self.loop: DeltaLoop | None = None
+        self.transfer: Transfer | None = None
+        if model is not None:
+            self._correct_with(model, stated, carried, extrapolate)
         self.target = np.zeros((self.num_envs, self.n))
         self._uncorrected = self.target[:, self.op]
         self.reset()
+
+    def _conditions(self, payload_mass: Array) -> list[Condition]:
+        """Return the condition of each simulation; payload_mass (num_envs,), kg."""
+        side = self.options.payload_side
+        return [Condition(float(mass), side, self.dt) for mass in payload_mass]
+
+    def _correct_with(
+        self,
+        model: Reference,
+        stated: list[Condition],
+        carried: list[Condition],
+        extrapolate: bool,
+    ) -> None:
+        """Use a network directly in the simulator of its training; elsewhere transfer commands.
+
+        Args:
+            model: A network with its simulator, or a simulator.
+            stated: Conditions of the robot that the simulations are to move like.
+            carried: Conditions of the simulations.
+            extrapolate: As in `__init__`.
+        """
+        robot = self.robot
+        nthread = self.options.nthread
+        locked = self.options.locked
+        # With another payload than stated, this is not the simulator of training.
+        network = model if isinstance(model, GapModel) and carried is stated else None
+        if network is not None and network.is_trained_in(robot) and self._has_rate_of(network):
+            self.loop = network.loop(self.num_envs, own_context(network, robot, stated))
+            return
+        inverse = AnalyticInverse.of(BatchSim(robot, carried, nthread, locked))
+        try:
+            self.transfer = Transfer(model, inverse, stated, locked, nthread, extrapolate)
+        except ModelError:
+            if network is None or not network.knows(robot, self.dt):
+                raise
+            if not self._has_rate_of(network):
+                raise
+            self.loop = network.loop(self.num_envs, network.contexts_of(robot, carried))
+
+    def _has_rate_of(self, network: GapModel) -> bool:
+        """Return true if the control period is that of the network's training."""
+        return control_periods_of(network, self.dt) == 1
 
     @property
     def qpos(self) -> Array:

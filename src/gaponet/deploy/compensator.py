@@ -43,6 +43,7 @@ from gaponet.deploy.payload import PayloadEstimate
 from gaponet.deploy.transfer import own_context
 from gaponet.nn.adaptation import Adaptation
 from gaponet.nn.artifact import GAIN_TOLERANCE, GapModel
+from gaponet.nn.loop import DeltaLoop
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.batch import BatchSim, Condition
 from gaponet.sim.model import idle_joints
@@ -60,8 +61,9 @@ class CompensatorConfig:
     dynamics: bool = False
     """Feed forward the torque of motion too, not only of holding; aim target alone.
 
-    For smooth targets: it halves the
-    error of planned motions, but amplifies 5 mrad of noise on targets to 0.2 rad on commands."""
+    For smooth targets: it halves the error of planned motions, but amplifies 5 mrad of noise on
+    targets to 0.2 rad on commands.
+    """
     acceleration_time: float = 0.02
     """Low-pass of the targets' acceleration, s."""
     gain: float = 0.5
@@ -88,12 +90,9 @@ class CompensatorConfig:
 
     def __post_init__(self) -> None:
         numbers = np.array([x for x in vars(self).values() if not isinstance(x, str)], float)
-        valid = (
-            self.aim in ("target", "simulator")
-            and 0 < self.gain <= 1
-            and min(self.limit, self.iterations) > 0
-        )
-        if not valid or not ((numbers >= 0) & (numbers < np.inf)).all():
+        in_range = 0 < self.gain <= 1 and self.limit > 0 and self.iterations > 0
+        finite = ((numbers >= 0) & (numbers < np.inf)).all()
+        if self.aim not in ("target", "simulator") or not in_range or not finite:
             text = "gain must be in (0, 1], limit and iterations > 0, the rest finite and ≥ 0"
             raise UsageError(f"compensator: aim is target or simulator; {text}")
 
@@ -150,7 +149,6 @@ class Compensator:
             UsageError: `follow` with a model, or with a robot that is not identified.
         """
         self.dt = robot.dt if dt is None else dt
-        max_mass = config.payload_max
         if follow is not None and model is not None:
             raise UsageError(
                 "compensator: follow takes no model. A model of the nominal simulator follows it "
@@ -158,21 +156,24 @@ class Compensator:
             )
         if model is not None:
             robot = _simulator_of(model, robot, self.dt, config)
-            max_mass = model.config.payload_max if extrapolate else model.max_payload
-        robot = robot if adaptation is None else adaptation.robot(robot)
+        if adaptation is not None:
+            robot = adaptation.robot(robot)
         self.robot = robot
         self.model = model
         self.config = config
         self.single = num_envs is None
         self.extrapolate = extrapolate
-        self.num_envs = num = 1 if num_envs is None else num_envs
-        max_mass = max_mass if robot.payload_mounts else 0.0
-        self.masses = np.linspace(0.0, max_mass, 1 + int(np.ceil(max_mass / payload_step - 1e-9)))
+        num = 1 if num_envs is None else num_envs
+        self.num_envs = num
+        max_mass = _max_payload(robot, model, config, extrapolate)
+        steps = int(np.ceil(max_mass / payload_step - 1e-9))
+        self.masses = np.linspace(0.0, max_mass, 1 + steps)
         locked = idle_joints(robot, robot.operated)
+        empty = Condition(0.0, payload_side, self.dt)
+        loads = [Condition(float(mass), payload_side, self.dt) for mass in self.masses]
         # The last rows never move. Their models have one of the masses each, and are copied when a
         # payload changes.
-        carried = [Condition(float(m), payload_side, self.dt) for m in (*[0.0] * num, *self.masses)]
-        self.shadow = BatchSim(robot, carried, nthread, locked)
+        self.shadow = BatchSim(robot, [empty] * num + loads, nthread, locked)
         self.ids = np.arange(num)
         self.op = robot.operated_index
         self.free = robot.index(self.shadow.joint_names)
@@ -181,9 +182,11 @@ class Compensator:
         self.kp = robot.kp[self.op]
         self.zero_offset = robot.offset[self.op]
         self.bias: Array = self.shadow.batch.bind("qfrc_bias")
-        self.loop = None if model is None else model.loop(num)
-        loads = [Condition(float(mass), payload_side, self.dt) for mass in self.masses]
-        self._contexts = None if model is None else own_context(model, robot, loads)
+        self.loop: DeltaLoop | None = None
+        self._contexts: Array | None = None
+        if model is not None:
+            self.loop = model.loop(num)
+            self._contexts = own_context(model, robot, loads)
         self.feedforward = Feedforward(
             self.shadow, self.operated, robot, self.dt, config.acceleration_time
         )
@@ -194,13 +197,12 @@ class Compensator:
         self._carried = np.full(num, -1)  # index of the mass that each shadow carries
         self.follower: Follower | None = None
         if follow is not None:
-            empty = Condition(0.0, payload_side, self.dt)
             self.follower = Follower(robot, empty, self.masses, num, locked, extrapolate)
         self.payload_mass = np.zeros(num)
         self.payload_stated = False
         self.periods = 0
-        # u − a′ of the iteration; last command, rad
-        self.offset, self.command = np.zeros((2, num, len(self.op)))
+        self.offset = np.zeros((num, len(self.op)))  # u − a′ of the iteration, rad
+        self.command = np.zeros((num, len(self.op)))  # the last one, rad
         self._target: Array | None = None  # last finite target; None before `reset`
         self._deviation = np.zeros((num, len(self.op)))  # of the robot from the shadow, slow, rad
         # Control periods in which a motor or the command was at its limit, (num, n).
@@ -537,6 +539,17 @@ class Feedback:
         integral = self.integral + config.feedback * self.dt * np.where(winds_up, 0.0, filtered)
         self._filtered = np.where(valid[:, None], filtered, self._filtered)
         self.integral = np.where(valid[:, None], np.clip(integral, -limit, limit), self.integral)
+
+
+def _max_payload(
+    robot: RobotSpec, model: GapModel | None, config: CompensatorConfig, extrapolate: bool
+) -> float:
+    """Return the largest mass that the shadow can carry in each hand, kg."""
+    if not robot.payload_mounts:
+        return 0.0
+    if model is None:
+        return config.payload_max
+    return model.config.payload_max if extrapolate else model.max_payload
 
 
 def _simulator_of(

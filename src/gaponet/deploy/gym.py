@@ -163,4 +163,5 @@ class AlignedActions(gymnasium.Wrapper):
         return self.env.reset(**how)
 
     def step(self, action: Any) -> Any:
-        return self.env.step(self.align(self.env.unwrapped.data, action))  # type: ignore[attr-defined]
+        scene: Any = self.env.unwrapped
+        return self.env.step(self.align(scene.data, action))

@@ -23,9 +23,10 @@ class MujocoAligner:
 
     One object per MjData.
 
-    align = MujocoAligner(load_robot("./my_h1_2"), mj_model, dt=0.02, payload_mass=3.0)  # or
-    GapModel.load("run") data.ctrl[:] = align(data, target)                    # once per control
-    period mujoco.mj_step(mj_model, data, round(0.02 / mj_model.opt.timestep))
+        model = load_robot("./my_h1_2")  # or GapModel.load("run")
+        align = MujocoAligner(model, mj_model, dt=0.02, payload_mass=3.0)
+        data.ctrl[:] = align(data, target)  # once per control period
+        mujoco.mj_step(mj_model, data, round(0.02 / mj_model.opt.timestep))
 
     If the robot of the scene differs from the identified one or from the simulator of training,
     commands are transferred (deploy/transfer.py): other gains, friction, inertias, actuators, or a
@@ -60,48 +61,31 @@ class MujocoAligner:
         Raises:
             ModelError: The scene, the control period or the payload does not fit.
         """
-        robot, source = (
-            (model.simulator(), model.path)
-            if isinstance(model, GapModel)
-            else (model, model.folder)
-        )
-        scene_joints = [mj_model.joint(j).name for j in range(mj_model.njnt)]
-        for name in robot.operated:
-            if prefix + name not in scene_joints:
-                raise ModelError(
-                    f"{source}: moves joint '{prefix + name}', the scene has "
-                    f"{', '.join(scene_joints)}; give prefix"
-                )
-        unchanged = not robot.has_servo_model
+        robot = model.simulator() if isinstance(model, GapModel) else model
+        _require_joints(mj_model, robot, model, prefix)
         if isinstance(model, GapModel):
             model.require_payload(payload_mass, extrapolate)
-            unchanged = control_periods_of(model, dt) == 1
-        driven = {mj_model.joint(j).name for j in mj_model.actuator_trnid[:, 0]}
-        locked = tuple(name for name in robot.joint_names if prefix + name not in driven)
+        can_agree = _can_agree(model, dt)
         condition = Condition(payload_mass, "both", dt)
+        locked = _undriven(mj_model, robot, prefix)
         reference = BatchSim(robot, [condition], 1, locked)
-        joints = reference.joint_names
-        inverse = _of_scene(mj_model, tuple(prefix + name for name in joints), dt)
+        inverse = _of_scene(mj_model, tuple(prefix + name for name in reference.joint_names), dt)
         self.payload_mass = payload_mass
         self.loop: DeltaLoop | None = None
         self.transfer: Transfer | None = None
-        equal = unchanged and inverse.agrees_with(AnalyticInverse.of(reference), reference.range)
-        if equal and isinstance(model, GapModel):
-            self.loop = model.loop(context=own_context(model, robot, [condition]))
-            joints = robot.operated
-        elif not equal:
+        of_reference = AnalyticInverse.of(reference)
+        if not can_agree or not inverse.agrees_with(of_reference, reference.range):
             try:
                 self.transfer = Transfer(model, inverse, [condition], locked, 1, extrapolate)
             except ModelError:
-                context = _known_context(model, mj_model, robot, dt, prefix)
-                if context is None or not isinstance(model, GapModel):
+                self.loop = _loop_of_known_scene(model, mj_model, robot, dt, prefix)
+                if self.loop is None:
                     raise
-                self.loop = model.loop(context=context)
-                joints = robot.operated
+        elif isinstance(model, GapModel):
+            self.loop = model.loop(context=own_context(model, robot, [condition]))
+        joints = reference.joint_names if self.loop is None else robot.operated
         names = [prefix + name for name in joints]
-        self.qpos = np.array([mj_model.joint(name).qposadr[0] for name in names])
-        self.qvel = np.array([mj_model.joint(name).dofadr[0] for name in names])
-        self.actuator = np.array([_actuator(mj_model, name) for name in names])
+        self.qpos, self.qvel, self.actuator = _addresses(mj_model, names)
         self._fresh = True
 
     def reset(self) -> None:
@@ -128,17 +112,42 @@ class MujocoAligner:
         return out
 
 
-def _known_context(
+def _require_joints(scene: mujoco.MjModel, robot: RobotSpec, model: Reference, prefix: str) -> None:
+    """Refuse a scene that lacks an operated joint."""
+    joints = [scene.joint(j).name for j in range(scene.njnt)]
+    for name in robot.operated:
+        if prefix + name not in joints:
+            source = model.path if isinstance(model, GapModel) else model.folder
+            raise ModelError(
+                f"{source}: moves joint '{prefix + name}', the scene has {', '.join(joints)}; give "
+                "prefix"
+            )
+
+
+def _can_agree(model: Reference, dt: float) -> bool:
+    """Return true if a scene of plain MuJoCo can move like the model's simulator."""
+    if isinstance(model, GapModel):
+        return control_periods_of(model, dt) == 1
+    return not model.has_servo_model
+
+
+def _undriven(scene: mujoco.MjModel, robot: RobotSpec, prefix: str) -> tuple[str, ...]:
+    """Return the robot's joints without an actuator in the scene."""
+    driven = {scene.joint(j).name for j in scene.actuator_trnid[:, 0]}
+    return tuple(name for name in robot.joint_names if prefix + name not in driven)
+
+
+def _loop_of_known_scene(
     model: Reference, scene: mujoco.MjModel, robot: RobotSpec, dt: float, prefix: str
-) -> Array | None:
-    """Return the scene's answers to fixed probes if the network's training has such answers."""
+) -> DeltaLoop | None:
+    """Return the network's loop if the scene answers fixed probes as simulators of training did."""
     if not isinstance(model, GapModel) or control_periods_of(model, dt) != 1:
         return None
     known = model.known_simulators
     if known is None:
         return None
     context = scene_context(scene, robot, dt, prefix)
-    return context if known.include(context) else None
+    return model.loop(context=context) if known.include(context) else None
 
 
 def _of_scene(scene: mujoco.MjModel, joints: tuple[str, ...], dt: float) -> AnalyticInverse:
@@ -149,6 +158,14 @@ def _of_scene(scene: mujoco.MjModel, joints: tuple[str, ...], dt: float) -> Anal
     return AnalyticInverse(
         Batch(model, nsim=1, nthread=1), model, joints, np.array([round(dt / h)]), np.array([h])
     )
+
+
+def _addresses(scene: mujoco.MjModel, joints: list[str]) -> tuple[Array, Array, Array]:
+    """Return the indices of joints in qpos, qvel and ctrl, each (n)."""
+    qpos = [scene.joint(name).qposadr[0] for name in joints]
+    qvel = [scene.joint(name).dofadr[0] for name in joints]
+    ctrl = [_actuator(scene, name) for name in joints]
+    return np.array(qpos), np.array(qvel), np.array(ctrl)
 
 
 def _actuator(scene: mujoco.MjModel, joint: str) -> int:
