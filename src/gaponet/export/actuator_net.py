@@ -257,25 +257,29 @@ def _fit(net: ActuatorNet, x: Tensor, y: Tensor) -> None:
     net.scale *= unit
 
 
+def _stack(tensors: ListOf[Tensor]) -> np.ndarray:
+    return np.stack([tensor.detach().numpy() for tensor in tensors])
+
+
+def _stacked_layer(nets: ListOf[ActuatorNet], k: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return weights (n, outputs, inputs) and biases (n, outputs) of the networks' k-th module."""
+    linear: list[Any] = [net.net[k] for net in nets]
+    weights = _stack([layer.weight for layer in linear])
+    biases = _stack([layer.bias for layer in linear])
+    return weights, biases
+
+
 def _stacked(nets: ListOf[ActuatorNet]) -> Callable[[np.ndarray], np.ndarray]:
     """Return the networks of all joints as one numpy function: pasts (n, 2L) → torque (n,) N·m."""
 
-    def stack(tensors: ListOf[Tensor]) -> np.ndarray:
-        return np.stack([tensor.detach().numpy() for tensor in tensors])
-
-    servo = stack([net.servo for net in nets])
-    mean = stack([net.mean for net in nets])
-    std = stack([net.std for net in nets])
+    servo = _stack([net.servo for net in nets])
+    mean = _stack([net.mean for net in nets])
+    std = _stack([net.std for net in nets])
     rest = np.array([net.rest for net in nets])
     limit = np.array([net.limit for net in nets])
     scale = np.array([net.gain * net.scale for net in nets])
     most_added = np.array([net.most_added for net in nets])
-    layers = []
-    for k in (0, 2, 4):
-        linear: list[Any] = [net.net[k] for net in nets]
-        weights = stack([layer.weight for layer in linear])
-        biases = stack([layer.bias for layer in linear])
-        layers.append((weights, biases))
+    layers = [_stacked_layer(nets, k) for k in (0, 2, 4)]
 
     def torque(past: np.ndarray) -> np.ndarray:
         z = np.clip((past - mean) / std, -MAX_INPUT_STD, MAX_INPUT_STD)

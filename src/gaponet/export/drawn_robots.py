@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from collections.abc import Sequence as ListOf
 from dataclasses import dataclass, replace
+from itertools import chain
 
 import numpy as np
 
@@ -28,10 +29,7 @@ RANGE_PERCENT = 5, 95
 Units = dict[str, Array]  # field → (units, n) in SI units; a row is one unit
 
 # in the robot folder: with the servo model, without it
-CACHES = (
-    "drawn_robots.json",
-    "drawn_plain_robots.json",
-)
+CACHES = ("drawn_robots.json", "drawn_plain_robots.json")
 
 # number of units, and the share that is retained
 DRAWN = 128
@@ -54,8 +52,7 @@ class DrawnRobots:
         units: Field → (retained units, n) in SI units, and coordinates of drawn links; a row is one
             unit.
         errors: "exported", "units", "one by one" (each number from the range of 9 of 10 units) and
-            "by hand" → mean
-            |error| on validation motions, rad.
+            "by hand" → mean |error| on validation motions, rad.
     """
 
     units: dict[str, list[list[float]]]
@@ -98,8 +95,11 @@ def draw_robots(
         progress: Called with done, total and a note.
     """
     train, validation = recordings
-    note = ", without the servo model" * plain
-    base = fit_plain_servos(robot, train, progress, engine_terms) if plain else robot
+    note = ""
+    base = robot
+    if plain:
+        note = ", without the servo model"
+        base = fit_plain_servos(robot, train, progress, engine_terms)
     first = {f: v[:DRAWN] for f, v in drawn.items()}
 
     def draw() -> DrawnRobots:
@@ -124,55 +124,53 @@ def _draw(
     validation: ListOf[Sequence],
     progress: Progress,
 ) -> DrawnRobots:
-    def errors_of(motions: ListOf[Sequence], robots: ListOf[RobotSpec], what: str) -> list[float]:
-        errors = []
-        for i, one in enumerate(robots):
-            errors.append(rollout_error(motions, one))
-            progress(i + 1, len(robots), what)
-        return errors
-
-    costs = errors_of(_windows(train), robots_of(base, drawn), "units on training motions")
+    every = robots_of(base, drawn)
+    costs = _rollout_errors(_windows(train), every, progress, "units on training motions")
     best = np.sort(np.argsort(costs)[: max(round(KEPT_SHARE * len(costs)), 1)])
     units = {field: values[best] for field, values in drawn.items()}
     rng = np.random.default_rng(0)
-    servos = [values for field, values in units.items() if field != "links"]
-    low, high = (
-        np.array([np.percentile(v, side, axis=0) for v in servos]) for side in RANGE_PERCENT
-    )
-    alone = rng.uniform(low, high, (JUDGED, *low.shape)).swapaxes(0, 1)
     robots = {
         "exported": [base],
         "units": robots_of(base, units)[:JUDGED],
-        "one by one": robots_of(base, dict(zip(units, alone, strict=False))),
+        "one by one": _one_by_one(base, units, rng),
         "by hand": _by_hand(base, rng),
     }
-    judged = iter(
-        errors_of(
-            validation,
-            [r for kind in robots.values() for r in kind],
-            "robots on validation motions",
-        )
-    )
-    errors = {
-        kind: float(np.mean([next(judged) for _ in several])) for kind, several in robots.items()
-    }
+    judged = list(chain(*robots.values()))
+    each = _rollout_errors(validation, judged, progress, "robots on validation motions")
+    errors = {}
+    start = 0
+    for kind, several in robots.items():
+        end = start + len(several)
+        errors[kind] = float(np.mean(each[start:end]))
+        start = end
     return DrawnRobots({field: values.tolist() for field, values in units.items()}, errors)
+
+
+def _rollout_errors(
+    motions: ListOf[Sequence], robots: ListOf[RobotSpec], progress: Progress, what: str
+) -> list[float]:
+    """Return the mean |error| of each robot over rollouts of motions, rad."""
+    errors = []
+    for i, robot in enumerate(robots):
+        errors.append(rollout_error(motions, robot))
+        progress(i + 1, len(robots), what)
+    return errors
 
 
 def robots_of(base: RobotSpec, units: Mapping[str, Array]) -> list[RobotSpec]:
     """Return a robot for each row of units."""
-    servos = {field: values for field, values in units.items() if field != "links"}
-    robots = [
-        base.with_servos(
-            {j: {f: float(v[k, i]) for f, v in servos.items()} for i, j in enumerate(base.operated)}
-        )
-        for k in range(len(units["kp"]))
-    ]
-    if links := LinkAxes(base.before_identification).links if "links" in units else None:
-        robots = [
-            replace(one, links=links(row)) for one, row in zip(robots, units["links"], strict=True)
-        ]
-    return robots
+    fields = [field for field in units if field != "links"]
+    robots = []
+    for k in range(len(units["kp"])):
+        servos = {}
+        for i, joint in enumerate(base.operated):
+            servos[joint] = {field: float(units[field][k, i]) for field in fields}
+        robots.append(base.with_servos(servos))
+    if "links" not in units:
+        return robots
+    axes = LinkAxes(base.before_identification)
+    rows = zip(robots, units["links"], strict=True)
+    return [replace(robot, links=axes.links(row)) for robot, row in rows]
 
 
 def _moved(robot: RobotSpec, base: RobotSpec, drawn: Units) -> Units:
@@ -180,31 +178,48 @@ def _moved(robot: RobotSpec, base: RobotSpec, drawn: Units) -> Units:
 
     Every second one deviates half as far.
     """
-    lacking = [] if base is robot else [f for f in SERVO_TERMS if not getattr(base, f).any()]
-    fields = [f for f in drawn if f not in ("effort_limit", "links", *lacking)]
-    own, center = (np.stack(list(to_axes(r, fields).values())) for r in (robot, base))
-    axes = np.stack(
-        [np.stack(list(to_axes(one, fields).values())) for one in robots_of(robot, drawn)]
-    )
-    share = np.where(np.arange(len(axes)) % 2, NEAR, 1.0)[:, None, None]
+    fields = [field for field in drawn if field not in ("effort_limit", "links")]
+    if base is not robot:
+        lacking = [term for term in SERVO_TERMS if not getattr(base, term).any()]
+        fields = [field for field in fields if field not in lacking]
+    own = _on_axes(robot, fields)
+    axes = np.stack([_on_axes(unit, fields) for unit in robots_of(robot, drawn)])
+    share = np.where(np.arange(len(axes)) % 2, NEAR, 1.0)[:, None]  # (units, 1)
+    x = _on_axes(base, fields) + share[:, :, None] * (axes - own)
     signed = [SERVO_FIELDS[f].axis == "log" or SERVO_FIELDS[f].signed for f in fields]
-    x = center + share * (axes - own)
     units: Units = dict(from_axes(fields, np.where(signed, x, np.maximum(x, 0.0))))
     op = robot.operated_index
     units["effort_limit"] = base.effort_limit[op] * units["kp"] / base.kp[op]
-    if links := ParameterUncertainty.require(robot).links if "links" in drawn else None:
-        units["links"] = np.array(links.values) + share[:, :, 0] * (
-            drawn["links"] - np.array(links.values)
-        )
+    links = ParameterUncertainty.require(robot).links
+    if links and "links" in drawn:
+        fitted = np.array(links.values)
+        units["links"] = fitted + share * (drawn["links"] - fitted)
     return units
 
 
+def _on_axes(robot: RobotSpec, fields: ListOf[str]) -> Array:
+    """Return fields of the operated joints on the axes of the uncertainty, (n, P)."""
+    return np.stack(list(to_axes(robot, fields).values()))
+
+
+def _one_by_one(
+    base: RobotSpec, units: Mapping[str, Array], rng: np.random.Generator
+) -> list[RobotSpec]:
+    """Return robots with each number drawn by itself from the range that the units have."""
+    servos = {field: values for field, values in units.items() if field != "links"}
+    low = np.array([np.percentile(v, RANGE_PERCENT[0], axis=0) for v in servos.values()])
+    high = np.array([np.percentile(v, RANGE_PERCENT[1], axis=0) for v in servos.values()])
+    alone = rng.uniform(low, high, (JUDGED, *low.shape)).swapaxes(0, 1)
+    return robots_of(base, dict(zip(servos, alone, strict=True)))
+
+
 def _by_hand(base: RobotSpec, rng: np.random.Generator) -> list[RobotSpec]:
-    values = {f: getattr(base, f)[base.operated_index] for f in BY_HAND_FIELDS}
-    return robots_of(
-        base,
-        {f: v * rng.uniform(1 - BY_HAND, 1 + BY_HAND, (JUDGED, len(v))) for f, v in values.items()},
-    )
+    """Return robots with a few fields drawn within ± BY_HAND of their values."""
+    units = {}
+    for field in BY_HAND_FIELDS:
+        values = getattr(base, field)[base.operated_index]
+        units[field] = values * rng.uniform(1 - BY_HAND, 1 + BY_HAND, (JUDGED, len(values)))
+    return robots_of(base, units)
 
 
 def _windows(sequences: ListOf[Sequence]) -> list[Sequence]:
@@ -212,10 +227,7 @@ def _windows(sequences: ListOf[Sequence]) -> list[Sequence]:
     pieces = []
     for s in sequences:
         rows = round(WINDOW_S / s.dt)
-        pieces += [
-            s.rows(slice(start, start + rows))
-            for start in range(0, max(len(s) - rows // 2, 1), rows)
-        ]
-    return [
-        pieces[i] for i in np.unique(np.linspace(0, len(pieces) - 1, WINDOWS).round().astype(int))
-    ]
+        for start in range(0, max(len(s) - rows // 2, 1), rows):
+            pieces.append(s.rows(slice(start, start + rows)))
+    taken = np.unique(np.linspace(0, len(pieces) - 1, WINDOWS).round().astype(int))
+    return [pieces[i] for i in taken]

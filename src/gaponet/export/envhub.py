@@ -40,18 +40,21 @@ envs = make_env("USER/NAME", n_envs=4, trust_remote_code=True)
 
 | what | value |
 | --- | --- |
-| action, `agent_pos` | joint targets and positions in LeRobot's values: degrees, 0..100 for {percent} |
+| action, `agent_pos` | targets and positions in LeRobot's values: degrees, 0..100 for {percent} |
 | `environment_state` | the goal, in the same values |
 | rate | {rate:.4g} Hz |
 | success | every operated joint within 0.05 rad of the goal for 10 control periods |
 | servos | {kind}; {drawn} |
 
-`env.py` needs gymnasium, MuJoCo 3.5 or newer and numpy; it fetches the other files of this repository.
-`python check.py` plays the motions of `check.npz` and prints the error.
+`env.py` needs gymnasium, MuJoCo 3.5 or newer and numpy; it fetches the other files of this
+repository. `python check.py` plays the motions of `check.npz` and prints the error.
 """
 IDENTIFIED = "Friction, delay, offset and gains of its servos were identified from logs by gaponet."
 NOMINAL = "Its servos are nominal: nothing was identified from logs."
-OF_VIRTUAL = " No real robot made them: the error shows that the files are complete, not how near they are to a robot."
+OF_VIRTUAL = (
+    " No real robot made them: the error shows that the files are complete, not how near they are "
+    "to a robot."
+)
 
 
 def lerobot_units(robot: RobotSpec) -> dict[str, str]:

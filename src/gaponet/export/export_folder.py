@@ -131,6 +131,17 @@ class _RobotExport:
         """Physics step, s."""
         return float(self.facts["options"]["timestep"])
 
+    def write_robot(self, source: Source | None) -> Path | None:
+        """Write the file of the robot, and return it; None for json, which has none."""
+        if self.to in MJCF_TARGETS:
+            return self.write_mjcf(source.file if source else self.robot.mjcf)
+        if self.to == "urdf":
+            assert source is not None
+            return self.write_urdf(source.file)
+        if self.to == "json":
+            return None
+        return self.write_scene()
+
     def write_mjcf(self, source: Path) -> Path:
         """Write an edited copy of an MJCF, and measure it in plain MuJoCo."""
         file, not_rad = edit_mjcf(source, self.out, self.plain, self.facts, self.payload_mass)
@@ -218,24 +229,61 @@ def export_robot(
     """
     if to == "urdf" and source is None:
         raise UsageError("--to urdf edits a copy of your own file: --into FILE.urdf")
-    played = recordings
-    if played is None:
-        motions = own_motions(robot, payload_mass, 24 if robot.has_servo_model else 2)
-        played = motions[::2], motions[1::2] or motions
-    train = played[0]
-    validation = comparable(played[1], robot, payload_mass)
+    train, validation = _motions(robot, recordings, payload_mass)
+    plain = fit_plain_servos(robot, train, progress, ENGINE_TERMS.get(to, ()))
+    dt = control_period(robot, (s.dt for s in validation))
+    facts = simulator_facts(robot, dt, payload_mass, plain)
+    facts["file"] = ROBOT
+    facts["prefix"] = source.prefix if source else ""
+    facts["virtual"] = validation[0].meta.virtual
+    export = _measured_export(robot, plain, to, out, validation, facts)
+    with lock_folder(out, FOLDER_KIND):
+        file = export.write_robot(source)
+        if file is not None:
+            facts["file"] = str(file.relative_to(out))
+        _write_motions(out / CHECK, export.checked)
+        _write_shipped(out, to, facts)
+    if to == "envhub":
+        has_units = envhub.write_units(robot, out, recordings, progress)
+        envhub.write_readme(robot, facts, has_units, out)
+    return ExportedFolder(
+        file, export.errors, len(validation), facts["virtual"], tuple(export.notes)
+    )
+
+
+def _motions(
+    robot: RobotSpec,
+    recordings: tuple[ListOf[Sequence], ListOf[Sequence]] | None,
+    payload_mass: float,
+) -> tuple[ListOf[Sequence], ListOf[Sequence]]:
+    """Return training motions, and validation motions that can be compared.
+
+    Without recordings, both are simulated motions of the robot itself.
+    """
+    if recordings is None:
+        count = 24 if robot.has_servo_model else 2
+        motions = own_motions(robot, payload_mass, count)
+        recordings = motions[::2], motions[1::2] or motions
+    train, played = recordings
+    validation = comparable(played, robot, payload_mass)
     if not validation:
         raise UsageError(
             f"no validation motion was made with {payload_mass:g} kg and the robot's own gains"
         )
-    plain = fit_plain_servos(robot, train, progress, ENGINE_TERMS.get(to, ()))
-    dt = control_period(robot, (s.dt for s in validation))
-    facts = simulator_facts(robot, dt, payload_mass, plain)
+    return train, validation
+
+
+def _measured_export(
+    robot: RobotSpec,
+    plain: RobotSpec,
+    to: str,
+    out: Path,
+    validation: ListOf[Sequence],
+    facts: dict[str, Any],
+) -> _RobotExport:
+    """Return an export with its errors in gaponet, before anything is written."""
     has_ramps = to in MJCF_TARGETS and MUJOCO_HAS_RAMPS
     checked = check_motions(validation, robot, ramped=not has_ramps)
-    is_virtual = validation[0].meta.virtual
-    prefix = source.prefix if source else ""
-    facts |= {"file": ROBOT, "prefix": prefix, "virtual": is_virtual}
     if to == "envhub":
         facts["lerobot_units"] = envhub.lerobot_units(robot)
     played_there = replace(plain, table=None) if to in WITHOUT_TABLE else plain
@@ -247,23 +295,7 @@ def export_robot(
     if robot.has_servo_model:
         errors["in gaponet, without the servo model"] = rollout_error(validation, plain)
     notes = _notes(robot, facts, to)
-    export = _RobotExport(robot, plain, to, out, validation, checked, facts, errors, notes)
-    file = None
-    with lock_folder(out, FOLDER_KIND):
-        if to in MJCF_TARGETS:
-            file = export.write_mjcf(source.file if source else robot.mjcf)
-        elif to == "urdf":
-            assert source is not None
-            file = export.write_urdf(source.file)
-        elif to != "json":
-            file = export.write_scene()
-        facts["file"] = str(file.relative_to(out)) if file else ROBOT
-        _write_motions(out / CHECK, checked)
-        _write_shipped(out, to, facts)
-    if to == "envhub":
-        has_units = envhub.write_units(robot, out, recordings, progress)
-        envhub.write_readme(robot, facts, has_units, out)
-    return ExportedFolder(file, errors, len(validation), is_virtual, tuple(notes))
+    return _RobotExport(robot, plain, to, out, validation, checked, facts, errors, notes)
 
 
 def _notes(robot: RobotSpec, facts: dict[str, Any], to: str) -> list[str]:
@@ -275,19 +307,14 @@ def _notes(robot: RobotSpec, facts: dict[str, Any], to: str) -> list[str]:
     if robot.target_speed.any():
         notes.append(_ramp_note(robot, to))
     if robot.friction_per_kelvin.any():
-        warm = ", ".join(f"{t:.0f}" for t in robot.friction_temperature[robot.operated_index])
-        notes.append(f"friction and damping are those at {warm} °C: no engine has a temperature")
+        notes.append(_temperature_note(robot))
     is_late = any(servo["delay"] for servo in servos)
     if is_late and to in DELAY_NOTES:
         notes.append(DELAY_NOTES[to])
     if to == "urdf":
         notes.append(_urdf_note(facts))
-    law = [term for term in facts["law"] if term not in ENGINE_TERMS.get(to, ())]
-    if law and to in WITHOUT_SERVO_MODEL:
-        terms = ", ".join(law)
-        notes.append(
-            f"the servo model ({terms}) is not in {to}: the numbers were fitted without it"
-        )
+    if to in WITHOUT_SERVO_MODEL:
+        notes += _law_notes(facts["law"], to)
     if to == "mjlab" and robot.backlash.any():
         notes.append("mjlab simulates no backlash: use the form for MuJoCo, or identify without it")
     return notes
@@ -304,6 +331,21 @@ def _stop_notes(robot: RobotSpec) -> list[str]:
                 "was that a stop?"
             )
     return notes
+
+
+def _temperature_note(robot: RobotSpec) -> str:
+    """Return at which temperatures friction and damping are those of the export."""
+    warm = ", ".join(f"{t:.0f}" for t in robot.friction_temperature[robot.operated_index])
+    return f"friction and damping are those at {warm} °C: no engine has a temperature"
+
+
+def _law_notes(law: ListOf[str], to: str) -> list[str]:
+    """Return which terms of the servo model an engine lacks."""
+    lacking = [term for term in law if term not in ENGINE_TERMS.get(to, ())]
+    if not lacking:
+        return []
+    terms = ", ".join(lacking)
+    return [f"the servo model ({terms}) is not in {to}: the numbers were fitted without it"]
 
 
 def _ramp_note(robot: RobotSpec, to: str) -> str:
@@ -448,12 +490,12 @@ def _error_in_mujoco(
     file: Path, facts: dict[str, Any], motions: ListOf[Sequence], robot: RobotSpec, form: str
 ) -> float:
     """Return the mean |error| of the written file in plain MuJoCo, rad."""
-    op, low, high = robot.operated_index, *robot.qpos_range.T
+    op = robot.operated_index
+    low, high = robot.qpos_range.T
     errors = []
     for s in motions:
         motion = {"ctrl": np.clip(s.ctrl, low, high), "qpos": s.qpos, "qvel": s.qvel, "dt": s.dt}
-        played = mujoco_servos.play(
-            mujoco.MjModel.from_xml_path(str(file)), facts, motion, facts["prefix"], form
-        )
+        model = mujoco.MjModel.from_xml_path(str(file))  # play changes its step
+        played = mujoco_servos.play(model, facts, motion, facts["prefix"], form)
         errors.append(mean_error(s.qpos[:, op], played[:, op]))
     return float(np.mean(errors))

@@ -43,26 +43,26 @@ OFFSETS = {offsets}
 '''
 README = """# {robot} for Isaac Lab 3
 
-The same servos in two forms. The errors are means over the joints on the motions of `check.npz`, which are
-{motions}, in gaponet, without a table.
+The same servos in two forms. The errors are means over the joints on the motions of `check.npz`,
+which are {motions}, in gaponet, without a table.
 
 | form | files | mrad |
 | --- | --- | --: |
 | Isaac Lab's own classes | `robot_cfg.py` | {native:.2f} |
 | action term | `gaponet_action.py`, `facts.json` | {action:.2f} |
 
-**Isaac Lab's own classes** run as native Newton actuators, the default of Isaac Lab 3. Take them unless you need the
-other form.
+**Isaac Lab's own classes** run as native Newton actuators, the default of Isaac Lab 3. Take them
+unless you need the other form.
 
-**The action term** has delays in parts of a physics step and drawn units, and it carries a network. It needs
-`use_newton_actuators=False`, which Isaac Lab calls deprecated.
+**The action term** has delays in parts of a physics step and drawn units, and it carries a network.
+It needs `use_newton_actuators=False`, which Isaac Lab calls deprecated.
 
 From the identified robot to Isaac Lab's own classes, one loss after the other, on all {motions}:
 
 {errors}
 
 ```console
-python make_usd.py         # usd/ from robot.xml, and usd_servos/ with the servos as NewtonActuator prims
+python make_usd.py         # usd/ from robot.xml; usd_servos/ with servos as NewtonActuator prims
 python check.py            # plays check.npz with robot_cfg.py, and prints the error
 python check.py action     # the same with the action term
 ```

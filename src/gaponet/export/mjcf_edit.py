@@ -13,6 +13,7 @@ import os
 import re
 import shutil
 import xml.parsers.expat as expat
+from collections.abc import Sequence as ListOf
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,7 @@ from gaponet.base.files import atomic_write, lock_folder, write_text
 from gaponet.export.simulator_facts import Joints
 from gaponet.robot.mjcf import compile_spec, inspect_mjcf, read_mjcf
 from gaponet.robot.spec import RobotSpec
+from gaponet.robot.toml_file import Link
 from gaponet.sim.model import (
     PAYLOAD_DENSITY,
     STIFF_SOLIMP,
@@ -231,49 +233,82 @@ def edit_mjcf(
     path = path.resolve()
     joints = facts["plain"]
     prefix = facts["prefix"]
-    before = compile_spec(spec := read_mjcf(path), path)
+    spec = read_mjcf(path)
+    before = compile_spec(spec, path)
     source = Source(path)
-    added = list[str]()
-    not_rad = list[str]()
+    homes_of_added = []  # targets of servos that the file did not have, for keyframes
+    not_rad = []
     for name, servo in joints.items():
         full = prefix + name
-        tag = source.one(f"joints '{full}'", "joint", name=full)
-        if tag is None:
-            have = ", ".join(before.joint(i).name for i in range(before.njnt))
-            what = f"has no joint '{full}' in its text (--prefix is the text before names)"
-            raise RobotError(f"{path}: {what}; it has {have}")
+        tag = _joint_tag(source, full, before)
         actuator = source.one(f"servos of '{full}'", "actuator/", joint=full)
         if actuator is not None and name not in robot.operated:
             continue
-        changed = {f: text_of(servo[f]) for f in JOINT_ATTRIBUTES}
-        if servo["zero"]:
-            ref = before.qpos0[before.joint(full).qposadr[0]] - servo["zero"]
-            changed["ref"] = text_of(math.degrees(ref) if spec.compiler.degree else ref)
-        changed |= {
-            "solreffriction": text_of(*STIFF_SOLREF),
-            "solimpfriction": text_of(*STIFF_SOLIMP),
-        }
-        source.set(tag, **changed)
+        source.set(tag, **_joint_attributes(servo, full, before, spec.compiler.degree))
         delay = max(servo["delay"], facts["joints"][name]["delay"])
-        samples = math.ceil(delay / before.opt.timestep - 1e-9) + 2 if delay else 0
-        if actuator is not None:
-            source.replace(
-                actuator, _servo(servo, samples, _servo_attributes(actuator, before, full))
-            )
-            not_rad += [full] * (abs(_radians_per_unit(before, full) - 1) > 1e-3)
-        else:
-            source.append(
-                "actuator", f"    {_servo(servo, samples, {'name': full, 'joint': full})}\n"
-            )
-            added.append(text_of(servo["home"]))
-    for key in source.tags if added else ():
-        if key.name == "key" and "ctrl" in key.attributes:
-            source.set(key, ctrl=" ".join([key.attributes["ctrl"], *added]))
+        samples = _buffer_length(delay, before.opt.timestep)
+        if actuator is None:
+            added = _servo(servo, samples, {"name": full, "joint": full})
+            source.append("actuator", f"    {added}\n")
+            homes_of_added.append(text_of(servo["home"]))
+            continue
+        own = _servo_attributes(actuator, before, full)
+        source.replace(actuator, _servo(servo, samples, own))
+        if abs(_radians_per_unit(before, full) - 1) > 1e-3:
+            not_rad.append(full)
+    if homes_of_added:
+        _extend_keyframes(source, homes_of_added)
     _add_surroundings(source, robot, prefix, payload_mass, before)
     target = _write(source, out)
     _require(compile_spec(read_mjcf(target), target), before, joints, robot, prefix, target)
     source.write_changes(out)
     return target, not_rad
+
+
+def _joint_tag(source: Source, name: str, model: mujoco.MjModel) -> Tag:
+    """Return the element of a joint."""
+    tag = source.one(f"joints '{name}'", "joint", name=name)
+    if tag is None:
+        have = ", ".join(model.joint(i).name for i in range(model.njnt))
+        raise RobotError(
+            f"{source.main}: has no joint '{name}' in its text (--prefix is the text before "
+            f"names); it has {have}"
+        )
+    return tag
+
+
+def _joint_attributes(
+    servo: dict[str, Any], joint: str, model: mujoco.MjModel, in_degrees: bool
+) -> dict[str, str]:
+    """Return the attributes of a joint that change.
+
+    Args:
+        servo: Wanted values.
+        joint: Name in the file.
+        model: The file, compiled.
+        in_degrees: The file has angles in degrees.
+    """
+    changed = {field: text_of(servo[field]) for field in JOINT_ATTRIBUTES}
+    if servo["zero"]:
+        ref = model.qpos0[model.joint(joint).qposadr[0]] - servo["zero"]
+        changed["ref"] = text_of(math.degrees(ref) if in_degrees else ref)
+    changed["solreffriction"] = text_of(*STIFF_SOLREF)
+    changed["solimpfriction"] = text_of(*STIFF_SOLIMP)
+    return changed
+
+
+def _buffer_length(delay: float, timestep: float) -> int:
+    """Return the length of a delay buffer in physics steps, 0 without a delay; both in s."""
+    if not delay:
+        return 0
+    return math.ceil(delay / timestep - 1e-9) + 2
+
+
+def _extend_keyframes(source: Source, homes: list[str]) -> None:
+    """Append the targets of added servos to the keyframes that have targets."""
+    for key in source.tags:
+        if key.name == "key" and "ctrl" in key.attributes:
+            source.set(key, ctrl=" ".join([key.attributes["ctrl"], *homes]))
 
 
 def _servo(servo: dict[str, Any], samples: int, own: dict[str, str]) -> str:
@@ -348,67 +383,92 @@ def _add_surroundings(
     source: Source, robot: RobotSpec, prefix: str, payload_mass: float, model: mujoco.MjModel
 ) -> None:
     """Add the solver's tolerance, table and payload, and write inertias of identified links."""
-    option = {"tolerance": text_of(TOLERANCE)} if model.opt.tolerance > TOLERANCE else {}
-
-    def body(name: str, what: str) -> Tag:
-        tag = source.one(f"bodies '{name}'", "body", name=name)
-        if tag is None:
-            raise RobotError(
-                f"{source.main}: a [[{what}]] names body '{name}', which is not in its text"
-            )
-        return tag
-
-    off = bool(model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONTACT)
-    if robot.table is not None and not (
-        off and (model.geom_contype | model.geom_conaffinity).any()
-    ):
-        own = build_model(robot)
-        table = prefix + TABLE
+    option = {}
+    if model.opt.tolerance > TOLERANCE:
+        option["tolerance"] = text_of(TOLERANCE)
+    if robot.table is not None and _may_touch_table(model):
         option["cone"] = "elliptic"  # a pyramid's stiffness depends on friction
-        if off:  # contacts are disabled in the file, and the pairs below are the only ones
+        if not _has_contacts(model):  # the pairs with the table are then the only ones
             source.append("option", '    <flag contact="enable"/>\n')
-        plane = (
-            f'<geom name="{table}" type="plane" size="2 2 0.1" contype="0" conaffinity="0" '
-            f'pos="0 0 {text_of(robot.table.height)}" rgba="0.55 0.5 0.45 1"/>'
-        )
-        source.append("worldbody", f"    {plane}\n")
-        for i, tip in enumerate(robot.tips):
-            name = f"{table}_tip_{i}"
-            size = text_of(tip.radius)
-            sphere = (
-                f'<geom name="{name}" type="sphere" size="{size}" pos="{text_of(*tip.pos)}" '
-                'mass="0" contype="0" conaffinity="0" group="3"/>'
-            )
-            source.insert(body(prefix + tip.body, "tip"), sphere)
-            words = _attributes(
-                {
-                    f: text_of(*getattr(own, f"pair_{f}")[i])
-                    for f in ("friction", "solref", "solimp")
-                }
-            )
-            source.append(
-                "contact", f'    <pair geom1="{name}" geom2="{table}" condim="3" {words}/>\n'
-            )
+        _add_table(source, robot, robot.table.height, prefix)
     for name, link in robot.links.items():
-        tag = body(prefix + name, "identified_link")
-        values = {"mass": text_of(link.mass), "pos": text_of(*link.pos)}
-        inertial = f"<inertial {_attributes(values | {'fullinertia': text_of(*link.inertia)})}/>"
-        own = source.child(tag, "inertial")
-        source.replace(own, inertial) if own else source.insert(tag, inertial)
+        tag = _body(source, prefix + name, "identified_link")
+        _write_inertia(source, tag, link)
     for mount in robot.payload_mounts:
-        if mass := payload_mass + mount.mass:
-            radius = (3 * mass / (4 * math.pi * PAYLOAD_DENSITY)) ** (1 / 3)
-            ball = (
-                f'<geom type="sphere" size="{text_of(radius)}" mass="{mass}" '
-                'contype="0" conaffinity="0"/>'
-            )
-            payload = (
-                f'<body name="{prefix}payload_{mount.side}" '
-                f'pos="{text_of(*mount.pos)}">{ball}</body>'
-            )
-            source.insert(body(prefix + mount.body, "payload_mount"), payload)
+        mass = payload_mass + mount.mass
+        if mass:
+            tag = _body(source, prefix + mount.body, "payload_mount")
+            source.insert(tag, _payload(f"{prefix}payload_{mount.side}", mass, mount.pos))
     if option:
         source.append(f"option {_attributes(option)}", "")
+
+
+def _has_contacts(model: mujoco.MjModel) -> bool:
+    return not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONTACT
+
+
+def _may_touch_table(model: mujoco.MjModel) -> bool:
+    """Return False if enabled contacts would also let geoms of the file meet, which do not now."""
+    return _has_contacts(model) or not (model.geom_contype | model.geom_conaffinity).any()
+
+
+def _body(source: Source, name: str, what: str) -> Tag:
+    """Return the element of a body that a table of robot.toml, `what`, names."""
+    tag = source.one(f"bodies '{name}'", "body", name=name)
+    if tag is None:
+        raise RobotError(
+            f"{source.main}: a [[{what}]] names body '{name}', which is not in its text"
+        )
+    return tag
+
+
+def _add_table(source: Source, robot: RobotSpec, height: float, prefix: str) -> None:
+    """Add a plane at a height, m, and its contacts with the robot's tips."""
+    own = build_model(robot)
+    table = prefix + TABLE
+    plane = (
+        f'<geom name="{table}" type="plane" size="2 2 0.1" contype="0" conaffinity="0" '
+        f'pos="0 0 {text_of(height)}" rgba="0.55 0.5 0.45 1"/>'
+    )
+    source.append("worldbody", f"    {plane}\n")
+    for i, tip in enumerate(robot.tips):
+        name = f"{table}_tip_{i}"
+        sphere = (
+            f'<geom name="{name}" type="sphere" size="{text_of(tip.radius)}" '
+            f'pos="{text_of(*tip.pos)}" mass="0" contype="0" conaffinity="0" group="3"/>'
+        )
+        source.insert(_body(source, prefix + tip.body, "tip"), sphere)
+        contact = {
+            "friction": text_of(*own.pair_friction[i]),
+            "solref": text_of(*own.pair_solref[i]),
+            "solimp": text_of(*own.pair_solimp[i]),
+        }
+        pair = f'<pair geom1="{name}" geom2="{table}" condim="3" {_attributes(contact)}/>'
+        source.append("contact", f"    {pair}\n")
+
+
+def _write_inertia(source: Source, body: Tag, link: Link) -> None:
+    """Write the mass, centre and inertia of a link in the place of the file's own."""
+    attributes = {
+        "mass": text_of(link.mass),
+        "pos": text_of(*link.pos),
+        "fullinertia": text_of(*link.inertia),
+    }
+    inertial = f"<inertial {_attributes(attributes)}/>"
+    own = source.child(body, "inertial")
+    if own is None:
+        source.insert(body, inertial)
+    else:
+        source.replace(own, inertial)
+
+
+def _payload(name: str, mass: float, pos: ListOf[float]) -> str:
+    """Return a body with a ball of a mass, kg, at pos, m."""
+    radius = (3 * mass / (4 * math.pi * PAYLOAD_DENSITY)) ** (1 / 3)
+    ball = (
+        f'<geom type="sphere" size="{text_of(radius)}" mass="{mass}" contype="0" conaffinity="0"/>'
+    )
+    return f'<body name="{name}" pos="{text_of(*pos)}">{ball}</body>'
 
 
 def _attributes(values: dict[str, str]) -> str:

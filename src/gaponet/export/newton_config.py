@@ -10,7 +10,8 @@ from typing import Any
 
 NEWTON = Template('''"""Servos of $robot as identified, for Newton; SI units.$note"""
 
-SERVOS = {  # fields of a ModelBuilder, by joint; robot.xml has armature, damping and friction as well
+# Fields of a ModelBuilder, by joint. robot.xml has armature, damping and friction as well.
+SERVOS = {
     "joint_target_ke": $kp,
     "joint_target_kd": $kd,
     "joint_effort_limit": $effort_limit,

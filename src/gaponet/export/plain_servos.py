@@ -245,7 +245,10 @@ def comparable(
 
 
 def rollout_error(recordings: ListOf[Sequence], robot: RobotSpec) -> float:
-    """Return the mean |error| over rollouts of recordings, of the operated joints that each holds, rad."""
+    """Return the mean |error| over rollouts of recordings, rad.
+
+    Of the operated joints that each recording holds.
+    """
     return float(rollout_errors(recordings, robot).mean())
 
 

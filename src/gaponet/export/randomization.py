@@ -90,58 +90,121 @@ def sample_units(
     """
     spec = robot if isinstance(robot, RobotSpec) else load_robot(robot)
     uncertainty = ParameterUncertainty.require(spec)
-    fields = uncertainty.fields
-    joints = spec.operated
-    now = np.stack([uncertainty.array(j, "values") for j in joints])
-    covariance = np.stack([uncertainty.array(j, "covariance") for j in joints])
     mean, deviations, notes = _between_units(spec, uncertainty, scope, others)
-    unknown = np.sqrt(np.einsum("njj->nj", covariance)) > UNDETERMINED_STD * prior_std(fields, now)
     rng = np.random.default_rng(seed)
     count = max(RANGE_SAMPLES, samples)
+    centers = _sample_centers(mean, deviations, count, rng)
+    links = uncertainty.links if engine != "isaaclab" else None
+    drawn_links: Array | None = None  # (count, Q)
+    if links:
+        link_rng = np.random.default_rng([seed, 1])
+        drawn_links = link_rng.multivariate_normal(links.values, links.covariance, count)
+    elif spec.links:
+        notes.append(_why_links_stay(uncertainty))
+    errors = _sample_errors(uncertainty, spec.operated, drawn_links, count, rng)
+    fields = uncertainty.fields
+    units = from_axes(fields, _bounded(fields, centers + errors, mean))
+    kp_errors = errors[:, :, fields.index("kp")]
+    units["effort_limit"] = spec.effort_limit[spec.operated_index] * np.exp(kp_errors)
+    if drawn_links is not None:
+        units["links"] = drawn_links
+    return Randomization(
+        robot=spec.name,
+        scope=scope,
+        units={field: rows[:samples] for field, rows in units.items()},
+        ranges=_ranges(units, _by_joint(spec.operated, from_axes(fields, mean))),
+        unknown=_undetermined(uncertainty, spec.operated),
+        notes=tuple(notes),
+        links=None if drawn_links is None else LinkAxes(spec.before_identification),
+    )
+
+
+def _sample_centers(mean: Array, deviations: Array, count: int, rng: np.random.Generator) -> Array:
+    """Sample the values of days or robots on the axes, (count, n, P)."""
     single = _uncorrelated_share(deviations)
     weights = rng.standard_normal((count, len(deviations)))
-    x = mean + np.sqrt(1 - single) * np.einsum("sd,dnp->snp", weights, deviations)
-    x = x + np.sqrt(single * np.square(deviations).sum(axis=0)) * rng.standard_normal(x.shape)
-    limit = np.repeat(spec.effort_limit[spec.operated_index][None], count, axis=0)
-    links = uncertainty.links if engine != "isaaclab" else None
-    drawn = dict[str, Array]()
-    if links:
-        drawn["links"] = np.random.default_rng([seed, 1]).multivariate_normal(
-            links.values, links.covariance, count
-        )
-    elif spec.links:
-        why = (
-            "Isaac Lab may place or join bodies differently"
-            if uncertainty.links
-            else "no others are stored"
-        )
-        notes.append(f"all units have the identified links: {why}")
+    together = np.einsum("sd,dnp->snp", weights, deviations)
+    single_std = np.sqrt(single * np.square(deviations).sum(axis=0))
+    centers = mean + np.sqrt(1 - single) * together
+    return np.asarray(centers + single_std * rng.standard_normal(centers.shape))
+
+
+def _sample_errors(
+    uncertainty: ParameterUncertainty,
+    joints: tuple[str, ...],
+    links: Array | None,
+    count: int,
+    rng: np.random.Generator,
+) -> Array:
+    """Sample errors of this robot's values on the axes, (count, n, P).
+
+    Args:
+        links: Drawn links, (count, Q), with which the servos' values change; None if all units have
+            the identified ones.
+    """
+    errors = np.empty((count, len(joints), len(uncertainty.fields)))
+    no_error = np.zeros(len(uncertainty.fields))
     for i, joint in enumerate(joints):
-        error = rng.multivariate_normal(np.zeros(len(fields)), covariance[i], count, method="eigh")
-        if links:
-            error += (drawn["links"] - links.values) @ np.transpose(links.servo_slopes[joint])
-        x[:, i] += error
-        limit[:, i] *= np.exp(error[:, fields.index("kp")])
-    bounded = [SERVO_FIELDS[f].axis != "log" and not SERVO_FIELDS[f].signed for f in fields]
-    x = np.where(bounded, np.maximum(x, 0.0), x)
+        covariance = uncertainty.array(joint, "covariance")
+        errors[:, i] = rng.multivariate_normal(no_error, covariance, count, method="eigh")
+        if links is not None and uncertainty.links is not None:
+            slopes = np.transpose(uncertainty.links.servo_slopes[joint])
+            errors[:, i] += (links - uncertainty.links.values) @ slopes
+    return errors
+
+
+def _bounded(fields: tuple[str, ...], x: Array, mean: Array) -> Array:
+    """Return values on the axes, (samples, n, P), within what a robot can have; mean (n, P)."""
+    linear = [SERVO_FIELDS[f].axis != "log" and not SERVO_FIELDS[f].signed for f in fields]
     inverse = [SERVO_FIELDS[f].axis == "inverse" for f in fields]
     optional = np.isin(fields, ("backlash", "no_load_speed"))
+    x = np.where(linear, np.maximum(x, 0.0), x)
     # zero is no limit, which no range states
     x = np.where(inverse, np.maximum(x, LEAST_INVERSE * mean), x)
-    x = np.where(optional & (mean == 0), 0.0, x)  # a joint without the effect gets none
-    sampled = from_axes(fields, x)
-    value = from_axes(fields, mean)
-    ranges: dict[str, dict[str, tuple[float, float, float]]] = {j: {} for j in joints}
+    return np.where(optional & (mean == 0), 0.0, x)  # a joint without the effect gets none
+
+
+def _undetermined(uncertainty: ParameterUncertainty, joints: tuple[str, ...]) -> tuple[str, ...]:
+    """Return "joint: field" of the numbers that no log determines."""
+    fields = uncertainty.fields
+    values = np.stack([uncertainty.array(joint, "values") for joint in joints])
+    covariance = np.stack([uncertainty.array(joint, "covariance") for joint in joints])
+    std = np.sqrt(np.einsum("njj->nj", covariance))
+    unknown = std > UNDETERMINED_STD * prior_std(fields, values)
+    return tuple(f"{joints[i]}: {fields[k]}" for i, k in np.argwhere(unknown))
+
+
+def _by_joint(joints: tuple[str, ...], values: Mapping[str, Array]) -> dict[str, dict[str, float]]:
+    """Return joint → field → value, from field → (n)."""
+    by_joint = {}
     for i, joint in enumerate(joints):
-        for field in fields:
-            low, high = np.percentile(sampled[field][:, i], RANGE_PERCENT)
-            ranges[joint][field] = float(low), float(value[field][i]), float(high)
-    names = tuple(
-        f"{j}: {f}" for i, j in enumerate(joints) for k, f in enumerate(fields) if unknown[i, k]
-    )
-    axes = LinkAxes(spec.before_identification) if links else None
-    units = {f: v[:samples] for f, v in (sampled | {"effort_limit": limit} | drawn).items()}
-    return Randomization(spec.name, scope, units, ranges, names, tuple(notes), axes)
+        by_joint[joint] = {field: float(each[i]) for field, each in values.items()}
+    return by_joint
+
+
+def _why_links_stay(uncertainty: ParameterUncertainty) -> str:
+    why = "no others are stored"
+    if uncertainty.links:
+        why = "Isaac Lab may place or join bodies differently"
+    return f"all units have the identified links: {why}"
+
+
+def _ranges(
+    units: Mapping[str, Array], values: Mapping[str, Mapping[str, float]]
+) -> dict[str, dict[str, tuple[float, float, float]]]:
+    """Return joint → field → low, value, high, with 9 of 10 units between.
+
+    Args:
+        units: Field → (samples, n).
+        values: Joint → field → value in the middle.
+    """
+    ranges: dict[str, dict[str, tuple[float, float, float]]] = {}
+    for i, (joint, by_field) in enumerate(values.items()):
+        ranges[joint] = {}
+        for field, value in by_field.items():
+            low, high = np.percentile(units[field][:, i], RANGE_PERCENT)
+            ranges[joint][field] = (float(low), value, float(high))
+    return ranges
 
 
 def judge_units(
@@ -158,30 +221,35 @@ def judge_units(
     Units of other days and robots are left as they are: this robot's recordings cannot judge them.
     The engine has the `engine_terms` of the servo model.
     """
-    mass = recordings[0][0].meta.payload_mass if recordings and recordings[0] else 0.0
-    train, validation = (comparable(part, robot, mass) for part in recordings or ((), ()))
-    if made.scope != "today" or not train or not validation:
-        why = (
-            "no recording with the robot's own gains"
-            if made.scope == "today"
-            else f"scope {made.scope}"
-        )
-        return replace(
-            made, notes=(*made.notes, f"{why}: the units were not compared with recordings")
-        )
+    if made.scope != "today":
+        return _not_judged(made, f"scope {made.scope}")
+    train, validation = _comparable_motions(recordings, robot)
+    if not train or not validation:
+        return _not_judged(made, "no recording with the robot's own gains")
     judged = plain = draw_robots(robot, made.units, (train, validation), progress=progress)
     if robot.has_servo_model:
         plain = draw_robots(robot, made.units, (train, validation), True, progress, engine_terms)
-    units = {f: np.array(v) for f, v in judged.units.items()}
-    ends = {f: np.percentile(v, RANGE_PERCENT, axis=0) for f, v in units.items() if f != "links"}
-    ranges = {
-        joint: {
-            f: (float(ends[f][0, i]), value, float(ends[f][1, i]))
-            for f, (_, value, _) in by_field.items()
-        }
-        for i, (joint, by_field) in enumerate(made.ranges.items())
-    }
-    return replace(made, units=units, ranges=ranges, judged=judged, plain=plain)
+    units = {field: np.array(rows) for field, rows in judged.units.items()}
+    values = {}
+    for joint, by_field in made.ranges.items():
+        values[joint] = {field: value for field, (_, value, _) in by_field.items()}
+    return replace(made, units=units, ranges=_ranges(units, values), judged=judged, plain=plain)
+
+
+def _not_judged(made: Randomization, why: str) -> Randomization:
+    note = f"{why}: the units were not compared with recordings"
+    return replace(made, notes=(*made.notes, note))
+
+
+def _comparable_motions(
+    recordings: tuple[ListOf[Sequence], ListOf[Sequence]] | None, robot: RobotSpec
+) -> tuple[ListOf[Sequence], ListOf[Sequence]]:
+    """Return training and validation motions with the first one's payload and the robot's gains."""
+    if not recordings or not recordings[0]:
+        return (), ()
+    train, validation = recordings
+    mass = train[0].meta.payload_mass
+    return comparable(train, robot, mass), comparable(validation, robot, mass)
 
 
 def _between_units(
@@ -277,8 +345,9 @@ def write_randomization(made: Randomization, engine: Engine, folder: Path) -> Pa
         NoGainError: Units of the engine's form follow the recordings worse than ± 20 % on each
             number.
     """
-    if (runs := made.plain if engine in ("mujoco", "isaaclab") else made.judged) is not None:
-        runs.require_better_than_by_hand()
+    used = made.plain if engine in ("mujoco", "isaaclab") else made.judged
+    if used is not None:
+        used.require_better_than_by_hand()
     content: dict[str, Any] = {
         "robot": made.robot,
         "scope": made.scope,
@@ -319,21 +388,22 @@ def _in_mrad(errors: dict[str, float]) -> dict[str, float]:
 
 def _written(units: Mapping[str, Any], axes: LinkAxes | None) -> dict[str, Any]:
     """Return units with links as MuJoCo has them, (units, bodies, 11)."""
-    written = {f: np.round(v, 9) for f, v in units.items() if f != "links"}
-    return written | (
-        {"links": [axes.inertials(np.array(row)) for row in units["links"]]} if axes else {}
-    )
+    written: dict[str, Any] = {f: np.round(v, 9) for f, v in units.items() if f != "links"}
+    if axes:
+        written["links"] = [axes.inertials(np.array(row)) for row in units["links"]]
+    return written
 
 
 def table_rows(made: Randomization) -> tuple[list[str], list[list[str]]]:
     """Return headings and rows: joint, and low … high of numbers that are not all zero."""
-    fields = [
-        SERVO_FIELDS[f]
-        for f in next(iter(made.ranges.values()))
-        if any(by[f][2] for by in made.ranges.values())
-    ]
-    rows: list[list[Any]] = [
-        [j, *(f"{by[f.name][0] * f.factor:.3g} … {by[f.name][2] * f.factor:.3g}" for f in fields)]
-        for j, by in made.ranges.items()
-    ]
+    names = next(iter(made.ranges.values()))
+    used = [f for f in names if any(by_field[f][2] for by_field in made.ranges.values())]
+    fields = [SERVO_FIELDS[f] for f in used]
+    rows = []
+    for joint, by_field in made.ranges.items():
+        row = [joint]
+        for field in fields:
+            low, _, high = by_field[field.name]
+            row.append(f"{low * field.factor:.3g} … {high * field.factor:.3g}")
+        rows.append(row)
     return ["joint", *(f.heading for f in fields)], rows

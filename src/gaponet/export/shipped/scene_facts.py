@@ -75,9 +75,12 @@ def require_scene(
         else:
             wrong += _differs(field, here[field], value)
     if wrong:
+        shown = "; ".join(wrong[:5])
+        if len(wrong) > 5:
+            shown += " and more"
         raise ValueError(
-            f"{folder}: was trained in simulator {facts['simulator']}; here {'; '.join(wrong[:5])}"
-            f"{' and more' * (len(wrong) > 5)}. Take mjlab_entity and mjlab_options, or check=False"
+            f"{folder}: was trained in simulator {facts['simulator']}; here {shown}. Take "
+            "mjlab_entity and mjlab_options, or check=False"
         )
 
 

@@ -92,8 +92,9 @@ def mjlab_units(file: str | Path, term: str = "joint_pos", rows: Any = None) -> 
     from mjlab.managers.event_manager import requires_model_fields
 
     bodies = json.loads(Path(file).read_text(encoding="utf-8")).get("bodies", [])
+    written = (*MODEL_FIELDS, *BODY_FIELDS) if bodies else MODEL_FIELDS
 
-    @requires_model_fields(*MODEL_FIELDS, *BODY_FIELDS * bool(bodies))
+    @requires_model_fields(*written)
     def use_units(env: Any, env_ids: Any) -> None:
         action = env.action_manager.get_term(term)
         robot = env.scene[action.cfg.entity_name]
@@ -106,19 +107,24 @@ def mjlab_units(file: str | Path, term: str = "joint_pos", rows: Any = None) -> 
         if identified:
             identified[0].set_units(env.sim.model, ids, joints, units)
             return
-        model = env.sim.mj_model
         joints = [f"{action.cfg.entity_name}/{name}" for name in joints]
-        driven = {}
-        for servo, joint in enumerate(model.actuator_trnid[:, 0]):
-            kind = model.actuator_trntype[servo], model.actuator_biastype[servo]
-            if kind == (0, 1):  # of a joint, with an affine bias
-                driven[model.joint(joint).name] = servo
-        columns_of(joints, driven, "joints with position servos")
-        at = [[driven[name] for name in joints], [model.joint(name).dofadr[0] for name in joints]]
-        servos, dofs = torch.tensor(at, device=env.device)
+        servos, dofs = torch.tensor(_addresses(env.sim.mj_model, joints), device=env.device)
         write_model(env.sim.model, ids, dofs, servos, units)
 
     return use_units
+
+
+def _addresses(model: Any, joints: list[str]) -> list[list[int]]:
+    """Return the numbers of the joints' position servos, and of their degrees of freedom."""
+    driven = {}
+    for servo, joint in enumerate(model.actuator_trnid[:, 0]):
+        kind = model.actuator_trntype[servo], model.actuator_biastype[servo]
+        if kind == (0, 1):  # of a joint, with an affine bias
+            driven[model.joint(joint).name] = servo
+    columns_of(joints, driven, "joints with position servos")
+    servos = [driven[name] for name in joints]
+    dofs = [model.joint(name).dofadr[0] for name in joints]
+    return [servos, dofs]
 
 
 def write_model(model: Any, env_ids: Tensor, dof: Tensor, servo: Tensor, units: Units) -> None:
@@ -182,12 +188,7 @@ def apply_units(
     robot = env.scene[asset_cfg.name]
     ids, joints, units = draw_units(file, "plain_units", env, env_ids, rows)
     columns = columns_of(joints, robot.joint_names, "joints of the articulation")
-    groups = {}
-    for group in robot.actuators.values():
-        if hasattr(group, "network"):
-            continue
-        for joint in getattr(group, "joint_names", ()):
-            groups[joint] = group
+    groups = _actuator_groups(robot)
     columns_of(
         joints, groups, "joints with PD actuators (set cfg.sim.use_newton_actuators = False)"
     )
@@ -195,30 +196,49 @@ def apply_units(
         _speed_lines(robot, joints, groups, units, ids)
     if term is None:
         _delay(joints, groups, units["delay"] / env.physics_dt, ids)
-    elif hasattr(action := env.action_manager.get_term(term), "set_units"):
-        action.set_units(ids, joints, units)
     else:
-        raise ValueError(
-            f"action term '{term}' has no delays and offsets; use isaaclab_action, or term=None"
-        )
+        action = env.action_manager.get_term(term)
+        if not hasattr(action, "set_units"):
+            raise ValueError(
+                f"action term '{term}' has no delays and offsets; use isaaclab_action, or term=None"
+            )
+        action.set_units(ids, joints, units)
     _write(robot, "armature", columns, ids, units["armature"])
     # PhysX, where rest ≥ motion
     both = any(name.startswith("write_joint_dynamic_friction") for name in dir(robot))
     friction = units["frictionloss"], units["frictionloss"] if both else None, units["damping"]
     _write(robot, "friction_coefficient", columns, ids, *friction)
-    implicit = [
-        i for i, joint in enumerate(joints) if getattr(groups[joint], "is_implicit_model", False)
-    ]
+    # Simulations have gains of implicit actuators only.
+    implicit = [i for i, joint in enumerate(joints) if _is_implicit(groups[joint])]
     for what, field in (("stiffness", "kp"), ("effort_limit", "effort_limit")):
-        for i, joint in enumerate(joints):  # simulations have gains of implicit actuators only
-            group = groups[joint]
-            values = getattr(group, f"actuator_{what}", None)  # Isaac Lab 3 renamed the limit
-            values = getattr(group, what) if values is None else values
-            getattr(values, "torch", values)[ids, list(group.joint_names).index(joint)] = units[
-                field
-            ][:, i]
+        for i, joint in enumerate(joints):
+            _set_actuator(groups[joint], what, joint, ids, units[field][:, i])
         if implicit:
             _write(robot, what, [columns[i] for i in implicit], ids, units[field][:, implicit])
+
+
+def _actuator_groups(robot: Any) -> dict[str, Any]:
+    """Return joint → its group of actuators without a network."""
+    groups = {}
+    for group in robot.actuators.values():
+        if hasattr(group, "network"):
+            continue
+        for joint in getattr(group, "joint_names", ()):
+            groups[joint] = group
+    return groups
+
+
+def _is_implicit(group: Any) -> bool:
+    return bool(getattr(group, "is_implicit_model", False))
+
+
+def _set_actuator(group: Any, what: str, joint: str, ids: Tensor, values: Tensor) -> None:
+    """Set "stiffness" or "effort_limit" of a joint in the worlds `ids`, (worlds)."""
+    own = getattr(group, f"actuator_{what}", None)  # Isaac Lab 3 renamed the limit
+    if own is None:
+        own = getattr(group, what)
+    column = list(group.joint_names).index(joint)
+    getattr(own, "torch", own)[ids, column] = values
 
 
 def _write(robot: Any, what: str, columns: list[int], ids: Tensor, *values: Tensor | None) -> None:
