@@ -122,9 +122,9 @@ def _serve_humanoid(
         options.domain,
         options.interface,
         options.rate,
-        options.fault,
-        options.fault_at,
     )
+    humanoid.fault = options.fault
+    humanoid.fault_at = options.fault_at
     where = (
         f"rt/lowstate at {options.rate:g} Hz, DDS domain {options.domain} on {options.interface}"
     )

@@ -83,28 +83,47 @@ def _record(
     warmth = np.array([_warmth(u, seed) for u, seed in zip(units, seeds, strict=True)])  # (k,) K
     robots = VirtualRobot(job.robot, units, payloads, dt, locked=locked)
     readings = _readings(robots, ctrl, seeds, warmth)
-
-    models = {p: build_model(job.robot, *p, dt, physics_only=True) for p in dict.fromkeys(payloads)}
+    models = {}
+    for payload in dict.fromkeys(payloads):
+        models[payload] = build_model(job.robot, *payload, dt, physics_only=True)
     sequences = []
     for i, take in enumerate(group):
-        qpos, qvel, tau, temperature = readings[:, : len(ctrl[i]), i]
-        torque, qacc = equivalent_torque(models[payloads[i]], qpos, dt)
         notes = {"rate_hz": take.rate, "warmth_K": round(float(warmth[i]), 2), "seed": job.seed}
-        sequences.append(
-            Sequence(
-                meta=_meta(job, take, motions[take.motion].level, notes),
-                joint_names=job.robot.joint_names,
-                dt=dt,
-                ctrl=ctrl[i],
-                qpos=qpos,
-                qvel=qvel,
-                qacc=qacc,
-                tau=tau,
-                tau_eq=torque,
-                temperature=temperature,
-            )
-        )
+        meta = _meta(job, take, motions[take.motion].level, notes)
+        measured = readings[:, : len(ctrl[i]), i]
+        sequences.append(_sequence(meta, job.robot, dt, ctrl[i], measured, models[payloads[i]]))
     return sequences
+
+
+def _sequence(
+    meta: SequenceMeta,
+    robot: RobotSpec,
+    dt: float,
+    ctrl: Array,
+    measured: Array,
+    model: mujoco.MjModel,
+) -> Sequence:
+    """Return a recording.
+
+    Args:
+        ctrl: Targets, (T, n) rad.
+        measured: qpos, qvel, tau, temperature, (4, T, n).
+        model: Nominal simulator with the payload.
+    """
+    qpos, qvel, tau, temperature = measured
+    torque, qacc = equivalent_torque(model, qpos, dt)
+    return Sequence(
+        meta=meta,
+        joint_names=robot.joint_names,
+        dt=dt,
+        ctrl=ctrl,
+        qpos=qpos,
+        qvel=qvel,
+        qacc=qacc,
+        tau=tau,
+        tau_eq=torque,
+        temperature=temperature,
+    )
 
 
 def _readings(robots: VirtualRobot, ctrl: list[Array], seeds: list[int], warmth: Array) -> Array:

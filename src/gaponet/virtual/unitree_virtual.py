@@ -72,6 +72,8 @@ class VirtualH12:
     """The robot on the bus.
 
     Attributes:
+        fault: Fault that is simulated; "none" until it is set.
+        fault_at: Its time after the first command, s.
         heard: Received commands: time (s), topic, weight, and targets, gains, modes and joint
             states then, (n) in motor order.
     """
@@ -84,15 +86,11 @@ class VirtualH12:
         domain: int = 0,
         interface: str = "lo",
         rate: float = 500.0,
-        fault: FaultKind = "none",
-        fault_at: float = 0.0,
-        seed: int = 0,
     ) -> None:
         """
         Args:
             payload: kg per hand, and side.
             rate: States per second.
-            fault_at: s after the first command.
         """
         from gaponet.hw.drivers import dds
 
@@ -100,14 +98,14 @@ class VirtualH12:
         bus = dds.Bus(domain, interface)
         self.robot = robot
         self.rate = rate
-        self.fault = fault
-        self.fault_at = fault_at
+        self.fault: FaultKind = "none"
+        self.fault_at = 0.0
         self._order = robot.index(MOTOR_NAMES)  # motor → place in the robot's order
         self._writer = bus.writer("rt/lowstate", dds.LowState)
         self._readers = {
             name: bus.reader(f"rt/{name}", dds.LowCmd) for name in ("arm_sdk", "lowcmd")
         }
-        self.live = LiveUnit(robot, physics, payload, seed=seed, period=1.0 / rate)
+        self.live = LiveUnit(robot, physics, payload, period=1.0 / rate)
         self.clock = MonotonicClock()
         self.heard = list[dict[str, Any]]()
         self.first_command: float | None = None

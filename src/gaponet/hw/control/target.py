@@ -94,6 +94,10 @@ class Readiness:
             return None if is_planning else first
         if first is None or not np.isfinite(first[self.context.joints]).all():
             return Fault("target", "the motion has no first target, or it is not a number")
+        return self._admitted(first, state, now)
+
+    def _admitted(self, first: Array, state: State, now: float) -> Array | Fault | None:
+        """Return the first target if the robot may go there from this state; None: wait."""
         before = self.plan
         fault = self._update_plan(first, state, now) or self.output.admit(state.qpos)
         if fault:
@@ -225,7 +229,6 @@ class TargetGenerator:
     def _blend_in(self, state: State, policy: Policy) -> Array | PhaseChange | Fault:
         """Go to the first target, and raise the weight to 1."""
         config = self.context.config
-        following = self.following
         arrived = self._progress >= self.path.duration + config.settle
         if arrived and self._handed > FULL_WEIGHT:
             return PhaseChange(Trigger.ARRIVED, "motion")
@@ -235,17 +238,23 @@ class TargetGenerator:
             return first
         goal = self.start if first is None else first[self.context.joints]
         distance = np.abs(goal - self.start)
-        is_far = distance.max() >= FAR_RAD
-        unproven = bool(following.share) and is_far and not following.shown.any()
+        is_far = bool(distance.max() >= FAR_RAD)
+        unproven = is_far and self._is_unproven()
         if unproven and arrived:
-            return following.fault(int(distance.argmax()))
+            return self.following.fault(int(distance.argmax()))
         self._last = self._on_path(self._progress, self.start, goal)
         self._hand_over(MAX_UNPROVEN_WEIGHT if unproven else 1.0)
-        partly = self.context.driver.at_end == "hand_over" and self._handed < FULL_WEIGHT
-        # While it is handed over joints lag, each in its own way: the target stands meanwhile.
-        if unproven or not (partly and is_far):
+        # While it is handed over joints lag, each in its own way: a far target stands meanwhile.
+        if unproven or not (is_far and self._is_partly_handed_over()):
             self._progress += self.context.dt
         return self._last
+
+    def _is_unproven(self) -> bool:
+        """Return true if joints must show that they follow, and none has."""
+        return bool(self.following.share) and not self.following.shown.any()
+
+    def _is_partly_handed_over(self) -> bool:
+        return self.context.driver.at_end == "hand_over" and self._handed < FULL_WEIGHT
 
     def _hand_over(self, max_weight: float) -> None:
         """Raise the weight by a period of the blend, up to max_weight; never lower it."""

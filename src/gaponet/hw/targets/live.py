@@ -11,7 +11,7 @@ lists the end of each fault.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
@@ -154,6 +154,13 @@ def next_step(step: Array, distance: Array, max_step: float, max_change: float) 
     return result
 
 
+class Rejection(NamedTuple):
+    """Why a message is not obeyed."""
+
+    kind: str  # key of counts["refused"]
+    reason: str
+
+
 class LiveTargets:
     """Policy of a controller whose targets arrive over a transport.
 
@@ -240,13 +247,19 @@ class LiveTargets:
                 )
         if self._target is None:
             return None if self._ended else self._still_silent(now - self._start)
-        ending = self._ended and running
+        return self._next_position(self._target, now, self._ended and running)
+
+    def _next_position(self, target: Array, now: float, ending: bool) -> Array | Fault | None:
+        """Return the position, (n) rad, one period further towards an accepted target.
+
+        None: ending, and it is reached. Fault: no target was accepted for long.
+        """
         silent = now - self._accepted_time
         if silent > self.config.hold and not ending:
             return Fault(
                 "silence", f"no target was accepted for {silent * 1e3:.0f} ms{self._rejection}"
             )
-        self._advance(self._target)
+        self._advance(target)
         if ending and not self._step.any():
             return None
         if silent > 0 and not ending:
@@ -306,12 +319,9 @@ class LiveTargets:
         since = now - self._accepted_time
         accepted = None
         for message in self.transport.receive():
-            target = None
-            kind, why = self._reject(message, now)
-            if not kind:
-                target, kind, why = self._full_target(message, before, since, state)
-            if kind:
-                self._count_rejection(message, kind, why)
+            target = self._reject(message, now) or self._full_target(message, before, since, state)
+            if isinstance(target, Rejection):
+                self._count_rejection(message, target)
             elif target is not None:
                 accepted = target
                 if message.time is not None:
@@ -322,59 +332,55 @@ class LiveTargets:
             self._accepted_time = now
             self._rejection = ""
 
-    def _count_rejection(self, message: Message, kind: str, why: str) -> None:
+    def _count_rejection(self, message: Message, rejection: Rejection) -> None:
         """Count a rejected message; remark on the first one of a second sender."""
-        if kind == "stranger" and not self.counts["refused"][kind]:
+        refused = self.counts["refused"]
+        if rejection.kind == "stranger" and not refused["stranger"]:
             self.remarks.append(
                 f"targets of a second sender, {sender_name(message.sender)}, are rejected"
             )
-        self.counts["refused"][kind] += 1
-        self._rejection = f"; the last one was rejected: {why}"
+        refused[rejection.kind] += 1
+        self._rejection = f"; the last one was rejected: {rejection.reason}"
 
-    def _reject(self, message: Message, now: float) -> tuple[str, str]:
-        """Return kind and reason if sender or time of a message are wrong, else empty strings."""
+    def _reject(self, message: Message, now: float) -> Rejection | None:
+        """Return why sender or time of a message are wrong; None if they are right."""
         if message.error:
-            return "malformed", message.error
+            return Rejection("malformed", message.error)
         if self._sender is None:
             self._sender = message.sender
             self.counts["sender"] = sender_name(message.sender)
         if message.sender != self._sender:
-            return (
+            return Rejection(
                 "stranger",
                 "it is from another sender than the first one; start a new run for a new sender",
             )
         if message.end:
             self._ended = True
         if message.time is None:
-            return "", ""
+            return None
         if message.time <= self._sender_time:
-            return "order", f"its time {message.time:.6g} s is not after {self._sender_time:.6g} s"
+            return Rejection(
+                "order", f"its time {message.time:.6g} s is not after {self._sender_time:.6g} s"
+            )
         drifted = self._offset + MAX_CLOCK_DRIFT * max(now - self._offset_time, 0.0)
         self._offset = min(now - message.time, drifted)
         self._offset_time = now
         late = now - message.time - self._offset
         if late > self.config.late:
-            return "late", f"it took {late * 1e3:.0f} ms longer than the fastest"
-        return "", ""
+            return Rejection("late", f"it took {late * 1e3:.0f} ms longer than the fastest")
+        return None
 
     def _full_target(
         self, message: Message, before: Array | None, since: float, state: State
-    ) -> tuple[Array | None, str, str]:
-        """Return the target of all joints (n) rad, None for a greeting.
-
-        Or kind and reason of its rejection.
-        """
+    ) -> Array | Rejection | None:
+        """Return the target of all joints (n) rad, or why it is rejected; None for a greeting."""
         if not message.target:
-            return None, "", ""
+            return None
         names = self._joints or tuple(message.target)
-        if message.target.keys() != set(names) or not set(names) <= set(self.commanded):
-            odd = sorted(message.target.keys() ^ set(names)) or [
-                n for n in names if n not in self.commanded
-            ]
-            return (
-                None,
-                "joints",
-                f"joint '{odd[0]}' is new, left out, or not one that is commanded",
+        odd = self._odd_joints(message.target, names)
+        if odd:
+            return Rejection(
+                "joints", f"joint '{odd[0]}' is new, left out, or not one that is commanded"
             )
         at = self.robot.index(names)
         wanted = np.array([message.target[name] for name in names], float)
@@ -382,18 +388,26 @@ class LiveTargets:
         beyond = np.maximum(low - wanted, wanted - high)
         if not beyond.max() <= MAX_BEYOND_RANGE_RAD:  # NaN too
             worst = int(np.argmax(beyond))
-            return None, "range", f"{names[worst]} at {wanted[worst]:.3g} rad is out of its range"
+            return Rejection(
+                "range", f"{names[worst]} at {wanted[worst]:.3g} rad is out of its range"
+            )
         target = np.array(state.qpos if before is None else before)
         step = np.abs(np.clip(wanted, low, high) - target[at])
         allowed = self.speed * min(since + self.dt, MAX_CATCH_UP_PERIODS * self.dt)
         if before is not None and step.max() > allowed:
             worst = int(step.argmax())
-            return (
-                None,
+            return Rejection(
                 "speed",
                 f"{names[worst]} goes {step[worst]:.2f} rad at once, {allowed:.2f} would be "
                 "possible",
             )
         target[at] = np.clip(wanted, low, high)
         self._joints = names
-        return target, "", ""
+        return target
+
+    def _odd_joints(self, target: Mapping[str, float], names: tuple[str, ...]) -> list[str]:
+        """Return joints that are not in both, or else those that are not commanded."""
+        odd = sorted(target.keys() ^ set(names))
+        if odd:
+            return odd
+        return [name for name in names if name not in self.commanded]
