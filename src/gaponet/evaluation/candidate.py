@@ -128,17 +128,29 @@ def select_entries(
     if motions:
         entries = dataset.select(motions, units)
     else:
-        entries = [entry for entry in unused if entry.hash in fitted[0].test] or [*unused]
-    if not entries and not motions:  # all motions were used, perhaps not all recordings of them
-        for entry in available:
-            if not any(entry.hash in data.hashes for data in fitted):
-                entries.append(entry)
+        entries = _default_entries(available, unused, fitted)
     if not entries:
         raise DatasetError(
             f"{dataset.path}: every sequence was used in training; give logs the runs never saw, "
             "or --motions"
         )
     return entries, {entry.hash for entry in entries} <= {entry.hash for entry in unused}
+
+
+def _default_entries(
+    available: list[Entry], unused: list[Entry], fitted: list[FittedData]
+) -> list[Entry]:
+    """Return the unused recordings of the first test set, or else all unused ones.
+
+    If all motions were used, the recordings that were not.
+    """
+    tests = [entry for entry in unused if entry.hash in fitted[0].test]
+    if tests:
+        return tests
+    if unused:
+        return unused
+    used = frozenset().union(*(data.hashes for data in fitted))
+    return [entry for entry in available if entry.hash not in used]
 
 
 @dataclass(frozen=True)
@@ -190,7 +202,8 @@ def _fitted_hashes(split: Any) -> set[str]:
 def split_of_run(run: Path) -> dict[str, dict[str, str]]:
     """Read {split: {sequence id: content hash}} of a run."""
     hint = "give a run folder of gaponet train"
-    return dict(read_json(SplitHashes, run / "split.json", ModelError, hint))  # type: ignore[arg-type]
+    split = read_json(SplitHashes, run / "split.json", ModelError, hint)
+    return {"train": split["train"], "val": split["val"], "test": split["test"]}
 
 
 def read_origin(folder: Path) -> Origin | None:

@@ -307,11 +307,8 @@ def error_floor(
         for period in Repetitions.periods(sequence):
             groups[*same, "period"].add(period)
     std = _std_of_repetitions(groups.values(), robot)
-    if not std:  # recordings of one command under several names
-        differences = repetition_difference(compared, robot.operated).tolist()
-        for joint, difference in zip(robot.operated, differences, strict=True):
-            if difference:
-                std[joint] = difference / np.sqrt(2)
+    if not std:
+        std = _std_under_several_names(compared, robot)
     floors: dict[str, dict[str, float | None]] = {}
     for column, joint in enumerate(robot.operated):
         encoder = encoder_step([angle[:, column] for angle in angles]) / 4 or None
@@ -328,6 +325,16 @@ def _std_of_repetitions(groups: Iterable[Repetitions], robot: RobotSpec) -> dict
         return {}
     summary = Repetitions.summary(repeated, robot.joint_names)
     return dict(summary["channels"]["qpos"]["joints"])
+
+
+def _std_under_several_names(sequences: list[Sequence], robot: RobotSpec) -> dict[str, float]:
+    """Return joint → standard deviation, rad, among recordings of one command with other names."""
+    differences = repetition_difference(sequences, robot.operated).tolist()
+    std = {}
+    for joint, difference in zip(robot.operated, differences, strict=True):
+        if difference:
+            std[joint] = difference / np.sqrt(2)
+    return std
 
 
 def _mean(values: ListOf[float | None]) -> float | None:

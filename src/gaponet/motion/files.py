@@ -87,23 +87,15 @@ def _level_of(ctrl: Array, robot: RobotSpec) -> str:
     """joint when one joint moves, upper_body when only operated joints and torso move, else
     whole_body.
     """
-    moved = [
-        name
-        for name, span in zip(robot.joint_names, np.ptp(ctrl, axis=0), strict=True)
-        if span > 1e-6
-    ]
+    moves = np.ptp(ctrl, axis=0) > 1e-6
+    moved = {robot.joint_names[i] for i in np.flatnonzero(moves)}
     if len(moved) <= 1:
         return "joint"
-    upper = {
-        name
-        for name in robot.joint_names
-        if name in robot.operated or name.startswith(("torso", "waist"))
-    }
-    return (
-        "upper_body"
-        if set(moved) <= upper and len(upper) < len(robot.joint_names)
-        else "whole_body"
-    )
+    trunk = {name for name in robot.joint_names if name.startswith(("torso", "waist"))}
+    upper = trunk.union(robot.operated)
+    if moved <= upper and len(upper) < len(robot.joint_names):
+        return "upper_body"
+    return "whole_body"
 
 
 def _text(path: Path) -> tuple[list[str], Array, float]:
@@ -112,6 +104,18 @@ def _text(path: Path) -> tuple[list[str], Array, float]:
     except UnicodeDecodeError:
         raise LogError(f"{path}: not a text file") from None
     names = [name.strip() for name in lines[0].split(",")] if lines else []
+    table = _table(lines, len(names), path)
+    if "time" in names:
+        at = names.index("time")
+        dt = _even_period(table[:, at], path)
+        return names[:at] + names[at + 1 :], np.delete(table, at, axis=1), dt
+    if path.suffix == ".csv":
+        raise LogError(f"{path}:1: no column time, s, so its pace is not known; add one")
+    return names, table, SAGE_DT
+
+
+def _table(lines: list[str], columns: int, path: Path) -> Array:
+    """Return the rows of numbers after the first line, (rows, columns)."""
     rows = []
     for number, line in enumerate(lines[1:], 2):
         if not line.strip():
@@ -121,27 +125,26 @@ def _text(path: Path) -> tuple[list[str], Array, float]:
             row = [float(cell) for cell in cells]
         except ValueError:
             raise LogError(f"{path}:{number}: not a row of numbers: {line[:60]}") from None
-        if len(row) != len(names) or not np.isfinite(row).all():
+        if len(row) != columns or not np.isfinite(row).all():
             raise LogError(
-                f"{path}:{number}: {len(row)} values for {len(names)} names, or one is not finite"
+                f"{path}:{number}: {len(row)} values for {columns} names, or one is not finite"
             )
         rows.append(row)
     if len(rows) < 2:
         raise LogError(
             f"{path}: {len(rows)} rows after the line of joint names; a motion needs two or more"
         )
-    table = np.array(rows)
-    if "time" not in names:
-        if path.suffix == ".csv":
-            raise LogError(f"{path}:1: no column time, s, so its pace is not known; add one")
-        return names, table, SAGE_DT
-    at = names.index("time")
-    period = np.diff(table[:, at])
+    return np.array(rows)
+
+
+def _even_period(time: Array, path: Path) -> float:
+    """Return the period of times (rows,), s."""
+    period = np.diff(time)
     if not (period > 0).all() or np.ptp(period) > 0.01 * period.mean():
         raise LogError(
             f"{path}: time must rise evenly; it steps by {period.min():.4g} to {period.max():.4g} s"
         )
-    return names[:at] + names[at + 1 :], np.delete(table, at, axis=1), float(period.mean())
+    return float(period.mean())
 
 
 def _npz(path: Path) -> tuple[list[str], Array, float]:

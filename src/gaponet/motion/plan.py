@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -59,11 +60,7 @@ def make_plan(robot: RobotSpec, minutes: float, payloads: tuple[float, ...], see
         UsageError: Too little time for one motion of each joint at each payload, or a payload that
             cannot be carried.
     """
-    if not payloads or min(payloads) < 0 or (max(payloads) > 0 and not robot.payload_mounts):
-        raise UsageError(
-            f"--payloads {payloads}: give kg ≥ 0; {robot.name} has {len(robot.payload_mounts)} "
-            "mounts"
-        )
+    _require_payloads(payloads, robot)
     library = Library(robot, seed, max(payloads))
     first = [library.make(f"{SIGNAL_ORDER[0]}-{short(joint)}") for joint in robot.operated]
     least = len(payloads) * sum(m.duration for m in first) / 60
@@ -77,7 +74,17 @@ def make_plan(robot: RobotSpec, minutes: float, payloads: tuple[float, ...], see
         if sum(m.duration for m in chosen) >= 60 * minutes / len(payloads):
             break
         chosen.append(_standing(library, name))
-    return Plan(tuple((mass, motion) for mass in payloads for motion in chosen))
+    return Plan(tuple(product(payloads, chosen)))
+
+
+def _require_payloads(payloads: tuple[float, ...], robot: RobotSpec) -> None:
+    """Refuse payloads, kg, that the robot cannot carry."""
+    no_mount = not robot.payload_mounts
+    if not payloads or min(payloads) < 0 or (max(payloads) > 0 and no_mount):
+        raise UsageError(
+            f"--payloads {payloads}: give kg ≥ 0; {robot.name} has {len(robot.payload_mounts)} "
+            "mounts"
+        )
 
 
 def _standing(library: Library, name: str) -> Motion:
@@ -123,9 +130,8 @@ def sheet(
         f"On virtual H1-2 robots {MIN_TRAINING_MINUTES:g} minutes left a third of the simulator's "
         f"error, {RECOMMENDED_MINUTES:g} came within a tenth of the best."
     )
-    size += " Enough to identify gains, friction and delay; little to train on." * (
-        plan.minutes < MIN_TRAINING_MINUTES
-    )
+    if plan.minutes < MIN_TRAINING_MINUTES:
+        size += " Enough to identify gains, friction and delay; little to train on."
     lines = [
         f"# Recording sheet: {robot.name}",
         "",
@@ -161,9 +167,8 @@ def sheet(
         "data"
         for p in plan.payloads
     ]
-    then = (
-        [f"    gaponet check {known} data", f"    gaponet adapt {known} data --out ROBOT_2"]
-        if known
-        else []
-    )
-    return "\n".join([*lines, "    gaponet doctor data", *then, ""])
+    lines.append("    gaponet doctor data")
+    if known:
+        lines.append(f"    gaponet check {known} data")
+        lines.append(f"    gaponet adapt {known} data --out ROBOT_2")
+    return "\n".join([*lines, ""])

@@ -7,6 +7,7 @@ from __future__ import annotations
 import hashlib
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
+from itertools import product
 from pathlib import Path
 from typing import Annotated
 
@@ -90,14 +91,7 @@ def takes(recipe: Recipe, names: list[str]) -> list[Take]:
     Raises:
         UsageError: A pattern matches nothing.
     """
-    motions: list[str] = []
-    for pattern in recipe.motions:
-        matches = [name for name in names if fnmatchcase(name, pattern)]
-        if not matches and any(c in pattern for c in "*?["):
-            raise UsageError(f"recipe '{recipe.name}': no motion of this robot matches '{pattern}'")
-        motions += matches or [pattern]
-    motions += [Path(file).stem for file in recipe.files]
-    motions = list(dict.fromkeys(motions))
+    motions = _motions(recipe, names)
     count = (
         len(motions)
         * len(recipe.rates)
@@ -109,11 +103,21 @@ def takes(recipe: Recipe, names: list[str]) -> list[Take]:
         raise UsageError(
             f"recipe '{recipe.name}': {count} sequences; at most {MOST_TAKES} in one recipe"
         )
-    return [
-        Take(motion, unit, float(payload), float(rate), repetition)
-        for motion in motions
-        for rate in recipe.rates
-        for payload in recipe.payloads
-        for unit in recipe.units
-        for repetition in range(recipe.repetitions)
-    ]
+    repetitions = range(recipe.repetitions)
+    every = product(motions, recipe.rates, recipe.payloads, recipe.units, repetitions)
+    wanted = []
+    for motion, rate, payload, unit, repetition in every:
+        wanted.append(Take(motion, unit, float(payload), float(rate), repetition))
+    return wanted
+
+
+def _motions(recipe: Recipe, names: list[str]) -> list[str]:
+    """Return the names of a recipe's motions and files, each once."""
+    motions: list[str] = []
+    for pattern in recipe.motions:
+        matches = [name for name in names if fnmatchcase(name, pattern)]
+        if not matches and any(c in pattern for c in "*?["):
+            raise UsageError(f"recipe '{recipe.name}': no motion of this robot matches '{pattern}'")
+        motions += matches or [pattern]
+    motions += [Path(file).stem for file in recipe.files]
+    return list(dict.fromkeys(motions))

@@ -161,6 +161,14 @@ def _is_within(delta: Array, largest: float) -> bool:
 
 def _contradiction(card: dict[str, Any], config: ModelConfig) -> str:
     """Return which field of a card has the wrong length or an impossible value; "" if none has."""
+    return (
+        _list_of_other_length(card)
+        or _context_of_other_length(card, config)
+        or _impossible_range(card)
+    )
+
+
+def _list_of_other_length(card: dict[str, Any]) -> str:
     n = len(card["joint_names"])
     lists = {name: card.get(name) for name in ("kp", "kd", "qpos_range")}
     for name, values in card.get("recorded", {}).items():
@@ -168,11 +176,21 @@ def _contradiction(card: dict[str, Any], config: ModelConfig) -> str:
     for name, values in lists.items():
         if values is not None and len(values) != n:
             return f"{name}: should have one entry for each of {n} joints"
-    if config.context:
-        answers = card.get("context", {})
-        for name in ("nominal", "low", "high"):
-            if len(answers.get(name, ())) != config.context_dim(n):
-                return f"context.{name}: should have {config.context_dim(n)} numbers"
+    return ""
+
+
+def _context_of_other_length(card: dict[str, Any], config: ModelConfig) -> str:
+    if not config.context:
+        return ""
+    numbers = config.context_dim(len(card["joint_names"]))
+    answers = card.get("context", {})
+    for name in ("nominal", "low", "high"):
+        if len(answers.get(name, ())) != numbers:
+            return f"context.{name}: should have {numbers} numbers"
+    return ""
+
+
+def _impossible_range(card: dict[str, Any]) -> str:
     for low, high in card.get("qpos_range", []):
         if low is not None and high is not None and not low < high:
             return f"qpos_range: {low} to {high} is no range"

@@ -13,6 +13,7 @@ from annotated_types import Interval
 from gaponet.base.arrays import Array
 from gaponet.base.errors import ModelError
 from gaponet.base.structure import Angle, read_json
+from gaponet.data.pair import SimulatedReplay
 from gaponet.data.sequence import Sequence
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.replay import replay
@@ -61,14 +62,10 @@ class DelayOffset:
         for i, delay in enumerate(delays):
             candidate = DelayOffset(dict.fromkeys(names, float(delay)), zero)
             rollouts = replay(pieces, robot, candidate.corrector(robot), nthread, lock_idle=True)
-            for k, (j, name) in enumerate(zip(op, names, strict=True)):
-                errors = []
-                for piece, rollout in zip(pieces, rollouts, strict=True):
-                    if name not in piece.meta.unrecorded:
-                        errors.append((piece.qpos - rollout.qpos)[1:, j])
-                every_row = np.concatenate(errors or [np.zeros(1)])
-                offset[i, k] = np.median(every_row)
-                error[i, k] = np.abs(every_row - offset[i, k]).mean()
+            for k, name in enumerate(names):
+                errors = _joint_errors(pieces, rollouts, name, op[k])
+                offset[i, k] = np.median(errors)
+                error[i, k] = np.abs(errors - offset[i, k]).mean()
         best = error.argmin(axis=0)  # index of the delay of each joint, (n,)
         best_delays = {}
         best_offsets = {}
@@ -90,6 +87,19 @@ class DelayOffset:
         return pieces[:: max(1, round(sum(map(len, pieces)) / max_rows))]
 
 
+def _joint_errors(
+    pieces: list[Sequence], rollouts: list[SimulatedReplay], name: str, joint: int
+) -> Array:
+    """Return recorded − simulated position of a joint, (rows,) rad; a single 0 if none has it."""
+    errors = []
+    for piece, rollout in zip(pieces, rollouts, strict=True):
+        if name not in piece.meta.unrecorded:
+            errors.append((piece.qpos - rollout.qpos)[1:, joint])
+    if not errors:
+        return np.zeros(1)
+    return np.concatenate(errors)
+
+
 class DelayOffsetCorrector:
     """Delays targets and adds the offset. Before the first target, the first target holds."""
 
@@ -109,9 +119,8 @@ class DelayOffsetCorrector:
 
     def reset(self, start: ListOf[Sequence]) -> None:
         """Start one simulation per sequence."""
-        self.periods = np.round(
-            self.delay[None, :] / np.array([s.dt for s in start])[:, None]
-        ).astype(int)
+        dt = np.array([s.dt for s in start])
+        self.periods = np.round(self.delay[None, :] / dt[:, None]).astype(int)
         self.past = []
 
     def correct(self, t: int, target: Array, qpos: Array, qvel: Array) -> Array:

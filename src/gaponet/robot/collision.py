@@ -101,11 +101,7 @@ class Collision:
             raise RobotError(
                 f"the plane is at {self.height:g} m; give its height in metres, up to 10 (--plane)"
             )
-        above = []
-        if self.height is not None:
-            stands = tuple(plane.stands.split()) if plane else ()
-            above = [i for i, name in enumerate(self.names) if not name.startswith(stands)]
-        self.above = np.array(above, int)
+        self.above = self._capsules_that_can_hit_plane(plane)
 
     def _pairs_that_can_collide(self, shapes: Shapes) -> Array:
         """Return the capsules of different bodies that are not of one limb, (pairs, 2)."""
@@ -117,6 +113,14 @@ class Collision:
             if one != other and not _grouped(one, other, groups):
                 pairs.append((i, k))
         return np.array(pairs, int).reshape(-1, 2)
+
+    def _capsules_that_can_hit_plane(self, plane: Plane | None) -> Array:
+        """Return the capsules of bodies that do not stand on the plane; none without a plane."""
+        if self.height is None:
+            return np.zeros(0, int)
+        stands = tuple(plane.stands.split()) if plane else ()
+        above = [i for i, name in enumerate(self.names) if not name.startswith(stands)]
+        return np.array(above, int)
 
     def distances(self, qpos: Array) -> Array:
         """Return distances of pairs, then of capsules to the plane, (T, n) rad → (T, pairs +
@@ -181,9 +185,11 @@ def segment_distance(a0: Array, a1: Array, b0: Array, b1: Array) -> Array:
     u = a1 - a0
     v = b1 - b0
     w = a0 - b0
-    uu, vv, uv, uw, vw = (
-        np.einsum("...i,...i", x, y) for x, y in ((u, u), (v, v), (u, v), (u, w), (v, w))
-    )
+    uu = np.einsum("...i,...i", u, u)
+    vv = np.einsum("...i,...i", v, v)
+    uv = np.einsum("...i,...i", u, v)
+    uw = np.einsum("...i,...i", u, w)
+    vw = np.einsum("...i,...i", v, w)
     tiny = 1e-12
     s = np.clip((uv * vw - uw * vv) / np.maximum(uu * vv - uv * uv, tiny), 0.0, 1.0)
     t = np.clip((uv * s + vw) / np.maximum(vv, tiny), 0.0, 1.0)
@@ -200,11 +206,9 @@ def read_shapes(folder: Path) -> Shapes:
         RobotError: It names the file and the field.
     """
     path = folder / "collision.toml"
-    return (
-        read_toml(Shapes, path, RobotError, "docs/new-robot.md lists the fields")
-        if path.is_file()
-        else Shapes()
-    )
+    if not path.is_file():
+        return Shapes()
+    return read_toml(Shapes, path, RobotError, "docs/new-robot.md lists the fields")
 
 
 def _require_bodies(robot: RobotSpec, model: mujoco.MjModel, shapes: Shapes) -> None:

@@ -43,21 +43,18 @@ class Finding:
         ]
         tables: Mend = {}
         for finding in bad:
-            lines += [f"# {finding.level}, {finding.check}: {escape(finding.message)}"] * bool(
-                finding.mend
-            )
+            if finding.mend:
+                lines.append(f"# {finding.level}, {finding.check}: {escape(finding.message)}")
             for table, values in finding.mend.items():
                 tables.setdefault(table, {}).update(values)
         for table, values in tables.items():
-            lines += [
-                "",
-                f"[{table}]",
-                *(f"{json.dumps(joint)} = {json.dumps(v)}" for joint, v in values.items()),
-            ]
-        if other := ", ".join(dict.fromkeys(f.check for f in bad if not f.mend)):
-            lines = [*lines, ""] * bool(tables) + [
-                f"# No line is known that mends: {other}. Do what the findings say."
-            ]
+            lines += ["", f"[{table}]"]
+            for joint, value in values.items():
+                lines.append(f"{json.dumps(joint)} = {json.dumps(value)}")
+        other = ", ".join(dict.fromkeys(f.check for f in bad if not f.mend))
+        if other:
+            unmended = f"# No line is known that mends: {other}. Do what the findings say."
+            lines = [*lines, "", unmended] if tables else [unmended]
         return "\n".join(lines) + "\n"
 
 

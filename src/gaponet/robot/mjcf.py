@@ -252,15 +252,13 @@ def _require_small(tag: ElementTree.Element, count: float, path: Path) -> None:
 def _require_files(
     root: ElementTree.Element, path: Path, folder: Path, inspection: _Inspection
 ) -> None:
-    places = {folder} | {
-        folder / tag.get(key, "")
-        for tag in root.iter("compiler")
-        for key in ("meshdir", "texturedir", "assetdir")
-    }
-    for name in {
-        path.name,
-        *(tag.get(key, "") for tag in root.iter() for key in ("file", "filename")),
-    }:
+    places = {folder}
+    for tag in root.iter("compiler"):
+        places.update(folder / tag.get(key, "") for key in ("meshdir", "texturedir", "assetdir"))
+    names = {path.name}
+    for tag in root.iter():
+        names.update(tag.get(key, "") for key in ("file", "filename"))
+    for name in names:
         for place in places:
             file = place / name
             if not file.exists() or file.is_dir():

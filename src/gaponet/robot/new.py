@@ -7,7 +7,8 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
+from collections.abc import Sequence as ListOf
 from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -73,11 +74,9 @@ def new_robot(
     notes += _notes(spec, model, logged, pose, path)
     for name, led in followers.items():
         notes.append(f"{name} follows {led.joint}, without a motor")
-    for drive in joint_drives:
-        _set_passive(spec.joint(drive.name), drive.passive)
-    xml = _robot_xml(spec, model, logged, pose, path, options.contacts)
+    _set_passive(spec, joint_drives)
+    xml = _without_slashes(_robot_xml(spec, model, logged, pose, path, options.contacts), model)
     toml = _robot_toml(model, joint_drives, options, path, source, followers)
-    xml = _without_slashes(xml, model)
     toml = _without_slashes(toml, model)
     if _holds_another_robot(out, xml, toml):
         raise UsageError(f"{out}: holds a robot; choose another --out, or move it away")
@@ -91,11 +90,13 @@ def new_robot(
     return replace(made, robot=load_robot(out))
 
 
-def _set_passive(joint: mujoco.MjsJoint, passive: Mapping[str, float]) -> None:
-    """Give a joint damping, friction and armature, SI."""
-    for name, value in passive.items():
-        is_polynomial = np.ndim(getattr(joint, name))  # of newer MuJoCo; a number of older
-        setattr(joint, name, [[value], [0.0], [0.0]] if is_polynomial else value)
+def _set_passive(spec: mujoco.MjSpec, drives: ListOf[Drive]) -> None:
+    """Give driven joints damping, friction and armature, SI."""
+    for drive in drives:
+        joint = spec.joint(drive.name)
+        for name, value in drive.passive.items():
+            is_polynomial = np.ndim(getattr(joint, name))  # of newer MuJoCo; a number of older
+            setattr(joint, name, [[value], [0.0], [0.0]] if is_polynomial else value)
 
 
 def _without_slashes(text: str, model: mujoco.MjModel) -> str:
@@ -195,8 +196,12 @@ def _home(model: mujoco.MjModel, keyframe: str, path: Path) -> tuple[np.ndarray,
     keys = [model.key(k).name for k in range(model.nkey)]
     if keyframe and keyframe not in keys:
         raise UsageError(f"--keyframe {keyframe}: {path.name} has {', '.join(keys) or 'none'}")
-    source = f'keyframe "{keyframe or keys[0]}"' if keys else "the model's zero"
-    pose = (model.key_qpos[keys.index(keyframe) if keyframe else 0] if keys else model.qpos0).copy()
+    source = "the model's zero"
+    pose = model.qpos0.copy()
+    if keys:
+        source = f'keyframe "{keyframe or keys[0]}"'
+        chosen = keys.index(keyframe) if keyframe else 0
+        pose = model.key_qpos[chosen].copy()
     for j in np.flatnonzero(model.jnt_limited):
         at = model.jnt_qposadr[j]
         low, high = model.jnt_range[j]

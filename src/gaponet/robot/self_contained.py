@@ -125,8 +125,10 @@ def _fill(
 
 def _unwrap(element: ET.Element) -> None:
     """Replace frames by their children: the model states positions relative to the body."""
-    while any(c.tag == "frame" for c in element):
-        children = [inner for c in element for inner in (list(c) if c.tag == "frame" else [c])]
+    while any(child.tag == "frame" for child in element):
+        children: list[ET.Element] = []
+        for child in element:
+            children += child if child.tag == "frame" else [child]
         element[:] = children
 
 

@@ -90,8 +90,10 @@ def _of_menagerie(name: str) -> Path:
     roots = [p for p in (*_stated(MENAGERIE_VARIABLES), *usual) if p.is_dir()]
     place = next((p / name for p in roots if (p / name).exists()), None)
     if place is None:
-        there = sorted(p.name for root in roots[:1] for p in root.iterdir() if any(p.glob("*.xml")))
-        where = f"{roots[0]} has {abbreviate(there)}" if roots else "it is not on this disk"
+        where = "it is not on this disk"
+        if roots:
+            there = sorted(p.name for p in roots[0].iterdir() if any(p.glob("*.xml")))
+            where = f"{roots[0]} has {abbreviate(there)}"
         raise RobotError(
             f"menagerie:{name}: {where}. Get MuJoCo Menagerie (git clone "
             "https://github.com/google-deepmind/mujoco_menagerie) and name its folder in "
@@ -158,18 +160,7 @@ def _description(name: str) -> Any:
 
 
 def _of_example_robot_data(name: str) -> Path:
-    share = Path("share/example-robot-data/robots")
-    prefixes = []
-    for variable in ("CONDA_PREFIX", "AMENT_PREFIX_PATH"):
-        prefixes += [Path(p) for p in os.environ.get(variable, "").split(os.pathsep) if p]
-    prefixes += [Path(p) / "cmeel.prefix" for p in sys.path]
-    usual = [prefix / share for prefix in prefixes]
-    usual += [
-        _cache() / "example-robot-data/robots",
-        Path("/opt/openrobots") / share,
-        Path("/usr") / share,
-    ]
-    roots = [p for p in (*_stated(EXAMPLE_VARIABLES), *usual) if p.is_dir()]
+    roots = [place for place in _places_of_example_robot_data() if place.is_dir()]
     if not roots:
         raise RobotError(
             f"example-robot-data:{name}: it is not on this disk; pip install example-robot-data, "
@@ -191,6 +182,22 @@ def _of_example_robot_data(name: str) -> Path:
     raise RobotError(f"example-robot-data:{name}: not among {', '.join(there)} of {root}")
 
 
+def _places_of_example_robot_data() -> list[Path]:
+    """Return folders that may hold its robots: stated ones first, then those of installations."""
+    share = Path("share/example-robot-data/robots")
+    prefixes = []
+    for variable in ("CONDA_PREFIX", "AMENT_PREFIX_PATH"):
+        prefixes += [Path(p) for p in os.environ.get(variable, "").split(os.pathsep) if p]
+    prefixes += [Path(p) / "cmeel.prefix" for p in sys.path]
+    return [
+        *_stated(EXAMPLE_VARIABLES),
+        *(prefix / share for prefix in prefixes),
+        _cache() / "example-robot-data/robots",
+        Path("/opt/openrobots") / share,
+        Path("/usr") / share,
+    ]
+
+
 def read_vendor(path: Path, packages: dict[str, Path]) -> tuple[mujoco.MjSpec, list[str]]:
     """Read a model file as a specification, with notes on what was omitted or corrected.
 
@@ -202,9 +209,8 @@ def read_vendor(path: Path, packages: dict[str, Path]) -> tuple[mujoco.MjSpec, l
         RobotError: The file is neither MJCF nor URDF, or is damaged.
     """
     if path.is_dir():
-        models = sorted(
-            p.relative_to(path).as_posix() for e in ("xml", "urdf") for p in path.rglob(f"*.{e}")
-        )
+        files = (*path.rglob("*.xml"), *path.rglob("*.urdf"))
+        models = sorted(file.relative_to(path).as_posix() for file in files)
         raise RobotError(
             f"{path}: is a folder; name the model in it: "
             f"{abbreviate(models) or 'there is no .xml or .urdf'}"
@@ -259,8 +265,11 @@ def _urdf(
                 continue
             name = mesh.get("filename", "")
             file = _resolve(name, path, packages)
-            if file is None or file.suffix.lower() not in MESHES:
-                (missing if file is None else unread).append(name)
+            if file is None:
+                missing.append(name)
+                link.remove(shape)
+            elif file.suffix.lower() not in MESHES:
+                unread.append(name)
                 link.remove(shape)
             else:
                 mesh.set("filename", str(file.resolve()))
@@ -289,11 +298,13 @@ def _correct_inertias(root: ET.Element) -> list[str]:
     light = []
     for link in root.iter("link"):
         inertial = link.find("inertial")
-        element = None if inertial is None else inertial.find("mass")
-        mass = _number(element, "value")
-        if inertial is not None and element is not None and mass <= 0:
+        stated = None if inertial is None else inertial.find("mass")
+        if inertial is None or stated is None:
+            light.append(link.get("name", ""))
+            continue
+        mass = _number(stated, "value")
+        if mass <= 0:
             link.remove(inertial)
-        if inertial is None or element is None or mass <= 0:
             light.append(link.get("name", ""))
             continue
         inertia = inertial.find("inertia")

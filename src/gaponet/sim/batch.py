@@ -190,25 +190,20 @@ class BatchSim:
         """
         self.robot = robot
         self.joint_names = tuple(name for name in robot.joint_names if name not in locked)
+        free = robot.index(self.joint_names)
         self.num_envs = len(conditions)
         self.n = len(self.joint_names)
         conditions = [Condition(*c) for c in conditions]
-        robots = {}
-        for c in dict.fromkeys(conditions):
-            robots[c] = robot.with_gains(c.kp, c.kd).at_temperature(c.temperature)
-        late = max((c.simulator.delay for c in conditions if c.simulator), default=0.0)
-        self.longest_delay = float(robot.delay.max()) + late  # s
-        self.models = _compiled(
-            robots, self.joint_names, locked, self.longest_delay if late else 0.0
-        )
+        robots = _under_conditions(robot, conditions)
+        added_delay = _largest_added_delay(conditions)
+        self.longest_delay = float(robot.delay.max()) + added_delay  # s
+        self.models = _compiled(robots, self.joint_names, locked, added_delay)
         models = [self.models[c] for c in conditions]
         first = models[0]
-        own_kp = np.where(robot.kp > 0, robot.kp, 1.0)
-        self._kp_ratio = np.array([robots[c].kp / own_kp for c in conditions])
-        self._kd = np.array([robots[c].kd for c in conditions])
-        # Threads with fewer simulations mostly wait.
-        useful = max(1, min(os.cpu_count() or 1, self.num_envs // 16))
-        self.batch = Batch(first, nsim=self.num_envs, nthread=nthread or useful)
+        self._kp_ratio, self._kd = _recorded_gains(robot, [robots[c] for c in conditions])
+        self.batch = Batch(
+            first, nsim=self.num_envs, nthread=nthread or _useful_threads(self.num_envs)
+        )
         # Model fields that differ between conditions, each (num_envs, …): a row may be copied over
         # another's.
         self.fields = expand_differences(self.batch, models)
@@ -230,9 +225,8 @@ class BatchSim:
         self.timestep = np.array([model.opt.timestep for model in models])
         self.range = qpos_range(first)
         self.max_change: Array | None = None  # without speed limits
-        speed = robot.target_speed[robot.index(self.joint_names)]
-        if speed.any():
-            self.max_change = self._max_change(speed)
+        if robot.target_speed[free].any():
+            self.max_change = self._max_change(robot.target_speed[free])
 
     def array(self, values: Any) -> Array:
         """Return values as an array of this simulator: numpy here, torch in sim/warp.py."""
@@ -271,11 +265,10 @@ class BatchSim:
         """
         if self.max_change is not None:
             near = np.clip(ctrl, self.ctrl - self.max_change, self.ctrl + self.max_change)
-            ctrl = (
-                near
-                if ids is None
-                else np.where(np.isin(np.arange(self.num_envs), ids)[:, None], near, self.ctrl)
-            )
+            ctrl = near
+            if ids is not None:
+                moves = np.isin(np.arange(self.num_envs), ids)
+                ctrl = np.where(moves[:, None], near, self.ctrl)
         np.clip(ctrl, self.range[:, 0], self.range[:, 1], out=self.ctrl)
         if self._one_rate:
             self._advance(ids, int(self.nstep[0]))
@@ -376,16 +369,46 @@ class BatchSim:
             state |= {"history": self._history.buffer, "time": self._history.time}
         if self.servo_model is not None:
             state |= {"servo_torque": self.servo_model.torque, "servo_load": self.servo_model.load}
-            if (play := self.servo_model.play) is not None:
+            play = self.servo_model.play
+            if play is not None:
                 state |= {"servo_gap": play.gap, "servo_rotor": play.rotor, "servo_seen": play.seen}
-        return state if self.max_change is None else state | {"ctrl": self.ctrl}
+        if self.max_change is not None:
+            state["ctrl"] = self.ctrl
+        return state
+
+
+def _under_conditions(robot: RobotSpec, conditions: list[Condition]) -> dict[Condition, RobotSpec]:
+    """Return the robot with the gains and at the temperature of each condition."""
+    robots = {}
+    for condition in dict.fromkeys(conditions):
+        with_gains = robot.with_gains(condition.kp, condition.kd)
+        robots[condition] = with_gains.at_temperature(condition.temperature)
+    return robots
+
+
+def _largest_added_delay(conditions: list[Condition]) -> float:
+    """Return the largest delay that a changed simulator adds, s."""
+    return max((c.simulator.delay for c in conditions if c.simulator), default=0.0)
+
+
+def _recorded_gains(robot: RobotSpec, robots: list[RobotSpec]) -> tuple[Array, Array]:
+    """Return kp as a ratio to the robot's own, and kd, of each simulation, (num_envs, n)."""
+    own_kp = np.where(robot.kp > 0, robot.kp, 1.0)
+    ratio = np.array([one.kp / own_kp for one in robots])
+    kd = np.array([one.kd for one in robots])
+    return ratio, kd
+
+
+def _useful_threads(num_envs: int) -> int:
+    """Return a number of threads; those with fewer than 16 simulations mostly wait."""
+    return max(1, min(os.cpu_count() or 1, num_envs // 16))
 
 
 def _compiled(
     robots: dict[Condition, RobotSpec],
     joint_names: tuple[str, ...],
     locked: tuple[str, ...],
-    buffer_s: float,
+    added_delay: float,
 ) -> dict[Condition, mujoco.MjModel]:
     """Return the model of each condition.
 
@@ -394,8 +417,8 @@ def _compiled(
     Args:
         robots: Condition → robot with its gains, at its temperature.
         joint_names: Joints that are not locked.
-        buffer_s: Every model gets buffers for servos that are so late, s; 0 for those that its
-            robot needs.
+        added_delay: Largest delay that a changed simulator adds, s. Every model then gets buffers
+            for servos that are so late.
 
     Raises:
         UsageError: A changed simulator of a robot with a servo model, whose terms are not changed
@@ -407,8 +430,9 @@ def _compiled(
         own = condition.without_change
         if own not in unchanged:
             buffered = robot
-            if buffer_s:
-                buffered = replace(robot, delay=np.full(len(robot.joint_names), buffer_s))
+            if added_delay:
+                longest = float(robot.delay.max()) + added_delay
+                buffered = replace(robot, delay=np.full(len(robot.joint_names), longest))
             model = build_model(buffered, *condition[:3], locked, physics_only=True)
             model.actuator_delay[:] = robot.delay[robot.index(joint_names)]
             unchanged[own] = model

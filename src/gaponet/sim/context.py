@@ -99,11 +99,7 @@ def scene_context(scene: mujoco.MjModel, robot: RobotSpec, dt: float, prefix: st
     ctrl[:, actuator] = home
     steps = round(dt / model.opt.timestep)
     if model.nhistory:
-        history = CommandHistory(batch.bind("history"), batch.bind("time"), model)
-        everywhere = np.full(len(moved), 1)
-        history.fill(
-            slice(None), ctrl[:, None].copy(), steps * everywhere, model.opt.timestep * everywhere
-        )
+        _fill_history(batch, model, ctrl, steps)
     ctrl[:, actuator] = moved
 
     def step() -> tuple[Array, Array]:
@@ -112,6 +108,13 @@ def scene_context(scene: mujoco.MjModel, robot: RobotSpec, dt: float, prefix: st
 
     result: Array = _answers(step, dt, operated, towards)[0]
     return result
+
+
+def _fill_history(batch: Batch, model: mujoco.MjModel, ctrl: Array, steps: int) -> None:
+    """Let the servos have had the targets ctrl, (nsim, nu) rad, in each control period before."""
+    history = CommandHistory(batch.bind("history"), batch.bind("time"), model)
+    each = np.ones(len(ctrl), int)
+    history.fill(slice(None), ctrl[:, None].copy(), steps * each, model.opt.timestep * each)
 
 
 def _probe_targets(home: Array, operated: Array, limits: Array) -> tuple[Array, Array]:

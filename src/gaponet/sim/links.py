@@ -115,14 +115,10 @@ def _members(
     for b in own:
         frame = np.eye(4)
         inertial = np.eye(4)
-        frame[:3, :3], frame[:3, 3] = (
-            turn.T @ data.xmat[b].reshape(3, 3),
-            turn.T @ (data.xpos[b] - centre),
-        )
-        inertial[:3, :3], inertial[:3, 3] = (
-            turn.T @ data.ximat[b].reshape(3, 3),
-            turn.T @ (data.xipos[b] - centre),
-        )
+        frame[:3, :3] = turn.T @ data.xmat[b].reshape(3, 3)
+        frame[:3, 3] = turn.T @ (data.xpos[b] - centre)
+        inertial[:3, :3] = turn.T @ data.ximat[b].reshape(3, 3)
+        inertial[:3, 3] = turn.T @ (data.xipos[b] - centre)
         moments = model.body_inertia[b]
         mass = model.body_mass[b]
         second = np.diag([*(moments.sum() / 2 - moments), mass])
@@ -208,21 +204,23 @@ class LinkResult:
                 continue
             known = std < MAX_STD_SHARE * prior
             moved = known & (abs(now - before) > std)
-            parts = [f"{before[0]:.3g} → {format_uncertainty(now[0], std[0])} kg"] * bool(known[0])
-            parts += [
-                f"centre of mass {format_uncertainty(1e2 * now[i], 1e2 * std[i])} cm along {axis}"
-                for i, axis in enumerate("xyz", 1)
-                if moved[i]
-            ]
-            parts += [
-                f"moment about the joint {1e2 * before[i]:.3g} → "
-                f"{format_uncertainty(1e2 * now[i], 1e2 * std[i])} kg·cm along {axis}"
-                for i, axis in enumerate("xyz", 4)
-                if moved[i] and not known[[0, i - 3]].all()
-            ]
-            unknown = ", ".join(
-                what for what, one in zip(("mass", *"xyz"), known, strict=False) if not one
-            )
-            parts += [f"not determined by themselves: {unknown}"] * bool(unknown)
+            parts = []
+            if known[0]:
+                parts.append(f"{before[0]:.3g} → {format_uncertainty(now[0], std[0])} kg")
+            for i, axis in enumerate("xyz", 1):
+                if moved[i]:
+                    place = format_uncertainty(1e2 * now[i], 1e2 * std[i])
+                    parts.append(f"centre of mass {place} cm along {axis}")
+            for i, axis in enumerate("xyz", 4):
+                if moved[i] and not known[[0, i - 3]].all():
+                    moment = format_uncertainty(1e2 * now[i], 1e2 * std[i])
+                    parts.append(
+                        f"moment about the joint {1e2 * before[i]:.3g} → {moment} kg·cm along "
+                        f"{axis}"
+                    )
+            named = zip(("mass", *"xyz"), known, strict=False)
+            unknown = [what for what, is_known in named if not is_known]
+            if unknown:
+                parts.append(f"not determined by themselves: {', '.join(unknown)}")
             sentences.append(f"{name}: {', '.join(parts)}")
         return sentences

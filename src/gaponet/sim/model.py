@@ -164,14 +164,17 @@ def model_hash(robot: RobotSpec) -> str:
     is written.
     """
     if "_model_hash" not in vars(robot):
-        warm = [getattr(robot, name).tolist() for name in TERMS["temperature"]]
         text = [
-            f"step {robot.timestep:.7g} density {PAYLOAD_DENSITY:g} mobility {STIFF_MOBILITY:g}",
-            *([] if robot.carries_payload else ["carries no payload"]),
-            *([f"target speed {robot.target_speed}"] * bool(robot.target_speed.any())),
-            *([f"friction per kelvin {warm}"] * any(robot.friction_per_kelvin)),
-            *model_fingerprint(build_model(robot)),
+            f"step {robot.timestep:.7g} density {PAYLOAD_DENSITY:g} mobility {STIFF_MOBILITY:g}"
         ]
+        if not robot.carries_payload:
+            text.append("carries no payload")
+        if robot.target_speed.any():
+            text.append(f"target speed {robot.target_speed}")
+        if robot.friction_per_kelvin.any():
+            warm = [getattr(robot, name).tolist() for name in TERMS["temperature"]]
+            text.append(f"friction per kelvin {warm}")
+        text += model_fingerprint(build_model(robot))
         digest = hashlib.sha256("\n".join(text).encode()).hexdigest()[:12]
         object.__setattr__(robot, "_model_hash", digest)
     return str(vars(robot)["_model_hash"])
@@ -361,9 +364,9 @@ def _add_payload(spec: mujoco.MjSpec, robot: RobotSpec, mass: float, side: str) 
     for mount in robot.payload_mounts:
         # An empty hand carries a massless ball: all payloads share one MjData layout, so one Batch
         # steps them together.
-        carried = mount.mass + (
-            mass if robot.carries_payload and side in ("both", mount.side) else 0.0
-        )
+        carried = mount.mass
+        if robot.carries_payload and side in ("both", mount.side):
+            carried += mass
         radius = max((3 * carried / (4 * math.pi * PAYLOAD_DENSITY)) ** (1 / 3), 1e-3)
         parent = spec.body(mount.body)
         if parent is None:

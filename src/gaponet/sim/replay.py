@@ -203,11 +203,9 @@ def rollout(
     """
     lengths = np.array([len(s) for s in sequences])
     free = sim.robot.index(sim.joint_names)
-    ctrl = np.zeros((lengths.max(), len(sequences), len(sim.robot.joint_names)))
+    ctrl = _commands(sequences)
     out = np.zeros((4, *ctrl.shape))
     out[0] = sim.robot.qpos_home
-    for i, s in enumerate(sequences):
-        ctrl[: len(s), i] = s.ctrl
     qpos = np.stack([s.qpos[0, free] for s in sequences])
     qvel = np.stack([s.qvel[0, free] for s in sequences])
     sim.reset(slice(None), qpos, qvel, past=ctrl[0][:, None, free])
@@ -232,6 +230,15 @@ def rollout(
         if t % 200 == 0 or t == last:
             progress(finished)
     return out
+
+
+def _commands(sequences: ListOf[Sequence]) -> Array:
+    """Return the commands by row, (longest T, k, n) rad, with zeros after a sequence's end."""
+    longest = max(len(s) for s in sequences)
+    ctrl = np.zeros((longest, len(sequences), sequences[0].ctrl.shape[1]))
+    for i, s in enumerate(sequences):
+        ctrl[: len(s), i] = s.ctrl
+    return ctrl
 
 
 def _go_on_from_recordings(

@@ -26,11 +26,7 @@ from gaponet.sim.batch import BatchSim, CommandHistory, ramp_start
 MAX_CONTACTS = 48
 CONSTRAINTS_PER_CONTACT = 4
 # field of Data → name in BatchSim.state
-STATE = {
-    "qpos": "qpos",
-    "qvel": "qvel",
-    "qacc_warmstart": "warmstart",
-}
+STATE = {"qpos": "qpos", "qvel": "qvel", "qacc_warmstart": "warmstart"}
 HISTORY = {"history": "history", "time": "time"}
 SERVO = {"actuator_force": "servo_torque", "qfrc_bias": "servo_load"}
 TARGET = {"ctrl": "ctrl"}
@@ -99,6 +95,19 @@ def _set_servos(
         force[i, j] = warp.vec2(low, high)
 
 
+def _own_fields(sim: BatchSim, rows: np.ndarray) -> dict[str, np.ndarray]:
+    """Return the fields of mujoco_warp's model that differ between simulations, (rows, …) each.
+
+    MuJoCo's other fields are precomputed values or have no effect on motion.
+    """
+    own = {}
+    for name in sorted(MODEL_FIELDS):
+        values = sim.batch.expanded(name)
+        if values is not None and name in mujoco_warp.Model.__dataclass_fields__:
+            own[name] = values[rows]
+    return own
+
+
 class _Worlds:
     """Simulations of one control period: mujoco_warp steps all of its worlds, equally often."""
 
@@ -107,17 +116,13 @@ class _Worlds:
         self.nstep = int(sim.nstep[rows[0]])
         self._graphs = dict[Any, Any]()
         model = next(iter(sim.models.values()))
-        own = {
-            name: x[rows]
-            for name in sorted(MODEL_FIELDS)
-            if (x := sim.batch.expanded(name)) is not None
-        }
-        timestep = own.pop("opt.timestep", np.full(len(rows), model.opt.timestep))
-        # MuJoCo's other fields are precomputed values or have no effect on motion.
-        own = {name: x for name, x in own.items() if name in mujoco_warp.Model.__dataclass_fields__}
-        contacts = (
-            0 if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONTACT else MAX_CONTACTS
-        )
+        timestep = sim.batch.expanded("opt.timestep")
+        if timestep is None:
+            timestep = np.full(sim.num_envs, model.opt.timestep)
+        own = _own_fields(sim, rows)
+        contacts = MAX_CONTACTS
+        if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONTACT:
+            contacts = 0
         constraints = max(64, 2 * model.nv + CONSTRAINTS_PER_CONTACT * contacts)
         with warp.ScopedDevice(self.device):
             try:
@@ -130,14 +135,14 @@ class _Worlds:
             self.data = mujoco_warp.put_data(
                 model, mujoco.MjData(model), len(rows), contacts or None, njmax=constraints
             )
-            self.model.opt.timestep = warp.array(timestep, dtype=float)
+            self.model.opt.timestep = warp.array(timestep[rows], dtype=float)
             # put_model's is 1e-6 at least
             self.model.opt.tolerance = warp.array([model.opt.tolerance], dtype=float)
             # float32 seldom reaches that tolerance: no message each time, as in C MuJoCo.
             self.model.opt.warn_overflow &= ~mujoco_warp.OverflowType.ITERATIONS
-            self._servo_inputs = (
-                None if sim.servo_model is None else self._inputs(sim.servo_model, rows)
-            )
+            self._servo_inputs: list[Any] | None = None
+            if sim.servo_model is not None:
+                self._servo_inputs = self._inputs(sim.servo_model, rows)
         for name, x in own.items():
             view = warp.to_torch(getattr(self.model, name))
             view.copy_(torch.tensor(x).reshape(view.shape))
@@ -164,6 +169,10 @@ class _Worlds:
         """Return a live view of a field of all worlds, (nworld, …)."""
         result: Tensor = warp.to_torch(getattr(self.data, name))
         return result
+
+    def bind_all(self, names: list[str]) -> dict[str, Tensor]:
+        """Return live views by name."""
+        return {name: self.bind(name) for name in names}
 
     def period(self) -> None:
         """Advance by a control period."""
@@ -207,6 +216,30 @@ class _Worlds:
         return capture.graph
 
 
+def _warp_device(device: str) -> str:
+    """Return Warp's name of a device, "cuda" or "warp-cpu", and refuse one that is not there."""
+    on_gpu = device == "cuda"
+    warp.config.log_level = warp.LOG_WARNING if on_gpu else warp.LOG_ERROR
+    name = f"cuda:{torch.cuda.current_device()}" if on_gpu else "cpu"
+    try:
+        warp.get_device(name)
+    except (ValueError, RuntimeError) as error:
+        raise UsageError(f"device {name}: Warp has no such device ({error}); use cpu") from None
+    return name
+
+
+def _stored_fields(sim: BatchSim) -> dict[str, str]:
+    """Return field of Data → name in BatchSim.state, of the state that a BatchSim has."""
+    stored = dict(STATE)
+    if next(iter(sim.models.values())).nhistory > 0:
+        stored |= HISTORY
+    if sim.servo_model:
+        stored |= SERVO
+    if sim.max_change is not None:
+        stored |= TARGET
+    return stored
+
+
 class WarpSim:
     """Copy of a BatchSim on a device, with its payloads, control periods, servos and state.
 
@@ -226,50 +259,44 @@ class WarpSim:
                 f"{sim.robot.name}: no GPU simulates its backlash; use --device cpu, or backlash "
                 "= 0"
             )
-        warp.config.log_level = warp.LOG_WARNING if device == "cuda" else warp.LOG_ERROR
-        device = f"cuda:{torch.cuda.current_device()}" if device == "cuda" else "cpu"
-        try:
-            warp.get_device(device)
-        except (ValueError, RuntimeError) as error:
-            raise UsageError(
-                f"device {device}: Warp has no such device ({error}); use cpu"
-            ) from None
+        model = next(iter(sim.models.values()))
+        name = _warp_device(device)
         self.robot = sim.robot
         self.joint_names = sim.joint_names
         self.num_envs = sim.num_envs
         self.n = sim.n
         self.range = sim.range
         rates = [np.flatnonzero(sim.nstep == n) for n in np.unique(sim.nstep)]
-        self._worlds = [_Worlds(sim, rows, device) for rows in rates]
-        self._delayed = next(iter(sim.models.values())).nhistory > 0
-        self._stored = (
-            STATE | (HISTORY if self._delayed else {}) | (SERVO if sim.servo_model else {})
-        )
-        self._stored |= {} if sim.max_change is None else TARGET
+        self._worlds = [_Worlds(sim, rows, name) for rows in rates]
+        self._delayed = model.nhistory > 0
+        self._stored = _stored_fields(sim)
         names = [*self._stored, "ctrl", "actuator_force"]
-        self._views = [{name: worlds.bind(name) for name in names} for worlds in self._worlds]
-        if len(self._worlds) == 1:
-            self._all = self._views[0]
-        else:
-            self._all = {
-                name: x.new_zeros(self.num_envs, *x.shape[1:]) for name, x in self._views[0].items()
-            }
-        self.qpos, self.qvel, self.ctrl = (self._all[name] for name in ("qpos", "qvel", "ctrl"))
+        self._views = [worlds.bind_all(names) for worlds in self._worlds]
+        self._all = self._views[0]
+        if len(self._worlds) > 1:
+            self._all = {name: self._zeros_like(x) for name, x in self._all.items()}
+        self.qpos = self._all["qpos"]
+        self.qvel = self._all["qvel"]
+        self.ctrl = self._all["ctrl"]
         self.torque = self._all["actuator_force"]
         self._ids = [self.array(rows) for rows in rates]
         self._low, self._high = self.array(self.range.T)
-        self._max_change = None if sim.max_change is None else self.array(sim.max_change)
+        self._max_change: Tensor | None = None
+        if sim.max_change is not None:
+            self._max_change = self.array(sim.max_change)
         if sim.servo_model:
-            gain = sim.batch.expand("actuator_gainprm")[..., 0]
-            servos = sim.servo_model
-            self._gain, self._bias, self._effort = map(
-                self.array, (gain, servos.bias, servos.effort)
-            )
-        self.nstep, self.timestep = self.array(sim.nstep), self.array(sim.timestep)
+            self._gain = self.array(sim.batch.expand("actuator_gainprm")[..., 0])
+            self._bias = self.array(sim.servo_model.bias)
+            self._effort = self.array(sim.servo_model.effort)
+        self.nstep = self.array(sim.nstep)
+        self.timestep = self.array(sim.timestep)
         if self._delayed:
-            model = next(iter(sim.models.values()))
             self._commands = CommandHistory(self._all["history"], self._all["time"], model)
         self.set_state(sim.state())
+
+    def _zeros_like(self, view: Tensor) -> Tensor:
+        """Return zeros for all simulations in the shape of some worlds' field, (nworld, …)."""
+        return view.new_zeros(self.num_envs, *view.shape[1:])
 
     def array(self, values: Any) -> Tensor:
         """Copy values to the device, floats as float32, without waiting."""
@@ -284,7 +311,8 @@ class WarpSim:
     def reset(self, ids: Any, qpos: Any, qvel: Any, past: Any = None) -> None:
         """Reset as BatchSim.reset does; arrays of any kind."""
         ids = ids if isinstance(ids, slice) else self.array(ids)
-        self.qpos[ids], self.qvel[ids] = self.array(qpos), self.array(qvel)
+        self.qpos[ids] = self.array(qpos)
+        self.qvel[ids] = self.array(qvel)
         self._all["qacc_warmstart"][ids] = 0.0
         if self._max_change is not None:
             speed = self._max_change[ids] / (self.nstep * self.timestep)[ids, None]

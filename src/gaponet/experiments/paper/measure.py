@@ -212,19 +212,26 @@ def measure_delivery(
         if config is not None:
             compensator = make_compensator(unit.robot, model, config, payloads)
         played = play(unit.robot, unit.physics, targets, payloads, unit.dt, compensator)
-        offsets: dict[float, list[list[float]]] = {payload: [] for payload in unit.payloads}
-        near: dict[float, list[bool]] = {payload: [] for payload in unit.payloads}
+        held: dict[float, list[Array]] = {payload: [] for payload in unit.payloads}
         for i, (plan, payload) in enumerate(runs):
             hands = delivery.planner.hand_positions(played.true_qpos[: len(plan.ctrl), i])
-            for away in held_offsets(hands, plan, unit.dt):  # (rows, 3) m
-                offsets[payload].append(np.abs(away).mean(axis=0).tolist())
-                distance = np.linalg.norm(away, axis=1)
-                near[payload].append(bool((distance <= SUCCESS_RADIUS_M).all()))
+            held[payload] += held_offsets(hands, plan, unit.dt)
         measured[way] = {
-            "offset": [offsets[payload] for payload in unit.payloads],
-            "near": [float(np.mean(near[payload])) for payload in unit.payloads],
+            "offset": [_mean_offsets(held[payload]) for payload in unit.payloads],
+            "near": [_near_share(held[payload]) for payload in unit.payloads],
         }
     return measured
+
+
+def _mean_offsets(held: list[Array]) -> list[list[float]]:
+    """Return mean |hand − goal| along X, Y, Z in each hold, (holds, 3) m; held (rows, 3) m each."""
+    return [np.abs(away).mean(axis=0).tolist() for away in held]
+
+
+def _near_share(held: list[Array]) -> float:
+    """Return the share of holds within SUCCESS_RADIUS_M of the goal; held (rows, 3) m each."""
+    near = [(np.linalg.norm(away, axis=1) <= SUCCESS_RADIUS_M).all() for away in held]
+    return float(np.mean(near))
 
 
 def held_offsets(hands: Array, plan: Plan, dt: float) -> list[Array]:

@@ -43,20 +43,19 @@ class RecordedRows:
             UsageError: No recording, a recording that is too short, or fewer environments than
                 groups.
         """
-        if not sequences:
-            raise UsageError("no sequences to train on; the split left the training set empty")
         _require_rows(sequences, min_rows)
         self.locked = idle_limbs(sequences, robot)
         free = [joint for joint in robot.joint_names if joint not in self.locked]
         self.operated = np.array([free.index(joint) for joint in robot.operated])
 
         columns = robot.index(free)
-        self.ctrl = _joined([s.ctrl[:, columns] for s in sequences])
-        self.qpos = _joined([s.qpos[:, columns] for s in sequences])
-        self.qvel = _joined([s.qvel[:, columns] for s in sequences])
-        operated = [values[:, self.operated] for values in (self.qpos, self.qvel, self.ctrl)]
+        self.ctrl = _joined([s.ctrl for s in sequences], columns)
+        self.qpos = _joined([s.qpos for s in sequences], columns)
+        self.qvel = _joined([s.qvel for s in sequences], columns)
+        op = self.operated
+        track = np.concatenate([self.qpos[:, op], self.qvel[:, op], self.ctrl[:, op]], axis=1)
         # take() copies an array that is neither contiguous nor float32.
-        self.track = np.ascontiguousarray(np.concatenate(operated, axis=1), np.float32)
+        self.track = np.ascontiguousarray(track, np.float32)
 
         length = np.array([len(s) for s in sequences])
         self.last = np.cumsum(length) - 1
@@ -69,16 +68,7 @@ class RecordedRows:
         self.unobserved = np.array([[j in unrecorded for j in free] for _, unrecorded in groups])
         self.group = _groups_of_environments(np.bincount(group_of_sequence, length), num_envs)
 
-        # Recordings by group, and the group number plus the cumulative share of rows in the group.
-        members = []
-        cumulative = []
-        for group in range(len(groups)):
-            in_group = np.flatnonzero(group_of_sequence == group)
-            share = np.cumsum(length[in_group] / length[in_group].sum())
-            members.append(in_group)
-            cumulative.append(group + share / share[-1])
-        self._members = np.concatenate(members)
-        self._cumulative = np.concatenate(cumulative)
+        self._members, self._cumulative = _shares_of_groups(group_of_sequence, length)
 
     def sample(self, group: Array, rng: Any) -> tuple[Array, Array]:
         """Draw a recording for each of these groups, in proportion to its rows.
@@ -93,7 +83,9 @@ class RecordedRows:
 
 
 def _require_rows(sequences: ListOf[Sequence], min_rows: int) -> None:
-    """Refuse a recording that is shorter than one step."""
+    """Refuse a training set without recordings, or with one that is shorter than one step."""
+    if not sequences:
+        raise UsageError("no sequences to train on; the split left the training set empty")
     shortest = min(sequences, key=len)
     if len(shortest) < min_rows:
         raise UsageError(
@@ -102,9 +94,24 @@ def _require_rows(sequences: ListOf[Sequence], min_rows: int) -> None:
         )
 
 
-def _joined(parts: list[Array]) -> Array:
-    """Return the rows of all recordings below each other, contiguous in memory."""
-    return np.ascontiguousarray(np.concatenate(parts))
+def _joined(parts: list[Array], columns: Array) -> Array:
+    """Return columns of all recordings below each other, contiguous in memory."""
+    return np.ascontiguousarray(np.concatenate([part[:, columns] for part in parts]))
+
+
+def _shares_of_groups(group_of_sequence: Array, length: Array) -> tuple[Array, Array]:
+    """Return recordings by group, and group number plus cumulative share of rows in the group.
+
+    Both are (recordings,), in the same order.
+    """
+    members = []
+    cumulative = []
+    for group in range(group_of_sequence.max() + 1):
+        in_group = np.flatnonzero(group_of_sequence == group)
+        share = np.cumsum(length[in_group] / length[in_group].sum())
+        members.append(in_group)
+        cumulative.append(group + share / share[-1])
+    return np.concatenate(members), np.concatenate(cumulative)
 
 
 def _groups_of_environments(rows: Array, num_envs: int) -> Array:

@@ -40,9 +40,9 @@ def train_best(out: Path, resume: bool, train: Train) -> GapModel:
     """
     present = _kind(out)
     begun = (out / FOLDER).is_dir()
-    if resume and present and not begun:
-        return train(present, out, 1.0, 0.0, True)
     if resume and not begun:
+        if present:
+            return train(present, out, 1.0, 0.0, True)
         raise UsageError(
             f"{out}: nothing to resume; train without --resume, or choose another --out"
         )
@@ -53,10 +53,23 @@ def train_best(out: Path, resume: bool, train: Train) -> GapModel:
     if interrupted:
         _copy(out, _best(errors) if errors else interrupted)
         return GapModel.load(out)
+    return _go_on_with_best(out, errors, SHARE * (len(kinds) - 1), train)
+
+
+def _go_on_with_best(
+    out: Path, errors: dict[ModelKind, float], spent: float, train: Train
+) -> GapModel:
+    """Train the best candidate with the rest of the budget.
+
+    If that is the trees, the best network gets the rest, and the better of the two is the result.
+
+    Args:
+        errors: Validation errors of all candidates, rad.
+        spent: Share of the budget.
+    """
     best = _best(errors)
     if _kind(out) != best:
         _copy(out, best)
-    spent = SHARE * (len(kinds) - 1)
     if best != "trees":
         return train(best, out, 1 - spent, spent, True)
     best_network = _best({kind: error for kind, error in errors.items() if kind != "trees"})
