@@ -103,6 +103,15 @@ def test_a_value_is_shown_without_its_error_where_no_log_shows_it():
     assert cell(0.0, 50.0) == "none seen"
 
 
+def test_a_value_that_ended_at_zero_is_shown_as_an_upper_bound():
+    def cell(field, value):
+        return JointSummary({field: value}, {field: 0.0029}).cell(field)
+
+    assert cell("delay", 0.0) == "at most 5.8"
+    assert cell("delay", 0.001) == "1.0 ± 2.9"
+    assert cell("offset", 0.0) == "0.0 ± 2.9"
+
+
 def test_a_parameter_without_information_keeps_its_prior_std(arm):
     """A joint that nothing loads and that hardly moves shows no gain: kp is believed to a factor, not to the moon."""
     still = [

@@ -32,10 +32,8 @@ from gaponet.sysid.axes import Values, first_values, from_axis, to_axis
 # of gear or motor, rad: no parameter of the simulator, but a change that later recordings may show
 PLAY = "play"
 # from which no effect was seen: of a value of zero, of another
-UNOBSERVED_RELATIVE_ERROR = (
-    1.0,
-    3.0,
-)
+UNOBSERVED_RELATIVE_ERROR = (1.0, 3.0)
+AT_BOUND = 0.05  # standard errors: a value nearer to zero has ended at this bound
 # from which parameters are known only as a set
 MIN_SET_CORRELATION = 0.9
 MIN_SET_RELATIVE_ERROR = 0.03
@@ -265,7 +263,10 @@ class JointSummary:
         relative = self.relative_error(field)
         if relative > UNOBSERVED_RELATIVE_ERROR[value != 0]:
             return f"{value:.3g} (no log shows it)" if value else "none seen"
-        return format_uncertainty(value, self.errors[field] * SERVO_FIELDS[field].factor)
+        error = self.errors[field] * SERVO_FIELDS[field].factor
+        if not SERVO_FIELDS[field].signed and value < AT_BOUND * error:
+            return f"at most {value + 2 * error:.2g}"  # a delay below zero does not exist
+        return format_uncertainty(value, error)
 
 
 def summarize(uncertainty: ParameterUncertainty, joint: str) -> JointSummary:
