@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from gaponet.base.arrays import Array
 from gaponet.base.errors import DatasetError, LogError, UsageError
 from gaponet.base.files import lock_folder
 from gaponet.base.progress import Progress, no_progress
@@ -337,11 +338,18 @@ def measure_delays(sequence: Sequence) -> Findings:
     delay = estimate_delay(sequence.ctrl, sequence.qpos, sequence.dt)
     speed = fast_speed(sequence.ctrl, sequence.dt)
     delay[[name in sequence.copied for name in sequence.joint_names]] = np.nan
-    by_joint = lambda x: {  # noqa: E731
-        j: round(float(v), 4) if np.isfinite(v) else None
-        for j, v in zip(sequence.joint_names, x, strict=True)
+    return {
+        "delay_s": _rounded(sequence.joint_names, delay),
+        "fast_speed": _rounded(sequence.joint_names, speed),
     }
-    return {"delay_s": by_joint(delay), "fast_speed": by_joint(speed)}
+
+
+def _rounded(joint_names: tuple[str, ...], values: Array) -> dict[str, float | None]:
+    """Return values (n) by joint, None for one that is not finite."""
+    rounded = {}
+    for name, value in zip(joint_names, values, strict=True):
+        rounded[name] = round(float(value), 4) if np.isfinite(value) else None
+    return rounded
 
 
 def _refuse_relabelled(sequence: Sequence, existing: Dataset) -> None:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+
 from gaponet.base.arrays import Array
 from gaponet.base.errors import DatasetError
 from gaponet.data.sequence import Sequence
@@ -44,4 +46,4 @@ class Pair:
     @property
     def gap(self) -> Array:
         """real.qpos − sim.qpos, (T, n), rad."""
-        return self.real.qpos - self.sim.qpos
+        return np.asarray(self.real.qpos - self.sim.qpos)

@@ -40,7 +40,7 @@ def resample_linear(time: Array, values: Array, grid: Array) -> Array:
     right = np.clip(np.searchsorted(time, grid, side="right"), 1, len(time) - 1)
     left = right - 1
     weight = ((grid - time[left]) / (time[right] - time[left]))[:, None]
-    return values[left] * (1 - weight) + values[right] * weight  # (T, n)
+    return np.asarray(values[left] * (1 - weight) + values[right] * weight)  # (T, n)
 
 
 def resample_zoh(time: Array, values: Array, grid: Array, near: float = SAME_INSTANT) -> Array:
@@ -57,14 +57,15 @@ def resample_zoh(time: Array, values: Array, grid: Array, near: float = SAME_INS
         near: Share of the grid's period that is shortly.
     """
     slack = near * (grid[-1] - grid[0]) / max(len(grid) - 1, 1)
-    return values[np.searchsorted(time, grid + slack, side="right") - 1]  # (T, n)
+    rows = np.searchsorted(time, grid + slack, side="right") - 1
+    return np.asarray(values[rows])  # (T, n)
 
 
 def differentiate(values: Array, dt: float) -> Array:
     """Return central differences, one-sided at the ends, without phase shift; (T, n) → (T, n) per
     second.
     """
-    return np.gradient(values, dt, axis=0)
+    return np.asarray(np.gradient(values, dt, axis=0))
 
 
 def lowpass(values: Array, dt: float, cutoff: float) -> Array:
@@ -78,7 +79,7 @@ def lowpass(values: Array, dt: float, cutoff: float) -> Array:
     from scipy.signal import butter, sosfiltfilt
 
     sos = butter(2, min(cutoff * 2 * dt, 0.99), output="sos")
-    return sosfiltfilt(sos, values, axis=0)  # (T, n)
+    return np.asarray(sosfiltfilt(sos, values, axis=0))  # (T, n)
 
 
 def estimate_delay(ctrl: Array, qpos: Array, dt: float, max_delay: float = 0.4) -> Array:
@@ -136,16 +137,20 @@ def range_before(values: Array, rows: int) -> Array:
 
 def fast_speed(ctrl: Array, dt: float) -> Array:
     """Return the 95th percentile of the commanded speed, (T, n) → (n), rad/s."""
-    return np.percentile(np.abs(differentiate(ctrl, dt)), 95, axis=0)
+    return np.asarray(np.percentile(np.abs(differentiate(ctrl, dt)), 95, axis=0))
 
 
 def correlation(a: Array, b: Array) -> Array:
     """Return the correlation of each row, (n, T) and (n, T) → (n); 0 where one does not change."""
     a = a - a.mean(axis=1, keepdims=True)
     b = b - b.mean(axis=1, keepdims=True)
-    product = lambda x, y: np.einsum("it,it->i", x, y)  # noqa: E731
-    power = np.sqrt(product(a, a) * product(b, b))
-    return np.asarray(product(a, b) / np.where(power > 0, power, np.inf))
+    power = np.sqrt(_row_products(a, a) * _row_products(b, b))
+    return np.asarray(_row_products(a, b) / np.where(power > 0, power, np.inf))
+
+
+def _row_products(a: Array, b: Array) -> Array:
+    """Return the scalar product of each row of a with that of b, (n, T) and (n, T) → (n)."""
+    return np.asarray(np.einsum("it,it->i", a, b))
 
 
 def busiest_window(qpos: Array, rows: int) -> int:

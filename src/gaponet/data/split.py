@@ -105,43 +105,62 @@ def split_entries(
         UsageError: A unit, payload or rate is not in the dataset, or a split would be empty.
     """
     _require_present(dataset, holdout_units, holdout_payloads, rates)
+    _require_share(train_share)
+    canonical = canonical_motions(dataset)
+    if _repeats_few_motions(dataset, canonical):
+        splits = split_by_order(dataset, "repetition")
+        for name in ("train", "val"):
+            splits[name] = _not_held_out(splits[name], holdout_units, holdout_payloads)
+        return splits
+    motions = _split_by_joints(
+        {canonical[e.meta.motion]: frozenset(e.meta.unrecorded) for e in dataset.entries}
+    )
+    training_motions = max(1, round(train_share * len(motions["train"])))
+    motions["train"] = motions["train"][:training_motions]
+    splits = {}
+    for name in SPLITS:
+        chosen = [e for e in dataset.entries if canonical[e.meta.motion] in motions[name]]
+        if rates:
+            chosen = [e for e in chosen if _has_rate(e, rates)]
+        if name != "test":
+            chosen = _not_held_out(chosen, holdout_units, holdout_payloads)
+        splits[name] = chosen
+    payloads = [f"{mass:g} kg" for mass in holdout_payloads]
+    reason = ", ".join([*holdout_units, *payloads]) or "all other rates"
+    for name in SPLITS:
+        if not splits[name]:
+            raise UsageError(f"{dataset.path}: nothing left for {name} after holding out {reason}")
+    return splits
+
+
+def _require_share(train_share: float) -> None:
     if not 0 < train_share <= 1:
         raise UsageError(
             f"train_share is {train_share:g}; it is a share of the training motions, above 0 and "
             "up to 1"
         )
-    held_out = lambda e: e.meta.unit_id in holdout_units or e.meta.payload_mass in holdout_payloads  # noqa: E731
-    canonical = canonical_motions(dataset)
+
+
+def _repeats_few_motions(dataset: Dataset, canonical: dict[str, str]) -> bool:
+    """Return True if there are too few motions to split, but one has as many repetitions."""
     repetitions = Counter(
         (canonical[e.meta.motion], *e.meta.repetition_key[1:]) for e in dataset.entries
     )
-    if len(set(canonical.values())) < MIN_MOTIONS <= max(repetitions.values(), default=0):
-        splits = split_by_order(dataset, "repetition")
-        return splits | {s: [e for e in splits[s] if not held_out(e)] for s in ("train", "val")}
-    motions = _split_by_joints(
-        {canonical[e.meta.motion]: frozenset(e.meta.unrecorded) for e in dataset.entries}
-    )
-    motions["train"] = motions["train"][: max(1, round(train_share * len(motions["train"])))]
-    entries = [
-        e
-        for e in dataset.entries
-        if not rates or any(abs(r - 1 / e.dt) < RATE_TOLERANCE * r for r in rates)
+    motions = set(canonical.values())
+    return len(motions) < MIN_MOTIONS <= max(repetitions.values(), default=0)
+
+
+def _has_rate(entry: Entry, rates: tuple[float, ...]) -> bool:
+    return any(abs(rate - 1 / entry.dt) < RATE_TOLERANCE * rate for rate in rates)
+
+
+def _not_held_out(
+    entries: list[Entry], units: tuple[str, ...], payloads: tuple[float, ...]
+) -> list[Entry]:
+    """Return the entries that have none of the held-out units and payloads."""
+    return [
+        e for e in entries if e.meta.unit_id not in units and e.meta.payload_mass not in payloads
     ]
-    splits = {
-        s: [
-            e
-            for e in entries
-            if canonical[e.meta.motion] in motions[s] and (s == "test" or not held_out(e))
-        ]
-        for s in SPLITS
-    }
-    if empty := [s for s in SPLITS if not splits[s]]:
-        reason = (
-            ", ".join([*holdout_units, *(f"{p:g} kg" for p in holdout_payloads)])
-            or "all other rates"
-        )
-        raise UsageError(f"{dataset.path}: nothing left for {empty[0]} after holding out {reason}")
-    return splits
 
 
 def _require_present(
@@ -177,31 +196,42 @@ def split_by_order(dataset: Dataset, by: str) -> Splits:
     """
     canonical = canonical_motions(dataset) if by == "repetition" else {}
     groups: dict[tuple[Any, ...], list[Entry]] = {}
-    for e in dataset.entries:
-        groups.setdefault(
-            (*e.meta.repetition_key[1:], canonical.get(e.meta.motion, e.meta.source)), []
-        ).append(e)
+    for entry in dataset.entries:
+        whole = canonical.get(entry.meta.motion, entry.meta.source)
+        groups.setdefault((*entry.meta.repetition_key[1:], whole), []).append(entry)
     splits: Splits = {s: [] for s in SPLITS}
     for group in groups.values():
-        place = {
-            e.id: (e.meta.motion, e.meta.repetition)
-            if canonical
-            else (e.meta.notes.get("from_s", 0.0),)
-            for e in group
-        }
-        places = sorted(set(place.values()), reverse=True)
-        test = max(1, round(TEST_SHARE * len(places))) if len(places) >= MIN_MOTIONS else 0
-        for e in group:
-            rank = places.index(place[e.id])
-            splits["test" if rank < test else "val" if test and rank == test else "train"].append(e)
+        places = sorted({_place(entry, by) for entry in group}, reverse=True)
+        held_out = 0
+        if len(places) >= MIN_MOTIONS:
+            held_out = max(1, round(TEST_SHARE * len(places)))
+        for entry in group:
+            rank = places.index(_place(entry, by))  # 0 is the last one
+            splits[_split_of_rank(rank, held_out)].append(entry)
     if not splits["test"]:
-        kind = (
-            "repetitions"
-            if by == "repetition"
-            else "pieces of one recording (gaponet import --cut 8)"
-        )
+        kind = "pieces of one recording (gaponet import --cut 8)"
+        if by == "repetition":
+            kind = "repetitions"
         raise UsageError(f"a split by {by} needs {MIN_MOTIONS} {kind} or more")
     return splits
+
+
+def _place(entry: Entry, by: str) -> tuple[Any, ...]:
+    """Return by what the repetitions of a motion, or the pieces of a recording, are ordered."""
+    if by == "repetition":
+        return (entry.meta.motion, entry.meta.repetition)
+    return (entry.meta.notes.get("from_s", 0.0),)
+
+
+def _split_of_rank(rank: int, held_out: int) -> str:
+    """Return the split of the `rank`-th last repetition: the last `held_out` are for testing, the
+    one before for validation.
+    """
+    if rank < held_out:
+        return "test"
+    if held_out and rank == held_out:
+        return "val"
+    return "train"
 
 
 def make_split(dataset: Dataset, by: str, holdout: tuple[str, ...] = ()) -> Splits:
@@ -278,6 +308,29 @@ def canonical_motions(dataset: Dataset) -> dict[str, str]:
     """Return motion → the name under which it is split: of motions with equal commands, the first
     in hash_order.
     """
+    fingerprints = _fingerprints(dataset)
+    names = hash_order(fingerprints)
+    owners: list[str] = []
+    commands: list[CommandFingerprint] = []
+    for name in names:
+        for command in fingerprints[name]:
+            owners.append(name)
+            commands.append(command)
+    group = {name: name for name in names}
+    for i, j in equal_commands(commands):
+        joined = group[owners[i]]
+        other = group[owners[j]]
+        for name in names:
+            if group[name] == other:
+                group[name] = joined
+    first: dict[str, str] = {}  # of each group
+    for name in names:
+        first.setdefault(group[name], name)
+    return {name: first[group[name]] for name in names}
+
+
+def _fingerprints(dataset: Dataset) -> dict[str, list[CommandFingerprint]]:
+    """Return motion → the distinct commands of its recordings."""
     fingerprints: dict[str, list[CommandFingerprint]] = {}
     for entry in dataset.entries:
         of_motion = fingerprints.setdefault(entry.meta.motion, [])
@@ -287,18 +340,7 @@ def canonical_motions(dataset: Dataset) -> dict[str, str]:
             command = fingerprint(dataset.channels(entry, ("ctrl",))["ctrl"], entry.dt)
         if command is not None and command not in of_motion:
             of_motion.append(command)
-    names = hash_order(fingerprints)
-    owners = [name for name in names for _ in fingerprints[name]]
-    group = {name: name for name in names}
-    for i, j in equal_commands([one for name in names for one in fingerprints[name]]):
-        first = group[owners[i]]
-        second = group[owners[j]]
-        if first != second:
-            group = {name: first if g == second else g for name, g in group.items()}
-    canonical: dict[str, str] = {}
-    for name in names:
-        canonical.setdefault(group[name], name)
-    return {name: canonical[g] for name, g in group.items()}
+    return fingerprints
 
 
 def split_motions(motions: Iterable[str]) -> dict[str, list[str]]:

@@ -109,7 +109,7 @@ class StaticError:
     @property
     def balanced(self) -> bool:
         """True if both sides were recorded; otherwise stiction and sag cannot be separated."""
-        return np.isfinite(self.half_band)
+        return bool(np.isfinite(self.half_band))
 
 
 def _last_side(qpos: Array, extremes: Array, rest: Array) -> Array:
@@ -158,4 +158,4 @@ def _ends_of_rest(sequence: Sequence, joints: Array) -> Array:
 def _moving_mean(values: Array, w: int) -> Array:
     """Return the mean of rows t … t + w − 1, (T, k) → (T − w + 1, k)."""
     total = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(values, axis=0)])
-    return (total[w:] - total[:-w]) / w
+    return np.asarray((total[w:] - total[:-w]) / w)

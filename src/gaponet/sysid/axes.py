@@ -55,11 +55,12 @@ def to_axis(field: str, value: Array, kp: Array) -> Array:
     """Return values of a field on its axis."""
     axis = SERVO_FIELDS[field].axis
     if axis == "inverse":
-        return np.divide(1.0, value, out=np.zeros_like(value, float), where=value > 0)
+        inverse = np.divide(1.0, value, out=np.zeros_like(value, float), where=value > 0)
+        return np.asarray(inverse)
     if axis == "log":
         return np.asarray(np.log(np.maximum(value, 1e-9)))
     if axis == "over kp":
-        return value / kp
+        return np.asarray(value / kp)
     return value
 
 

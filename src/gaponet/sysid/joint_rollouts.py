@@ -327,7 +327,7 @@ def _loads_along(part: Sequence, model: mujoco.MjModel, op: Array, thin: int) ->
         data.qvel[:] = qvel
         mujoco.mj_fwdPosition(model, data)
         mujoco.mj_fwdVelocity(model, data)
-        return data.qfrc_bias.copy()
+        return np.array(data.qfrc_bias)
 
     qvel = differentiate(lowpass(part.qpos.astype(float), part.dt, CUTOFF_HZ), part.dt)
     qacc = differentiate(qvel, part.dt)

@@ -187,7 +187,8 @@ class TorqueFit:
 
         def residual(x: Array) -> Array:  # a place that torque does not determine stays
             mine = (x[4:].reshape(3, -1)[:, column] * own).sum(axis=0)
-            return np.r_[required(x) + mine - tau, MOUNT_PRIOR_NM_PER_M * (x[:3] - start[:3])]
+            moved = MOUNT_PRIOR_NM_PER_M * (x[:3] - start[:3])
+            return np.concatenate([required(x) + mine - tau, moved])
 
         scale = np.r_[0.1 * np.ones(3), 1.0, np.ones(n)]
         first = np.clip(start, low + 1e-6, high - 1e-6)

@@ -106,7 +106,7 @@ class _Motion:
             order: Column order[i] of the log belongs to joint i.
             sign, turn: Of the angles of each joint, (n).
         """
-        columns = np.empty_like(self.qpos)
+        columns: Array = np.empty_like(self.qpos)
         for payload in dict.fromkeys(self.payloads):
             rows = np.array([p == payload for p in self.payloads])
             qpos = sign * self.qpos[rows][:, order] + turn
@@ -285,7 +285,8 @@ def _beyond(low: Array, high: Array, order: Array, robot: RobotSpec) -> Array:
     to, (n) rad.
     """
     ranges = robot.qpos_range
-    return np.maximum(ranges[:, 0] - low[order], high[order] - ranges[:, 1]).clip(0.0)
+    beyond = np.maximum(ranges[:, 0] - low[order], high[order] - ranges[:, 1])
+    return np.asarray(beyond.clip(0.0))
 
 
 def _finding(text: str, order: Array, robot: RobotSpec, values: dict[str, float]) -> Finding:

@@ -217,4 +217,5 @@ def _unexplained(
         x = x - x.mean(axis=0)
         y = y - y.mean(axis=0)
     power = (x**2).sum(axis=0) * (y**2).sum(axis=0)
-    return 1 - np.maximum((x * y).sum(axis=0), 0) ** 2 / np.where(power > 0, power, np.inf) + 1e-4
+    explained = np.maximum((x * y).sum(axis=0), 0) ** 2 / np.where(power > 0, power, np.inf)
+    return np.asarray(1 - explained + 1e-4)

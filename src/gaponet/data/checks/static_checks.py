@@ -104,7 +104,7 @@ class _Fit:
 
     @property
     def significant(self) -> Array:
-        return np.abs(self.x - PRIOR) > SIGNIFICANCE * self.std
+        return np.asarray(np.abs(self.x - PRIOR) > SIGNIFICANCE * self.std)
 
 
 def static_checks(surveys: list[Survey], robot: RobotSpec, model: Gravity) -> Iterator[Finding]:

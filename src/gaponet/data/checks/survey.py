@@ -157,12 +157,12 @@ class Survey:
     @property
     def ctrl_range(self) -> Array:
         """(n) rad."""
-        return np.ptp(self.ctrl_limits, axis=1)
+        return np.asarray(np.ptp(self.ctrl_limits, axis=1))
 
     @property
     def qpos_range(self) -> Array:
         """(n) rad."""
-        return np.ptp(self.qpos_limits, axis=1)
+        return np.asarray(np.ptp(self.qpos_limits, axis=1))
 
     @property
     def missing_samples(self) -> bool:
@@ -357,9 +357,15 @@ def _standstill(ctrl: Array, qpos: Array, dt: float) -> float:
     commanded = max(2.0, 0.5 * (np.ptp(ctrl, axis=0) > BLOCKED_COMMAND_RAD).sum())
     late = round(MAX_LAG_S / dt)
     standing = np.asarray(_standing(qpos, dt).all(axis=1))
-    runs = [r for r in _runs(standing) if r.stop - r.start > 2 * late]
-    moving = lambda r: (np.ptp(ctrl[r.start : r.stop - late], axis=0) > BLOCKED_COMMAND_RAD).sum()  # noqa: E731
-    return max((r.stop - r.start for r in runs if moving(r) >= commanded), default=0) * dt
+    longest = 0
+    for run in _runs(standing):
+        rows = run.stop - run.start
+        if rows <= 2 * late:
+            continue
+        moving = np.ptp(ctrl[run.start : run.stop - late], axis=0) > BLOCKED_COMMAND_RAD
+        if moving.sum() >= commanded:
+            longest = max(longest, rows)
+    return longest * dt
 
 
 def _copied_rows(sequence: Sequence) -> Array:
@@ -482,11 +488,12 @@ def _all_repeated(sequence: Sequence) -> float:
     state = [getattr(sequence, name) for name in ("qpos", "qvel", "tau", "temperature")]
     same = np.all([(np.diff(x, axis=0) == 0).all(axis=1) for x in state if x is not None], axis=0)
     late = round(MAX_LAG_S / 2 / sequence.dt)
-    moved = lambda r: np.ptp(sequence.ctrl[r.start : max(r.stop - late, r.start) + 1], axis=0).max()  # noqa: E731
-    rows = max(
-        (r.stop - r.start for r in _runs(same) if moved(r) > REPEATED_COMMAND_RAD), default=0
-    )
-    return rows * sequence.dt
+    longest = 0
+    for run in _runs(same):
+        command = sequence.ctrl[run.start : max(run.stop - late, run.start) + 1]
+        if np.ptp(command, axis=0).max() > REPEATED_COMMAND_RAD:
+            longest = max(longest, run.stop - run.start)
+    return longest * sequence.dt
 
 
 def _repeated(ctrl: Array, qpos: Array, dt: float) -> Array:

@@ -160,7 +160,7 @@ def _shifts(responses: list[Response]) -> Array:
             break
         shifts = shifts + np.where(far, deviation, 0.0)
         more = Response.common([r.later(-s) for r, s in zip(responses, shifts, strict=True)]).whole
-    return shifts + np.nan_to_num(more)
+    return np.asarray(shifts + np.nan_to_num(more))
 
 
 def _late_recordings(surveys: list[Survey], unknown: float) -> Iterator[Finding]:
@@ -225,7 +225,7 @@ def _agree(late: float, delay: float) -> bool:
     to the others, s.
     """
     if np.isnan(delay):
-        return abs(late) < SHIFTS_S[-1]
+        return abs(late) < float(SHIFTS_S[-1])
     return delay * late > 0 and abs(delay) >= min(MIN_AGREEMENT * abs(late), MIN_SHIFT_S)
 
 

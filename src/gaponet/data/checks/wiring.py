@@ -116,40 +116,49 @@ def _swapped_pairs(surveys: list[Survey], motions: Array) -> dict[tuple[int, int
 
 def _command(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     """Are the commands positions?"""
-    column = lambda field: np.stack([getattr(s, field) for s in surveys])[:, robot.operated_index]  # noqa: E731
-    distance = column("command_distance")
-    judged = np.isfinite(distance) & (column("ctrl_range") > 0)
+    operated = robot.operated_index
+    distance = np.stack([s.command_distance for s in surveys])[:, operated]
+    spans = np.stack([s.ctrl_range for s in surveys])[:, operated]
+    judged = np.isfinite(distance) & (spans > 0)  # (sequences, operated)
     if not judged.any() or float(np.median(distance[judged])) < MAX_DISTANCE:
         return
+
+    def median(by_sequence: list[Array]) -> float:
+        return float(np.median(np.stack(by_sequence)[:, operated][judged]))
+
     correlation = {
-        kind: float(np.median(column(field)[judged]))
-        for kind, field in (
-            ("velocities", "velocity_correlation"),
-            ("torques", "torque_correlation"),
-        )
+        "velocities": median([s.velocity_correlation for s in surveys]),
+        "torques": median([s.torque_correlation for s in surveys]),
     }
-    best = max(correlation, key=lambda kind: np.nan_to_num(correlation[kind]))
-    words = {
-        "velocities": "velocities, or steps from the present position (deltas)",
-        "torques": "torques",
-    }
-    kind = f"they are most like {words[best]} (correlation {correlation[best]:.2f})"
-    kind = kind if correlation[best] > MIN_KIND_CORRELATION else "are they torques?"
     text = (
         f"states are {np.median(distance[judged]):.2f} times as far from their commands as from "
         "their own mean"
     )
-    follows = np.stack([np.diag(s.follows) for s in surveys])[:, robot.operated_index]
     alike = max(np.nan_to_num(list(correlation.values()))) >= MIN_KIND_CORRELATION
-    if not alike and np.median(follows[judged]) > MIN_FOLLOWING:
+    if not alike and median([np.diag(s.follows) for s in surveys]) > MIN_FOLLOWING:
         text += (
             ", though they move with them: motors too weak for their load, or a wrong kp; check "
             "payload and kp"
         )
         yield Finding("warning", "command", text, (), correlation)
         return
-    text += f": these are no position targets; {kind}. Log the targets of the position controller"
+    text += (
+        f": these are no position targets; {_likely_kind(correlation)}. Log the targets of the "
+        "position controller"
+    )
     yield Finding("error", "command", text, (), correlation)
+
+
+def _likely_kind(correlation: dict[str, float]) -> str:
+    """Say what commands are that are no positions, by their correlation with each kind."""
+    best = max(correlation, key=lambda kind: np.nan_to_num(correlation[kind]))
+    if not correlation[best] > MIN_KIND_CORRELATION:
+        return "are they torques?"
+    words = {
+        "velocities": "velocities, or steps from the present position (deltas)",
+        "torques": "torques",
+    }
+    return f"they are most like {words[best]} (correlation {correlation[best]:.2f})"
 
 
 def _sign(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
@@ -175,17 +184,14 @@ def _copied(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
         )
         yield Finding("warning", "copied", text)
         return
+    copies = _copies(surveys, robot)
+    copied = {name for motions in copies.values() for name in motions}
     usual: list[int] = []  # joints that follow their commands in most recordings
-    copies: dict[int, dict[str, list[str]]] = {}  # rows → joint → motions
     for i, name in enumerate(robot.joint_names):
-        moved = _moved(surveys, i)
-        copied = [s for s in moved if np.isfinite(s.copied_rows[i])]
-        for s in copied:
-            joints = copies.setdefault(round(float(s.copied_rows[i])), {})
-            joints.setdefault(name, []).append(s.motion)
-        leads = [s.lead[i] for s in moved if np.isfinite(s.lead[i])]
-        if copied:
+        if name in copied:
             continue
+        moved = _moved(surveys, i)
+        leads = _leads(moved, i)
         if len(leads) > 0.5 * len(moved):
             lead = float(np.median(leads))
             text = (
@@ -206,6 +212,22 @@ def _copied(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     with_torque = all(s.torque is not None for s in surveys)
     for rows, motions in copies.items():
         yield _copy(rows, motions, with_torque)
+
+
+def _leads(surveys: list[Survey], i: int) -> list[float]:
+    """Return by how much joint i moves before its command, s, in the recordings in which it does."""
+    return [float(s.lead[i]) for s in surveys if np.isfinite(s.lead[i])]
+
+
+def _copies(surveys: list[Survey], robot: RobotSpec) -> dict[int, dict[str, list[str]]]:
+    """Return where a state repeats its command: rows between both → joint → motions."""
+    copies: dict[int, dict[str, list[str]]] = {}
+    for i, name in enumerate(robot.joint_names):
+        for s in _moved(surveys, i):
+            if np.isfinite(s.copied_rows[i]):
+                motions = copies.setdefault(round(float(s.copied_rows[i])), {})
+                motions.setdefault(name, []).append(s.motion)
+    return copies
 
 
 def driven_by_torque(surveys: list[Survey]) -> bool:
@@ -260,51 +282,74 @@ def _moves_first(survey: Survey, joints: list[int]) -> bool:
 
 def _unit(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     """Are commands, positions and velocities in the same unit, the radian?"""
-    median = lambda values: float(np.median(values)) if values else 1.0  # noqa: E731
-    wrong = []
+    wrong: list[Finding] = []
     for i, name in enumerate(robot.joint_names):
-        commanded = _moved(surveys, i) or [s for s in surveys if _follow_small_commands(s)[i]]
-        ratio = median([s.qpos_range[i] / s.ctrl_range[i] for s in commanded])
-        if ratio > RATIO_BOUNDS[1] or 0 < ratio < RATIO_BOUNDS[0]:
-            text = (
-                f"{name} moves {ratio:.3g} times as far as commanded (57.3 and 0.0175 are degrees "
-                "beside radians): convert the command or the state in the logs, and import again"
-            )
-            wrong.append(Finding("error", "unit", text, (name,), {"ratio": ratio}))
-        slope = median([s.slope[i] for s in surveys if np.isfinite(s.slope[i])])
-        if not wrong and (slope > SLOPE_BOUNDS[1] or 0.1 < slope < SLOPE_BOUNDS[0]):
-            text = (
-                f"{name} goes {slope:.2f} rad where its command goes 1 rad: another scale (a "
-                "gear, a range, ticks a turn), or a motor that does not reach its targets; check "
-                "both at a right angle"
-            )
-            wrong.append(Finding("warning", "unit", text, (name,), {"slope": slope}))
-        moved = [
-            s
-            for s in surveys
-            if np.isfinite(s.qvel_ratio[i]) and s.qpos_range[i] > 20 * s.resolution[i]
-        ]
-        ratio = median([s.qvel_ratio[i] for s in moved])
-        if not QVEL_RATIO_BOUNDS[0] < ratio < QVEL_RATIO_BOUNDS[1]:
-            text = (
-                f"recorded velocity of {name} is {ratio:.3g} times the derivative of its "
-                "position: not rad/s; leave the velocity out at import, it is then computed"
-            )
-            wrong.append(Finding("warning", "unit", text, (name,), {"ratio": ratio}))
+        wrong += _range_unit(surveys, i, name)
+        if not wrong:
+            wrong += _scale(surveys, i, name)
+        wrong += _velocity_unit(surveys, i, name)
+    wrong += _small_commands(surveys)
+    yield from _converted(surveys, robot)
+    yield from wrong or [Finding("ok", "unit", "commands, positions and velocities agree in unit")]
+
+
+def _median_or_one(values: list[float]) -> float:
+    return float(np.median(values)) if values else 1.0
+
+
+def _range_unit(surveys: list[Survey], i: int, name: str) -> Iterator[Finding]:
+    """Does joint i move as far as it is commanded?"""
+    commanded = _moved(surveys, i) or [s for s in surveys if _follow_small_commands(s)[i]]
+    ratio = _median_or_one([s.qpos_range[i] / s.ctrl_range[i] for s in commanded])
+    if ratio > RATIO_BOUNDS[1] or 0 < ratio < RATIO_BOUNDS[0]:
+        text = (
+            f"{name} moves {ratio:.3g} times as far as commanded (57.3 and 0.0175 are degrees "
+            "beside radians): convert the command or the state in the logs, and import again"
+        )
+        yield Finding("error", "unit", text, (name,), {"ratio": ratio})
+
+
+def _scale(surveys: list[Survey], i: int, name: str) -> Iterator[Finding]:
+    """Does joint i go 1 rad where its command goes 1 rad?"""
+    slope = _median_or_one([s.slope[i] for s in surveys if np.isfinite(s.slope[i])])
+    if slope > SLOPE_BOUNDS[1] or 0.1 < slope < SLOPE_BOUNDS[0]:
+        text = (
+            f"{name} goes {slope:.2f} rad where its command goes 1 rad: another scale (a "
+            "gear, a range, ticks a turn), or a motor that does not reach its targets; check "
+            "both at a right angle"
+        )
+        yield Finding("warning", "unit", text, (name,), {"slope": slope})
+
+
+def _velocity_unit(surveys: list[Survey], i: int, name: str) -> Iterator[Finding]:
+    """Is the recorded velocity of joint i the derivative of its position?"""
+    ratios = []
+    for s in surveys:
+        if np.isfinite(s.qvel_ratio[i]) and s.qpos_range[i] > 20 * s.resolution[i]:
+            ratios.append(s.qvel_ratio[i])
+    ratio = _median_or_one(ratios)
+    if not QVEL_RATIO_BOUNDS[0] < ratio < QVEL_RATIO_BOUNDS[1]:
+        text = (
+            f"recorded velocity of {name} is {ratio:.3g} times the derivative of its "
+            "position: not rad/s; leave the velocity out at import, it is then computed"
+        )
+        yield Finding("warning", "unit", text, (name,), {"ratio": ratio})
+
+
+def _small_commands(surveys: list[Survey]) -> Iterator[Finding]:
+    """Are commands so small that they were radians, read as degrees?"""
     small = [s.motion for s in surveys if np.abs(s.ctrl_limits).max() < MAX_READ_AS_DEGREES_RAD]
     widest = max(float(s.ctrl_range.max()) for s in surveys)
     if widest < MIN_WIDEST_COMMAND_RAD:
         text = f"no command spans more than {widest:.3f} rad: were radians read as degrees?"
-        wrong.append(Finding("warning", "unit", text))
+        yield Finding("warning", "unit", text)
     elif small and _read_as_degrees(surveys):
         text = (
             f"no command of {abbreviate(small)} is further than "
             f"{np.degrees(MAX_READ_AS_DEGREES_RAD):.1f}° from zero: radians that were read as "
             "degrees, beside logs in degrees? Import them by themselves, with their unit"
         )
-        wrong.append(Finding("error", "unit", text))
-    yield from _converted(surveys, robot)
-    yield from wrong or [Finding("ok", "unit", "commands, positions and velocities agree in unit")]
+        yield Finding("error", "unit", text)
 
 
 def _units(surveys: list[Survey]) -> dict[str, str]:

@@ -70,7 +70,7 @@ def _angles(
     if unit == "rad":
         return values
     if unit == "deg":
-        return np.radians(values)
+        return np.asarray(np.radians(values))
     in_range = robot.log_units[robot.joint_names.index(joint)] == "fraction"  # a gripper
     if encoder is not None and unit == "ticks" and in_range:
         values = encoder.fractions(values, speed)
@@ -83,7 +83,8 @@ def _angles(
     low, high = robot.qpos_range[robot.joint_names.index(joint)]
     start, span = FRACTIONS[unit]
     shares = values / span if speed else (values - start) / span
-    return shares * (high - low) + (0.0 if speed else low)
+    zero = 0.0 if speed else low
+    return np.asarray(shares * (high - low) + zero)
 
 
 def require_plausible(log: Log, robot: RobotSpec, strict: bool = False) -> Log:
@@ -154,7 +155,7 @@ def _nonsense(name: str, log: Log, robot: RobotSpec) -> Array:
             values > np.maximum(20 * robot.effort_limit[robot.index(log.joint_names)], 100.0)
         )
     if name != "qvel":
-        return values > MOST[name]
+        return np.asarray(values > MOST[name])
     time, qpos = log.channels["qpos"]
     fastest = np.abs(np.diff(qpos, axis=0) / np.diff(time)[:, None]).max(axis=0)
     return np.asarray(values > np.minimum(FASTER + 10 * fastest, MOST[name]))

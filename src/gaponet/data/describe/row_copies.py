@@ -86,7 +86,7 @@ def _nearest(time: Array, at: Array) -> Array:
     """Return the row of `time` nearest to each instant of `at`."""
     right = np.clip(np.searchsorted(time, at), 1, len(time) - 1)
     before_is_nearer = at - time[right - 1] < time[right] - at
-    return right - before_is_nearer
+    return np.asarray(right - before_is_nearer)
 
 
 def _shift(told: Array, later: Array, shifts: Array, usual_change: float) -> float:

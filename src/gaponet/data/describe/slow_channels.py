@@ -76,5 +76,5 @@ def _between_samples(name: str, time: Array, values: Array, present: Array) -> A
     if name in COMMANDS:
         last = np.searchsorted(samples, np.arange(len(values)), side="right") - 1
         return np.where(last >= 0, values[samples[np.maximum(last, 0)]], np.nan)
-    nan = float("nan")
-    return np.interp(time, time[samples], values[samples], left=nan, right=nan)
+    between = np.interp(time, time[samples], values[samples], left=np.nan, right=np.nan)
+    return np.asarray(between)

@@ -370,26 +370,32 @@ def _motion(episode: dict[str, Any], tasks: dict[int, str]) -> str:
 def _matrix(file: Path, table: Any, feature: str, n: int) -> Array:
     """A column of lists of n numbers, or of numbers where n is 1: (frames, n) float64."""
     import pyarrow as pa
-    import pyarrow.compute as pc
 
     column = table[feature].combine_chunks()
     kind = table.schema.field(feature).type
     lists = pa.types.is_list(kind) or pa.types.is_fixed_size_list(kind)
-    kind = kind.value_type if lists else kind
-    if not (pa.types.is_integer(kind) or pa.types.is_floating(kind)) or not (lists or n == 1):
-        raise LogError(
-            f"{file}: {feature} is {table.schema.field(feature).type}, not {n} numbers a row; "
-            f"{AGAIN}"
-        )
+    element = kind.value_type if lists else kind
+    numeric = pa.types.is_integer(element) or pa.types.is_floating(element)
+    if not numeric or not (lists or n == 1):
+        raise LogError(f"{file}: {feature} is {kind}, not {n} numbers a row; {AGAIN}")
+    row = _first_wrong_row(column, lists, n)
+    if row is not None:
+        raise LogError(f"{file}:{row + 1}: {feature} is not {n} numbers; {AGAIN}")
+    flat = column.flatten() if lists else column
+    values: Array = flat.to_numpy(zero_copy_only=False).astype(float)
+    return values.reshape(-1, n)
+
+
+def _first_wrong_row(column: Any, lists: bool, n: int) -> int | None:
+    """Return the first row of a column that is not n numbers; None if all are."""
+    import pyarrow.compute as pc
+
     wrong = column.is_null().to_numpy(False)
     if lists and not wrong.any():
         wrong = pc.list_value_length(column).to_numpy(zero_copy_only=False) != n
+    if wrong.any():
+        return int(wrong.argmax())
     flat = column.flatten() if lists else column
-    if wrong.any() or flat.null_count:
-        row = (
-            int(wrong.argmax())
-            if wrong.any()
-            else int(flat.is_null().to_numpy(False).argmax()) // n
-        )
-        raise LogError(f"{file}:{row + 1}: {feature} is not {n} numbers; {AGAIN}")
-    return flat.to_numpy(zero_copy_only=False).astype(float).reshape(-1, n)
+    if flat.null_count:
+        return int(flat.is_null().to_numpy(False).argmax()) // n
+    return None

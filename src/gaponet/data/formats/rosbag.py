@@ -16,7 +16,7 @@ messages that were dropped, stand in the notes.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Container, Iterator
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -39,6 +39,7 @@ PEEK = 200  # messages of a topic in which all its joints are named
 LATENCY = 0.1
 DRIFT = 0.005  # s by which a stamp may run away from the recorder's clock during a recording
 COMMANDS = ("command", "cmd", "desired", "target", "goal", "reference", "setpoint")
+COMMAND_FIELDS = (".position", ".point", ".data", ".q")  # that hold commanded positions
 # Unitree's hg messages, for bags that do not hold the definitions of their messages; fields as in
 # its public IDL.
 HG = {
@@ -100,38 +101,55 @@ def recordings(path: Path, specified: LogsFile) -> Iterator[RawRecording]:
 
 def _usual(signals: dict[str, tuple[str, ...]]) -> LogsFile:
     """Which signals are command and state, where only one of each can be."""
-    measured = lambda s: ".feedback." in s or ".actual." in s  # noqa: E731
-    is_command = lambda s: (  # noqa: E731
-        not measured(s) and (any(w in s.lower() for w in COMMANDS) or s.endswith(".point"))
-    )
-    states = [s for s in signals if s.endswith((".position", ".q")) and not is_command(s)]
-    specified: LogsFile = {}
-    commands = [
-        s for s in signals if is_command(s) and s.endswith((".position", ".point", ".data", ".q"))
-    ]
+    states = [s for s in signals if s.endswith((".position", ".q")) and not _is_command(s)]
     if len(states) > 1:  # a controller's feedback repeats what another topic says
-        states = [s for s in states if not measured(s)] or states
+        states = [s for s in states if not _is_feedback(s)] or states
+    commands = [s for s in signals if s.endswith(COMMAND_FIELDS) and _is_command(s)]
+    specified: LogsFile = {}
     if len(states) == 1:
-        specified["qpos"] = states[0]
-        for channel, (theirs, motors) in {
-            "qvel": ("velocity", "dq"),
-            "tau": ("effort", "tau_est"),
-        }.items():
-            name = (
-                states[0].rpartition(".")[0]
-                + "."
-                + (motors if states[0].endswith(".q") else theirs)
-            )
-            if name in signals:
-                specified[channel] = name  # type: ignore[literal-required]
+        specified |= _of_state(states[0], signals)
     command = _best_command(signals, commands, states)
     if command:
-        commands = [command]
-        specified["ctrl"] = commands[0]
-        gain = commands[0].rpartition(".")[0]
-        if f"{gain}.kp" in signals:
-            specified["kp"], specified["kd"] = f"{gain}.kp", f"{gain}.kd"
-            specified |= {"feedforward_torque": f"{gain}.tau"} if f"{gain}.tau" in signals else {}
+        specified |= _of_command(command, signals)
+    return specified
+
+
+def _is_feedback(signal: str) -> bool:
+    """Return True for the measured part of a controller's state."""
+    return ".feedback." in signal or ".actual." in signal
+
+
+def _is_command(signal: str) -> bool:
+    if _is_feedback(signal):
+        return False
+    return signal.endswith(".point") or any(word in signal.lower() for word in COMMANDS)
+
+
+def _of_state(position: str, signals: Container[str]) -> LogsFile:
+    """Return a state's position, and the velocity and torque beside it."""
+    topic, _, field = position.rpartition(".")
+    velocity = f"{topic}.velocity"
+    torque = f"{topic}.effort"
+    if field == "q":
+        velocity = f"{topic}.dq"
+        torque = f"{topic}.tau_est"
+    specified: LogsFile = {"qpos": position}
+    if velocity in signals:
+        specified["qvel"] = velocity
+    if torque in signals:
+        specified["tau"] = torque
+    return specified
+
+
+def _of_command(position: str, signals: Container[str]) -> LogsFile:
+    """Return a command's position, and the gains and the feed-forward torque beside it."""
+    topic = position.rpartition(".")[0]
+    specified: LogsFile = {"ctrl": position}
+    if f"{topic}.kp" in signals:
+        specified["kp"] = f"{topic}.kp"
+        specified["kd"] = f"{topic}.kd"
+        if f"{topic}.tau" in signals:
+            specified["feedforward_torque"] = f"{topic}.tau"
     return specified
 
 
@@ -430,28 +448,59 @@ def _numbers(topic: str, m: Any) -> Fields:
     texts: list[tuple[str, ...]] = []
     for name in m.__dataclass_fields__:
         value = getattr(m, name)
-        if isinstance(value, np.ndarray) and value.dtype.kind in "fiu" and value.dtype.itemsize > 1:
-            messages[name] = (), value
-        elif isinstance(value, list) and value and isinstance(value[0], str):
-            texts.append(tuple(value))
-        elif isinstance(value, list) and value and hasattr(value[0], "__dataclass_fields__"):
-            numbers = [
-                f
-                for f in value[0].__dataclass_fields__
-                if isinstance(getattr(value[0], f), int | float)
-            ]
-            messages |= {f"{name}.{f}": ((), [getattr(part, f) for part in value]) for f in numbers}
-            texts += [
-                tuple(t)
-                for f in ("name", "joint_name")
-                if all(t := [getattr(x, f, "") for x in value])
-            ]
+        if _is_numeric(value):
+            messages[name] = ((), value)
+        elif isinstance(value, list) and value:
+            if isinstance(value[0], str):
+                texts.append(tuple(value))
+            elif hasattr(value[0], "__dataclass_fields__"):
+                messages |= _numbers_of_parts(name, value)
+                texts += _names_of_parts(value)
         elif hasattr(value, "__dataclass_fields__") and name != "header":
-            messages |= {f"{name}.{f}": x for f, x in _numbers(topic, value).items()}
-    named = lambda k: next((t for t in texts if len(t) == k), tuple(map(str, range(k))))  # noqa: E731
-    return {
-        f: (labels or named(len(x)), x) for f, (labels, x) in messages.items() if 0 < len(x) <= MOST
-    }
+            for field, numbers in _numbers(topic, value).items():
+                messages[f"{name}.{field}"] = numbers
+    return _labelled(messages, texts)
+
+
+def _is_numeric(value: Any) -> bool:
+    """Return True for an array of numbers; bytes are no numbers, but a picture."""
+    if not isinstance(value, np.ndarray):
+        return False
+    return value.dtype.kind in "fiu" and value.dtype.itemsize > 1
+
+
+def _numbers_of_parts(name: str, parts: list[Any]) -> Fields:
+    """Return each field that holds a number in the parts of a list, as the array NAME.field."""
+    messages: Fields = {}
+    for field in parts[0].__dataclass_fields__:
+        if isinstance(getattr(parts[0], field), int | float):
+            messages[f"{name}.{field}"] = ((), [getattr(part, field) for part in parts])
+    return messages
+
+
+def _names_of_parts(parts: list[Any]) -> list[tuple[str, ...]]:
+    """Return the names of the parts of a list, if all have one."""
+    texts = []
+    for field in ("name", "joint_name"):
+        names = tuple(getattr(part, field, "") for part in parts)
+        if all(names):
+            texts.append(names)
+    return texts
+
+
+def _labelled(messages: Fields, texts: list[tuple[str, ...]]) -> Fields:
+    """Return the fields of at most MOST numbers; those without names get the first texts of their
+    length, or digits.
+    """
+    labelled: Fields = {}
+    for field, (labels, numbers) in messages.items():
+        count = len(numbers)
+        if not 0 < count <= MOST:
+            continue
+        digits = tuple(str(i) for i in range(count))
+        named = next((names for names in texts if len(names) == count), digits)
+        labelled[field] = (labels or named, numbers)
+    return labelled
 
 
 def _controller(topic: str, m: Any) -> Fields:
