@@ -38,6 +38,13 @@ def test_per_joint_motions_cover_nine_tenths_of_every_operated_joint_at_three_ki
         assert np.ptp(column) >= 0.9 * (high - low), joint
 
 
+def test_a_joint_that_turns_without_end_sweeps_a_turn_about_its_home():
+    robot = load_robot("xl330_bench")
+    (joint,) = robot.operated
+    column = Library(robot).make(f"sweep-{short(joint)}").ctrl[:, robot.index([joint])[0]]
+    assert np.ptp(column) == pytest.approx(2 * np.pi, rel=0.1)
+
+
 def test_left_and_right_reach_the_same_places_mirrored(library):
     kit = library.kit
     for point in ([0.4, 0.2, 1.2], [0.3, 0.35, 1.0]):

@@ -78,6 +78,16 @@ class Feasibility:
         self.limit = TORQUE_SHARE * robot.effort_limit
         self.collision = Collision(robot, self.models[0], height, unchecked)
 
+    def reach(self) -> tuple[Array, Array]:
+        """Return the lowest and highest angles that are worth a visit, (n) rad each.
+
+        A joint that turns without end is moved by half a turn to both sides of its home.
+        """
+        home = self.robot.qpos_home
+        low = np.where(np.isfinite(self.low), self.low, home - np.pi)
+        high = np.where(np.isfinite(self.high), self.high, home + np.pi)
+        return low, high
+
     def demand(
         self, ctrl: Array, dt: float, named: Array | slice = slice(None), need: Array | None = None
     ) -> Demand:
@@ -207,8 +217,7 @@ def find_excitation_range(limits: Feasibility, joint: str, seed: int = 0) -> Exc
     limb = _limb(limits.models[0], robot.operated, joint)
     columns = robot.index([name for name in limb if name != joint])
     rng = np.random.default_rng([seed, j])
-    low = limits.low
-    high = limits.high
+    low, high = limits.reach()
     home = np.clip(robot.qpos_home, low, high)
     best = _span(limits, home, int(j))
     for i in range(MAX_POSTURES):
@@ -227,7 +236,8 @@ def find_excitation_range(limits: Feasibility, joint: str, seed: int = 0) -> Exc
 
 def _span(limits: Feasibility, posture: Array, j: int) -> ExcitationRange:
     """Return the longest feasible interval of the joint's range from a posture."""
-    grid = np.linspace(limits.low[j], limits.high[j], GRID_POINTS)
+    reach_low, reach_high = limits.reach()
+    grid = np.linspace(reach_low[j], reach_high[j], GRID_POINTS)
     rows = np.repeat(posture[None], GRID_POINTS, axis=0)
     rows[:, j] = grid
     empty = ExcitationRange(posture, grid[0], grid[0], 0.0)
@@ -242,8 +252,8 @@ def _span(limits: Feasibility, posture: Array, j: int) -> ExcitationRange:
         return empty
     low = float(grid[start])
     high = float(grid[stop - 1])
-    full = np.diff(limits.robot.qpos_range[j])[0]
-    return ExcitationRange(posture, low, high, (high - low) / float(full))
+    full = float(reach_high[j] - reach_low[j]) + 2 * RANGE_MARGIN
+    return ExcitationRange(posture, low, high, (high - low) / full)
 
 
 def _longest_run(mask: Array) -> tuple[int, int]:

@@ -117,7 +117,10 @@ def _motions(recipe: Recipe, names: list[str]) -> list[str]:
     for pattern in recipe.motions:
         matches = [name for name in names if fnmatchcase(name, pattern)]
         if not matches and any(c in pattern for c in "*?["):
-            raise UsageError(f"recipe '{recipe.name}': no motion of this robot matches '{pattern}'")
+            raise UsageError(
+                f"recipe '{recipe.name}': no motion of this robot matches '{pattern}'; recipe arm "
+                "has motions for any robot"
+            )
         motions += matches or [pattern]
     motions += [Path(file).stem for file in recipe.files]
     return list(dict.fromkeys(motions))
