@@ -27,7 +27,7 @@ from gaponet.base.arrays import Array
 from gaponet.base.errors import LogError
 from gaponet.base.files import write_text
 from gaponet.base.text import format_uncertainty
-from gaponet.data.formats import read_logs
+from gaponet.data.formats import ReadOptions, read_logs
 from gaponet.data.log import Log
 from gaponet.robot.spec import load_robot
 from gaponet.sysid.torque import Gains, servo_gains
@@ -387,7 +387,7 @@ def main(
     """
     spec = load_robot(robot)
     gain = dict(zip(spec.joint_names, spec.kp.tolist(), strict=True))
-    labels = estimate(read_logs(logs, spec, rate=rate), payloads, units, gain)
+    labels = estimate(read_logs(logs, spec, ReadOptions(rate=rate)), payloads, units, gain)
     write(labels, out, rate)
     print("held torque at equal commands:")
     for group in labels.groups:

@@ -14,7 +14,7 @@ from estimate_labels import Labels, estimate, write
 from gaponet.base.errors import UsageError
 from gaponet.base.files import write_text
 from gaponet.base.structure import Name, read_toml
-from gaponet.data.formats import read_logs
+from gaponet.data.formats import ReadOptions, read_logs
 from gaponet.data.importer import import_logs
 from gaponet.data.store import Dataset
 from gaponet.robot.spec import RobotSpec, load_robot
@@ -122,7 +122,10 @@ def prepare(card: Card, data: Path, work: Path) -> tuple[Dataset, RobotSpec, Lab
     if card.labels:
         gain = dict(zip(robot.joint_names, robot.kp.tolist(), strict=True))
         labels = estimate(
-            read_logs(source, robot, rate=card.rate), card.labels.payloads, card.labels.units, gain
+            read_logs(source, robot, ReadOptions(rate=card.rate)),
+            card.labels.payloads,
+            card.labels.units,
+            gain,
         )
         write(labels, place)
         options["manifest"] = "labels.csv"

@@ -15,7 +15,7 @@ from base.hostile import parsed
 
 from gaponet.base import sandbox
 from gaponet.base.errors import LogError, ModelError, RobotError
-from gaponet.data.formats import parquet, read_logs
+from gaponet.data.formats import ReadOptions, parquet, read_logs
 from gaponet.nn.artifact import GapModel
 from gaponet.robot.spec import load_robot
 
@@ -120,7 +120,9 @@ def test_a_log_beyond_the_limits_is_refused(tmp_path, name, monkeypatch):
     with pytest.raises(LogError):
         list(
             read_logs(
-                tmp_path / "logs", robot, allow_pickle=True, position_unit="rad", time_unit="s"
+                tmp_path / "logs",
+                robot,
+                ReadOptions(allow_pickle=True, position_unit="rad", time_unit="s"),
             )
         )
 

@@ -228,9 +228,16 @@ def _facts(card: dict[str, Any]) -> Iterator[str]:
     if collected:
         fleet, seed = (escape_markdown(str(collected.get(name))) for name in ("fleet", "seed"))
         yield f"- made by gaponet collect: fleet {fleet}, seed {seed}"
-    yield f"- {total['frames']:,} frames of {len(card['joints'])} joints, {total['motions']} motions"
-    yield f"- {card['bytes'] / 1e6:,.1f} MB, dataset hash {card['dataset_hash']}, gaponet {card['gaponet']}"
-    yield "\nEvery number was counted or measured from the files; `gaponet data card DIR` writes this page again.\n"
+    joints = len(card["joints"])
+    yield f"- {total['frames']:,} frames of {joints} joints, {total['motions']} motions"
+    yield (
+        f"- {card['bytes'] / 1e6:,.1f} MB, dataset hash {card['dataset_hash']}, "
+        f"gaponet {card['gaponet']}"
+    )
+    yield (
+        "\nEvery number was counted or measured from the files; `gaponet data card DIR` writes "
+        "this page again.\n"
+    )
 
 
 def _beside_paper(card: dict[str, Any]) -> Iterator[str]:
@@ -243,7 +250,9 @@ def _repeatability(card: dict[str, Any]) -> Iterator[str]:
     repeated = card["repeatability"]
     yield "## Repeatability\n"
     if not repeated["channels"]:
-        yield "No motion was repeated with the same command by the same unit with the same payload.\n"
+        yield (
+            "No motion was repeated with the same command by the same unit with the same payload.\n"
+        )
         return
     yield (
         "Standard deviation over repetitions of the same command, root mean square over rows; "

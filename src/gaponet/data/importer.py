@@ -19,7 +19,7 @@ from gaponet.base.arrays import Array
 from gaponet.base.errors import DatasetError, LogError, UsageError
 from gaponet.base.files import lock_folder
 from gaponet.base.progress import Progress, no_progress
-from gaponet.data.formats import find_logs, read_logs
+from gaponet.data.formats import ReadOptions, find_logs, read_logs
 from gaponet.data.journal import Findings
 from gaponet.data.log import Log, skip_bad_rows, skipped_rows
 from gaponet.data.offsets import Gravity, JointOffset, read_offsets, record_offsets, unit_offsets
@@ -114,9 +114,8 @@ def import_logs(
         gravity: Gravity of the nominal model, to measure offsets (data.offsets); default: no
             offsets.
         simulator: Hash of that model, recorded beside the offsets.
-        options: Options of data.formats.read_logs: joint_map, logs, position_unit, time_unit, rate,
-            allow_pickle, strict. All other arguments are those of gaponet.api.logs.import_logs,
-            `fmt` its `format`.
+        options: The other fields of data.formats.ReadOptions. All other arguments are those of
+            gaponet.api.logs.import_logs, `fmt` its `format`.
 
     Raises:
         LogError, JointMismatchError: A recording cannot be read; the message names file and line.
@@ -138,30 +137,32 @@ def import_logs(
         "kd": _parse_gains("kd", kd, robot),
     }
     labels = {name: value for name, value in labels.items() if value is not None}
-    if cut is not None and not cut >= MIN_PIECE_S:
-        raise UsageError(f"--cut {cut:g}: pieces are {MIN_PIECE_S} s long or more")
+    if cut is not None:
+        _require_piece(cut)
     with lock_folder(out, KIND):
         existing = Dataset.open_existing(out, robot)
         if existing is not None:
             read_offsets(existing)  # a damaged file is refused before anything is read
-        source = _Source(src, robot, labels, fmt, cut, options)
+        source = _Source(src, robot, labels, cut, ReadOptions(fmt, **options))
         with skip_bad_rows(skip_bad) as skipped:
             source.check(existing, progress)
             dataset = Dataset.create(out, robot)
             poses: dict[str, StaticPoses] = {}
             added, present = source.write(dataset, poses if gravity else None)
-        units = dict.fromkeys(e.meta.unit_id for e in (*present, *added)) if gravity else {}
-        offsets = (
-            {unit: unit_offsets(dataset, robot, unit, gravity, poses) for unit in units}
-            if gravity
-            else {}
-        )
+        offsets: dict[str, dict[str, JointOffset]] = {}  # unit → joint → offset
+        if gravity is not None:
+            for unit in dict.fromkeys(e.meta.unit_id for e in (*present, *added)):
+                offsets[unit] = unit_offsets(dataset, robot, unit, gravity, poses)
         for unit, of_unit in offsets.items():
             record_offsets(dataset, unit, of_unit, simulator)
     only = next(iter(offsets.values())) if len(offsets) == 1 else None
-    return ImportResult(
-        dataset, robot, tuple(added), tuple(present), only, tuple(dict.fromkeys(skipped or ()))
-    )
+    cut_rows = tuple(dict.fromkeys(skipped or ()))
+    return ImportResult(dataset, robot, tuple(added), tuple(present), only, cut_rows)
+
+
+def _require_piece(seconds: float) -> None:
+    if not seconds >= MIN_PIECE_S:
+        raise UsageError(f"--cut {seconds:g}: pieces are {MIN_PIECE_S} s long or more")
 
 
 @dataclass
@@ -175,16 +176,15 @@ class _Source:
     src: Path
     robot: RobotSpec
     labels: dict[str, Any]
-    fmt: str | None
     cut: float | None
-    options: dict[str, Any]
+    options: ReadOptions
     hashes: list[str] = field(default_factory=list)
     held: list[Sequence] | None = field(default_factory=list)
     provenance: dict[str, str] = field(default_factory=dict)
 
     def check(self, existing: Dataset | None, progress: Progress) -> None:
         """Read and check every recording."""
-        total = len(find_logs(self.src, self.fmt))
+        total = len(find_logs(self.src, self.options.fmt))
         source_of: dict[str, str] = {}  # content hash → source
         duplicates: list[tuple[str, str]] = []
         size = 0
@@ -251,7 +251,7 @@ class _Source:
     def sequences(self) -> Iterator[tuple[Sequence, Log]]:
         """Yield every recording, or every piece, on its grid and with its labels."""
         file_hashes: dict[tuple[str, ...], str] = {}  # many episodes may be in one file
-        for motion, log in read_logs(self.src, self.robot, self.fmt, **self.options):
+        for motion, log in read_logs(self.src, self.robot, self.options):
             files = tuple(sorted({*log.meta["files"].values(), *log.meta.get("all_files", ())}))
             if files not in file_hashes:
                 file_hashes[files] = _sha256(files)

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -13,6 +14,9 @@ from gaponet.base.arrays import Array
 from gaponet.base.errors import DatasetError
 from gaponet.base.files import atomic_write
 from gaponet.data.log import UNITS
+
+if TYPE_CHECKING:
+    import pyarrow.parquet as pq
 
 HINT = "restore the file or import the log again"
 MAX_BYTES = 1 << 30  # of the arrays that are read of one sequence at once
@@ -58,22 +62,7 @@ def read_arrays(path: Path, columns: tuple[str, ...], rows: int, n: int) -> dict
 
     try:
         file = pq.ParquetFile(path)
-        if file.metadata.num_rows != rows:
-            raise DatasetError(
-                f"{path}: holds {file.metadata.num_rows} rows, the journal says {rows}; {HINT}"
-            )
-        for column in columns:
-            kind = file.schema_arrow.field(column).type
-            if (
-                not pa.types.is_fixed_size_list(kind)
-                or kind.list_size != n
-                or kind.value_type != pa.float32()
-            ):
-                raise DatasetError(f"{path}: {column} is {kind}, not {n} joints' float32; {HINT}")
-        if 4 * rows * n * len(columns) > MAX_BYTES:
-            raise DatasetError(
-                f"{path}: {rows:,} rows of {n} joints are more than {MAX_BYTES >> 20} MiB; {HINT}"
-            )
+        _require_shape(path, file, columns, rows, n)
         table = file.read(columns=list(columns), use_threads=False)
         arrays = {
             c: table.column(c).combine_chunks().flatten().to_numpy(zero_copy_only=False)
@@ -86,3 +75,24 @@ def read_arrays(path: Path, columns: tuple[str, ...], rows: int, n: int) -> dict
         if len(values) != rows * n or not np.isfinite(values).all():
             raise DatasetError(f"{path}: {column} lacks values or holds NaN; {HINT}")
     return {c: values.reshape(rows, n) for c, values in arrays.items()}
+
+
+def _require_shape(
+    path: Path, file: pq.ParquetFile, columns: tuple[str, ...], rows: int, n: int
+) -> None:
+    """Refuse a file with other rows or columns than read_arrays expects, or too large to read."""
+    import pyarrow as pa
+
+    if file.metadata.num_rows != rows:
+        raise DatasetError(
+            f"{path}: holds {file.metadata.num_rows} rows, the journal says {rows}; {HINT}"
+        )
+    for column in columns:
+        kind = file.schema_arrow.field(column).type
+        is_list = pa.types.is_fixed_size_list(kind)
+        if not is_list or kind.list_size != n or kind.value_type != pa.float32():
+            raise DatasetError(f"{path}: {column} is {kind}, not {n} joints' float32; {HINT}")
+    if 4 * rows * n * len(columns) > MAX_BYTES:
+        raise DatasetError(
+            f"{path}: {rows:,} rows of {n} joints are more than {MAX_BYTES >> 20} MiB; {HINT}"
+        )

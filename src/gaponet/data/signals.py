@@ -5,6 +5,7 @@ commands.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -98,28 +99,35 @@ def estimate_delay(ctrl: Array, qpos: Array, dt: float, max_delay: float = 0.4) 
         (n,) s; NaN for a joint that is not commanded to move, does not follow, or follows best at
         the longest lag tried, which happens in slow motions with stiction.
     """
-    kernel = np.hanning(7)[1:-1] / np.hanning(7).sum()
-    u, v = (
-        np.stack([np.convolve(c, kernel, "same") for c in np.diff(x, axis=0).T])
-        for x in (ctrl, qpos)
-    )
-    shifts = range(min(int(max_delay / dt), u.shape[1] // 2) + 1)
-    score = np.stack([correlation(u[:, : u.shape[1] - s], v[:, s:]) for s in shifts])  # (S, n)
-    best = score.argmax(axis=0)
+    commanded = _smooth_changes(ctrl)
+    moved = _smooth_changes(qpos)
+    rows = commanded.shape[1]
+    shifts = range(min(int(max_delay / dt), rows // 2) + 1)
+    score = np.stack([correlation(commanded[:, : rows - s], moved[:, s:]) for s in shifts])
     delay = np.full(ctrl.shape[1], np.nan)
-    for j, s in enumerate(best):
-        if (
-            np.ptp(ctrl[:, j]) < MIN_COMMAND_RAD
-            or not score[s, j] > MIN_CORRELATION
-            or s == len(score) - 1
-        ):
-            continue
-        offset = 0.0
-        if s > 0:
-            a, b, c = score[s - 1 : s + 2, j]
-            offset = 0.5 * (a - c) / (a - 2 * b + c) if a - 2 * b + c < 0 else 0.0
-        delay[j] = (s + offset) * dt
+    for j, best in enumerate(score.argmax(axis=0)):
+        is_moved = np.ptp(ctrl[:, j]) >= MIN_COMMAND_RAD
+        follows = score[best, j] > MIN_CORRELATION
+        if is_moved and follows and best < len(score) - 1:
+            delay[j] = (best + _peak_offset(score[:, j], best)) * dt
     return delay
+
+
+def _smooth_changes(values: Array) -> Array:
+    """Return the change from row to row, averaged over five, (T, n) → (n, T − 1)."""
+    kernel = np.hanning(7)[1:-1] / np.hanning(7).sum()
+    return np.stack([np.convolve(column, kernel, "same") for column in np.diff(values, axis=0).T])
+
+
+def _peak_offset(score: Array, best: int) -> float:
+    """Return by how much of a step the vertex of a parabola through the best score and both beside
+    it lies behind the best; score (S).
+    """
+    if best == 0:
+        return 0.0
+    before, peak, after = score[best - 1 : best + 2]
+    curvature = before - 2 * peak + after
+    return float(0.5 * (before - after) / curvature) if curvature < 0 else 0.0
 
 
 def range_before(values: Array, rows: int) -> Array:
@@ -241,50 +249,32 @@ class Response:
         Args:
             used: Recordings from which the common response is estimated; all by default.
         """
-        from scipy.linalg import toeplitz
-
-        step, n, lags = responses[0].step, *responses[0].own.shape[1:]
-        at = (np.arange(lags) - round(BEFORE_S / step)) * step
+        step = responses[0].step
+        n = responses[0].own.shape[1]
+        now = round(BEFORE_S / step)
+        at = (np.arange(responses[0].own.shape[2]) - now) * step  # lags of the weights, s
         mask = np.ones(len(responses), bool) if used is None else np.array(used)
-        parts = [
-            np.stack([getattr(r, f) for r in responses]).astype(float)
-            for f in ("own", "cross", "power")
-        ]
-        own, cross, power = (x[mask].sum(axis=(0, 1)) for x in parts)
-        quick = Response.sharp(responses)
+        own = np.stack([r.own for r in responses]).astype(float)  # (recordings, SPLITS, n, lags)
+        cross = np.stack([r.cross for r in responses]).astype(float)
+        power = np.stack([r.power for r in responses]).astype(float)  # (recordings, SPLITS, n)
+        own_sum = own[mask].sum(axis=(0, 1))
+        cross_sum = cross[mask].sum(axis=(0, 1))
+        power_sum = power[mask].sum(axis=(0, 1))
+        sharp = Response.sharp(responses)
         onset = np.full(n, np.nan)
         early = np.full(n, np.nan)
         fits = np.zeros((len(responses), SPLITS, len(SHIFTS_S)))
         for j in range(n):
-            if own[j, 0] <= 0 or power[j] <= 0:
+            if own_sum[j, 0] <= 0 or power_sum[j] <= 0:
+                continue  # it is not commanded to move, or does not
+            joint = _JointResponse.of(own_sum[j], cross_sum[j], power_sum[j], now)
+            if joint is None:
                 continue
-            weights = np.linalg.solve(toeplitz(own[j]) + RIDGE * own[j, 0] * np.eye(lags), cross[j])
-            residual = power[j] - weights @ cross[j]
-            now = round(BEFORE_S / step)
-            if residual > MAX_UNEXPLAINED * power[j] or weights.sum() < 0.3:
-                continue
-            past_only = toeplitz(own[j, :-now]) + RIDGE * own[j, 0] * np.eye(lags - now)
-            early[j] = (
-                power[j] - cross[j, now:] @ np.linalg.solve(past_only, cross[j, now:])
-            ) / residual
-            progress = np.cumsum(weights) / weights.sum()
-            first = int(np.argmax(progress > ONSET_SHARE))
-            # the earliest lag also stands for still earlier ones, or for chance
-            if quick[j] and first:
-                before = progress[first - 1]
-                onset[j] = (
-                    at[first]
-                    + step
-                    - step * (progress[first] - ONSET_SHARE) / max(progress[first] - before, 1e-9)
-                )
-            shifted = np.stack(
-                [np.interp(at - s, at, weights, left=0.0, right=0.0) for s in SHIFTS_S]
-            )
-            spectrum = np.fft.rfft(shifted, 2 * lags, axis=1)
-            # of the weights with themselves
-            square = np.fft.irfft(np.abs(spectrum) ** 2, 2 * lags, axis=1)[:, :lags]
-            square[:, 1:] *= 2
-            fits += (parts[1][:, :, j] @ shifted.T - 0.5 * parts[0][:, :, j] @ square.T) / residual
+            early[j] = joint.early
+            if sharp[j]:
+                onset[j] = _onset(joint.weights, at, step)
+            shifted, square = _shifted_weights(joint.weights, at)
+            fits += (cross[:, :, j] @ shifted.T - 0.5 * own[:, :, j] @ square.T) / joint.residual
         return CommonResponse(onset, early, _best_shifts(fits), _best_shifts(fits.sum(axis=1)))
 
 
@@ -299,6 +289,68 @@ class CommonResponse:
     early: Array  # unexplained power without weights of future commands over that with them, (n)
     shifts: Array  # delay of each part of each recording against all, (recordings, SPLITS) s
     whole: Array  # delay of whole recordings, (recordings) s
+
+
+class _JointResponse(NamedTuple):
+    """How one joint follows its commands."""
+
+    weights: Array  # of commanded velocities before and after, (L)
+    residual: float  # power that they do not explain
+    early: float  # power that weights of earlier commands alone do not explain, over residual
+
+    @classmethod
+    def of(cls, own: Array, cross: Array, power: float, now: int) -> _JointResponse | None:
+        """Return the response; None if the joint does not follow.
+
+        Args:
+            own, cross, power: As in Response, of one joint.
+            now: Index of lag 0 in cross.
+        """
+        weights = _ridge_weights(own, cross)
+        residual = power - weights @ cross
+        if residual > MAX_UNEXPLAINED * power or weights.sum() < 0.3:
+            return None
+        past = _ridge_weights(own[:-now], cross[now:])
+        return cls(weights, residual, (power - cross[now:] @ past) / residual)
+
+
+def _ridge_weights(own: Array, cross: Array) -> Array:
+    """Return the weights of commanded velocities that explain a joint's velocity; all (L).
+
+    Args:
+        own: Correlation of the command with itself.
+        cross: With the state.
+    """
+    from scipy.linalg import toeplitz
+
+    return np.linalg.solve(toeplitz(own) + RIDGE * own[0] * np.eye(len(own)), cross)
+
+
+def _onset(weights: Array, at: Array, step: float) -> float:
+    """Return the lag at which a joint has covered ONSET_SHARE of its way, s; NaN if that is the
+    earliest one, which also stands for still earlier ones, or for chance.
+
+    Args:
+        weights, at: At lags (L) s, `step` s apart.
+    """
+    progress = np.cumsum(weights) / weights.sum()
+    first = int(np.argmax(progress > ONSET_SHARE))
+    if first == 0:
+        return np.nan
+    gain = max(progress[first] - progress[first - 1], 1e-9)
+    return float(at[first] + step - step * (progress[first] - ONSET_SHARE) / gain)
+
+
+def _shifted_weights(weights: Array, at: Array) -> tuple[Array, Array]:
+    """Return weights of a joint that follows later by each of SHIFTS_S, and the correlation of
+    these with themselves; both (S, L).
+    """
+    lags = len(weights)
+    shifted = np.stack([np.interp(at - s, at, weights, left=0.0, right=0.0) for s in SHIFTS_S])
+    spectrum = np.fft.rfft(shifted, 2 * lags, axis=1)
+    square = np.fft.irfft(np.abs(spectrum) ** 2, 2 * lags, axis=1)[:, :lags]
+    square[:, 1:] *= 2
+    return shifted, square
 
 
 def _best_shifts(fits: Array) -> Array:

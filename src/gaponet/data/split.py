@@ -117,20 +117,24 @@ def split_entries(
     )
     training_motions = max(1, round(train_share * len(motions["train"])))
     motions["train"] = motions["train"][:training_motions]
+    entries = [e for e in dataset.entries if not rates or _has_rate(e, rates)]
     splits = {}
     for name in SPLITS:
-        chosen = [e for e in dataset.entries if canonical[e.meta.motion] in motions[name]]
-        if rates:
-            chosen = [e for e in chosen if _has_rate(e, rates)]
+        chosen = [e for e in entries if canonical[e.meta.motion] in motions[name]]
         if name != "test":
             chosen = _not_held_out(chosen, holdout_units, holdout_payloads)
         splits[name] = chosen
-    payloads = [f"{mass:g} kg" for mass in holdout_payloads]
-    reason = ", ".join([*holdout_units, *payloads]) or "all other rates"
+    held_out = [*holdout_units, *(f"{mass:g} kg" for mass in holdout_payloads)]
+    _require_entries(dataset, splits, held_out or ["all other rates"])
+    return splits
+
+
+def _require_entries(dataset: Dataset, splits: Splits, held_out: list[str]) -> None:
     for name in SPLITS:
         if not splits[name]:
-            raise UsageError(f"{dataset.path}: nothing left for {name} after holding out {reason}")
-    return splits
+            raise UsageError(
+                f"{dataset.path}: nothing left for {name} after holding out {', '.join(held_out)}"
+            )
 
 
 def _require_share(train_share: float) -> None:
@@ -249,7 +253,10 @@ def make_split(dataset: Dataset, by: str, holdout: tuple[str, ...] = ()) -> Spli
     if by in ORDERED and not holdout:
         return split_by_order(dataset, by)
     canonical = canonical_motions(dataset)
-    motion_of: Callable[[Entry], str] = lambda e: canonical[e.meta.motion]  # noqa: E731
+
+    def motion_of(entry: Entry) -> str:
+        return canonical[entry.meta.motion]
+
     key = motion_of if by == "motion" else PROPERTIES[by]
     held_out = _held_out_values(dataset, by, holdout, key)
     rest = [e for e in dataset.entries if key(e) not in held_out]
@@ -265,10 +272,12 @@ def make_split(dataset: Dataset, by: str, holdout: tuple[str, ...] = ()) -> Spli
         "val": [e for e in rest if val_key(e) in val_values],
         "test": [e for e in dataset.entries if key(e) in held_out],
     }
-    if empty := [s for s in SPLITS if not splits[s]]:
+    empty = [name for name in SPLITS if not splits[name]]
+    if empty:
+        left = len(set(map(motion_of, rest)))
         raise UsageError(
             f"{dataset.path}: holding out {by} {', '.join(sorted(held_out))} leaves nothing for "
-            f"{empty[0]} ({len(set(map(motion_of, rest)))} motion(s) remain); hold out less"
+            f"{empty[0]} ({left} motion(s) remain); hold out less"
         )
     return splits
 
@@ -388,14 +397,16 @@ def stratified_subset(entries: ListOf[Entry], count: int) -> list[Entry]:
     """
     groups: dict[tuple[object, ...], list[Entry]] = {}
     for entry in entries:
-        m = entry.meta
-        groups.setdefault(
-            (m.payload_mass, m.payload_side, m.unit_id, round(1 / entry.dt, 1)), []
-        ).append(entry)
+        meta = entry.meta
+        rate = round(1 / entry.dt, 1)
+        kind = (meta.payload_mass, meta.payload_side, meta.unit_id, rate)
+        groups.setdefault(kind, []).append(entry)
+    # each begins with another motion
     rotated = [g[i % len(g) :] + g[: i % len(g)] for i, g in enumerate(groups.values())]
-    chosen = [e.id for turn in itertools.zip_longest(*rotated) for e in turn if e is not None][
-        :count
-    ]
+    in_turn: list[str] = []
+    for turn in itertools.zip_longest(*rotated):
+        in_turn += [entry.id for entry in turn if entry is not None]
+    chosen = in_turn[:count]
     return [e for e in entries if e.id in chosen]
 
 

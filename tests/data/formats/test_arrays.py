@@ -14,7 +14,7 @@ from strange_logs import motion, write_bag
 
 from gaponet.base.errors import LogError, UsageError
 from gaponet.cli.main import main
-from gaponet.data.formats import detect, pickles, read_logs
+from gaponet.data.formats import ReadOptions, detect, pickles, read_logs
 from gaponet.data.sequence import SequenceMeta, to_sequence
 
 WRITERS = {
@@ -42,7 +42,7 @@ def documented(heading):
 def test_the_same_motion_comes_out_of_each_also_by_the_lines_of_the_docs(tmp_path, arm, fmt):
     WRITERS[fmt](tmp_path)
     assert detect(tmp_path) == fmt
-    ((name, log),) = read_logs(tmp_path, arm, allow_pickle=True)
+    ((name, log),) = read_logs(tmp_path, arm, ReadOptions(allow_pickle=True))
     ctrl, qpos = motion()
     assert name == {"hdf5": "episode_0", "asap": "walk"}.get(fmt, "a")
     assert log.joint_names == ("shoulder", "elbow")
@@ -52,7 +52,7 @@ def test_the_same_motion_comes_out_of_each_also_by_the_lines_of_the_docs(tmp_pat
         ([20.0, 30.0], [1.0, 1.5]) if fmt == "pace" else (None, None)
     )
     (tmp_path / "logs.toml").write_text(documented(HEADINGS[fmt]))
-    for by in (log, next(read_logs(tmp_path, arm, allow_pickle=True))[1]):
+    for by in (log, next(read_logs(tmp_path, arm, ReadOptions(allow_pickle=True)))[1]):
         assert np.allclose(by.channels["ctrl"].values, ctrl)
 
 
@@ -79,13 +79,13 @@ def test_half_a_file_is_one_clear_error(tmp_path, arm, fmt):
     file = next(f for f in tmp_path.iterdir() if f.suffix != ".toml")
     file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
     with pytest.raises(LogError, match=file.name + ".*not a "):
-        list(read_logs(tmp_path, arm, fmt, allow_pickle=True))
+        list(read_logs(tmp_path, arm, ReadOptions(fmt, allow_pickle=True)))
     if file.suffix in (".pt", ".npz"):  # which say where they end
         with pytest.raises(LogError, match="it is cut short: copy or record it again"):
-            list(read_logs(tmp_path, arm, fmt))
+            list(read_logs(tmp_path, arm, ReadOptions(fmt)))
         file.write_bytes(b"not a zip file at all")
         with pytest.raises(LogError, match=r"not a readable .*; is it the right file\?"):
-            list(read_logs(tmp_path, arm, fmt))
+            list(read_logs(tmp_path, arm, ReadOptions(fmt)))
 
 
 def test_gains_of_another_number_of_joints_are_one_clear_error(tmp_path, arm):
@@ -138,7 +138,7 @@ def test_windows_in_which_one_joint_moves_are_recordings_of_that_joint(tmp_path,
     with pytest.raises(LogError, match=r"or rate = 50\.0 \(Hz\)"):
         list(read_logs(tmp_path, arm))
     (tmp_path / "logs.toml").write_text("[posture]\nshoulder = 0.3\n")
-    (_, elbow), (name, shoulder) = read_logs(tmp_path, arm, rate=50.0)
+    (_, elbow), (name, shoulder) = read_logs(tmp_path, arm, ReadOptions(rate=50.0))
     assert (name, elbow.joint_names, shoulder.joint_names) == (
         "motor-0001",
         ("elbow",),
@@ -253,7 +253,7 @@ def test_hostile_objects_in_a_file_run_nothing(tmp_path, arm, write):
     for thing in evil(str(tmp_path / "ran")):
         write(tmp_path, thing)
         with pytest.raises(LogError, match="nothing of it was run"):
-            list(read_logs(tmp_path, arm, allow_pickle=True))
+            list(read_logs(tmp_path, arm, ReadOptions(allow_pickle=True)))
     assert not (tmp_path / "ran").exists()
 
 

@@ -8,7 +8,7 @@ import pytest
 from logs import late, wave, write_bam
 
 from gaponet.base.errors import JointMismatchError, LogError, UsageError
-from gaponet.data.formats import detect, read_logs
+from gaponet.data.formats import ReadOptions, detect, read_logs
 from gaponet.data.importer import import_logs
 from gaponet.robot.spec import load_robot
 from gaponet.sim.batch import Condition
@@ -72,7 +72,7 @@ def test_a_recording_ends_where_torque_is_switched_off(tmp_path, bench):
 )
 def test_what_cannot_be_a_recording_is_refused(tmp_path, bench, changes, message):
     with pytest.raises(LogError, match=message):
-        list(read_logs(write_bam(tmp_path / "a.json", **changes), bench, "bam"))
+        list(read_logs(write_bam(tmp_path / "a.json", **changes), bench, ReadOptions("bam")))
 
 
 def test_any_servo_comes_in_whose_gain_law_robot_toml_states(tmp_path, bench):

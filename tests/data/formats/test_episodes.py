@@ -7,7 +7,7 @@ import pytest
 from logs import arm_columns, table_text
 
 from gaponet.base.errors import LogError
-from gaponet.data.formats import read_logs
+from gaponet.data.formats import ReadOptions, read_logs
 from gaponet.data.importer import import_logs
 
 SI = {"position_unit": "rad", "time_unit": "s"}
@@ -41,7 +41,7 @@ def write(file, columns):
 @pytest.mark.parametrize("column", ["episode_index", "episode", "traj_id"])
 def test_each_episode_is_a_recording(tmp_path, arm, name, column):
     write(tmp_path / name, joined(**{column: numbers([4, 5, 7])}))
-    logs = dict(read_logs(tmp_path / name, arm, **SI))
+    logs = dict(read_logs(tmp_path / name, arm, ReadOptions(**SI)))
     assert {motion: len(log.channels["qpos"].time) for motion, log in logs.items()} == {
         "log-0004": 120, "log-0005": 90, "log-0007": 150,
     }  # fmt: skip
@@ -49,7 +49,9 @@ def test_each_episode_is_a_recording(tmp_path, arm, name, column):
 
 def test_numbers_that_no_float_counts_are_no_episodes(tmp_path, arm):
     write(tmp_path / "log.csv", arm_columns(60) | {"episode": np.repeat([1e300, 2.0], 30)})
-    assert [motion for motion, _ in read_logs(tmp_path / "log.csv", arm, **SI)] == ["log"]
+    assert [motion for motion, _ in read_logs(tmp_path / "log.csv", arm, ReadOptions(**SI))] == [
+        "log"
+    ]
 
 
 def test_a_reset_between_episodes_is_no_motion(tmp_path, arm):
@@ -64,7 +66,8 @@ def test_episodes_whose_rows_alternate_are_taken_apart(tmp_path, arm):
     order = np.argsort(columns["time"], kind="stable")
     write(tmp_path / "log.csv", {name: values[order] for name, values in columns.items()})
     lengths = [
-        len(log.channels["qpos"].time) for _, log in read_logs(tmp_path / "log.csv", arm, **SI)
+        len(log.channels["qpos"].time)
+        for _, log in read_logs(tmp_path / "log.csv", arm, ReadOptions(**SI))
     ]
     assert lengths == list(ROWS)
 
@@ -73,7 +76,7 @@ def test_frames_that_begin_again_are_episodes(tmp_path, arm):
     columns = joined(frame_index=[np.arange(rows) for rows in ROWS])
     del columns["time"]
     write(tmp_path / "log.csv", columns)
-    logs = list(read_logs(tmp_path / "log.csv", arm, rate=50.0, position_unit="rad"))
+    logs = list(read_logs(tmp_path / "log.csv", arm, ReadOptions(rate=50.0, position_unit="rad")))
     assert [len(log.channels["qpos"].time) for _, log in logs] == list(ROWS)
 
 
@@ -82,7 +85,7 @@ def test_the_line_of_a_bad_row_is_that_of_the_file(tmp_path, arm):
     columns["qpos.elbow"][ROWS[0] + 3] = np.nan
     write(tmp_path / "log.csv", columns)
     with pytest.raises(LogError, match=rf"log\.csv:{ROWS[0] + 3 + 2}:"):
-        list(read_logs(tmp_path / "log.csv", arm, **SI))
+        list(read_logs(tmp_path / "log.csv", arm, ReadOptions(**SI)))
 
 
 @pytest.mark.parametrize("skip_bad", [False, True])

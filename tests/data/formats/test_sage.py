@@ -5,7 +5,7 @@ import pytest
 from logs import SERVO_NAMES, late, wave, write_sage, write_so101
 
 from gaponet.base.errors import JointMismatchError, LogError, UsageError
-from gaponet.data.formats import detect, find_logs, read_logs
+from gaponet.data.formats import ReadOptions, detect, find_logs, read_logs
 
 
 def edit(file, line: int, old: str, new: str) -> None:
@@ -37,7 +37,7 @@ def test_numbers_and_joints_come_back_as_written(tmp_path, so101):
     )  # a share of its range
     assert log.meta["converted_from"] == {"gripper": "fraction"}
     with pytest.raises(UsageError, match="--time-unit means nothing to the sage format"):
-        list(read_logs(tmp_path, so101, time_unit="s"))
+        list(read_logs(tmp_path, so101, ReadOptions(time_unit="s")))
 
 
 def test_the_period_tells_the_unit_of_time(tmp_path, so101):
@@ -139,7 +139,7 @@ def test_a_joint_of_another_robot_says_how_to_map_it(motion, so101):
         JointMismatchError, match=r"joint_list\.txt names joint 'forearm', which robot 'so101'"
     ):
         list(read_logs(motion, so101))
-    ((_, log),) = read_logs(motion, so101, joint_map={"forearm": "elbow_flex"})
+    ((_, log),) = read_logs(motion, so101, ReadOptions(joint_map={"forearm": "elbow_flex"}))
     assert log.joint_names == so101.joint_names
 
 
@@ -168,7 +168,7 @@ def test_what_no_joint_does_costs_that_channel_there_and_is_said(tmp_path, so101
         LogError,
         match=rf"state_motor\.csv:9: .* of shoulder_pan is 1e\+30 {unit}: no joint does that",
     ):
-        list(read_logs(folder, so101, strict=True))
+        list(read_logs(folder, so101, ReadOptions(strict=True)))
     ((_, log),) = read_logs(folder, so101)
     channel = ("", "qvel", "tau")[column]
     told = log.meta["notes"]["nonsense"][channel]

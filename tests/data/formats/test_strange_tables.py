@@ -9,7 +9,7 @@ from logs import arm_columns, table_text
 
 from gaponet.base.errors import LogError
 from gaponet.data.describe.guess import guess_logs
-from gaponet.data.formats import files_under, look, read_logs
+from gaponet.data.formats import ReadOptions, files_under, look, read_logs
 
 SI = {"position_unit": "rad", "time_unit": "s"}
 ROWS = 200
@@ -22,7 +22,7 @@ def cells(columns):
 
 
 def only(path, robot, **options):
-    ((_, log),) = read_logs(path, robot, **options)
+    ((_, log),) = read_logs(path, robot, ReadOptions(**options))
     return log
 
 
@@ -168,7 +168,7 @@ def test_files_that_belong_together_are_proposed_and_then_read_as_one_recording(
         (tmp_path / "logs.toml").write_text('format = "table"\n')
     kind, known, found = look(tmp_path)
     (tmp_path / "logs.toml").write_text(guess_logs(found, arm, kind, dict(known)))
-    logs = dict(read_logs(tmp_path, arm, fmt="table"))
+    logs = dict(read_logs(tmp_path, arm, ReadOptions(fmt="table")))
     assert list(logs) == ["run1", "run2"]
     assert np.array_equal(logs["run1"].channels["ctrl"].values, command)
     assert np.array_equal(logs["run1"].channels["qpos"].values, state)

@@ -8,7 +8,7 @@ from logs import arm_columns, table_text
 
 from gaponet.base.errors import LogError, UsageError
 from gaponet.data.describe.plausibility import require_plausible
-from gaponet.data.formats import detect, find_logs, read_logs
+from gaponet.data.formats import ReadOptions, detect, find_logs, read_logs
 
 SI = {"position_unit": "rad", "time_unit": "s"}
 
@@ -24,7 +24,7 @@ def write_parquet(path, columns):
 
 
 def only(path, robot, **options):
-    ((_, log),) = read_logs(path, robot, **(SI | options))
+    ((_, log),) = read_logs(path, robot, ReadOptions(**(SI | options)))
     return log
 
 
@@ -64,7 +64,7 @@ def test_rows_per_joint_give_the_same_log_as_columns_per_joint(tmp_path, arm):
     columns = {name: list(map(float, values)) for name, values in arm_columns().items()}
     logs = tmp_path / "logs.toml"
     logs.write_text('ctrl = "command"\nqpos = "position"\ntime_unit = "s"\nposition_unit = "rad"\n')
-    ((_, log),) = read_logs(by_joint(columns, tmp_path / "long.csv"), arm, logs=logs)
+    ((_, log),) = read_logs(by_joint(columns, tmp_path / "long.csv"), arm, ReadOptions(logs=logs))
     for k, joint in enumerate(log.joint_names):
         assert np.array_equal(log.channels["qpos"].values[:, k], columns[f"qpos.{joint}"])
         assert np.array_equal(log.channels["ctrl"].values[:, k], columns[f"ctrl.{joint}"])
@@ -73,7 +73,7 @@ def test_rows_per_joint_give_the_same_log_as_columns_per_joint(tmp_path, arm):
     with pytest.raises(
         LogError, match=r"joints have different times \(elbow 60, shoulder 59 rows\)"
     ):
-        next(read_logs(tmp_path / "long.csv", arm, logs=logs))[1]()
+        next(read_logs(tmp_path / "long.csv", arm, ReadOptions(logs=logs)))[1]()
 
 
 def test_a_column_called_joint_beside_a_column_per_joint_is_no_table_with_a_row_per_joint(
@@ -92,7 +92,7 @@ def test_a_folder_holds_one_motion_per_file(tmp_path, arm):
     (folder / ".hidden.csv").touch()
     assert detect(folder) == "table"
     assert [f.name for f in find_logs(folder)] == ["a.parquet", "b.csv"]
-    assert [name for name, _ in read_logs(folder, arm, **SI)] == ["a", "b"]
+    assert [name for name, _ in read_logs(folder, arm, ReadOptions(**SI))] == ["a", "b"]
 
 
 @pytest.mark.parametrize("given", [{}, {"position_unit": "rad"}, {"time_unit": "s"}])
@@ -103,7 +103,7 @@ def test_a_unit_that_was_not_said_is_asked_for(tmp_path, arm, given):
         UsageError,
         match=f"the table's {missing} unit is not given; say it with --position-unit rad",
     ):
-        list(read_logs(file, arm, **given))
+        list(read_logs(file, arm, ReadOptions(**given)))
 
 
 def test_90_degrees_are_half_pi_and_1500_ms_are_one_and_a_half_seconds(tmp_path, arm):
@@ -136,7 +136,7 @@ def test_a_column_map_names_columns_and_units(tmp_path, arm):
         'time = "t"\ntime_unit = "ms"\nposition_unit = "rad"\n[columns]\n"ctrl.shoulder" = "cmd_1"\n'
         '"ctrl.elbow" = "cmd_2"\n"qpos.shoulder" = "pos_1"\n"qpos.elbow" = "pos_2"\n[joint_units]\nelbow = "deg"\n'
     )
-    ((_, log),) = read_logs(file, arm, logs=toml)
+    ((_, log),) = read_logs(file, arm, ReadOptions(logs=toml))
     assert np.array_equal(log.channels["qpos"].values[:, 0], theirs["pos_1"])
     assert np.allclose(log.channels["qpos"].values[:, 1], theirs["pos_2"] * np.pi / 180)
     assert log.channels["qpos"].time[-1] == pytest.approx(1.18)
@@ -226,7 +226,7 @@ def test_a_folder_without_logs_names_the_known_formats(tmp_path, arm):
     with pytest.raises(LogError, match="nowhere: does not exist"):
         list(read_logs(tmp_path / "nowhere", arm))
     with pytest.raises(LogError, match="unknown format 'ascii'; use one of sage, table, npz"):
-        list(read_logs(tmp_path, arm, "ascii"))
+        list(read_logs(tmp_path, arm, ReadOptions("ascii")))
 
 
 def test_a_cell_longer_than_the_csv_module_takes_is_refused_by_line(tmp_path, arm):

@@ -41,15 +41,14 @@ def _rate(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
         rates[next((r for r in rates if abs(r - s.rate_hz) < near * r), s.rate_hz)] += 1
     text = ", ".join(f"{count} at {r:.2f} Hz ({1e3 / r:.2f} ms)" for r, count in rates.items())
     deviation = max(abs(s.rate_hz * robot.dt - 1) for s in surveys)
-    level = "warning" if len(rates) > 1 else "note" if deviation > 0.05 else "ok"
-    hint = (
-        f"; robot.toml says {1 / robot.dt:.2f} Hz; the recorded rate is used"
-        if deviation > 0.001
-        else ""
-    )
-    yield Finding(
-        level, "rate", text + hint, values={f"{r:.2f}": count for r, count in rates.items()}
-    )
+    level = "ok"
+    if len(rates) > 1:
+        level = "warning"
+    elif deviation > 0.05:
+        level = "note"
+    if deviation > 0.001:
+        text += f"; robot.toml says {1 / robot.dt:.2f} Hz; the recorded rate is used"
+    yield Finding(level, "rate", text, values={f"{r:.2f}": count for r, count in rates.items()})
     resampled = [
         s.motion for s in surveys if "resampled" in str(s.entry.meta.notes.get("rows", ""))
     ]
@@ -65,13 +64,11 @@ def _regularity(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     """How evenly was it sampled, and what is missing?"""
     jitter = [s.jitter_ms * s.rate_hz / 1e3 for s in surveys]  # of a period
     worst = surveys[int(np.argmax(jitter))]
-    level = (
-        "ok"
-        if max(jitter) <= MAX_JITTER[0]
-        else "note"
-        if max(jitter) <= MAX_JITTER[1]
-        else "warning"
-    )
+    level = "warning"
+    if max(jitter) <= MAX_JITTER[0]:
+        level = "ok"
+    elif max(jitter) <= MAX_JITTER[1]:
+        level = "note"
     where = f" ({worst.motion})" if worst.jitter_ms else ""
     text = f"periods deviate from their median by at most {worst.jitter_ms:.2f} ms{where}"
     if level == "warning" and (unknown := 2 * max(s.uneven_ms for s in surveys)):
@@ -316,21 +313,15 @@ def _stuck(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     """Does every channel change when it should?"""
     for i, name in enumerate(robot.joint_names):
         moved = [s for s in surveys if s.ctrl_range[i] > MIN_COMMANDED_RAD]
-        still = [
-            s for s in moved if s.qpos_range[i] < 0.03 and s.qpos_range[i] < 0.05 * s.ctrl_range[i]
-        ]
+        still = [s for s in moved if _stands_still(s, i)]
         if still:
             text = (
                 f"{name} does not move when commanded in {_motions(still)}: unplugged, torque off "
                 "or not read; leave these out"
             )
-            yield Finding(
-                "error" if len(still) == len(moved) else "warning", "stuck", text, (name,)
-            )
-        # At a stop, an encoder with coarse steps repeats one number too: _blocked reports that.
-        steps = any(s.resolution[i] for s in surveys)
-        repeated = [s for s in surveys if s.repeated_s[i] > MIN_REPEATED_S and s not in still]
-        repeated = [s for s in repeated if not (steps and s.blocked_s[i])]
+            level = "error" if len(still) == len(moved) else "warning"
+            yield Finding(level, "stuck", text, (name,))
+        repeated = [s for s in _repeating(surveys, i) if s not in still]
         if repeated and not any(s.all_repeated_s > MIN_REPEATED_S for s in repeated):
             seconds = max(s.repeated_s[i] for s in repeated)
             text = (
@@ -338,6 +329,28 @@ def _stuck(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
                 f"in {_motions(repeated)}: it was not read; cut these logs there"
             )
             yield Finding("warning", "stuck", text, (name,))
+    yield from _frozen(surveys)
+
+
+def _stands_still(survey: Survey, i: int) -> bool:
+    """Return True if joint i moves little, and far less than commanded."""
+    moved = survey.qpos_range[i]
+    return bool(moved < 0.03 and moved < 0.05 * survey.ctrl_range[i])
+
+
+def _repeating(surveys: list[Survey], i: int) -> list[Survey]:
+    """Return the recordings in which joint i repeats one number while its command moves on.
+
+    At a stop, an encoder with coarse steps repeats one number too: _blocked reports that.
+    """
+    repeated = [s for s in surveys if s.repeated_s[i] > MIN_REPEATED_S]
+    if any(s.resolution[i] for s in surveys):
+        repeated = [s for s in repeated if not s.blocked_s[i]]
+    return repeated
+
+
+def _frozen(surveys: list[Survey]) -> Iterator[Finding]:
+    """Find recordings whose whole state repeats itself."""
     frozen = [s for s in surveys if s.all_repeated_s > MIN_REPEATED_S and not _all_blocked(s)]
     if frozen:
         text = (

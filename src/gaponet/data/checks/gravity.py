@@ -78,14 +78,13 @@ class _Best(NamedTuple):
 
 def gravity(surveys: list[Survey], robot: RobotSpec, model: Gravity) -> Iterator[Finding]:
     """Are zero, sign and order of the joints those of the model?"""
-    results = [
-        _best(loads, robot, model, centred)
-        for loads, centred in (
-            (_recorded_torques(surveys), False),
-            (_servo_torques(surveys, robot), True),
-        )
-        if sum(len(qpos) for qpos, _ in loads.values()) >= MIN_ROWS
-    ]
+    results = []
+    recorded = _recorded_torques(surveys)
+    if _count_rows(recorded) >= MIN_ROWS:
+        results.append(_best(recorded, robot, model, centred=False))
+    servos = _servo_torques(surveys, robot)
+    if _count_rows(servos) >= MIN_ROWS:
+        results.append(_best(servos, robot, model, centred=True))
     if not results:
         yield Finding(
             "ok",
@@ -120,12 +119,7 @@ def _best(loads: Loads, robot: RobotSpec, model: Gravity, centred: bool) -> _Bes
     """Return the hypothesis that explains the torques best; `centred` ignores a constant of each
     joint.
     """
-    step = max(1, sum(len(qpos) for qpos, _ in loads.values()) // MAX_ROWS)
-    loads = {
-        k: (q[::step].astype(float), t[::step].astype(float))
-        for k, (q, t) in loads.items()
-        if len(q)
-    }
+    loads = _thinned(loads, max(1, _count_rows(loads) // MAX_ROWS))
     as_logged = {key: model(qpos, *key) for key, (qpos, _) in loads.items()}
     rms = np.sqrt(np.mean(np.concatenate(list(as_logged.values())) ** 2, axis=0))  # (n) N·m
     loaded = np.flatnonzero(rms > MIN_LOAD * robot.effort_limit)
@@ -140,17 +134,33 @@ def _best(loads: Loads, robot: RobotSpec, model: Gravity, centred: bool) -> _Bes
     return best
 
 
+def _count_rows(loads: Loads) -> int:
+    return sum(len(qpos) for qpos, _ in loads.values())
+
+
+def _thinned(loads: Loads, step: int) -> Loads:
+    """Return every `step`-th row of each payload that has any."""
+    thinned = {}
+    for payload, (qpos, torque) in loads.items():
+        if len(qpos):
+            thinned[payload] = (qpos[::step].astype(float), torque[::step].astype(float))
+    return thinned
+
+
 def _joint_faults(robot: RobotSpec, loaded: Array) -> Iterator[_Hypothesis]:
     """Yield hypotheses with one joint mirrored, its zero turned, or its torque negated."""
     for j in loaded.tolist():
         name = robot.joint_names[j]
         one = np.eye(len(robot.joint_names))[j]
         for sign, turn, torque_sign in JOINT_FAULTS:
-            words = f"its zero turned by {turn:+.2f} rad" if turn else "its torque negated"
-            words = "its angle mirrored" if sign < 0 else words
-            mend: Mend = (
-                {"offsets": {name: turn}} if turn else {"signs": {name: sign}} if sign < 0 else {}
-            )
+            words = "its torque negated"
+            mend: Mend = {}
+            if sign < 0:
+                words = "its angle mirrored"
+                mend = {"signs": {name: sign}}
+            elif turn:
+                words = f"its zero turned by {turn:+.2f} rad"
+                mend = {"offsets": {name: turn}}
             factors = (1 + (sign - 1) * one, turn * one, 1 + (torque_sign - 1) * one)
             yield _Hypothesis(f"{words} at {name}", (j,), mend, np.arange(len(one)), *factors)
 
@@ -160,23 +170,26 @@ def _order_faults(robot: RobotSpec) -> Iterator[_Hypothesis]:
     reversed.
     """
     op = robot.operated_index
-    orders = [
-        ((a, b), [b, a], f"{robot.joint_names[a]} and {robot.joint_names[b]} in each other's place")
-        for a, b in combinations(op.tolist(), 2)
-    ]
-    orders += [
-        (tuple(op.tolist()), order.tolist(), f"the order of joints {words}")
-        for order, words in (
-            (np.roll(op, 1), "one place on"),
-            (np.roll(op, -1), "one place back"),
-            (op[::-1], "backwards"),
-        )
-    ]
-    for joints, replaced, words in orders:
-        order = np.arange(len(robot.joint_names))
-        order[list(joints)] = replaced
-        names = {robot.joint_names[o]: robot.joint_names[i] for i, o in enumerate(order) if i != o}
-        yield _Hypothesis(words, joints, {"names": names}, order)
+    for a, b in combinations(op.tolist(), 2):
+        words = f"{robot.joint_names[a]} and {robot.joint_names[b]} in each other's place"
+        yield _order_fault(robot, (a, b), [b, a], words)
+    for words, moved in (
+        ("one place on", np.roll(op, 1)),
+        ("one place back", np.roll(op, -1)),
+        ("backwards", op[::-1]),
+    ):
+        words = f"the order of joints {words}"
+        yield _order_fault(robot, tuple(op.tolist()), moved.tolist(), words)
+
+
+def _order_fault(
+    robot: RobotSpec, joints: tuple[int, ...], replaced: list[int], words: str
+) -> _Hypothesis:
+    """Return the hypothesis that the columns `replaced` belong to these joints."""
+    order = np.arange(len(robot.joint_names))
+    order[list(joints)] = replaced
+    names = {robot.joint_names[o]: robot.joint_names[i] for i, o in enumerate(order) if i != o}
+    return _Hypothesis(words, joints, {"names": names}, order)
 
 
 def _recorded_torques(surveys: list[Survey]) -> Loads:

@@ -9,7 +9,7 @@ import numpy as np
 from gaponet.base.arrays import Array
 from gaponet.data.checks.check import Check
 from gaponet.data.checks.completeness import unsigned_torque
-from gaponet.data.checks.survey import Survey
+from gaponet.data.checks.survey import Survey, Torque
 from gaponet.data.signals import FAST_COMMAND_RAD_S, Response
 from gaponet.data.static_poses import StaticError, StaticPoses
 from gaponet.robot.finding import Finding, abbreviate, masked_names
@@ -20,53 +20,90 @@ MIN_SAG_RAD = 0.02  # static error that is reported
 MAX_DEAD_TIME_S = 0.15
 MAX_EXTRA_LAG_S = 0.05
 DEAD_TIMES = (  # up to s, verdict
-    (0.015, "as good as none"), (0.06, "usual for a bus and a servo's firmware"),
+    (0.015, "as good as none"),
+    (0.06, "usual for a bus and a servo's firmware"),
     (MAX_DEAD_TIME_S, "long, as of hobby servos and slow buses"),
-    (np.inf, "very long: look for a buffer, a filter, or clocks of command and state that are apart"),
-)  # fmt: skip
+    (
+        np.inf,
+        "very long: look for a buffer, a filter, or clocks of command and state that are apart",
+    ),
+)
 
 
 def _lag(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     """How long after the command does each joint move?"""
     lags = fast_lags(surveys, robot)
-    if not lags and any(np.isfinite(s.copied_rows).any() for s in surveys):
-        yield Finding("ok", "lag", "a command that repeats the state shows no lag")
-        return
     if not lags:
-        text = (
-            f"nothing is commanded faster than {FAST_COMMAND_RAD_S} rad/s: lag and stiction "
-            "cannot be separated"
-        )
-        yield Finding("note", "lag", f"{text}; add fast motions")
+        yield _no_lag(surveys)
         return
     every = np.concatenate(list(lags.values()))
+    median = float(np.median(every))
     period = float(np.median([1 / s.rate_hz for s in surveys]))
     low = every.min()
     high = every.max()
     text = (
-        f"state follows command after {np.median(every) * 1e3:.0f} ms "
+        f"state follows command after {median * 1e3:.0f} ms "
         f"({low * 1e3:.0f}–{high * 1e3:.0f} over joints and motions at {FAST_COMMAND_RAD_S} rad/s "
         f"or faster), {low / period:.0f} to {high / period:.0f} periods"
     )
     expected = _expected_lag(robot)
-    sharp = dict(zip(robot.operated, Response.sharp([s.response for s in surveys]), strict=True))
-    # The timing check sees more of joints whose commands change sharply.
-    smooth = [name for name in lags if name in robot.operated and not sharp[name]]
-    dead_time = {name: float(np.median(lags[name])) - expected[name][0] for name in smooth}
-    usual = float(np.median(list(dead_time.values()))) if dead_time else 0.0
-    if dead_time:
+    dead_times = _dead_times(lags, surveys, robot, expected)
+    usual = 0.0
+    if dead_times:
+        usual = float(np.median(list(dead_times.values())))
         verdict = next(words for limit, words in DEAD_TIMES if usual <= limit)
         text += (
             f". kp and damping do not explain {usual * 1e3:.0f} ms of it: dead time, friction or "
             f"inertia (gaponet identify separates them). As a dead time this is {verdict}"
         )
-    level = "warning" if usual > MAX_DEAD_TIME_S else "note" if np.median(every) > period else "ok"
-    yield Finding(
-        level, "lag", text, tuple(lags), {name: lag_values(x) for name, x in lags.items()}
+    level = "ok"
+    if usual > MAX_DEAD_TIME_S:
+        level = "warning"
+    elif median > period:
+        level = "note"
+    values = {name: lag_values(x) for name, x in lags.items()}
+    yield Finding(level, "lag", text, tuple(lags), values)
+    if len(dead_times) > 2:
+        yield from _late_joints(dead_times, usual, expected)
+
+
+def _no_lag(surveys: list[Survey]) -> Finding:
+    """Say why no lag is known."""
+    if any(np.isfinite(s.copied_rows).any() for s in surveys):
+        return Finding("ok", "lag", "a command that repeats the state shows no lag")
+    text = (
+        f"nothing is commanded faster than {FAST_COMMAND_RAD_S} rad/s: lag and stiction "
+        "cannot be separated"
     )
-    for name, late in dead_time.items():
+    return Finding("note", "lag", f"{text}; add fast motions")
+
+
+def _dead_times(
+    lags: dict[str, Array],
+    surveys: list[Survey],
+    robot: RobotSpec,
+    expected: dict[str, tuple[float, float]],
+) -> dict[str, float]:
+    """Return by how much longer joints lag than kp and damping explain, s.
+
+    Only joints with smooth commands: of the others the timing check sees more.
+    """
+    sharp = dict(zip(robot.operated, Response.sharp([s.response for s in surveys]), strict=True))
+    dead_times = {}
+    for name, of_joint in lags.items():
+        if name in robot.operated and not sharp[name]:
+            slow, _ = expected[name]
+            dead_times[name] = float(np.median(of_joint)) - slow
+    return dead_times
+
+
+def _late_joints(
+    dead_times: dict[str, float], usual: float, expected: dict[str, tuple[float, float]]
+) -> Iterator[Finding]:
+    """Find joints that lag longer than the others, whose dead time is `usual`, s."""
+    for name, late in dead_times.items():
         slow, near = expected[name]
-        if len(dead_time) > 2 and late - usual > MAX_EXTRA_LAG_S and late > max(2 * slow, near):
+        if late - usual > MAX_EXTRA_LAG_S and late > max(2 * slow, near):
             text = (
                 f"{name} lags {(late - usual) * 1e3:.0f} ms longer than the other joints: its "
                 "channel is read late, filtered or from another bus, or it moves stiffly"
@@ -104,40 +141,49 @@ def _expected_lag(robot: RobotSpec) -> dict[str, tuple[float, float]]:
 def _sag(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     """How far from its command does each joint rest, with the lightest and the heaviest payload?"""
     payloads = sorted({s.entry.meta.payload_mass for s in surveys})
-    errors = {
-        p: static_errors([s for s in surveys if s.entry.meta.payload_mass == p], robot)
-        for p in dict.fromkeys([payloads[0], payloads[-1]])
-    }
+    errors: dict[float, dict[str, StaticError]] = {}  # payload → joint → error
+    for payload in (payloads[0], payloads[-1]):
+        same = [s for s in surveys if s.entry.meta.payload_mass == payload]
+        errors[payload] = static_errors(same, robot)
     largest = {name: max(abs(e[name].middle) for e in errors.values()) for name in robot.operated}
-    sagging = sorted(
-        (name for name in robot.operated if largest[name] >= MIN_SAG_RAD),
-        key=lambda name: -largest[name],
-    )
+    sagging = [name for name in robot.operated if largest[name] >= MIN_SAG_RAD]
+    sagging.sort(key=lambda name: -largest[name])
     if sagging:
-        by_payload = "; ".join(
-            ", ".join(f"{name} {_mrad(e[name])}" for name in sagging[:4])
-            + (f" with {p:g} kg" if payloads[1:] else "")
-            for p, e in errors.items()
-        )
-        more = (
-            f"; {len(sagging) - 4} more joints above {MIN_SAG_RAD * 1e3:.0f}"
-            if len(sagging) > 4
-            else ""
-        )
-        text = (
-            f"state − command at rest, mrad: {by_payload}{more}: sag under load, or an offset. "
-            "Within ± (stiction) a joint can stop anywhere"
-        )
-        values = {
-            f"{p:g} kg": {name: e[name].middle for name in sagging} for p, e in errors.items()
-        }
-        yield Finding("note", "sag", text, tuple(sagging), values)
-    elif all(e.up + e.down == 0 for by_joint in errors.values() for e in by_joint.values()):
+        yield _sag_finding(sagging, errors)
+        return
+    rests = 0
+    for by_joint in errors.values():
+        rests += sum(error.up + error.down for error in by_joint.values())
+    if rests == 0:
         text = (
             "the robot never rests under a constant command: sag and offsets are not determined; "
             "add holds"
         )
         yield Finding("note", "sag", text)
+
+
+def _sag_finding(sagging: list[str], errors: dict[float, dict[str, StaticError]]) -> Finding:
+    """Report joints that rest away from their commands, the farthest first.
+
+    Args:
+        errors: Payload → joint → static error.
+    """
+    shown = sagging[:4]
+    parts = []
+    for payload, by_joint in errors.items():
+        part = ", ".join(f"{name} {_mrad(by_joint[name])}" for name in shown)
+        if len(errors) > 1:
+            part += f" with {payload:g} kg"
+        parts.append(part)
+    text = f"state − command at rest, mrad: {'; '.join(parts)}"
+    others = len(sagging) - len(shown)
+    if others:
+        text += f"; {others} more joints above {MIN_SAG_RAD * 1e3:.0f}"
+    text += ": sag under load, or an offset. Within ± (stiction) a joint can stop anywhere"
+    values = {}
+    for payload, by_joint in errors.items():
+        values[f"{payload:g} kg"] = {name: by_joint[name].middle for name in sagging}
+    return Finding("note", "sag", text, tuple(sagging), values)
 
 
 def _torque(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
@@ -162,36 +208,42 @@ def _torque(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
             "magnitude; do not fit it"
         )
         yield Finding("warning", "torque", text, unsigned)
-    if spiky := [(s, t) for s, t in recorded if t.spikes.any()]:
-        # (sequences, n) N·m
-        height = np.array([np.maximum(-t.low, t.high) * (t.spikes > 0) for _, t in spiky])
-        k, i = np.unravel_index(height.argmax(), height.shape)
-        samples = sum(int(t.spikes.sum()) for _, t in spiky)
-        text = (
-            f"torque spikes: {samples} samples in {abbreviate([s.motion for s, _ in spiky])}; "
-            f"worst {height[k, i]:.2f} N·m on {robot.joint_names[i]} in {spiky[k][0].motion}"
-        )
-        values = {"samples": samples, "worst": height[k, i]}
-        yield Finding("warning", "torque", text, (robot.joint_names[i],), values)
+    yield from _spikes([(s, t) for s, t in recorded if t.spikes.any()], robot)
+
+
+def _spikes(spiky: list[tuple[Survey, Torque]], robot: RobotSpec) -> Iterator[Finding]:
+    """Report recordings with torque spikes, and the worst of these."""
+    if not spiky:
+        return
+    # (sequences, n) N·m
+    height = np.array([np.maximum(-t.low, t.high) * (t.spikes > 0) for _, t in spiky])
+    k, i = np.unravel_index(height.argmax(), height.shape)
+    samples = sum(int(t.spikes.sum()) for _, t in spiky)
+    text = (
+        f"torque spikes: {samples} samples in {abbreviate([s.motion for s, _ in spiky])}; "
+        f"worst {height[k, i]:.2f} N·m on {robot.joint_names[i]} in {spiky[k][0].motion}"
+    )
+    values = {"samples": samples, "worst": height[k, i]}
+    yield Finding("warning", "torque", text, (robot.joint_names[i],), values)
 
 
 def fast_lags(surveys: list[Survey], robot: RobotSpec) -> dict[str, Array]:
     """Return joint → lags in motions that command it at FAST_COMMAND_RAD_S or more, s; only joints
     that have any.
     """
-    lags = {
-        name: np.array(
-            [
-                s.delay[i]
-                for s in surveys
-                if s.speed[i] >= FAST_COMMAND_RAD_S
-                and np.isfinite(s.delay[i])
-                and np.isnan(s.copied_rows[i])
-            ]
-        )
-        for i, name in enumerate(robot.joint_names)
-    }
-    return {name: x for name, x in lags.items() if len(x)}
+    lags = {}
+    for i, name in enumerate(robot.joint_names):
+        known = [float(s.delay[i]) for s in surveys if _shows_fast_lag(s, i)]
+        if known:
+            lags[name] = np.array(known)
+    return lags
+
+
+def _shows_fast_lag(survey: Survey, i: int) -> bool:
+    """Return True if the lag of joint i is known, and of a fast motion."""
+    if survey.speed[i] < FAST_COMMAND_RAD_S:
+        return False
+    return bool(np.isfinite(survey.delay[i]) and np.isnan(survey.copied_rows[i]))
 
 
 def lag_values(lags: Array) -> dict[str, float]:

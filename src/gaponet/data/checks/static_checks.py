@@ -60,10 +60,8 @@ MIN_SHARE = 0.3  # of the weight that the command does not hold
 MIN_UNEXPLAINED = 0.02
 MIN_IMPROVEMENT = 8.0
 # of the sag that kp and the weight give: at a share of 1, and more per share below
-MAX_SAG = (
-    0.25,
-    2.5,
-)
+MAX_SAG = 0.25
+MAX_SAG_PER_SHARE = 2.5
 MIN_JOINTS_SHARE = 1 / 3  # of the joints that are judged
 
 
@@ -122,39 +120,49 @@ def static_checks(surveys: list[Survey], robot: RobotSpec, model: Gravity) -> It
     if findings:
         yield from findings
         return
-    while (
-        len(findings) < MAX_ODD_SEQUENCES
-        and (odd := _odd_sequence(surveys, robot, poses, judged)) is not None
-    ):
-        findings.append(odd[1])
-        poses = poses.only(poses.sequence != odd[0])
+    findings, poses = _odd_sequences(surveys, robot, poses, judged)
     findings = findings or _two_units(surveys, robot, poses, judged, min_size=1, min_joints=3)
     softness: dict[str, float] = {}
     for j in judged:
-        name = robot.joint_names[j]
         own = poses.of_joint(j)
         if len(own) < MIN_POSES:
             continue
+        name = robot.joint_names[j]
         fit = _fit(own)
         findings += _offset_and_scale(name, fit)
-        sag = float(np.sqrt(np.mean(own.columns[:, SOFTNESS] ** 2)))
-        soft = float(fit.x[SOFTNESS])
-        if sag > MIN_SAG_RAD and fit.significant[SOFTNESS] and soft > -SOFTNESS_BOUNDS[0]:
-            softness |= {} if SOFTNESS_BOUNDS[0] < soft < SOFTNESS_BOUNDS[1] else {name: soft}
+        soft = _odd_softness(own, fit)
+        if soft is not None:
+            softness[name] = soft
     if softness:
-        median = max(float(np.median(list(softness.values()))), 0.0)
-        fed = (
-            "" if median > 1 else ", or was a torque fed forward (feedforward_torque in logs.toml)"
-        )
-        text = (
-            f"{abbreviate(list(softness))} sag {median:.2f} times as far as the stated kp says: "
-            f"were these logs made at other gains, or with another payload than their label{fed}? "
-            "Import again with --kp or --payload-mass"
-        )
-        findings.append(Finding("warning", "gains", text, tuple(softness), {"softness": softness}))
+        findings.append(_wrong_gains(softness))
     yield from findings or [
         Finding("ok", "rests", "rests agree with gravity, gains and payload labels")
     ]
+
+
+def _odd_softness(poses: _Poses, fit: _Fit) -> float | None:
+    """Return how many times as far a joint sags as kp says, if that is odd and known."""
+    sag = float(np.sqrt(np.mean(poses.columns[:, SOFTNESS] ** 2)))
+    soft = float(fit.x[SOFTNESS])
+    low, high = SOFTNESS_BOUNDS
+    if low < soft < high:
+        return None
+    known = sag > MIN_SAG_RAD and fit.significant[SOFTNESS] and soft > -low
+    return soft if known else None
+
+
+def _wrong_gains(softness: dict[str, float]) -> Finding:
+    """Report joints that do not sag as kp says. softness: joint → sag over that of kp."""
+    median = max(float(np.median(list(softness.values()))), 0.0)
+    fed = ""
+    if median <= 1:
+        fed = ", or was a torque fed forward (feedforward_torque in logs.toml)"
+    text = (
+        f"{abbreviate(list(softness))} sag {median:.2f} times as far as the stated kp says: "
+        f"were these logs made at other gains, or with another payload than their label{fed}? "
+        "Import again with --kp or --payload-mass"
+    )
+    return Finding("warning", "gains", text, tuple(softness), {"softness": softness})
 
 
 def _collect(surveys: list[Survey], robot: RobotSpec, model: Gravity) -> _Poses:
@@ -230,11 +238,9 @@ def _offset_and_scale(name: str, fit: _Fit) -> Iterator[Finding]:
         yield Finding("warning", "scale", text, (name,), {"scale": scale})
     elif fit.significant[0] and abs(offset) > MIN_OFFSET_RAD:
         far = abs(offset) > FAR_OFFSET_RAD
-        verdict = (
-            "more than assembly leaves: a wrong zero or a missed homing"
-            if far
-            else "as assembly leaves it"
-        )
+        verdict = "as assembly leaves it"
+        if far:
+            verdict = "more than assembly leaves: a wrong zero or a missed homing"
         text = (
             f"{name} rests {offset * 1e3:+.0f} ± {fit.std[0] * 1e3:.0f} mrad off its command, sag "
             f"and stiction taken off: a constant offset, {verdict}; gaponet identify finds it, or "
@@ -283,46 +289,92 @@ def _two_units(
     """Do the recordings form two groups of `min_size` or more that rest apart in `min_joints` or
     more joints?
     """
-    # residual of each sequence and joint, rad
-    median = np.full((len(surveys), len(judged)), np.nan)
+    rests = _median_residuals(surveys, poses, judged)
+    known = np.flatnonzero(np.isfinite(rests).all(axis=1))
+    if len(known) <= 2:
+        return []
+    best = max(_groups(rests, known, min_size), key=lambda g: g.size, default=None)
+    if best is None or best.size[0] < min_joints:
+        return []
+    names = [robot.joint_names[j] for j, apart in zip(judged, best.apart, strict=True) if apart]
+    members = [surveys[i].motion for i in known if i in best.members]
+    others = [surveys[i].motion for i in known if i not in best.members]
+    text = (
+        f"{abbreviate(members)} rest up to {best.distance * 1e3:.0f} mrad from where "
+        f"{abbreviate(others)} do ({abbreviate(names)}): two robots under one name, or "
+        "zeros set in between? Import one part with another --unit-id"
+    )
+    values = {"apart": best.distance, "motions": members}
+    return [Finding("warning", "unit_id", text, tuple(names), values)]
+
+
+def _median_residuals(surveys: list[Survey], poses: _Poses, judged: list[int]) -> Array:
+    """Return how far each sequence rests from the fit to all, (sequences, judged) rad; NaN where
+    a joint has fewer than two poses.
+    """
+    medians = np.full((len(surveys), len(judged)), np.nan)
     for column, j in enumerate(judged):
         own = poses.of_joint(j)
         residual = own.error - own.columns @ _solve(own.columns, own.error)[0]
         for number in set(own.sequence.tolist()):
-            if len(part := residual[own.of_sequence(number)]) > 1:
-                median[number, column] = np.median(part)
-    known = np.flatnonzero(np.isfinite(median).all(axis=1))
-    best: tuple[int, float, list[str], Array] = (min_joints - 1, 0.0, [], known[:0])
-    for column in range(len(judged)) if len(known) > 2 else ():
-        order = known[np.argsort(median[known, column])]
+            part = residual[own.of_sequence(number)]
+            if len(part) > 1:
+                medians[number, column] = np.median(part)
+    return medians
+
+
+@dataclass(frozen=True)
+class _Groups:
+    """Two groups of sequences that rest apart."""
+
+    members: Array  # sequences of the first group
+    apart: Array  # judged joints in which they rest apart, (judged) bool
+    distance: float  # in any joint, rad
+
+    @property
+    def size(self) -> tuple[int, float]:
+        """Number of joints and distance: of several groups, the greatest is told."""
+        return int(self.apart.sum()), self.distance
+
+
+def _groups(rests: Array, known: Array, min_size: int) -> Iterator[_Groups]:
+    """Yield every cut of the sequences, ordered by where one joint rests, into two groups.
+
+    Args:
+        rests: (sequences, judged) rad.
+        known: Sequences that are cut.
+        min_size: Of a group.
+    """
+    for column in range(rests.shape[1]):
+        order = known[np.argsort(rests[known, column])]
         cuts = np.arange(min_size, len(order) + 1 - min_size)
-        centred = median[order] - median[order].mean(axis=0)  # their sum is zero, (N, judged)
+        centred = rests[order] - rests[order].mean(axis=0)  # their sum is zero, (N, judged)
         sums = centred.cumsum(axis=0)[cuts - 1]
         per = (1 / cuts + 1 / (len(order) - cuts))[:, None]
         within = np.sqrt(np.maximum((centred**2).sum(axis=0) - sums**2 * per, 0) / (len(order) - 2))
         gaps = np.abs(sums) * per
-        far = (gaps > MIN_GROUP_DISTANCE_RAD) & (
-            gaps > MIN_GROUP_SCATTERS * np.maximum(within, MIN_SCATTER_RAD)
+        least = np.maximum(
+            MIN_GROUP_DISTANCE_RAD, MIN_GROUP_SCATTERS * np.maximum(within, MIN_SCATTER_RAD)
         )
-        for cut, gap, apart in zip(cuts.tolist(), gaps.max(axis=1).tolist(), far, strict=True):
-            if (int(apart.sum()), gap) > best[:2]:
-                names = [robot.joint_names[j] for j, yes in zip(judged, apart, strict=True) if yes]
-                best = (len(names), gap, names, order[:cut])
-    if best[0] < min_joints:
-        return []
-    motions = [
-        [surveys[i].motion for i in known if (i in best[3]) == side] for side in (True, False)
-    ]
-    text = (
-        f"{abbreviate(motions[0])} rest up to {best[1] * 1e3:.0f} mrad from where "
-        f"{abbreviate(motions[1])} do ({abbreviate(best[2])}): two robots under one name, or "
-        "zeros set in between? Import one part with another --unit-id"
-    )
-    return [
-        Finding(
-            "warning", "unit_id", text, tuple(best[2]), {"apart": best[1], "motions": motions[0]}
-        )
-    ]
+        for cut, gap, apart in zip(cuts.tolist(), gaps, gaps > least, strict=True):
+            yield _Groups(order[:cut], apart, float(gap.max()))
+
+
+def _odd_sequences(
+    surveys: list[Survey], robot: RobotSpec, poses: _Poses, judged: list[int]
+) -> tuple[list[Finding], _Poses]:
+    """Return findings of the sequences that rest elsewhere than the others, and the poses without
+    these.
+    """
+    findings: list[Finding] = []
+    while len(findings) < MAX_ODD_SEQUENCES:
+        odd = _odd_sequence(surveys, robot, poses, judged)
+        if odd is None:
+            break
+        number, finding = odd
+        findings.append(finding)
+        poses = poses.only(poses.sequence != number)
+    return findings, poses
 
 
 def _odd_sequence(
@@ -336,43 +388,64 @@ def _odd_sequence(
     heaviest = max(s.entry.meta.payload_mass for s in surveys) or 1.0
     odd: tuple[float, int, Finding] | None = None
     for number in sorted(set(poses.sequence.tolist())):
-        residuals = []
-        slopes = []
-        apart = {}
+        rests = _Rests.of(number, by_joint, fits, robot)
+        judgement = _judge_sequence(surveys[number], heaviest, rests)
+        if judgement is None:
+            continue
+        mean_square, finding = judgement
+        if odd is None or mean_square > odd[0]:
+            odd = (mean_square, number, finding)
+    if odd is None:
+        return None
+    return odd[1], odd[2]
+
+
+@dataclass(frozen=True)
+class _Rests:
+    """Where one sequence rests, against what the others say.
+
+    Attributes:
+        residuals: One array per joint, in scatters of the joint.
+        slopes: Change of these with 1 kg more payload.
+        apart: Joint → distance, rad, of joints that rest far away.
+    """
+
+    residuals: list[Array]
+    slopes: list[Array]
+    apart: dict[str, float]
+
+    @classmethod
+    def of(
+        cls, number: int, by_joint: dict[int, _Poses], fits: dict[int, _Fit], robot: RobotSpec
+    ) -> _Rests:
+        """Compare the sequence of this number with the fits to the others."""
+        rests = cls([], [], {})
         for j, fit in fits.items():
-            own = by_joint[j].only(by_joint[j].of_sequence(number))
-            if len(own) < 3 or len(by_joint[j]) - len(own) < MIN_POSES:
+            every = by_joint[j]
+            own = every.only(every.of_sequence(number))
+            if len(own) < 3 or len(every) - len(own) < MIN_POSES:
                 continue
             x = fit.without[number]
             residual = own.error - own.columns @ x
-            residuals.append(residual / fit.scatter)
-            slopes.append(x[SOFTNESS] * own.per_kg / fit.scatter)
+            rests.residuals.append(residual / fit.scatter)
+            rests.slopes.append(x[SOFTNESS] * own.per_kg / fit.scatter)
             middle = float(np.median(residual))
             scatter = max(fit.scatter, 1.48 * float(np.median(np.abs(residual - middle))))
-            if abs(middle) > max(
-                MIN_UNIT_DISTANCE_RAD, SIGNIFICANCE * scatter / np.sqrt(len(residual))
-            ):
-                apart[robot.joint_names[j]] = middle
-        judged_sequence = _judge_sequence(surveys[number], heaviest, residuals, slopes, apart)
-        if judged_sequence is not None and (odd is None or judged_sequence[0] > odd[0]):
-            odd = (judged_sequence[0], number, judged_sequence[1])
-    return odd and odd[1:]
+            error = scatter / np.sqrt(len(residual))
+            if abs(middle) > max(MIN_UNIT_DISTANCE_RAD, SIGNIFICANCE * error):
+                rests.apart[robot.joint_names[j]] = middle
+        return rests
 
 
-def _judge_sequence(
-    s: Survey, heaviest: float, residuals: list[Array], slopes: list[Array], apart: dict[str, float]
-) -> tuple[float, Finding] | None:
+def _judge_sequence(s: Survey, heaviest: float, rests: _Rests) -> tuple[float, Finding] | None:
     """Return the mean square of a sequence's residuals and its finding, if another mass or unit
     explains them.
-
-    Args:
-        residuals, slopes: One array per joint, in scatters, and in scatters per kg of payload.
-        apart: Joint → distance from where the others rest, rad, of those that are far.
     """
-    if not residuals:
+    if not rests.residuals:
         return None
-    r = np.concatenate(residuals)
-    slope = np.concatenate(slopes)
+    r = np.concatenate(rests.residuals)
+    slope = np.concatenate(rests.slopes)
+    apart = rests.apart
     meta = s.entry.meta
     mean_square = float(r @ r) / len(r)
     power = float(slope @ slope)
@@ -406,19 +479,17 @@ def feedforward(surveys: list[Survey], robot: RobotSpec, model: Gravity) -> Iter
     recorded = [(s, s.torque) for s in surveys if s.torque is not None]
     if not recorded or unsigned_torque(recorded, robot):
         return
-    shares = {
-        name: x
-        for j, name in enumerate(robot.joint_names)
-        if (x := _shares(surveys, robot, model, j))
-    }
+    shares: dict[str, tuple[float, float, float]] = {}
+    for j, name in enumerate(robot.joint_names):
+        of_joint = _shares(surveys, robot, model, j)
+        if of_joint is not None:
+            shares[name] = of_joint
+    if not shares:
+        yield Finding("ok", "feed-forward", "too few rests with torque to tell")
+        return
     fed = {name: x for name, x in shares.items() if x[0] > 0}
-    if not shares or len(fed) < MIN_JOINTS_SHARE * len(shares):
-        what = (
-            "no torque beside the commands is seen at rest"
-            if shares
-            else "too few rests with torque to tell"
-        )
-        yield Finding("ok", "feed-forward", what)
+    if len(fed) < MIN_JOINTS_SHARE * len(shares):
+        yield Finding("ok", "feed-forward", "no torque beside the commands is seen at rest")
         return
     share, alone, both = np.clip(np.median(list(fed.values()), axis=0), 0, 1)
     text = (
@@ -441,22 +512,8 @@ def _shares(
     shares of its torque that PD alone and both explain; None with too few holds, or without a
     weight that changes.
     """
-    parts = [np.zeros((0, 5))]
-    for number, s in enumerate(surveys):
-        if s.holds is not None and (s.holds[:, 0] == joint).any():
-            own = s.holds[s.holds[:, 0] == joint]
-            meta = s.entry.meta
-            kp = max(float(robot.with_gains(*s.entry.meta.recorded_gains).kp[joint]), 1e-9)
-            weight = model(own[:, 3:], meta.payload_mass, meta.payload_side)[:, joint]
-            columns = (
-                np.full(len(own), number),
-                own[:, 2] / kp,
-                weight / kp,
-                own[:, 1],
-                own[:, 3 + joint],
-            )
-            parts.append(np.stack(columns, axis=1))
-    recording, torque, weight, error, qpos = np.concatenate(parts).T  # (k,); torques over kp, rad
+    # (k,); torques over kp, rad
+    recording, torque, weight, error, qpos = _holds_of(surveys, robot, model, joint).T
     numbers, fold = np.unique(recording, return_inverse=True)
     least = MIN_LOAD * robot.effort_limit[joint] / max(robot.kp[joint], 1e-9)
     if len(torque) < MIN_POSES or len(numbers) < MIN_RECORDINGS or np.std(weight) < least:
@@ -466,11 +523,30 @@ def _shares(
     # qpos: command and state may differ in scale
     _, _, alone = _explained(torque, fold, error, qpos)
     share, std, both = _explained(torque, fold, weight, error, qpos)
-    significant = share > max(MIN_SHARE, SIGNIFICANCE * std) and sag < MAX_SAG[0] + MAX_SAG[
-        1
-    ] * max(1 - share, 0.0)
+    max_sag = MAX_SAG + MAX_SAG_PER_SHARE * max(1 - share, 0.0)
+    significant = share > max(MIN_SHARE, SIGNIFICANCE * std) and sag < max_sag
     better = 1 - alone > max(MIN_UNEXPLAINED, MIN_IMPROVEMENT * (1 - both))
     return (share if significant and better else 0.0), alone, both
+
+
+def _holds_of(surveys: list[Survey], robot: RobotSpec, model: Gravity, joint: int) -> Array:
+    """Return the holds of a joint: number of the recording, torque over kp, weight over kp, command
+    − position, position, (k, 5) in rad.
+    """
+    parts = [np.zeros((0, 5))]
+    for number, survey in enumerate(surveys):
+        if survey.holds is None:
+            continue
+        own = survey.holds[survey.holds[:, 0] == joint]
+        if not len(own):
+            continue
+        meta = survey.entry.meta
+        kp = max(float(robot.with_gains(*meta.recorded_gains).kp[joint]), 1e-9)
+        weight = model(own[:, 3:], meta.payload_mass, meta.payload_side)[:, joint]
+        numbers = np.full(len(own), number)
+        columns = (numbers, own[:, 2] / kp, weight / kp, own[:, 1], own[:, 3 + joint])
+        parts.append(np.stack(columns, axis=1))
+    return np.concatenate(parts)
 
 
 def _explained(values: Array, fold: Array, *columns: Array) -> tuple[float, float, float]:

@@ -321,20 +321,14 @@ def _kind_of_command(sequence: Sequence) -> dict[str, Array]:
         q_power = (q**2).mean(axis=1)
         variance = np.maximum(q.var(axis=1), 1e-12)
         # other checks judge units, signs and names
-        for scale in (
-            1.0,
-            np.degrees(1),
-            np.radians(1),
-        ):
+        for scale in (1.0, np.degrees(1), np.radians(1)):
             square = scale**2 * u_power + q_power - 2 * scale * product
             distances.append((np.maximum(square, 0) / variance).min(axis=1))
         velocity.append(correlation(u, speed[:, lag:]))
     near = np.where(np.ptp(qpos, axis=1) > MOVING_RAD, np.sqrt(np.min(distances, axis=0)), np.nan)
-    torque = (
-        np.full(near.shape, np.nan)
-        if sequence.tau is None
-        else correlation(ctrl, sequence.tau[::every].T)
-    )
+    torque = np.full(near.shape, np.nan)
+    if sequence.tau is not None:
+        torque = correlation(ctrl, sequence.tau[::every].T)
     return {
         "command_distance": near,
         "velocity_correlation": np.max(velocity, axis=0),
@@ -455,20 +449,14 @@ def _holds(sequence: Sequence) -> Array | None:
     rests = range_before(sequence.ctrl, rows) < HELD_COMMAND_RAD
     rests &= range_before(sequence.qpos, max(2, rows // 4)) < STANDSTILL_RAD
     rests[:rows] = False
-    stretches = [
-        (j, run)
-        for j, mask in enumerate(rests.T)
-        for run in _runs(mask)
-        if run.stop - run.start > least
-    ]
-    means = [
-        [x[run].mean(axis=0) for x in (sequence.ctrl, sequence.qpos, sequence.tau)]
-        for _, run in stretches
-    ]
-    holds = [
-        [j, ctrl[j] - qpos[j], tau[j], *qpos]
-        for (j, _), (ctrl, qpos, tau) in zip(stretches, means, strict=True)
-    ]
+    holds = []
+    for j, mask in enumerate(rests.T):
+        for run in _runs(mask):
+            if run.stop - run.start > least:
+                ctrl = sequence.ctrl[run].mean(axis=0)
+                qpos = sequence.qpos[run].mean(axis=0)
+                tau = sequence.tau[run].mean(axis=0)
+                holds.append([j, ctrl[j] - qpos[j], tau[j], *qpos])
     return np.reshape(holds, (-1, 3 + rests.shape[1])).astype(float)
 
 

@@ -57,9 +57,7 @@ def _timing(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     complete = [s for s in comparable if not s.missing_samples] or comparable
     unknown = max(s.uneven_ms for s in complete) * UNEVEN_ROWS_SHARE / 1e3  # s
     findings = [*_late_recordings(comparable, unknown)]
-    odd = {recording for f in findings for recording in f.values["recordings"]}
-    usual = [s.entry.id not in odd for s in complete]
-    common = Response.common([s.response for s in complete], usual)
+    common = _common_response(complete, findings)
     onset = _usual_onset(common)
     if _moves_early(common, onset, unknown, step):
         text = (
@@ -74,6 +72,15 @@ def _timing(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     if unknown < step:
         findings += _averaged(complete)
     yield from findings or [Finding("ok", "timing", "commands and states have the same clock")]
+
+
+def _common_response(surveys: list[Survey], late: list[Finding]) -> CommonResponse:
+    """Return the common response of the recordings that were not found to be late."""
+    odd = set()
+    for finding in late:
+        odd.update(finding.values["recordings"])
+    usual = [s.entry.id not in odd for s in surveys]
+    return Response.common([s.response for s in surveys], usual)
 
 
 def _usual_onset(common: CommonResponse) -> float:
@@ -172,35 +179,46 @@ def _late_recordings(surveys: list[Survey], unknown: float) -> Iterator[Finding]
     period = float(np.median([1 / s.rate_hz for s in surveys]))
     limit = max(MIN_SHIFT_S, SHIFT_SCATTERS * scatter, unknown, MIN_SHIFT_PERIODS * period)
     delays = _relative_delays(surveys)
-    far = [
-        (s, late)
-        for s, late, delay in zip(surveys, shifts.tolist(), delays.tolist(), strict=True)
-        if abs(late) > limit
-        and max(s.speed) >= FAST_COMMAND_RAD_S  # stiction delays slow motions
-        and _agree(late, delay)
-    ]
-    for word, group in (
-        ("later", [f for f in far if f[1] > 0]),
-        ("sooner", [f for f in far if f[1] < 0]),
-    ):
-        single = len(group) < MIN_RECORDINGS
-        for part in [[one] for one in group] if single else [group]:
-            labels = [
-                f"{s.motion} ({s.entry.meta.unit_id}, {s.entry.meta.payload_mass:g} kg)"
-                for s, _ in part
-            ]
-            ms = sorted(abs(late) * 1e3 for _, late in part)
-            by = f"{ms[0]:.0f} ms" if single else f"{ms[0]:.0f} to {ms[-1]:.0f} ms"
-            text = (
-                f"{abbreviate(labels)} {'follows its' if single else 'follow their'} commands "
-                f"{by} {word} than the other recordings: clocks of command and state that are "
-                "apart, or another servo; leave them out if it is the clocks"
-            )
-            values = {
-                "recordings": [s.entry.id for s, _ in part],
-                "late_s": [late for _, late in part],
-            }
-            yield Finding("warning", "lag", text, (), values)
+    far: list[tuple[Survey, float]] = []
+    for survey, late, delay in zip(surveys, shifts.tolist(), delays.tolist(), strict=True):
+        fast = max(survey.speed) >= FAST_COMMAND_RAD_S  # stiction delays slow motions
+        if abs(late) > limit and fast and _agree(late, delay):
+            far.append((survey, late))
+    yield from _shifted("later", [(s, late) for s, late in far if late > 0])
+    yield from _shifted("sooner", [(s, late) for s, late in far if late < 0])
+
+
+def _shifted(word: str, group: list[tuple[Survey, float]]) -> Iterator[Finding]:
+    """Report recordings that follow later or sooner by some s: a few each by itself, many as
+    one.
+    """
+    if len(group) >= MIN_RECORDINGS:
+        yield _shift_finding(word, group)
+        return
+    for one in group:
+        yield _shift_finding(word, [one])
+
+
+def _shift_finding(word: str, group: list[tuple[Survey, float]]) -> Finding:
+    labels = []
+    for survey, _ in group:
+        meta = survey.entry.meta
+        labels.append(f"{meta.motion} ({meta.unit_id}, {meta.payload_mass:g} kg)")
+    ms = sorted(abs(late) * 1e3 for _, late in group)
+    follow = "follow their"
+    by = f"{ms[0]:.0f} to {ms[-1]:.0f} ms"
+    if len(group) == 1:
+        follow = "follows its"
+        by = f"{ms[0]:.0f} ms"
+    text = (
+        f"{abbreviate(labels)} {follow} commands {by} {word} than the other recordings: clocks of "
+        "command and state that are apart, or another servo; leave them out if it is the clocks"
+    )
+    values = {
+        "recordings": [survey.entry.id for survey, _ in group],
+        "late_s": [late for _, late in group],
+    }
+    return Finding("warning", "lag", text, (), values)
 
 
 def _relative_delays(surveys: list[Survey]) -> Array:

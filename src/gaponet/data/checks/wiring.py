@@ -15,10 +15,7 @@ from gaponet.robot.spec import RobotSpec
 
 MIN_COMMAND_RAD = 0.05  # a joint with a smaller command range shows neither order, sign nor unit
 # a loaded joint falls short of its command, or passes it if its load is on top
-SLOPE_BOUNDS = (
-    0.5,
-    1.25,
-)
+SLOPE_BOUNDS = (0.5, 1.25)
 # of a swap that shows in several motions
 MAX_OWN_CORRELATION = 0.8
 MIN_OTHER_CORRELATION = 0.95
@@ -28,10 +25,7 @@ MIN_KIND_CORRELATION = 0.7  # of the command with what else it may be
 # correlation of velocities, from which commands are positions that a weak motor does not reach
 MIN_FOLLOWING = 0.75
 # measured over commanded range; between 0.03 and 0.1 a joint may be stuck
-RATIO_BOUNDS = (
-    0.03,
-    10.0,
-)
+RATIO_BOUNDS = (0.03, 10.0)
 QVEL_RATIO_BOUNDS = (0.5, 2.0)
 MIN_WIDEST_COMMAND_RAD = 0.12
 MAX_READ_AS_DEGREES_RAD = np.radians(3.3)
@@ -66,11 +60,7 @@ def _order(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
                 j = int(others[s.follows[i, others].argmax()])
                 candidates[int(i), j].append(float(s.follows[i, j]))
     candidates |= _swapped_pairs(surveys, motions)
-    swapped = {
-        pair: evidence
-        for pair, evidence in candidates.items()
-        if 2 * len(evidence) >= motions[pair[0]]
-    }
+    swapped = {p: found for p, found in candidates.items() if 2 * len(found) >= motions[p[0]]}
     for (own, other), correlations in swapped.items():
         a = robot.joint_names[own]
         b = robot.joint_names[other]
@@ -85,11 +75,8 @@ def _order(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     if idle:
         level = "warning" if set(idle) & set(robot.operated) else "note"
         text = f"no motion commands {abbreviate(list(idle))} over more than {MIN_COMMAND_RAD:g} rad"
-        text += (
-            ", read as degrees; were they logged in rad?"
-            if set(idle) & set(_read_as_degrees(surveys))
-            else ""
-        )
+        if set(idle) & set(_read_as_degrees(surveys)):
+            text += ", read as degrees; were they logged in rad?"
         yield Finding(level, "order", f"{text}: nothing can be learned there", idle)
     if not swapped:
         yield Finding("ok", "order", "each command moves the joint of its name")
@@ -203,19 +190,24 @@ def _copied(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
             usual.append(i)
     early = [s for s in surveys if _moves_first(s, usual)]
     if early:
-        text = (
-            f"joints move before their commands in {abbreviate([s.motion for s in early])}, not "
-            "in other recordings: command and state are swapped there; leave these out, or import "
-            "them with the columns exchanged"
-        )
-        yield Finding("error", "copied", text, (), {"recordings": [s.entry.id for s in early]})
+        yield _swapped_recordings(early)
     with_torque = all(s.torque is not None for s in surveys)
     for rows, motions in copies.items():
         yield _copy(rows, motions, with_torque)
 
 
+def _swapped_recordings(early: list[Survey]) -> Finding:
+    """Report recordings in which joints move before their commands."""
+    text = (
+        f"joints move before their commands in {abbreviate([s.motion for s in early])}, not "
+        "in other recordings: command and state are swapped there; leave these out, or import "
+        "them with the columns exchanged"
+    )
+    return Finding("error", "copied", text, (), {"recordings": [s.entry.id for s in early]})
+
+
 def _leads(surveys: list[Survey], i: int) -> list[float]:
-    """Return by how much joint i moves before its command, s, in the recordings in which it does."""
+    """Return by how much joint i moves before its command, s, where it does."""
     return [float(s.lead[i]) for s in surveys if np.isfinite(s.lead[i])]
 
 
@@ -354,11 +346,10 @@ def _small_commands(surveys: list[Survey]) -> Iterator[Finding]:
 
 def _units(surveys: list[Survey]) -> dict[str, str]:
     """Return joint → unit from which its positions were converted."""
-    return {
-        name: unit
-        for s in surveys
-        for name, unit in s.entry.meta.notes.get("converted_from", {}).items()
-    }
+    units: dict[str, str] = {}
+    for s in surveys:
+        units |= s.entry.meta.notes.get("converted_from", {})
+    return units
 
 
 def _read_as_degrees(surveys: list[Survey]) -> tuple[str, ...]:

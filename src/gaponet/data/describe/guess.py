@@ -30,13 +30,14 @@ from gaponet.robot.spec import RobotSpec
 # later one.
 WORDS = {
     FEEDFORWARD: ("ff", "feedforward", "ffwd"),
-    "ctrl": ("ctrl", "cmd", "command", "commands", "commanded", "des", "desired", "d", "target", "targets", "goal",
-             "goals", "ref", "reference", "action", "actions", "qaction", "setpoint", "sp"),
+    "ctrl": ("ctrl", "cmd", "command", "commands", "commanded", "des", "desired", "d", "target",
+             "targets", "goal", "goals", "ref", "reference", "action", "actions", "qaction",
+             "setpoint", "sp"),
     "qvel": ("qvel", "vel", "velocity", "velocities", "dq", "qd", "speed", "dof_vel"),
     "tau": ("tau", "torque", "torques", "effort", "trq", "tau_est", "current"),
     "temperature": ("temperature", "temp"),
-    "qpos": ("qpos", "pos", "position", "positions", "q", "meas", "measured", "actual", "act", "state",
-             "states", "present", "angle", "enc"),
+    "qpos": ("qpos", "pos", "position", "positions", "q", "meas", "measured", "actual", "act",
+             "state", "states", "present", "angle", "enc"),
 }  # fmt: skip
 CLOCKS = (
     "time",
@@ -69,10 +70,7 @@ def guess_logs(
         raise LogError("no recording found")
     family = _family([Path(r.source).name for r in recordings])
     if family:
-        by_kind = {
-            kind: next(r for r in recordings if _fits(Path(r.source).name, pattern))
-            for kind, pattern in family.items()
-        }
+        by_kind = {kind: _first_of(recordings, pattern) for kind, pattern in family.items()}
         if "qpos" in _channels(by_kind["qpos"], robot) and "ctrl" in family:
             return _guess_two_files(by_kind, family, robot, fmt, known)
         return _guess_family(by_kind, family, robot, fmt)
@@ -80,21 +78,26 @@ def guess_logs(
     if topics:
         files = {kind: Path(recording.source).name for kind, recording in topics.items()}
         return _guess_two_files(topics, files, robot, fmt, known)
+    return _guess_one_file(recordings, robot, fmt, known)
+
+
+def _guess_one_file(
+    recordings: list[RawRecording], robot: RobotSpec, fmt: str, known: dict[str, Any]
+) -> str:
+    """The text of a logs.toml for recordings whose signals are in one file each."""
     first = recordings[0]
-    specified = dict(known) | {k: v for k, v in first.default.items() if k not in known}
+    specified: dict[str, Any] = dict(first.default) | known
+    channels = _channels(first, robot)
+    for channel in WORDS:
+        if channel in specified and _values(first, specified[channel]) is not None:
+            channels[channel] = specified[channel]
+    joints = _joints(first, channels)
     lines = [
-        f"# {fmt}; the first recording: {first.where or first.source}",
+        f"# {fmt}; the first recording: {first.place}",
         f"# its columns: {first.shown(40)}",
         "# Lines with a ? are guesses: look at them.",
         "",
     ]
-    stated = {
-        c: specified[c]
-        for c in WORDS
-        if c in specified and _values(first, specified[c]) is not None
-    }
-    channels = _channels(first, robot) | stated
-    joints = _joints(first, channels)
     lines += _clock(first, specified)
     lines += _positions(first, channels)
     lines += [_channel_line(channel, name, lines) for channel, name in channels.items()]
@@ -103,19 +106,27 @@ def guess_logs(
             lines.append(f'# {need} = "…"          ? none of the names looks like it')
     lines += _names(channels, joints, robot)
     lines += _names_of_commands(_joints(first, channels, "ctrl"), joints, robot)
-    repeated = _repeated(recordings, channels.get("ctrl", ""))
-    lines += [
+    lines += _labels([r.name for r in recordings], _repeated(recordings, channels.get("ctrl", "")))
+    return "\n".join(lines) + "\n"
+
+
+def _labels(names: list[str], repeated: bool) -> list[str]:
+    """Lines of what the names of the recordings say.
+
+    Args:
+        repeated: A final number in the names counts repetitions.
+    """
+    more = ", …" if len(names) > 5 else ""
+    return [
         "",
         "# What the names of the recordings say, or a sheet (file, motion, payload, unit, rep):",
-        "# names here: "
-        f"{', '.join(r.name for r in recordings[:5])}{', …' if len(recordings) > 5 else ''}",
-        f"motion = {_text(_pattern([r.name for r in recordings], repeated))}",
+        f"# names here: {', '.join(names[:5])}{more}",
+        f"motion = {_text(_pattern(names, repeated))}",
         '# manifest = "sheet.csv"',
         '# unit = "…"',
         "# payload = 0.0        # kg",
         "# kp = …               # N·m/rad while recording; default: robot.toml's",
     ]
-    return "\n".join(lines) + "\n"
 
 
 def _family(files: list[str]) -> dict[str, str]:
@@ -124,25 +135,33 @@ def _family(files: list[str]) -> dict[str, str]:
 
     Empty where files are recordings of their own.
     """
-    names: dict[str, dict[str, str]] = defaultdict(dict)  # {name} → kind → pattern
+    by_name: dict[str, dict[str, str]] = defaultdict(dict)  # {name} → kind → pattern
     for file in files:
         stem, _, suffix = file.rpartition(".")
-        words = [m[0] for m in re.finditer(r"[A-Z]?[a-z]+|[A-Z]+", stem)]
-        known = [w for w in words if _kind(w) or w.lower() in CLOCKS]
-        if not known:
+        name = _without_kind(stem)
+        if name is None:
             return {}
-        name = stem
-        for word in known:
-            name = re.sub(rf"[-_. ]?{word}", "", name, count=1)
-        name = name.strip("-_. ")
-        kind = _kind(stem) or "time"
         pattern = stem.replace(name, "{name}", 1) if name else stem
-        names[name][kind] = f"{pattern}.{suffix}"
-    families = list(names.values())
+        by_name[name][_kind(stem) or "time"] = f"{pattern}.{suffix}"
+    families = list(by_name.values())
     kinds = families[0]
     # the last may be cut off
     alike = all(family.keys() == kinds.keys() for family in families[:-1])
     return kinds if alike and "qpos" in kinds and len(kinds) > 1 else {}
+
+
+def _without_kind(stem: str) -> str | None:
+    """Return what is left of a file's name without words for channels and clocks; None if it has no
+    such word.
+    """
+    words = re.findall(r"[A-Z]?[a-z]+|[A-Z]+", stem)
+    known = [word for word in words if _kind(word) or word.lower() in CLOCKS]
+    if not known:
+        return None
+    name = stem
+    for word in known:
+        name = re.sub(rf"[-_. ]?{word}", "", name, count=1)
+    return name.strip("-_. ")
 
 
 def _guess_family(
@@ -175,7 +194,9 @@ def _guess_family(
         ]
     else:
         lines.append("rate = 50.0  # ? Hz: no file holds times")
-    unit = "rad" if span <= 7 else "ticks" if look_like_ticks(values) else "deg"
+    unit = "rad"
+    if span > 7:
+        unit = "ticks" if look_like_ticks(values) else "deg"
     lines += [
         f'position_unit = "{unit}"  # ? values up to {span:.3g}',
         'ctrl = "{joint}"',
@@ -255,9 +276,14 @@ def _numbered(recording: RawRecording) -> str:
     return max(numbered, key=lambda pattern: numbered[pattern], default="…")
 
 
-def _fits(file: str, pattern: str) -> bool:
+def _first_of(recordings: list[RawRecording], pattern: str) -> RawRecording:
+    """Return the first recording whose file fits a pattern with {name}."""
     before, _, after = pattern.partition("{name}")
-    return file.startswith(before) and file.endswith(after)
+    for recording in recordings:
+        file = Path(recording.source).name
+        if file.startswith(before) and file.endswith(after):
+            return recording
+    raise LogError(f"no file looks like {pattern}")
 
 
 def _time_unit(stamps: Array) -> str:
@@ -344,13 +370,14 @@ def _patterns(name: str) -> list[tuple[str, str]]:
     """
     words = list(re.finditer(r"[A-Za-z0-9]+", name))
     matches = []
-    for known, run in groupby(
-        words, lambda m: any(m[0].lower() in words for words in WORDS.values())
-    ):
-        first, *_, last = *(together := list(run)), together[-1]
+    for known, run in groupby(words, lambda word: _is_word(word[0])):
+        together = list(run)
+        first = together[0]
+        last = together[-1]
         if known and last.end() < len(name):
             start = last.end() + 1
-            joint, closing = re.fullmatch(r"(.*?)([^A-Za-z0-9]*)", name[start:]).groups()  # type: ignore[union-attr]
+            joint = re.sub(r"[^A-Za-z0-9]*$", "", name[start:])
+            closing = name[start + len(joint) :]
             if joint:
                 matches.append((name[:start] + "{joint}" + closing, joint))
         if known and first.start():
@@ -362,6 +389,10 @@ def _patterns(name: str) -> list[tuple[str, str]]:
     return matches or [(name, "0")]
 
 
+def _is_word(text: str) -> bool:
+    return any(text.lower() in words for words in WORDS.values())
+
+
 def _joints(recording: RawRecording, channels: dict[str, str], channel: str = "qpos") -> list[str]:
     """Names of the joints as a channel has them, in its order; digits where it has none."""
     pattern = channels.get(channel) or channels.get("ctrl")
@@ -371,40 +402,44 @@ def _joints(recording: RawRecording, channels: dict[str, str], channel: str = "q
         return list(recording.signals.get(pattern) or ("0",))
     before, after = map(re.escape, pattern.split("{joint}"))
     kind = channel if channel in channels else "ctrl"
-    return [
-        m[1]
-        for c in recording.columns
-        if (m := re.fullmatch(f"{before}(.+?){after}", c)) and _kind(c) == kind
-    ]
+    joints = []
+    for column in recording.columns:
+        match = re.fullmatch(f"{before}(.+?){after}", column)
+        if match and _kind(column) == kind:
+            joints.append(match[1])
+    return joints
 
 
 def _names(channels: dict[str, str], joints: list[str], robot: RobotSpec) -> list[str]:
     """joints and [names]."""
     if not joints:
         return []
-    if all(j.isdigit() for j in joints) and "{joint}" not in (
-        channels.get("qpos") or channels["ctrl"]
-    ):
-        n = len(joints)
-        own = list(robot.joint_names[:n]) + [""] * (n - len(robot.joint_names))
-        question = (
-            "the robot's order: is it the log's?"
-            if n >= len(robot.joint_names)
-            else "which joints are these?"
-        )
-        return [f"joints = {json.dumps(own)}  # ? {question}"]
+    pattern = channels.get("qpos") or channels["ctrl"]
+    if "{joint}" not in pattern and all(joint.isdigit() for joint in joints):
+        return [_joints_in_order(len(joints), robot)]
     strange = [joint for joint in joints if not _is_joint(joint, robot)]
     if not strange:
         return []
     left = [j for j in robot.joint_names if j not in joints]
-    in_order = len(left) == len(strange)
-    lines = [
-        "",
-        "[names]  # ? the log's = the robot's" + (", in the order of both" if in_order else ""),
-    ]
-    for i, joint in enumerate(strange):
-        lines.append(f"{_text(joint)} = {_text(left[i] if in_order else '…')}")
+    if len(left) == len(strange):
+        heading = "[names]  # ? the log's = the robot's, in the order of both"
+    else:
+        heading = "[names]  # ? the log's = the robot's"
+        left = ["…"] * len(strange)
+    lines = ["", heading]
+    for theirs, ours in zip(strange, left, strict=True):
+        lines.append(f"{_text(theirs)} = {_text(ours)}")
     return lines
+
+
+def _joints_in_order(n: int, robot: RobotSpec) -> str:
+    """The line of joints for n columns without names."""
+    given = list(robot.joint_names[:n])
+    missing = n - len(given)
+    question = "the robot's order: is it the log's?"
+    if n < len(robot.joint_names):
+        question = "which joints are these?"
+    return f"joints = {json.dumps(given + [''] * missing)}  # ? {question}"
 
 
 def _names_of_commands(told: list[str], joints: list[str], robot: RobotSpec) -> list[str]:
@@ -494,11 +529,17 @@ def _repeated(recordings: list[RawRecording], ctrl: str) -> bool:
     """Return True if the first two recordings have equal commands: a final number in their names
     counts repetitions.
     """
-    commands = [_values(recording, ctrl) for recording in recordings[:2]]
-    if len(commands) < 2 or any(x is None for x in commands):
+    if len(recordings) < 2:
         return True
-    a, b = (np.nan_to_num(x[: min(map(len, commands))]) for x in commands)  # type: ignore[arg-type, index]
-    return bool(np.abs(a - b).mean() <= APART * np.abs(a - a.mean(axis=0)).mean())
+    first = _values(recordings[0], ctrl)
+    second = _values(recordings[1], ctrl)
+    if first is None or second is None:
+        return True
+    rows = min(len(first), len(second))
+    first = np.nan_to_num(first[:rows])
+    second = np.nan_to_num(second[:rows])
+    own_motion = np.abs(first - first.mean(axis=0)).mean()
+    return bool(np.abs(first - second).mean() <= APART * own_motion)
 
 
 def _pattern(names: list[str], repeated: bool) -> str:

@@ -25,44 +25,57 @@ def resolve_all(
         JointMismatchError: A name is no joint of this robot, or two names are one joint.
     """
     matched = []
-    strange = []
+    errors: dict[str, JointMismatchError] = {}
     for name in names:
         try:
             matched.append(robot.resolve(name, where, joint_map))
         except JointMismatchError as error:
-            strange.append((name, error))
+            errors[name] = error
+    strange = [name for name in names if name in errors]
     if len(strange) == 1:
-        raise strange[0][1]
-    kin = (
-        [] if matched or joint_map else [name for name in packaged_robots() if _all_of(name, names)]
-    )
-    if strange and kin:
-        raise JointMismatchError(
-            f"{where} names joints {', '.join(names)}: no joint of robot '{robot.name}', all of "
-            f"robot '{kin[0]}': give that one (import --robot {kin[0]}; start {kin[0]} LOGS)"
-        )
+        raise errors[strange[0]]
     if strange:
+        if not matched and not joint_map:
+            _refuse_joints_of_another_robot(names, robot, where)
         free = [j for j in robot.joint_names if j not in matched]
-        maps = []
-        for name, _ in strange:
-            close = difflib.get_close_matches(name.split("/")[-1], free, n=1, cutoff=0.5)
-            maps.append(f"--map {name}={close[0] if close else '…'}")
-            free = [j for j in free if j not in close]
-        left = (
-            f" (… is one of {', '.join(free)})"
-            if free and any(m.endswith("=…") for m in maps)
-            else ""
-        )
-        raise JointMismatchError(
-            f"{where} names joints {', '.join(n for n, _ in strange)}, which robot '{robot.name}' "
-            f"does not have. Map them with {' '.join(maps)}{left}, or under [names] in logs.toml; "
-            'what is no joint of this robot is left out by ignore = ["NAME", …] there'
-        )
+        raise _unknown_joints(strange, free, robot, where)
     if len(set(matched)) != len(matched):
         raise JointMismatchError(
             f"{where}: two names map to one joint: {', '.join(matched)}; mend --map or [names]"
         )
     return matched
+
+
+def _refuse_joints_of_another_robot(names: Sequence[str], robot: RobotSpec, where: str) -> None:
+    for other in packaged_robots():
+        if _all_of(other, names):
+            raise JointMismatchError(
+                f"{where} names joints {', '.join(names)}: no joint of robot '{robot.name}', all "
+                f"of robot '{other}': give that one (import --robot {other}; start {other} LOGS)"
+            )
+
+
+def _unknown_joints(
+    strange: list[str], free: list[str], robot: RobotSpec, where: str
+) -> JointMismatchError:
+    """Return the error that names are no joints of the robot, with a proposal for each.
+
+    Args:
+        free: Joints that no name means.
+    """
+    maps = []
+    for name in strange:
+        close = difflib.get_close_matches(name.split("/")[-1], free, n=1, cutoff=0.5)
+        maps.append(f"--map {name}={close[0] if close else '…'}")
+        free = [j for j in free if j not in close]
+    left = ""
+    if free and any(one.endswith("=…") for one in maps):
+        left = f" (… is one of {', '.join(free)})"
+    return JointMismatchError(
+        f"{where} names joints {', '.join(strange)}, which robot '{robot.name}' "
+        f"does not have. Map them with {' '.join(maps)}{left}, or under [names] in logs.toml; "
+        'what is no joint of this robot is left out by ignore = ["NAME", …] there'
+    )
 
 
 def _all_of(name: str, joints: Sequence[str]) -> bool:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import csv
 import io
 import re
-from collections.abc import Iterable
+from collections.abc import Mapping
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -34,8 +34,8 @@ FIELDS = {
     "motion": ("motion", r".+"), "unit": ("unit_id", r".+"), "side": ("payload_side", r"[^_/]+"),
     "payload": ("payload_mass", r"\d+(?:[.p]\d+)?"), "rep": ("repetition", r"\d+"),
     "level": ("level", r"[a-z_]+"), "virtual": ("virtual", r"yes|no"),
-    "kp": ("kp", r"\d+(?:[.p]\d+)?"), "kd": ("kd", r"\d+(?:[.p]\d+)?"), "estimated": ("estimated", r".+"),
-    "leave_out": ("leave_out", r"yes|no"), "": ("", r".+?"),
+    "kp": ("kp", r"\d+(?:[.p]\d+)?"), "kd": ("kd", r"\d+(?:[.p]\d+)?"),
+    "estimated": ("estimated", r".+"), "leave_out": ("leave_out", r"yes|no"), "": ("", r".+?"),
 }  # fmt: skip
 # of a pattern's words that match anything: each more makes a name that does not fit slower to
 # refuse
@@ -96,9 +96,10 @@ class LogsFile(TypedDict, total=False):
 
 def read_logs_file(src: Path, given: str | Path | None = None) -> tuple[LogsFile, Path | None]:
     """Read logs.toml, the given one or that beside the logs; return its contents and path."""
-    beside = (src if src.is_dir() else src.parent) / NAME
-    file = Path(given) if given is not None else beside if beside.is_file() else None
-    if file is None:
+    file = (src if src.is_dir() else src.parent) / NAME
+    if given is not None:
+        file = Path(given)
+    elif not file.is_file():
         return LogsFile(), None
     specified = read_toml(LogsFile, file, UsageError, f"docs/logs.md lists the fields; {HINT}")
     if "calibration" in specified:
@@ -118,20 +119,16 @@ class Naming:
                 f'{self.where}: manifest = "{specified["manifest"]}": it lies beside logs.toml; '
                 "give its name"
             )
-        self.sheet = (
-            _read_sheet((where or Path()).parent / specified["manifest"])
-            if "manifest" in specified
-            else None
-        )
+        self.sheet: list[dict[str, str]] | None = None
+        if "manifest" in specified:
+            self.sheet = _read_sheet((where or Path()).parent / specified["manifest"])
         self.unused = set(range(len(self.sheet or ())))
-        stated = {
-            k: specified[k] for k in ("unit", "payload", "side", "kp", "kd") if k in specified
-        }
-        self.all = {
-            FIELDS[k][0]: v
-            for k, v in stated.items()
-            if k in ("unit", "side") or not isinstance(v, str)
-        }
+        self.all: dict[str, Any] = {}
+        for word in ("unit", "payload", "side", "kp", "kd"):
+            value = specified.get(word)
+            is_array = word in ("kp", "kd") and isinstance(value, str)  # a name: it says no number
+            if value is not None and not is_array:
+                self.all[FIELDS[word][0]] = value
 
     def of(self, name: str, path: str) -> dict[str, Any]:
         """Fields of SequenceMeta for a recording called `name` at a path relative to the logs."""
@@ -149,22 +146,21 @@ class Naming:
                 facts, _fields(match.groupdict(), path), path, f"logs.toml and {name}"
             )
         if self.sheet is not None:
-            rows = [
-                i
-                for i, row in enumerate(self.sheet)
-                if any(
-                    fnmatchcase(word, _stem(row["file"]))
-                    for word in (name, path, path.split("#")[0])
-                )
-            ]
+            words = (name, path, path.split("#")[0])
+            rows = []
+            for i, row in enumerate(self.sheet):
+                pattern = _stem(row["file"])
+                if any(fnmatchcase(word, pattern) for word in words):
+                    rows.append(i)
             if len(rows) != 1:
                 raise LogError(
                     f"{path}: {len(rows) or 'no'} rows of the manifest of {self.where} name it; "
                     f"one must: write {name} under file"
                 )
             self.unused -= set(rows)
-            row = _fields({k: v for k, v in self.sheet[rows[0]].items() if k != "file"}, path)
-            facts |= _agreeing(facts, row, path, "logs.toml (or a name) and the manifest")
+            stated = {k: v for k, v in self.sheet[rows[0]].items() if k != "file"}
+            both = "logs.toml (or a name) and the manifest"
+            facts |= _agreeing(facts, _fields(stated, path), path, both)
         return facts
 
     def require_all_used(self) -> None:
@@ -203,18 +199,17 @@ def _pattern(text: str | None, where: str) -> tuple[re.Pattern[str] | None, bool
     seen = set()
     loose = 0
     for literal, word, brace in re.findall(r"([^{}]+)|\{(\w*)(?::[^{}]*)?\}|([{}])", text):
-        if brace or (not literal and (word not in FIELDS or (word and word in seen))):
+        if literal:
+            parts.append(re.escape(literal))
+            continue
+        if brace or word not in FIELDS or (word and word in seen):
             known = ", ".join("{" + k + "}" for k in FIELDS)
             raise UsageError(f'{where}: motion = "{text}": use each of {known} at most once')
         seen.add(word)
-        loose += not literal and FIELDS[word][1].startswith(".+")
-        parts.append(
-            re.escape(literal)
-            if literal
-            else f"(?P<{word}>{FIELDS[word][1]})"
-            if word
-            else FIELDS[""][1]
-        )
+        expression = FIELDS[word][1]
+        if expression.startswith(".+"):
+            loose += 1
+        parts.append(f"(?P<{word}>{expression})" if word else expression)
     if loose > MOST_LOOSE:
         raise UsageError(
             f'{where}: motion = "{text}": at most {MOST_LOOSE} words may be of any text; use a '
@@ -223,7 +218,7 @@ def _pattern(text: str | None, where: str) -> tuple[re.Pattern[str] | None, bool
     return re.compile("".join(parts)), "/" in text
 
 
-def _fields(stated: dict[str, str], where: str) -> dict[str, Any]:
+def _fields(stated: Mapping[str, str | None], where: str) -> dict[str, Any]:
     """Words and their texts → fields of SequenceMeta; kp.<joint> becomes {"kp": {joint:
     number}}.
     """
@@ -233,28 +228,37 @@ def _fields(stated: dict[str, str], where: str) -> dict[str, Any]:
             continue
         kind, _, joint = word.partition(".")
         field = FIELDS[kind][0]
-        value: Any = text.strip()
-        if field in NUMBERS:
-            try:
-                value = float(value.replace("p", "."))
-                if not (
-                    np.isfinite(value)
-                    and value >= 0
-                    and (field != "repetition" or value == int(value))
-                ):
-                    raise ValueError
-            except ValueError:
-                raise LogError(f"{where}: {word} is '{text}', not a number ≥ 0; mend it") from None
-            value = int(value) if field == "repetition" else value
-        if field in ("virtual", "leave_out"):
-            if value not in ("yes", "no"):
-                raise LogError(f"{where}: {field} is '{text}'; write yes or no")
-            value = value == "yes"
+        value: Any = _value(field, text, word, where)
         if joint:
             gains = facts.get(field, {})
             value = (gains if isinstance(gains, dict) else {"": gains}) | {joint: value}
         facts[field] = value
     return facts
+
+
+def _value(field: str, text: str, word: str, where: str) -> str | float | bool:
+    """Return what the text of a word says of a field of SequenceMeta."""
+    stripped = text.strip()
+    if field in NUMBERS:
+        number = _number(stripped)
+        whole = field == "repetition"
+        if number is None or (whole and number != int(number)):
+            raise LogError(f"{where}: {word} is '{text}', not a number ≥ 0; mend it")
+        return int(number) if whole else number
+    if field in ("virtual", "leave_out"):
+        if stripped not in ("yes", "no"):
+            raise LogError(f"{where}: {field} is '{text}'; write yes or no")
+        return stripped == "yes"
+    return stripped
+
+
+def _number(text: str) -> float | None:
+    """Return a number ≥ 0, whose decimal point may be a p; None if the text is none."""
+    try:
+        number = float(text.replace("p", "."))
+    except ValueError:
+        return None
+    return number if np.isfinite(number) and number >= 0 else None
 
 
 def _stem(file: str) -> str:
@@ -266,42 +270,55 @@ def _read_sheet(file: Path) -> list[dict[str, str]]:
     if not file.is_file() or file.stat().st_size > 16 << 20:
         raise UsageError(f"{file}: the manifest is missing, or no table; a CSV with a column file")
     try:
-        rows = list(
-            table := csv.DictReader(
-                io.StringIO(file.read_text(encoding="utf-8-sig")), skipinitialspace=True
-            )
-        )
+        content = io.StringIO(file.read_text(encoding="utf-8-sig"))
+        table = csv.DictReader(content, skipinitialspace=True)
+        rows = list(table)
     except (UnicodeDecodeError, csv.Error) as error:
         raise UsageError(f"{file}: not a CSV table ({error})") from None
+    names = list(table.fieldnames or ())
     if not rows or not rows[0].get("file"):
         raise UsageError(f"{file}: a manifest has a column file, and a row for each recording")
-    columns = ["file", *_known(rows[0])]
-    ours = {name: k for k, (field, _) in FIELDS.items() if k for name in (k, field)}
-    for name in (names := list(table.fieldnames or ())):
-        near = ours.get(
-            word := name.strip().lower(), "payload" if word.startswith("payload") else ""
-        )
-        if (near and name not in columns) or (name in columns and names.count(name) > 1):
+    columns = ["file", *filter(_is_known, names)]
+    _require_clear_names(file, names, columns)
+    for row in rows:
+        if any(row.get(None, ())):  # cells behind the last column
+            raise UsageError(
+                f"{file}: the row of {row['file']} has more cells than the header; is a decimal "
+                "comma in it?"
+            )
+    sheet = []
+    for row in rows:
+        if row.get("file"):
+            sheet.append({c: row[c] for c in columns if row.get(c) is not None})
+    return sheet
+
+
+def _require_clear_names(file: Path, names: list[str], columns: list[str]) -> None:
+    """Refuse names of a manifest that are nearly those of FIELDS, and columns of one name.
+
+    Args:
+        names: Of all columns.
+        columns: Those that say something here.
+    """
+    ours = {}
+    for word, (field, _) in FIELDS.items():
+        if word:
+            ours[word] = word
+            ours[field] = word
+    for name in names:
+        written = name.strip().lower()
+        near = ours.get(written, "payload" if written.startswith("payload") else "")
+        misspelt = near and name not in columns
+        twice = name in columns and names.count(name) > 1
+        if misspelt or twice:
             raise UsageError(f"{file}: column '{name}': write {near or name}, once")
-    if long := [row["file"] for row in rows if any(row.get(None, ()))]:
-        raise UsageError(
-            f"{file}: the row of {long[0]} has more cells than the header; is a decimal comma in "
-            "it?"
-        )
-    return [
-        {c: row[c] or "" for c in columns if row.get(c) is not None}
-        for row in rows
-        if row.get("file")
-    ]
 
 
-def _known(columns: Iterable[Any]) -> list[str]:
-    return [
-        c
-        for c in columns
-        if isinstance(c, str)
-        and c
-        and c.partition(".")[0] in FIELDS
-        and c.count(".") <= 1
-        and ("." not in c or c.partition(".")[0] in ("kp", "kd"))
-    ]
+def _is_known(column: Any) -> bool:
+    """Return True for a word of FIELDS, and for kp.<joint> and kd.<joint>."""
+    if not isinstance(column, str) or not column:
+        return False
+    kind, dot, joint = column.partition(".")
+    if not dot:
+        return kind in FIELDS
+    return kind in ("kp", "kd") and "." not in joint

@@ -7,6 +7,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -105,46 +106,59 @@ def require_plausible(log: Log, robot: RobotSpec, strict: bool = False) -> Log:
         )
     channels = dict(log.channels)
     replaced = {}
-    for name in (n for n in UNITS if n in log.channels):
+    for name in UNITS:
+        if name not in log.channels:
+            continue
         values = log.channels[name].values
         if name in ("ctrl", "qpos"):
             require_radians(values, log.joint_names, robot, partial(_place, log, name))
             continue
         wrong = _nonsense(name, log, robot)
-        if (strict or name == FEEDFORWARD) and wrong.any():  # commands are never made up
-            row, column = np.argwhere(wrong)[0]
-            raise LogError(
-                f"{log.row(name, int(row))}: {name} of {log.joint_names[column]} is "
-                f"{values[row, column]:.4g} {UNITS[name]}: no joint does that; repair or cut the "
-                "row, or leave the column out"
-            )
-        if wrong.any():
-            tolerable = wrong.mean(axis=0).max() <= MOSTLY
-            source = "from positions" if name == "qvel" else "from the rows around them"
-            replaced[name] = {
-                "rows": int(wrong.any(axis=1).sum()),
-                "of": len(values),
-                "worst": float(values[wrong][0]),
-                "joints": [
-                    j
-                    for j, bad in zip(log.joint_names, np.ravel(wrong.any(axis=0)), strict=True)
-                    if bad
-                ],
-                "done": source if tolerable else "left out",
-            }
-            channels.pop(name)
-            channels |= (
-                {name: Channel(log.channels[name].time, _made_up(name, log, wrong))}
-                if tolerable
-                else {}
-            )
+        if not wrong.any():
+            continue
+        if strict or name == FEEDFORWARD:  # commands are never made up
+            raise _implausible(name, log, wrong)
+        tolerable = bool(wrong.mean(axis=0).max() <= MOSTLY)
+        replaced[name] = _note(name, log, wrong, tolerable)
+        channels.pop(name)
+        if tolerable:
+            channels[name] = Channel(log.channels[name].time, _made_up(name, log, wrong))
     if not replaced:
         return log
-    return replace(
-        log,
-        channels=channels,
-        meta=log.meta | {"notes": log.meta.get("notes", {}) | {"nonsense": replaced}},
+    notes = log.meta.get("notes", {}) | {"nonsense": replaced}
+    return replace(log, channels=channels, meta=log.meta | {"notes": notes})
+
+
+def _implausible(name: str, log: Log, wrong: Array) -> LogError:
+    """Return the error that a channel holds nonsense. wrong: (k, n) bool."""
+    row, column = np.argwhere(wrong)[0]
+    value = log.channels[name].values[row, column]
+    return LogError(
+        f"{log.row(name, int(row))}: {name} of {log.joint_names[column]} is "
+        f"{value:.4g} {UNITS[name]}: no joint does that; repair or cut the "
+        "row, or leave the column out"
     )
+
+
+def _note(name: str, log: Log, wrong: Array, tolerable: bool) -> dict[str, Any]:
+    """Return the note of nonsense in a channel.
+
+    Args:
+        wrong: Where it is, (k, n) bool.
+        tolerable: It is made up for; else the channel is left out.
+    """
+    values = log.channels[name].values
+    joints = zip(log.joint_names, np.ravel(wrong.any(axis=0)), strict=True)
+    done = "left out"
+    if tolerable:
+        done = "from positions" if name == "qvel" else "from the rows around them"
+    return {
+        "rows": int(wrong.any(axis=1).sum()),
+        "of": len(values),
+        "worst": float(values[wrong][0]),
+        "joints": [joint for joint, bad in joints if bad],
+        "done": done,
+    }
 
 
 def _nonsense(name: str, log: Log, robot: RobotSpec) -> Array:

@@ -12,7 +12,7 @@ from typing import Any
 from gaponet.base.errors import GAPONetError, LogError, UsageError
 from gaponet.base.files import write_text
 from gaponet.data.describe.guess import guess_logs
-from gaponet.data.formats import find_logs, look, read_logs
+from gaponet.data.formats import ReadOptions, find_logs, look, read_logs
 from gaponet.data.log import Log, skip_bad_rows
 from gaponet.robot.spec import RobotSpec
 
@@ -46,7 +46,7 @@ def read_first_recording(
         specified: A logs.toml; nothing is guessed beside it.
         anyhow: Also by a guess of which joint is which.
         skip_bad: Leave out recordings that cannot be read.
-        options: Arguments of read_logs.
+        options: The other fields of ReadOptions.
 
     Raises:
         DescriptionNeededError, LogError, UsageError: The message says what is missing.
@@ -54,7 +54,7 @@ def read_first_recording(
 
     def by(file: Path | None, described: str = "") -> tuple[Log, int, str]:
         with skip_bad_rows(skip_bad):
-            first = next(iter(read_logs(logs, robot, logs=file, **options)), None)
+            first = next(iter(read_logs(logs, robot, ReadOptions(logs=file, **options))), None)
         if first is None:
             raise UsageError(f"{logs}: holds no recording")
         return first[1], len(find_logs(logs, options.get("fmt"))), described

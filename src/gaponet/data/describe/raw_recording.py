@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from collections.abc import Sequence as ListOf
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -70,15 +70,22 @@ class RawRecording:
     default: LogsFile = field(default_factory=lambda: LogsFile())  # unless something else is stated
 
     @property
+    def place(self) -> str:
+        """File and line, or what else an error about names points at."""
+        return self.where or self.source
+
+    @property
     def columns(self) -> dict[str, tuple[str, int | None]]:
         """Every column by the name that logs.toml may call it: "signal" or "signal[label]" →
         (signal, which).
         """
-        return {
-            f"{name}[{label}]" if labels else name: (name, i if labels else None)
-            for name, labels in self.signals.items()
-            for i, label in enumerate(labels or ("",))
-        }
+        columns: dict[str, tuple[str, int | None]] = {}
+        for name, labels in self.signals.items():
+            if not labels:
+                columns[name] = (name, None)
+            for i, label in enumerate(labels):
+                columns[f"{name}[{label}]"] = (name, i)
+        return columns
 
     def shown(self, most: int = 12) -> str:
         """The signals, for an error."""
@@ -121,27 +128,16 @@ class RawRecording:
         """
         arrays, turned = rows_first(arrays)
         if turned:
-            notes = more.get("meta", {}).get("notes", {}) | {"transposed": turned}
-            more["meta"] = more.get("meta", {}) | {"notes": notes}
-        numeric = {
-            n: a
-            for n, a in arrays.items()
-            if isinstance(a, np.ndarray)
-            and a.dtype.kind in "fiu"
-            and len(a.shape) in (1, 2)
-            and len(a) > 1
-            and (a.ndim == 1 or 0 < a.shape[1] <= WIDEST)
-        }
-        signals = {
-            n: ()
-            if a.ndim == 1
-            else names
-            if a.shape[1] == len(names)
-            else tuple(map(str, range(a.shape[1])))
-            for n, a in numeric.items()
-        }
+            meta = more.get("meta", {})
+            notes = meta.get("notes", {}) | {"transposed": turned}
+            more["meta"] = meta | {"notes": notes}
+        numeric = {name: array for name, array in arrays.items() if _is_signal(array)}
+        signals = {name: _column_names(array, names) for name, array in numeric.items()}
         source = f"{file}#{part}" if part else str(file)
-        load = lambda wanted: {n: Signal(numeric[n].astype(float)) for n in wanted}  # noqa: E731
+
+        def load(wanted: list[str]) -> dict[str, Signal]:
+            return {name: Signal(numeric[name].astype(float)) for name in wanted}
+
         return RawRecording(name or file.stem, source, signals, load, source, (str(file),), **more)
 
     def to_log(
@@ -155,45 +151,41 @@ class RawRecording:
         chosen = _choose(self, robot, specified, joint_map)
         if FEEDFORWARD in stated and FEEDFORWARD not in chosen:
             raise LogError(
-                f"{self.where or self.source}: no column holds {FEEDFORWARD}; there are: "
-                f"{self.shown()}"
+                f"{self.place}: no column holds {FEEDFORWARD}; there are: {self.shown()}"
             )
         clocks = _clocks(specified, chosen)
         self._require_one_clock(clocks, specified)
-        gains = {
-            name: _gain_columns(self, specified, name, chosen["ctrl"]) for name in ("kp", "kd")
-        }
+        gains = _gain_columns(self, specified, chosen["ctrl"])
         loaded = self._load_columns([*chosen.values(), *gains.values()], clocks)
-        if any(loaded[clock].in_seconds for clock in clocks.values() if clock in loaded):
+        if _is_in_seconds(clocks, loaded):
             specified = LogsFile(time_unit="s") | specified
         units = _units(robot, specified, list(chosen["ctrl"]), joint_map)
         joints = tuple(name for name in robot.joint_names if name in chosen["ctrl"])
-        in_si = _Conversion(
-            robot,
-            joints,
-            [units[j] for j in joints],
-            specified,
-            _encoders(robot, specified, joint_map),
-        )
+        encoders = _encoders(robot, specified, joint_map)
+        in_si = _Conversion(robot, joints, [units[j] for j in joints], specified, encoders)
         channels = {}
         for channel, columns in chosen.items():
             time = _time(self, specified, loaded, clocks[channel], channel, columns)
             channels[channel] = Channel(time, in_si.values(channel, columns, loaded))
-        channels, empty = sampled_channels(channels, joints, self.where or self.source)
+        channels, empty = sampled_channels(channels, joints, self.place)
         channels = _from_zero(channels)
-        meta = dict(self.meta)
+        meta = self._meta(channels, specified)
         if empty:
             meta["notes"] = meta.get("notes", {}) | empty
         for name, columns in gains.items():
-            if columns:
-                meta[name] = [_constant(self, name, _column(loaded, *columns[j])) for j in joints]
+            meta[name] = [_constant(self, name, _column(loaded, *columns[j])) for j in joints]
+        meta["converted_from"] = {j: units[j] for j in joints if units[j] != "rad"}
+        return Log(robot.name, joints, channels, self.source, meta)
+
+    def _meta(self, channels: Iterable[str], specified: LogsFile) -> dict[str, Any]:
+        """Log.meta of what the recording and logs.toml say of its files and its period."""
+        meta = dict(self.meta)
         if "rate" in specified:
             meta["dt"] = 1 / specified["rate"]
         meta["files"] = dict.fromkeys(channels, self.files[0] if self.files else self.source)
         meta["all_files"] = self.files
         meta["first_line"] = self.first_line
-        meta["converted_from"] = {j: units[j] for j in joints if units[j] != "rad"}
-        return Log(robot.name, joints, channels, self.source, meta)
+        return meta
 
     def _load_columns(
         self, columns: list[Columns], clocks: dict[str, str | None]
@@ -212,7 +204,7 @@ class RawRecording:
         periods = clock_periods(self.signals, self.load)
         used = list(specified.get("clock", {}).values())
         for clock in sorted(filter(None, chosen)):
-            where = self.where or self.source
+            where = self.place
             require_one_rate(periods, clock, used, specified.get("ignore", ()), where)
 
 
@@ -223,19 +215,49 @@ def rows_first(arrays: dict[str, Any]) -> tuple[dict[str, Any], list[str]]:
     taken as transposed.
     """
     tables = {n: a for n, a in arrays.items() if isinstance(a, np.ndarray) and a.ndim == 2}
-    flat = {n: a for n, a in tables.items() if 1 in a.shape and named_like_a_clock(n)}
-    arrays = arrays | {n: a.ravel() for n, a in flat.items()}
-    single = [len(a) for a in arrays.values() if isinstance(a, np.ndarray) and a.ndim == 1]
-    wide = [a.shape[0] * MIN_WIDTHS <= a.shape[1] for a in tables.values()]
-    samples = max(single, default=0)
+    clocks = {n: a.ravel() for n, a in tables.items() if 1 in a.shape and named_like_a_clock(n)}
+    arrays = arrays | clocks
+    samples = _samples(arrays, list(tables.values()))
     if samples < 2:
-        samples = max((a.shape[1] for a in tables.values()), default=0) if wide and all(wide) else 0
-    turned = [
-        n
-        for n, a in tables.items()
-        if n not in flat and a.shape[1] == samples and a.shape[0] != samples and samples > 1
-    ]
-    return arrays | {n: tables[n].T for n in turned}, turned
+        return arrays, []
+    turned = []
+    for name, table in tables.items():
+        rows, columns = table.shape
+        if name not in clocks and columns == samples and rows != samples:
+            turned.append(name)
+    return arrays | {name: tables[name].T for name in turned}, turned
+
+
+def _samples(arrays: dict[str, Any], tables: list[Array]) -> int:
+    """Return the number of samples: the length of single columns, else the width of tables that
+    are all far wider than high; 0 if one is not.
+    """
+    single = [a for a in arrays.values() if isinstance(a, np.ndarray) and a.ndim == 1]
+    samples = max(map(len, single), default=0)
+    if samples > 1:
+        return samples
+    if any(table.shape[0] * MIN_WIDTHS > table.shape[1] for table in tables):
+        return 0
+    return max((table.shape[1] for table in tables), default=0)
+
+
+def _is_signal(array: Any) -> bool:
+    """Return True for an array of numbers with a row per sample."""
+    if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiu":
+        return False
+    if array.ndim not in (1, 2) or len(array) < 2:
+        return False
+    return array.ndim == 1 or 0 < array.shape[1] <= WIDEST
+
+
+def _column_names(array: Array, names: tuple[str, ...]) -> tuple[str, ...]:
+    """Return the names of an array's columns: none of a single one, else these, or digits."""
+    if array.ndim == 1:
+        return ()
+    columns = array.shape[1]
+    if columns == len(names):
+        return names
+    return tuple(str(i) for i in range(columns))
 
 
 GIT_LFS_POINTER = b"version https://git-lfs"  # how such a file begins
@@ -348,6 +370,11 @@ def _clocks(specified: LogsFile, chosen: Chosen) -> dict[str, str | None]:
     return {channel: own.get(channel) or specified.get("time") for channel in chosen}
 
 
+def _is_in_seconds(clocks: dict[str, str | None], loaded: dict[str, Signal]) -> bool:
+    """Return True if a clock of a channel was written as dates."""
+    return any(loaded[clock].in_seconds for clock in clocks.values() if clock in loaded)
+
+
 def _from_zero(channels: dict[str, Channel]) -> dict[str, Channel]:
     """Return channels whose time starts at 0: nanoseconds since 1970 would lose their digits."""
     start = min((float(c.time[0]) for c in channels.values() if len(c.time)), default=0.0)
@@ -359,7 +386,7 @@ def _choose(
     recording: RawRecording, robot: RobotSpec, specified: LogsFile, joint_map: dict[str, str] | None
 ) -> Chosen:
     """Which column holds what."""
-    where = recording.where or recording.source
+    where = recording.place
     columns = recording.columns
     single = specified.get("columns", {})
     for ours, theirs in single.items():
@@ -412,13 +439,18 @@ def _matching(
     found = []
     for column in recording.columns:
         match = fits.fullmatch(column)
-        if match is None or column in taken or column.startswith(TIME):
-            continue
-        if column.startswith(COMMAND) and channel not in COMMANDS:
+        if match is None or column in taken or not _may_hold(column, channel):
             continue
         if not any(other.fullmatch(column) for other in others):
             found.append((match["joint"], column))
     return found
+
+
+def _may_hold(column: str, channel: str) -> bool:
+    """Return False for columns of a time_file, and of a command_file if the channel is a state."""
+    if column.startswith(TIME):
+        return False
+    return channel in COMMANDS or not column.startswith(COMMAND)
 
 
 def _columns_of_array(
@@ -436,7 +468,7 @@ def _columns_of_array(
         if given is None or len(given) != len(labels):
             explanation = f"joints has {len(given)}" if given else "nothing names them"
             raise LogError(
-                f"{recording.where or recording.source}: {array} has {len(labels)} columns and "
+                f"{recording.place}: {array} has {len(labels)} columns and "
                 f"{explanation}; write joints = [{len(labels)} names, in its order] into logs.toml"
             )
         names = given
@@ -457,23 +489,23 @@ def _column_pattern(pattern: str) -> re.Pattern[str]:
     return re.compile(f"{before}(?P<joint>.+?){after}")
 
 
-def _gain_columns(
-    recording: RawRecording, specified: LogsFile, name: str, ctrl: Columns
-) -> Columns:
-    """joint → column, where logs.toml says that an array holds the gains; it has the columns of
-    the command's.
+def _gain_columns(recording: RawRecording, specified: LogsFile, ctrl: Columns) -> Chosen:
+    """kp and kd → joint → column, where logs.toml says that an array holds them; it has the columns
+    of the command's.
     """
-    array = specified.get(name)
-    if not isinstance(array, str):
-        return {}
     widths = {len(recording.signals[signal]) for signal, _ in ctrl.values()}
-    if array not in recording.signals or widths != {len(recording.signals[array])}:
-        raise LogError(
-            f'{recording.where or recording.source}: {name} = "{array}" is no array like the '
-            "command's; "
-            f"there are: {recording.shown()}"
-        )
-    return {joint: (array, index) for joint, (_, index) in ctrl.items()}
+    gains: Chosen = {}
+    for name in ("kp", "kd"):
+        array = specified.get(name)
+        if not isinstance(array, str):
+            continue
+        if array not in recording.signals or widths != {len(recording.signals[array])}:
+            raise LogError(
+                f'{recording.place}: {name} = "{array}" is no array like the command\'s; there '
+                f"are: {recording.shown()}"
+            )
+        gains[name] = {joint: (array, index) for joint, (_, index) in ctrl.items()}
+    return gains
 
 
 def _constant(recording: RawRecording, name: str, values: Array) -> float:
@@ -487,11 +519,11 @@ def _constant(recording: RawRecording, name: str, values: Array) -> float:
 
 
 def _require_complete(columns: Chosen, recording: RawRecording, specified: LogsFile) -> None:
-    where = recording.where or recording.source
+    where = recording.place
     for need in REQUIRED:
         if need in columns:
             continue
-        explanation = f' (expected "{specified[need]}")' if need in specified else ""  # type: ignore[literal-required]
+        explanation = f' (expected "{specified.get(need)}")' if need in specified else ""
         why = f": {NO_COMMANDS}" if need == "ctrl" else ""
         raise LogError(
             f"{where}: no column holds {need}.<joint>{explanation}; there are: "
@@ -540,18 +572,12 @@ def _time(
     columns: Columns,
 ) -> Array:
     """The time stamps of a channel, s, from any start."""
-    where = recording.where or recording.source
+    where = recording.place
     own = next(loaded[signal] for signal, _ in columns.values())
     if channel not in specified.get("clock", {}) and own.time is not None:
         return own.time
     if "rate" in specified:
-        periods = (
-            specified["rate"] * float(np.median(np.diff(loaded[clock].values)))
-            if clock in loaded
-            else 0.0
-        )
-        # in no unit of time
-        if periods > 0 and min(abs(periods * unit - 1) for unit in SECONDS.values()) > 0.1:
+        if clock in loaded and not _has_rate(loaded[clock].values, specified["rate"]):
             raise LogError(
                 f"{where}: '{clock}' is not at rate = {specified['rate']:g} Hz; leave out one of "
                 "them"
@@ -572,6 +598,14 @@ def _time(
     if loaded[clock].in_seconds:
         return time
     return time * SECONDS[specified.get("time_unit", "s")]
+
+
+def _has_rate(stamps: Array, rate: float) -> bool:
+    """Return True if a clock that runs has this rate, Hz, in some unit of time."""
+    periods = rate * float(np.median(np.diff(stamps)))
+    if not periods > 0:
+        return True
+    return min(abs(periods * unit - 1) for unit in SECONDS.values()) <= 0.1
 
 
 def _column(loaded: dict[str, Signal], signal: str, index: int | None) -> Array:

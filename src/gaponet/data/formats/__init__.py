@@ -30,8 +30,8 @@ file that another format detects is no `table`. The shortest readers to copy are
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import replace
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import islice
 from pathlib import Path
@@ -133,31 +133,32 @@ def files_below(folder: Path) -> Iterator[Path]:
 
 def detect(path: Path) -> str:
     """The format of a file or folder; refuses one that could be several."""
-    matches = [
-        fmt
-        for fmt, where in formats().items()
-        if attempt(where, partial(_detects, fmt, path), False)
-    ]
+    matches = []
+    for fmt, where in formats().items():
+        if attempt(where, partial(_detects, fmt, path), False):
+            matches.append(fmt)
     others = [fmt for fmt in matches if fmt != "table"]
-    if others and len(matches) > len(others):
-        tables = module("table").find(path)
-        if all(any(_detects(fmt, file) for fmt in others) for file in tables):
-            matches = others
-    if len(matches) > 1:
+    if others and "table" in matches and _are_of(others, module("table").find(path)):
+        matches = others
+    if len(matches) == 1:
+        return matches[0]
+    if matches:
+        kinds = " and ".join(f"{fmt} ({about(fmt)})" for fmt in matches)
         ways = " or ".join(f"--format {fmt}" for fmt in matches)
+        raise LogError(f"{path}: could be {kinds}; say {ways}")
+    if (path / "dataset.json").is_file():
         raise LogError(
-            f"{path}: could be {' and '.join(f'{f} ({about(f)})' for f in matches)}; say {ways}"
+            f"{path}: is a dataset of gaponet, not logs; go on with gaponet doctor {path}"
         )
-    if not matches:
-        if (path / "dataset.json").is_file():
-            raise LogError(
-                f"{path}: is a dataset of gaponet, not logs; go on with gaponet doctor {path}"
-            )
-        raise LogError(
-            f"{path}: no log of {', '.join(formats())} (gaponet import --formats explains "
-            f"them){_json_hint(path)}"
-        )
-    return matches[0]
+    raise LogError(
+        f"{path}: no log of {', '.join(formats())} (gaponet import --formats explains "
+        f"them){_json_hint(path)}"
+    )
+
+
+def _are_of(formats: list[str], files: list[Path]) -> bool:
+    """Return True if each file is detected by one of the formats."""
+    return all(any(_detects(fmt, file) for fmt in formats) for file in files)
 
 
 def _json_hint(path: Path) -> str:
@@ -187,47 +188,75 @@ def find_logs(path: Path, fmt: str | None = None) -> list[Path]:
     return _find(_reader(path, fmt or read_logs_file(path)[0].get("format")), path)
 
 
+@dataclass(frozen=True)
+class ReadOptions:
+    """What is said of logs beside logs.toml, and what is allowed; as in gaponet.api.ImportOptions.
+
+    joint_map, position_unit, time_unit and rate win over logs.toml; the last three are refused
+    where the format itself fixes them.
+    """
+
+    fmt: str | None = None
+    """Name of the format; default logs.toml's, or by inspection."""
+    joint_map: dict[str, str] | None = None
+    """Joint name in the logs → joint name of the robot."""
+    logs: str | Path | None = None
+    """A logs.toml; default the one beside the logs."""
+    position_unit: str | None = None
+    """Unit of positions, as in logs.toml."""
+    time_unit: str | None = None
+    """Unit of the clock, as in logs.toml."""
+    allow_pickle: bool = False
+    """Open pickled files, with data.formats.pickles."""
+    rate: float | None = None
+    """Hz, of logs without a clock."""
+    strict: bool = False
+    """Refuse implausible channels instead of making up for them."""
+
+    def as_logs_file(self) -> LogsFile:
+        """Return what is said here of fields of logs.toml."""
+        said = LogsFile()
+        if self.position_unit is not None:
+            said["position_unit"] = self.position_unit
+        if self.time_unit is not None:
+            said["time_unit"] = self.time_unit
+        if self.rate is not None:
+            said["rate"] = self.rate
+        return said
+
+
+DEFAULT_OPTIONS = ReadOptions()
+
+
 def read_logs(
-    path: Path,
-    robot: RobotSpec,
-    fmt: str | None = None,
-    joint_map: dict[str, str] | None = None,
-    logs: str | Path | None = None,
-    position_unit: str | None = None,
-    time_unit: str | None = None,
-    allow_pickle: bool = False,
-    rate: float | None = None,
-    strict: bool = False,
+    path: Path, robot: RobotSpec, options: ReadOptions = DEFAULT_OPTIONS
 ) -> Iterator[tuple[str, Log]]:
-    """Yield (motion name, Log) for every recording under a path; arguments and errors as of
+    """Yield (motion name, Log) for every recording under a path; errors as of
     gaponet.api.import_logs.
 
     While data.log.skip_bad_rows is open, bad rows are cut, recordings that cannot be read are left
-    out, and both are listed there. joint_map, position_unit, time_unit and rate win over logs.toml;
-    the last three are refused where the format itself fixes them.
+    out, and both are listed there.
     """
-    specified, file = read_logs_file(path, logs)
-    reader = _reader(path, fmt or specified.get("format"))
-    by_hand = {"position_unit": position_unit, "time_unit": time_unit, "rate": rate}
-    specified = specified | {k: v for k, v in by_hand.items() if v is not None}  # type: ignore[assignment]
-    kind = _require_allowed(reader, path, allow_pickle)
+    specified, file = read_logs_file(path, options.logs)
+    reader = _reader(path, options.fmt or specified.get("format"))
+    kind = _require_allowed(reader, path, options.allow_pickle)
+    by_hand = options.as_logs_file()
+    specified = specified | by_hand
     for name in specified:
-        if name not in ALWAYS and name not in _options(reader):
-            option = (
-                f"--{name.replace('_', '-')}"
-                if by_hand.get(name) is not None
-                else f"{file}: {name}"
-            )
+        if name not in (*ALWAYS, *_options(reader)):
+            option = f"--{name.replace('_', '-')}" if name in by_hand else f"{file}: {name}"
             raise UsageError(
                 f"{option} means nothing to the {kind} format, which fixes it itself; leave it out"
             )
-    names = specified.get("names", {}) | (joint_map or {})
+    names = specified.get("names", {}) | (options.joint_map or {})
     naming = Naming(specified, file)
     root = path if path.is_dir() else path.parent
     bad = skipped_rows()
     for name, load in _loaders(reader, path, robot, specified, names):
         try:
-            log = _corrected(require_plausible(load(), robot, strict), robot, specified, names)
+            log = _corrected(
+                require_plausible(load(), robot, options.strict), robot, specified, names
+            )
             log = without_repeated_rows(log)  # after the checks, which name lines of the file
             log = continued_turns(log, robot)
         except LogError as error:
@@ -235,13 +264,17 @@ def read_logs(
                 raise
             bad.append(f"left out: {error}")
             continue
-        inside, _, part = log.source.partition("#")
-        place = Path(inside).relative_to(root).as_posix()
-        words = naming.of(name, place + ("#" + part if part else ""))
+        words = naming.of(name, _place_below(root, log.source))
         if words.pop("leave_out", False):
             continue
         yield str(words.pop("motion", name)), _named(log, words, robot, names)
     naming.require_all_used()
+
+
+def _place_below(root: Path, source: str) -> str:
+    """Return a source relative to a folder; a #part stays behind it."""
+    file, mark, part = source.partition("#")
+    return Path(file).relative_to(root).as_posix() + mark + part
 
 
 def look(
@@ -389,35 +422,39 @@ def _corrected(log: Log, robot: RobotSpec, specified: LogsFile, names: dict[str,
     """Signs and offsets, where logs.toml says some, noted; and where joints stood that the log
     does not hold.
     """
-    stood = {
-        robot.resolve(j, "[posture] of logs.toml", names): v
-        for j, v in specified.get("posture", {}).items()
-    }
-    if stood:
-        log = replace(log, meta=log.meta | {"posture": stood})
-    signs, offsets = (
-        {robot.resolve(j, f"[{t}] of logs.toml", names): v for j, v in specified.get(t, {}).items()}  # type: ignore[attr-defined]
-        for t in ("signs", "offsets")
-    )
+    posture = _by_joint("posture", specified.get("posture", {}), robot, names)
+    if posture:
+        log = replace(log, meta=log.meta | {"posture": posture})
+    signs = _by_joint("signs", specified.get("signs", {}), robot, names)
+    offsets = _by_joint("offsets", specified.get("offsets", {}), robot, names)
     if not signs and not offsets:
         return log
     if 0 in signs.values():
         raise UsageError("[signs] of logs.toml: a sign is 1 or -1")
     sign = np.array([signs.get(j, 1) for j in log.joint_names], float)
     offset = np.array([offsets.get(j, 0.0) for j in log.joint_names])
-    turned = {
-        name: Channel(
-            c.time,
-            c.values
-            if name == "temperature"
-            else sign * c.values + offset * (name in ("ctrl", "qpos")),
-        )
-        for name, c in log.channels.items()
-    }
-    notes = log.meta.get("notes", {}) | {
-        k: v for k, v in (("signs", signs), ("offsets", offsets)) if v
-    }
-    return require_plausible(replace(log, channels=turned, meta=log.meta | {"notes": notes}), robot)
+    channels = {}
+    for name, (time, values) in log.channels.items():
+        if name != "temperature":
+            # positions are moved; velocities and torques are only turned
+            shift = offset if name in ("ctrl", "qpos") else 0.0 * offset
+            values = sign * values + shift
+        channels[name] = Channel(time, values)
+    notes = dict(log.meta.get("notes", {}))
+    if signs:
+        notes["signs"] = signs
+    if offsets:
+        notes["offsets"] = offsets
+    corrected = replace(log, channels=channels, meta=log.meta | {"notes": notes})
+    return require_plausible(corrected, robot)
+
+
+def _by_joint(
+    section: str, stated: Mapping[str, float], robot: RobotSpec, names: dict[str, str]
+) -> dict[str, float]:
+    """Return what a section of logs.toml says, by the robot's own joint."""
+    where = f"[{section}] of logs.toml"
+    return {robot.resolve(joint, where, names): value for joint, value in stated.items()}
 
 
 def _named(log: Log, option: dict[str, Any], robot: RobotSpec, names: dict[str, str]) -> Log:

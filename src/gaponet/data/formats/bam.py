@@ -14,7 +14,7 @@ import logging
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
-from typing import Annotated, NotRequired
+from typing import Annotated, Any, NotRequired
 
 import numpy as np
 from annotated_types import Gt, Interval, Len
@@ -26,6 +26,8 @@ from gaponet.data.formats import files_below
 from gaponet.data.log import Channel, Log
 from gaponet.robot.spec import RobotSpec
 
+# channel → field of a Sample
+FIELDS = {"ctrl": "goal_position", "qpos": "position", "qvel": "speed", "temperature": "temp"}
 MAX_VOLTS_RATIO = 0.1  # difference of stated and measured supply voltage, relative
 Size = Annotated[float, Gt(0), Interval(le=1e3)]
 
@@ -103,19 +105,14 @@ def _log(file: Path, log_data: BamFile, robot: RobotSpec, joint_map: dict[str, s
             f"N·m/rad is not known; write gain (and gain_volts) into the [[servo]] of {joint} in "
             f"the robot.toml of {robot.name}"
         )
-    on = log_data["entries"]
-    off = next(
-        (i for i, e in enumerate(on) if not e["torque_enable"] or e["goal_position"] is None),
-        len(on),
-    )
-    if off < 2:
+    entries = log_data["entries"]
+    end = _rows_with_torque(entries)
+    if end < 2:
         raise LogError(
             f"{file}: torque is off from the start; a log needs commands that the servo follows"
         )
-    on, cut = on[:off], on[off:]
-    channels = {"ctrl": "goal_position", "qpos": "position", "qvel": "speed", "temperature": "temp"}
-    time = np.array([e["timestamp"] for e in on])
-    volts = float(np.median([e.get("input_volts", log_data["vin"]) for e in on]))
+    samples = entries[:end]
+    volts = float(np.median([e.get("input_volts", log_data["vin"]) for e in samples]))
     if abs(volts - log_data["vin"]) > MAX_VOLTS_RATIO * log_data["vin"]:
         logging.getLogger("gaponet").warning(
             "%s: vin says %g V, the servo measured %g V: the gain is taken at vin; correct the "
@@ -124,29 +121,37 @@ def _log(file: Path, log_data: BamFile, robot: RobotSpec, joint_map: dict[str, s
             log_data["vin"],
             volts,
         )
-    gain = (
-        log_data["kp"]
-        * servo.gain
-        * (log_data["vin"] / servo.gain_volts if servo.gain_volts else 1.0)
-    )
-    return Log(
-        robot.name,
-        (joint,),
-        {
-            name: Channel(time, np.array([[e[key]] for e in on], float))  # type: ignore[literal-required]
-            for name, key in channels.items()
-            if all(key in e for e in on)
+    volts_ratio = log_data["vin"] / servo.gain_volts if servo.gain_volts else 1.0
+    arm_mass = log_data.get("arm_mass", 0.0)
+    notes: dict[str, Any] = {"firmware_kp": log_data["kp"], "volts": log_data["vin"]}
+    if end < len(entries):
+        notes["cut"] = f"torque is off from {entries[end]['timestamp']:.2f} s on"
+    meta = {
+        "files": dict.fromkeys(FIELDS, str(file)),
+        "kp": [log_data["kp"] * servo.gain * volts_ratio],
+        "stated": {
+            "payload_mass": log_data["mass"] + 0.5 * arm_mass,  # as seen from the joint
+            "payload_side": f"{1e3 * log_data['length']:.0f}mm",
         },
-        str(file),
-        {
-            "files": {name: str(file) for name in channels},
-            "kp": [gain],
-            "stated": {
-                "payload_mass": log_data["mass"]
-                + 0.5 * log_data.get("arm_mass", 0.0),  # its weight as seen from the joint
-                "payload_side": f"{1e3 * log_data['length']:.0f}mm",
-            },
-            "notes": {"firmware_kp": log_data["kp"], "volts": log_data["vin"]}
-            | ({"cut": f"torque is off from {cut[0]['timestamp']:.2f} s on"} if cut else {}),
-        },
-    )
+        "notes": notes,
+    }
+    return Log(robot.name, (joint,), _channels(samples), str(file), meta)
+
+
+def _rows_with_torque(entries: list[Sample]) -> int:
+    """Return the number of samples before torque is switched off."""
+    for i, sample in enumerate(entries):
+        if not sample["torque_enable"] or sample["goal_position"] is None:
+            return i
+    return len(entries)
+
+
+def _channels(samples: list[Sample]) -> dict[str, Channel]:
+    """Return the channels that every sample holds, (k, 1)."""
+    time = np.array([sample["timestamp"] for sample in samples])
+    channels = {}
+    for name, field in FIELDS.items():
+        values = [sample.get(field) for sample in samples]
+        if None not in values:
+            channels[name] = Channel(time, np.array(values, float)[:, None])
+    return channels

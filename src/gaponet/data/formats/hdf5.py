@@ -46,28 +46,32 @@ def recordings(path: Path, specified: LogsFile) -> Iterator[RawRecording]:
         demos = sorted({"/".join(n.split("/")[:2]) for n in arrays if n.startswith("data/")})
         demos.sort(key=lambda demo: int(re.sub(r"\D", "", demo)[:9] or 0))
         for demo in demos or [""]:
-            members = {
-                n.removeprefix(demo).lstrip("/"): labels
-                for n, labels in arrays.items()
-                if n.startswith(demo)
-            }
-            part = demo.rpartition("/")[2]
-            name = f"{file.stem}-{part}" if part else file.stem
-            aloha = not demo and {"action", "observations/qpos"} <= members.keys()
-            default = (
-                {k: v for k, v in ALOHA.items() if v in members or k == "position_unit"}
-                if aloha
-                else {}
-            )
-            yield RawRecording(
-                name,
-                f"{file}#{part}" if part else str(file),
-                members,
-                partial(_load, file, demo),
-                str(file),
-                (str(file),),
-                default=cast("LogsFile", default),
-            )
+            yield _recording(file, demo, arrays)
+
+
+def _recording(file: Path, demo: str, arrays: dict[str, tuple[str, ...]]) -> RawRecording:
+    """A file, or one demonstration in it.
+
+    Args:
+        demo: Its path in the file; "" for the whole file.
+        arrays: Of the whole file.
+    """
+    signals = {}
+    for path, labels in arrays.items():
+        if path.startswith(demo):
+            signals[path.removeprefix(demo).lstrip("/")] = labels
+    default = LogsFile()
+    if not demo and {"action", "observations/qpos"} <= signals.keys():
+        known = {k: v for k, v in ALOHA.items() if v in signals or k == "position_unit"}
+        default = cast("LogsFile", known)
+    name = file.stem
+    source = str(file)
+    part = demo.rpartition("/")[2]
+    if part:
+        name = f"{file.stem}-{part}"
+        source = f"{file}#{part}"
+    load = partial(_load, file, demo)
+    return RawRecording(name, source, signals, load, str(file), (str(file),), default=default)
 
 
 @contextmanager
@@ -98,22 +102,21 @@ def _listed(file: Path) -> dict[str, tuple[str, ...]]:
                 item = group[name]
                 if isinstance(item, h5py.Group) and depth < DEEPEST:
                     groups.append((path, item, depth + 1))
-                elif (
-                    isinstance(item, h5py.Dataset)
-                    and item.dtype.kind in "fiu"
-                    and 1 <= item.ndim <= 2
-                ):
+                elif isinstance(item, h5py.Dataset) and _is_signal(item):
                     width = item.shape[1] if item.ndim == 2 else 0
-                    if (
-                        len(item) > 0
-                        and width <= WIDEST
-                        and item.external is None
-                        and not item.is_virtual
-                    ):
-                        arrays[path] = tuple(map(str, range(width)))
+                    arrays[path] = tuple(str(i) for i in range(width))
                 if len(arrays) > MOST:
                     raise LogError(f"{file}: more than {MOST} arrays; give one recording per file")
     return dict(sorted(arrays.items()))
+
+
+def _is_signal(item: Any) -> bool:
+    """Return True for an array in this file with a row of numbers per sample."""
+    if item.dtype.kind not in "fiu" or item.ndim not in (1, 2):
+        return False
+    if item.external is not None or item.is_virtual:
+        return False
+    return len(item) > 0 and (item.ndim == 1 or item.shape[1] <= WIDEST)
 
 
 @sandboxed(LogError, "h5py")

@@ -47,36 +47,49 @@ def recording(file: Path, names: list[str], joint: str, logs: LogsFile) -> RawRe
     Raises:
         LogError: The time column is not known, or a joint is missing at a time.
     """
-    times = [n for n in names if n == logs.get("time") or n.lower() in TIME_COLUMNS]
-    time = logs.get("time") if logs.get("time") in times else next(iter(times), None)
+    time = _time_column(names, logs)
     if time is None:
         raise LogError(
             f"{file}:1: a row per joint, and no column of times; name it in logs.toml: time = …"
         )
     table = _table(file, names)
     of_row = np.array([str(name) for name in table.column(joint).to_pylist()], dtype=object)
-    joints = tuple(dict.fromkeys(of_row.tolist()))
-    order = [np.flatnonzero(of_row == name) for name in joints]
+    rows_of = {name: np.flatnonzero(of_row == name) for name in dict.fromkeys(of_row.tolist())}
     stamps = _numbers(file, table, time)
-    if len({len(rows) for rows in order}) > 1 or any(
-        (stamps[rows] != stamps[order[0]]).any() for rows in order
-    ):
-        counts = ", ".join(f"{name} {len(rows)}" for name, rows in zip(joints, order, strict=True))
+    times = _common_times(file, stamps, rows_of)
+    arrays = {time: times}
+    for name in names:
+        column = table.column(name)
+        is_used = name in logs.values() or not column.null_count
+        if name not in (joint, time) and is_used and is_number(column.type):
+            numbers = _numbers(file, table, name)
+            arrays[name] = np.stack([numbers[rows] for rows in rows_of.values()], axis=1)
+    recording = RawRecording.of_arrays(file, arrays, tuple(rows_of), default={"time": time})
+    return replace(recording, where=f"{file}:1")
+
+
+def _time_column(names: list[str], logs: LogsFile) -> str | None:
+    """Return the column of times: that of logs.toml, else the first that is called like one."""
+    stated = logs.get("time")
+    if stated in names:
+        return stated
+    return next((name for name in names if name.lower() in TIME_COLUMNS), None)
+
+
+def _common_times(file: Path, stamps: Array, rows_of: dict[str, Array]) -> Array:
+    """Return the times of the first joint; refuse joints with others.
+
+    Args:
+        stamps: Of all rows.
+        rows_of: Joint → its rows.
+    """
+    times: list[Array] = [stamps[rows] for rows in rows_of.values()]
+    if not all(np.array_equal(of_joint, times[0]) for of_joint in times):
+        counts = ", ".join(f"{name} {len(rows)}" for name, rows in rows_of.items())
         raise LogError(
             f"{file}: joints have different times ({counts} rows); write every joint at every time"
         )
-    used = {n for n in names if n in logs.values() or not table.column(n).null_count} - {
-        joint,
-        time,
-    }
-    numbers = [n for n in names if n in used and is_number(table.column(n).type)]
-    arrays = {
-        n: np.stack([_numbers(file, table, n)[rows] for rows in order], axis=1) for n in numbers
-    }
-    recording = RawRecording.of_arrays(
-        file, {time: stamps[order[0]]} | arrays, joints, default={"time": time}
-    )
-    return replace(recording, where=f"{file}:1")
+    return times[0]
 
 
 def _table(file: Path, names: list[str]) -> pa.Table:

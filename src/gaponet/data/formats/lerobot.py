@@ -258,13 +258,8 @@ class _Frames:
     def _joints(self, channel: str, feature: str, spec: Feature) -> list[str]:
         """The robot's own joint of each column, "" where it is said to be none."""
         options = self.options
-        names = spec["names"]
         where = f"{self.part.path}/meta/info.json: {feature}"
-        if isinstance(names, dict):
-            names = next((v for v in names.values() if isinstance(v, list)), None)
-        if names and isinstance(names[0], list):
-            names = names[0]
-        names = names or options.joints
+        names = _value_names(spec) or options.joints
         if not names or len(names) != int(np.prod(spec["shape"])):
             raise LogError(
                 f"{where} does not name its {spec['shape']} values; write joints = [their names, "
@@ -341,12 +336,11 @@ class _Frames:
         where they differ.
         """
         regular = np.arange(len(where)) * self.part.dt
-        since_start = self.timestamp[where] - self.timestamp[where[0]]
-        return (
-            regular
-            if np.abs(since_start - regular).max(initial=0) < max(1e-3, 1e-6 * regular[-1])
-            else since_start
-        )
+        since_start: Array = self.timestamp[where] - self.timestamp[where[0]]
+        tolerance = max(1e-3, 1e-6 * regular[-1])
+        if np.abs(since_start - regular).max(initial=0) < tolerance:
+            return regular
+        return since_start
 
     def _si(self, channel: str, values: Array) -> Array:
         """Return values in SI."""
@@ -354,6 +348,17 @@ class _Frames:
         return to_radians(
             channel, values.copy(), self.joints, self.units, options.robot, options.encoders
         )
+
+
+def _value_names(spec: Feature) -> list[Any] | None:
+    """Return the names of a feature's values: a list, or one in a list or in a dictionary."""
+    names = spec["names"]
+    if isinstance(names, dict):
+        lists = [value for value in names.values() if isinstance(value, list)]
+        names = lists[0] if lists else None
+    if names and isinstance(names[0], list):
+        return names[0]
+    return names
 
 
 def _motion(episode: dict[str, Any], tasks: dict[int, str]) -> str:

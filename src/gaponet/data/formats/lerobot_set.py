@@ -127,7 +127,10 @@ class Set:
             "episode_chunk": "data/chunk_index",
             "episode_index": "episode_index",
         }
-        number = lambda m: f"{episode[which[m[1]]]:0{m[2] or 0}d}"  # noqa: E731
+
+        def number(match: re.Match[str]) -> str:
+            return f"{episode[which[match[1]]]:0{match[2] or 0}d}"
+
         place = os.path.normpath(re.sub(rf"\{{({'|'.join(which)})(?::0?(\d))?d?\}}", number, given))
         if re.search(r"[{}\0]", place) or os.path.isabs(place) or place.startswith(".."):
             raise LogError(
@@ -158,36 +161,26 @@ def _open(file: Path) -> Set:
     root = file.parents[1]
     features = info["features"]
     ours = file.with_name(OURS)
-    stated = (
-        read_json(
-            Ours,
-            ours,
-            LogError,
-            "restore it, or delete it to read the set as a stock one",
-            allow_extra=True,
-        )
-        if ours.is_file()
-        else None
-    )
+    stated: Ours | None = None
+    if ours.is_file():
+        hint = "restore it, or delete it to read the set as a stock one"
+        stated = read_json(Ours, ours, LogError, hint, allow_extra=True)
     listed = root / "meta" / "episodes.jsonl"
     if listed.is_file():
         episodes = _listed(listed, info.get("chunks_size", 1000))
     else:
-        episodes = [
-            row
-            for f in sorted((root / "meta" / "episodes").glob("*/*.parquet"))
-            for row in _episodes(f, stated)
-        ]
+        episodes = []
+        for table in sorted((root / "meta" / "episodes").glob("*/*.parquet")):
+            episodes += _episodes(table, stated)
     if not episodes:
         raise LogError(f"{root}: meta/episodes lists no episode; {AGAIN}")
     episodes.sort(key=lambda e: e["episode_index"])
-    known = {
-        f: validated(
-            Feature, features[f], f"{file}: features.{f}", LogError, AGAIN, allow_extra=True
-        )
-        for f in FEATURES.values()
-        if f in features
-    }
+    known = {}
+    for name in FEATURES.values():
+        if name in features:
+            where = f"{file}: features.{name}"
+            spec = features[name]
+            known[name] = validated(Feature, spec, where, LogError, AGAIN, allow_extra=True)
     part = Set(root, info, known, episodes, stated)
     if not listed.is_file():
         return part

@@ -39,14 +39,13 @@ def _read(file: Path) -> dict[str, Any]:
             )
     with reading(file, ".mat file"):
         specified = loadmat(file, simplify_cells=True)
-        specified |= {
-            f"{name}.{k}": x
-            for name, v in specified.items()
-            if isinstance(v, dict)
-            for k, x in v.items()
-        }
-        return {
-            n: x
-            for n, x in specified.items()
-            if isinstance(x, np.ndarray) and x.dtype.kind in "fiu"
-        }
+        members: dict[str, Any] = {}
+        for name, struct in specified.items():
+            if isinstance(struct, dict):
+                members |= {f"{name}.{field}": value for field, value in struct.items()}
+        return {name: value for name, value in (specified | members).items() if _is_array(value)}
+
+
+def _is_array(value: Any) -> bool:
+    """Return True for an array of numbers."""
+    return isinstance(value, np.ndarray) and value.dtype.kind in "fiu"

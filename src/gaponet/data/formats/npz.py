@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from gaponet.base.arrays import Array
 from gaponet.base.errors import LogError
 from gaponet.base.sandbox import sandboxed
 from gaponet.data.describe.logs_file import LogsFile
@@ -50,38 +51,56 @@ def recordings(path: Path, specified: LogsFile) -> Iterator[RawRecording]:
 
 def _motions(file: Path, arrays: dict[str, Any], names: tuple[str, ...]) -> Iterator[RawRecording]:
     """GAPONet's: the first axis counts motions."""
-    keys = [k for k in GAPONET.values() if k in arrays]
-    count = min(len(arrays[k]) for k in keys)
-    single = len(names) == count and all(
-        arrays[k].dtype != object and arrays[k].ndim == 2 for k in keys
-    )
+    signals = {k: arrays[k] for k in GAPONET.values() if k in arrays}
+    count = min(len(array) for array in signals.values())
+    single = len(names) == count and all(_is_table(array) for array in signals.values())
     payloads = np.asarray(arrays["payloads"]).ravel() if "payloads" in arrays else ()
+    default = {k: v for k, v in GAPONET.items() if v in signals or k.endswith("_unit")}
     for i in range(count):
-        one = {k: np.asarray(arrays[k][i], float) for k in keys}
-        one = {k: a[:, None] for k, a in one.items()} if single else one
-        if any(a.ndim != 2 for a in one.values()):
-            raise LogError(
-                f"{file}: motion {i} of {', '.join(keys)} is not rows of joints; write it again"
-            )
-        rows = min(len(a) for a in one.values())
-        used = np.flatnonzero(
-            one["real_dof_positions"][:rows].any(axis=1)
-            | one["real_dof_positions_cmd"][:rows].any(axis=1)
-        )
-        end = int(used[-1]) + 1 if len(used) else 0  # behind it zeros pad the array
+        motion = _motion(file, signals, i, single)
         stated = {"payload_mass": float(payloads[i])} if len(payloads) == count else {}
-        default = {k: v for k, v in GAPONET.items() if v in one or k.endswith("_unit")}
-        one = {k: a[:end] for k, a in one.items()}
-        joints = names[i : i + 1] if single else names
         yield RawRecording.of_arrays(
             file,
-            one,
-            joints,
+            motion,
+            names[i : i + 1] if single else names,
             f"{file.stem}-{i:04d}",
             str(i),
             meta={"stated": stated},
             default=default,
         )
+
+
+def _motion(file: Path, signals: dict[str, Array], i: int, single: bool) -> dict[str, Array]:
+    """Return motion i of arrays of motions without padding, (rows, joints) each.
+
+    Args:
+        single: Only one joint moves in each motion, so that a motion has no axis of joints.
+    """
+    motion = {}
+    for name, array in signals.items():
+        values = np.asarray(array[i], float)
+        if single:
+            values = values[:, None]
+        if values.ndim != 2:
+            raise LogError(
+                f"{file}: motion {i} of {', '.join(signals)} is not rows of joints; write it again"
+            )
+        motion[name] = values
+    return _without_padding(motion)
+
+
+def _is_table(array: Array) -> bool:
+    return array.dtype != object and array.ndim == 2
+
+
+def _without_padding(motion: dict[str, Array]) -> dict[str, Array]:
+    """Return the arrays (rows, joints) to the last row in which a command or position is not 0."""
+    qpos = motion["real_dof_positions"]
+    ctrl = motion["real_dof_positions_cmd"]
+    rows = min(len(values) for values in motion.values())
+    used = np.flatnonzero(qpos[:rows].any(axis=1) | ctrl[:rows].any(axis=1))
+    end = int(used[-1]) + 1 if len(used) else 0
+    return {name: values[:end] for name, values in motion.items()}
 
 
 @sandboxed(LogError, "numpy")

@@ -88,7 +88,7 @@ class _Array:
     def __setstate__(self, state: Any) -> None:
         self.state = state
 
-    def real(self, made: Any) -> Any:
+    def real(self, make: Callable[[Any], Any]) -> Any:
         shape, kind, order, data = self.state[-4:]
         if (
             not isinstance(kind, _Type)
@@ -98,7 +98,7 @@ class _Array:
             raise _RefusedError("an array without type or shape")
         if kind.text.lstrip("|<>=")[:1] == "O":
             out = np.empty(len(data), object)
-            out[:] = [made(x) for x in data]
+            out[:] = [make(x) for x in data]
             return out.reshape(shape)
         if kind.real().kind not in KINDS or not isinstance(data, (bytes, bytearray)):
             raise _RefusedError(f"an array of {kind.text}")
@@ -143,7 +143,7 @@ class _Scalar:
         self.kind = kind
         self.data = data
 
-    def real(self, made: Any) -> Any:
+    def real(self, make: Callable[[Any], Any]) -> Any:
         return np.frombuffer(self.data, self.kind.real())[0]
 
 
@@ -151,19 +151,7 @@ class _Tensor:
     """A tensor that was meant: a view of a storage, which the persistent id before it named."""
 
     def __init__(self, storage: Any, offset: Any, size: Any, stride: Any, *_: Any) -> None:
-        if (
-            not isinstance(storage, np.ndarray)
-            or not isinstance(size, tuple)
-            or not isinstance(stride, tuple)
-        ):
-            raise _RefusedError("a tensor without storage, size or stride")
-        if len(size) != len(stride) or not all(
-            type(n) is int and n >= 0 for n in (offset, *size, *stride)
-        ):
-            raise _RefusedError("a tensor whose size is not numbers")
-        last = offset + sum((n - 1) * step for n, step in zip(size, stride, strict=True))
-        if math.prod(size) and last >= len(storage):
-            raise _RefusedError(f"a tensor of size {size} in a storage of {len(storage)}")
+        _require_view(storage, offset, size, stride)
         steps = [n * storage.itemsize for n in stride]
         self.array = None
         # one may claim to be large by repeating one number: it is left alone
@@ -171,6 +159,19 @@ class _Tensor:
             self.array = np.lib.stride_tricks.as_strided(
                 storage[offset:], size, steps, writeable=False
             ).copy()
+
+
+def _require_view(storage: Any, offset: Any, size: Any, stride: Any) -> None:
+    """Refuse what is no view of a storage, or reaches beyond it."""
+    shaped = isinstance(size, tuple) and isinstance(stride, tuple)
+    if not isinstance(storage, np.ndarray) or not shaped:
+        raise _RefusedError("a tensor without storage, size or stride")
+    counts = all(type(n) is int and n >= 0 for n in (offset, *size, *stride))
+    if len(size) != len(stride) or not counts:
+        raise _RefusedError("a tensor whose size is not numbers")
+    last = offset + sum((n - 1) * step for n, step in zip(size, stride, strict=True))
+    if math.prod(size) and last >= len(storage):
+        raise _RefusedError(f"a tensor of size {size} in a storage of {len(storage)}")
 
 
 def _codec(text: Any, encoding: Any) -> bytes:
@@ -235,6 +236,29 @@ class _Unpickler(pickle._Unpickler):
     dispatch: ClassVar[Any] = pickle._Unpickler.dispatch | {pickle.BUILD[0]: load_build}
 
 
+class _Maker:
+    """Makes arrays and plain values of what was meant, and counts them."""
+
+    def __init__(self) -> None:
+        self.steps = 0
+
+    def make(self, x: Any) -> Any:
+        self.steps += 1
+        if self.steps > MOST_STEPS:
+            raise _RefusedError("too many values")
+        if isinstance(x, (_Array, _Scalar)):
+            return x.real(self.make)
+        if isinstance(x, (_Wrapped, _Tensor)):
+            return x.array
+        if isinstance(x, dict):
+            return {k: self.make(v) for k, v in x.items()}
+        if isinstance(x, (list, tuple)):
+            return [self.make(v) for v in x]
+        if x is None or isinstance(x, (bool, int, float, str)):
+            return x
+        raise _RefusedError(f"a {type(x).__name__}")
+
+
 def load(data: bytes, where: str, storage: Callable[[str], bytes] | None = None) -> Any:
     """Return the contents of a pickle, or of an uncompressed or zlib joblib file.
 
@@ -245,30 +269,11 @@ def load(data: bytes, where: str, storage: Callable[[str], bytes] | None = None)
     Raises:
         LogError: It names anything else, is damaged, or too large.
     """
-    steps = 0
-
-    def made(x: Any) -> Any:
-        nonlocal steps
-        steps += 1
-        if steps > MOST_STEPS:
-            raise _RefusedError("too many values")
-        if isinstance(x, (_Array, _Scalar)):
-            return x.real(made)
-        if isinstance(x, (_Wrapped, _Tensor)):
-            return x.array
-        if isinstance(x, dict):
-            return {k: made(v) for k, v in x.items()}
-        if isinstance(x, (list, tuple)):
-            return [made(v) for v in x]
-        if x is None or isinstance(x, (bool, int, float, str)):
-            return x
-        raise _RefusedError(f"a {type(x).__name__}")
-
     try:
         if data[:1] == b"\x78":
             packed = zlib.decompressobj()
             data = packed.decompress(data, MAX_ARRAYS_BYTES)
-        return made(_Unpickler(io.BytesIO(data), storage).load())
+        return _Maker().make(_Unpickler(io.BytesIO(data), storage).load())
     except Exception as error:  # a damaged stream makes the machine of a pickle fail in any way
         reason = " ".join(str(error).split())[:150] or type(error).__name__
         raise LogError(

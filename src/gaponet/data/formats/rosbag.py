@@ -19,6 +19,7 @@ import re
 from collections.abc import Callable, Container, Iterator
 from contextlib import contextmanager
 from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -58,8 +59,9 @@ HG = {
 POINT = "trajectory_msgs/JointTrajectoryPoint"
 # packages and messages of what is seen, of bodies and of the system itself
 NOT_JOINTS = re.compile(
-    r"(sensor_msgs/msg/(?!JointState$)|nav_msgs|tf2?_msgs|geometry_msgs|visualization_msgs|rosgraph_msgs|rcl_interfaces|"
-    r"diagnostic_msgs|stereo_msgs|vision_msgs|action_msgs|lifecycle_msgs|statistics_msgs|std_msgs/msg/U?Int8).*"
+    r"(sensor_msgs/msg/(?!JointState$)|nav_msgs|tf2?_msgs|geometry_msgs|visualization_msgs"
+    r"|rosgraph_msgs|rcl_interfaces|diagnostic_msgs|stereo_msgs|vision_msgs|action_msgs"
+    r"|lifecycle_msgs|statistics_msgs|std_msgs/msg/U?Int8).*"
 )
 MOST = 256  # numbers of a field: more is a picture
 CONTROLLER = (
@@ -72,6 +74,7 @@ INTERFACES = {
     "joint_names\ncontrol_msgs/InterfaceValue[] interface_values",
 }
 Fields = dict[str, tuple[tuple[str, ...], Any]]  # field → (names of its columns, its numbers)
+Wanted = dict[str, dict[str, tuple[str, ...]]]  # topic → field → names of its columns
 
 
 def find(path: Path) -> list[Path]:
@@ -203,17 +206,11 @@ def _messages(
     for connection, time, raw in reader.messages(connections):
         message = reader.deserialize(raw, connection.msgtype)
         stamp = getattr(getattr(message, "header", None), "stamp", None)
-        stamped = (
-            stamp.sec + 1e-9 * stamp.nanosec
-            if stamp is not None and (stamp.sec or stamp.nanosec)
-            else None
-        )
-        yield (
-            connection,
-            1e-9 * time,
-            KINDS.get(connection.msgtype, _numbers)(connection.topic, message),
-            stamped,
-        )
+        stamped = None
+        if stamp is not None and (stamp.sec or stamp.nanosec):
+            stamped = stamp.sec + 1e-9 * stamp.nanosec
+        fields = KINDS.get(connection.msgtype, _numbers)(connection.topic, message)
+        yield connection, 1e-9 * time, fields, stamped
 
 
 def _known(reader: Any) -> list[Any]:
@@ -226,43 +223,52 @@ def _known(reader: Any) -> list[Any]:
 
 
 @sandboxed(LogError, "rosbags.highlevel", 4.0)
-def _peeked(bag: Path) -> dict[str, dict[str, tuple[str, ...]]]:
+def _peeked(bag: Path) -> Wanted:
     with _opened(bag) as reader:
         return _peek(bag, reader)
 
 
-def _peek(bag: Path, reader: Any) -> dict[str, dict[str, tuple[str, ...]]]:
+def _peek(bag: Path, reader: Any) -> Wanted:
     """topic → field → names of its columns, of all messages together: several publishers may tell
     of some joints each.
 
     Arrays without names that have another length are a field of TOPIC#2.
     """
-    topics: dict[str, dict[str, tuple[str, ...]]] = {}
+    topics: Wanted = {}
     for connection in _known(reader):
-        sets: dict[str, list[tuple[str, ...]]] = {}  # of a field
-        for i, (_, _, fields, _) in enumerate(_messages(reader, [connection])):
+        sets: dict[str, list[tuple[str, ...]]] = {}  # field → names of its columns, by topic
+        for _, _, fields, _ in islice(_messages(reader, [connection]), PEEK + 1):
             for field, (labels, _) in fields.items():
-                mine = sets.setdefault(field, [])
-                alike = [k for k, known in enumerate(mine) if _joined(known, labels)]
-                at = alike[0] if alike else len(mine)
-                if alike:
-                    mine[at] = tuple(dict.fromkeys((*mine[at], *labels)))
-                else:
-                    mine.append(labels)
-                topic = f"{connection.topic}#{at + 1}" if at else connection.topic
-                topics.setdefault(topic, {})[field] = mine[at]
-            if i == PEEK:
-                break
+                of_field = sets.setdefault(field, [])
+                number = _join(of_field, labels)
+                topic = f"{connection.topic}#{number + 1}" if number else connection.topic
+                topics.setdefault(topic, {})[field] = of_field[number]
     if not topics:
-        types = ", ".join(sorted({c.msgtype for c in reader.connections})) or "no topics at all"
-        strange = sorted({c.msgtype for c in reader.connections} - set(reader.typestore.types))
-        why = (
-            f"; the bag does not define {', '.join(strange)}: record as .mcap, which does"
-            if strange
-            else ""
-        )
-        raise LogError(f"{bag}: none of its topics is about joints; it has {types}{why}")
+        raise _no_joints(bag, reader)
     return topics
+
+
+def _no_joints(bag: Path, reader: Any) -> LogError:
+    """Return the error that no topic of a bag is about joints."""
+    kinds = {c.msgtype for c in reader.connections}
+    undefined = sorted(kinds - set(reader.typestore.types))
+    why = ""
+    if undefined:
+        why = f"; the bag does not define {', '.join(undefined)}: record as .mcap, which does"
+    types = ", ".join(sorted(kinds)) or "no topics at all"
+    return LogError(f"{bag}: none of its topics is about joints; it has {types}{why}")
+
+
+def _join(sets: list[tuple[str, ...]], labels: tuple[str, ...]) -> int:
+    """Add names of columns to the first set that they belong to, or as a new set; return its
+    number.
+    """
+    for number, known in enumerate(sets):
+        if _joined(known, labels):
+            sets[number] = tuple(dict.fromkeys((*known, *labels)))
+            return number
+    sets.append(labels)
+    return len(sets) - 1
 
 
 def _joined(known: tuple[str, ...], labels: tuple[str, ...]) -> bool:
@@ -285,9 +291,6 @@ class _Row(NamedTuple):
     stamped: bool
     # by field, in the order of its columns; NaN for those of which it tells nothing
     values: list[list[float]]
-
-
-Wanted = dict[str, dict[str, tuple[str, ...]]]  # topic → field → names of its columns
 
 
 @sandboxed(LogError, "rosbags.highlevel", 4.0)
@@ -414,23 +417,20 @@ def _clocks(stamps: dict[str, Array], notes: dict[str, Any]) -> dict[str, Array]
     """Time of the rows of each topic, from columns received, stamp, whether stamped; all on one
     clock.
     """
-    off = {}
-    for topic, (received, stamp, stamped) in ((t, s.T) for t, s in stamps.items()):
+    lines: dict[str, Array] = {}  # of received − stamp over time: slope, s/s, and start, s
+    for topic, table in stamps.items():
+        received, stamp, stamped = table.T
         if len(stamp) > 1 and stamped.all():
-            off[topic] = np.polyfit(received - received[0], received - stamp, 1)  # s/s, s
-    span = {t: float(np.ptp(s[:, 0])) for t, s in stamps.items()}
-    late = [float(b) for _, b in off.values()] + [0.0] * (len(stamps) > len(off))
-    apart = len(stamps) > 1 and (max(late, default=0.0) - min(late, default=0.0) > LATENCY)
-    drifts = any(abs(a) * span[t] > DRIFT for t, (a, _) in off.items())
+            lines[topic] = np.polyfit(received - received[0], received - stamp, 1)
+    moved = _must_be_moved(stamps, lines)
     times = {}
     for topic, table in stamps.items():
-        received = table[:, 0]
-        stamp = table[:, 1]
-        if topic not in off:
+        received, stamp, _ = table.T
+        if topic not in lines:
             times[topic] = received
             notes.setdefault("clock", {})[topic] = "the recorder's: no stamps"
-        elif apart or drifts:
-            rate, start = off[topic]
+        elif moved:
+            rate, start = lines[topic]
             times[topic] = stamp + start + rate * (received - received[0])
             notes.setdefault("clock", {})[topic] = (
                 f"stamps moved by {start:.4f} s and {1e6 * rate:.0f} ppm"
@@ -438,6 +438,21 @@ def _clocks(stamps: dict[str, Array], notes: dict[str, Any]) -> dict[str, Array]
         else:
             times[topic] = stamp
     return times
+
+
+def _must_be_moved(stamps: dict[str, Array], lines: dict[str, Array]) -> bool:
+    """Return True if stamps are of several clocks: topics lie apart, or one runs away.
+
+    Args:
+        stamps, lines: As in _clocks.
+    """
+    spans = {topic: float(np.ptp(table[:, 0])) for topic, table in stamps.items()}
+    late = [float(start) for _, start in lines.values()]
+    if len(lines) < len(stamps):
+        late.append(0.0)  # a topic with the recorder's clock
+    if len(stamps) > 1 and max(late) - min(late) > LATENCY:
+        return True
+    return any(abs(rate) * spans[topic] > DRIFT for topic, (rate, _) in lines.items())
 
 
 def _numbers(topic: str, m: Any) -> Fields:

@@ -27,7 +27,7 @@ from gaponet.data.describe.raw_recording import RawRecording, Signal, require_co
 from gaponet.data.formats import files_under, joint_rows, parquet
 from gaponet.data.formats.dates import is_date, to_seconds
 from gaponet.data.formats.episodes import episodes
-from gaponet.data.log import CHANNELS, skipped_rows
+from gaponet.data.log import skipped_rows
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -41,7 +41,15 @@ MIN_TRANSPOSED_CELLS = (
 )
 DECIMAL_SAMPLE_BYTES = 20_000  # of the first rows, by which decimal commas are told
 EMPTY = ("", "nan", "NaN", "NA", "N/A", "null", "None")  # cells without a number
-DEFAULT: LogsFile = {"time": "time"} | {c: c + ".{joint}" for c in CHANNELS}  # type: ignore[assignment]
+DEFAULT: LogsFile = {
+    "time": "time",
+    "ctrl": "ctrl.{joint}",
+    "qpos": "qpos.{joint}",
+    "qvel": "qvel.{joint}",
+    "tau": "tau.{joint}",
+    "temperature": "temperature.{joint}",
+    "feedforward_torque": "feedforward_torque.{joint}",
+}
 
 
 def detects(path: Path) -> bool:
