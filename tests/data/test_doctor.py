@@ -15,7 +15,7 @@ from arm import recordings, write_dataset
 from logs import arm_sequence, late, table_text, wave
 
 from gaponet.base.errors import DatasetError, WorkerError
-from gaponet.data.checks.timing import MIN_EARLY_RATIO, _drift
+from gaponet.data.checks.timing import MIN_EARLY_RATIO, clock_drift
 from gaponet.data.doctor import DoctorResult
 from gaponet.data.importer import import_logs
 from gaponet.data.sequence import Sequence
@@ -226,9 +226,9 @@ def test_a_clock_that_drifts_is_late_by_half_in_the_middle_and_motions_that_diff
     end = 0.02 * np.array([0.7, 0.9, 1.0, 1.0, 1.1, 1.3])
     way = middle * np.array([1, -1, 1, -1, 1, -1]) if middle > 1 else middle
     shifts = np.stack([0 * end, way * end, end], axis=1)
-    assert [f.check for f in _drift(surveys, shifts)] == ["clock"] * told
+    assert [f.check for f in clock_drift(surveys, shifts)] == ["clock"] * told
     short = [SimpleNamespace(response=SimpleNamespace(duration=5.0))] * 6
-    assert not list(_drift(short, shifts))
+    assert not list(clock_drift(short, shifts))
 
 
 @pytest.mark.parametrize(("ahead", "said"), [(0, False), (6, True)])

@@ -72,18 +72,17 @@ def make_card(dataset: Dataset, progress: Progress = no_progress) -> dict[str, A
             progress(done, len(dataset), entry.meta.motion)
         if repetitions.count > 1:
             repeated.append(repetitions.result())
-    return _counted(dataset) | {
-        "signals": {
-            name: {
+    signals: dict[str, Any] = {}
+    for name in ARRAYS:
+        if stats[name]:
+            values = np.concatenate(samples[name])
+            signals[name] = {
                 "unit": UNITS[name],
                 "sequences": len(stats[name]),
-                "joints": _by_joint(
-                    pool(stats[name]), np.concatenate(samples[name]), dataset.joint_names
-                ),
+                "joints": _by_joint(pool(stats[name]), values, dataset.joint_names),
             }
-            for name in ARRAYS
-            if stats[name]
-        },
+    return _counted(dataset) | {
+        "signals": signals,
         "repeatability": Repetitions.summary(repeated, dataset.joint_names),
     }
 
@@ -203,7 +202,9 @@ def paper_table(card: dict[str, Any]) -> ResultTable:
 
 def card_markdown(card: dict[str, Any]) -> str:
     """Return the card as Markdown; the first line says if robots were virtual."""
-    tables = [line for by in PROPERTIES for line in (count_table(card, by).markdown(), "")]
+    tables: list[str] = []
+    for by in PROPERTIES:
+        tables += (count_table(card, by).markdown(), "")
     lines = [
         f"# {escape_markdown(headline(card))}",
         "",
@@ -262,7 +263,9 @@ def _repeatability(card: dict[str, Any]) -> Iterator[str]:
     if excluded := repeated["left_out_other_command"]:
         yield f"{excluded:,} sequences of these groups had another command and were left out."
     channels = repeated["channels"]
-    joints = dict.fromkeys(j for c in channels.values() for j in c["joints"])
+    joints: dict[str, None] = {}
+    for channel in channels.values():
+        joints |= dict.fromkeys(channel["joints"])
     rows = [
         (joint, *(_digits(c["joints"].get(joint)) for c in channels.values())) for joint in joints
     ]

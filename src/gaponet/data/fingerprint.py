@@ -73,13 +73,8 @@ def equal_commands(fingerprints: Sequence[CommandFingerprint]) -> list[tuple[int
     slopes = np.gradient(outlines, axis=1)
     ranges = np.ptp(outlines, axis=1)
     for i in np.flatnonzero(ranges > 0):
-        others = (
-            i
-            + 1
-            + np.flatnonzero(
-                np.abs(seconds[i + 1 :] - seconds[i]) <= MAX_DURATION_DIFFERENCE * seconds[i]
-            )
-        )
+        longer = np.abs(seconds[i + 1 :] - seconds[i])
+        others = i + 1 + np.flatnonzero(longer <= MAX_DURATION_DIFFERENCE * seconds[i])
         difference = outlines[others] - outlines[i]
         slope = slopes[i]
         shift = np.clip(
@@ -96,11 +91,13 @@ def _pairs_with_shared_rows(samples: list[set[int]]) -> Iterator[tuple[int, int]
     from scipy.sparse import csr_matrix
 
     index = {row: k for k, row in enumerate(sorted(set().union(*samples)))}
-    places = [(i, index[row]) for i, sample in enumerate(samples) for row in sample]
-    contains = csr_matrix(
-        (np.ones(len(places), np.int32), tuple(zip(*places, strict=True))),
-        (len(samples), len(index)),
-    )
+    owners: list[int] = []
+    columns: list[int] = []
+    for i, sample in enumerate(samples):
+        owners += [i] * len(sample)
+        columns += [index[row] for row in sample]
+    ones = np.ones(len(columns), np.int32)
+    contains = csr_matrix((ones, (owners, columns)), (len(samples), len(index)))
     common = (contains @ contains.T).tocoo()
     for i, j, n in zip(common.row.tolist(), common.col.tolist(), common.data.tolist(), strict=True):
         a = samples[i]

@@ -36,17 +36,16 @@ def repetition_difference(sequences: ListOf[Sequence], joints: ListOf[str]) -> A
         joints: Names of the n joints.
     """
     marks = [fingerprint(s.ctrl, s.dt) for s in sequences]
-    pairs = [(sequences[i], sequences[j]) for i, j in equal_commands(marks)]
-    pairs = [
-        (a, b)
-        for a, b in pairs
-        if a.meta.repetition_key[1:] == b.meta.repetition_key[1:] and a.dt == b.dt
-    ]
+    pairs = []
+    for i, j in equal_commands(marks):
+        a = sequences[i]
+        b = sequences[j]
+        if a.meta.repetition_key[1:] == b.meta.repetition_key[1:] and a.dt == b.dt:
+            pairs.append((a, b))
     total, count = np.zeros((2, len(joints)))
     for a, b in pairs[:: max(1, len(pairs) // MAX_PAIRS)]:
-        columns = [
-            i for i, j in enumerate(joints) if j not in (*a.meta.unrecorded, *b.meta.unrecorded)
-        ]
+        unrecorded = {*a.meta.unrecorded, *b.meta.unrecorded}
+        columns = [i for i, name in enumerate(joints) if name not in unrecorded]
         places = [a.joint_names.index(joints[i]) for i in columns]
         if columns and (difference := _tracking_difference(a, b, places)) is not None:
             total[columns] += difference

@@ -513,14 +513,13 @@ def _resample(log: Log, dt: float, begin: float | None) -> dict[str, Array]:
         grid = begin + dt * np.arange(round((stop - begin) / dt) + 1)
         near = 0.5
     grid = np.clip(grid, start, stop)
-    return {
-        name: (
-            resample_zoh(c.time, c.values, grid, near)
-            if name in COMMANDS
-            else resample_linear(c.time, c.values, grid)
-        )
-        for name, c in log.channels.items()
-    }
+    arrays = {}
+    for name, (time, values) in log.channels.items():
+        if name in COMMANDS:
+            arrays[name] = resample_zoh(time, values, grid, near)
+        else:
+            arrays[name] = resample_linear(time, values, grid)
+    return arrays
 
 
 def _feedforward_position(
@@ -542,11 +541,11 @@ def _feedforward_position(
 
 def _led(log: Log, robot: RobotSpec) -> dict[str, Follower]:
     """Mimic joints that a log lacks, and whose leading joint it holds."""
-    return {
-        name: follower
-        for name, follower in robot.followers.items()
-        if name not in log.joint_names and follower.joint in log.joint_names
-    }
+    led = {}
+    for name, follower in robot.followers.items():
+        if name not in log.joint_names and follower.joint in log.joint_names:
+            led[name] = follower
+    return led
 
 
 def _to_robot(channel: str, values: Array, log: Log, robot: RobotSpec) -> Array:
@@ -559,8 +558,9 @@ def _to_robot(channel: str, values: Array, log: Log, robot: RobotSpec) -> Array:
         for joint, angle in log.meta.get("posture", {}).items():
             out[:, robot.index([joint])] = angle
     out[:, robot.index(log.joint_names)] = values
-    moving = channel in ("ctrl", "qpos", "qvel")
-    for name, follower in _led(log, robot).items() if moving else ():
+    if channel not in ("ctrl", "qpos", "qvel"):
+        return out
+    for name, follower in _led(log, robot).items():
         leader = out[:, robot.index([follower.joint])]
         at_zero = follower.at_zero if channel != "qvel" else 0.0
         out[:, robot.index([name])] = follower.ratio * leader + at_zero

@@ -258,11 +258,10 @@ def _by_range(surveys: list[Survey], robot: RobotSpec) -> list[Finding]:
     beyond = _beyond(low, high, same, robot)
     if beyond.max(initial=0.0) < MAX_BEYOND_RAD:
         return []
-    fitting = [
-        exchange
-        for exchange in _exchanges(judged, robot)
-        if _beyond(low, high, exchange.order, robot).max() < MAX_INSIDE_RAD
-    ]
+    fitting = []
+    for exchange in _exchanges(judged, robot):
+        if _beyond(low, high, exchange.order, robot).max() < MAX_INSIDE_RAD:
+            fitting.append(exchange)
     if not fitting:
         return []
     outside = [

@@ -5,7 +5,8 @@ without values?
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from itertools import chain
 
 import numpy as np
 
@@ -26,6 +27,11 @@ RESOLUTION_TOLERANCE = 0.02  # relative difference of an encoder's steps
 # of torque cut off at one value; of the torque limit
 MIN_FLAT_ROWS = 20
 MIN_FLAT_SHARE = 0.01
+
+
+def _joined(parts: list[Iterable[str]]) -> tuple[str, ...]:
+    """Return the names of all parts, each once."""
+    return tuple(dict.fromkeys(chain.from_iterable(parts)))
 
 
 def _motions(surveys: list[Survey]) -> str:
@@ -123,7 +129,7 @@ def _nonsense(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
         notes = [s.entry.meta.notes["nonsense"][channel] for s in hit]
         rows = sum(n["rows"] for n in notes)
         done = ", ".join(dict.fromkeys(n["done"] for n in notes))
-        joints = tuple(dict.fromkeys(j for n in notes for j in n["joints"]))
+        joints = _joined([n["joints"] for n in notes])
         text = (
             f"{channel} of {abbreviate(list(joints))} was what no joint does (first "
             f"{notes[0]['worst']:.4g}) in {rows} rows of {_motions(hit)}, a counter or a bad "
@@ -149,8 +155,7 @@ def _as_logged(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     """What was held, left out, continued or cut at import?"""
     for key, of_channel in (("slower", _slower), ("absent", _absent), ("turns", _turns)):
         hit = [s for s in surveys if key in s.entry.meta.notes]
-        names = dict.fromkeys(name for s in hit for name in s.entry.meta.notes[key])
-        for name in names:
+        for name in _joined([s.entry.meta.notes[key] for s in hit]):
             yield of_channel(name, [s for s in hit if name in s.entry.meta.notes[key]])
     cut = [
         s for s in surveys if s.entry.meta.notes.get("rows_cut", 0) > MAX_CUT_SHARE * s.entry.rows
@@ -177,7 +182,7 @@ def _slower(channel: str, hit: list[Survey]) -> Finding:
 
 
 def _absent(channel: str, hit: list[Survey]) -> Finding:
-    joints = tuple(dict.fromkeys(j for s in hit for j in s.entry.meta.notes["absent"][channel]))
+    joints = _joined([s.entry.meta.notes["absent"][channel] for s in hit])
     text = (
         f"{channel} of {abbreviate(list(joints))} is empty in all rows of {_motions(hit)}: "
         f"{channel} is left out"
@@ -289,11 +294,8 @@ def _resolution(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
             "radians?"
         )
         yield Finding("warning", "unit", f"{text} Import again with the right unit", degrees)
-    coarse = [
-        (float(x), name)
-        for x, name in zip(step, robot.joint_names, strict=True)
-        if x > MAX_RESOLUTION_RAD
-    ]
+    steps = zip(step.tolist(), robot.joint_names, strict=True)
+    coarse = [(size, name) for size, name in steps if size > MAX_RESOLUTION_RAD]
     if not coarse:
         yield Finding(
             "ok", "resolution", f"positions change in steps of at most {step.max() * 1e3:.2f} mrad"

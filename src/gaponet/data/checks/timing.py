@@ -68,7 +68,7 @@ def _timing(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     elif np.isfinite(onset):
         yield _dead_time(onset)
     findings += _late_joints(common, onset, robot)
-    findings += _drift(complete, common.shifts, unknown)
+    findings += clock_drift(complete, common.shifts, unknown)
     if unknown < step:
         findings += _averaged(complete)
     yield from findings or [Finding("ok", "timing", "commands and states have the same clock")]
@@ -247,7 +247,7 @@ def _agree(late: float, delay: float) -> bool:
     return delay * late > 0 and abs(delay) >= min(MIN_AGREEMENT * abs(late), MIN_SHIFT_S)
 
 
-def _drift(surveys: list[Survey], shifts: Array, unknown: float = 0.0) -> Iterator[Finding]:
+def clock_drift(surveys: list[Survey], shifts: Array, unknown: float = 0.0) -> Iterator[Finding]:
     """Find a clock drift from the shifts (recordings, parts) s of the parts of each recording."""
     duration = np.array([s.response.duration for s in surveys])
     long = duration >= MIN_DRIFT_DURATION_S  # in shorter recordings friction changes the shift

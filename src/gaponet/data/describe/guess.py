@@ -474,16 +474,13 @@ def _clock(recording: RawRecording, specified: dict[str, Any]) -> list[str]:
 
 def _which_clock(clock: str, period: float, others: dict[str, float]) -> list[str]:
     """Ask which of several columns is the clock. others: name → its distance of rows."""
-    apart = [
-        name
-        for name, other in others.items()
-        if abs(rate_ratio(period, other) - 1) > MAX_RATE_DIFFERENCE
-    ]
+    ratios = {name: rate_ratio(period, other) for name, other in others.items()}
+    apart = [name for name, ratio in ratios.items() if abs(ratio - 1) > MAX_RATE_DIFFERENCE]
     rates = "; ".join(f"{name} {other:.4g} a row" for name, other in others.items())
     line = f"time = {_text(clock)}  # ? {period:.4g} a row; also like clocks: {rates}"
     if not apart:
         return [line]
-    factors = ", ".join(f"{rate_ratio(period, others[name]):.3g}" for name in apart)
+    factors = ", ".join(f"{ratios[name]:.3g}" for name in apart)
     return [
         f"# {clock} and {', '.join(apart)} run like clocks and differ by a factor of {factors}: "
         "choose one",
@@ -500,11 +497,8 @@ def _values(recording: RawRecording, pattern: str) -> Array | None:
     if "{joint}" not in pattern:
         return None
     before, after = map(re.escape, pattern.split("{joint}"))
-    names = [
-        c
-        for c in recording.columns
-        if re.fullmatch(f"{before}(.+?){after}", c) and c in recording.signals
-    ]
+    fits = re.compile(f"{before}(.+?){after}")
+    names = [c for c in recording.columns if c in recording.signals and fits.fullmatch(c)]
     if not names:
         return None
     loaded = recording.load(names)

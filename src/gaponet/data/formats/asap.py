@@ -51,13 +51,14 @@ def _read(file: Path) -> Any:
     return pickles.load(read_limited(file, LogError, "split it", MAX_ARRAYS_BYTES), str(file))
 
 
+def _is_array(value: Any) -> bool:
+    """Return True for an array of numbers."""
+    return isinstance(value, np.ndarray) and value.dtype.kind in "fiu" and value.ndim > 0
+
+
 def _recording(file: Path, name: str, motion: dict[str, Any]) -> RawRecording:
     where = f"{file}#{name}"
-    arrays = {
-        k: v
-        for k, v in motion.items()
-        if isinstance(v, np.ndarray) and v.dtype.kind in "fiu" and v.ndim
-    }
+    arrays = {name: value for name, value in motion.items() if _is_array(value)}
     fps = motion.get("fps")
     if not isinstance(fps, (int, float, np.number)) or not 1 <= float(fps) <= 10_000:
         raise LogError(f"{where}: fps is {fps!r:.40}; a number from 1 to 10000 Hz")

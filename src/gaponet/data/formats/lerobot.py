@@ -68,7 +68,10 @@ def detects(path: Path) -> bool:
 
 def find(path: Path) -> list[Path]:
     """The data file of every episode, of every set under the path."""
-    return [s.data_file(e) for s in sets_under(path) for e in s.episodes]
+    files: list[Path] = []
+    for part in sets_under(path):
+        files += map(part.data_file, part.episodes)
+    return files
 
 
 @dataclass(frozen=True)
@@ -122,15 +125,12 @@ def read(
                 "%s: %d episodes that meta/episodes lists are missing", part.path, part.absent
             )
         tasks = tasks_of(part)
-        open_file = Path()
-        table = None
+        frames = None
         for episode in part.episodes:
             file = part.data_file(episode)
-            if file != open_file:
-                open_file = file
-                table = _Frames(part, file, options)
-            assert table is not None
-            yield _motion(episode, tasks), partial(table.episode, episode)
+            if frames is None or frames.file != file:
+                frames = _Frames(part, file, options)
+            yield _motion(episode, tasks), partial(frames.episode, episode)
 
 
 def read_episodes(part: Set, episodes: list[dict[str, Any]], robot: RobotSpec) -> Iterator[Log]:
@@ -147,11 +147,10 @@ def read_episodes(part: Set, episodes: list[dict[str, Any]], robot: RobotSpec) -
 
 def _unit(part: Set, given: str | None) -> str:
     """The unit of positions: stated by an export, else by the user."""
-    stated = [
-        (part.features[f].get("info") or {}).get("unit")
-        for f in ("action", "observation.state")
-        if f in part.features
-    ]
+    stated = []
+    for name in ("action", "observation.state"):
+        if name in part.features:
+            stated.append((part.features[name].get("info") or {}).get("unit"))
     if part.ours and stated == ["rad", "rad"]:
         if given not in (None, "rad"):
             raise UsageError(
@@ -293,11 +292,8 @@ class _Frames:
                 f"{where} holds joint positions ({', '.join(joints)}), and {held} ({shown}); "
                 f"leave these out: ignore = [{patterns}] in logs.toml"
             )
-        others = [
-            name
-            for name in self.part.info["features"]
-            if re.search(r"joint|qpos", name) and name not in where
-        ]
+        named = [name for name in self.part.info["features"] if re.search(r"joint|qpos", name)]
+        others = [name for name in named if name not in where]
         hint = f" Features that may hold them: {', '.join(others)}." if others else ""
         raise LogError(f"{where} holds {held} ({shown}), not joint positions. {NO_TARGETS}.{hint}")
 

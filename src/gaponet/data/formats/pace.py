@@ -58,9 +58,8 @@ def recordings(path: Path, specified: LogsFile) -> Iterator[RawRecording]:
 def _read(file: Path) -> dict[str, Any]:
     """Every array of numbers; others are left alone."""
     with pickles.open_zip(file, ".pt file of tensors") as packed:  # as torch 1.6 and later write
-        top = next(
-            (n.removesuffix("data.pkl") for n in packed.namelist() if n.endswith("/data.pkl")), None
-        )
+        pickled = [name for name in packed.namelist() if name.endswith("/data.pkl")]
+        top = pickled[0].removesuffix("data.pkl") if pickled else None
         if top is None:
             raise LogError(
                 f"{file}: a zip file without data.pkl, so not what torch.save writes; is it the "
@@ -77,11 +76,9 @@ def _read(file: Path) -> dict[str, Any]:
         raise LogError(
             f"{file}: holds no dictionary of tensors; save {{time, dof_pos, des_dof_pos}}"
         )
-    arrays = {
-        str(name): value
-        for name, value in specified.items()
-        if isinstance(value, (np.ndarray, int, float))
-    }
-    return {
-        n: np.asarray(v, float) for n, v in arrays.items() if np.asarray(v).dtype.kind in "fiub"
-    }
+    arrays = {}
+    for name, value in specified.items():
+        is_number = isinstance(value, (np.ndarray, int, float))
+        if is_number and np.asarray(value).dtype.kind in "fiub":
+            arrays[str(name)] = np.asarray(value, float)
+    return arrays

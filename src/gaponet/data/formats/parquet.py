@@ -32,19 +32,11 @@ def header(file: Path) -> tuple[list[str], dict[str, str]]:
 @sandboxed(LogError, "pyarrow.parquet")
 def list_widths(file: Path) -> dict[str, int]:
     """Columns whose cells are lists of numbers → how many numbers the first cell holds."""
-    import pyarrow as pa
     import pyarrow.parquet as pq
 
     with reading(file, "Parquet file"):
         schema = pq.read_schema(file)
-        lists = [
-            field.name
-            for field in schema
-            if pa.types.is_list(field.type)
-            or pa.types.is_fixed_size_list(field.type)
-            or pa.types.is_large_list(field.type)
-        ]
-        numbers = [name for name in lists if _holds_numbers(schema.field(name).type)]
+        numbers = [field.name for field in schema if _holds_numbers(field.type)]
         if not numbers:
             return {}
         first = next(pq.ParquetFile(file).iter_batches(1, columns=numbers, use_threads=False), None)
@@ -55,8 +47,12 @@ def list_widths(file: Path) -> dict[str, int]:
 
 
 def _holds_numbers(kind: pa.DataType) -> bool:
+    """Return True if cells of a column are lists of numbers."""
     import pyarrow as pa
 
+    tests = (pa.types.is_list, pa.types.is_fixed_size_list, pa.types.is_large_list)
+    if not any(is_list(kind) for is_list in tests):
+        return False
     return bool(pa.types.is_integer(kind.value_type) or pa.types.is_floating(kind.value_type))
 
 

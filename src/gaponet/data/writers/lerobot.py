@@ -246,12 +246,14 @@ class _Set:
         import pyarrow as pa
 
         schema = self._schema()
-        arrays = [
-            pa.FixedSizeListArray.from_arrays(pa.array(x.ravel()), type=field.type)
-            if pa.types.is_fixed_size_list(field.type)
-            else pa.array(x.ravel(), field.type)
-            for field, x in zip(schema, columns.values(), strict=True)
-        ]
+        arrays = []
+        for field, values in zip(schema, columns.values(), strict=True):
+            flat = values.ravel()
+            if pa.types.is_fixed_size_list(field.type):
+                array = pa.FixedSizeListArray.from_arrays(pa.array(flat), type=field.type)
+            else:
+                array = pa.array(flat, field.type)
+            arrays.append(array)
         return pa.table(arrays, schema=schema)
 
     def _write_meta(self, stats: FeatureStatistics) -> None:
@@ -262,9 +264,8 @@ class _Set:
         pq.write_table(_task_table(self.tasks), meta / "tasks.parquet")
         write_json(meta / "info.json", self._info())
         write_json(meta / "stats.json", stats)
-        header = {
-            k: self.dataset.header[k] for k in ("licence", "source") if k in self.dataset.header
-        }
+        stated = self.dataset.header
+        header = {name: stated[name] for name in ("licence", "source") if name in stated}
         write_json(
             meta / OURS,
             {
@@ -280,18 +281,16 @@ class _Set:
 
     def _info(self) -> dict[str, Any]:
         names = list(self.dataset.joint_names)
-        features: dict[str, Any] = {
-            FEATURES[c]: {
+        features: dict[str, Any] = {}
+        for channel in self.channels:
+            features[FEATURES[channel]] = {
                 "dtype": "float32",
                 "shape": [self.n],
                 "names": names,
-                "info": {"unit": UNITS[c]},
+                "info": {"unit": UNITS[channel]},
             }
-            for c in self.channels
-        }
-        features |= {
-            name: {"dtype": kind, "shape": [1], "names": None} for name, kind in INDEX.items()
-        }
+        for name, kind in INDEX.items():
+            features[name] = {"dtype": kind, "shape": [1], "names": None}
         return {
             "codebase_version": VERSION,
             "robot_type": self.dataset.robot_name,
