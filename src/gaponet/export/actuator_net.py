@@ -90,9 +90,11 @@ class ActuatorNet(nn.Module):
         self.scale = kp
         self.gain = 1.0
         self.most_added = kp * delta_max  # N·m
-        widths = (2 * length, *HIDDEN)
-        layers = [layer for a, b in pairwise(widths) for layer in (nn.Linear(a, b), nn.ELU())]
-        self.net = nn.Sequential(*layers, head := nn.Linear(HIDDEN[-1], 1))
+        layers: list[nn.Module] = []
+        for inputs, outputs in pairwise((2 * length, *HIDDEN)):
+            layers += [nn.Linear(inputs, outputs), nn.ELU()]
+        head = nn.Linear(HIDDEN[-1], 1)
+        self.net = nn.Sequential(*layers, head)
         nn.init.zeros_(head.weight)
         nn.init.zeros_(head.bias)
 
@@ -120,12 +122,12 @@ def read_run_recordings(
     place = data or read_config(run)["dataset"]
     dataset = Dataset(place if data else run / place)
     entries = [e for e in dataset.entries if e.meta.payload_mass == payload_mass]
-    hashes = [set(split_of_run(run)[split].values()) for split in ("train", "val")]
-    chosen = [
-        stratified_subset([e for e in entries if e.hash in split], MAX_RECORDINGS)
-        for split in hashes
-    ]
-    recordings = [comparable(dataset.sequences(split), robot, payload_mass) for split in chosen]
+    recordings = []
+    for split in ("train", "val"):
+        hashes = set(split_of_run(run)[split].values())
+        of_split = [entry for entry in entries if entry.hash in hashes]
+        chosen = stratified_subset(of_split, MAX_RECORDINGS)
+        recordings.append(comparable(dataset.sequences(chosen), robot, payload_mass))
     if not all(recordings):
         raise UsageError(
             f"no recording of {run} was made with {payload_mass:g} kg and the robot's own gains"
@@ -146,16 +148,13 @@ def write_networks(
     Returns:
         Mean |error| on the motions by form, rad.
     """
-    nets = _fit_networks(
-        sequences, replay(sequences, robot, corrector, lock_idle=True), robot, facts
-    )
+    rollouts = replay(sequences, robot, corrector, lock_idle=True)
+    nets = _fit_networks(sequences, rollouts, robot, facts)
     op = robot.operated_index
     aligned = zip(motions, replay(motions, robot, corrector, lock_idle=True), strict=True)
-    errors = {
-        gain: _error_in_mujoco(folder / facts["file"], motions, robot, nets, facts, gain)
-        for gain in GAINS
-    }
-    gain = min(errors, key=lambda g: errors[g])
+    file = folder / facts["file"]
+    errors = {g: _error_in_mujoco(file, motions, robot, nets, facts, g) for g in GAINS}
+    gain = min(errors, key=errors.__getitem__)
     info = {
         "length": _length(facts),
         "step": facts["options"]["timestep"],
@@ -187,25 +186,22 @@ def _fit_networks(
     step = facts["options"]["timestep"]
     length = _length(facts)
     delta_max = facts["delta_max"]
-    nets = {
-        name: ActuatorNet(joint, step, length, delta_max) for name, joint in facts["joints"].items()
-    }
+    nets = {}
+    for name, joint in facts["joints"].items():
+        nets[name] = ActuatorNet(joint, step, length, delta_max)
     rng = np.random.default_rng(0)
     torch.manual_seed(0)
-    for name in robot.joint_names:
-        i = robot.joint_names.index(name)
-        net = nets[name]
-        rows = ROWS // len(sequences) + 1
-        if name in robot.operated:
-            samples = [
-                _samples(s, r, i, net, facts, rng, rows)
-                for s, r in zip(sequences, rollouts, strict=True)
-            ]
-            x, y = (
-                torch.tensor(np.concatenate(p), dtype=torch.float32)
-                for p in zip(*samples, strict=True)
-            )
-            _fit(net, x, y)
+    rows = ROWS // len(sequences) + 1
+    for i, name in enumerate(robot.joint_names):
+        if name not in robot.operated:
+            continue
+        inputs = []
+        outputs = []
+        for sequence, rollout in zip(sequences, rollouts, strict=True):
+            x, y = _samples(sequence, rollout, i, nets[name], facts, rng, rows)
+            inputs.append(x)
+            outputs.append(y)
+        _fit(nets[name], _tensor(inputs), _tensor(outputs))
     return {name: net.eval().requires_grad_(False) for name, net in nets.items()}
 
 
@@ -230,9 +226,14 @@ def _samples(
     chosen = rng.integers(0, len(target), rows)
     past = np.maximum(chosen[:, None] - np.arange(length), 0)
     weights = net.servo[:length, 0].numpy() / facts["joints"][s.joint_names[i]]["kp"]
-    return np.concatenate([target[past] - q[past], v[past]], axis=1), (delta[past] @ weights)[
-        :, None
-    ]
+    inputs = np.concatenate([target[past] - q[past], v[past]], axis=1)
+    delayed = delta[past] @ weights
+    return inputs, delayed[:, None]
+
+
+def _tensor(parts: ListOf[np.ndarray]) -> Tensor:
+    """Return the rows of all parts as float32."""
+    return torch.tensor(np.concatenate(parts), dtype=torch.float32)
 
 
 def _fit(net: ActuatorNet, x: Tensor, y: Tensor) -> None:

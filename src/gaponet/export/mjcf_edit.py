@@ -74,19 +74,22 @@ class Tag:
     end: int = 0
 
 
+Edit = tuple[Path, int, int, bytes]  # file, start and end of the bytes to replace, new bytes
+
+
 @dataclass
 class Source:
     """Text of a file and of those that it includes, and the changes to make in it.
 
     Attributes:
-        edits: File, start and end of the bytes to replace, new bytes.
+        edits: Changes, in the order in which they were asked for.
         sections: Name of a section → text to add in such a section at the end of the main file.
     """
 
     main: Path
     text: dict[Path, bytes] = field(default_factory=dict)
     tags: list[Tag] = field(default_factory=list)
-    edits: list[tuple[Path, int, int, bytes]] = field(default_factory=list)
+    edits: list[Edit] = field(default_factory=list)
     sections: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -153,16 +156,13 @@ class Source:
         out = dict(self.text)
         root = next(t for t in self.tags if t.file == self.main)
         place = self.text[self.main].rindex(b"</", 0, root.end)
-        ends = "".join(
-            f"  <{name}>\n{text}  </{name}>\n" if text else f"  <{name}/>\n"
-            for name, text in self.sections.items()
-        )
+        ends = ""
+        for name, text in self.sections.items():
+            ends += f"  <{name}>\n{text}  </{name}>\n" if text else f"  <{name}/>\n"
         edits = [*self.edits, (self.main, place, place, ends.encode())]
-        # From the back. Of an insertion right before an element that changes, the element comes
-        # first.
-        for _, (file, start, end, new) in sorted(
-            enumerate(edits), key=lambda e: (-e[1][1], e[1][1] == e[1][2], -e[0])
-        ):
+        edits.reverse()  # of changes at one place, the last that was asked for is made first
+        edits.sort(key=_from_the_back)
+        for file, start, end, new in edits:
             out[file] = out[file][:start] + new + out[file][end:]
         return out
 
@@ -183,20 +183,14 @@ class Source:
 
     def child(self, parent: Tag, name: str) -> Tag | None:
         """Return the first element of a name in another one, which is in no body in between."""
-        inside = [
-            t
-            for t in self.tags
-            if t.file == parent.file and parent.open_end <= t.start < parent.end
-        ]
-        bodies = [t for t in inside if t.name == "body"]
-        return next(
-            (
-                t
-                for t in inside
-                if t.name == name and not any(b.start < t.start < b.end for b in bodies)
-            ),
-            None,
-        )
+        tags = [tag for tag in self.tags if tag.file == parent.file]
+        inside = [tag for tag in tags if parent.open_end <= tag.start < parent.end]
+        bodies = [tag for tag in inside if tag.name == "body"]
+        for tag in inside:
+            in_body = any(body.start < tag.start < body.end for body in bodies)
+            if tag.name == name and not in_body:
+                return tag
+        return None
 
     def write_changes(self, folder: Path) -> None:
         """Write the changes as a unified diff, changes.diff."""
@@ -206,6 +200,15 @@ class Source:
             a, b = (text.decode("utf-8").splitlines(keepends=True) for text in (old, edited[file]))
             lines += difflib.unified_diff(a, b, f"a/{file.name}", f"b/{file.name}", n=1)
         write_text(folder / "changes.diff", "".join(lines))
+
+
+def _from_the_back(edit: Edit) -> tuple[int, bool]:
+    """Return the key by which edits are made: later places first.
+
+    Of an insertion right before an element that changes, the element comes first.
+    """
+    _, start, end, _ = edit
+    return -start, start == end
 
 
 def edit_mjcf(
@@ -480,9 +483,8 @@ def _write(source: Source, out: Path) -> Path:
 
     Return the main one.
     """
-    needed = {
-        Path(os.path.abspath(f)) for f in mujoco.mju_getXMLDependencies(str(source.main))
-    } | set(source.text)
+    named = mujoco.mju_getXMLDependencies(str(source.main))
+    needed = {Path(os.path.abspath(file)) for file in named} | set(source.text)
     root = Path(os.path.commonpath([f.parent for f in needed]))
     edited = source.edited()
     with lock_folder(out, "engine"):
@@ -512,9 +514,10 @@ def _require(
         servo = joints[name]
         dof = now.joint(prefix + name).dofadr[0]
         i = _actuator(now, prefix + name)
-        passive = [
-            float(np.ravel(getattr(now, f"dof_{field}")[dof])[0]) for field in JOINT_ATTRIBUTES
-        ]
+        passive = []
+        for attribute in JOINT_ATTRIBUTES:
+            values = np.ravel(getattr(now, f"dof_{attribute}")[dof])  # of newer MuJoCo a polynomial
+            passive.append(float(values[0]))
         actual = [
             *passive,
             now.actuator_gainprm[i, 0],

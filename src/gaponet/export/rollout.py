@@ -76,19 +76,22 @@ def predict(
     """
     op = robot.operated_index
     played = [r.qpos[:, op] for r in replay(rollouts, robot, lock_idle=True)]
-    spread = [np.zeros_like(q) for q in played]
-    if sampled:
-        others = [replay(rollouts, other, lock_idle=True) for other in sampled]
-        spread = [
-            BAND_STD * np.sqrt(np.mean([(o[k].qpos[:, op] - q) ** 2 for o in others], axis=0))
-            for k, q in enumerate(played)
-        ]
-    return [
-        RolloutPrediction(
-            s.meta.motion, s.dt, s.ctrl[:, op], s.qpos[:, op], q, np.sqrt(error**2 + std**2)
+    others = [replay(rollouts, other, lock_idle=True) for other in sampled]
+    predictions = []
+    for k, rollout in enumerate(rollouts):
+        spread = np.zeros_like(played[k])
+        if others:
+            squared = [(other[k].qpos[:, op] - played[k]) ** 2 for other in others]
+            spread = BAND_STD * np.sqrt(np.mean(squared, axis=0))
+        half_width = np.sqrt(error**2 + spread**2)
+        target = rollout.ctrl[:, op]
+        simulated = rollout.qpos[:, op]
+        predictions.append(
+            RolloutPrediction(
+                rollout.meta.motion, rollout.dt, target, simulated, played[k], half_width
+            )
         )
-        for s, q, std in zip(rollouts, played, spread, strict=True)
-    ]
+    return predictions
 
 
 def summary(
@@ -106,17 +109,13 @@ def summary(
     difference = rows(lambda p: np.abs(p.rollout - p.robot))
     inside = rows(lambda p: p.inside)
     band = rows(lambda p: p.half_width)
-    rollout_behind, robot_behind = (
-        rows(lambda p, f=f: np.abs(getattr(p, f) - p.target)) for f in ("rollout", "robot")
-    )
-    first = np.concatenate(
-        [np.abs(p.rollout - p.robot)[1 : 1 + round(1 / p.dt)] for p in predictions]
-    )
-    largest = np.array([np.abs(p.rollout - p.robot).max(axis=0) for p in predictions])
-    worst = [predictions[i] for i in largest.argmax(axis=0)]
-    worst_at = [
-        float(np.abs(p.rollout - p.robot)[:, j].argmax() * p.dt) for j, p in enumerate(worst)
-    ]
+    rollout_behind = rows(lambda p: np.abs(p.rollout - p.target))
+    robot_behind = rows(lambda p: np.abs(p.robot - p.target))
+    apart = [np.abs(p.rollout - p.robot) for p in predictions]  # (T, n) rad each
+    seconds = [round(1 / p.dt) for p in predictions]  # rows of the first second
+    first = np.concatenate([a[1 : 1 + n] for a, n in zip(apart, seconds, strict=True)])
+    largest = np.array([a.max(axis=0) for a in apart])
+    worst = largest.argmax(axis=0)  # prediction with the largest difference of each joint
     by_joint = {}
     for j, joint in enumerate(joints):
         by_joint[joint] = {
@@ -127,7 +126,7 @@ def summary(
             "band": float(band[:, j].mean()),
             "inside": float(inside[:, j].mean()),
             "worst": float(largest[:, j].max()),
-            "worst_in": worst[j].name,
-            "worst_at": worst_at[j],
+            "worst_in": predictions[worst[j]].name,
+            "worst_at": float(apart[worst[j]][:, j].argmax() * predictions[worst[j]].dt),
         }
     return by_joint

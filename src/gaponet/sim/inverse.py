@@ -109,21 +109,19 @@ class AnalyticInverse:
         self.low, self.high = _most_torque(model, joints, act)
         self.frictionloss = _own(batch, model, "dof_frictionloss")[:, self.dof]
         self.damping = _own(batch, model, "dof_damping")[:, self.dof]
-        has_terms = model.nuser_actuator == len(SERVO_TERMS)
-        self.terms = present(
-            dict(zip(SERVO_TERMS, model.actuator_user[act].T, strict=True)) if has_terms else {}
-        )
+        terms = {}
+        if model.nuser_actuator == len(SERVO_TERMS):
+            terms = dict(zip(SERVO_TERMS, model.actuator_user[act].T, strict=True))
+        self.terms = present(terms)
         # kd takes the speed before the step
         self.explicit = model.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER
         self.h = timestep[:, None]
         self.dt = (nstep * timestep)[:, None]
         self.ahead = int(np.ceil((self.delay / self.dt).max() - 1e-9))
-        before, speeds = zip(
-            *(self.within_period(int(n), int(nstep.max())) for n in nstep), strict=True
-        )
-        self.before, self.speeds = (
-            np.array(x).transpose(1, 2, 0)[..., None] for x in (before, speeds)
-        )
+        within = [self.within_period(int(n), int(nstep.max())) for n in nstep]
+        before, speeds = zip(*within, strict=True)
+        self.before = np.array(before).transpose(1, 2, 0)[..., None]
+        self.speeds = np.array(speeds).transpose(1, 2, 0)[..., None]
         # of each physics step, (steps, num)
         self.share = (np.arange(nstep.max())[:, None] < nstep) / nstep
         self.qpos = batch.bind("qpos")
@@ -179,7 +177,8 @@ class AnalyticInverse:
         high = self.high
         mean_low = low
         mean_high = high
-        if (no_load := self.terms.get("no_load_speed")) is not None:
+        no_load = self.terms.get("no_load_speed")
+        if no_load is not None:
             low, high = torque_range(self.high, before[:-1] / no_load)
             mean_low = mean(low)
             mean_high = mean(high)

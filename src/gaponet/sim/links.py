@@ -47,20 +47,20 @@ class LinkAxes:
         self.names = list[str]()
         scale = list[Array]()
         self._arms = list[Array]()
+        bodies: list[str] = []
         for root in range(1, model.nbody):
-            if model.body_weldid[root] == root and model.body_jntnum[root]:
-                welded = np.flatnonzero(
-                    (model.body_weldid == root) & (model.body_mass > 0)
-                ).tolist()
-                own = [b for b in welded if not model.body(b).name.startswith("payload_")]
-                if own and all(model.body(b).name and not model.body_simple[b] for b in own):
-                    self.names.append(model.body(root).name)
-                    self._bodies.append(_members(model, data, root, own))
-                    scale.append(_prior_std(model, data, root))
-                    arm = _centre(model, data, own) - data.xanchor[model.body_jntadr[root]]
-                    self._arms.append(data.xmat[root].reshape(3, 3).T @ arm)
+            own = _bodies_of_link(model, root)
+            if not own:
+                continue
+            members = _members(model, data, root, own)
+            self.names.append(model.body(root).name)
+            self._bodies.append(members)
+            bodies += [name for name, _, _ in members]
+            scale.append(_prior_std(model, data, root))
+            arm = _centre(model, data, own) - data.xanchor[model.body_jntadr[root]]
+            self._arms.append(data.xmat[root].reshape(3, 3).T @ arm)
         self.scale = np.array(scale).reshape(-1, COORDINATES)
-        self.bodies = tuple(name for members in self._bodies for name, _, _ in members)
+        self.bodies = tuple(bodies)
 
     def links(self, x: Array) -> dict[str, Link]:
         """Return the bodies of links that x (L · COORDINATES,) changes, and those that the robot
@@ -68,10 +68,11 @@ class LinkAxes:
         """
         links = dict(self._robot.links)
         for own, bodies in zip(x.reshape(-1, COORDINATES) * self.scale, self._bodies, strict=True):
-            if own.any():
-                links |= {
-                    name: _link(_upper(own) @ p @ _upper(own).T, frame) for name, frame, p in bodies
-                }
+            if not own.any():
+                continue
+            upper = _upper(own)
+            for name, frame, p in bodies:
+                links[name] = _link(upper @ p @ upper.T, frame)
         return links
 
     def inertials(self, x: Array) -> Array:
@@ -79,10 +80,11 @@ class LinkAxes:
         (bodies, 11).
         """
         links = self.links(np.where(x == 0, 1e-12, x))  # of all bodies, those of the file too
-        each = [links[name] for name in self.bodies]
-        return np.array(
-            [[one.mass, *one.pos, *np.concatenate(principal_axes(one))] for one in each]
-        )
+        rows = []
+        for name in self.bodies:
+            link = links[name]
+            rows.append([link.mass, *link.pos, *np.concatenate(principal_axes(link))])
+        return np.array(rows)
 
     def moments(self, x: Array) -> Array:
         """Return mass, kg, centre of mass, m from the file's, and moment about the joint, kg·m,
@@ -97,6 +99,21 @@ class LinkAxes:
             centre = p[:3, 3] / p[3, 3]
             rows.append([mass, *centre, *mass * (arm + centre)])
         return np.array(rows)
+
+
+def _bodies_of_link(model: mujoco.MjModel, root: int) -> list[int]:
+    """Return the bodies with mass that are welded to a moving body, without payloads.
+
+    None if root does not move, or a body has no name or no inertia of its own.
+    """
+    if model.body_weldid[root] != root or not model.body_jntnum[root]:
+        return []
+    welded = np.flatnonzero((model.body_weldid == root) & (model.body_mass > 0)).tolist()
+    own = [body for body in welded if not model.body(body).name.startswith("payload_")]
+    for body in own:
+        if not model.body(body).name or model.body_simple[body]:
+            return []
+    return own
 
 
 def _centre(model: mujoco.MjModel, data: mujoco.MjData, own: list[int]) -> Array:
@@ -131,9 +148,10 @@ def _prior_std(model: mujoco.MjModel, data: mujoco.MjData, root: int) -> Array:
     next joint.
     """
     own = model.body_weldid == root
-    others = [
-        data.xpos[b] for b in range(1, model.nbody) if own[model.body_parentid[b]] and not own[b]
-    ]
+    others = []
+    for body in range(1, model.nbody):
+        if own[model.body_parentid[body]] and not own[body]:
+            others.append(data.xpos[body])
     ends = np.array([*data.xipos[own & (model.body_mass > 0)], *others]) - data.xpos[root]
     length = max(float(np.linalg.norm(ends, axis=1).max()), MIN_LENGTH_M)
     return np.array([MASS_LOG_STD / 2, *[STRETCH_STD] * 6, *[SHIFT_STD * length] * 3])
@@ -156,10 +174,8 @@ def _link(p: Array, frame: Array) -> Link:
     # a flat link stays physical when its numbers are rounded
     second += 1e-6 * np.trace(second) * np.eye(3)
     inertia = np.trace(second) * np.eye(3) - second
-    numbers = [
-        float(f"{v:.9g}")
-        for v in (p[3, 3], *centre, *np.diag(inertia), *inertia[[0, 0, 1], [1, 2, 2]])
-    ]
+    exact = (p[3, 3], *centre, *np.diag(inertia), *inertia[[0, 0, 1], [1, 2, 2]])
+    numbers = [float(f"{number:.9g}") for number in exact]
     return Link(numbers[0], (numbers[1], numbers[2], numbers[3]), tuple(numbers[4:]))
 
 

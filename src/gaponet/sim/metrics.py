@@ -168,11 +168,10 @@ def summary(part: Iterable[Run], robot: RobotSpec) -> dict[str, Any]:
         "unit": sorted(rows["unit"]),
         "horizon": [h for h in HORIZON_NAMES if h in rows["horizon"]],
     }
-    total = {"mpjae_no_wrist": float("nan")} | _mean(rows["all"][""])
-    return total | {
-        f"by_{group}": {name: _mean(rows[group][name]) for name in names}
-        for group, names in order.items()
-    }
+    result: dict[str, Any] = {"mpjae_no_wrist": float("nan")} | _mean(rows["all"][""])
+    for group, names in order.items():
+        result[f"by_{group}"] = {name: _mean(rows[group][name]) for name in names}
+    return result
 
 
 def _grouped_rows(run: Run, robot: RobotSpec) -> Iterator[tuple[str, str, list[_Row]]]:
@@ -205,24 +204,31 @@ def metrics(part: ListOf[Run], columns: list[int] | None = None) -> dict[str, fl
         correlation, cosine, mape % (those that SAGE and the paper report, tables show the first
         few).
     """
-    return _mean([row for run in part for row in _row(run, columns)])
+    rows = []
+    for run in part:
+        rows += _row(run, columns)
+    return _mean(rows)
 
 
 def _mean(rows: list[_Row]) -> _Row:
-    return {
-        k: float(np.mean([row[k] for row in rows if k in row]))
-        for k in dict.fromkeys(k for r in rows for k in r)
-    }
+    """Return the mean of each metric over the rows that have it."""
+    values: dict[str, list[float]] = {}
+    for row in rows:
+        for metric, value in row.items():
+            values.setdefault(metric, []).append(value)
+    return {metric: float(np.mean(each)) for metric, each in values.items()}
 
 
 def _row(run: Run, columns: list[int] | None = None) -> list[_Row]:
     """Return a sequence's metrics over these columns; nothing if it holds none of them."""
-    if not (c := run.holds(columns)):
+    held = run.holds(columns)
+    if not held:
         return []
-    error = run.error[:, c].astype(float)
+    error = run.error[:, held].astype(float)
     size = np.abs(error)
-    real = run.qpos_real[1:, c].astype(float)
-    sim = run.qpos_sim[1:, c].astype(float)
+    real = run.qpos_real[1:, held].astype(float)
+    sim = run.qpos_sim[1:, held].astype(float)
+    norms = np.linalg.norm(real, axis=0) * np.linalg.norm(sim, axis=0)
     low, high = np.percentile(size, [25, 75], axis=0)
     bias = np.median(error, axis=0)
     out = {
@@ -234,10 +240,7 @@ def _row(run: Run, columns: list[int] | None = None) -> list[_Row]:
         "iqr": (high - low).mean(),
         "range": np.ptp(size, axis=0).mean(),
         "correlation": _mean_correlation(real, sim),
-        "cosine": (
-            (real * sim).sum(0)
-            / np.maximum(np.linalg.norm(real, axis=0) * np.linalg.norm(sim, axis=0), 1e-12)
-        ).mean(),
+        "cosine": ((real * sim).sum(0) / np.maximum(norms, 1e-12)).mean(),
         "mape": (size / np.maximum(np.abs(real), 0.01)).mean() * 100,
     }
     return [out | {f"large_{t:g}": (size >= t).mean() for t in THRESHOLDS}]

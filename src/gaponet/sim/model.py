@@ -107,10 +107,11 @@ def build_spec(
     """
     spec = read_mjcf(robot.mjcf)
     names = sorted(j.name for j in spec.joints)
-    if missing := [name for name in robot.joint_names if name not in names]:
-        raise RobotError(
-            f"{robot.mjcf}: robot.toml names joint '{missing[0]}', the MJCF has: {', '.join(names)}"
-        )
+    for name in robot.joint_names:
+        if name not in names:
+            raise RobotError(
+                f"{robot.mjcf}: robot.toml names joint '{name}', the MJCF has: {', '.join(names)}"
+            )
     # few joints, no contacts: islands cost more
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_ISLAND
     period = robot.dt if dt is None else dt

@@ -131,7 +131,8 @@ def rollout_errors(
     (sequences,) rad.
     """
     replays = replay(sequences, robot, corrector, nthread, lock_idle=True)
-    errors = [run.mean_error() for run in runs(sequences, [r.qpos for r in replays], robot)]
+    simulated = [replayed.qpos for replayed in replays]
+    errors = [run.mean_error() for run in runs(sequences, simulated, robot)]
     result: Array = np.nan_to_num(np.array(errors), nan=np.pi)
     return result
 

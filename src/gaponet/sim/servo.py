@@ -539,9 +539,9 @@ class ServoModel:
         self._gain = batch.expand("actuator_gainprm")
         self._bias = batch.expand("actuator_biasprm")
         self._limit = batch.expand("dof_frictionloss")
-        self.values: ServoTerms = {
-            name: np.tile(user[:, i], (len(self._qpos), 1)) for i, name in enumerate(SERVO_TERMS)
-        }
+        self.values: ServoTerms = {}
+        for i, name in enumerate(SERVO_TERMS):
+            self.values[name] = np.tile(user[:, i], (len(self._qpos), 1))
         self._servos = np.zeros(self._limit.shape, SERVO_RECORD)
         self.frictionloss = self._servos["frictionloss"]
         self.frictionloss[:] = self._limit
