@@ -68,12 +68,13 @@ class Follower:
         self._nominal = self._transfer.sim
         if not extrapolate:
             require_measured_range(inverse, AnalyticInverse.of(self._nominal), plant.joint_names)
+        side = condition.payload_side
         self._carried = []
         for spec, batch in ((robot, plant.batch), (nominal, self._nominal.batch)):
-            models = [
-                build_model(spec, float(m), condition.payload_side, condition.dt, locked, True)
-                for m in masses
-            ]
+            models = []
+            for mass in masses:
+                model = build_model(spec, float(mass), side, condition.dt, locked, True)
+                models.append(model)
             self._carried.append(PayloadFields(batch, models))
 
     @property

@@ -22,6 +22,7 @@ from gaponet.base.arrays import Array
 from gaponet.base.errors import ModelError
 from gaponet.data.sequence import Sequence
 from gaponet.nn.artifact import RATE_TOLERANCE, GapModel
+from gaponet.nn.loop import DeltaLoop
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.batch import BatchSim, Condition
 from gaponet.sim.inverse import AnalyticInverse, Period
@@ -77,13 +78,10 @@ class Transfer:
             _require_measured(inverse, AnalyticInverse.of(sim), sim.joint_names)
         self.joint_names = sim.joint_names
         self.op = np.array([sim.joint_names.index(name) for name in robot.operated])
-        self.periods = (
-            1
-            if model is None
-            else max(control_periods_of(model, c.dt) for c in dict.fromkeys(conditions))
-        )
-        self.loop = None
+        self.periods = 1  # of these in a control period of the model
+        self.loop: DeltaLoop | None = None
         if model is not None:
+            self.periods = max(control_periods_of(model, c.dt) for c in dict.fromkeys(conditions))
             self.loop = model.loop(self.num_envs, own_context(model, robot, conditions))
         self.payload_mass = np.array([c.payload_mass for c in conditions])
         self._delta = np.zeros((self.num_envs, len(self.op)))
@@ -182,11 +180,10 @@ class TransferCorrector:
             self.reference, AnalyticInverse.of(own), reference, locked, 0, self.extrapolate
         )
         self.free = self.robot.index(self.transfer.joint_names)
-        first = [
-            np.stack([getattr(s, name)[0, self.free] for s in start])
-            for name in ("qpos", "qvel", "ctrl")
-        ]
-        self.transfer.reset(slice(None), first[0], first[1], past=first[2][:, None])
+        qpos = np.stack([s.qpos[0, self.free] for s in start])
+        qvel = np.stack([s.qvel[0, self.free] for s in start])
+        ctrl = np.stack([s.ctrl[0, self.free] for s in start])
+        self.transfer.reset(slice(None), qpos, qvel, past=ctrl[:, None])
 
     def correct(self, t: int, target: Array, qpos: Array, qvel: Array) -> Array:
         """Return commands, (k, n_all) rad."""

@@ -47,7 +47,9 @@ def _later_and_shifted(runs: ListOf[Run]) -> list[Run]:
     """Return runs with delays and offsets that were fitted to the other half of the motions."""
     names = list(dict.fromkeys(run.meta.independent_motion for run in runs))
     half = {name: i % 2 for i, name in enumerate(names)}
-    folds = [[run for run in runs if half[run.meta.independent_motion] == k] for k in (0, 1)]
+    folds: list[list[Run]] = [[], []]
+    for run in runs:
+        folds[half[run.meta.independent_motion]].append(run)
     fitted = [fit_delay_offset(fold or folds[0]) for fold in folds]
     moved = []
     for run in runs:

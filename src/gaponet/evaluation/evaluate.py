@@ -70,27 +70,26 @@ class Evaluation:
         """
         reals = self.runs["nominal"]
         picked = evenly_spaced(list(range(len(reals))), STORED_TRAJECTORIES)
-        shown = [
-            {
-                "motion": r.meta.motion,
-                "unit_id": r.meta.unit_id,
-                "payload_mass": r.meta.payload_mass,
-                "dt": r.dt,
-            }
-            for r in (reals[i] for i in picked)
-        ]
-        result = self.result | {
-            "date": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
-            "shown": shown,
-        }
+        shown = []
         arrays = {}
         for row, i in enumerate(picked):
+            meta = reals[i].meta
+            shown.append(
+                {
+                    "motion": meta.motion,
+                    "unit_id": meta.unit_id,
+                    "payload_mass": meta.payload_mass,
+                    "dt": reals[i].dt,
+                }
+            )
             arrays[f"{row}/recorded"] = reals[i].qpos_real
             arrays[f"{row}/command"] = self.ctrl[i]
             for name, part in self.runs.items():
                 arrays[f"{row}/{name}"] = part[i].qpos_sim
             for name, delta in self.deltas.items():
                 arrays[f"{row}/delta/{name}"] = delta[i]
+        date = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
+        result = self.result | {"date": date, "shown": shown}
         with lock_folder(folder, "robot" if is_robot(folder) else "run"):
             with atomic_write(folder / "trajectories.npz") as temporary:
                 single = {name: array.astype(np.float32) for name, array in arrays.items()}

@@ -30,8 +30,10 @@ def newton_config(robot: str, facts: dict[str, Any]) -> str:
     joints = facts["plain"]
     law = ", ".join(facts["law"])
     fields = ("kp", "kd", "effort_limit", "armature", "damping", "frictionloss", "offset", "delay")
-    columns = {field: {name: s[field] for name, s in joints.items()} for field in fields}
-    note = (
-        f" They lack the servo model ({law}); these numbers were fitted without it." if law else ""
-    )
+    columns = {}
+    for field in fields:
+        columns[field] = {name: servo[field] for name, servo in joints.items()}
+    note = ""
+    if law:
+        note = f" They lack the servo model ({law}); these numbers were fitted without it."
     return NEWTON.substitute(columns, robot=robot, note=note)

@@ -73,9 +73,12 @@ def read_recordings(
         return None
     splits = split_entries(dataset, ())
     if origin is not None:
-        hashes = {split: set(origin["parts"][split].values()) for split in ("train", "val")}
-        own = {split: [e for e in dataset.entries if e.hash in hashes[split]] for split in hashes}
-        splits |= own if all(own.values()) else {}
+        own = {}
+        for split in ("train", "val"):
+            hashes = set(origin["parts"][split].values())
+            own[split] = [entry for entry in dataset.entries if entry.hash in hashes]
+        if all(own.values()):
+            splits |= own
     return dataset.sequences(splits["train"]), dataset.sequences(splits["val"])
 
 
@@ -237,11 +240,8 @@ def comparable(
     recordings: ListOf[Sequence], robot: RobotSpec, payload_mass: float
 ) -> list[Sequence]:
     """Return the recordings made with this payload, kg, and with the robot's own gains."""
-    return [
-        s
-        for s in recordings
-        if Condition.of(s, robot).kp is None and s.meta.payload_mass == payload_mass
-    ]
+    loaded = [s for s in recordings if s.meta.payload_mass == payload_mass]
+    return [s for s in loaded if Condition.of(s, robot).kp is None]
 
 
 def rollout_error(recordings: ListOf[Sequence], robot: RobotSpec) -> float:
@@ -278,13 +278,11 @@ def check_motions(
     """
     first = {s.meta.motion: s for s in reversed(recordings)}
     low, high = robot.qpos_range.T
-    cut = [
-        s.rows(slice(0, round(MAX_CHECK_MOTION_S / s.dt)))
-        for s in list(first.values())[:MAX_CHECK_MOTIONS]
-    ]
     limited = ramped & (robot.target_speed > 0)
     speed = np.where(limited, robot.target_speed, np.inf)
-    return [
-        replace(s, ctrl=speed_limited(np.clip(s.ctrl, low, high), s.qpos[0], speed, s.dt))
-        for s in cut
-    ]
+    motions = []
+    for recording in list(first.values())[:MAX_CHECK_MOTIONS]:
+        cut = recording.rows(slice(0, round(MAX_CHECK_MOTION_S / recording.dt)))
+        ctrl = speed_limited(np.clip(cut.ctrl, low, high), cut.qpos[0], speed, cut.dt)
+        motions.append(replace(cut, ctrl=ctrl))
+    return motions

@@ -124,9 +124,9 @@ def mjcf_text(robot: RobotSpec, dt: float, payload_mass: float = 0.0) -> str:
     for i, pair in enumerate(root.iter("pair")):  # a table's stiffness is set after compilation
         set_attributes(
             pair,
-            **{
-                name: getattr(model, f"pair_{name}")[i] for name in ("solref", "solimp", "friction")
-            },
+            solref=model.pair_solref[i],
+            solimp=model.pair_solimp[i],
+            friction=model.pair_friction[i],
         )
     servos = ET.SubElement(root, "actuator")
     for i in range(model.nu):

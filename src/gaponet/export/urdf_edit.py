@@ -52,26 +52,23 @@ def edit_urdf(
     prefix = facts["prefix"]
     if source.tags[0].name != "robot":
         raise RobotError(f"{path}: begins with <{source.tags[0].name}>, so it is no URDF")
-    tags = {
-        t.attributes.get("name", ""): t
-        for t in source.tags
-        if t.name == "joint" and t.parent == "robot"
-    }
+    joints = [tag for tag in source.tags if tag.name == "joint" and tag.parent == "robot"]
+    tags = {tag.attributes.get("name", ""): tag for tag in joints}
     for name in robot.operated:
-        if (tag := tags.get(prefix + name)) is None:
+        tag = tags.get(prefix + name)
+        if tag is None:
             raise RobotError(
                 f"{path}: has no joint '{prefix + name}' (--prefix); it has {', '.join(tags)}"
             )
         servo = facts["plain"][name]
-        values = {"damping": text_of(servo["damping"]), "friction": text_of(servo["frictionloss"])}
-        dynamics, limit = (source.child(tag, element) for element in ("dynamics", "limit"))
+        damping = text_of(servo["damping"])
+        friction = text_of(servo["frictionloss"])
+        dynamics = source.child(tag, "dynamics")
+        limit = source.child(tag, "limit")
         if dynamics is not None:
-            source.set(dynamics, **values)
+            source.set(dynamics, damping=damping, friction=friction)
         else:
-            source.insert(
-                tag,
-                f'    <dynamics damping="{values["damping"]}" friction="{values["friction"]}"/>',
-            )
+            source.insert(tag, f'    <dynamics damping="{damping}" friction="{friction}"/>')
         if limit is not None and np.isfinite(servo["effort_limit"]):
             source.set(limit, effort=text_of(servo["effort_limit"]))
     other = _set_links(source, robot, prefix)
@@ -91,7 +88,8 @@ def _set_links(source: Source, robot: RobotSpec, prefix: str) -> list[str]:
     other = list[str]()
     tags = {t.attributes.get("name", ""): t for t in source.tags if t.name == "link"}
     for name, link in robot.links.items():
-        inertial = source.child(tag, "inertial") if (tag := tags.get(prefix + name)) else None
+        tag = tags.get(prefix + name)
+        inertial = source.child(tag, "inertial") if tag else None
         mass = source.child(inertial, "mass") if inertial else None
         own = float(mass.attributes["value"]) if mass else np.nan
         if inertial is None or not np.isclose(own, before.body(name).mass[0], rtol=1e-2):

@@ -79,8 +79,10 @@ def write_motion(path: Path, motion: Motion, robot: RobotSpec, rate: float) -> N
     if path.suffix == ".csv":
         rows = np.column_stack([np.arange(len(rows)) / rate, rows])
         names = ["time", *names]
-    text = "\n".join([", ".join(names), *(", ".join(f"{x:.6f}" for x in row) for row in rows)])
-    write_text(path, text + "\n")
+    lines = [", ".join(names)]
+    for row in rows:
+        lines.append(", ".join(f"{number:.6f}" for number in row))
+    write_text(path, "\n".join(lines) + "\n")
 
 
 def _level_of(ctrl: Array, robot: RobotSpec) -> str:

@@ -106,7 +106,9 @@ def _names(robot: RobotSpec, library: Library) -> Iterator[str]:
     """
     kinds = ["tour-all", "limber-all", *(f"wander-{side}" for side in library.kit.arms)]
     for k in range(MAX_ROUNDS):
-        yield from (f"{kind}-{v}" for kind in kinds for v in (2 * k, 2 * k + 1))
+        for kind in kinds:
+            yield f"{kind}-{2 * k}"
+            yield f"{kind}-{2 * k + 1}"
         if k + 1 < len(SIGNAL_ORDER):
             yield from (f"{SIGNAL_ORDER[k + 1]}-{short(joint)}" for joint in robot.operated)
 
@@ -120,11 +122,10 @@ def sheet(
         files: Motion → file.
         known: Folder of a robot of which there are logs already.
     """
-    gains = "; ".join(
-        f"{short(j)} {robot.kp[i]:g}/{robot.kd[i]:g}"
-        for i, j in enumerate(robot.joint_names)
-        if j in robot.operated
-    )
+    gains = []
+    for i, joint in enumerate(robot.joint_names):
+        if joint in robot.operated:
+            gains.append(f"{short(joint)} {robot.kp[i]:g}/{robot.kd[i]:g}")
     masses = ", ".join(f"{p:g}" for p in plan.payloads)
     size = (
         f"On virtual H1-2 robots {MIN_TRAINING_MINUTES:g} minutes left a third of the simulator's "
@@ -144,7 +145,7 @@ def sheet(
         "1. Warm up for ten minutes with any of these motions: cold joints rub more.",
         "2. Note kp and kd of the controller and leave them: one setting for all motions, or a "
         "folder for each.",
-        f"   The simulator has (N·m/rad, N·m·s/rad): {gains}.",
+        f"   The simulator has (N·m/rad, N·m·s/rad): {'; '.join(gains)}.",
         "3. Log the command as it is sent, the measured position and, if there are, velocity and "
         "signed torque: with",
         "   one clock, at the commands' rate or above, with all digits, from before the motion to "
@@ -162,11 +163,11 @@ def sheet(
             f"| {number} | {files[motion.name]} | {mass:g} | {motion.duration:.0f} | | | |"
         )
     lines += ["", "Then, for each payload:", ""]
-    lines += [
-        f"    gaponet import LOGS/{p:g}kg --robot ROBOT --unit-id UNIT --payload-mass {p:g} --out "
-        "data"
-        for p in plan.payloads
-    ]
+    for mass in plan.payloads:
+        lines.append(
+            f"    gaponet import LOGS/{mass:g}kg --robot ROBOT --unit-id UNIT --payload-mass "
+            f"{mass:g} --out data"
+        )
     lines.append("    gaponet doctor data")
     if known:
         lines.append(f"    gaponet check {known} data")

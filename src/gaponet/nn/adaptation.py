@@ -53,9 +53,10 @@ class Adaptation:
 
     def robot(self, simulator: RobotSpec) -> RobotSpec:
         """Return the simulator with the parameters of this unit."""
-        return simulator.with_servos(
-            {j: {str(f): x for f, x in servo.items()} for j, servo in self.servos.items()}
-        )
+        servos = {}
+        for joint, servo in self.servos.items():
+            servos[joint] = {str(field): value for field, value in servo.items()}
+        return simulator.with_servos(servos)
 
     def save(self, run: Path) -> Path:
         """Write RUN/adaptation/UNIT.json and return its path.

@@ -135,10 +135,8 @@ def _options(model: mujoco.MjModel) -> Iterator[str]:
         names = {bit.name for bit in bits if getattr(model.opt, flags) & bit.value}
         yield f"{flags} {' '.join(sorted(names - IGNORED_FLAGS))}"
     if model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_OVERRIDE:
-        yield " ".join(
-            _exact(getattr(model.opt, f))
-            for f in ("o_margin", "o_solref", "o_solimp", "o_friction")
-        )
+        fields = ("o_margin", "o_solref", "o_solimp", "o_friction")
+        yield " ".join(_exact(getattr(model.opt, field)) for field in fields)
 
 
 def _inertia(model: mujoco.MjModel, data: mujoco.MjData, root: int) -> str:

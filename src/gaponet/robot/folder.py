@@ -215,14 +215,13 @@ def _with_gains(text: str, robot: RobotSpec) -> str:
 
 def _servo(robot: RobotSpec, joint: str) -> str:
     i = robot.joint_names.index(joint)
-    values = {name: float(getattr(robot, name)[i]) for name in SERVO_FIELDS}
     optional = (*SERVO_TERMS, *TERMS["temperature"], "target_speed")  # 0 if absent
-    stated = {
-        name: value
-        for name, value in values.items()
-        if np.isfinite(value) and (value or name not in optional)
-    }
-    lines = [f"{name} = {value!r}\n" for name, value in stated.items()]
+    lines = []
+    for name in SERVO_FIELDS:
+        value = float(getattr(robot, name)[i])
+        is_absent = value == 0 and name in optional
+        if np.isfinite(value) and not is_absent:
+            lines.append(f"{name} = {value!r}\n")
     return f"[identified.{_key(joint)}]\n" + "".join(lines)
 
 

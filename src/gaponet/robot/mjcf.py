@@ -279,7 +279,9 @@ def _copies(tag: ElementTree.Element) -> float:
 
 
 def _extent(tag: ElementTree.Element, *names: str) -> float:
-    return math.prod(abs(x) for name in names for x in _numbers(tag.get(name, "0"))[:1])
+    """Return the product of the first numbers of some attributes, without signs."""
+    first = [_numbers(tag.get(name, "0"))[:1] for name in names]
+    return math.prod(abs(numbers[0]) for numbers in first if numbers)
 
 
 def _bytes(text: str) -> float:

@@ -189,10 +189,11 @@ def _geom(element: ET.Element, model: mujoco.MjModel, g: int, asset: ET.Element)
         element.set(name, str(int(getattr(model, f"geom_{name}")[g])))
     set_attributes(
         element,
-        **{
-            n: getattr(model, f"geom_{n}")[g]
-            for n in ("solmix", "solref", "solimp", "margin", "gap")
-        },
+        solmix=model.geom_solmix[g],
+        solref=model.geom_solref[g],
+        solimp=model.geom_solimp[g],
+        margin=model.geom_margin[g],
+        gap=model.geom_gap[g],
     )
     if kind != "mesh":
         set_attributes(element, size=size)

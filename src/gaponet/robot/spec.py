@@ -206,16 +206,14 @@ class RobotSpec:
     def __getstate__(self) -> dict[str, Any]:
         """Include the files: another process may run on a machine without this folder."""
         files = [self.mjcf, *self.folder.glob("*.toml")]
-        return vars(self) | {
-            "files": {file.name: file.read_bytes() for file in files if file.is_file()}
-        }
+        contents = {file.name: file.read_bytes() for file in files if file.is_file()}
+        return vars(self) | {"files": contents}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         files: dict[str, bytes] = state.pop("files")
         vars(self).update(state)
-        if {
-            f.name: f.read_bytes() for f in map(self.mjcf.parent.joinpath, files) if f.is_file()
-        } != files:
+        here = [self.mjcf.parent / name for name in files]
+        if {file.name: file.read_bytes() for file in here if file.is_file()} != files:
             folder = _unpacked(tuple(sorted(files.items())))
             vars(self).update(folder=folder, mjcf=folder / self.mjcf.name)
 

@@ -99,9 +99,9 @@ class ServoType:
         if value is None:
             return ""
         if isinstance(value, Spread):
-            middle, low, high = (
-                _two_digits(factor * x) for x in (value.value, value.low, value.high)
-            )
+            middle = _two_digits(factor * value.value)
+            low = _two_digits(factor * value.low)
+            high = _two_digits(factor * value.high)
             return f"{middle} ({low}…{high})"
         supply = f" at {self.gain_volts:g} V" if field == "gain" and self.gain_volts else ""
         return f"{factor * value:.3g}{supply}"

@@ -239,11 +239,10 @@ def _read(path: Path, packages: dict[str, Path]) -> tuple[mujoco.MjSpec, list[st
 def _mjcf(path: Path) -> tuple[mujoco.MjSpec, list[str]]:
     spec = read_mjcf(path, tried=True)
     place = path.parent / spec.meshdir
-    missing = {
-        m.name or Path(m.file).stem: m
-        for m in spec.meshes
-        if m.file and not (place / m.file).is_file()
-    }
+    missing = {}
+    for mesh in spec.meshes:
+        if mesh.file and not (place / mesh.file).is_file():
+            missing[mesh.name or Path(mesh.file).stem] = mesh
     for geom in [g for g in spec.geoms if g.meshname in missing]:
         spec.delete(geom)
     for mesh in missing.values():
@@ -368,14 +367,7 @@ def _drop_unreadable_meshes(spec: mujoco.MjSpec) -> list[str]:
             break
         except (ValueError, mujoco.FatalError) as error:
             why = " ".join(str(error).split())
-            bad = next(
-                (
-                    m
-                    for m in spec.meshes
-                    if (m.file and Path(m.file).name in why) or f"'{m.name}'" in why
-                ),
-                None,
-            )
+            bad = _named_mesh(spec, why)
             if bad is None:
                 break
             omitted.append(f"mesh left out: {why}")
@@ -383,6 +375,14 @@ def _drop_unreadable_meshes(spec: mujoco.MjSpec) -> list[str]:
                 spec.delete(geom)
             spec.delete(bad)
     return omitted
+
+
+def _named_mesh(spec: mujoco.MjSpec, message: str) -> mujoco.MjsMesh | None:
+    """Return the mesh that a message of MuJoCo names by its file or its name; None without one."""
+    for mesh in spec.meshes:
+        if (mesh.file and Path(mesh.file).name in message) or f"'{mesh.name}'" in message:
+            return mesh
+    return None
 
 
 def _resolve(name: str, path: Path, packages: dict[str, Path]) -> Path | None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from copy import copy
 from dataclasses import replace
+from itertools import product
 from typing import NamedTuple
 
 import mujoco
@@ -58,9 +59,8 @@ def check_robot(
     Raises:
         RobotError: It does not compile.
     """
-    models = {
-        mass: build_model(replace(robot, delay=np.zeros(len(robot.kp))), mass) for mass in payloads
-    }
+    prompt = replace(robot, delay=np.zeros(len(robot.kp)))
+    models = {mass: build_model(prompt, mass) for mass in payloads}
     model = models[payloads[0]]
     if (robot.folder / "collision.toml").is_file():
         Collision(robot, model)  # raises where it is wrong
@@ -274,7 +274,7 @@ def _steps(
     them, is left out.
     """
     thin = [robot.qpos_home, *postures[:: max(1, len(postures) // MAX_POSTURES)][:MAX_POSTURES]]
-    cases = [(mass, model, q) for mass, model in models.items() for q in thin]
+    cases = [(mass, model, q) for (mass, model), q in product(models.items(), thin)]
     each = [(_growth(model, q), mass) for mass, model, q in cases]
     (growth, joint, oscillates), mass = max(each, key=lambda one: one[0].factor)
     name = robot.joint_names[joint]

@@ -54,7 +54,8 @@ def library(robot: RobotSpec, seed: int, recipe: Recipe, files: tuple[Motion, ..
 def play(job: Job) -> list[Sequence]:
     """Record the takes of a job, in order."""
     source = library(job.robot, job.seed, job.recipe, job.files)
-    motions = {name: source.make(name) for name in dict.fromkeys(t.motion for t in job.takes)}
+    names = dict.fromkeys(take.motion for take in job.takes)
+    motions = {name: source.make(name) for name in names}
     locked = {name: _resting_joints(job.robot, motion) for name, motion in motions.items()}
     done: dict[Take, Sequence] = {}
     for joints in dict.fromkeys(locked.values()):

@@ -103,7 +103,8 @@ class VirtualH12:
         self._order = robot.index(MOTOR_NAMES)  # motor → place in the robot's order
         self._writer = bus.writer("rt/lowstate", dds.LowState)
         self._readers = {
-            name: bus.reader(f"rt/{name}", dds.LowCmd) for name in ("arm_sdk", "lowcmd")
+            "arm_sdk": bus.reader("rt/arm_sdk", dds.LowCmd),
+            "lowcmd": bus.reader("rt/lowcmd", dds.LowCmd),
         }
         self.live = LiveUnit(robot, physics, payload, period=1.0 / rate)
         self.clock = MonotonicClock()

@@ -93,9 +93,8 @@ def _command_claims(results: Results, block: Block) -> list[Claim]:
             kept = _with_payload(results, payload)
             reductions = {}
             for name in results.networks(block):
-                errors = [
-                    results.over_joints(q_dis) for q_dis in results.command_q_dis(block, name, way)
-                ]
+                measured = results.command_q_dis(block, name, way)
+                errors = [results.over_joints(q_dis) for q_dis in measured]
                 reductions[name] = _reduction(results, errors, baseline, kept)
             printed = None
             if way == "delta":
@@ -128,9 +127,7 @@ def _delivery_claims(results: Results, block: Block) -> list[Claim]:
         for name in results.networks(block):
             offsets[name] = [seed[-1] for seed in results.offsets(block, name, way)]
         for axis, letter in enumerate(AXES):
-            reductions = {
-                name: _offset_reduction(seeds, plain, axis) for name, seeds in offsets.items()
-            }
+            reductions = _offset_reductions(offsets, plain, axis)
             text = (
                 f"hand to goal along {letter}, {WAY_TITLES[way]}, {heaviest}: less than "
                 f"{WITHOUT_NETWORK[reference]}"
@@ -138,17 +135,20 @@ def _delivery_claims(results: Results, block: Block) -> list[Claim]:
             found.append(Claim(block, text, None, reductions))
         if "MLP" not in offsets:
             continue
-        mlp = np.mean(offsets["MLP"], axis=0)
+        mlp = np.mean(offsets.pop("MLP"), axis=0)
         for axis, letter in enumerate(AXES):
-            reductions = {
-                name: _offset_reduction(seeds, mlp, axis)
-                for name, seeds in offsets.items()
-                if name != "MLP"
-            }
+            reductions = _offset_reductions(offsets, mlp, axis)
             text = f"hand to goal along {letter}, {WAY_TITLES[way]}, {heaviest}: less than the MLP"
             printed = CLAIM_BY_AXIS[letter] if way == "delta" else None
             found.append(Claim(block, text, printed, reductions))
     return found
+
+
+def _offset_reductions(
+    offsets: dict[str, list[Array]], baseline: Array, axis: int
+) -> dict[str, Reduction]:
+    """Return method → reduction along an axis; arguments as of `_offset_reduction`."""
+    return {name: _offset_reduction(seeds, baseline, axis) for name, seeds in offsets.items()}
 
 
 def _offset_reduction(seeds: list[Array], baseline: Array, axis: int) -> Reduction:
@@ -177,16 +177,17 @@ def _reduction(results: Results, errors: list[Array], baseline: Array, kept: Arr
 def claim_table(found: list[Claim], block: Block) -> ResultTable:
     """Return the claims of a block as a table; one column for each method."""
     of_block = [claim for claim in found if claim.block == block]
-    methods = list(dict.fromkeys(name for claim in of_block for name in claim.reductions))
+    methods: dict[str, None] = {}
+    for claim in of_block:
+        methods |= dict.fromkeys(claim.reductions)
     rows = []
     for claim in of_block:
-        cells = [
-            str(claim.reductions[name]) if name in claim.reductions else "" for name in methods
-        ]
+        cells = [str(claim.reductions.get(name, "")) for name in methods]
         printed = "" if claim.printed is None else f"{claim.printed:g}"
         rows.append((claim.text, printed, *cells, claim.verdict))
-    everything = [reduction for claim in of_block for reduction in claim.reductions.values()]
-    seeds = max((reduction.seeds for reduction in everything), default=0)
+    seeds = 0
+    for claim in of_block:
+        seeds = max([seeds, *(reduction.seeds for reduction in claim.reductions.values())])
     over = f"over {seeds} seeds and over motions or goals"
     if seeds == 1:
         over = "over motions or goals; of one seed the spread over seeds is not known"

@@ -99,9 +99,8 @@ def run_paper_experiment(
             make_shared_inputs(study, trainings[0].config, update)
         with open_bars("trainings", len(jobs)) as show:
             failures = run_jobs(jobs, show)
-        if not jobs[0].result_file.is_file() or not any(
-            job.result_file.is_file() for job in jobs[1:]
-        ):
+        done = [job.result_file.is_file() for job in jobs]
+        if not done[0] or not any(done[1:]):
             raise ModelError(f"{out}: nothing could be trained; the first: {failures[0]}")
         return summarise(study, jobs, failures)
 
@@ -179,7 +178,9 @@ def summarise(study: Study, jobs: list[Job], failures: list[str]) -> PaperResult
     sections.append(Section("", "Large gaps by payload", tables=gaps))
     page = write_page(study, sections, failures)
     sentences = [*_conclusions(found), *failures]
-    tables = {table.name: table for section in sections for table in section.tables}
+    tables: dict[str, ResultTable] = {}
+    for section in sections:
+        tables |= {table.name: table for table in section.tables}
     return PaperResult(page, found, tables, sentences, failures)
 
 
@@ -238,11 +239,10 @@ def _conclusions(found: list[Claim]) -> list[str]:
             f"{claim.text} ({BLOCK_TITLES[claim.block]}): the paper claims {claim.printed:g} %; "
             f"GAPONet {ours} %, {claim.verdict}."
         )
-        others = [
-            f"{name} {reduction} %"
-            for name, reduction in claim.reductions.items()
-            if name != "GAPONet"
-        ]
+        others = []
+        for name, reduction in claim.reductions.items():
+            if name != "GAPONet":
+                others.append(f"{name} {reduction} %")
         if others:
             sentence = f"{sentence} Beside it: {', '.join(others)}."
         sentences.append(sentence)

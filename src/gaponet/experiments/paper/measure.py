@@ -9,6 +9,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence as ListOf
 from dataclasses import dataclass
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -60,7 +61,7 @@ class VirtualUnit:
     def motion_runs(self) -> list[tuple[UnseenMotion, float]]:
         """Return each motion with each payload, the longest motions first."""
         longest_first = sorted(self.motions, key=lambda motion: -len(motion.ctrl))
-        return [(motion, payload) for motion in longest_first for payload in self.payloads]
+        return list(product(longest_first, self.payloads))
 
     def motion_targets(self) -> list[Array]:
         """Return the targets of `motion_runs`, (T, n) rad each, with the rest before them."""
@@ -203,7 +204,7 @@ def measure_delivery(
         near: share of the goals at which the hand stays within SUCCESS_RADIUS_M then, (payloads,).
     """
     ways = PLAIN_WAYS if model is None else NETWORK_WAYS
-    runs = [(plan, payload) for plan in delivery.plans for payload in unit.payloads]
+    runs = list(product(delivery.plans, unit.payloads))
     targets = [plan.ctrl for plan, _ in runs]
     payloads = [payload for _, payload in runs]
     measured = {}

@@ -73,11 +73,14 @@ def write_page(study: Study, sections: list[Section], failures: list[str]) -> Pa
     if study.options.despite_errors:
         provenance = f"{DESPITE_ERRORS} {provenance}"
     facts = _facts(study)
+    tables: dict[str, Any] = {}
+    for section in sections:
+        tables |= {table.name: table.record() for table in section.tables}
     record: dict[str, Any] = {
         "provenance": provenance,
         "facts": facts,
         "failures": failures,
-        "tables": {t.name: t.record() for section in sections for t in section.tables},
+        "tables": tables,
     }
     write_json(out / "paper.json", record)
     diagram = files("gaponet.experiments.paper").joinpath("figure1.svg").read_text("utf-8")

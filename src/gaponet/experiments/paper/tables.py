@@ -162,10 +162,8 @@ def table_2(results: Results) -> ResultTable:
             baseline = "nominal_fastest"
         nominal = results.over_joints(results.baseline_q_dis(baseline)) / results.durations
         # (recordings,) rad each: MPJAE is Q_dis by the duration
-        errors = [
-            results.over_joints(q_dis) / results.durations
-            for q_dis in results.q_dis("table2", name)
-        ]
+        measured = results.q_dis("table2", name)
+        errors = [results.over_joints(q_dis) / results.durations for q_dis in measured]
         cells = []
         for mass in results.masses:
             kept = results.payloads == mass

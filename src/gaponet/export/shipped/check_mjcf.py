@@ -13,9 +13,9 @@ HERE = Path(__file__).parent
 check = Check(HERE)
 file = str(HERE / check.facts["file"])
 for form, what in (("plain", "the MJCF alone"), ("joints", "the MJCF with mujoco_servos.py")):
-    models = [mujoco.MjModel.from_xml_path(file) for _ in check.motions]
-    paths = [
-        play(m, check.facts, x, check.facts["prefix"], form)
-        for m, x in zip(models, check.motions, strict=True)
-    ]
-    check.report_motions(what, [path[1:] for path in paths], form)
+    paths = []
+    for motion in check.motions:
+        model = mujoco.MjModel.from_xml_path(file)
+        path = play(model, check.facts, motion, check.facts["prefix"], form)
+        paths.append(path[1:])
+    check.report_motions(what, paths, form)

@@ -25,8 +25,10 @@ step = facts["actuator_net"]["step"] if networks else check.step
 robot = newton.ModelBuilder()
 newton.solvers.SolverMuJoCo.register_custom_attributes(robot)
 robot.add_mjcf(str(HERE / facts["file"]), enable_self_collisions=False, parse_mujoco_options=False)
-joints = [[label.rsplit("/", 1)[-1] for label in robot.joint_label].index(name) for name in names]
-dof, at = ([starts[i] for i in joints] for starts in (robot.joint_qd_start, robot.joint_q_start))
+labels = [label.rsplit("/", 1)[-1] for label in robot.joint_label]
+joints = [labels.index(name) for name in names]
+dof = [robot.joint_qd_start[i] for i in joints]
+at = [robot.joint_q_start[i] for i in joints]
 if networks:
     for i, k, name in zip(dof, at, names, strict=True):
         robot.add_actuator(
@@ -63,9 +65,11 @@ target = 0.0 * rows(model.joint_q)
 histories = (
     [[actuator.state(), actuator.state()] for actuator in model.actuators] if networks else []
 )
-zeros = dict.fromkeys(names, 0.0)
-tables = (zeros, zeros) if networks else (robot_cfg.DELAYS, robot_cfg.OFFSETS)
-delay, offset = (np.array([table[name] for name in names]) for table in tables)
+delay = np.zeros(len(names))
+offset = np.zeros(len(names))
+if not networks:
+    delay = np.array([robot_cfg.DELAYS[name] for name in names])
+    offset = np.array([robot_cfg.OFFSETS[name] for name in names])
 weights = delay_weights(delay, step)[:, None]
 past = np.zeros((len(weights), worlds, len(names)))
 

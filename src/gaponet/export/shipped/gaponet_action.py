@@ -105,15 +105,16 @@ class Aligner:
 
         facts = read_facts(folder)
         corrected = facts["corrected"]
-        if missing := [name for name in corrected if name not in joint_names]:
-            raise ValueError(
-                f"{folder}: corrects '{missing[0]}', which is not among {', '.join(joint_names)}"
-            )
+        for name in corrected:
+            if name not in joint_names:
+                raise ValueError(
+                    f"{folder}: corrects '{name}', which is not among {', '.join(joint_names)}"
+                )
         self.columns = torch.tensor([joint_names.index(name) for name in corrected], device=device)
-        ranges = [
-            facts["joints"].get(name, {}).get("range") or (-torch.inf, torch.inf)
-            for name in joint_names
-        ]
+        ranges = []
+        for name in joint_names:
+            own = facts["joints"].get(name, {}).get("range")
+            ranges.append(own or (-torch.inf, torch.inf))
         self.low, self.high = torch.tensor(ranges, device=device).T
         module = None
         if "model" in facts:
@@ -183,10 +184,13 @@ class AlignedAction:
         """
         me: Any = self
         facts = read_facts(self.folder)
-        if "model" in facts and abs((dt := me._env.step_dt) / facts["dt"] - 1) > 0.02:
-            raise ValueError(
-                f"{self.folder}: its network has a control period of {facts['dt']} s, not {dt} s"
-            )
+        if "model" in facts:
+            dt = me._env.step_dt
+            if abs(dt / facts["dt"] - 1) > 0.02:
+                raise ValueError(
+                    f"{self.folder}: its network has a control period of {facts['dt']} s, not "
+                    f"{dt} s"
+                )
         self.aligner = Aligner(self.folder, list(names), me.num_envs, me.device, self.payload_mass)
         self.servo_offset = offset * torch.tensor(
             [facts[form][name]["offset"] for name in names], device=me.device
@@ -380,9 +384,8 @@ class DelayedAction:
         columns = torch.tensor(
             columns_of(joints, me._joint_names, "the action term"), device=me.device
         )
-        delay, me.servo_offset = (
-            x.expand(me.num_envs, -1).clone() for x in (self.delay, me.servo_offset)
-        )
+        delay = self.delay.expand(me.num_envs, -1).clone()
+        me.servo_offset = me.servo_offset.expand(me.num_envs, -1).clone()
         delay[env_ids[:, None], columns] = units["delay"]
         me.servo_offset[env_ids[:, None], columns] = units["offset"]
         self.set_delays(delay)

@@ -27,11 +27,10 @@ def add_servos(path: str, servos: dict[str, Any]) -> None:
     """Add a NewtonActuator prim for each joint; servos as in facts.json, native."""
     stage = Usd.Stage.Open(path)
     root = stage.GetDefaultPrim()
-    joints = {
-        prim.GetName(): prim.GetPath()
-        for prim in Usd.PrimRange(root)
-        if prim.GetTypeName() in JOINTS
-    }
+    joints = {}
+    for prim in Usd.PrimRange(root):
+        if prim.GetTypeName() in JOINTS:
+            joints[prim.GetName()] = prim.GetPath()
     for name, servo in servos.items():
         prim = stage.DefinePrim(root.GetPath().AppendChild(f"servo_{name}"), "NewtonActuator")
         prim.CreateRelationship("newton:targets").SetTargets([joints[name]])

@@ -31,11 +31,7 @@ def apply(model: mujoco.MjModel, drawn: dict[str, Any], row: int) -> None:
     """
     form = "plain_units" if "plain_units" in drawn else "units"
     for i, name in enumerate(drawn["joints"]):
-        unit = {
-            field: float(values[row][i])
-            for field, values in drawn[form].items()
-            if field != "links"
-        }
+        unit = _servo(drawn[form], row, i)
         joint = model.joint(name)
         dof = joint.dofadr[0]
         kp = unit["kp"]
@@ -44,17 +40,27 @@ def apply(model: mujoco.MjModel, drawn: dict[str, Any], row: int) -> None:
         model.dof_frictionloss[dof] = unit["frictionloss"]
         model.dof_armature[dof] = unit["armature"]
         for servo in np.flatnonzero(model.actuator_trnid[:, 0] == joint.id):
-            if model.actuator_trntype[servo] == mujoco.mjtTrn.mjTRN_JOINT:
-                model.actuator_gainprm[servo, 0] = kp
-                model.actuator_biasprm[servo, :2] = kp * unit["offset"], -kp
-                model.actuator_biastype[servo] = mujoco.mjtBias.mjBIAS_AFFINE
-                if model.actuator_forcelimited[servo]:
-                    model.actuator_forcerange[servo] = -limit, limit
-                if samples := int(model.actuator_history[servo, 0]):
-                    model.actuator_delay[servo] = min(
-                        unit["delay"], (samples - 2) * model.opt.timestep
-                    )
+            if model.actuator_trntype[servo] != mujoco.mjtTrn.mjTRN_JOINT:
+                continue
+            model.actuator_gainprm[servo, 0] = kp
+            model.actuator_biasprm[servo, :2] = kp * unit["offset"], -kp
+            model.actuator_biastype[servo] = mujoco.mjtBias.mjBIAS_AFFINE
+            if model.actuator_forcelimited[servo]:
+                model.actuator_forcerange[servo] = -limit, limit
+            samples = int(model.actuator_history[servo, 0])
+            if samples:
+                longest = (samples - 2) * model.opt.timestep
+                model.actuator_delay[servo] = min(unit["delay"], longest)
     set_links(model, drawn, row, form)
+
+
+def _servo(units: dict[str, Any], row: int, joint: int) -> dict[str, float]:
+    """Return the numbers of a joint in a unit; links are none of them."""
+    servo = {}
+    for field, values in units.items():
+        if field != "links":
+            servo[field] = float(values[row][joint])
+    return servo
 
 
 def set_links(model: mujoco.MjModel, drawn: dict[str, Any], row: int, form: str = "units") -> None:
@@ -82,9 +88,5 @@ def unit_facts(facts: dict[str, Any], drawn: dict[str, Any], row: int) -> dict[s
     """
     joints = {name: dict(servo) for name, servo in facts["joints"].items()}
     for i, name in enumerate(drawn["joints"]):
-        joints[name] |= {
-            field: float(values[row][i])
-            for field, values in drawn["units"].items()
-            if field != "links"
-        }
+        joints[name] |= _servo(drawn["units"], row, i)
     return facts | {"joints": joints}

@@ -48,10 +48,10 @@ class Servos:
         import mujoco
 
         joints = facts["joints"]
-        numbers = [
-            f for f, value in next(iter(joints.values())).items() if isinstance(value, int | float)
-        ]
-        column = {f: np.array([j.get(f, 0.0) for j in joints.values()]) for f in numbers}
+        column = {}
+        for field, value in next(iter(joints.values())).items():
+            if isinstance(value, int | float):
+                column[field] = np.array([joint.get(field, 0.0) for joint in joints.values()])
         self.model = model
         self.dof, self.qpos, self.servo = addresses(model, list(joints), prefix)
         self.kp = column["kp"]
@@ -246,10 +246,10 @@ class Check:
         self.facts = read(folder / "facts.json")
         stored = np.load(folder / "check.npz")
         self.names = list(self.facts["joints"])
-        fields = ("ctrl", "qpos", "qvel", "dt")
-        self.motions: list[Motion] = [
-            {name: stored[f"{name}_{i}"] for name in fields} for i in range(int(stored["count"]))
-        ]
+        self.motions: list[Motion] = []
+        for i in range(int(stored["count"])):
+            motion = {name: stored[f"{name}_{i}"] for name in ("ctrl", "qpos", "qvel", "dt")}
+            self.motions.append(motion)
         self.step = float(np.median([m["dt"] for m in self.motions])) / self.facts["decimation"]
         self.worlds = min(CHECK_WORLDS, len(self.motions))
         free = [0] * self.worlds  # period in which each world ends its last motion
@@ -289,11 +289,10 @@ class Check:
             path: Positions after each period, (T, worlds, n) rad.
             form: Form of the robot that was played, a key of error_mrad in facts.json.
         """
-        places = zip(self._places, self.motions, strict=True)
-        paths = [
-            np.asarray(path)[row : row + len(motion["qpos"]) - 1, world]
-            for (row, world), motion in places
-        ]
+        paths = []
+        for (row, world), motion in zip(self._places, self.motions, strict=True):
+            end = row + len(motion["qpos"]) - 1
+            paths.append(np.asarray(path)[row:end, world])
         self.report_motions(f"{engine}, {self.worlds} worlds", paths, form)
 
     def report_motions(self, engine: str, paths: list[Any], form: str = "plain") -> None:

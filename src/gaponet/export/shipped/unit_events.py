@@ -42,9 +42,8 @@ def read_units(file: str | Path, form: str) -> tuple[list[str], Units]:
     A robot without a servo model has one form of them.
     """
     drawn = json.loads(Path(file).read_text(encoding="utf-8"))
-    return drawn["joints"], {
-        field: torch.tensor(x) for field, x in drawn.get(form, drawn["units"]).items()
-    }
+    units = drawn.get(form, drawn["units"])
+    return drawn["joints"], {field: torch.tensor(values) for field, values in units.items()}
 
 
 def draw_units(
@@ -60,19 +59,21 @@ def draw_units(
         Indices of the worlds, joints, and the units' numbers.
     """
     joints, units = read_units(file, form)
-    ids = torch.arange(env.num_envs, device=env.device)[slice(None) if env_ids is None else env_ids]
-    row = (
-        torch.randint(len(units["kp"]), (len(ids),))
-        if rows is None
-        else torch.as_tensor(rows)[ids.cpu()]
-    )
+    ids = torch.arange(env.num_envs, device=env.device)
+    if env_ids is not None:
+        ids = ids[env_ids]
+    if rows is None:
+        row = torch.randint(len(units["kp"]), (len(ids),))
+    else:
+        row = torch.as_tensor(rows)[ids.cpu()]
     return ids, joints, {field: x[row].to(env.device) for field, x in units.items()}
 
 
 def columns_of(joints: Iterable[str], names: Iterable[str], what: str) -> list[int]:
     """Return the places of joints among names; a joint that is missing is an error."""
-    if missing := [name for name in joints if name not in names]:
-        raise ValueError(f"randomization.json has joint '{missing[0]}'; {what}: {', '.join(names)}")
+    for joint in joints:
+        if joint not in names:
+            raise ValueError(f"randomization.json has joint '{joint}'; {what}: {', '.join(names)}")
     return [list(names).index(name) for name in joints]
 
 
@@ -268,11 +269,8 @@ def _speed_lines(
     for i, joint in enumerate(joints):
         limit = units["effort_limit"][:, i]
         speed = units["no_load_speed"][:, i]
-        motors = [
-            m
-            for m in (groups[joint], *together)
-            if joint in m.joint_names and hasattr(m, "_saturation_effort")
-        ]
+        actuators = [one for one in (groups[joint], *together) if joint in one.joint_names]
+        motors = [one for one in actuators if hasattr(one, "_saturation_effort")]
         if not motors and (speed > 0).any():
             raise ValueError(
                 f"joint '{joint}' needs a torque-speed line: take isaaclab_actuators, or a "

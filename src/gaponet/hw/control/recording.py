@@ -198,10 +198,10 @@ class Recording:
 
 def _quantiles_ms(seconds: Array) -> dict[str, float]:
     """Return the quantiles of some durations, s, in ms."""
-    return {
-        name: round(float(np.quantile(seconds, share)) * 1e3, 3)
-        for name, share in QUANTILES.items()
-    }
+    quantiles = {}
+    for name, share in QUANTILES.items():
+        quantiles[name] = round(float(np.quantile(seconds, share)) * 1e3, 3)
+    return quantiles
 
 
 def _free_name(folder: Path, name: str) -> str:

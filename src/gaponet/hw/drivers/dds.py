@@ -64,11 +64,10 @@ def _struct(name: str, fields: hg.Fields, **parts: type[IdlStruct]) -> type[IdlS
 
     parts: its structs, by field.
     """
-    members = {field: (parts.get(field) or SCALARS[kind], count) for field, kind, count in fields}
-    hints = {
-        field: kind if count == 1 else array[kind, count]
-        for field, (kind, count) in members.items()
-    }
+    hints = {}
+    for field, scalar, count in fields:
+        kind = parts.get(field) or SCALARS[scalar]
+        hints[field] = kind if count == 1 else array[kind, count]
     result: type[IdlStruct] = make_struct(f"unitree_hg.msg.dds_.{name}_", **hints)
     return result
 

@@ -113,9 +113,10 @@ class Message:
         names = [path.split(".")[-1] for path, *_ in wire if path.startswith(f"{motors}[1].")]
         # From the second motor on, slots repeat every `stride` bytes; the first may begin closer to
         # what precedes it.
-        self.columns = {
-            n: np.array([self._at[f"{motors}[{i}].{n}"][2] for i in range(MOTORS)]) for n in names
-        }
+        self.columns = {}
+        for name in names:
+            offsets = [self._at[f"{motors}[{i}].{name}"][2] for i in range(MOTORS)]
+            self.columns[name] = np.array(offsets)
         self._gather = self._bytes(wire, packed)
 
     def _bytes(

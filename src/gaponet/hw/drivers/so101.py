@@ -269,7 +269,9 @@ class SO101Driver:
         stored = {joint: self._stored_calibration(servo) for joint, servo in numbers.items()}
         self.arm = resolve_calibration(self.file_calibration, stored, self.robot, self.port)
         self.qpos_range = self.arm.qpos_range
-        servo_facts = {name: [self._settings[servo][name] for servo in servos] for name in GAINS}
+        servo_facts = {}
+        for name in GAINS:
+            servo_facts[name] = [self._settings[servo][name] for servo in servos]
         for name, register in (LIMITS | {"voltage": reg.PRESENT_VOLTAGE}).items():
             servo_facts[name] = [register.value_in(reg.RUNNING, running[servo]) for servo in servos]
         self.kp = STIFFNESS_PER_P * np.array(servo_facts["p"], float)

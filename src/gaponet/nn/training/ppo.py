@@ -242,7 +242,9 @@ class PPO:
     def _descend(optimiser: torch.optim.Optimizer, loss: Tensor) -> None:
         optimiser.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
-        parameters = [p for group in optimiser.param_groups for p in group["params"]]
+        parameters = []
+        for group in optimiser.param_groups:
+            parameters += group["params"]
         nn.utils.clip_grad_norm_(parameters, MAX_GRADIENT_NORM)
         optimiser.step()
 
