@@ -328,7 +328,8 @@ class Compensator:
                 "period"
             )
         given = self._as_rows(target)
-        self._target = targets = np.where(np.isfinite(given), given, self._target)
+        targets = np.where(np.isfinite(given), given, self._target)
+        self._target = targets
         a = targets[:, self.op]
         if qpos is not None:
             if self.periods == 0:
@@ -339,8 +340,10 @@ class Compensator:
                     self.robot,
                     lambda row: "compensator: the position",
                 )
-            v, torque = (None if x is None else self._as_rows(x)[:, self.op] for x in (qvel, tau))
-            self._process_state(self._as_rows(qpos)[:, self.op], v, torque)
+            q = self._as_rows(qpos)[:, self.op]
+            v = np.zeros_like(q) if qvel is None else self._as_rows(qvel)[:, self.op]
+            torque = None if tau is None else self._as_rows(tau)[:, self.op]
+            self._process_state(q, v, torque)
         self.feedforward.update(a)
         shadow_target = self._shadow_target(targets[:, self.free])
         u = self._invert(shadow_target) + self.feedback.integral
@@ -470,16 +473,16 @@ class Compensator:
         """Return u with u + G(u) = a′. Without a model, u = a′."""
         if self.loop is None:
             return shadow_target
-        q, v = (x[: self.num_envs, self.operated] for x in (self.shadow.qpos, self.shadow.qvel))
+        q = self.shadow.qpos[: self.num_envs, self.operated]
+        v = self.shadow.qvel[: self.num_envs, self.operated]
         gain = self.config.gain
         iterations = self.config.iterations
         return self.loop.solve(
             q, v, shadow_target, self.payload_mass, self.offset, gain, iterations
         )
 
-    def _process_state(self, q: Array, v: Array | None, tau: Array | None) -> None:
+    def _process_state(self, q: Array, v: Array, tau: Array | None) -> None:
         """Update feedback and payload estimate from a measured state."""
-        v = np.zeros_like(q) if v is None else v
         valid = np.isfinite(q + v + (0.0 if tau is None else tau)).all(axis=1)  # robots
         if self.periods:
             self.feedback.update(self.shadow.qpos[: self.num_envs, self.operated] - q, valid)

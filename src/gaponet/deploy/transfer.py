@@ -73,7 +73,8 @@ class Transfer:
         robot = reference.simulator() if isinstance(reference, GapModel) else reference
         self.inverse = inverse
         self.num_envs = len(conditions)
-        self.sim = sim = BatchSim(robot, conditions, nthread, locked)
+        sim = BatchSim(robot, conditions, nthread, locked)
+        self.sim = sim
         if not extrapolate:
             _require_measured(inverse, AnalyticInverse.of(sim), sim.joint_names)
         self.joint_names = sim.joint_names

@@ -97,7 +97,8 @@ class Source:
         self._read(self.main)
 
     def _read(self, file: Path) -> None:
-        text = self.text[file] = file.read_bytes()
+        text = file.read_bytes()
+        self.text[file] = text
         if text[:2] in (b"\xff\xfe", b"\xfe\xff"):
             raise RobotError(f"{file}: is in UTF-16; write it in UTF-8")
         parser = expat.ParserCreate()
@@ -197,8 +198,9 @@ class Source:
         edited = self.edited()
         lines = list[str]()
         for file, old in self.text.items():
-            a, b = (text.decode("utf-8").splitlines(keepends=True) for text in (old, edited[file]))
-            lines += difflib.unified_diff(a, b, f"a/{file.name}", f"b/{file.name}", n=1)
+            before = old.decode("utf-8").splitlines(keepends=True)
+            after = edited[file].decode("utf-8").splitlines(keepends=True)
+            lines += difflib.unified_diff(before, after, f"a/{file.name}", f"b/{file.name}", n=1)
         write_text(folder / "changes.diff", "".join(lines))
 
 

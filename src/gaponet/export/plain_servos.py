@@ -220,7 +220,7 @@ def own_motions(robot: RobotSpec, payload_mass: float = 0.0, count: int = 24) ->
     op = robot.operated_index
     t = np.arange(0.0, OWN_MOTION_S, robot.dt)[:, None]
     home = robot.qpos_home[op]
-    low, high = (np.clip(x, home - np.pi, home + np.pi) for x in robot.qpos_range[op].T)
+    low, high = np.clip(robot.qpos_range[op].T, home - np.pi, home + np.pi)
     motions = []
     for i in range(count):
         turn = 2 * np.pi * (rng.uniform(0.1, 0.6, len(op)) * t + rng.uniform(0, 1, len(op)))

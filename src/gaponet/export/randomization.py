@@ -226,7 +226,8 @@ def judge_units(
     train, validation = _comparable_motions(recordings, robot)
     if not train or not validation:
         return _not_judged(made, "no recording with the robot's own gains")
-    judged = plain = draw_robots(robot, made.units, (train, validation), progress=progress)
+    judged = draw_robots(robot, made.units, (train, validation), progress=progress)
+    plain = judged
     if robot.has_servo_model:
         plain = draw_robots(robot, made.units, (train, validation), True, progress, engine_terms)
     units = {field: np.array(rows) for field, rows in judged.units.items()}

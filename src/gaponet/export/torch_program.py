@@ -220,7 +220,10 @@ def _largest_difference(program: Any, step: DeltaStep, model: GapModel) -> float
             ctrl = ctrl + rng.normal(0, 0.02, ctrl.shape)
             qvel = rng.normal(0, 0.3, ctrl.shape)
             qpos = qpos + 0.3 * (ctrl - qpos)
-            q, v, a = (x.astype(np.float32) for x in (qpos, qvel, ctrl))
-            delta = past.delta(*(torch.from_numpy(x) for x in (q, v, a, payload))).numpy()
+            q = qpos.astype(np.float32)
+            v = qvel.astype(np.float32)
+            a = ctrl.astype(np.float32)
+            inputs = [torch.from_numpy(values) for values in (q, v, a, payload)]
+            delta = past.delta(*inputs).numpy()
             largest = max(largest, float(np.abs(delta - loop.delta(q, v, a, payload)).max()))
     return largest

@@ -152,7 +152,9 @@ class DeltaLoop:
             payload_mass: kg, one number or (num_envs,).
         """
         if self.any_fresh:
-            q, v, u = (x.reshape(-1, 1, self.n)[self.fresh] for x in (qpos, qvel, ctrl))
+            q = qpos.reshape(-1, 1, self.n)[self.fresh]
+            v = qvel.reshape(-1, 1, self.n)[self.fresh]
+            u = ctrl.reshape(-1, 1, self.n)[self.fresh]
             self.begin(self.fresh.copy(), q, v, u)
         if self.config.sensor_hold == 1:
             self._q[...] = qpos
@@ -198,9 +200,9 @@ class DeltaLoop:
             qvel = np.asarray(qvel)
             ctrl = np.asarray(ctrl)
         if not qpos.shape == qvel.shape == ctrl.shape or ctrl.shape not in self._shapes:
-            q, v, a = (tuple(values.shape) for values in (qpos, qvel, ctrl))
             raise UsageError(
-                f"delta: qpos {q}, qvel {v}, ctrl {a}; give the {self.n} operated joints of "
+                f"delta: qpos {tuple(qpos.shape)}, qvel {tuple(qvel.shape)}, ctrl "
+                f"{tuple(ctrl.shape)}; give the {self.n} operated joints of "
                 f"{self.num_envs} robots each, or make another loop for another number of robots: "
                 "model.loop(num_envs)"
             )

@@ -357,13 +357,13 @@ class RobotSpec:
         for table in (extra or {}, self.aliases):
             mapped = table.get(full, table.get(short))
             if mapped is not None:
-                full = short = mapped
-        exact = next((n for n in (full.replace("/", "_"), short) if n in self.joint_names), None)
-        matches = (
-            [exact]
-            if exact
-            else [joint for joint in self.joint_names if _letters(joint) == _letters(short)]
-        )
+                full = mapped
+                short = mapped
+        exact = [name for name in (full.replace("/", "_"), short) if name in self.joint_names]
+        matches = exact[:1]
+        if not exact:
+            letters = _letters(short)
+            matches = [joint for joint in self.joint_names if _letters(joint) == letters]
         if len(matches) != 1:
             message, nearest = self._unknown(short, where)
             raise JointMismatchError(

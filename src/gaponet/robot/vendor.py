@@ -325,7 +325,7 @@ def _correct_inertias(root: ET.Element) -> list[str]:
 
 def _is_impossible(inertia: ET.Element) -> bool:
     """Return True for a finite inertia tensor that is not positive definite."""
-    xx, yy, zz, xy, xz, yz = (_number(inertia, f"i{axes}") for axes in AXES)
+    xx, yy, zz, xy, xz, yz = [_number(inertia, f"i{axes}") for axes in AXES]
     matrix = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
     return bool(np.isfinite(matrix).all() and np.linalg.eigvalsh(matrix)[0] <= 0)
 

@@ -83,14 +83,16 @@ class OneByOne:
         model = self._model
         data = self._data
         for i in np.arange(self.nsim)[slice(None) if ids is None else ids]:
-            for name, x in self._expanded.items():
-                owner, field = (model.opt, name[4:]) if name.startswith("opt.") else (model, name)
-                setattr(owner, field, x[i])
-            for name, x in self._bound.items():
-                setattr(data, name, x[i])
+            for name, values in self._expanded.items():
+                if name.startswith("opt."):
+                    setattr(model.opt, name.removeprefix("opt."), values[i])
+                else:
+                    setattr(model, name, values[i])
+            for name, values in self._bound.items():
+                setattr(data, name, values[i])
             function(model, data)
-            for name, x in self._bound.items():
-                x[i] = getattr(data, name)
+            for name, values in self._bound.items():
+                values[i] = getattr(data, name)
 
 
 if TYPE_CHECKING:
@@ -126,7 +128,8 @@ def speed_limited(ctrl: Array, qpos: Array, speed: Array, dt: Array | float) -> 
     limited = np.empty_like(ctrl)
     at = ramp_start(ctrl[0], qpos, speed)
     for t, target in enumerate(ctrl):
-        limited[t] = at = np.clip(target, at - speed * dt, at + speed * dt)
+        at = np.clip(target, at - speed * dt, at + speed * dt)
+        limited[t] = at
     return limited
 
 
@@ -193,14 +196,15 @@ class BatchSim:
         free = robot.index(self.joint_names)
         self.num_envs = len(conditions)
         self.n = len(self.joint_names)
-        conditions = [Condition(*c) for c in conditions]
+        conditions = [Condition(*condition) for condition in conditions]
         robots = _under_conditions(robot, conditions)
         added_delay = _largest_added_delay(conditions)
         self.longest_delay = float(robot.delay.max()) + added_delay  # s
         self.models = _compiled(robots, self.joint_names, locked, added_delay)
-        models = [self.models[c] for c in conditions]
+        models = [self.models[condition] for condition in conditions]
         first = models[0]
-        self._kp_ratio, self._kd = _recorded_gains(robot, [robots[c] for c in conditions])
+        own = [robots[condition] for condition in conditions]
+        self._kp_ratio, self._kd = _recorded_gains(robot, own)
         self.batch = Batch(
             first, nsim=self.num_envs, nthread=nthread or _useful_threads(self.num_envs)
         )
@@ -220,7 +224,7 @@ class BatchSim:
         if first.nhistory:
             self._history = CommandHistory(bind("history"), bind("time"), first)
         # Physics steps per control period, and their length in s, of each simulation.
-        self.nstep = np.array([robot.steps_per(c.dt) for c in conditions])
+        self.nstep = np.array([robot.steps_per(condition.dt) for condition in conditions])
         self._one_rate = bool((self.nstep == self.nstep[0]).all())
         self.timestep = np.array([model.opt.timestep for model in models])
         self.range = qpos_range(first)
@@ -356,12 +360,12 @@ class BatchSim:
 
     def state(self) -> dict[str, Array]:
         """Return copies of the complete state."""
-        return {name: x.copy() for name, x in self._state().items()}
+        return {name: values.copy() for name, values in self._state().items()}
 
     def set_state(self, state: dict[str, Array]) -> None:
         """Restore a `state`; entries of other names are ignored."""
-        for name, x in self._state().items():
-            x[:] = state[name]
+        for name, values in self._state().items():
+            values[:] = state[name]
 
     def _state(self) -> dict[str, Array]:
         state = {"qpos": self.qpos, "qvel": self.qvel, "warmstart": self._warmstart}
@@ -453,9 +457,9 @@ def expand_differences(batch: Batch, models: list[mujoco.MjModel]) -> dict[str, 
     """Expand every model field that differs between simulations, (nsim) models, and return those
     fields, live.
     """
-    unique = list({id(m): m for m in models}.values())
-    place = {id(m): i for i, m in enumerate(unique)}
-    rows = [place[id(m)] for m in models]
+    unique = list({id(model): model for model in models}.values())
+    place = {id(model): i for i, model in enumerate(unique)}
+    rows = [place[id(model)] for model in models]
     fields: dict[str, Array] = {}
     for name, values in differing_fields(unique).items():
         fields[name] = batch.expand(name)

@@ -154,7 +154,8 @@ class AnalyticInverse:
             return undelayed
         late = np.broadcast_to(self.delay / self.dt, held[0].shape)
         whole = np.minimum(late.astype(int), self.ahead - 1)
-        first, second = (np.take_along_axis(held, i[None], axis=0)[0] for i in (whole, whole + 1))
+        first = np.take_along_axis(held, whole[None], axis=0)[0]
+        second = np.take_along_axis(held, whole[None] + 1, axis=0)[0]
         delayed: Array = first + (late - whole) * (second - first)
         return delayed
 
@@ -232,10 +233,14 @@ class AnalyticInverse:
         for _ in range(COMPARED_MOTIONS):
             low, high = np.clip(limits, -np.pi, np.pi).T
             q = low + (high - low) * rng.random((1, n))
-            v, a, friction = (rng.uniform(-top, top, (1, n)) for top in (1.0, 5.0, 1.0))
-            ends = q + self.dt * (v + 0.5 * self.dt * a), v + self.dt * a
-            period = Period(q, v, *ends, friction)
-            mine, theirs = (inverse([period] * (1 + inverse.ahead)) for inverse in (self, other))
+            v = rng.uniform(-1.0, 1.0, (1, n))
+            a = rng.uniform(-5.0, 5.0, (1, n))
+            friction = rng.uniform(-1.0, 1.0, (1, n))
+            q_end = q + self.dt * (v + 0.5 * self.dt * a)
+            v_end = v + self.dt * a
+            period = Period(q, v, q_end, v_end, friction)
+            mine = self([period] * (1 + self.ahead))
+            theirs = other([period] * (1 + other.ahead))
             if np.abs(mine - theirs).max() > MAX_TARGET_DIFFERENCE_RAD:
                 return False
         return True

@@ -35,9 +35,9 @@ def warm_values(values: Mapping[str, Array], temperature: Array) -> tuple[Array,
     """Return damping and friction of candidates (k, n) at temperatures (n, windows) °C, (k, n,
     windows) each.
     """
-    zero = np.zeros_like(values["kp"])[..., None]
+    zero = np.zeros_like(values["kp"])
     names = ("damping", "frictionloss", *TERMS["temperature"])
-    *now, reference = (values[f][..., None] if f in values else zero for f in names)
+    *now, reference = [values.get(name, zero)[..., None] for name in names]
     damping, friction = warmed(np.nan_to_num(temperature - reference), *now)
     return damping, friction
 

@@ -194,8 +194,10 @@ class _Worlds:
         """
         with warp.ScopedDevice(self.device):
             if self.device.is_cuda:
-                graph = self._graphs[kernels] = self._graphs.get(kernels) or self._captured(kernels)
-                warp.capture_launch(graph, warp.stream_from_torch(torch.cuda.current_stream()))
+                if kernels not in self._graphs:
+                    self._graphs[kernels] = self._captured(kernels)
+                stream = warp.stream_from_torch(torch.cuda.current_stream())
+                warp.capture_launch(self._graphs[kernels], stream)
             else:
                 kernels()
 

@@ -237,7 +237,7 @@ class VirtualH12:
         """Return qpos, qvel, tau, temperature, (n) each, with a fault."""
         if fault in ("freeze", "repeat") and self._frozen is not None:
             return self._frozen
-        qpos, qvel, tau, temperature = (values.copy() for values in self.live.read())
+        qpos, qvel, tau, temperature = [values.copy() for values in self.live.read()]
         joint = self.robot.index(["left_elbow_joint"])[0]
         if fault == "encoder" and self._frozen is not None:
             qpos[joint] = self._frozen[0][joint]

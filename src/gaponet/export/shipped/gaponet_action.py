@@ -151,7 +151,9 @@ class Aligner:
         """
         last = torch.where(self.past.fresh[:, None], qpos, self.sent)
         target = torch.where(torch.isfinite(target), target, last)
-        q, v, a = (x[:, self.columns].float() for x in (qpos, qvel, target))
+        q = qpos[:, self.columns].float()
+        v = qvel[:, self.columns].float()
+        a = target[:, self.columns].float()
         out = target.clone()
         out[:, self.columns] = (a + self.past.delta(q, v, a, self.payload_mass)).to(out.dtype)
         self.sent = torch.minimum(torch.maximum(out, self.low), self.high)
@@ -202,7 +204,8 @@ class AlignedAction:
         super().process_actions(actions)  # type: ignore[misc]
         data = self._aligned.data
         ids = self._columns
-        q, v = (tensor(x)[:, ids] for x in (data.joint_pos, data.joint_vel))
+        q = tensor(data.joint_pos)[:, ids]
+        v = tensor(data.joint_vel)[:, ids]
         # mjlab subtracts it again
         bias = data.encoder_bias[:, ids] if hasattr(data, "encoder_bias") else 0.0
         self.restart(q, q if self.standing_command is None else self.standing_command)
@@ -238,7 +241,8 @@ class CheckPlayer:
         def reset(env: Any, env_ids: Any) -> None:
             robot = env.scene["robot"]
             order = [self.check.names.index(name) for name in robot.joint_names]
-            position, velocity = (x[env_ids][:, order] for x in self.start)
+            position = self.start[0][env_ids][:, order]
+            velocity = self.start[1][env_ids][:, order]
             if hasattr(robot, "write_joint_state_to_sim_index"):  # Isaac Lab 3
                 robot.write_joint_state_to_sim_index(
                     position=position, velocity=velocity, env_ids=env_ids
@@ -524,7 +528,8 @@ def __getattr__(name: str) -> Any:
     }
     if name not in makers:
         raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
-    new = globals()[name] = makers[name]()
+    new = makers[name]()
+    globals()[name] = new
     new.__module__ = __name__
     new.__qualname__ = name
     return new

@@ -86,8 +86,11 @@ def require_scene(
 
 def _differs(what: str, now: Any, wanted: Any) -> list[str]:
     """Return a text on two values that differ, or nothing."""
-    a, b = (np.array(x, float) for x in (now, wanted))
-    same = a.shape == b.shape and np.allclose(a, b, rtol=RELATIVE_TOLERANCE, atol=1e-12)
+    here = np.array(now, float)
+    there = np.array(wanted, float)
+    same = here.shape == there.shape and np.allclose(
+        here, there, rtol=RELATIVE_TOLERANCE, atol=1e-12
+    )
     return [] if same else [f"{what} {now} instead of {wanted}"]
 
 

@@ -165,7 +165,7 @@ class Rows:
     def _row(self, record: Any) -> Row:
         target = None if np.isnan(record["target"]).all() else np.array(record["target"])
         ctrl = None if np.isnan(record["ctrl"]).all() else np.array(record["ctrl"])
-        qpos, qvel, tau, temperature = (np.array(record[name]) for name in READINGS)
+        qpos, qvel, tau, temperature = [np.array(record[name]) for name in READINGS]
         refused = int(record["refused"])
         tilt = float(record["tilt"])
         state = State(float(record["state_time"]), qpos, qvel, tau, temperature, refused, tilt)
