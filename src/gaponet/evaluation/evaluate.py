@@ -162,7 +162,7 @@ def _require_control_periods(candidate: Candidate, sequences: list[Sequence]) ->
     """Refuse a network that does not run at the rates of the recordings."""
     if candidate.model is None:
         return
-    for dt in sorted({s.dt for s in sequences}):
+    for dt in sorted({sequence.dt for sequence in sequences}):
         candidate.model.require(candidate.robot, dt)
 
 
@@ -189,7 +189,7 @@ class _Rollouts:
         self._dataset = dataset
         self._entries = entries
         self.first = next(iter(candidates.values()))
-        self.ctrl = [s.ctrl[:, robot.operated_index] for s in self.sequences]
+        self.ctrl = [sequence.ctrl[:, robot.operated_index] for sequence in self.sequences]
         self.runs: dict[str, list[Run]] = {}
         self.deltas: dict[str, list[Array]] = {}
         self.notes: list[str] = []
@@ -252,9 +252,9 @@ class _Rollouts:
             "methods": methods,
             "ratio_to_nominal": ratios,
             "sequences": len(self.sequences),
-            "motions": sorted({s.meta.motion for s in self.sequences}),
+            "motions": sorted({sequence.meta.motion for sequence in self.sequences}),
             "moves": self._recordings_that_move(),
-            "virtual": any(s.meta.virtual for s in self.sequences),
+            "virtual": any(sequence.meta.virtual for sequence in self.sequences),
             "robot": self._robot.name,
             "simulator_hash": model_hash(self.first.robot.before_identification),
             "simulators": self._simulators,
@@ -266,7 +266,7 @@ class _Rollouts:
 
     def _add(self, name: str, simulator: RobotSpec, replays: list[SimulatedReplay]) -> None:
         self._simulators[name] = model_hash(simulator)
-        self.runs[name] = runs(self.sequences, [r.qpos for r in replays], self._robot)
+        self.runs[name] = runs(self.sequences, [replayed.qpos for replayed in replays], self._robot)
 
     def _corrections(self, replays: list[SimulatedReplay]) -> list[Array]:
         operated = self._robot.operated_index
@@ -278,7 +278,7 @@ class _Rollouts:
 
     def _recordings_that_move(self) -> dict[str, int]:
         """Return joint → number of recordings in which it is commanded to move."""
-        moved = [np.ptp(c, axis=0) > MIN_MOTION_RAD for c in self.ctrl]
+        moved = [np.ptp(ctrl, axis=0) > MIN_MOTION_RAD for ctrl in self.ctrl]
         counts = np.sum(moved, axis=0)  # (n operated)
         return {name: int(n) for name, n in zip(self._robot.operated, counts, strict=True)}
 
@@ -380,8 +380,8 @@ def _by_unit(
 ) -> list[SimulatedReplay]:
     """Roll out the model in each unit's adapted simulator, or in the common one for other units."""
     replays: dict[int, SimulatedReplay] = {}
-    for unit in dict.fromkeys(s.meta.unit_id for s in sequences):
-        rows = [i for i, s in enumerate(sequences) if s.meta.unit_id == unit]
+    for unit in dict.fromkeys(sequence.meta.unit_id for sequence in sequences):
+        rows = [i for i, sequence in enumerate(sequences) if sequence.meta.unit_id == unit]
         physics = adapted[unit].robot(candidate.robot) if unit in adapted else candidate.robot
         part = replay([sequences[i] for i in rows], physics, candidate.corrector(), lock_idle=True)
         replays |= dict(zip(rows, part, strict=True))
@@ -393,10 +393,10 @@ def _delta_summary(parts: list[Array], sequences: list[Sequence], limit: float) 
     """Return mean and largest |Δa|, rad, their mean rate, rad/s, and the share at the limit Δ_max
     (rad).
     """
-    dt = float(np.median([s.dt for s in sequences]))
+    dt = float(np.median([sequence.dt for sequence in sequences]))
     return {
-        "mean": float(np.mean([np.abs(d).mean() for d in parts])),
-        "max": float(max(np.abs(d).max() for d in parts)),
-        "at_limit": float(np.mean([(np.abs(d) >= limit - 1e-6).mean() for d in parts])),
-        "rate": float(np.mean([np.abs(np.diff(d, axis=0)).mean() for d in parts]) / dt),
+        "mean": float(np.mean([np.abs(delta).mean() for delta in parts])),
+        "max": float(max(np.abs(delta).max() for delta in parts)),
+        "at_limit": float(np.mean([(np.abs(delta) >= limit - 1e-6).mean() for delta in parts])),
+        "rate": float(np.mean([np.abs(np.diff(delta, axis=0)).mean() for delta in parts]) / dt),
     }

@@ -100,7 +100,7 @@ def draw_robots(
     if plain:
         note = ", without the servo model"
         base = fit_plain_servos(robot, train, progress, engine_terms)
-    first = {f: v[:DRAWN] for f, v in drawn.items()}
+    first = {field: values[:DRAWN] for field, values in drawn.items()}
 
     def draw() -> DrawnRobots:
         return _draw(
@@ -108,7 +108,7 @@ def draw_robots(
             _moved(robot, base, first),
             train,
             validation,
-            lambda i, n, s: progress(i, n, s + note),
+            lambda i, n, what: progress(i, n, what + note),
         )
 
     inputs = *first.values(), np.array([len(train), len(validation), len(engine_terms)])
@@ -186,7 +186,7 @@ def _moved(robot: RobotSpec, base: RobotSpec, drawn: Units) -> Units:
     axes = np.stack([_on_axes(unit, fields) for unit in robots_of(robot, drawn)])
     share = np.where(np.arange(len(axes)) % 2, NEAR, 1.0)[:, None]  # (units, 1)
     x = _on_axes(base, fields) + share[:, :, None] * (axes - own)
-    signed = [SERVO_FIELDS[f].axis == "log" or SERVO_FIELDS[f].signed for f in fields]
+    signed = [SERVO_FIELDS[field].axis == "log" or SERVO_FIELDS[field].signed for field in fields]
     units: Units = dict(from_axes(fields, np.where(signed, x, np.maximum(x, 0.0))))
     op = robot.operated_index
     units["effort_limit"] = base.effort_limit[op] * units["kp"] / base.kp[op]
@@ -207,8 +207,8 @@ def _one_by_one(
 ) -> list[RobotSpec]:
     """Return robots with each number drawn by itself from the range that the units have."""
     servos = {field: values for field, values in units.items() if field != "links"}
-    low = np.array([np.percentile(v, RANGE_PERCENT[0], axis=0) for v in servos.values()])
-    high = np.array([np.percentile(v, RANGE_PERCENT[1], axis=0) for v in servos.values()])
+    low = np.array([np.percentile(values, RANGE_PERCENT[0], axis=0) for values in servos.values()])
+    high = np.array([np.percentile(values, RANGE_PERCENT[1], axis=0) for values in servos.values()])
     alone = rng.uniform(low, high, (JUDGED, *low.shape)).swapaxes(0, 1)
     return robots_of(base, dict(zip(servos, alone, strict=True)))
 
@@ -225,9 +225,9 @@ def _by_hand(base: RobotSpec, rng: np.random.Generator) -> list[RobotSpec]:
 def _windows(sequences: ListOf[Sequence]) -> list[Sequence]:
     """Cut WINDOWS pieces of WINDOW_S, taken evenly from the recordings."""
     pieces = []
-    for s in sequences:
-        rows = round(WINDOW_S / s.dt)
-        for start in range(0, max(len(s) - rows // 2, 1), rows):
-            pieces.append(s.rows(slice(start, start + rows)))
+    for recording in sequences:
+        rows = round(WINDOW_S / recording.dt)
+        for start in range(0, max(len(recording) - rows // 2, 1), rows):
+            pieces.append(recording.rows(slice(start, start + rows)))
     taken = np.unique(np.linspace(0, len(pieces) - 1, WINDOWS).round().astype(int))
     return [pieces[i] for i in taken]

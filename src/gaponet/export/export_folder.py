@@ -231,7 +231,7 @@ def export_robot(
         raise UsageError("--to urdf edits a copy of your own file: --into FILE.urdf")
     train, validation = _motions(robot, recordings, payload_mass)
     plain = fit_plain_servos(robot, train, progress, ENGINE_TERMS.get(to, ()))
-    dt = control_period(robot, (s.dt for s in validation))
+    dt = control_period(robot, (motion.dt for motion in validation))
     facts = simulator_facts(robot, dt, payload_mass, plain)
     facts["file"] = ROBOT
     facts["prefix"] = source.prefix if source else ""
@@ -324,7 +324,7 @@ def _stop_notes(robot: RobotSpec) -> list[str]:
     """Return a question for each joint with stops, which the MJCF of the user does not get."""
     notes = []
     for name, low, high in zip(robot.joint_names, robot.stop_low, robot.stop_high, strict=True):
-        stops = " and ".join(f"{x:.2f}" for x in (low, high) if np.isfinite(x))
+        stops = " and ".join(f"{stop:.2f}" for stop in (low, high) if np.isfinite(stop))
         if stops:
             notes.append(
                 f"{name} met something at {stops} rad in the recordings; the file keeps its range: "
@@ -366,7 +366,7 @@ def _ramp_note(robot: RobotSpec, to: str) -> str:
 def _urdf_note(facts: dict[str, Any]) -> str:
     """Return what a URDF has no place for."""
     servos = facts["plain"].values()
-    missing = ", ".join(f for f in MISSING_FIELDS if any(servo[f] for servo in servos))
+    missing = ", ".join(field for field in MISSING_FIELDS if any(servo[field] for servo in servos))
     return (
         f"the file has no place for {missing}: they are in facts.json (plain), kp and kd for your "
         "controller; files that it names stay where they were"
@@ -457,14 +457,14 @@ def _write_scene(
 def _write_motions(file: Path, motions: ListOf[Sequence]) -> None:
     arrays: dict[str, Any] = {
         "count": np.array(len(motions)),
-        "names": np.array([s.meta.motion for s in motions]),
+        "names": np.array([motion.meta.motion for motion in motions]),
     }
-    for i, s in enumerate(motions):
+    for i, motion in enumerate(motions):
         arrays |= {
-            f"ctrl_{i}": s.ctrl,
-            f"qpos_{i}": s.qpos,
-            f"qvel_{i}": s.qvel,
-            f"dt_{i}": np.array(s.dt),
+            f"ctrl_{i}": motion.ctrl,
+            f"qpos_{i}": motion.qpos,
+            f"qvel_{i}": motion.qvel,
+            f"dt_{i}": np.array(motion.dt),
         }
     with atomic_write(file) as temporary, temporary.open("wb") as opened:
         np.savez_compressed(opened, **arrays)

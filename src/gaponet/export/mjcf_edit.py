@@ -487,7 +487,7 @@ def _write(source: Source, out: Path) -> Path:
     """
     named = mujoco.mju_getXMLDependencies(str(source.main))
     needed = {Path(os.path.abspath(file)) for file in named} | set(source.text)
-    root = Path(os.path.commonpath([f.parent for f in needed]))
+    root = Path(os.path.commonpath([file.parent for file in needed]))
     edited = source.edited()
     with lock_folder(out, "engine"):
         for file in sorted(needed):
@@ -549,4 +549,4 @@ def _require(
 
 def text_of(*numbers: float) -> str:
     """Return numbers as an attribute of MJCF or URDF has them."""
-    return " ".join(f"{float(x):.9g}" for x in numbers)
+    return " ".join(f"{float(number):.9g}" for number in numbers)

@@ -160,7 +160,7 @@ def _key(robot: RobotSpec, recordings: ListOf[Sequence], *other: Array) -> str:
     for one in (robot, robot.before_identification):
         for name in SERVO_FIELDS:
             key.update(getattr(one, name).tobytes())
-    for digest in sorted(_recording_digest(s) for s in recordings):
+    for digest in sorted(_recording_digest(recording) for recording in recordings):
         key.update(digest)
     for values in other:
         key.update(np.ascontiguousarray(values).tobytes())
@@ -240,8 +240,8 @@ def comparable(
     recordings: ListOf[Sequence], robot: RobotSpec, payload_mass: float
 ) -> list[Sequence]:
     """Return the recordings made with this payload, kg, and with the robot's own gains."""
-    loaded = [s for s in recordings if s.meta.payload_mass == payload_mass]
-    return [s for s in loaded if Condition.of(s, robot).kp is None]
+    loaded = [recording for recording in recordings if recording.meta.payload_mass == payload_mass]
+    return [recording for recording in loaded if Condition.of(recording, robot).kp is None]
 
 
 def rollout_error(recordings: ListOf[Sequence], robot: RobotSpec) -> float:
@@ -276,7 +276,7 @@ def check_motions(
     ramped: Targets change as slowly as the servos change them, for engines that do not limit the
     speed of targets.
     """
-    first = {s.meta.motion: s for s in reversed(recordings)}
+    first = {recording.meta.motion: recording for recording in reversed(recordings)}
     low, high = robot.qpos_range.T
     limited = ramped & (robot.target_speed > 0)
     speed = np.where(limited, robot.target_speed, np.inf)

@@ -39,7 +39,7 @@ class Plan:
     @property
     def motions(self) -> tuple[Motion, ...]:
         """Return each motion once."""
-        return tuple({m.name: m for _, m in self.played}.values())
+        return tuple({motion.name: motion for _, motion in self.played}.values())
 
     @property
     def payloads(self) -> tuple[float, ...]:
@@ -49,7 +49,7 @@ class Plan:
     @property
     def minutes(self) -> float:
         """Return the duration at all payloads together."""
-        return sum(m.duration for _, m in self.played) / 60
+        return sum(motion.duration for _, motion in self.played) / 60
 
 
 def make_plan(robot: RobotSpec, minutes: float, payloads: tuple[float, ...], seed: int = 0) -> Plan:
@@ -63,7 +63,7 @@ def make_plan(robot: RobotSpec, minutes: float, payloads: tuple[float, ...], see
     _require_payloads(payloads, robot)
     library = Library(robot, seed, max(payloads))
     first = [library.make(f"{SIGNAL_ORDER[0]}-{short(joint)}") for joint in robot.operated]
-    least = len(payloads) * sum(m.duration for m in first) / 60
+    least = len(payloads) * sum(motion.duration for motion in first) / 60
     if least > minutes:
         raise UsageError(
             f"--minutes {minutes:g} is too short for {robot.name} at these payloads: give "
@@ -71,7 +71,7 @@ def make_plan(robot: RobotSpec, minutes: float, payloads: tuple[float, ...], see
         )
     chosen = list(first)
     for name in _names(robot, library):
-        if sum(m.duration for m in chosen) >= 60 * minutes / len(payloads):
+        if sum(motion.duration for motion in chosen) >= 60 * minutes / len(payloads):
             break
         chosen.append(_standing(library, name))
     return Plan(tuple(product(payloads, chosen)))
@@ -126,7 +126,7 @@ def sheet(
     for i, joint in enumerate(robot.joint_names):
         if joint in robot.operated:
             gains.append(f"{short(joint)} {robot.kp[i]:g}/{robot.kd[i]:g}")
-    masses = ", ".join(f"{p:g}" for p in plan.payloads)
+    masses = ", ".join(f"{mass:g}" for mass in plan.payloads)
     size = (
         f"On virtual H1-2 robots {MIN_TRAINING_MINUTES:g} minutes left a third of the simulator's "
         f"error, {RECOMMENDED_MINUTES:g} came within a tenth of the best."

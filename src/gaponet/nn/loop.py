@@ -312,8 +312,8 @@ class DeltaCorrector:
         loop = DeltaLoop(
             self.config, self.robot.qpos_range[self.operated], len(start), self.network
         )
-        self.payload = np.array([s.meta.payload_mass for s in start], np.float32)
-        conditions = [Condition.of(s, self.robot) for s in start]
+        self.payload = np.array([sequence.meta.payload_mass for sequence in start], np.float32)
+        conditions = [Condition.of(sequence, self.robot) for sequence in start]
         if self.config.context:
             loop.set_context(contexts(self.robot, conditions, loaded=self.config.context_is_loaded))
         if self.config.needs_simulator:

@@ -275,7 +275,7 @@ def _exact(values: object) -> str:
     """Format numbers with seven digits, without trailing zeros: their count differs between
     versions of MuJoCo.
     """
-    texts = [f"{x + 0.0:.7g}" for x in np.ravel(np.asarray(values, float))]
+    texts = [f"{number + 0.0:.7g}" for number in np.ravel(np.asarray(values, float))]
     while texts and texts[-1] == "0":
         texts.pop()
     return " ".join(texts) or "0"

@@ -61,7 +61,7 @@ def self_contained_text(spec: mujoco.MjSpec, path: Path) -> str:
     spec.compiler.discardvisual = spec.compiler.fusestatic = False
     model = compile_spec(spec, path)
     root = ET.fromstring(spec.to_xml())
-    for child in [c for c in root if c.tag in (*DROPPED_SECTIONS, "compiler")]:
+    for child in [part for part in root if part.tag in (*DROPPED_SECTIONS, "compiler")]:
         root.remove(child)
     for element in root.iter("geom"):  # a default class may name a material that was dropped
         element.attrib.pop("material", None)
@@ -96,7 +96,7 @@ def _fill(
     order.
     """
     _unwrap(element)
-    for child in [c for c in element if c.tag not in ("joint", "geom", "site", "body")]:
+    for child in [part for part in element if part.tag not in ("joint", "geom", "site", "body")]:
         element.remove(child)
     if body:
         set_attributes(element, pos=model.body_pos[body], quat=model.body_quat[body])
@@ -116,10 +116,10 @@ def _fill(
         elif child.tag == "geom":
             _geom(child, model, next(counters["geom"]), asset)
         elif child.tag == "site":
-            s = next(counters["site"])
+            site = next(counters["site"])
             child.attrib.pop("material", None)
-            set_attributes(child, pos=model.site_pos[s], quat=model.site_quat[s])
-    for child in [c for c in element if c.tag == "body"]:
+            set_attributes(child, pos=model.site_pos[site], quat=model.site_quat[site])
+    for child in [part for part in element if part.tag == "body"]:
         _fill(child, next(bodies), model, asset, counters, bodies)
 
 

@@ -61,7 +61,7 @@ def find_model(name: str) -> Path:
     collection, _, rest = name.partition(":")
     strange = collection == "robot_descriptions" and not rest.isidentifier()
     if collection not in COLLECTIONS or not rest or ".." in Path(rest).parts or strange:
-        known = ", ".join(f"{c}:NAME" for c in COLLECTIONS)
+        known = ", ".join(f"{collection}:NAME" for collection in COLLECTIONS)
         raise RobotError(f"'{name}': use one of {known}")
     if collection == "menagerie":
         return _of_menagerie(rest)
@@ -137,7 +137,7 @@ def _of_robot_descriptions(name: str) -> Path:
     finally:
         cache.clone_to_cache = original
     paths = [getattr(description, kind, "") for kind in ("MJCF_PATH", "URDF_PATH", "XACRO_PATH")]
-    path = next((Path(p) for p in paths if p), Path())
+    path = next((Path(entry) for entry in paths if entry), Path())
     if not path.is_file():
         raise RobotError(f"robot_descriptions:{name}: {path} is not there; get it: {pulled}")
     return path
@@ -170,15 +170,15 @@ def _of_example_robot_data(name: str) -> Path:
     if (root / name).is_file():
         return root / name
     stems = {name, f"{name}_robot"}
-    found = sorted(f for f in root.rglob("*.urdf") if f.stem in stems)
+    found = sorted(file for file in root.rglob("*.urdf") if file.stem in stems)
     if len(found) == 1:
         return found[0]
     if found:
-        files = ", ".join(f.relative_to(root).as_posix() for f in found)
+        files = ", ".join(file.relative_to(root).as_posix() for file in found)
         raise RobotError(
             f"example-robot-data:{name}: several files have this name; name one: {files}"
         )
-    there = sorted(f.stem for f in root.rglob("*.urdf"))
+    there = sorted(file.stem for file in root.rglob("*.urdf"))
     raise RobotError(f"example-robot-data:{name}: not among {', '.join(there)} of {root}")
 
 
@@ -243,7 +243,7 @@ def _mjcf(path: Path) -> tuple[mujoco.MjSpec, list[str]]:
     for mesh in spec.meshes:
         if mesh.file and not (place / mesh.file).is_file():
             missing[mesh.name or Path(mesh.file).stem] = mesh
-    for geom in [g for g in spec.geoms if g.meshname in missing]:
+    for geom in [one for one in spec.geoms if one.meshname in missing]:
         spec.delete(geom)
     for mesh in missing.values():
         spec.delete(mesh)
@@ -255,10 +255,11 @@ def _urdf(
 ) -> tuple[mujoco.MjSpec, list[str]]:
     missing: list[str] = []
     unread: list[str] = []
-    for element in [e for e in root if e.tag in ("transmission", "gazebo", "ros2_control")]:
+    foreign = [child for child in root if child.tag in ("transmission", "gazebo", "ros2_control")]
+    for element in foreign:
         root.remove(element)
     for link in root.iter("link"):
-        for shape in [s for s in link if s.tag in ("visual", "collision")]:
+        for shape in [part for part in link if part.tag in ("visual", "collision")]:
             mesh = shape.find("geometry/mesh")
             if mesh is None:
                 continue
@@ -371,7 +372,7 @@ def _drop_unreadable_meshes(spec: mujoco.MjSpec) -> list[str]:
             if bad is None:
                 break
             omitted.append(f"mesh left out: {why}")
-            for geom in [g for g in spec.geoms if g.meshname == bad.name]:
+            for geom in [one for one in spec.geoms if one.meshname == bad.name]:
                 spec.delete(geom)
             spec.delete(bad)
     return omitted
@@ -394,6 +395,7 @@ def _resolve(name: str, path: Path, packages: dict[str, Path]) -> Path | None:
         package, _, inner = rest.partition("/")
         above = path.resolve().parents
         places = [packages[package] / inner] if package in packages else []
-        places += [p / inner for p in above if p.name == package] + [p / rest for p in above]
-        places += [p / inner for p in above if (p / "package.xml").is_file()]
-    return next((p for p in places if p.is_file()), None)
+        places += [place / inner for place in above if place.name == package]
+        places += [place / rest for place in above]
+        places += [place / inner for place in above if (place / "package.xml").is_file()]
+    return next((place for place in places if place.is_file()), None)

@@ -343,7 +343,7 @@ class BatchSim:
             fixed.append("delay")
         if self.servo_model is None:
             fixed += SERVO_TERMS
-        refused = [f for f in fixed if f in values and np.any(values[f])]
+        refused = [field for field in fixed if field in values and np.any(values[field])]
         if refused:
             raise UsageError(
                 f"{', '.join(refused)} cannot differ between simulations of {self.robot.name}: "
@@ -392,7 +392,8 @@ def _under_conditions(robot: RobotSpec, conditions: list[Condition]) -> dict[Con
 
 def _largest_added_delay(conditions: list[Condition]) -> float:
     """Return the largest delay that a changed simulator adds, s."""
-    return max((c.simulator.delay for c in conditions if c.simulator), default=0.0)
+    changes = [condition.simulator for condition in conditions]
+    return max((change.delay for change in changes if change), default=0.0)
 
 
 def _recorded_gains(robot: RobotSpec, robots: list[RobotSpec]) -> tuple[Array, Array]:

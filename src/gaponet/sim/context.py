@@ -43,20 +43,20 @@ def contexts(
     """
     probed = conditions
     if not loaded:
-        probed = [c._replace(payload_mass=0.0) for c in conditions]
+        probed = [condition._replace(payload_mass=0.0) for condition in conditions]
     known: dict[Condition, Array] = vars(robot).setdefault("_contexts", {})
-    unknown = [c for c in dict.fromkeys(probed) if c not in known]
-    for dt in dict.fromkeys(c.dt for c in unknown):
-        same_rate = [c for c in unknown if c.dt == dt]
+    unknown = [condition for condition in dict.fromkeys(probed) if condition not in known]
+    for dt in dict.fromkeys(condition.dt for condition in unknown):
+        same_rate = [condition for condition in unknown if condition.dt == dt]
         known.update(zip(same_rate, _of_simulators(robot, same_rate, nthread), strict=True))
-    return np.stack([known[c] for c in probed])
+    return np.stack([known[condition] for condition in probed])
 
 
 def _of_simulators(robot: RobotSpec, conditions: list[Condition], nthread: int) -> Array:
     """Return the answers of simulations with one control period, (conditions, 8n) float32."""
     count = len(conditions)
     probes = len(robot.operated) + 1
-    sim = BatchSim(robot, [c for c in conditions for _ in range(probes)], nthread)
+    sim = BatchSim(robot, [condition for condition in conditions for _ in range(probes)], nthread)
     home = np.tile(robot.qpos_home, (count * probes, 1))
     moved, towards = _probe_targets(robot.qpos_home, robot.operated_index, sim.range)
     target = np.tile(moved, (count, 1))

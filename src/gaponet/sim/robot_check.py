@@ -78,7 +78,7 @@ def check_robot(
         *_contacts(robot, places, postures is not None),
         *_steps(robot, models, places),
     ]
-    if not any(f.level == "error" for f in findings):
+    if not any(finding.level == "error" for finding in findings):
         findings += _hold(robot, payloads)
     if not robot.payload_mounts:
         text = (
@@ -86,7 +86,7 @@ def check_robot(
             "if it carries any"
         )
         findings.append(Finding("warning", "payload", text))
-    return sorted(findings, key=lambda f: -LEVELS.index(f.level))
+    return sorted(findings, key=lambda finding: -LEVELS.index(finding.level))
 
 
 def _joints(robot: RobotSpec) -> Iterator[Finding]:
@@ -436,7 +436,7 @@ def _hold(robot: RobotSpec, payloads: tuple[float, ...]) -> Iterator[Finding]:
         if len(wrong):
             yield _hold_finding(robot, payloads, limit, wrong)
             return
-    masses = ", ".join(f"{p:g}" for p in payloads)
+    masses = ", ".join(f"{mass:g}" for mass in payloads)
     yield Finding(
         "ok",
         "hold",

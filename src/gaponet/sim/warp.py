@@ -143,9 +143,9 @@ class _Worlds:
             self._servo_inputs: list[Any] | None = None
             if sim.servo_model is not None:
                 self._servo_inputs = self._inputs(sim.servo_model, rows)
-        for name, x in own.items():
+        for name, values in own.items():
             view = warp.to_torch(getattr(self.model, name))
-            view.copy_(torch.tensor(x).reshape(view.shape))
+            view.copy_(torch.tensor(values).reshape(view.shape))
 
     def _inputs(self, servos: servo.ServoModel, rows: np.ndarray) -> list[Any]:
         """Return the arguments of _set_servos."""
@@ -206,12 +206,12 @@ class _Worlds:
         moved = [
             self.bind(name) for name in (*STATE, *HISTORY, *SERVO) if getattr(self.data, name).size
         ]
-        before = [x.clone() for x in moved]
+        before = [view.clone() for view in moved]
         torch.cuda.synchronize()
         kernels()
         warp.synchronize_device(self.device)
-        for x, old in zip(moved, before, strict=True):
-            x.copy_(old)
+        for view, old in zip(moved, before, strict=True):
+            view.copy_(old)
         torch.cuda.synchronize()
         with warp.ScopedCapture(self.device) as capture:
             kernels()
@@ -276,7 +276,7 @@ class WarpSim:
         self._views = [worlds.bind_all(names) for worlds in self._worlds]
         self._all = self._views[0]
         if len(self._worlds) > 1:
-            self._all = {name: self._zeros_like(x) for name, x in self._all.items()}
+            self._all = {name: self._zeros_like(view) for name, view in self._all.items()}
         self.qpos = self._all["qpos"]
         self.qvel = self._all["qvel"]
         self.ctrl = self._all["ctrl"]
@@ -345,12 +345,12 @@ class WarpSim:
         """
         for worlds, views, rows in zip(self._worlds, self._views, self._ids, strict=True):
             if views is not self._all:
-                for name, x in views.items():
-                    x.copy_(self._all[name][rows])
+                for name, view in views.items():
+                    view.copy_(self._all[name][rows])
             yield worlds
             if views is not self._all:
-                for name, x in views.items():
-                    self._all[name][rows] = x
+                for name, view in views.items():
+                    self._all[name][rows] = view
 
     def step(self, ctrl: Any, ids: Any = None) -> None:
         """Step as BatchSim.step does: all are stepped, and the others are restored."""
@@ -367,17 +367,17 @@ class WarpSim:
             self._commands.time.zero_()
         if ids is not None:
             moved = self.array(ids)
-            for name, x in self._state().items():
-                x.copy_(before[name].index_copy(0, moved, x[moved]))
+            for name, values in self._state().items():
+                values.copy_(before[name].index_copy(0, moved, values[moved]))
 
     def state(self) -> dict[str, Tensor]:
         """Return copies of the complete state, as BatchSim.state does."""
-        return {name: x.clone() for name, x in self._state().items()}
+        return {name: values.clone() for name, values in self._state().items()}
 
     def set_state(self, state: dict[str, Any]) -> None:
         """Restore a `state` of this object or of a BatchSim."""
-        for name, x in self._state().items():
-            x.copy_(self.array(state[name]))
+        for name, values in self._state().items():
+            values.copy_(self.array(state[name]))
 
     def _state(self) -> dict[str, Tensor]:
         return {name: self._all[field] for field, name in self._stored.items()}

@@ -104,8 +104,8 @@ class Fleet:
         sha = hashlib.sha256()
         for unit_id, unit in self.units.items():
             sha.update(unit_id.encode())
-            for f in fields(Physics):
-                sha.update(np.ascontiguousarray(getattr(unit, f.name), float).tobytes())
+            for parameter in fields(Physics):
+                sha.update(np.ascontiguousarray(getattr(unit, parameter.name), float).tobytes())
         return sha.hexdigest()[:12]
 
 
@@ -127,7 +127,7 @@ def load_fleet(name_or_path: str | Path, robot: RobotSpec) -> Fleet:
     table = validated(FleetTable, loaded, path, UsageError)
     seed = table["seed"]
     distributions = table["distribution"]
-    _require_parameters([d.name for d in distributions], path)
+    _require_parameters([distribution.name for distribution in distributions], path)
     units = {}
     for number in range(1, UNITS + 1):
         unit_id = f"virtual-{number}"
@@ -138,7 +138,7 @@ def load_fleet(name_or_path: str | Path, robot: RobotSpec) -> Fleet:
 
 def _require_parameters(names: list[str], path: Path) -> None:
     """Refuse distributions of unknown parameters, or two of one."""
-    parameters = [f.name for f in fields(Physics)]
+    parameters = [parameter.name for parameter in fields(Physics)]
     for name in names:
         if name not in parameters or names.count(name) > 1:
             raise UsageError(
@@ -177,14 +177,16 @@ def sample_unit(
 
 def _require_possible(unit: Physics, where: str) -> None:
     """Refuse parameters that no robot can have."""
-    for f in fields(Physics):
-        value = getattr(unit, f.name)
-        highest = MAX_DELAY_S if f.name in ("delay", "jitter", "drop") else MAX_PARAMETER
-        lowest = -highest if f.name in SIGNED else 0.0
+    for parameter in fields(Physics):
+        value = getattr(unit, parameter.name)
+        highest = MAX_DELAY_S if parameter.name in ("delay", "jitter", "drop") else MAX_PARAMETER
+        lowest = -highest if parameter.name in SIGNED else 0.0
         possible = (lowest <= value) & (value <= highest)
-        if f.name == "corner":
+        if parameter.name == "corner":
             possible &= value < 1.0
-        if f.metadata["neutral"] == np.inf:
+        if parameter.metadata["neutral"] == np.inf:
             possible |= value == np.inf
         if not possible.all():
-            raise UsageError(f"{where}: {f.name} is {value.tolist()}; correct its [[distribution]]")
+            raise UsageError(
+                f"{where}: {parameter.name} is {value.tolist()}; correct its [[distribution]]"
+            )
