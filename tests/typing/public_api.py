@@ -59,6 +59,7 @@ assert_type(gp.export_network("run", to="onnx").parity, float | None)
 gp.randomization("robot", out="ranges")
 
 sim = gp.AlignedSim(robot)
+unladen = gp.AlignedSim(robot, options=gp.AlignedSimOptions(simulator_payload=0.0))
 compensator = gp.Compensator(robot)
 assert_type(sim, gp.AlignedSim)
 assert_type(compensator, gp.Compensator)
