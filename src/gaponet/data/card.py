@@ -227,7 +227,8 @@ def _facts(card: dict[str, Any]) -> Iterator[str]:
     dates = recorded if isinstance(recorded, str) else " to ".join(dict.fromkeys(recorded))
     yield f"- recorded: {escape_markdown(dates)}"
     if collected:
-        fleet, seed = (escape_markdown(str(collected.get(name))) for name in ("fleet", "seed"))
+        fleet = escape_markdown(str(collected.get("fleet")))
+        seed = escape_markdown(str(collected.get("seed")))
         yield f"- made by gaponet collect: fleet {fleet}, seed {seed}"
     joints = len(card["joints"])
     yield f"- {total['frames']:,} frames of {joints} joints, {total['motions']} motions"

@@ -199,7 +199,7 @@ class _Source:
             if existing is not None:
                 _refuse_relabelled(sequence, existing)
             self.provenance |= log.meta.get("dataset", {})
-            size += sum(x.nbytes for c in ARRAYS if (x := getattr(sequence, c)) is not None)
+            size += _count_bytes(sequence)
             if size > MAX_HELD_BYTES:
                 self.held = None
             if self.held is not None:
@@ -294,6 +294,11 @@ class _Source:
             origin | self.labels | {"robot": self.robot.name, "motion": motion} | stated
         )
         return SequenceMeta(**fields)
+
+
+def _count_bytes(sequence: Sequence) -> int:
+    arrays = [getattr(sequence, name) for name in ARRAYS]
+    return sum(array.nbytes for array in arrays if array is not None)
 
 
 def _pieces(sequence: Sequence, seconds: float | None) -> Iterator[Sequence]:

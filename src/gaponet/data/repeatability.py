@@ -46,8 +46,11 @@ def repetition_difference(sequences: ListOf[Sequence], joints: ListOf[str]) -> A
     for a, b in pairs[:: max(1, len(pairs) // MAX_PAIRS)]:
         unrecorded = {*a.meta.unrecorded, *b.meta.unrecorded}
         columns = [i for i, name in enumerate(joints) if name not in unrecorded]
+        if not columns:
+            continue
         places = [a.joint_names.index(joints[i]) for i in columns]
-        if columns and (difference := _tracking_difference(a, b, places)) is not None:
+        difference = _tracking_difference(a, b, places)
+        if difference is not None:
             total[columns] += difference
             count[columns] += 1
     return np.sqrt(total / np.maximum(count, 1))
@@ -57,21 +60,27 @@ def _tracking_difference(a: Sequence, b: Sequence, columns: list[int]) -> Array 
     """Return the mean squared difference of the tracking errors of two recordings, (n) rad²; None
     for two commands.
     """
-    one, other = (
-        np.concatenate([s.ctrl[:, columns], s.qpos[:, columns]], axis=1).astype(float)
-        for s in (a, b)
-    )
+    n = len(columns)
+    one = _command_and_position(a, columns)
+    other = _command_and_position(b, columns)
     rows = np.arange(MAX_SHIFT_ROWS, min(len(a), len(b)) - MAX_SHIFT_ROWS)
     if not len(rows):
         return None
-    each = [one[rows] - other[rows + shift] for shift in range(-MAX_SHIFT_ROWS, MAX_SHIFT_ROWS + 1)]
-    command, position = np.split(
-        min(each, key=lambda x: np.abs(x[:, : len(columns)]).mean()), 2, axis=1
-    )
+    shifts = range(-MAX_SHIFT_ROWS, MAX_SHIFT_ROWS + 1)
+    differences = [one[rows] - other[rows + shift] for shift in shifts]
+    difference = min(differences, key=lambda x: np.abs(x[:, :n]).mean())
+    command = difference[:, :n]
+    position = difference[:, n:]
     limit = MAX_COMMAND_DIFFERENCE_SHARE * float(np.ptp(a.ctrl[:, columns], axis=0).max())
     if np.abs(command).mean() > max(MAX_COMMAND_DIFFERENCE_RAD, limit):
         return None
     return np.asarray(np.square(position - command).mean(axis=0))
+
+
+def _command_and_position(sequence: Sequence, columns: list[int]) -> Array:
+    """Return commands and positions of some of the joints side by side, (T, 2 n) rad."""
+    both = [sequence.ctrl[:, columns], sequence.qpos[:, columns]]
+    return np.concatenate(both, axis=1).astype(float)
 
 
 @dataclass(frozen=True)

@@ -530,7 +530,8 @@ def _feedforward_position(
     − kd q̇. `assumed`: nobody stated kp.
     """
     without = torque.any(axis=0) & (assumed | (kp == 0))
-    if lacking := [name for name, x in zip(robot.joint_names, without, strict=True) if x]:
+    lacking = [name for name, x in zip(robot.joint_names, without, strict=True) if x]
+    if lacking:
         raise LogError(
             f"{log.source}: a {FEEDFORWARD} counts as command + torque / kp, and kp of "
             f"{', '.join(lacking)} is {'not stated' if assumed else '0'}; give it in logs.toml "

@@ -136,10 +136,9 @@ def range_before(values: Array, rows: int) -> Array:
     """
     from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
-    most, least = (
-        f(values, rows, axis=0, origin=(rows - 1) // 2)
-        for f in (maximum_filter1d, minimum_filter1d)
-    )
+    origin = (rows - 1) // 2
+    most = maximum_filter1d(values, rows, axis=0, origin=origin)
+    least = minimum_filter1d(values, rows, axis=0, origin=origin)
     return np.asarray(most - least)
 
 
@@ -210,7 +209,8 @@ class Response:
         power = []
         for part in range(SPLITS):
             rows = slice(part * size, (part + 1) * size)
-            u, v = (np.diff(x[::every][rows].astype(float), axis=0) for x in (ctrl, qpos))
+            u = np.diff(ctrl[::every][rows].astype(float), axis=0)
+            v = np.diff(qpos[::every][rows].astype(float), axis=0)
             length = 1 << (2 * max(len(u), lags) - 1).bit_length()
             a = np.fft.rfft(u, length, axis=0)
             b = np.fft.rfft(v, length, axis=0)
@@ -218,14 +218,20 @@ class Response:
             later = np.fft.irfft(a.conj() * b, length, axis=0)
             cross.append(np.concatenate([later[length - before :], later[: lags - before]]).T)
             power.append((v**2).sum(axis=0))
-        arrays = [np.array(x, np.float32) for x in (own, cross, power)]
-        return Response(step, arrays[0], arrays[1], arrays[2], len(ctrl) * dt)
+        return Response(
+            step=step,
+            own=np.array(own, np.float32),
+            cross=np.array(cross, np.float32),
+            power=np.array(power, np.float32),
+            duration=len(ctrl) * dt,
+        )
 
     def later(self, seconds: float) -> Response:
         """Return the correlations as if the state had been recorded later; NaN changes nothing."""
-        lags = np.arange(self.cross.shape[-1]) * self.step
-        if not (seconds := np.nan_to_num(seconds)):
+        seconds = np.nan_to_num(seconds)
+        if seconds == 0:
             return self
+        lags = np.arange(self.cross.shape[-1]) * self.step
         moved = [np.interp(lags - seconds, lags, x) for x in self.cross.reshape(-1, len(lags))]
         return replace(self, cross=np.reshape(moved, self.cross.shape).astype(np.float32))
 
@@ -235,10 +241,9 @@ class Response:
         move, (n) bool.
         """
         lags = [max(round(0.02 / r.step), 1) for r in responses]
-        now, soon = (
-            np.sum([r.own.sum(axis=0)[:, k] for r, k in zip(responses, ks, strict=True)], axis=0)
-            for ks in ([0] * len(responses), lags)
-        )
+        own = [r.own.sum(axis=0) for r in responses]  # (n, L) each
+        now = np.sum([x[:, 0] for x in own], axis=0)
+        soon = np.sum([x[:, lag] for x, lag in zip(own, lags, strict=True)], axis=0)
         return np.asarray(soon < MAX_SHARP_CORRELATION * now)
 
     @staticmethod

@@ -368,7 +368,8 @@ def split_motions(motions: Iterable[str]) -> dict[str, list[str]]:
             "or more; motions with equal commands count once. Long recordings can be cut into "
             "several: gaponet import --cut 8"
         )
-    test, val = (max(1, round(len(names) * share)) for share in (TEST_SHARE, VAL_SHARE))
+    test = max(1, round(len(names) * TEST_SHARE))
+    val = max(1, round(len(names) * VAL_SHARE))
     return {"train": names[test + val :], "val": names[test : test + val], "test": names[:test]}
 
 

@@ -77,7 +77,8 @@ def _regularity(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
         level = "note"
     where = f" ({worst.motion})" if worst.jitter_ms else ""
     text = f"periods deviate from their median by at most {worst.jitter_ms:.2f} ms{where}"
-    if level == "warning" and (unknown := 2 * max(s.uneven_ms for s in surveys)):
+    unknown = 2 * max(s.uneven_ms for s in surveys)
+    if level == "warning" and unknown:
         text += (
             f". Delays shorter than {unknown:.0f} ms cannot be told between such rows; log at an "
             "even rate"

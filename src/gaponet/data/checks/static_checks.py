@@ -177,12 +177,14 @@ def _collect(surveys: list[Survey], robot: RobotSpec, model: Gravity) -> _Poses:
         heavier = np.zeros_like(load)
         if robot.payload_mounts:
             heavier = model(poses.qpos, meta.payload_mass + 1.0, meta.payload_side) / kp - load
-        nth, pose = np.nonzero((poses.distinct & (poses.approach != 0))[:, robot.operated_index].T)
-        at = pose, (j := robot.operated_index[nth])
-        columns = np.column_stack([np.ones(len(j)), poses.ctrl[at], -load[at], -poses.approach[at]])
-        parts.append(
-            (np.full(len(j), number), j, poses.qpos[at] - poses.ctrl[at], columns, -heavier[at])
-        )
+        judged = poses.distinct & (poses.approach != 0)  # (poses, n)
+        nth, pose = np.nonzero(judged[:, robot.operated_index].T)
+        joint = robot.operated_index[nth]
+        at = (pose, joint)
+        ones = np.ones(len(joint))
+        columns = np.column_stack([ones, poses.ctrl[at], -load[at], -poses.approach[at]])
+        error = poses.qpos[at] - poses.ctrl[at]
+        parts.append((np.full(len(joint), number), joint, error, columns, -heavier[at]))
     return _Poses(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 

@@ -307,8 +307,8 @@ def _slope(ctrl: Array, qpos: Array, dt: float, lag: Array, speed: Array) -> Arr
 def _kind_of_command(sequence: Sequence) -> dict[str, Array]:
     """Compare the command with the position soon after, with the velocity, and with the torque."""
     every = max(1, round(0.02 / sequence.dt))
-    # (n, T)
-    ctrl, qpos = (np.ascontiguousarray(x[::every].T, float) for x in (sequence.ctrl, sequence.qpos))
+    ctrl = np.ascontiguousarray(sequence.ctrl[::every].T, float)  # (n, T)
+    qpos = np.ascontiguousarray(sequence.qpos[::every].T, float)
     rows = qpos.shape[1]
     speed = np.gradient(qpos, axis=1)
     distances = []

@@ -161,9 +161,12 @@ def _shifts(responses: list[Response]) -> Array:
     """
     more = Response.common(responses).whole
     shifts = np.where(np.isfinite(more), 0.0, np.nan)
-    for _ in range(MAX_ITERATIONS if np.isfinite(shifts).sum() >= MIN_RECORDINGS else 0):
+    if np.isfinite(shifts).sum() < MIN_RECORDINGS:
+        return np.asarray(shifts + np.nan_to_num(more))
+    for _ in range(MAX_ITERATIONS):
         deviation = np.nan_to_num(more - np.nanmedian(more))
-        if not (far := np.abs(deviation) > MIN_SHIFT_S / 2).any():
+        far = np.abs(deviation) > MIN_SHIFT_S / 2
+        if not far.any():
             break
         shifts = shifts + np.where(far, deviation, 0.0)
         more = Response.common([r.later(-s) for r, s in zip(responses, shifts, strict=True)]).whole

@@ -195,9 +195,9 @@ class _Frames:
             for c, f in self.features.items()
         }
         self._require_unit()
-        self.timestamp, self.frame, self.episodes = (
-            _matrix(file, table, name, 1)[:, 0] for name in INDEX
-        )
+        self.timestamp = _matrix(file, table, "timestamp", 1)[:, 0]
+        self.frame = _matrix(file, table, "frame_index", 1)[:, 0]
+        self.episodes = _matrix(file, table, "episode_index", 1)[:, 0]
 
     def _features(self) -> dict[str, Feature]:
         """Choose the feature of each channel, and return what info.json says of them."""

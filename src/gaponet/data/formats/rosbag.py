@@ -523,12 +523,14 @@ def _controller(topic: str, m: Any) -> Fields:
     messages = {}
     for part in ("reference", "desired", "feedback", "actual"):
         point = getattr(m, part, None)
-        for theirs, ours in (
-            ("positions", "position"),
-            ("velocities", "velocity"),
-            ("effort", "effort"),
+        if point is None:
+            continue
+        for ours, values in (
+            ("position", point.positions),
+            ("velocity", point.velocities),
+            ("effort", point.effort),
         ):
-            if point is not None and len(values := getattr(point, theirs)) == len(names):
+            if len(values) == len(names):
                 messages[f"{part}.{ours}"] = (names, values)
     return messages
 
