@@ -55,28 +55,33 @@ def write_files(path: Path, folder: Path, address: str) -> tuple[str, ...]:
     robot = load_stored_robot(dataset.path, dataset.robot_name)
     contents = tuple(sorted(entry.hash for entry in dataset.select()))
     with progress_bar("reading") as update:
-        done = iter(range(1, len(dataset) + 1))
-        sets = write(dataset, folder, lambda motion: update(next(done), len(dataset), motion))
-    (folder / SIDECAR).mkdir()
-    save_robot(robot.nominal or robot, folder / SIDECAR / STORED_ROBOT)
-    (folder / SIDECAR / STORED_ROBOT / ".gaponet").unlink()
-    copy_sidecars(dataset.path, folder / SIDECAR, dataset)
+        written = 0
+
+        def show(motion: str) -> None:
+            nonlocal written
+            written += 1
+            update(written, len(dataset), motion)
+
+        sets = write(dataset, folder, show)
+    sidecar = folder / SIDECAR
+    sidecar.mkdir()
+    save_robot(robot.nominal or robot, sidecar / STORED_ROBOT)
+    (sidecar / STORED_ROBOT / FOLDER_MARKER).unlink()
+    copy_sidecars(dataset.path, sidecar, dataset)
     card = make_card(dataset)
-    text = dataset_readme(
-        card, card_markdown(card), address, [part.path.as_posix() for part in sets]
-    )
-    write_text(folder / "README.md", text)
+    places = [part.path.as_posix() for part in sets]
+    write_text(folder / "README.md", dataset_readme(card, card_markdown(card), address, places))
     write_text(folder / SOURCE, source)
     return contents
 
 
 def is_pushed(path: Path, address: str, index: Index) -> bool:
-    """True if a dataset and everything that is pushed with it are as in the push of this index."""
+    """Return True if a dataset and all that is pushed with it are as in the push of this index."""
     record = index.files.get(SOURCE)
-    return (
-        record is not None
-        and record.sha256 == hashlib.sha256(_source_text(path, address).encode()).hexdigest()
-    )
+    if record is None:
+        return False
+    now = hashlib.sha256(_source_text(path, address).encode()).hexdigest()
+    return record.sha256 == now
 
 
 def _source_text(path: Path, address: str) -> str:
@@ -85,21 +90,22 @@ def _source_text(path: Path, address: str) -> str:
 
     The journal lists the content hash of every recording, so that no recording is read.
     """
-    names = ("dataset.json", JOURNAL, *COPIED_FILES, "splits/*.json", f"{STORED_ROBOT}/*.*")
-    files = sorted(
-        file
-        for name in names
-        for file in path.glob(name)
-        if file.is_file() and file.name != FOLDER_MARKER
-    )
-    hashes = {file.relative_to(path).as_posix(): FileRecord.of(file).sha256 for file in files}
-    return (
-        json.dumps({"gaponet": __version__, "address": address, "files": hashes}, indent=1) + "\n"
-    )
+    patterns = ("dataset.json", JOURNAL, *COPIED_FILES, "splits/*.json", f"{STORED_ROBOT}/*.*")
+    files: list[Path] = []
+    for pattern in patterns:
+        files += path.glob(pattern)
+    hashes = {}
+    for file in sorted(files):
+        if file.is_file() and file.name != FOLDER_MARKER:
+            hashes[file.relative_to(path).as_posix()] = FileRecord.of(file).sha256
+    source = {"gaponet": __version__, "address": address, "files": hashes}
+    return json.dumps(source, indent=1) + "\n"
 
 
 def is_recording_file(path: str) -> bool:
-    """Return True for a pushed file with samples; all others are small."""
+    """Return True for a pushed file that holds recordings, below a folder `data`; all others are
+    small.
+    """
     return "data" in path.split("/")[:-1]
 
 
@@ -122,7 +128,8 @@ def missing_files(files: Path, index: Index, present: Dataset | None) -> list[st
         for episode in part.episodes:
             if present is None or present.find(str(episode["content_hash"])) is None:
                 wanted.add(part.data_file(episode).relative_to(files).as_posix())
-    if unlisted := wanted - index.files.keys():
+    unlisted = wanted - index.files.keys()
+    if unlisted:
         raise RemoteError(f"{min(unlisted)} is not in {INDEX}; {AGAIN}")
     return sorted(wanted)
 
@@ -142,16 +149,17 @@ def add_missing(files: Path, robot: RobotSpec, out: Path, new: bool) -> None:
     dataset = Dataset.create(out, robot)
     sets = sets_under(files)
     total = sum(len(part.episodes) for part in sets)
-    done = 0
+    done = 0  # episodes that the dataset has
     with dataset.appending(), progress_bar("checking") as update:
         for part in sets:
             if part.ours is None:
                 raise RemoteError(f"{part.path}: gaponet did not write this set")
             if new:
                 dataset.set_provenance(**_provenance(part))
-            episodes = [e for e in part.episodes if dataset.find(e["content_hash"]) is None]
-            done += len(part.episodes) - len(episodes)
-            for episode, log in zip(episodes, read_episodes(part, episodes, robot), strict=True):
+            lacking = [e for e in part.episodes if dataset.find(e["content_hash"]) is None]
+            done += len(part.episodes) - len(lacking)
+            logs = read_episodes(part, lacking, robot)
+            for episode, log in zip(lacking, logs, strict=True):
                 sequence = _pushed_sequence(episode, log, robot)
                 findings = episode["findings"] or measure_delays(sequence)
                 dataset.append(sequence, findings, str(episode["content_hash"]))
@@ -161,7 +169,7 @@ def add_missing(files: Path, robot: RobotSpec, out: Path, new: bool) -> None:
 
 
 def _provenance(part: Set) -> dict[str, str]:
-    """Return licence and source that a pushed set states."""
+    """Return licence and source that a set which gaponet wrote (`part.ours`) states."""
     assert part.ours is not None
     stated: dict[str, Any] = {**part.ours["dataset"]}
     return {name: str(stated[name]) for name in Stated.__annotations__ if name in stated}
@@ -182,16 +190,20 @@ def _pushed_sequence(episode: dict[str, Any], log: Log, robot: RobotSpec) -> Seq
 
 def copy_sidecars(source: Path, out: Path, dataset: Dataset) -> None:
     """Copy splits, recipe and offsets of a dataset, checked, where `out` has none yet."""
-    for file in [source / name for name in COPIED_FILES] + sorted(
-        (source / "splits").glob("*.json")
-    ):
-        copy = out / file.relative_to(source)
-        if file.is_file() and not copy.exists():
-            if file.parent != source:
-                read_split(file, dataset)
+    for name in COPIED_FILES:
+        if _is_new(source / name, out / name):
+            shutil.copyfile(source / name, out / name)
+    for split in sorted((source / "splits").glob("*.json")):
+        copy = out / "splits" / split.name
+        if _is_new(split, copy):
+            read_split(split, dataset)  # raises an error for a damaged one
             copy.parent.mkdir(exist_ok=True)
-            shutil.copyfile(file, copy)
-    read_offsets(dataset)
+            shutil.copyfile(split, copy)
+    read_offsets(dataset)  # raises an error for damaged ones
+
+
+def _is_new(file: Path, copy: Path) -> bool:
+    return file.is_file() and not copy.exists()
 
 
 def downloaded_robot(folder: Path) -> RobotSpec:

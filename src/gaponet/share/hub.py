@@ -33,6 +33,12 @@ class Hub:
     """A repository of the Hub, or at HF_ENDPOINT; the token is HF_TOKEN or that of `hf auth login`.
 
     Its methods raise RemoteError for errors of network and place.
+
+    Attributes:
+        repo: USER/NAME.
+        revision: Branch, tag or commit.
+        type: Type of the repository, a value of REPOSITORY_TYPES; "" until `index` has found it.
+        commit: Newest commit of the revision when `index` was called; "" before.
     """
 
     def __init__(self, address: str) -> None:
@@ -59,47 +65,57 @@ class Hub:
         )
         self.api = HfApi(os.environ.get("HF_ENDPOINT"))
         self.revision = revision or "main"
-        self.type = self.commit = ""
-        self._sizes: dict[str, int | None] = {}
+        self.type = ""
+        self.commit = ""
+        self._sizes: dict[str, int | None] = {}  # file at the commit → bytes
 
     def index(self, kind: Kind | None = None) -> bytes | None:
-        """Return the content of gaponet.json, None if nothing was pushed; kind: look for this one
-        only.
+        """Return the content of gaponet.json; None if nothing was pushed.
+
+        Args:
+            kind: Look in the repository of this kind only; default: in all that have the name.
         """
         from huggingface_hub.errors import RepositoryNotFoundError
 
-        types = dict.fromkeys(REPOSITORY_TYPES.values())
-        for wanted in types if kind is None else (REPOSITORY_TYPES[kind],):
+        types = set(REPOSITORY_TYPES.values()) if kind is None else {REPOSITORY_TYPES[kind]}
+        for repo_type in sorted(types):  # a dataset before a model
             with network_errors(self.address), suppress(RepositoryNotFoundError):
-                info = self.api.repo_info(
-                    self.repo, repo_type=wanted, revision=self.revision, files_metadata=True
-                )
-                self.type = wanted
-                self.commit = str(info.sha)
-                self._sizes = {
-                    file.rfilename: file.size for file in getattr(info, "siblings", None) or ()
-                }
-                if (self._sizes.get(INDEX) or 0) > MAX_INDEX_BYTES:
-                    raise RemoteError(
-                        f"{self.address}: {INDEX} has more than {MAX_INDEX_BYTES >> 20} MiB"
-                    )
+                self._look_at(repo_type)
                 if INDEX in self._sizes:
-                    file = self.api.hf_hub_download(
-                        self.repo, INDEX, repo_type=wanted, revision=self.commit
-                    )
-                    return Path(file).read_bytes()
-                if self._sizes.keys() - INITIAL_FILES:
-                    raise RemoteError(
-                        f"{self.address}: the {wanted} repository holds files but no {INDEX}: "
-                        "gaponet did not push it; a LeRobot set is fetched with: hf download "
-                        "--repo-type dataset, and read by gaponet import"
-                    )
+                    return self._read_index()
+                self._require_unused()
         if kind is None and not self.type:
             raise RemoteError(
                 f"{self.address}: no dataset, run or robot there that may be read; see hf auth "
                 "login"
             )
         return None
+
+    def _look_at(self, repo_type: str) -> None:
+        """Find the newest commit of a repository, and the sizes of its files."""
+        info = self.api.repo_info(
+            self.repo, repo_type=repo_type, revision=self.revision, files_metadata=True
+        )
+        self.type = repo_type
+        self.commit = str(info.sha)
+        files = getattr(info, "siblings", None) or ()
+        self._sizes = {file.rfilename: file.size for file in files}
+
+    def _read_index(self) -> bytes:
+        """Download gaponet.json of the newest commit."""
+        if (self._sizes[INDEX] or 0) > MAX_INDEX_BYTES:
+            raise RemoteError(f"{self.address}: {INDEX} has more than {MAX_INDEX_BYTES >> 20} MiB")
+        file = self.api.hf_hub_download(self.repo, INDEX, repo_type=self.type, revision=self.commit)
+        return Path(file).read_bytes()
+
+    def _require_unused(self) -> None:
+        """Refuse a repository into which something else was put."""
+        if self._sizes.keys() - INITIAL_FILES:
+            raise RemoteError(
+                f"{self.address}: the {self.type} repository holds files but no {INDEX}: "
+                "gaponet did not push it; a LeRobot set is fetched with: hf download "
+                "--repo-type dataset, and read by gaponet import"
+            )
 
     def is_outdated(self, index: Index) -> bool:
         """Return True if a file of the index is missing at the Hub or has another size there."""
@@ -136,7 +152,7 @@ class Hub:
             RemoteError: Somebody else pushed since `index` was called.
         """
         from huggingface_hub import CommitOperationAdd, CommitOperationDelete
-        from huggingface_hub.errors import HfHubHTTPError, RevisionNotFoundError
+        from huggingface_hub.errors import HfHubHTTPError
 
         repo_type = REPOSITORY_TYPES[index.kind]
         files = {*index.files, INDEX}
@@ -148,12 +164,13 @@ class Hub:
                 if self.index(index.kind) is not None:
                     raise lost_race(self.address)
             removed = sorted(self._sizes.keys() - files - INITIAL_FILES)
+            additions = [CommitOperationAdd(path, str(folder / path)) for path in sorted(files)]
+            deletions = [CommitOperationDelete(path) for path in removed]
             try:
                 # upload_folder and upload_large_folder show readers a part of the new state
                 self.api.create_commit(
                     self.repo,
-                    [CommitOperationAdd(path, str(folder / path)) for path in sorted(files)]
-                    + [CommitOperationDelete(path) for path in removed],
+                    [*additions, *deletions],
                     commit_message=f"gaponet push: {index.kind} of {len(index.files)} files",
                     repo_type=repo_type,
                     revision=self.revision,
@@ -163,8 +180,13 @@ class Hub:
                 if error.response.status_code == PARENT_CHANGED:
                     raise lost_race(self.address) from None
                 raise
-            # LeRobot opens the tag of its version, not main
             if index.kind == "dataset" and self.revision == "main":
-                with suppress(RevisionNotFoundError):
-                    self.api.delete_tag(self.repo, tag=LEROBOT_TAG, repo_type=repo_type)
-                self.api.create_tag(self.repo, tag=LEROBOT_TAG, repo_type=repo_type, exist_ok=True)
+                self._move_lerobot_tag(repo_type)
+
+    def _move_lerobot_tag(self, repo_type: str) -> None:
+        """Let the tag of LeRobot's version name the newest commit: LeRobot opens it, not main."""
+        from huggingface_hub.errors import RevisionNotFoundError
+
+        with suppress(RevisionNotFoundError):
+            self.api.delete_tag(self.repo, tag=LEROBOT_TAG, repo_type=repo_type)
+        self.api.create_tag(self.repo, tag=LEROBOT_TAG, repo_type=repo_type, exist_ok=True)

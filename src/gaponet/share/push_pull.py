@@ -63,7 +63,7 @@ def push(
         path: Dataset, run or robot folder.
         address: USER/NAME on the Hugging Face Hub.
         private: Readable by its owner alone, if a new repository is made for it.
-        replace: Also replace what this is no newer state of.
+        replace: Replace what is there even if it has content that this lacks, such as sequences.
         licence: SPDX identifier for the card of a run or a robot; a dataset states its own.
         trained_on: Dataset of the Hub that a run or a robot was made from, USER/NAME, for its card.
 
@@ -75,17 +75,13 @@ def push(
     kind = _kind(path)
     if kind == "dataset" and (licence or trained_on):
         raise UsageError("--licence and --trained-on are for runs and robots; leave them out")
-    facts = ModelFacts(licence, trained_on)
     hub = Hub(address)
-    content = hub.index(kind)
-    present = None if replace or content is None else read_index(hub.address, content)
-    same = (
-        present
-        and kind == present.kind == "dataset"
-        and datasets.is_pushed(path, hub.address, present)
-    )
-    if present and same and not hub.is_outdated(present):
-        return TransferResult(kind, len(present.files), present.size(present.files))
+    pushed = hub.index(kind)
+    earlier = None
+    if pushed is not None and not replace:
+        earlier = read_index(hub.address, pushed)
+    if earlier is not None and _is_up_to_date(path, kind, hub, earlier):
+        return TransferResult(kind, len(earlier.files), earlier.size(earlier.files))
     with _work_folder(path, "push") as folder:
         _clear(folder)  # files of a killed push
         files = folder / "files"
@@ -94,19 +90,35 @@ def push(
             if kind == "dataset":
                 contents = datasets.write_files(path, files, hub.address)
             else:
+                facts = ModelFacts(licence, trained_on)
                 contents = MODELS[kind].write_files(path, files, hub.address, facts)
-            _require_newer(present, kind, contents, hub.address)
-            records = {
-                file.relative_to(files).as_posix(): FileRecord.of(file)
-                for file in sorted(files.rglob("*"))
-                if file.is_file()
-            }
-            index = Index(FORMAT, kind, path.name, contents, records)
+            if earlier is not None:
+                _require_newer(earlier, kind, contents, hub.address)
+            index = Index(FORMAT, kind, path.name, contents, _records_below(files))
             write_text(files / INDEX, index.text())
             hub.store(files, index, private)
         finally:
             _clear(folder)
-    return TransferResult(kind, len(records), index.size(records))
+    return TransferResult(kind, len(index.files), index.size(index.files))
+
+
+def _is_up_to_date(path: Path, kind: Kind, hub: Hub, earlier: Index) -> bool:
+    """Return True if the earlier push was of this state of a dataset and is whole at the Hub.
+
+    Of runs and robots nothing tells that before their files are written.
+    """
+    if kind != "dataset" or earlier.kind != "dataset":
+        return False
+    return datasets.is_pushed(path, hub.address, earlier) and not hub.is_outdated(earlier)
+
+
+def _records_below(folder: Path) -> dict[str, FileRecord]:
+    """Return path → size and hash of all files below a folder."""
+    records = {}
+    for file in sorted(folder.rglob("*")):
+        if file.is_file():
+            records[file.relative_to(folder).as_posix()] = FileRecord.of(file)
+    return records
 
 
 def pull(address: str, out: str | Path) -> TransferResult:
@@ -125,27 +137,31 @@ def pull(address: str, out: str | Path) -> TransferResult:
         UsageError: The folder holds something.
     """
     out = Path(out)
-    present = Dataset(out) if (out / "dataset.json").is_file() else None
-    if present is None and out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise UsageError(f"{out}: exists and is not an empty folder; choose a new one")
+    own = None  # the dataset that is there already
+    if (out / "dataset.json").is_file():
+        own = Dataset(out)
+    else:
+        _require_empty(out)
     hub = Hub(address)
     index = read_index(hub.address, hub.index())
-    if present is not None and index.kind != "dataset":
-        raise UsageError(
-            f"{out}: is a dataset, and {address} holds a {index.kind}; choose a new folder"
-        )
-    if present is not None and all(present.find(digest) for digest in index.contents):
-        return TransferResult(index.kind, 0, 0)
+    if own is not None:
+        if index.kind != "dataset":
+            raise UsageError(
+                f"{out}: is a dataset, and {address} holds a {index.kind}; choose a new folder"
+            )
+        if all(own.find(digest) for digest in index.contents):
+            return TransferResult(index.kind, 0, 0)
     with _work_folder(out.absolute(), "pull") as folder:
+        # A killed pull goes on in the folder of the state that it pulled; others are removed.
         state = hashlib.sha256(index.text().encode()).hexdigest()[:16]
-        _clear(folder, keep=state)  # files of a killed pull of another state
+        _clear(folder, keep=state)
         work = folder / state
         work.mkdir(exist_ok=True)
         if index.kind == "dataset":
-            fetched, new = _pull_dataset(hub, index, work, present)
+            fetched, new = _pull_dataset(hub, index, work, own)
         else:
             fetched, new = _pull_model(hub, index, work)
-        if present is None:
+        if own is None:
             if out.exists():
                 out.rmdir()
             new.rename(out)
@@ -153,11 +169,19 @@ def pull(address: str, out: str | Path) -> TransferResult:
     return TransferResult(index.kind, len(fetched), index.size(fetched))
 
 
+def _require_empty(folder: Path) -> None:
+    """Refuse a file, and a folder that holds something."""
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise UsageError(f"{folder}: exists and is not an empty folder; choose a new one")
+
+
 def _pull_dataset(
-    hub: Hub, index: Index, work: Path, present: Dataset | None
+    hub: Hub, index: Index, work: Path, own: Dataset | None
 ) -> tuple[list[str], Path]:
-    """Download what a dataset lacks, and add it to the dataset or to a new one; return the files
-    and the dataset.
+    """Download the sequences that the user's own dataset lacks, and add them to it, or all to a new
+    one in `work`.
+
+    Return the downloaded files, and the folder of the dataset.
     """
     files = work / "files"
     files.mkdir(exist_ok=True)
@@ -165,11 +189,11 @@ def _pull_dataset(
     hub.download(small, index, files)
     with file_errors(hub.address, files):
         robot = datasets.downloaded_robot(files)
-        recordings = datasets.missing_files(files, index, present)
+        recordings = datasets.missing_files(files, index, own)
     hub.download(recordings, index, files)
-    dataset = work / "dataset" if present is None else present.path
+    dataset = work / "dataset" if own is None else own.path
     with file_errors(hub.address, files):
-        datasets.add_missing(files, robot, dataset, new=present is None)
+        datasets.add_missing(files, robot, dataset, new=own is None)
     return small + recordings, dataset
 
 
@@ -197,17 +221,17 @@ def _kind(path: Path) -> Kind:
     )
 
 
-def _require_newer(
-    present: Index | None, kind: Kind, contents: tuple[str, ...], address: str
-) -> None:
-    """Refuse to replace a push with content that this one lacks."""
-    lost = set(present.contents) - set(contents) if present else set()
-    if present and (present.kind != kind or lost):
+def _require_newer(earlier: Index, kind: Kind, contents: tuple[str, ...], address: str) -> None:
+    """Refuse to replace an earlier push that has content which this one lacks."""
+    lost = set(earlier.contents) - set(contents)
+    if earlier.kind != kind:
+        what = f"a {earlier.kind}"
+    elif lost:
         what = LOST[kind].format(len(lost))
-        if present.kind != kind:
-            what = f"a {present.kind}"
-        hint = "push to another place, or say --replace"
-        raise RemoteError(f"{address}: holds {what} that would be lost ('{present.name}'); {hint}")
+    else:
+        return
+    hint = "push to another place, or say --replace"
+    raise RemoteError(f"{address}: holds {what} that would be lost ('{earlier.name}'); {hint}")
 
 
 @contextmanager
@@ -215,8 +239,9 @@ def _work_folder(path: Path, purpose: str) -> Iterator[Path]:
     """Hidden folder beside a path, for one process at a time; it is removed at the end if the
     block does not fail.
     """
-    # a disk that is only read
-    parent = path.parent if os.access(path.parent, os.W_OK) else Path(gettempdir())
+    parent = path.parent
+    if not os.access(parent, os.W_OK):  # a disk that is only read
+        parent = Path(gettempdir())
     folder = parent / f"{FOLDER_MARKER}-{purpose}-{path.name}"
     with lock_folder(folder, purpose):
         yield folder

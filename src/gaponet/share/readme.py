@@ -15,7 +15,7 @@ from gaponet.evaluation.tables import mrad, totals
 from gaponet.nn.artifact import GapModel
 from gaponet.robot.spec import RobotSpec
 
-# the Hub's
+# Licences that the Hub knows by these identifiers.
 LICENCES = (
     "apache-2.0",
     "mit",
@@ -35,10 +35,10 @@ def dataset_readme(card: dict[str, Any], text: str, address: str, sets: list[str
         sets: Folders of the sets, below the repository.
     """
     licence = card["licence"]
-    configs = [
-        {"config_name": s.strip("./") or "default", "data_files": f"{s}/data/*/*.parquet"}
-        for s in sets
-    ]
+    configs = []
+    for place in sets:
+        name = place.strip("./") or "default"
+        configs.append({"config_name": name, "data_files": f"{place}/data/*/*.parquet"})
     header: dict[str, Any] = {
         "task_categories": ["robotics"],
         "tags": _tags(card, "LeRobot"),
@@ -71,10 +71,11 @@ class ModelFacts:
     def header(self, tags: list[str]) -> dict[str, Any]:
         """Return the header with which the Hub shows and finds a model."""
         licence = self.licence.lower() or "unknown"
-        named = {} if licence in (*LICENCES, "unknown") else {"license_name": self.licence}
+        stated = {"license": licence}
+        if licence not in (*LICENCES, "unknown"):
+            stated = {"license": "other", "license_name": self.licence}
         return {
-            "license": "other" if named else licence,
-            **named,
+            **stated,
             "library_name": "gaponet",
             "tags": tags,
             "datasets": [self.trained_on] if self.trained_on else [],
@@ -117,19 +118,25 @@ def robot_readme(robot: RobotSpec, origin: Origin | None, address: str, facts: M
 
 
 def run_readme(found: dict[str, Any], address: str, facts: ModelFacts) -> str:
-    """Return a model card: corrected joints, training data, and errors on the test motions."""
+    """Return a model card: corrected joints, training data, and errors on the test motions.
+
+    Args:
+        found: What share.run reads of the run: card, metrics (None without an evaluation), weights.
+    """
     card = found["card"]
     metrics = found["metrics"]
-    virtual = ", trained on VIRTUAL robots"
+    heading = f"{escape_markdown(card['robot'])}: a model of its motor gap"
+    if card.get("virtual"):
+        heading += ", trained on VIRTUAL robots"
+    joints = card["joint_names"]
     rates = ", ".join(f"{1 / dt:.2f}" for dt in card.get("dt", []))
+    training = escape_markdown(GapModel.how_trained(card))
+    dataset = escape_markdown(str(card.get("dataset_hash", "")))
     lines = [
-        f"# {escape_markdown(card['robot'])}: a model of its motor "
-        f"gap{virtual * bool(card.get('virtual'))}",
+        f"# {heading}",
         "",
-        f"- corrects the targets of {len(card['joint_names'])} joints: "
-        f"{escape_markdown(', '.join(card['joint_names']))}",
-        f"- trained {escape_markdown(GapModel.how_trained(card))}, on {card.get('hours', 0):.2f} "
-        f"h of dataset {escape_markdown(str(card.get('dataset_hash', '')))}",
+        f"- corrects the targets of {len(joints)} joints: {escape_markdown(', '.join(joints))}",
+        f"- trained {training}, on {card.get('hours', 0):.2f} h of dataset {dataset}",
         f"- at {rates} Hz, in simulator {escape_markdown(card['simulator'])}",
         f"- weights {found['weights']}",
     ]
@@ -143,8 +150,10 @@ def run_readme(found: dict[str, Any], address: str, facts: ModelFacts) -> str:
 
 
 def _tags(card: dict[str, Any], *more: str) -> list[str]:
-    virtual = card.get("virtual_sequences") or card.get("virtual")
-    return [*more, "gaponet", "sim-to-real", card["robot"], *["virtual"] * bool(virtual)]
+    tags = [*more, "gaponet", "sim-to-real", card["robot"]]
+    if card.get("virtual_sequences") or card.get("virtual"):
+        tags.append("virtual")
+    return tags
 
 
 def _page(header: dict[str, Any], lines: list[str], use: list[str]) -> str:

@@ -56,19 +56,15 @@ class Index:
     files: Annotated[dict[str, FileRecord], Len(1, 20_000)]
 
     def __post_init__(self) -> None:
+        folders = set[str]()
         for path in self.files:
-            parts = path.split("/")
-            invalid = any(
-                p in ("", "..") or p.startswith(".") or "\\" in p or not p.isprintable()
-                for p in parts
-            )
-            too_long = len(parts) > MAX_FOLDER_DEPTH or len(path) > MAX_PATH_LENGTH
-            if invalid or too_long or ":" in path or path == INDEX:
+            if not _is_inside_folder(path):
                 raise RemoteError(f"files: '{path}' is not the name of a file inside a folder")
+            folders.update(str(folder) for folder in PurePosixPath(path).parents)
         if len({path.casefold() for path in self.files}) < len(self.files):
             raise RemoteError("files: two names differ in capitals alone")
-        folders = {str(folder) for path in self.files for folder in PurePosixPath(path).parents}
-        if both := folders & self.files.keys():
+        both = folders & self.files.keys()
+        if both:
             raise RemoteError(f"files: '{min(both)}' is a file and a folder")
 
     def text(self) -> str:
@@ -78,6 +74,25 @@ class Index:
     def size(self, paths: Collection[str]) -> int:
         """Return the total bytes of some files."""
         return sum(self.files[path].size for path in paths)
+
+
+def _is_inside_folder(path: str) -> bool:
+    """Return True for the path of a pushed file, which no system takes for a place outside the
+    folder.
+    """
+    if ":" in path or path == INDEX:
+        return False
+    names = path.split("/")
+    if len(names) > MAX_FOLDER_DEPTH or len(path) > MAX_PATH_LENGTH:
+        return False
+    return all(_is_visible_name(name) for name in names)
+
+
+def _is_visible_name(name: str) -> bool:
+    """Return True for the name of a file or folder that is not hidden, and not .. or empty."""
+    if not name or name.startswith("."):
+        return False
+    return "\\" not in name and name.isprintable()
 
 
 def lost_race(address: str) -> RemoteError:

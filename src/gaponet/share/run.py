@@ -22,12 +22,24 @@ from gaponet.share.readme import ModelFacts, run_readme
 from gaponet.share.remote import Index
 
 README = "README.md"
-FILES = re.compile(
-    r"config\.json|split\.json|delay_offset\.json|metrics\.json|progress\.jsonl|trajectories\.npz|gap\.json|"
-    r"checkpoint\.pt|adaptation/[A-Za-z0-9._-]+\.json|"
-    r"robot/(robot\.toml|robot\.xml|collision\.toml|look\.toml|identified\.json)|"
-    r"model/(card\.json|model\.onnx)"
-)
+FILES = {
+    "config.json",
+    "split.json",
+    "delay_offset.json",
+    "metrics.json",
+    "progress.jsonl",
+    "trajectories.npz",
+    "gap.json",
+    "checkpoint.pt",
+    "robot/robot.toml",
+    "robot/robot.xml",
+    "robot/collision.toml",
+    "robot/look.toml",
+    "robot/identified.json",
+    "model/card.json",
+    "model/model.onnx",
+}
+ADAPTATION = re.compile(r"adaptation/[A-Za-z0-9._-]+\.json")  # one for each adapted unit
 
 
 def write_files(run: Path, folder: Path, address: str, facts: ModelFacts) -> tuple[str, ...]:
@@ -38,7 +50,8 @@ def write_files(run: Path, folder: Path, address: str, facts: ModelFacts) -> tup
         raise ModelError(f"{run}: no model yet; train it first")
     write_text(folder / README, run_readme(_facts(run), address, facts))
     for file in sorted(run.rglob("*")):
-        if file.is_file() and FILES.fullmatch(path := file.relative_to(run).as_posix()):
+        path = file.relative_to(run).as_posix()
+        if file.is_file() and _is_pushed(path):
             (folder / path).parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(file, folder / path)
     return (sha256(run / "model" / WEIGHTS),)
@@ -47,8 +60,13 @@ def write_files(run: Path, folder: Path, address: str, facts: ModelFacts) -> tup
 def require_files(index: Index) -> None:
     """Refuse an index with files that no run has."""
     for path in index.files.keys() - {README}:
-        if not FILES.fullmatch(path):
+        if not _is_pushed(path):
             raise RemoteError(f"{path}: a run has no such file")
+
+
+def _is_pushed(path: str) -> bool:
+    """Return True for a file of a run that a push holds, by its path below the run."""
+    return path in FILES or ADAPTATION.fullmatch(path) is not None
 
 
 def require_pushed(folder: Path, index: Index) -> None:
