@@ -45,15 +45,16 @@ def _error(runs: list[Run]) -> float:
 
 def _later_and_shifted(runs: ListOf[Run]) -> list[Run]:
     """Return runs with delays and offsets that were fitted to the other half of the motions."""
-    names = list(dict.fromkeys(run.meta.independent_motion for run in runs))
-    half = {name: i % 2 for i, name in enumerate(names)}
-    folds: list[list[Run]] = [[], []]
-    for run in runs:
-        folds[half[run.meta.independent_motion]].append(run)
-    fitted = [fit_delay_offset(fold or folds[0]) for fold in folds]
+    motions = list(dict.fromkeys(run.meta.independent_motion for run in runs))
+    first_half = set(motions[::2])
+    first = [run for run in runs if run.meta.independent_motion in first_half]
+    second = [run for run in runs if run.meta.independent_motion not in first_half]
+    of_first = fit_delay_offset(first)
+    of_second = fit_delay_offset(second or first)  # a single motion is fitted to itself
     moved = []
     for run in runs:
-        delay, offset = fitted[1 - half[run.meta.independent_motion]]
+        in_first_half = run.meta.independent_motion in first_half
+        delay, offset = of_second if in_first_half else of_first
         moved.append(replace(run, qpos_sim=delayed(run.qpos_sim, delay, run.dt) + offset))
     return moved
 
@@ -61,28 +62,37 @@ def _later_and_shifted(runs: ListOf[Run]) -> list[Run]:
 def delayed(path: Array, delay: Array, dt: float) -> Array:
     """Return a path (T, n) rad, whose first row holds before it, later by delays (n,) s."""
     rows = np.arange(len(path))
-    late = [np.interp(rows - d / dt, rows, x) for d, x in zip(delay, path.T, strict=True)]
+    late = []
+    for joint_delay, joint_path in zip(delay, path.T, strict=True):
+        late.append(np.interp(rows - joint_delay / dt, rows, joint_path))
     return np.stack(late, axis=1)
 
 
 def fit_delay_offset(runs: ListOf[Run]) -> tuple[Array, Array]:
     """Return each joint's delay, s, and offset, rad, (n,), with the least mean |error|."""
     joints = runs[0].qpos_real.shape[1]
-    every = max(1, sum(len(run.qpos_real) for run in runs) // MAX_FITTED_ROWS)
+    stride = max(1, sum(len(run.qpos_real) for run in runs) // MAX_FITTED_ROWS)
     step = max(MIN_DELAY_STEP_S, min(run.dt for run in runs))
     delays = np.arange(0.0, MAX_DELAY_S + step / 2, step)
-    error = np.full((len(delays), joints), np.inf)
-    offset = np.zeros((len(delays), joints))
+    error = np.full((len(delays), joints), np.inf)  # rad; infinite for a joint without recordings
+    offset = np.zeros((len(delays), joints))  # rad
     for i, delay in enumerate(delays):
-        apart = []
-        for run in runs:
-            late = delayed(run.qpos_sim, np.full(joints, delay), run.dt)
-            away = (run.qpos_real - late)[1::every]
-            away[:, [j for j in range(joints) if j not in run.recorded]] = np.nan
-            apart.append(away)
-        away = np.concatenate(apart)
-        held = ~np.isnan(away).all(axis=0)
-        offset[i, held] = np.nanmedian(away[:, held], axis=0)
-        error[i, held] = np.nanmean(np.abs(away[:, held] - offset[i, held]), axis=0)
+        differences = _differences(runs, np.full(joints, delay), stride)
+        held = ~np.isnan(differences).all(axis=0)  # (n,)
+        offset[i, held] = np.nanmedian(differences[:, held], axis=0)
+        error[i, held] = np.nanmean(np.abs(differences[:, held] - offset[i, held]), axis=0)
     best = error.argmin(axis=0)
     return delays[best], offset[best, np.arange(joints)]
+
+
+def _differences(runs: ListOf[Run], delay: Array, stride: int) -> Array:
+    """Return q_real − q_sim of every `stride`th row with delays (n,) s, all runs together, (rows,
+    n) rad; NaN for a joint that a run does not hold.
+    """
+    parts = []
+    for run in runs:
+        part = (run.qpos_real - delayed(run.qpos_sim, delay, run.dt))[1::stride]
+        missing = [j for j in range(len(delay)) if j not in run.recorded]
+        part[:, missing] = np.nan
+        parts.append(part)
+    return np.concatenate(parts)

@@ -4,7 +4,7 @@ simulator.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NotRequired
@@ -27,19 +27,14 @@ DATA_HINT = "data of the robot that the run was trained for"
 
 
 class Origin(TypedDict):
-    """Data that a robot was identified from.
+    """Data that a robot was identified from."""
 
-    dataset is a path from the folder; parts and motions are recordings and motions by split;
-    val_mpjae is the error on validation motions, rad; findings say what was learned about backlash
-    and links, doctor what was found in the recordings (checks/gate.py).
-    """
-
-    dataset: str
-    parts: SplitHashes
-    motions: dict[str, tuple[str, ...]]
-    val_mpjae: dict[str, float]
-    findings: NotRequired[tuple[str, ...]]
-    doctor: NotRequired[dict[str, tuple[str, ...]]]
+    dataset: str  # path from the robot folder
+    parts: SplitHashes  # recordings by split
+    motions: dict[str, tuple[str, ...]]  # names of motions by split
+    val_mpjae: dict[str, float]  # nominal and identified → error on validation motions, rad
+    findings: NotRequired[tuple[str, ...]]  # sentences about backlash and links
+    doctor: NotRequired[dict[str, tuple[str, ...]]]  # faults of the recordings (checks/gate.py)
 
 
 @dataclass(frozen=True)
@@ -105,14 +100,17 @@ def select_entries(
     motions: tuple[str, ...] = (),
     units: tuple[str, ...] = (),
 ) -> tuple[list[Entry], bool]:
-    """Select recordings for an evaluation.
+    """Select recordings for an evaluation: those of the given motions, or unseen ones.
 
-    Return them, and True if no candidate was fitted to any of them.
+    A robot folder without an origin counts as fitted to everything and is evaluated on everything.
 
-    The default is the test set of the first candidate, or else all recordings, each time without
-    recordings that any candidate was fitted to. If all motions were used, the default is recordings
-    that were not used. A robot folder without an origin counts as fitted to everything and is
-    evaluated on everything.
+    Args:
+        folders: Robot folders and runs.
+        motions: Only these, even if they were used. Default: as of `_unseen_entries`.
+        units: Only recordings of these units.
+
+    Returns:
+        The recordings, and True if no candidate was fitted to any of them.
 
     Raises:
         DatasetError: Every recording was used in training.
@@ -128,29 +126,32 @@ def select_entries(
     if motions:
         entries = dataset.select(motions, units)
     else:
-        entries = _default_entries(available, unused, fitted)
+        entries = _unseen_entries(available, unused, fitted)
     if not entries:
         raise DatasetError(
             f"{dataset.path}: every sequence was used in training; give logs the runs never saw, "
             "or --motions"
         )
-    return entries, {entry.hash for entry in entries} <= {entry.hash for entry in unused}
+    unused_hashes = {entry.hash for entry in unused}
+    return entries, all(entry.hash in unused_hashes for entry in entries)
 
 
-def _default_entries(
+def _unseen_entries(
     available: list[Entry], unused: list[Entry], fitted: list[FittedData]
 ) -> list[Entry]:
-    """Return the unused recordings of the first test set, or else all unused ones.
+    """Return the first of these that has recordings: the test set of the first candidate; motions
+    that no candidate was fitted to; recordings that no candidate was fitted to, though their
+    motions were used.
 
-    If all motions were used, the recordings that were not.
+    Args:
+        unused: Those of the available recordings that no candidate was fitted to.
     """
-    tests = [entry for entry in unused if entry.hash in fitted[0].test]
-    if tests:
-        return tests
+    test = [entry for entry in unused if entry.hash in fitted[0].test]
+    if test:
+        return test
     if unused:
         return unused
-    used = frozenset().union(*(data.hashes for data in fitted))
-    return [entry for entry in available if entry.hash not in used]
+    return [entry for entry in available if not any(entry.hash in data.hashes for data in fitted)]
 
 
 @dataclass(frozen=True)
@@ -172,23 +173,28 @@ class FittedData:
             origin = read_origin(folder)
             return None if origin is None else cls._of(origin["parts"], origin["motions"])
         model = GapModel.load(folder)
-        logs = set[str]()
+        also_fitted = set[str]()  # hashes
         for adaptation in Adaptation.load(folder, model.weights_hash()).values():
-            logs.update(adaptation.logs)
+            also_fitted.update(adaptation.logs)
         origin = read_origin(folder / STORED_ROBOT)  # of the robot under the model
         if origin is not None:
-            logs |= _fitted_hashes(origin["parts"])
-        return cls._of(split_of_run(folder), model.card.get("motions", {}), logs)
+            also_fitted |= _fitted_hashes(origin["parts"])
+        return cls._of(split_of_run(folder), model.card.get("motions", {}), also_fitted)
 
     @classmethod
     def _of(
-        cls, split: Any, motions: Mapping[str, Any], more: set[str] | None = None
+        cls, split: Any, motions: Mapping[str, Any], also_fitted: Collection[str] = ()
     ) -> FittedData:
-        hashes = _fitted_hashes(split) | (more or set())
+        """Return the data of a split, {train, val, test: {id: hash}}, with its motions by part."""
+        hashes = _fitted_hashes(split).union(also_fitted)
         used = {*motions.get("train", ()), *motions.get("val", ())}
-        return cls(frozenset(hashes), frozenset(used), frozenset(split["test"].values()) - hashes)
+        test = set(split["test"].values()) - hashes
+        return cls(frozenset(hashes), frozenset(used), frozenset(test))
 
     def __contains__(self, entry: Entry) -> bool:
+        """Return True if the folder was fitted to a recording, or to another one of its motion
+        that is not in the test set.
+        """
         if entry.hash in self.hashes:
             return True
         return entry.hash not in self.test and entry.meta.motion in self.motions

@@ -38,7 +38,9 @@ from gaponet.sim.replay import Corrector, kept_replays, replay
 
 T = TypeVar("T")
 STORED_TRAJECTORIES = 8  # for the report
-# Of tables and figures.
+# Order of the methods in tables and figures. The last three are in another simulator: as it is;
+# with the network, which gets the other simulator's answers as its input; with targets that make it
+# move as the candidate does.
 ORDER = (
     "nominal",
     "delay_offset",
@@ -68,33 +70,41 @@ class Evaluation:
         """Write metrics.json and trajectories.npz, which the report reads, into a run or robot
         folder.
         """
-        reals = self.runs["nominal"]
-        picked = evenly_spaced(list(range(len(reals))), STORED_TRAJECTORIES)
+        nominal = self.runs["nominal"]
+        picked = evenly_spaced(list(range(len(nominal))), STORED_TRAJECTORIES)
         shown = []
-        arrays = {}
-        for row, i in enumerate(picked):
-            meta = reals[i].meta
-            shown.append(
-                {
-                    "motion": meta.motion,
-                    "unit_id": meta.unit_id,
-                    "payload_mass": meta.payload_mass,
-                    "dt": reals[i].dt,
-                }
-            )
-            arrays[f"{row}/recorded"] = reals[i].qpos_real
-            arrays[f"{row}/command"] = self.ctrl[i]
-            for name, part in self.runs.items():
-                arrays[f"{row}/{name}"] = part[i].qpos_sim
-            for name, delta in self.deltas.items():
-                arrays[f"{row}/delta/{name}"] = delta[i]
-        date = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
-        result = self.result | {"date": date, "shown": shown}
+        for i in picked:
+            meta = nominal[i].meta
+            facts = {
+                "motion": meta.motion,
+                "unit_id": meta.unit_id,
+                "payload_mass": meta.payload_mass,
+                "dt": nominal[i].dt,
+            }
+            shown.append(facts)
+        result = self.result | {
+            "date": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
+            "shown": shown,
+        }
+        arrays = self._arrays_of(picked)
         with lock_folder(folder, "robot" if is_robot(folder) else "run"):
             with atomic_write(folder / "trajectories.npz") as temporary:
-                single = {name: array.astype(np.float32) for name, array in arrays.items()}
-                np.savez_compressed(temporary, **single)  # type: ignore[arg-type]
+                np.savez_compressed(temporary, **arrays)  # type: ignore[arg-type]
             write_json(folder / "metrics.json", result)
+
+    def _arrays_of(self, picked: list[int]) -> dict[str, Array]:
+        """Return ROW/recorded, ROW/command, ROW/METHOD and ROW/delta/METHOD of some recordings by
+        number, (T, n operated) rad in float32; ROW counts the picked ones.
+        """
+        arrays = {}
+        for row, i in enumerate(picked):
+            arrays[f"{row}/recorded"] = self.runs["nominal"][i].qpos_real
+            arrays[f"{row}/command"] = self.ctrl[i]
+            for name, rollouts in self.runs.items():
+                arrays[f"{row}/{name}"] = rollouts[i].qpos_sim
+            for name, delta in self.deltas.items():
+                arrays[f"{row}/delta/{name}"] = delta[i]
+        return {name: array.astype(np.float32) for name, array in arrays.items()}
 
 
 def evaluate(
@@ -205,9 +215,10 @@ class _Rollouts:
         corrector: Corrector | None,
         progress: Callable[[int, int], None],
     ) -> None:
-        """Roll out a method.
+        """Roll out a method; methods come in the order of ORDER.
 
-        A transfer that is refused is a note if the network could be told its simulator.
+        A transfer that is refused ends the evaluation, unless "told" has shown the network in that
+        simulator in its own way: then the refusal is a note.
         """
         try:
             if corrector is None:
@@ -217,10 +228,11 @@ class _Rollouts:
                     self.sequences, simulator, corrector, progress=progress, lock_idle=True
                 )
         except ModelError as error:
-            if name != "transfer" or "told" not in self.runs:
-                raise
-            self.notes.append(f"no transfer: {error}")
-            return
+            was_told = "told" in self.runs
+            if name == "transfer" and was_told:
+                self.notes.append(f"no transfer: {error}")
+                return
+            raise
         self._add(name, simulator, replays)
         if name == "told" and self.first.model is not None:
             dt = self.sequences[0].dt
@@ -347,13 +359,17 @@ def _methods(
         raise UsageError(
             "these start from different identified simulators; compare those of one identification"
         )
-    for robot in identified.values():
+    for robot in identified.values():  # at most one
         yield "identified", robot, None
-    for name in sorted(candidates, key=lambda name: ORDER.index(name.removeprefix(IDENTIFIED))):
+    for name in sorted(candidates, key=_place_in_order):
         if candidates[name].model is not None:
             yield name, candidates[name].robot, candidates[name].corrector()
     if target is not None:
         yield from _methods_in(target, first, nominal)
+
+
+def _place_in_order(method: str) -> int:
+    return ORDER.index(method.removeprefix(IDENTIFIED))
 
 
 def _methods_in(
@@ -361,7 +377,7 @@ def _methods_in(
 ) -> Iterator[tuple[str, RobotSpec, Corrector | None]]:
     """Yield the methods in another simulator.
 
-    Gains of a log change it by as much as they change the nominal one.
+    It gets the nominal robot, so that gains which a recording states change both by as much.
     """
     simulator = replace(target, nominal=target.nominal or nominal)
     if model_hash(target) != model_hash(nominal):
@@ -379,12 +395,15 @@ def _by_unit(
     progress: Callable[[int, int], None],
 ) -> list[SimulatedReplay]:
     """Roll out the model in each unit's adapted simulator, or in the common one for other units."""
-    replays: dict[int, SimulatedReplay] = {}
-    for unit in dict.fromkeys(sequence.meta.unit_id for sequence in sequences):
-        rows = [i for i, sequence in enumerate(sequences) if sequence.meta.unit_id == unit]
-        physics = adapted[unit].robot(candidate.robot) if unit in adapted else candidate.robot
-        part = replay([sequences[i] for i in rows], physics, candidate.corrector(), lock_idle=True)
-        replays |= dict(zip(rows, part, strict=True))
+    replays: dict[int, SimulatedReplay] = {}  # number of the recording → its simulation
+    for unit in dict.fromkeys(s.meta.unit_id for s in sequences):
+        numbers = [i for i, s in enumerate(sequences) if s.meta.unit_id == unit]
+        simulator = candidate.robot
+        if unit in adapted:
+            simulator = adapted[unit].robot(candidate.robot)
+        of_unit = [sequences[i] for i in numbers]
+        simulated = replay(of_unit, simulator, candidate.corrector(), lock_idle=True)
+        replays |= dict(zip(numbers, simulated, strict=True))
         progress(len(replays), len(sequences))
     return [replays[i] for i in range(len(sequences))]
 

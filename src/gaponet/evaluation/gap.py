@@ -53,14 +53,18 @@ def gap_by_step(
     motions: tuple[str, ...] = (),
     progress: Progress = no_progress,
 ) -> dict[str, Any]:
-    """Mean |error| after each step, in open-loop rollouts of motions that the candidate was not
-    fitted to.
+    """Return the mean |error| after each step from the nominal simulator to the candidate.
 
-    Steps: nominal; of a run, delay (fitted on the training motions) and offset (delay and offset);
-    of an identified simulator its CAUSES, one after the other, and static friction that holds
-    ("creep": with the step "friction" alone, friction creeps as MuJoCo's does); of a run, its
-    model. Standard errors are over independent motions, of paired reductions. The reduction by a
-    cause depends on the order of causes. "unexplained" is the error above the floor.
+    Errors are of open-loop rollouts. The steps, in this order:
+
+    - "nominal": the simulator before identification.
+    - of a run, "delay" and "offset": nominal, with the delay (and the offset) of each joint that
+      fit the training motions best.
+    - of an identified simulator, its CAUSES, one after the other. Friction is two steps. After
+      "friction" joints creep as MuJoCo's do under a constant load; after "creep" they hold.
+    - of a run, its model.
+
+    The reduction by a cause depends on the order of the causes.
 
     Args:
         candidate: An identified robot, or a run; its recordings, baseline, simulator and model are
@@ -70,11 +74,17 @@ def gap_by_step(
         progress: Called while recordings are simulated.
 
     Returns:
-        {"methods": {nominal, identified, …: metrics.summary}, "baselines": {delay_offset, command:
-        rad}, "left": {step: rad}, "removed": {step: [rad, standard error]}, "unexplained": rad,
-        "by_joint": {joint: the same and "floor"}, "by_payload": {kg: {step: rad}}, "floor":
-        {"encoder", "repeatability", "both": rad}, …}; an unknown floor is None, and so is the error
-        above it.
+        A dictionary with these entries, and facts about dataset, robot and simulators. Errors are
+        in rad; what is unknown is None.
+
+        - methods: nominal, identified, … → `metrics.summary`.
+        - baselines: delay_offset, command → error.
+        - left: step → error after it.
+        - removed: step → [reduction, its standard error over independent motions].
+        - floor: encoder, repeatability, both → error that no simulator can remove.
+        - unexplained: error of the last step above the floor.
+        - by_joint: joint → left, removed, floor and unexplained.
+        - by_payload: kg → step → error.
     """
     robot = candidate.robot
     dataset.require_robot(robot)
@@ -82,18 +92,19 @@ def gap_by_step(
     entries, unseen = select_entries([candidate.folder], dataset, motions)
     sequences = dataset.sequences(entries)
     causes = cause_steps(robot)
-    done = _simulate(_steps(candidate, causes), dataset, entries, sequences, robot, progress)
+    steps = _steps(candidate, causes)
+    runs_after = _simulate(steps, dataset, entries, sequences, robot, progress)
     floors = _floors(sequences, dataset, robot)
     simulators = {"nominal": model_hash(nominal)}
     if causes:
         simulators["identified"] = model_hash(robot)
     commands = [command_run(sequence, robot) for sequence in sequences]
     return {
-        "methods": _methods(candidate, causes, done),
-        "baselines": baseline_errors(done["nominal"], commands),
-        **_sources(done, floors["all"]),
-        "by_joint": _by_joint(done, floors, robot),
-        "by_payload": _by_payload(done, sequences),
+        "methods": _methods(candidate, causes, runs_after),
+        "baselines": baseline_errors(runs_after["nominal"], commands),
+        **_sources(runs_after, floors["all"]),
+        "by_joint": _by_joint(runs_after, floors, robot),
+        "by_payload": _by_payload(runs_after, sequences),
         "virtual": any(sequence.meta.virtual for sequence in sequences),
         "unseen": unseen,
         "sequences": len(sequences),
@@ -113,33 +124,33 @@ def _simulate(
     robot: RobotSpec,
     progress: Progress,
 ) -> dict[str, list[Run]]:
-    """Return the runs of all recordings after each step."""
-    done = {}
+    """Return step → the runs of all recordings after it."""
+    runs_after = {}
     for step in steps:
         report = with_note(progress, step.name)
         if step.corrector is None:
-            creeps = step.name == "friction"
+            creeps = step.name == "friction"  # "creep" is the next step: it ends the creeping
             replays = kept_replays(dataset, entries, step.simulator, report, creeps=creeps)
         else:
             replays = replay(
                 sequences, step.simulator, step.corrector, lock_idle=True, progress=report
             )
-        done[step.name] = runs(sequences, [one.qpos for one in replays], robot)
-    return done
+        runs_after[step.name] = runs(sequences, [one.qpos for one in replays], robot)
+    return runs_after
 
 
 def _methods(
-    candidate: Candidate, causes: ListOf[GapStep], done: dict[str, list[Run]]
+    candidate: Candidate, causes: ListOf[GapStep], runs_after: dict[str, list[Run]]
 ) -> dict[str, Any]:
     """Return the errors of the methods that some steps are: nominal, identified, …"""
     step_of = {"nominal": "nominal"}
-    if "offset" in done:
+    if "offset" in runs_after:
         step_of["delay_offset"] = "offset"
     if causes:
         step_of["identified"] = causes[-1].name
     if candidate.model is not None:
-        step_of[candidate.method] = list(done)[-1]
-    return {name: errors_of(done[step], candidate.robot) for name, step in step_of.items()}
+        step_of[candidate.method] = list(runs_after)[-1]
+    return {name: errors_of(runs_after[step], candidate.robot) for name, step in step_of.items()}
 
 
 def _floors(
@@ -162,27 +173,27 @@ def _floors(
 
 
 def _by_joint(
-    done: dict[str, list[Run]], floors: dict[str, dict[str, float | None]], robot: RobotSpec
+    runs_after: dict[str, list[Run]], floors: dict[str, dict[str, float | None]], robot: RobotSpec
 ) -> dict[str, Any]:
     """Return the sources of the gap of each joint that was recorded."""
-    last = list(done)[-1]
+    last = list(runs_after)[-1]
     sources = {}
     for column, joint in enumerate(robot.operated):
-        if metrics(done[last], [column]):
-            sources[joint] = _sources(done, floors[joint], [column])
+        if metrics(runs_after[last], [column]):
+            sources[joint] = _sources(runs_after, floors[joint], [column])
     return sources
 
 
 def _by_payload(
-    done: dict[str, list[Run]], sequences: list[Sequence]
+    runs_after: dict[str, list[Run]], sequences: list[Sequence]
 ) -> dict[str, dict[str, float]]:
     """Return payload, kg → step → error, rad."""
     errors: dict[str, dict[str, float]] = {}
     for payload in sorted({sequence.meta.payload_mass for sequence in sequences}):
         left = {}
-        for name, part in done.items():
-            same = [run for run in part if run.meta.payload_mass == payload]
-            left[name] = metrics(same)["mpjae"]
+        for step, runs_of_step in runs_after.items():
+            same = [run for run in runs_of_step if run.meta.payload_mass == payload]
+            left[step] = metrics(same)["mpjae"]
         errors[f"{payload:g}"] = left
     return errors
 
@@ -202,10 +213,16 @@ def _steps(candidate: Candidate, causes: list[GapStep]) -> list[GapStep]:
 
 
 def _sources(
-    done: dict[str, list[Run]], floor: dict[str, float | None], columns: list[int] | None = None
+    runs_after: dict[str, list[Run]],
+    floor: dict[str, float | None],
+    columns: list[int] | None = None,
 ) -> dict[str, Any]:
-    """Return the error after each step, its reductions, the floor, and the error above it, rad."""
-    left = {name: metrics(part, columns)["mpjae"] for name, part in done.items()}
+    """Return the error after each step, its reductions, the floor, and the error above it, rad.
+
+    Args:
+        columns: Only these operated joints, by number; default: all.
+    """
+    left = {step: metrics(part, columns)["mpjae"] for step, part in runs_after.items()}
     least = floor["both"]
     unexplained = None
     if least is not None:
@@ -213,7 +230,7 @@ def _sources(
         unexplained = max(last - least, 0.0)
     return {
         "left": left,
-        "removed": reductions(done, columns),
+        "removed": reductions(runs_after, columns),
         "unexplained": unexplained,
         "floor": floor,
     }
@@ -268,17 +285,17 @@ def _with_cause(
 
 
 def reductions(
-    done: dict[str, list[Run]], columns: list[int] | None = None
+    runs_after: dict[str, list[Run]], columns: list[int] | None = None
 ) -> dict[str, list[float]]:
     """Return the reduction of the error by each step and its standard error over independent
     motions, rad.
     """
-    errors = {}
+    errors = {}  # step → mean |error| of each recording, (recordings,) rad
     metas: list[SequenceMeta] = []
-    for name, part in done.items():
+    for step, part in runs_after.items():
         held = [run for run in part if run.holds(columns)]
-        errors[name] = np.array([run.mean_error(columns) for run in held])
-        metas = metas or [run.meta for run in held]
+        errors[step] = np.array([run.mean_error(columns) for run in held])
+        metas = [run.meta for run in held]  # the same after every step
     removed = {}
     for before, after in pairwise(errors):
         removed[after] = list(mean_reduction(metas, errors[before], errors[after]))
@@ -288,34 +305,46 @@ def reductions(
 def error_floor(
     sequences: Iterable[Sequence], robot: RobotSpec
 ) -> dict[str, dict[str, float | None]]:
-    """Mean |error| that no simulator can remove, by joint: {"encoder", "repeatability", "both"},
-    rad; None if unknown.
+    """Return the mean |error| that no simulator can remove: joint → encoder, repeatability, and
+    both together, rad; None if unknown.
 
     An encoder of step s reads wrong by s/4 on average. A robot that differs from itself by σ from
     one repetition, or from one period of a motion, to the next differs from its own mean by
     √(2/π)·σ on average, encoder included.
     """
+    # What is compared, by motion, unit, payload and rate: whole recordings, and periods.
     groups: dict[Any, Repetitions] = defaultdict(Repetitions)
-    angles: list[Array] = []
-    compared: list[Sequence] = []
+    angles: list[Array] = []  # (T, n operated) rad of each recording
+    first_sequences: list[Sequence] = []
     for sequence in sequences:
-        if len(compared) < MAX_COMPARED:
-            compared.append(sequence)
+        if len(first_sequences) < MAX_COMPARED:
+            first_sequences.append(sequence)
         angles.append(sequence.qpos[:, robot.operated_index])
-        same = (*sequence.meta.repetition_key, round(sequence.dt * 1e6))
-        groups[same].add(sequence)
+        key = (*sequence.meta.repetition_key, round(sequence.dt * 1e6))
+        groups[key, "whole"].add(sequence)
         for period in Repetitions.periods(sequence):
-            groups[*same, "period"].add(period)
+            groups[key, "period"].add(period)
     std = _std_of_repetitions(groups.values(), robot)
     if not std:
-        std = _std_under_several_names(compared, robot)
-    floors: dict[str, dict[str, float | None]] = {}
+        std = _std_of_equal_commands(first_sequences, robot)
+    floors = {}
     for column, joint in enumerate(robot.operated):
-        encoder = encoder_step([angle[:, column] for angle in angles]) / 4 or None
-        repeatability = std[joint] * np.sqrt(2 / np.pi) if joint in std else None
-        both = max(encoder or 0.0, repeatability or 0.0) or None
-        floors[joint] = {"encoder": encoder, "repeatability": repeatability, "both": both}
+        step = encoder_step([angle[:, column] for angle in angles])
+        floors[joint] = _floor(step, std.get(joint))
     return floors
+
+
+def _floor(encoder_step: float, std: float | None) -> dict[str, float | None]:
+    """Return the error that no simulator can remove, rad; None if unknown.
+
+    Args:
+        encoder_step: rad; 0 if unknown.
+        std: Standard deviation among repetitions, rad; None if unknown.
+    """
+    encoder = encoder_step / 4 if encoder_step else None
+    repeatability = None if std is None else std * np.sqrt(2 / np.pi)
+    known = [part for part in (encoder, repeatability) if part]
+    return {"encoder": encoder, "repeatability": repeatability, "both": max(known, default=None)}
 
 
 def _std_of_repetitions(groups: Iterable[Repetitions], robot: RobotSpec) -> dict[str, float]:
@@ -327,10 +356,14 @@ def _std_of_repetitions(groups: Iterable[Repetitions], robot: RobotSpec) -> dict
     return dict(summary["channels"]["qpos"]["joints"])
 
 
-def _std_under_several_names(sequences: list[Sequence], robot: RobotSpec) -> dict[str, float]:
-    """Return joint → standard deviation, rad, among recordings of one command with other names."""
-    differences = repetition_difference(sequences, robot.operated).tolist()
+def _std_of_equal_commands(sequences: list[Sequence], robot: RobotSpec) -> dict[str, float]:
+    """Return joint → standard deviation among recordings of one command under several names, rad;
+    without joints for which there are none.
+
+    The difference of two recordings has √2 times the standard deviation of one.
+    """
     std = {}
+    differences = repetition_difference(sequences, robot.operated).tolist()
     for joint, difference in zip(robot.operated, differences, strict=True):
         if difference:
             std[joint] = difference / np.sqrt(2)

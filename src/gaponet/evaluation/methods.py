@@ -8,7 +8,8 @@ from __future__ import annotations
 
 from gaponet.robot.spec import RobotSpec
 
-METHODS = {  # title, colour
+# Method → title and colour.
+METHODS = {
     "target": ("target", "#00838f"),
     "command": ("command", "#00838f"),
     "recorded": ("recorded", "#111111"),
@@ -46,22 +47,26 @@ def method(kind: str, simulator: RobotSpec) -> str:
     """Return the method of a model: its kind, with identified+ in front where it corrects an
     identified simulator.
     """
-    return (IDENTIFIED if simulator.is_identified else "") + kind
+    return f"{IDENTIFIED}{kind}" if simulator.is_identified else kind
 
 
 def title(method: str) -> str:
     """Return the method's name for people."""
     kind = method.removeprefix(IDENTIFIED)
-    name = METHODS.get(kind, (kind,))[0]
-    return f"{METHODS['identified'][0]} + {name}" if method.startswith(IDENTIFIED) else name
+    name, _ = METHODS.get(kind, (kind, OTHER_COLOUR))
+    if method == kind:
+        return name
+    identification, _ = METHODS["identified"]
+    return f"{identification} + {name}"
 
 
 def colour(method: str) -> str:
     """Return the colour of the method, #rrggbb, darker where it corrects an identified
     simulator.
     """
-    base = METHODS.get(method.removeprefix(IDENTIFIED), ("", OTHER_COLOUR))[1]
-    return shade(base, -0.4) if method.startswith(IDENTIFIED) else base
+    kind = method.removeprefix(IDENTIFIED)
+    _, base = METHODS.get(kind, (kind, OTHER_COLOUR))
+    return base if method == kind else shade(base, -0.4)
 
 
 def shade(base: str, share: float) -> str:
@@ -69,5 +74,8 @@ def shade(base: str, share: float) -> str:
     negative.
     """
     end = 255 if share > 0 else 0
-    parts = (int(base[i : i + 2], 16) for i in (1, 3, 5))
-    return "#" + "".join(f"{round(p + (end - p) * abs(share)):02x}" for p in parts)
+    mixed = "#"
+    for i in (1, 3, 5):  # red, green, blue
+        part = int(base[i : i + 2], 16)
+        mixed += f"{round(part + (end - part) * abs(share)):02x}"
+    return mixed

@@ -39,7 +39,9 @@ Joints = Annotated[dict[str, _JointError], Len(1)]
 Motions = Annotated[dict[str, _Error], Len(1)]
 Payloads = Annotated[dict[Annotated[str, Predicate(_is_number)], _Error], Len(1)]
 Horizons = dict[Annotated[str, Predicate(lambda time: time == "whole" or _is_number(time))], _Error]
-Scores = TypedDict(  # metrics of one method, in total and by group
+# Metrics of one method, in total and by group. Every metric that the report shows stands here, so
+# that the report of a run without it asks for another evaluation.
+Scores = TypedDict(
     "Scores",
     {
         "mpjae": Number,
@@ -162,10 +164,8 @@ def read_trajectories(run: Path, metrics: dict[str, Any], joints: int) -> dict[s
     file = run / "trajectories.npz"
     arrays = read_npz(file, ModelError, REPAIR_HINT)
     for row in range(len(metrics.get("shown", []))):
-        names = [f"{row}/{m}" for m in ("recorded", "command", *metrics["methods"])]
-        shapes = {arrays[name].shape if name in arrays else () for name in names}
-        shape = max(shapes, key=len)
-        if len(shapes) != 1 or len(shape) != 2 or shape[0] < 2 or shape[1] != joints:
+        names = [f"{row}/{name}" for name in ("recorded", "command", *metrics["methods"])]
+        if not _have_one_shape(arrays, names, joints):
             raise ModelError(
                 f"{file}: sequence {row} has arrays of {joints} joints missing or of other sizes; "
                 f"{REPAIR_HINT}"
@@ -173,6 +173,19 @@ def read_trajectories(run: Path, metrics: dict[str, Any], joints: int) -> dict[s
     if not all(a.dtype == np.float32 and np.isfinite(a).all() for a in arrays.values()):
         raise ModelError(f"{file}: holds NaN or other types than float32; {REPAIR_HINT}")
     return arrays
+
+
+def _have_one_shape(arrays: dict[str, Array], names: list[str], joints: int) -> bool:
+    """Return True if all these arrays are there and are (T, joints), with one T of at least 2."""
+    shapes = set[tuple[int, ...]]()
+    for name in names:
+        if name not in arrays or arrays[name].ndim != 2:
+            return False
+        shapes.add(arrays[name].shape)
+    if len(shapes) != 1:
+        return False
+    rows, columns = shapes.pop()
+    return rows >= 2 and columns == joints
 
 
 def read_progress(run: Path) -> list[dict[str, Any]]:

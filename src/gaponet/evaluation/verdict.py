@@ -125,14 +125,17 @@ def _about_network(methods: Scores, own: str) -> str:
 def next_step(
     methods: Scores, dataset: str, folder: Path | None = None, reported: bool = False
 ) -> str:
-    """Return the next command: identify, or export without a useful network, else report.
+    """Return the next command for a person.
+
+    If a network helps, that is its report, and once that exists its export. Without a useful
+    network it is the export of the identified robot, or its identification.
 
     Args:
         methods: Method → its metrics.
         dataset: Dataset, as the command line names it.
         folder: Folder of the identified robot or of the run, or a network of the package by name or
             folder.
-        reported: The report exists; a run's model is exported.
+        reported: The report exists.
     """
     identify = shlex.join(["gaponet", "identify", dataset, "--out", "my_robot"])
     networks = _networks(methods)
