@@ -35,10 +35,10 @@ PERCENTILE_ROWS = 100_000
 NOT_STATED = "not stated"
 # Property → its heading and its value; the card counts sequences by each.
 PROPERTIES: dict[str, tuple[str, Callable[[Entry], str]]] = {
-    "level": ("Level", lambda e: e.meta.level),
-    "payload_kg": ("Payload, kg per hand", lambda e: f"{e.meta.payload_mass:g}"),
-    "unit": ("Unit", lambda e: e.meta.unit_id),
-    "rate_hz": ("Rate, Hz", lambda e: f"{1 / e.dt:.2f}".rstrip("0").rstrip(".")),
+    "level": ("Level", lambda entry: entry.meta.level),
+    "payload_kg": ("Payload, kg per hand", lambda entry: f"{entry.meta.payload_mass:g}"),
+    "unit": ("Unit", lambda entry: entry.meta.unit_id),
+    "rate_hz": ("Rate, Hz", lambda entry: f"{1 / entry.dt:.2f}".rstrip("0").rstrip(".")),
 }
 
 
@@ -49,12 +49,12 @@ def make_card(dataset: Dataset, progress: Progress = no_progress) -> dict[str, A
         DatasetError: It is empty, or a file is damaged.
     """
     dataset.require_sequences()
-    stride = max(1, sum(e.rows for e in dataset.entries) // PERCENTILE_ROWS)
+    stride = max(1, sum(entry.rows for entry in dataset.entries) // PERCENTILE_ROWS)
     stats: dict[str, list[Statistics]] = defaultdict(list)
     samples: dict[str, list[Array]] = defaultdict(list)
     groups: dict[tuple[object, ...], list[Entry]] = defaultdict(list)
-    for e in dataset.entries:
-        groups[*e.meta.repetition_key, round(e.dt, 7)].append(e)
+    for entry in dataset.entries:
+        groups[*entry.meta.repetition_key, round(entry.dt, 7)].append(entry)
     rows_before: Counter[str] = Counter()
     repeated = []
     done = 0
@@ -104,7 +104,7 @@ def beside_paper(dataset: Dataset) -> dict[str, Any]:
 def _counted(dataset: Dataset) -> dict[str, Any]:
     """Return what the journal and dataset.json alone say."""
     collected = dataset.path / "collect.json"
-    recorded = sorted({e.meta.recorded_at for e in dataset.entries} - {""})
+    recorded = sorted({entry.meta.recorded_at for entry in dataset.entries} - {""})
     by_property: dict[str, dict[str, Any]] = {}
     for name, (_, value_of) in PROPERTIES.items():
         groups: dict[str, list[Entry]] = defaultdict(list)
@@ -117,7 +117,7 @@ def _counted(dataset: Dataset) -> dict[str, Any]:
         "name": dataset.path.resolve().name,
         "robot": dataset.robot_name,
         "joints": list(dataset.joint_names),
-        "virtual_sequences": sum(e.meta.virtual for e in dataset.entries),
+        "virtual_sequences": sum(entry.meta.virtual for entry in dataset.entries),
         "licence": dataset.header.get("licence", NOT_STATED),
         "source": dataset.header.get("source", NOT_STATED),
         "recorded": [recorded[0], recorded[-1]] if recorded else NOT_STATED,
@@ -137,9 +137,9 @@ def count_entries(entries: list[Entry]) -> dict[str, float]:
     """Return the number of sequences, hours, frames and motions."""
     return {
         "sequences": len(entries),
-        "hours": sum(e.rows * e.dt for e in entries) / 3600,
-        "frames": sum(e.rows for e in entries),
-        "motions": len({e.meta.motion for e in entries}),
+        "hours": sum(entry.rows * entry.dt for entry in entries) / 3600,
+        "frames": sum(entry.rows for entry in entries),
+        "motions": len({entry.meta.motion for entry in entries}),
     }
 
 

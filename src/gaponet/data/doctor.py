@@ -39,7 +39,7 @@ class DoctorResult:
 
     def count(self, level: str) -> int:
         """Return the number of findings of a level: error, warning or note."""
-        return sum(f.level == level for f in self.findings)
+        return sum(finding.level == level for finding in self.findings)
 
     @property
     def verdict(self) -> str:
@@ -86,17 +86,17 @@ class DoctorResult:
         findings = run_checks(CHECKS, surveys, robot)
         if gravity_model is not None:
             findings += _examine_loads(findings, surveys, robot, gravity_model, dynamics_model)
-        findings.sort(key=lambda f: -LEVELS.index(f.level))
-        rows = tuple(_sequence_row(s, robot) for s in surveys)
+        findings.sort(key=lambda finding: -LEVELS.index(finding.level))
+        rows = tuple(_sequence_row(survey, robot) for survey in surveys)
         return DoctorResult(tuple(findings), rows, tuple(_joint_rows(surveys, robot)))
 
     @staticmethod
     def inventory(dataset: Dataset) -> str:
         """Return the number of sequences, motions and minutes, and the units and payloads."""
-        motions = len({e.meta.motion for e in dataset.entries})
-        units = Counter(e.meta.unit_id for e in dataset.entries)
-        payloads = sorted({e.meta.payload_mass for e in dataset.entries})
-        virtual = sum(e.meta.virtual for e in dataset.entries)
+        motions = len({entry.meta.motion for entry in dataset.entries})
+        units = Counter(entry.meta.unit_id for entry in dataset.entries)
+        payloads = sorted({entry.meta.payload_mass for entry in dataset.entries})
+        virtual = sum(entry.meta.virtual for entry in dataset.entries)
         kind = f", {virtual} of them VIRTUAL" if virtual else ""
         return (
             f"{len(dataset)} recordings{kind}, {motions} motions, {dataset.hours() * 60:.1f} min; "
@@ -114,13 +114,13 @@ def _examine_loads(
     """Compare torques and static poses with gravity, unless another error would cause these
     findings too.
     """
-    errors = [f.check for f in findings if f.level == "error"]
+    errors = [finding.check for finding in findings if finding.level == "error"]
     result = list[Finding]()
     if dynamics is not None and not errors:
         result += arrangement(surveys, robot, dynamics)
-    if any(f.level == "warning" for f in result):  # wrong names would cause findings of the others
+    if _warns(result):  # wrong names would cause findings of the others
         return result
-    errors += [f.check for f in findings if "slope" in f.values]
+    errors += [finding.check for finding in findings if "slope" in finding.values]
     if errors:
         text = (
             "zeros, offsets, gains and payloads are judged by gravity once this is mended: "
@@ -130,24 +130,28 @@ def _examine_loads(
     by_commands = () if driven_by_torque(surveys) else (feedforward, static_checks)
     for check in (gravity, *by_commands):
         result += check(surveys, robot, model)
-        if any(f.level == "warning" for f in result):  # it would cause findings of the next
+        if _warns(result):  # it would cause findings of the next
             break
     return result
 
 
-def _sequence_row(s: Survey, robot: RobotSpec) -> dict[str, Any]:
-    lags = {name: round(x[0], 4) for name, x in fast_lags([s], robot).items()}
-    meta = s.entry.meta
+def _warns(findings: list[Finding]) -> bool:
+    return any(finding.level == "warning" for finding in findings)
+
+
+def _sequence_row(survey: Survey, robot: RobotSpec) -> dict[str, Any]:
+    lags = {name: round(x[0], 4) for name, x in fast_lags([survey], robot).items()}
+    meta = survey.entry.meta
     return {
         "motion": meta.motion,
         "unit": meta.unit_id,
         "payload_mass": meta.payload_mass,
         "repetition": meta.repetition,
-        "rows": s.entry.rows,
-        "seconds": round(s.entry.rows * s.entry.dt, 2),
-        "rate_hz": round(s.rate_hz, 2),
-        "jitter_ms": s.jitter_ms,
-        "longest_gap_ms": s.longest_gap_ms,
+        "rows": survey.entry.rows,
+        "seconds": round(survey.entry.rows * survey.entry.dt, 2),
+        "rate_hz": round(survey.rate_hz, 2),
+        "jitter_ms": survey.jitter_ms,
+        "longest_gap_ms": survey.longest_gap_ms,
         "rows_are": meta.notes.get("rows", ""),
         "fast_lag_s": lags,
     }
@@ -156,8 +160,9 @@ def _sequence_row(s: Survey, robot: RobotSpec) -> dict[str, Any]:
 def _joint_rows(surveys: list[Survey], robot: RobotSpec) -> list[dict[str, Any]]:
     lags = fast_lags(surveys, robot)
     errors = static_errors(surveys, robot)
-    ctrl = np.array([s.ctrl_limits for s in surveys])  # (sequences, n, 2)
-    qpos = np.array([s.qpos_limits for s in surveys])
+    ctrl = np.array([survey.ctrl_limits for survey in surveys])  # (sequences, n, 2)
+    qpos = np.array([survey.qpos_limits for survey in surveys])
+    torques = [survey.torque for survey in surveys if survey.torque]
     rows = []
     for i, name in enumerate(robot.joint_names):
         error = errors.get(name)
@@ -171,7 +176,7 @@ def _joint_rows(surveys: list[Survey], robot: RobotSpec) -> list[dict[str, Any]]
                 "static_error_rad": error.middle if error and np.isfinite(error.middle) else None,
                 "stiction_band_rad": error.half_band if error and error.balanced else None,
                 "rests": error.up + error.down if error else 0,
-                "torque_spikes": sum(int(s.torque.spikes[i]) for s in surveys if s.torque),
+                "torque_spikes": sum(int(torque.spikes[i]) for torque in torques),
             }
         )
     return rows

@@ -61,24 +61,26 @@ class ImportResult:
 
     def fast_lags(self, joint: str) -> list[float]:
         """Lags of a joint in the sequences that command it fast, s."""
-        measured = [{name: x.get(joint) for name, x in e.findings.items()} for e in self.entries]
-        lags = [
-            x.get("delay_s") for x in measured if (x.get("fast_speed") or 0) >= FAST_COMMAND_RAD_S
-        ]
-        return [lag for lag in lags if lag is not None]
+        lags = []
+        for entry in self.entries:
+            speed = entry.findings.get("fast_speed", {}).get(joint) or 0.0
+            lag = entry.findings.get("delay_s", {}).get(joint)
+            if speed >= FAST_COMMAND_RAD_S and lag is not None:
+                lags.append(lag)
+        return lags
 
     def to_dict(self) -> dict[str, Any]:
         """Return the result as plain data."""
         offsets = self.offsets or {}
         return {
             "dataset": str(self.dataset.path),
-            "imported": [e.id for e in self.added],
-            "present": [e.id for e in self.present],
+            "imported": [entry.id for entry in self.added],
+            "present": [entry.id for entry in self.present],
             "sequences": len(self.dataset),
-            "minutes": sum(e.rows * e.dt for e in self.entries) / 60,
-            "rate_hz": sorted({round(1 / e.dt, 2) for e in self.entries}),
+            "minutes": sum(entry.rows * entry.dt for entry in self.entries) / 60,
+            "rate_hz": sorted({round(1 / entry.dt, 2) for entry in self.entries}),
             "fast_lag_s": {joint: self.fast_lags(joint) for joint in self.robot.operated},
-            "delay_s": {e.id: e.findings.get("delay_s", {}) for e in self.entries},
+            "delay_s": {entry.id: entry.findings.get("delay_s", {}) for entry in self.entries},
             "offsets": {name: vars(joint) for name, joint in offsets.items()},
             "offsets_applied": False,
             "cut": list(self.cut),
@@ -151,7 +153,7 @@ def import_logs(
             added, present = source.write(dataset, poses if gravity else None)
         offsets: dict[str, dict[str, JointOffset]] = {}  # unit → joint → offset
         if gravity is not None:
-            for unit in dict.fromkeys(e.meta.unit_id for e in (*present, *added)):
+            for unit in dict.fromkeys(entry.meta.unit_id for entry in (*present, *added)):
                 offsets[unit] = unit_offsets(dataset, robot, unit, gravity, poses)
         for unit, of_unit in offsets.items():
             record_offsets(dataset, unit, of_unit, simulator)
@@ -230,7 +232,7 @@ class _Source:
         if self.provenance and not dataset.entries:
             dataset.set_provenance(**self.provenance)
         present = [entry for content_hash in self.hashes if (entry := dataset.find(content_hash))]
-        repetitions = Counter(e.meta.repetition_key for e in dataset.entries)
+        repetitions = Counter(entry.meta.repetition_key for entry in dataset.entries)
         sequences = self.held if self.held is not None else (s for s, _ in self.sequences())
         added = []
         with dataset.appending():
@@ -362,7 +364,7 @@ def _refuse_relabelled(sequence: Sequence, existing: Dataset) -> None:
     wrong.
     """
     meta = sequence.meta
-    same_length = [e.meta for e in existing.entries if e.rows == len(sequence)]
+    same_length = [entry.meta for entry in existing.entries if entry.rows == len(sequence)]
     for unit, mass, side in {(m.unit_id, m.payload_mass, m.payload_side) for m in same_length}:
         other = replace(meta, unit_id=unit, payload_mass=mass, payload_side=side)
         entry = existing.find(replace(sequence, meta=other).content_hash())

@@ -77,15 +77,15 @@ def count_as_paper(dataset: Dataset) -> DatasetCounts:
     """
     dataset.require_sequences()
     entries = dataset.entries
-    repetitions = Counter((e.meta.repetition_key, round(e.dt, 7)) for e in entries)
+    repetitions = Counter((entry.meta.repetition_key, round(entry.dt, 7)) for entry in entries)
     return DatasetCounts(
         hours=dataset.hours(),
         sequences=len(entries),
-        frames=sum(e.rows for e in entries),
-        units=len({e.meta.unit_id for e in entries}),
+        frames=sum(entry.rows for entry in entries),
+        units=len({entry.meta.unit_id for entry in entries}),
         joints=len(load_stored_robot(dataset.path, dataset.robot_name).operated),
-        payloads_kg=tuple(sorted({e.meta.payload_mass for e in entries})),
-        rates_hz=tuple(sorted({round(1 / e.dt, 2) for e in entries})),
+        payloads_kg=tuple(sorted({entry.meta.payload_mass for entry in entries})),
+        rates_hz=tuple(sorted({round(1 / entry.dt, 2) for entry in entries})),
         repetitions=max(repetitions.values()),
         signals=len(common_signals(entries)),
     )
@@ -95,7 +95,7 @@ def common_signals(entries: Iterable[Entry]) -> tuple[str, ...]:
     """Return the channels that every sequence stores, without the command, in the order of
     ARRAYS.
     """
-    stored = [set(e.channels) for e in entries]
+    stored = [set(entry.channels) for entry in entries]
     return tuple(name for name in ARRAYS if name != COMMAND and all(name in s for s in stored))
 
 

@@ -32,11 +32,11 @@ Splits = dict[str, list[Entry]]
 FORMAT = 1
 SPLITS = ("train", "val", "test")
 PROPERTIES: dict[str, Callable[[Entry], str]] = {
-    "motion": lambda e: e.meta.motion,
-    "unit": lambda e: e.meta.unit_id,
-    "payload": lambda e: f"{e.meta.payload_mass:g}",
-    "repetition": lambda e: str(e.meta.repetition),
-    "time": lambda e: f"{e.meta.notes.get('from_s', 0.0):g}",
+    "motion": lambda entry: entry.meta.motion,
+    "unit": lambda entry: entry.meta.unit_id,
+    "payload": lambda entry: f"{entry.meta.payload_mass:g}",
+    "repetition": lambda entry: str(entry.meta.repetition),
+    "time": lambda entry: f"{entry.meta.notes.get('from_s', 0.0):g}",
 }
 ORDERED = ("repetition", "time")  # properties of which the last values are held out
 MIN_MOTIONS = 3  # one for each split
@@ -112,15 +112,16 @@ def split_entries(
         for name in ("train", "val"):
             splits[name] = _not_held_out(splits[name], holdout_units, holdout_payloads)
         return splits
-    motions = _split_by_joints(
-        {canonical[e.meta.motion]: frozenset(e.meta.unrecorded) for e in dataset.entries}
-    )
+    unrecorded: dict[str, frozenset[str]] = {}
+    for entry in dataset.entries:
+        unrecorded[canonical[entry.meta.motion]] = frozenset(entry.meta.unrecorded)
+    motions = _split_by_joints(unrecorded)
     training_motions = max(1, round(train_share * len(motions["train"])))
     motions["train"] = motions["train"][:training_motions]
-    entries = [e for e in dataset.entries if not rates or _has_rate(e, rates)]
+    entries = [entry for entry in dataset.entries if not rates or _has_rate(entry, rates)]
     splits = {}
     for name in SPLITS:
-        chosen = [e for e in entries if canonical[e.meta.motion] in motions[name]]
+        chosen = [entry for entry in entries if canonical[entry.meta.motion] in motions[name]]
         if name != "test":
             chosen = _not_held_out(chosen, holdout_units, holdout_payloads)
         splits[name] = chosen
@@ -148,7 +149,7 @@ def _require_share(train_share: float) -> None:
 def _repeats_few_motions(dataset: Dataset, canonical: dict[str, str]) -> bool:
     """Return True if there are too few motions to split, but one has as many repetitions."""
     repetitions = Counter(
-        (canonical[e.meta.motion], *e.meta.repetition_key[1:]) for e in dataset.entries
+        (canonical[entry.meta.motion], *entry.meta.repetition_key[1:]) for entry in dataset.entries
     )
     motions = set(canonical.values())
     return len(motions) < MIN_MOTIONS <= max(repetitions.values(), default=0)
@@ -162,22 +163,23 @@ def _not_held_out(
     entries: list[Entry], units: tuple[str, ...], payloads: tuple[float, ...]
 ) -> list[Entry]:
     """Return the entries that have none of the held-out units and payloads."""
-    return [
-        e for e in entries if e.meta.unit_id not in units and e.meta.payload_mass not in payloads
-    ]
+    of_units = [entry for entry in entries if entry.meta.unit_id not in units]
+    return [entry for entry in of_units if entry.meta.payload_mass not in payloads]
 
 
 def _require_present(
     dataset: Dataset, units: tuple[str, ...], payloads: tuple[float, ...], rates: tuple[float, ...]
 ) -> None:
-    known_units = sorted({e.meta.unit_id for e in dataset.entries})
+    known_units = sorted({entry.meta.unit_id for entry in dataset.entries})
     if missing_units := [u for u in units if u not in known_units]:
         raise UsageError(
             f"unit '{missing_units[0]}' is not in {dataset.path}; it holds {', '.join(known_units)}"
         )
+    known_payloads = {entry.meta.payload_mass for entry in dataset.entries}
+    known_rates = {round(1 / entry.dt, 2) for entry in dataset.entries}
     for wanted, known, text, tolerance in (
-        (payloads, {e.meta.payload_mass for e in dataset.entries}, "with {:g} kg", 0.0),
-        (rates, {round(1 / e.dt, 2) for e in dataset.entries}, "at {:g} Hz", RATE_TOLERANCE),
+        (payloads, known_payloads, "with {:g} kg", 0.0),
+        (rates, known_rates, "at {:g} Hz", RATE_TOLERANCE),
     ):
         if missing := [x for x in wanted if not any(abs(x - k) <= tolerance * x for k in known)]:
             present = ", ".join(f"{k:g}" for k in sorted(known))
@@ -259,7 +261,7 @@ def make_split(dataset: Dataset, by: str, holdout: tuple[str, ...] = ()) -> Spli
 
     key = motion_of if by == "motion" else PROPERTIES[by]
     held_out = _held_out_values(dataset, by, holdout, key)
-    rest = [e for e in dataset.entries if key(e) not in held_out]
+    rest = [entry for entry in dataset.entries if key(entry) not in held_out]
     if by in ORDERED:
         val_key = key
         val_values = {max(map(key, rest), key=float)} if rest else set()
@@ -268,9 +270,9 @@ def make_split(dataset: Dataset, by: str, holdout: tuple[str, ...] = ()) -> Spli
         val_key = motion_of
         val_values = set(hash_order(map(motion_of, rest))[:count])
     splits = {
-        "train": [e for e in rest if val_key(e) not in val_values],
-        "val": [e for e in rest if val_key(e) in val_values],
-        "test": [e for e in dataset.entries if key(e) in held_out],
+        "train": [entry for entry in rest if val_key(entry) not in val_values],
+        "val": [entry for entry in rest if val_key(entry) in val_values],
+        "test": [entry for entry in dataset.entries if key(entry) in held_out],
     }
     empty = [name for name in SPLITS if not splits[name]]
     if empty:
@@ -309,7 +311,7 @@ def _held_out_values(
             "nothing to split"
         )
     if holdout:
-        return {key(e) for e in dataset.entries if PROPERTIES[by](e) in holdout}
+        return {key(entry) for entry in dataset.entries if PROPERTIES[by](entry) in holdout}
     return set(keys[: max(1, round(len(keys) * TEST_SHARE))])
 
 
@@ -408,7 +410,7 @@ def stratified_subset(entries: ListOf[Entry], count: int) -> list[Entry]:
     for turn in itertools.zip_longest(*rotated):
         in_turn += [entry.id for entry in turn if entry is not None]
     chosen = in_turn[:count]
-    return [e for e in entries if e.id in chosen]
+    return [entry for entry in entries if entry.id in chosen]
 
 
 def require_distinct_samples(
@@ -446,9 +448,9 @@ def write_split(dataset: Dataset, splits: Splits, by: str, holdout: tuple[str, .
         "robot": dataset.robot_name,
         "dataset_hash": dataset_hash(dataset.entries),
         "by": by,
-        "held_out": sorted({PROPERTIES[by](e) for e in splits["test"]}),
-        "virtual": any(e.meta.virtual for e in dataset.entries),
-        "parts": {s: {e.id: e.hash for e in splits[s]} for s in SPLITS},
+        "held_out": sorted({PROPERTIES[by](entry) for entry in splits["test"]}),
+        "virtual": any(entry.meta.virtual for entry in dataset.entries),
+        "parts": {s: {entry.id: entry.hash for entry in splits[s]} for s in SPLITS},
     }
     with dataset.writing():
         path.parent.mkdir(exist_ok=True)

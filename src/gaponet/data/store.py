@@ -227,7 +227,7 @@ class Dataset:
 
     def hours(self) -> float:
         """Total recorded time, h."""
-        return sum(e.rows * e.dt for e in self.entries) / 3600
+        return sum(entry.rows * entry.dt for entry in self.entries) / 3600
 
     def find(self, content_hash: str) -> Entry | None:
         """Return the entry with this content hash, if any."""
@@ -240,13 +240,13 @@ class Dataset:
             DatasetError: The dataset has no such motion or unit, or is empty.
         """
         for kind, attribute, wanted in (("motion", "motion", motions), ("unit", "unit_id", units)):
-            present = {getattr(e.meta, attribute) for e in self.entries} if wanted else set()
+            present = {getattr(entry.meta, attribute) for entry in self.entries if wanted}
             if missing := sorted(set(wanted) - present):
                 available = ", ".join(sorted(present)) or "nothing"
                 raise DatasetError(f"{self.path}: no {kind} '{missing[0]}'; it holds: {available}")
         self.require_sequences()
-        chosen = [e for e in self.entries if not motions or e.meta.motion in motions]
-        return [e for e in chosen if not units or e.meta.unit_id in units]
+        chosen = [entry for entry in self.entries if not motions or entry.meta.motion in motions]
+        return [entry for entry in chosen if not units or entry.meta.unit_id in units]
 
     # ---- changes
 
@@ -296,14 +296,17 @@ class Dataset:
         """
         with self.writing():
             for pattern in patterns:
-                if not any(fnmatchcase(e.id, pattern) for e in self.entries):
+                if not any(fnmatchcase(entry.id, pattern) for entry in self.entries):
                     raise DatasetError(
                         f"{self.path}: no sequence '{pattern}'; {JOURNAL} in it lists the ids"
                     )
-            removed = [e for e in self.entries if any(fnmatchcase(e.id, p) for p in patterns)]
+            removed = []
+            for entry in self.entries:
+                if any(fnmatchcase(entry.id, pattern) for pattern in patterns):
+                    removed.append(entry)
             with atomic_write(self.path / JOURNAL) as temporary:
                 temporary.write_bytes(
-                    b"".join(e.line + b"\n" for e in self.entries if e not in removed)
+                    b"".join(entry.line + b"\n" for entry in self.entries if entry not in removed)
                 )
             for entry in removed:  # if this is cut short, the files that remain are not listed
                 self._file(entry).unlink(missing_ok=True)
@@ -328,7 +331,8 @@ class Dataset:
         self, entries: list[Entry] | None = None, optional: bool = True
     ) -> list[Sequence]:
         """Load sequences, all by default; each as `read`."""
-        return [self.read(e, optional) for e in (self.entries if entries is None else entries)]
+        chosen = self.entries if entries is None else entries
+        return [self.read(entry, optional) for entry in chosen]
 
     def has_replay(self, entry: Entry, model: str) -> bool:
         """True if a replay of the sequence by the simulator with this model hash is stored."""
@@ -372,4 +376,5 @@ def entry_id(meta: SequenceMeta, content_hash: str) -> str:
 
 def dataset_hash(entries: list[Entry]) -> str:
     """Return the identity of a set of recordings in any order, 12 hex digits."""
-    return hashlib.sha256("".join(sorted(e.hash for e in entries)).encode()).hexdigest()[:12]
+    hashes = sorted(entry.hash for entry in entries)
+    return hashlib.sha256("".join(hashes).encode()).hexdigest()[:12]

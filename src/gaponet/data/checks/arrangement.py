@@ -68,11 +68,11 @@ class _Motion:
     def __init__(self, surveys: list[Survey], robot: RobotSpec, model: Dynamics) -> None:
         parts: list[Array] = []
         payloads: list[Payload] = []
-        for s in surveys:
-            if s.movement is not None:
-                parts.append(s.movement)
-                payload = (s.entry.meta.payload_mass, s.entry.meta.payload_side)
-                payloads += [payload] * s.movement.shape[1]
+        for survey in surveys:
+            if survey.movement is not None:
+                parts.append(survey.movement)
+                payload = (survey.entry.meta.payload_mass, survey.entry.meta.payload_side)
+                payloads += [payload] * survey.movement.shape[1]
         rows = np.concatenate(parts, axis=1).astype(float)
         step = -(-rows.shape[1] // MAX_ROWS)
         self.qpos, self.qvel, self.qacc, torque, error, *target = rows[:, ::step]
@@ -138,7 +138,10 @@ class _Motion:
 def arrangement(surveys: list[Survey], robot: RobotSpec, model: Dynamics) -> Iterator[Finding]:
     """Would the joints fit the model better under other names?"""
     by_range = _by_range(surveys, robot)
-    if sum(s.movement.shape[1] for s in surveys if s.movement is not None) < MIN_ROWS:
+    if (
+        sum(survey.movement.shape[1] for survey in surveys if survey.movement is not None)
+        < MIN_ROWS
+    ):
         yield from by_range
         return
     motion = _Motion(surveys, robot, model)
@@ -251,8 +254,8 @@ def _one_joint_explains(
 
 def _by_range(surveys: list[Survey], robot: RobotSpec) -> list[Finding]:
     """Find exchanges that bring positions far outside of their joints' ranges inside."""
-    low = np.min([s.qpos_limits[:, 0] for s in surveys], axis=0)
-    high = np.max([s.qpos_limits[:, 1] for s in surveys], axis=0)
+    low = np.min([survey.qpos_limits[:, 0] for survey in surveys], axis=0)
+    high = np.max([survey.qpos_limits[:, 1] for survey in surveys], axis=0)
     judged = [int(j) for j in robot.operated_index if high[j] - low[j] > MIN_MOTION_RAD]
     same = np.arange(len(low))
     beyond = _beyond(low, high, same, robot)

@@ -35,18 +35,19 @@ def _joined(parts: list[Iterable[str]]) -> tuple[str, ...]:
 
 
 def _motions(surveys: list[Survey]) -> str:
-    return abbreviate([s.motion for s in surveys])
+    return abbreviate([survey.motion for survey in surveys])
 
 
 def _rate(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     """At which rate was each sequence recorded?"""
     rates: Counter[float] = Counter()
-    for s in surveys:
-        uneven = s.uneven_ms * s.rate_hz / 1e3  # of a period; a median of such periods scatters
+    for survey in surveys:
+        # of a period; a median of such periods scatters
+        uneven = survey.uneven_ms * survey.rate_hz / 1e3
         near = 0.01 + 0.1 * uneven
-        rates[next((r for r in rates if abs(r - s.rate_hz) < near * r), s.rate_hz)] += 1
+        rates[next((r for r in rates if abs(r - survey.rate_hz) < near * r), survey.rate_hz)] += 1
     text = ", ".join(f"{count} at {r:.2f} Hz ({1e3 / r:.2f} ms)" for r, count in rates.items())
-    deviation = max(abs(s.rate_hz * robot.dt - 1) for s in surveys)
+    deviation = max(abs(survey.rate_hz * robot.dt - 1) for survey in surveys)
     level = "ok"
     if len(rates) > 1:
         level = "warning"
@@ -55,20 +56,19 @@ def _rate(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     if deviation > 0.001:
         text += f"; robot.toml says {1 / robot.dt:.2f} Hz; the recorded rate is used"
     yield Finding(level, "rate", text, values={f"{r:.2f}": count for r, count in rates.items()})
-    resampled = [
-        s.motion for s in surveys if "resampled" in str(s.entry.meta.notes.get("rows", ""))
-    ]
+    resampled = [survey for survey in surveys if _is_resampled(survey)]
     if resampled:
-        yield Finding(
-            "note",
-            "rate",
-            f"{len(resampled)} sequence(s) were put on a uniform grid: {abbreviate(resampled)}",
-        )
+        text = f"{len(resampled)} sequence(s) were put on a uniform grid: {_motions(resampled)}"
+        yield Finding("note", "rate", text)
+
+
+def _is_resampled(survey: Survey) -> bool:
+    return "resampled" in str(survey.entry.meta.notes.get("rows", ""))
 
 
 def _regularity(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     """How evenly was it sampled, and what is missing?"""
-    jitter = [s.jitter_ms * s.rate_hz / 1e3 for s in surveys]  # of a period
+    jitter = [survey.jitter_ms * survey.rate_hz / 1e3 for survey in surveys]  # of a period
     worst = surveys[int(np.argmax(jitter))]
     level = "warning"
     if max(jitter) <= MAX_JITTER[0]:
@@ -77,15 +77,15 @@ def _regularity(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
         level = "note"
     where = f" ({worst.motion})" if worst.jitter_ms else ""
     text = f"periods deviate from their median by at most {worst.jitter_ms:.2f} ms{where}"
-    unknown = 2 * max(s.uneven_ms for s in surveys)
+    unknown = 2 * max(survey.uneven_ms for survey in surveys)
     if level == "warning" and unknown:
         text += (
             f". Delays shorter than {unknown:.0f} ms cannot be told between such rows; log at an "
             "even rate"
         )
     yield Finding(level, "jitter", text, values={"jitter_ms": worst.jitter_ms})
-    longest = max(surveys, key=lambda s: s.longest_gap_ms)
-    gaps = [s for s in surveys if s.missing_samples]
+    longest = max(surveys, key=lambda survey: survey.longest_gap_ms)
+    gaps = [survey for survey in surveys if survey.missing_samples]
     if not gaps:
         yield Finding(
             "ok", "gaps", f"no samples missing; longest period {longest.longest_gap_ms:.2f} ms"
@@ -101,18 +101,18 @@ def _regularity(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
 def _jumps(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     """Is the state somewhere that no joint can reach and leave in one period?"""
     for i, name in enumerate(robot.joint_names):
-        hit = [s for s in surveys if s.jump_rows[i] > s.zero_rows]
+        hit = [survey for survey in surveys if survey.jump_rows[i] > survey.zero_rows]
         if hit:
-            rows = sum(int(s.jump_rows[i]) for s in hit)
+            rows = sum(int(survey.jump_rows[i]) for survey in hit)
             text = (
                 f"{name} jumps and comes back faster than any motor in {rows} rows of "
                 f"{_motions(hit)}: a misread sample or a wrap of the encoder; repair or cut these "
                 "rows"
             )
             yield Finding("warning", "jumps", text, (name,), {"rows": rows})
-    dropped = [s for s in surveys if s.zero_rows]
+    dropped = [survey for survey in surveys if survey.zero_rows]
     if dropped:
-        rows = sum(s.zero_rows for s in dropped)
+        rows = sum(survey.zero_rows for survey in dropped)
         text = (
             f"all joints are exactly 0 for {rows} rows of {_motions(dropped)}, and far from it a "
             "row before or after: nothing was read there; repair or cut these rows"
@@ -123,11 +123,11 @@ def _jumps(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
 def _nonsense(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     """Were impossible values of a channel replaced at import?"""
     by_channel: dict[str, list[Survey]] = defaultdict(list)
-    for s in surveys:
-        for channel in s.entry.meta.notes.get("nonsense", {}):
-            by_channel[channel].append(s)
+    for survey in surveys:
+        for channel in survey.entry.meta.notes.get("nonsense", {}):
+            by_channel[channel].append(survey)
     for channel, hit in by_channel.items():
-        notes = [s.entry.meta.notes["nonsense"][channel] for s in hit]
+        notes = [survey.entry.meta.notes["nonsense"][channel] for survey in hit]
         rows = sum(n["rows"] for n in notes)
         done = ", ".join(dict.fromkeys(n["done"] for n in notes))
         joints = _joined([n["joints"] for n in notes])
@@ -141,10 +141,10 @@ def _nonsense(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
 
 def _repeated_rows(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     """Were rows that the logger wrote twice left out at import?"""
-    hit = [s for s in surveys if "repeated" in s.entry.meta.notes]
+    hit = [survey for survey in surveys if "repeated" in survey.entry.meta.notes]
     if not hit:
         return
-    rows = sum(s.entry.meta.notes["repeated"]["rows"] for s in hit)
+    rows = sum(survey.entry.meta.notes["repeated"]["rows"] for survey in hit)
     text = (
         f"{rows} rows of {_motions(hit)} repeat the row before within a fraction of a period: the "
         "logger wrote them twice, and they were left out at import"
@@ -155,24 +155,26 @@ def _repeated_rows(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]
 def _as_logged(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     """What was held, left out, continued or cut at import?"""
     for key, of_channel in (("slower", _slower), ("absent", _absent), ("turns", _turns)):
-        hit = [s for s in surveys if key in s.entry.meta.notes]
-        for name in _joined([s.entry.meta.notes[key] for s in hit]):
-            yield of_channel(name, [s for s in hit if name in s.entry.meta.notes[key]])
-    cut = [
-        s for s in surveys if s.entry.meta.notes.get("rows_cut", 0) > MAX_CUT_SHARE * s.entry.rows
-    ]
+        hit = [survey for survey in surveys if key in survey.entry.meta.notes]
+        for name in _joined([survey.entry.meta.notes[key] for survey in hit]):
+            yield of_channel(name, [one for one in hit if name in one.entry.meta.notes[key]])
+    cut = [survey for survey in surveys if _rows_cut(survey) > MAX_CUT_SHARE * survey.entry.rows]
     if cut:
-        rows = sum(s.entry.meta.notes["rows_cut"] for s in cut)
+        rows = sum(_rows_cut(survey) for survey in cut)
+        left = sum(survey.entry.rows for survey in cut)
         text = (
-            f"--skip-bad cut {rows} rows of {_motions(cut)}, and left "
-            f"{sum(s.entry.rows for s in cut)}: what moved there is interpolated. Look at the "
-            "lines that import listed, and repair their cause"
+            f"--skip-bad cut {rows} rows of {_motions(cut)}, and left {left}: what moved there is "
+            "interpolated. Look at the lines that import listed, and repair their cause"
         )
         yield Finding("warning", "cut", text, values={"rows": rows})
 
 
+def _rows_cut(survey: Survey) -> int:
+    return int(survey.entry.meta.notes.get("rows_cut", 0))
+
+
 def _slower(channel: str, hit: list[Survey]) -> Finding:
-    notes = [s.entry.meta.notes["slower"][channel] for s in hit]
+    notes = [survey.entry.meta.notes["slower"][channel] for survey in hit]
     filled = "held" if channel in COMMANDS else "interpolated"
     rows = sum(n["rows"] for n in notes)
     text = (
@@ -183,7 +185,7 @@ def _slower(channel: str, hit: list[Survey]) -> Finding:
 
 
 def _absent(channel: str, hit: list[Survey]) -> Finding:
-    joints = _joined([s.entry.meta.notes["absent"][channel] for s in hit])
+    joints = _joined([survey.entry.meta.notes["absent"][channel] for survey in hit])
     text = (
         f"{channel} of {abbreviate(list(joints))} is empty in all rows of {_motions(hit)}: "
         f"{channel} is left out"
@@ -192,7 +194,7 @@ def _absent(channel: str, hit: list[Survey]) -> Finding:
 
 
 def _turns(joint: str, hit: list[Survey]) -> Finding:
-    notes = [s.entry.meta.notes["turns"][joint] for s in hit]
+    notes = [survey.entry.meta.notes["turns"][joint] for survey in hit]
     text = (
         f"{joint} turns on: {sum(n['wraps'] for n in notes)} jumps by a whole turn in "
         f"{_motions(hit)} were continued"
@@ -204,18 +206,19 @@ def _turns(joint: str, hit: list[Survey]) -> Finding:
 
 def _blocked(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     """Did a joint run into a stop, or were all of them held?"""
-    held = [s for s in surveys if s.standstill_s >= MIN_STANDSTILL_S]
+    held = [survey for survey in surveys if survey.standstill_s >= MIN_STANDSTILL_S]
     if held:
-        seconds = max(s.standstill_s for s in held)
+        seconds = max(survey.standstill_s for survey in held)
         text = (
             f"all joints stand still for up to {seconds:.1f} s while their commands move on in "
             f"{_motions(held)}: an emergency stop, brakes, or drives that were off; cut it out"
         )
         yield Finding("warning", "stop", text, (), {"seconds": seconds})
     for i, name in enumerate(robot.joint_names):
-        hit = [s for s in surveys if s.blocked_s[i] >= MIN_BLOCKED_S and s not in held]
+        blocked = [survey for survey in surveys if survey.blocked_s[i] >= MIN_BLOCKED_S]
+        hit = [survey for survey in blocked if survey not in held]
         if hit:
-            worst = max(hit, key=lambda s: s.blocked_s[i])
+            worst = max(hit, key=lambda survey: survey.blocked_s[i])
             text = (
                 f"{name} stood at {worst.blocked_at[i]:.2f} rad for {worst.blocked_s[i]:.1f} s, "
                 f"far from its command, in {_motions(hit)}: a stop, an obstacle, too little "
@@ -235,17 +238,17 @@ def unsigned_torque(recorded: list[tuple[Survey, Torque]], robot: RobotSpec) -> 
         return ()
     low = np.min([t.low for _, t in recorded], axis=0)
     high = np.max([t.high for _, t in recorded], axis=0)
-    alive = (np.max([s.qpos_range for s, _ in recorded], axis=0) > 0.05) & (low < high)
+    alive = (np.max([survey.qpos_range for survey, _ in recorded], axis=0) > 0.05) & (low < high)
     return () if (alive & (low < 0)).any() else masked_names(robot, alive)
 
 
 def _saturation(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     """Did a motor reach its torque limit?"""
-    recorded = [(s, s.torque) for s in surveys if s.torque is not None]
+    recorded = [(survey, survey.torque) for survey in surveys if survey.torque is not None]
     if unsigned_torque(recorded, robot):  # the torque check warns of it
         yield Finding("ok", "saturation", "no signed torque recorded")
         return
-    over = [(s, t) for s, t in recorded if t.over_limit.any()]
+    over = [(survey, t) for survey, t in recorded if t.over_limit.any()]
     if not over:
         ok = Finding(
             "ok", "saturation", "no torque at a limit" if recorded else "no torque recorded"
@@ -255,9 +258,10 @@ def _saturation(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     worst = np.max([np.maximum(-t.low, t.high) for _, t in over], axis=0)  # (n,) N·m
     i = int((worst / robot.effort_limit).argmax())
     rows = sum(int(t.over_limit.sum()) for _, t in over)
+    motions = _motions([survey for survey, _ in over])
     text = (
         f"torque beyond the limit of robot.toml in {rows} rows of "
-        f"{_motions([s for s, _ in over])}; worst {worst[i]:.2f} N·m on {robot.joint_names[i]} "
+        f"{motions}; worst {worst[i]:.2f} N·m on {robot.joint_names[i]} "
         f"(limit {robot.effort_limit[i]:.2f}): a collision, a spike or a wrong limit"
     )
     yield Finding(
@@ -273,12 +277,13 @@ def _flat_torque(recorded: list[tuple[Survey, Torque]], robot: RobotSpec) -> Ite
     """Find torques that are cut off at one value below the limit of robot.toml."""
     for i, name in enumerate(robot.joint_names):
         top = max((max(-float(t.low[i]), float(t.high[i])) for _, t in recorded), default=0.0)
-        near = [(s, t) for s, t in recorded if max(-t.low[i], t.high[i]) > 0.999 * top]
+        near = [(survey, t) for survey, t in recorded if max(-t.low[i], t.high[i]) > 0.999 * top]
         rows = sum(int(t.flat[i]) for _, t in near)
         if top > MIN_FLAT_SHARE * robot.effort_limit[i] and rows >= MIN_FLAT_ROWS:
+            motions = _motions([survey for survey, _ in near])
             text = (
                 f"torque of {name} is cut off flat at {top:.3g} N·m in {rows} rows of "
-                f"{_motions([s for s, _ in near])}: the motor or its driver gives no more. Write "
+                f"{motions}: the motor or its driver gives no more. Write "
                 f"effort_limit = {top:.3g} in robot.toml, or leave these recordings out"
             )
             yield Finding("warning", "saturation", text, (name,), {"rows": rows, "limit": top})
@@ -286,7 +291,7 @@ def _flat_torque(recorded: list[tuple[Survey, Torque]], robot: RobotSpec) -> Ite
 
 def _resolution(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     """Are positions recorded finely enough?"""
-    step = np.max([s.resolution for s in surveys], axis=0)
+    step = np.max([survey.resolution for survey in surveys], axis=0)
     ratio = np.radians(step) / np.median(step[step > 0]) if step.any() else np.zeros_like(step)
     degrees = masked_names(robot, np.abs(ratio - 1) < RESOLUTION_TOLERANCE)
     if degrees and len(degrees) < (step > 0).sum() / 2:
@@ -315,8 +320,8 @@ def _resolution(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
 def _stuck(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     """Does every channel change when it should?"""
     for i, name in enumerate(robot.joint_names):
-        moved = [s for s in surveys if s.ctrl_range[i] > MIN_COMMANDED_RAD]
-        still = [s for s in moved if _stands_still(s, i)]
+        moved = [survey for survey in surveys if survey.ctrl_range[i] > MIN_COMMANDED_RAD]
+        still = [survey for survey in moved if _stands_still(survey, i)]
         if still:
             text = (
                 f"{name} does not move when commanded in {_motions(still)}: unplugged, torque off "
@@ -324,9 +329,9 @@ def _stuck(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
             )
             level = "error" if len(still) == len(moved) else "warning"
             yield Finding(level, "stuck", text, (name,))
-        repeated = [s for s in _repeating(surveys, i) if s not in still]
-        if repeated and not any(s.all_repeated_s > MIN_REPEATED_S for s in repeated):
-            seconds = max(s.repeated_s[i] for s in repeated)
+        repeated = [survey for survey in _repeating(surveys, i) if survey not in still]
+        if repeated and not any(survey.all_repeated_s > MIN_REPEATED_S for survey in repeated):
+            seconds = max(survey.repeated_s[i] for survey in repeated)
             text = (
                 f"{name} repeats one number for up to {seconds:.2f} s while its command moves on "
                 f"in {_motions(repeated)}: it was not read; cut these logs there"
@@ -346,19 +351,20 @@ def _repeating(surveys: list[Survey], i: int) -> list[Survey]:
 
     At a stop, an encoder with coarse steps repeats one number too: _blocked reports that.
     """
-    repeated = [s for s in surveys if s.repeated_s[i] > MIN_REPEATED_S]
-    if any(s.resolution[i] for s in surveys):
-        repeated = [s for s in repeated if not s.blocked_s[i]]
+    repeated = [survey for survey in surveys if survey.repeated_s[i] > MIN_REPEATED_S]
+    if any(survey.resolution[i] for survey in surveys):
+        repeated = [survey for survey in repeated if not survey.blocked_s[i]]
     return repeated
 
 
 def _frozen(surveys: list[Survey]) -> Iterator[Finding]:
     """Find recordings whose whole state repeats itself."""
-    frozen = [s for s in surveys if s.all_repeated_s > MIN_REPEATED_S and not _all_blocked(s)]
+    repeated = [survey for survey in surveys if survey.all_repeated_s > MIN_REPEATED_S]
+    frozen = [survey for survey in repeated if not _all_blocked(survey)]
     if frozen:
         text = (
             "the whole state repeats itself for up to "
-            f"{max(s.all_repeated_s for s in frozen):.2f} s while the command moves in "
+            f"{max(survey.all_repeated_s for survey in frozen):.2f} s while the command moves in "
             f"{_motions(frozen)}: samples were lost; cut the logs there"
         )
         yield Finding("warning", "stuck", text)

@@ -194,24 +194,30 @@ def _order_fault(
 
 def _recorded_torques(surveys: list[Survey]) -> Loads:
     """Return recorded torques in slow rows; none if they are unsigned."""
-    if not any((s.torque.low < 0).any() for s in surveys if s.torque):
+    if not any((survey.torque.low < 0).any() for survey in surveys if survey.torque):
         return {}
-    return _by_payload((s, *s.gravity_samples) for s in surveys if s.gravity_samples is not None)
+    samples = []
+    for survey in surveys:
+        if survey.gravity_samples is not None:
+            qpos, torque = survey.gravity_samples
+            samples.append((survey, qpos, torque))
+    return _by_payload(samples)
 
 
 def _servo_torques(surveys: list[Survey], robot: RobotSpec) -> Loads:
     """Return the torques of the servos at rest, from their distance to the command."""
-    kps = [robot.with_gains(*s.entry.meta.recorded_gains).kp for s in surveys]
-    poses = [s.static_poses for s in surveys]
-    return _by_payload(
-        (s, p.qpos, kp * (p.ctrl - p.qpos)) for s, p, kp in zip(surveys, poses, kps, strict=True)
-    )
+    samples = []
+    for survey in surveys:
+        kp = robot.with_gains(*survey.entry.meta.recorded_gains).kp
+        poses = survey.static_poses
+        samples.append((survey, poses.qpos, kp * (poses.ctrl - poses.qpos)))
+    return _by_payload(samples)
 
 
 def _by_payload(samples: Iterable[tuple[Survey, Array, Array]]) -> Loads:
     parts: dict[Payload, list[tuple[Array, Array]]] = defaultdict(list)
-    for s, qpos, torque in samples:
-        parts[s.entry.meta.payload_mass, s.entry.meta.payload_side].append((qpos, torque))
+    for survey, qpos, torque in samples:
+        parts[survey.entry.meta.payload_mass, survey.entry.meta.payload_side].append((qpos, torque))
     return {
         key: (np.concatenate([q for q, _ in p]), np.concatenate([t for _, t in p]))
         for key, p in parts.items()

@@ -38,7 +38,7 @@ def _lag(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
         return
     every = np.concatenate(list(lags.values()))
     median = float(np.median(every))
-    period = float(np.median([1 / s.rate_hz for s in surveys]))
+    period = float(np.median([1 / survey.rate_hz for survey in surveys]))
     low = every.min()
     high = every.max()
     text = (
@@ -69,7 +69,7 @@ def _lag(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
 
 def _no_lag(surveys: list[Survey]) -> Finding:
     """Say why no lag is known."""
-    if any(np.isfinite(s.copied_rows).any() for s in surveys):
+    if any(np.isfinite(survey.copied_rows).any() for survey in surveys):
         return Finding("ok", "lag", "a command that repeats the state shows no lag")
     text = (
         f"nothing is commanded faster than {FAST_COMMAND_RAD_S} rad/s: lag and stiction "
@@ -88,7 +88,9 @@ def _dead_times(
 
     Only joints with smooth commands: of the others the timing check sees more.
     """
-    sharp = dict(zip(robot.operated, Response.sharp([s.response for s in surveys]), strict=True))
+    sharp = dict(
+        zip(robot.operated, Response.sharp([survey.response for survey in surveys]), strict=True)
+    )
     dead_times = {}
     for name, of_joint in lags.items():
         if name in robot.operated and not sharp[name]:
@@ -140,10 +142,10 @@ def _expected_lag(robot: RobotSpec) -> dict[str, tuple[float, float]]:
 
 def _sag(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     """How far from its command does each joint rest, with the lightest and the heaviest payload?"""
-    payloads = sorted({s.entry.meta.payload_mass for s in surveys})
+    payloads = sorted({survey.entry.meta.payload_mass for survey in surveys})
     errors: dict[float, dict[str, StaticError]] = {}  # payload → joint → error
     for payload in (payloads[0], payloads[-1]):
-        same = [s for s in surveys if s.entry.meta.payload_mass == payload]
+        same = [survey for survey in surveys if survey.entry.meta.payload_mass == payload]
         errors[payload] = static_errors(same, robot)
     largest = {name: max(abs(e[name].middle) for e in errors.values()) for name in robot.operated}
     sagging = [name for name in robot.operated if largest[name] >= MIN_SAG_RAD]
@@ -188,7 +190,7 @@ def _sag_finding(sagging: list[str], errors: dict[float, dict[str, StaticError]]
 
 def _torque(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     """Can the torque signal be trusted?"""
-    recorded = [(s, s.torque) for s in surveys if s.torque is not None]
+    recorded = [(survey, survey.torque) for survey in surveys if survey.torque is not None]
     if not recorded:
         yield Finding(
             "note", "torque", "no torque recorded; equivalent torque comes from inverse dynamics"
@@ -196,7 +198,7 @@ def _torque(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
         return
     low = np.min([t.low for _, t in recorded], axis=0)
     high = np.max([t.high for _, t in recorded], axis=0)
-    used = np.max([s.qpos_range for s, _ in recorded], axis=0) > 0.05
+    used = np.max([survey.qpos_range for survey, _ in recorded], axis=0) > 0.05
     constant = masked_names(robot, used & (low == high))
     unsigned = unsigned_torque(recorded, robot)
     if constant:
@@ -208,7 +210,7 @@ def _torque(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
             "magnitude; do not fit it"
         )
         yield Finding("warning", "torque", text, unsigned)
-    yield from _spikes([(s, t) for s, t in recorded if t.spikes.any()], robot)
+    yield from _spikes([(survey, t) for survey, t in recorded if t.spikes.any()], robot)
 
 
 def _spikes(spiky: list[tuple[Survey, Torque]], robot: RobotSpec) -> Iterator[Finding]:
@@ -219,8 +221,9 @@ def _spikes(spiky: list[tuple[Survey, Torque]], robot: RobotSpec) -> Iterator[Fi
     height = np.array([np.maximum(-t.low, t.high) * (t.spikes > 0) for _, t in spiky])
     k, i = np.unravel_index(height.argmax(), height.shape)
     samples = sum(int(t.spikes.sum()) for _, t in spiky)
+    motions = abbreviate([survey.motion for survey, _ in spiky])
     text = (
-        f"torque spikes: {samples} samples in {abbreviate([s.motion for s, _ in spiky])}; "
+        f"torque spikes: {samples} samples in {motions}; "
         f"worst {height[k, i]:.2f} N·m on {robot.joint_names[i]} in {spiky[k][0].motion}"
     )
     values = {"samples": samples, "worst": height[k, i]}
@@ -233,7 +236,7 @@ def fast_lags(surveys: list[Survey], robot: RobotSpec) -> dict[str, Array]:
     """
     lags = {}
     for i, name in enumerate(robot.joint_names):
-        known = [float(s.delay[i]) for s in surveys if _shows_fast_lag(s, i)]
+        known = [float(survey.delay[i]) for survey in surveys if _shows_fast_lag(survey, i)]
         if known:
             lags[name] = np.array(known)
     return lags
@@ -258,7 +261,7 @@ def lag_values(lags: Array) -> dict[str, float]:
 
 def static_errors(surveys: list[Survey], robot: RobotSpec) -> dict[str, StaticError]:
     """Return the static error of each operated joint over all static poses."""
-    poses = StaticPoses.joined([s.static_poses for s in surveys], len(robot.joint_names))
+    poses = StaticPoses.joined([survey.static_poses for survey in surveys], len(robot.joint_names))
     return {
         name: poses.static_error(j)
         for name, j in zip(robot.operated, robot.operated_index, strict=True)

@@ -167,9 +167,9 @@ def _wrong_gains(softness: dict[str, float]) -> Finding:
 
 def _collect(surveys: list[Survey], robot: RobotSpec, model: Gravity) -> _Poses:
     parts = [(np.zeros(0, int), np.zeros(0, int), np.zeros(0), np.zeros((0, 4)), np.zeros(0))]
-    for number, s in enumerate(surveys):
-        meta = s.entry.meta
-        poses = s.static_poses
+    for number, survey in enumerate(surveys):
+        meta = survey.entry.meta
+        poses = survey.static_poses
         if not len(poses):
             continue
         kp = np.where(robot.kp > 0, robot.with_gains(*meta.recorded_gains).kp, np.inf)
@@ -200,9 +200,8 @@ def _fit(poses: _Poses) -> _Fit:
         (len(every) - 1) / len(every) * ((every - every.mean(axis=0)) ** 2).sum(axis=0)
     )
     std = np.maximum(formal_std, jackknife) if len(every) > 2 else 3 * formal_std
-    return _Fit(
-        x, std, scatter, {s: without[i % MAX_FOLDS] for i, s in enumerate(numbers.tolist())}
-    )
+    left_out = {number: without[i % MAX_FOLDS] for i, number in enumerate(numbers.tolist())}
+    return _Fit(x, std, scatter, left_out)
 
 
 def _solve(
@@ -253,7 +252,7 @@ def _offset_and_scale(name: str, fit: _Fit) -> Iterator[Finding]:
 
 def _swapped_labels(surveys: list[Survey], poses: _Poses, judged: list[int]) -> list[Finding]:
     """Would the labels' masses in another order explain the poses better?"""
-    mass = np.array([s.entry.meta.payload_mass for s in surveys])[poses.sequence]
+    mass = np.array([survey.entry.meta.payload_mass for survey in surveys])[poses.sequence]
     labels = sorted(set(mass.tolist()))
     if not 1 < len(labels) <= 3:
         return []
@@ -387,7 +386,7 @@ def _odd_sequence(
     """
     by_joint = {j: poses.of_joint(j) for j in judged}
     fits = {j: _fit(own) for j, own in by_joint.items() if len(own) >= MIN_POSES}
-    heaviest = max(s.entry.meta.payload_mass for s in surveys) or 1.0
+    heaviest = max(survey.entry.meta.payload_mass for survey in surveys) or 1.0
     odd: tuple[float, int, Finding] | None = None
     for number in sorted(set(poses.sequence.tolist())):
         rests = _Rests.of(number, by_joint, fits, robot)
@@ -439,7 +438,7 @@ class _Rests:
         return rests
 
 
-def _judge_sequence(s: Survey, heaviest: float, rests: _Rests) -> tuple[float, Finding] | None:
+def _judge_sequence(survey: Survey, heaviest: float, rests: _Rests) -> tuple[float, Finding] | None:
     """Return the mean square of a sequence's residuals and its finding, if another mass or unit
     explains them.
     """
@@ -448,7 +447,7 @@ def _judge_sequence(s: Survey, heaviest: float, rests: _Rests) -> tuple[float, F
     r = np.concatenate(rests.residuals)
     slope = np.concatenate(rests.slopes)
     apart = rests.apart
-    meta = s.entry.meta
+    meta = survey.entry.meta
     mean_square = float(r @ r) / len(r)
     power = float(slope @ slope)
     more = float(slope @ r) / power if power > 0 else 0.0  # kg
@@ -478,7 +477,7 @@ def _judge_sequence(s: Survey, heaviest: float, rests: _Rests) -> tuple[float, F
 
 def feedforward(surveys: list[Survey], robot: RobotSpec, model: Gravity) -> Iterator[Finding]:
     """Is a torque fed forward beside the position command?"""
-    recorded = [(s, s.torque) for s in surveys if s.torque is not None]
+    recorded = [(survey, survey.torque) for survey in surveys if survey.torque is not None]
     if not recorded or unsigned_torque(recorded, robot):
         return
     shares: dict[str, tuple[float, float, float]] = {}
