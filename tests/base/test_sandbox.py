@@ -133,7 +133,7 @@ def test_a_plain_or_already_accepted_robot_starts_no_child(tmp_path, monkeypatch
     mesh(tmp_path / "meshed")
     meshed = load_robot(tmp_path / "meshed" / "arm")
     assert meshed.qpos_range.shape == (2, 2)
-    monkeypatch.setattr(sandbox, "_run", None)
+    monkeypatch.setattr(sandbox, "_answer_of_child", None)
     assert robot.qpos_range.shape == (2, 2)
     assert load_robot("so101").qpos_range.shape == (6, 2)
     assert load_robot(tmp_path / "meshed" / "arm").qpos_range.shape == (2, 2)

@@ -15,7 +15,7 @@ import traceback
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import partial
 from multiprocessing import get_context
@@ -76,7 +76,7 @@ class Pool:
                 asks the job to end and returns True if the job has begun; those jobs are awaited.
         """
         waiting = iter(jobs)
-        running = dict[Future[Any], tuple[Job, int]]()
+        running = dict[Future[Any], tuple[Job, int]]()  # → job, and how many workers died of it
 
         def submit(job: Job, deaths: int) -> None:
             with _child_environment(self.threads):
@@ -92,19 +92,17 @@ class Pool:
                     job, deaths = running.pop(future)
                     death = future.exception()
                     if death is None:
-                        yield _Outcome(job, *future.result())
+                        value, error = future.result()  # of _run_job
+                        yield _Outcome(job, value, error)
                     elif deaths < MAX_RETRIES:
                         submit(job, deaths + 1)
                     else:
-                        reason = str(death).strip() or type(death).__name__
-                        message = (
-                            f"{deaths + 1} workers died of it, out of memory? The last: {reason}"
-                        )
-                        yield _Outcome(job, None, WorkerError(message))
+                        yield _Outcome(job, None, _worker_error(death, deaths + 1))
                 on_poll()
         finally:
             for future, (job, _) in running.items():
-                if not request_stop(job):
+                has_begun = request_stop(job)
+                if not has_begun:
                     future.cancel()
             wait(running)
 
@@ -124,8 +122,14 @@ class Pool:
         return max(1, (os.cpu_count() or 1) // threads)
 
 
+def _worker_error(last: BaseException, deaths: int) -> WorkerError:
+    """Return the error of a job of which so many workers died."""
+    reason = str(last).strip() or type(last).__name__
+    return WorkerError(f"{deaths} workers died of it, out of memory? The last: {reason}")
+
+
 def _run_job(work: Callable[[Job], Result], job: Job) -> tuple[Result | None, Exception | None]:
-    """Run a job in its worker."""
+    """Run a job in its worker; return its result and None, or None and its error."""
     try:
         return work(job), None
     except Exception as error:
@@ -171,11 +175,15 @@ class _ProcessPerWorker(Executor):
         self.last_jobs: dict[ProcessPoolExecutor, Future[Any]] = {}
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        for pool in [pool for pool, last in self.last_jobs.items() if last.done()]:
-            with suppress(BrokenProcessPool):
-                self.last_jobs[pool] = pool.submit(fn, *args, **kwargs)
-                return self.last_jobs[pool]
-            del self.last_jobs[pool]
+        idle = [pool for pool, last in self.last_jobs.items() if last.done()]
+        for pool in idle:
+            try:
+                future = pool.submit(fn, *args, **kwargs)
+            except BrokenProcessPool:
+                del self.last_jobs[pool]
+                continue
+            self.last_jobs[pool] = future
+            return future
         pool = ProcessPoolExecutor(1, get_context("spawn"), _end_with_parent, (os.getpid(),))
         self.last_jobs[pool] = pool.submit(fn, *args, **kwargs)
         return self.last_jobs[pool]
@@ -207,17 +215,16 @@ def _connect_ray(
     machines.
     """
     address = address or os.environ.get("RAY_ADDRESS") or LOCAL
+    options: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR"}
     if address == LOCAL:
-        os.environ["RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"] = (
-            "0"  # binds to the loopback interface on every system
-        )
+        options |= {"include_dashboard": False, "num_cpus": workers * threads or None}
+        # Ray then binds to the loopback interface on every system.
+        os.environ["RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"] = "0"
     import ray
 
     if not ray.is_initialized():
-        own: dict[str, Any] = {"include_dashboard": False, "num_cpus": workers * threads or None}
-        quiet = {"log_to_driver": False, "logging_level": "ERROR"}
         try:
-            ray.init(address, **quiet, **(own if address == LOCAL else {}))
+            ray.init(address, **options)
         except (ConnectionError, ValueError) as error:
             raise UsageError(f"--executor ray: no cluster at {address}: {error}") from None
         stack.callback(ray.shutdown)

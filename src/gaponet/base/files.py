@@ -118,13 +118,15 @@ def require_own_folder(folder: Path, kind: str) -> None:
         if folder.exists() or folder.is_symlink():
             raise FolderError(f"{folder}: is no folder; choose another place")
         return
-    marked = _marker_lines(folder)[:1]
-    if marked and marked[0] != kind:
+    stated_kind, _ = _read_marker(folder)
+    if stated_kind == kind:
+        return
+    if stated_kind:
         raise FolderError(
-            f"{folder}: holds gaponet's {marked[0]}, not {kind}; choose another folder"
+            f"{folder}: holds gaponet's {stated_kind}, not {kind}; choose another folder"
         )
     signs = UNMARKED_FOLDERS.get(kind, (FOLDER_MARKER,))
-    if marked or any(any(folder.glob(sign)) for sign in signs):
+    if any((folder / sign).exists() for sign in signs):
         return
     names = sorted(child.name for child in folder.iterdir())
     others = [name for name in names if not name.startswith(FOLDER_MARKER)]
@@ -136,19 +138,22 @@ def require_own_folder(folder: Path, kind: str) -> None:
         )
 
 
-def _marker_lines(folder: Path) -> list[str]:
-    """Return the kind of a folder and the process that writes into it, as far as the marker states
-    them.
+def _read_marker(folder: Path) -> tuple[str, str]:
+    """Return the kind of a folder, and the process that writes into it; "" where the marker does
+    not state them.
     """
     marker = folder / FOLDER_MARKER
-    return marker.read_text(encoding="utf-8", errors="replace").split() if marker.is_file() else []
+    if not marker.is_file():
+        return "", ""
+    kind, process, *_ = [*marker.read_text(encoding="utf-8", errors="replace").split(), "", ""]
+    return kind, process
 
 
 @contextmanager
 def lock_folder(folder: Path, kind: str, wait: float = 0.0) -> Iterator[None]:
     """Lock a folder for this thread, the only writer; the folder is created if missing.
 
-    Nested calls do nothing.
+    A call within the block of another one, for the same folder, does nothing.
 
     If the block fails before it wrote anything, a folder or marker that was created here is
     removed.
@@ -180,13 +185,13 @@ def lock_folder(folder: Path, kind: str, wait: float = 0.0) -> Iterator[None]:
         yield
         succeeded = True
     finally:
-        if not succeeded and new and [p.name for p in folder.iterdir()] == [FOLDER_MARKER]:
+        if not succeeded and new and _holds_marker_alone(folder):
             with suppress(OSError):  # another program wrote into it; Windows keeps open files
                 (folder / FOLDER_MARKER).unlink()
                 for path in created:
                     path.rmdir()
         elif os.fstat(descriptor).st_size > len(kind_line):
-            os.ftruncate(descriptor, len(kind_line))
+            os.ftruncate(descriptor, len(kind_line))  # the line that names this process
         _locked_here.discard(key)
         os.close(descriptor)
 
@@ -237,6 +242,10 @@ def _replace_files(source: Path, target: Path, last: str, obsolete: tuple[str, .
     flush_to_disk(target)
 
 
+def _holds_marker_alone(folder: Path) -> bool:
+    return [path.name for path in folder.iterdir()] == [FOLDER_MARKER]
+
+
 def _write_at(descriptor: int, offset: int, line: bytes) -> None:
     os.lseek(descriptor, offset, os.SEEK_SET)
     os.write(descriptor, line)
@@ -252,7 +261,8 @@ def _lock_marker(folder: Path, kind: str, wait: float) -> int:
         if descriptor is not None:
             return descriptor
         if time.monotonic() >= deadline:
-            writer = "".join(f" (process {process})" for process in _marker_lines(folder)[1:2])
+            _, process = _read_marker(folder)
+            writer = f" (process {process})" if process else ""
             raise FolderError(
                 f"{folder}: another gaponet{writer} is writing here; wait for it or stop it"
             )

@@ -31,15 +31,12 @@ def _network_error_types() -> tuple[type[Exception], ...]:
 
     A library that was not imported cannot have raised one.
     """
-    loaded = (
-        (sys.modules[module], names)
-        for module, names in LIBRARY_ERRORS.items()
-        if module in sys.modules
-    )
-    own = (
-        getattr(module, name) for module, names in loaded for name in names if hasattr(module, name)
-    )
-    return (OSError, ValueError, RuntimeError, *own)  # Xet raises RuntimeError
+    types: list[type[Exception]] = [OSError, ValueError, RuntimeError]  # Xet raises RuntimeError
+    for module_name, names in LIBRARY_ERRORS.items():
+        module = sys.modules.get(module_name)
+        if module is not None:
+            types += [getattr(module, name) for name in names if hasattr(module, name)]
+    return tuple(types)
 
 
 @contextmanager
@@ -51,8 +48,9 @@ def network_errors(address: str) -> Iterator[None]:
         yield
     except _network_error_types() as error:
         text = re.sub(r"\?\S+", "?…", " ".join(str(error).split()))  # a query may hold a signature
-        missing, refused = (
-            isinstance(error, kind) for kind in (FileNotFoundError, PermissionError)
-        )
-        reason = "not found: " * missing + "no permission: " * refused
+        reason = ""
+        if isinstance(error, FileNotFoundError):
+            reason = "not found: "
+        elif isinstance(error, PermissionError):
+            reason = "no permission: "
         raise RemoteError(f"{address}: {reason}{text[:300] or type(error).__name__}") from None

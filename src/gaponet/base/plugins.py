@@ -2,9 +2,10 @@
 
 A package names them in its metadata, as entry points of one of two groups:
 
-    gaponet.formats   a module that reads logs (gaponet.data.formats says what it has)
-    gaponet.drivers   a function (robot, **options) that returns a Driver (gaponet.hw.control.driver). `gaponet run`
-                      gives it those options of --help that are its parameters, such as port
+- `gaponet.formats`: a module that reads logs. gaponet.data.formats says what it has.
+- `gaponet.drivers`: a function (robot, **options) that returns a Driver
+  (gaponet.hw.control.driver). `gaponet run` gives it those of its own options that are parameters
+  of the function, such as port.
 
 A built-in name cannot be replaced. A failure of an extension is logged once as a warning, and
 gaponet continues without the extension.
@@ -65,8 +66,10 @@ def load(where: str) -> Any:
 
 
 def attempt(where: str, call: Callable[[], Result], otherwise: Result) -> Result:
-    """Return call(), or `otherwise` and a warning where it fails and `where` belongs to an
-    extension.
+    """Return call(). If it fails in an extension, warn and return `otherwise`.
+
+    Args:
+        where: `module:attribute` that is called; an error of a built-in one is raised.
     """
     try:
         return call()

@@ -29,8 +29,9 @@ class MeanStd:
         Without any, the mean is NaN.
         """
         finite = np.array([v for v in values if math.isfinite(v)]) * scale
+        mean = float(finite.mean()) if len(finite) else math.nan
         std = float(finite.std(ddof=1)) if len(finite) > 1 else math.nan
-        return cls(float(finite.mean()) if len(finite) else math.nan, std, len(finite))
+        return cls(mean, std, len(finite))
 
     @property
     def standard_error(self) -> float:
@@ -74,14 +75,12 @@ class ResultTable:
 
     def markdown(self) -> str:
         """Return the table in Markdown, with the caption below."""
-        ruler = ["---", *["---:"] * (len(self.columns) - 1)]
-        lines = [
-            map(escape_markdown, self.columns),
-            ruler,
-            *(map(escape_markdown, row) for row in self.texts()),
-        ]
-        table = "\n".join(f"| {' | '.join(line)} |" for line in lines)
-        return f"{table}\n\n{escape_markdown(self.caption)}" if self.caption else table
+        numbers = ["---:"] * (len(self.columns) - 1)  # aligned on the right
+        lines = [_markdown_line(self.columns), f"| {' | '.join(['---', *numbers])} |"]
+        lines += [_markdown_line(row) for row in self.texts()]
+        if self.caption:
+            lines += ["", escape_markdown(self.caption)]
+        return "\n".join(lines)
 
     def csv(self) -> str:
         """Return the table as CSV at full precision.
@@ -109,11 +108,19 @@ class ResultTable:
         return any(isinstance(row[column], MeanStd) for row in self.rows)
 
 
+def _markdown_line(cells: Iterable[str]) -> str:
+    return f"| {' | '.join(map(escape_markdown, cells))} |"
+
+
 def _csv_values(cell: Any, with_std: bool) -> list[Any]:
-    """Return a cell, or a cell with its standard deviation and count; "" where there is none."""
-    values = [cell.mean, cell.std, cell.count] if isinstance(cell, MeanStd) else [cell, None, None]
-    if not with_std:
-        values = values[:1]
+    """Return the values of a cell: its number or text, and its standard deviation and count where
+    the column has them; "" where there is none.
+    """
+    values = [cell]
+    if isinstance(cell, MeanStd):
+        values = [cell.mean, cell.std, cell.count]
+    elif with_std:
+        values = [cell, None, None]
     return [_csv_value(value) for value in values]
 
 

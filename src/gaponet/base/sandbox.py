@@ -3,7 +3,7 @@ open files.
 
 A file of a few bytes can demand gigabytes or never end, and no parser can tell beforehand. The
 child is started on demand, serves until it is idle for IDLE_S or this process ends, and is
-restarted when a file was its end. Memory and processor time are limited where the system allows it
+restarted if it dies of a file. Memory and processor time are limited where the system allows it
 (Linux; macOS limits the time only). Elsewhere a file that does not end is given up after
 MAX_WALL_FACTOR times its processor time.
 """
@@ -25,7 +25,7 @@ from contextlib import suppress
 from importlib import import_module
 from itertools import islice
 from pathlib import Path
-from typing import IO, Any, TypeVar
+from typing import IO, Any, NamedTuple, TypeVar
 
 from gaponet.base.child_process import module_command
 from gaponet.base.errors import GAPONetError
@@ -80,15 +80,15 @@ def sandboxed(
     def wrap(function: Callable[..., T]) -> Callable[..., T]:
         @functools.wraps(function)
         def call(file: Path, *arguments: Any) -> T:
+            if _Child.is_this_process:
+                return function(file, *arguments)
             path = Path(os.path.abspath(file))
-            return _run(
-                function,
-                error,
-                PROCESSOR_S + 1e-6 * seconds_per_mb * _size(path),
-                path,
-                file,
-                arguments,
+            seconds = PROCESSOR_S + 1e-6 * seconds_per_mb * _size(path)
+            request = _Request(
+                function.__module__, function.__name__, path, file, arguments, seconds
             )
+            result: T = _answer_of_child(request, error)
+            return result
 
         call.sandboxed = function, library  # type: ignore[attr-defined]
         return call
@@ -101,21 +101,29 @@ def in_sandbox() -> bool:
     return _Child.is_this_process
 
 
-def _run(
-    function: Callable[..., T],
-    error: type[GAPONetError],
-    seconds: float,
-    path: Path,
-    file: Path,
-    arguments: Any,
-) -> T:
-    if _Child.is_this_process:
-        return function(file, *arguments)
-    request = function.__module__, function.__name__, path, file, arguments, seconds
+class _Request(NamedTuple):
+    """What the child is asked to do: call a function of a module with a file."""
+
+    module: str
+    function: str
+    path: Path  # absolute, since the child works in another folder
+    file: Path  # the same, as the caller names it in messages
+    arguments: tuple[Any, ...]
+    seconds: float  # processor time that it may take
+
+
+def _answer_of_child(request: _Request, error: type[GAPONetError]) -> Any:
+    """Return the result of a request.
+
+    Raises:
+        error: The child ended, or exceeded a limit.
+        Exception: That of the function.
+    """
     with _LOCK:
-        answer, failure = _Child.current_or_new().request(request, seconds)
-        if failure == IDLE:
-            answer, failure = _Child.current_or_new().request(request, seconds)
+        answer, failure = _Child.current_or_new().request(request)
+        if failure == IDLE:  # it ended before it could read the request
+            answer, failure = _Child.current_or_new().request(request)
+    file = request.file
     if failure == "memory":
         raise error(
             f"{file}: takes more than {MEMORY_BYTES >> 20} MiB to be read, more than a file may; "
@@ -123,15 +131,14 @@ def _run(
         )
     if failure == "time":
         raise error(
-            f"{file}: is not read after {seconds:.0f} s, longer than a file of its size may take; "
-            "cut it"
+            f"{file}: is not read after {request.seconds:.0f} s, longer than a file of its size "
+            "may take; cut it"
         )
     if failure:
         raise error(f"{file}: is not readable ({failure}); copy or make it again")
     if isinstance(answer, Exception):
         raise answer
-    result: T = answer
-    return result
+    return answer
 
 
 def _size(path: Path) -> int:
@@ -174,18 +181,18 @@ class _Child:
             cls.current = child
         return child
 
-    def request(self, request: Any, seconds: float) -> tuple[Any, str]:
+    def request(self, request: _Request) -> tuple[Any, str]:
         """Return the answer and "", or None and the failure: "memory", "time", or a reason."""
         assert self.process.stdin
         assert self.process.stdout
-        timeout = threading.Timer(MAX_WALL_FACTOR * seconds, self.process.kill)
+        timeout = threading.Timer(MAX_WALL_FACTOR * request.seconds, self.process.kill)
         timeout.start()
         try:
             _write(self.process.stdin, request)
             result: tuple[Any, str] = pickle.load(self.process.stdout)
             return result
         except (EOFError, BrokenPipeError, pickle.UnpicklingError):
-            # The child has ended, the last error: within its answer.
+            # The child has ended: before its answer, before it read the request, or in its answer.
             code = self.process.wait()
             if code == 0:
                 return None, IDLE
@@ -216,7 +223,7 @@ def _close() -> None:
 def _write(stream: IO[bytes], value: Any) -> None:
     """Write a pickle.
 
-    Of protocol 5 arrays are written without a copy, which would count as the child's memory.
+    Protocol 5 writes arrays without a copy, which would count as the child's memory.
     """
     pickle.dump(value, stream, 5)
     stream.flush()
@@ -229,29 +236,31 @@ def _serve() -> None:
     _Child.is_this_process = True
     while os.name == "nt" or select.select([0], [], [], IDLE_S)[0]:
         try:
-            module, name, path, file, arguments, seconds = pickle.load(sys.stdin.buffer)
+            request: _Request = pickle.load(sys.stdin.buffer)
         except EOFError:
             return
         try:
-            function, library = getattr(import_module(module), name).sandboxed
+            decorated = getattr(import_module(request.module), request.function)
+            function, library = decorated.sandboxed
             import_module(library)
-            _set_limits(seconds)
-            _write(out, _answer(function, path, file, arguments))
+            _set_limits(request.seconds)
+            _write(out, _answer(function, request))
         except ImportError as error:  # an extra that is not installed
             _write(out, (error, ""))
         except MemoryError:
             _write(out, (None, "memory"))
 
 
-def _answer(
-    function: Callable[..., Any], path: Path, file: Path, arguments: tuple[Any, ...]
-) -> tuple[Any, str]:
+def _answer(function: Callable[..., Any], request: _Request) -> tuple[Any, str]:
+    """Return the result of a function or its error, and ""; or None and why the file cannot be
+    read.
+    """
     try:
-        return function(path, *arguments), ""
+        return function(request.path, *request.arguments), ""
     except (MemoryError, ImportError):
         raise
     except GAPONetError as error:
-        return type(error)(str(error).replace(str(path), str(file))), ""
+        return type(error)(str(error).replace(str(request.path), str(request.file))), ""
     except Exception as error:
         return None, f"{type(error).__name__}: {' '.join(str(error).split())}"[:200]
 

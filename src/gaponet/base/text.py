@@ -17,11 +17,12 @@ def format_uncertainty(value: float, standard_error: float) -> str:
     """
     if standard_error > MAX_PRINTED_ERROR:
         return f"{value:.3g} ± ?"
-    digits = 1 - math.floor(math.log10(standard_error)) if 0 < standard_error < math.inf else 3
-    return (
-        f"{round(value, digits) + 0.0:.{max(digits, 0)}f} ± "
-        f"{round(standard_error, digits):.{max(digits, 0)}f}"
-    )
+    digits = 3  # behind the decimal point; below zero, tens and hundreds are rounded
+    if 0 < standard_error < math.inf:
+        digits = 1 - math.floor(math.log10(standard_error))
+    shown = max(digits, 0)
+    no_minus_zero = round(value, digits) + 0.0
+    return f"{no_minus_zero:.{shown}f} ± {round(standard_error, digits):.{shown}f}"
 
 
 def escape(text: str) -> str:

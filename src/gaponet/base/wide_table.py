@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator
 
 from gaponet.base.text import escape
 
-NUMBER = 22  # letters: numbers longer than that are wrapped
+MAX_WHOLE_CELL = 22  # letters: a longer cell is text, and is wrapped
 BORDER = 3  # letters between two cells
 
 
@@ -31,19 +31,24 @@ class TableCells:
             self.least.append(_least_width(head, cells))
 
     def is_text(self, i: int) -> bool:
-        """Return True for a column of text."""
-        return i == 0 or self.longest[i] > NUMBER
+        """Return True for a column of text: the first one, and one with a long cell."""
+        return i == 0 or self.longest[i] > MAX_WHOLE_CELL
 
     def parts(self, room: int) -> Iterator[list[int]]:
-        """Yield columns that fit beside each other into the room, in letters; each with the
-        first."""
+        """Yield the numbers of columns that fit beside each other, part by part; the first column
+        stands in every part.
+
+        Args:
+            room: Width of the screen, letters.
+        """
         count = len(self.heads)
         if count == 1:
             yield [0]
+        border_and_first = 1 + self.least[0]
         start = 1
         while start < count:
-            stop = start + 1
-            while stop < count and self.least[0] + 1 + sum(self.least[start : stop + 1]) <= room:
+            stop = start + 1  # one column at least
+            while stop < count and border_and_first + sum(self.least[start : stop + 1]) <= room:
                 stop += 1
             yield [0, *range(start, stop)]
             start = stop
@@ -61,11 +66,11 @@ class TableCells:
 
 
 def _least_width(head: str, cells: list[str]) -> int:
-    """Letters that a column and its border need: cells are wrapped only where they are long, heads
-    at any space.
+    """Return the letters that a column and its border need: cells are wrapped only where they are
+    long, heads at any space.
     """
-    whole = [cell for cell in cells if len(cell) <= NUMBER]
-    words = [word for text in (head, *cells) for word in text.split()]
-    return BORDER + max(
-        max(map(len, whole), default=1), min(max(map(len, words), default=1), NUMBER)
-    )
+    whole = [cell for cell in cells if len(cell) <= MAX_WHOLE_CELL]
+    longest_whole = max(map(len, whole), default=1)
+    words = " ".join([head, *cells]).split()
+    longest_word = max(map(len, words), default=1)
+    return BORDER + max(longest_whole, min(longest_word, MAX_WHOLE_CELL))
