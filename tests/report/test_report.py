@@ -105,9 +105,10 @@ def test_the_robot_is_drawn_or_the_page_says_why_not(evaluated):
     def blind(*_):
         raise UsageError("no OpenGL here <b>")
 
-    assert report._photo(contents, 0, draw)["photo"] == '<img src="data:image/png;base64,UE5H">'
+    photo, _ = report._photo(contents, 0, draw)
+    assert photo == '<img src="data:image/png;base64,UE5H">'
     assert seen[0][3] == ["command", "nominal", "identified+gaponet", "recorded"]
-    assert report._photo(contents, 0, blind)["photo_error"] == "no OpenGL here <b>"
+    assert report._photo(contents, 0, blind) == (None, "no OpenGL here <b>")
 
 
 @pytest.mark.parametrize("absent", ["date", "command", "moves", "shown"])

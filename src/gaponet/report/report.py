@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from markupsafe import Markup
 
 from gaponet.base.arrays import Array
 from gaponet.base.errors import DatasetError, ModelError, UsageError
@@ -31,7 +32,7 @@ from gaponet.evaluation.tables import by_group, mrad, mrad_and_degrees, totals
 from gaponet.evaluation.verdict import network_gain, verdict
 from gaponet.nn.artifact import GapModel
 from gaponet.nn.packaged_networks import is_packaged, named_folder
-from gaponet.report.page import inline_image, page_figure, render
+from gaponet.report.page import PageFigure, inline_image, page_figure, render
 from gaponet.robot.folder import load_stored_robot
 from gaponet.robot.servo_fields import SERVO_FIELDS
 from gaponet.robot.spec import RobotSpec, load_robot
@@ -58,19 +59,16 @@ CARD_FACTS = (
 
 
 class _Evaluated(NamedTuple):
-    """An evaluated run or robot folder; own is its method.
-
-    Of a robot folder, card is None, config and curve empty.
-    """
+    """An evaluated run or robot folder."""
 
     robot: RobotSpec
-    own: str
-    card: dict[str, Any] | None
-    config: dict[str, Any]
-    metrics: dict[str, Any]
-    arrays: dict[str, Array]
-    curve: list[dict[str, Any]]
-    gap: dict[str, Any] | None
+    own: str  # its method
+    card: dict[str, Any] | None  # of its model; None for a robot folder
+    config: dict[str, Any]  # of its training; empty for a robot folder
+    metrics: dict[str, Any]  # metrics.json
+    arrays: dict[str, Array]  # trajectories.npz: ROW/METHOD, …, (T, n operated) rad
+    curve: list[dict[str, Any]]  # validations during training; empty for a robot folder
+    gap: dict[str, Any] | None  # gap.json, if it is there
 
     @classmethod
     def read(cls, folder: Path, model: GapModel | None, robot: RobotSpec) -> _Evaluated:
@@ -85,14 +83,22 @@ class _Evaluated(NamedTuple):
             missing += [name for name in CARD_FACTS if name not in card]
         if not _is_complete(metrics, robot) or own not in metrics["methods"]:
             missing.append(f"a whole evaluation of {title(own)}")
-        if card is not None and not curve:
-            missing.append("progress.jsonl")
-        if card is not None and {"train", "val"} - card.get("motions", {}).keys():
-            missing.append("motions")
+        if card is not None:
+            missing += _missing_of_training(card, curve)
         if missing:
             raise ModelError(f"{folder}: {', '.join(missing)} is missing; {REPAIR_HINT}")
         arrays = read_trajectories(folder, metrics, len(robot.operated))
         return cls(robot, own, card, config, metrics, arrays, curve, read_gap(folder))
+
+
+def _missing_of_training(card: dict[str, Any], curve: list[dict[str, Any]]) -> list[str]:
+    """Return what a run lacks of its training."""
+    missing = []
+    if not curve:
+        missing.append("progress.jsonl")
+    if {"train", "val"} - card.get("motions", {}).keys():
+        missing.append("motions")
+    return missing
 
 
 def _is_complete(metrics: dict[str, Any], robot: RobotSpec) -> bool:
@@ -168,12 +174,58 @@ def _evaluate(run: Path, dataset: Path | None, robot: RobotSpec | None, progress
 
 
 def _values(e: _Evaluated, picture: Picture | None) -> dict[str, Any]:
-    """Return the values of the template."""
+    """Return the values of templates/report.html.j2."""
+    from gaponet.report.figures import evaluation as draw
+
+    methods = e.metrics["methods"]
+    own_title = title(e.own)
+    joint_columns, joint_rows = _by_joint(e)
+    shown = e.metrics["shown"]
+    figures = draw.trajectories(e.arrays, shown, e.robot.operated, list(methods))
+    trajectories = []
+    for row, figure in figures.items():
+        caption = f" (unit {shown[row]['unit_id']}, {shown[row]['payload_mass']:g} kg)"
+        trajectories.append(page_figure(figure, caption, shown[row]["motion"]))
+    photo, photo_error = _photo(e, next(iter(figures), None), picture)
+    simulators = []
+    for name, simulator in e.metrics.get("simulators", {}).items():
+        simulators.append(f"{title(name)} {simulator}")
+    values: dict[str, Any] = {
+        "title": f"{e.robot.name} {own_title}",
+        "heading": f"{e.robot.description}: {own_title}",
+        "metrics": e.metrics,
+        "card": e.card,
+        "config": e.config,
+        "verdict": " ".join(verdict(methods)),
+        "warnings": warnings(e.card, e.own, e.metrics),
+        "totals": totals(methods, mrad_and_degrees),
+        "best": int(np.argmin([m["mpjae"] for m in methods.values()])),
+        "simulators": "; ".join(simulators),
+        "adapted_title": title("adapted"),
+        "joint_columns": joint_columns,
+        "joint_rows": joint_rows,
+        "bars": _bars(methods),
+        "trajectories": trajectories,
+        "open_trajectories": OPEN_TRAJECTORIES,
+        "by_motion": by_group(methods, "motion", mrad_and_degrees),
+        "waterfall": None,
+        "parameters": _parameters(e.robot),
+        "photo": photo,
+        "photo_error": photo_error,
+    }
+    if e.gap is not None:
+        caption = "Reduction of the mean |error| by each step (hollow: increase)."
+        values["waterfall"] = page_figure(draw.waterfall(e.gap), caption)
+    if e.card is not None:
+        values |= _values_of_training(e.card, e.curve, e.metrics)
+    return values
+
+
+def _bars(methods: dict[str, Any]) -> list[PageFigure]:
+    """Return the figures of the errors by joint, horizon and payload."""
     from gaponet.report.figures import evaluation as draw
     from gaponet.report.figures.style import joint_label
 
-    methods = e.metrics["methods"]
-    name = title(e.own)
     by_joint = draw.by_group(methods, "joint", joint_label)
     by_horizon = draw.by_horizon(methods)
     bars = [
@@ -183,56 +235,32 @@ def _values(e: _Evaluated, picture: Picture | None) -> dict[str, Any]:
     if len(methods["nominal"]["by_payload"]) > 1:
         by_payload = draw.by_group(methods, "payload", "{} kg".format)
         bars.append(page_figure(by_payload, "Payload in each hand."))
-    joint_columns, joint_rows = _by_joint(e)
-    shown = e.metrics["shown"]
-    trajectories = []
-    drawn = draw.trajectories(e.arrays, shown, e.robot.operated, list(methods))
-    for row, fig in drawn.items():
-        caption = f" (unit {shown[row]['unit_id']}, {shown[row]['payload_mass']:g} kg)"
-        trajectories.append(page_figure(fig, caption, shown[row]["motion"]))
-    simulators = e.metrics.get("simulators", {}).items()
-    values: dict[str, Any] = {
-        "title": f"{e.robot.name} {name}",
-        "heading": f"{e.robot.description}: {name}",
-        "metrics": e.metrics,
-        "card": e.card,
-        "config": e.config,
-        "verdict": " ".join(verdict(methods)),
-        "warnings": warnings(e.card, e.own, e.metrics),
-        "totals": totals(methods, mrad_and_degrees),
-        "best": int(np.argmin([m["mpjae"] for m in methods.values()])),
-        "simulators": "; ".join(f"{title(name)} {simulator}" for name, simulator in simulators),
-        "adapted_title": title("adapted"),
-        "joint_columns": joint_columns,
-        "joint_rows": joint_rows,
-        "bars": bars,
-        "trajectories": trajectories,
-        "open_trajectories": OPEN_TRAJECTORIES,
-        "by_motion": by_group(methods, "motion", mrad_and_degrees),
-        "waterfall": None,
-        "parameters": _parameters(e.robot),
-        **_photo(e, next(iter(drawn), None), picture),
+    return bars
+
+
+def _values_of_training(
+    card: dict[str, Any], curve: list[dict[str, Any]], metrics: dict[str, Any]
+) -> dict[str, Any]:
+    """Return the values of the template about the training of a run."""
+    from gaponet.report.figures import evaluation as draw
+
+    corrections = [f"{name} {delta['max']:.3f}" for name, delta in metrics["delta"].items()]
+    artifacts = []
+    for name, artifact in metrics["artifacts"].items():
+        artifacts.append(f"{name} {artifact['weights']} (seed {artifact['seed']})")
+    caption = "Free run over whole validation motions; the circled model was selected."
+    return {
+        "training_curve": page_figure(draw.training_curve(curve), caption),
+        "how_trained": GapModel.how_trained(card),
+        "largest_corrections": ", ".join(corrections),
+        "artifacts": ", ".join(artifacts),
+        "versions": ", ".join(f"{name} {version}" for name, version in card["versions"].items()),
     }
-    if e.gap is not None:
-        caption = "Reduction of the mean |error| by each step (hollow: increase)."
-        values["waterfall"] = page_figure(draw.waterfall(e.gap), caption)
-    if e.card is not None:
-        caption = "Free run over whole validation motions; the circled model was selected."
-        delta = e.metrics["delta"].items()
-        artifacts = e.metrics["artifacts"].items()
-        values |= {
-            "training_curve": page_figure(draw.training_curve(e.curve), caption),
-            "how_trained": GapModel.how_trained(e.card),
-            "largest_corrections": ", ".join(f"{n} {d['max']:.3f}" for n, d in delta),
-            "artifacts": ", ".join(f"{n} {a['weights']} (seed {a['seed']})" for n, a in artifacts),
-            "versions": ", ".join(f"{k} {v}" for k, v in e.card["versions"].items()),
-        }
-    return values
 
 
 def _parameters(robot: RobotSpec) -> tuple[list[str], list[list[str]]] | None:
-    """Return columns and rows of the identified values with their standard errors; None if the robot
-    keeps none.
+    """Return columns and rows of the identified values with their standard errors; None if the
+    robot keeps none.
     """
     known = ParameterUncertainty.load(robot)
     if known is None:
@@ -264,15 +292,15 @@ def _by_joint(e: _Evaluated) -> tuple[list[str], list[list[str]]]:
     return [*table.columns, f"{own} static", f"{own} dynamic", "moves in"], rows
 
 
-def _photo(e: _Evaluated, row: int | None, picture: Picture | None) -> dict[str, Any]:
-    """Draw the robot in a motion with stored trajectories.
+def _photo(e: _Evaluated, row: int | None, picture: Picture | None) -> tuple[Markup | None, str]:
+    """Draw the robot in a motion with stored trajectories, of which row is the number.
 
-    Return photo, or the reason for its absence.
+    Return the photo and "", or None and the reason for its absence.
     """
     metrics = e.metrics
     arrays = e.arrays
     if picture is None or row is None:
-        return {"photo": None, "photo_error": ""}
+        return None, ""
     shown = metrics["shown"][row]
     meta = SequenceMeta(
         robot=e.robot.name,
@@ -287,10 +315,9 @@ def _photo(e: _Evaluated, row: int | None, picture: Picture | None) -> dict[str,
     qpos["command"] = np.roll(qpos["command"], 1, axis=0)
     qpos["command"][0] = qpos["recorded"][0]
     try:
-        photo = inline_image(picture(e.robot, meta, shown["dt"], qpos), "image/png")
+        return inline_image(picture(e.robot, meta, shown["dt"], qpos), "image/png"), ""
     except UsageError as error:
-        return {"photo": None, "photo_error": str(error)}
-    return {"photo": photo, "photo_error": ""}
+        return None, str(error)
 
 
 def warnings(card: dict[str, Any] | None, own: str, metrics: dict[str, Any]) -> list[str]:
@@ -329,14 +356,35 @@ def _warnings_of_joints(own: str, methods: dict[str, Any]) -> list[str]:
 def _warnings_of_model(card: dict[str, Any], own: str, methods: dict[str, Any]) -> list[str]:
     """Warn where a model does not help, or was trained on too little or for too short a time."""
     found = []
-    others = {name: m for name, m in methods.items() if name not in (own, "adapted")}
-    better = [name for name, m in others.items() if m["mpjae"] <= methods[own]["mpjae"]]
+    better = []
+    for name, scores in methods.items():
+        if name not in (own, "adapted") and scores["mpjae"] <= methods[own]["mpjae"]:
+            better.append(title(name))
     if better:
-        found.append(f"The model does not beat {', '.join(map(title, better))}: do not use it.")
+        found.append(f"The model does not beat {', '.join(better)}: do not use it.")
+    payloads = [float(payload) for payload in methods["nominal"]["by_payload"]]
+    found += _warnings_of_coverage(card, payloads)
+    done, planned = card.get("stages", {}).get("pretraining_rounds", (0, 0))
+    if done < planned:
+        is_useless = "identified" in methods and not network_gain(methods, own).helps
+        advice = "" if is_useless else "; train longer"
+        rounds = f"{done} of {planned} rounds of supervised pre-training"
+        found.append(f"Undertrained: the budget ended after {rounds}{advice}.")
+    if card.get("interrupted"):
+        found.append("Training was interrupted before its budget was out.")
+    return found
+
+
+def _warnings_of_coverage(card: dict[str, Any], payloads: list[float]) -> list[str]:
+    """Warn where the training data or the history of a model do not cover what is asked of it.
+
+    Args:
+        payloads: Those of the evaluation, kg.
+    """
+    found = []
     lightest = min(card["payload_seen"])
     heaviest = max(card["payload_seen"])
-    evaluated = [float(payload) for payload in methods["nominal"]["by_payload"]]
-    outside = [payload for payload in evaluated if not lightest <= payload <= heaviest]
+    outside = [payload for payload in payloads if not lightest <= payload <= heaviest]
     if outside:
         found.append(
             f"Payloads {outside} kg lie outside those trained on ({lightest:g} to {heaviest:g} kg)."
@@ -352,12 +400,4 @@ def _warnings_of_model(card: dict[str, Any], own: str, methods: dict[str, Any]) 
             f"The robot lags the simulator by {card['excess_delay'] * 1e3:.0f} ms, the history "
             f"spans {span * 1e3:.0f} ms: raise --model.history or --model.stride."
         )
-    done, planned = card.get("stages", {}).get("pretraining_rounds", (0, 0))
-    if done < planned:
-        is_useless = "identified" in methods and not network_gain(methods, own).helps
-        advice = "" if is_useless else "; train longer"
-        rounds = f"{done} of {planned} rounds of supervised pre-training"
-        found.append(f"Undertrained: the budget ended after {rounds}{advice}.")
-    if card.get("interrupted"):
-        found.append("Training was interrupted before its budget was out.")
     return found

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -29,11 +31,12 @@ from gaponet.report.figures.style import (
     styled,
 )
 from gaponet.robot.servo_fields import SERVO_FIELDS
-from gaponet.sysid.uncertainty import ParameterUncertainty, summarize
+from gaponet.sysid.uncertainty import JointSummary, ParameterUncertainty, summarize
 
 SHOWN_S = 20.0  # of each motion, so that details are visible
-# rad of a position axis, so that encoder steps of a joint at rest are not magnified
-MIN_POSITION_SPAN = 0.06
+MIN_POSITION_SPAN = (
+    0.06  # rad of an axis, so that encoder steps of a joint at rest are not magnified
+)
 MIN_CORRECTION = 1e-5  # rad; smaller corrections are noise
 MAX_COLUMNS = 4
 FLOOR_COLOUR = "#1f7a56"
@@ -139,10 +142,9 @@ def trajectories(
 def _trajectory(
     arrays: dict[str, Array], row: int, joints: tuple[str, ...], methods: list[str], dt: float
 ) -> Figure:
-    """Draw the three joints with the largest nominal error, a column each.
+    """Draw three joints of the stored motion `row`, a column each.
 
-    Moving joints come first.
-
+    Moving joints come before those at rest, and among these those with the largest nominal error.
     From top to bottom: positions, positions around the largest turn of the command, errors, and
     corrections.
     """
@@ -150,12 +152,9 @@ def _trajectory(
     count = round(SHOWN_S / dt)
     start = busiest_window(recorded, count)
     window = slice(start, min(start + count, len(recorded)))
-    time = np.arange(len(recorded))[window] * dt
-    command = arrays[f"{row}/command"][window]
-    still = np.ptp(command, axis=0) <= MIN_MOTION_RAD  # (n,)
+    is_still = np.ptp(arrays[f"{row}/command"][window], axis=0) <= MIN_MOTION_RAD  # (n,)
     nominal_error = np.abs(arrays[f"{row}/nominal"] - recorded).mean(axis=0)
-    columns = np.lexsort((-nominal_error, still))[:3]
-    simulated = {name: arrays[f"{row}/{name}"][window] for name in methods}  # (T, n) rad each
+    picked = sorted(np.lexsort((-nominal_error, is_still))[:3].tolist())
     deltas = {}
     for name in methods:
         delta = arrays.get(f"{row}/delta/{name}")
@@ -164,28 +163,23 @@ def _trajectory(
     heights = {"position, rad": 1.8, "zoom, rad": 1.6, "error, mrad": 1.1}
     if deltas:
         heights["Δa, mrad"] = 0.9
-    fig = figure(3.6 * len(columns), 1.0 + 1.1 * sum(heights.values()))
+    fig = figure(3.6 * len(picked), 1.0 + 1.1 * sum(heights.values()))
     axes = fig.subplots(
-        len(heights), len(columns), squeeze=False, height_ratios=list(heights.values())
+        len(heights), len(picked), squeeze=False, height_ratios=list(heights.values())
     )
-    for column, j in zip(axes.T, sorted(columns.tolist()), strict=True):
-        zoom = _turn(command[:, j], dt)
-        real = recorded[window, j]
-        positions = {name: qpos[:, j] for name, qpos in simulated.items()}
-        whole = slice(None)
-        _draw_positions(column[0], time, command[:, j], positions, real, whole)
-        _draw_positions(column[1], time, command[:, j], positions, real, zoom)
-        column[0].axvspan(*time[zoom][[0, -1]], color="#000000", alpha=0.06, lw=0)
-        for name, qpos in positions.items():
-            column[2].plot(time, (qpos - real) * 1e3, color=colour(name), lw=1.0)
-        column[2].axhline(0, color="#111111", lw=0.6)
-        for name, delta in deltas.items():
-            column[3].plot(time[: len(delta)], delta[:, j] * 1e3, color=colour(name), lw=0.9)
+    time = np.arange(len(recorded))[window] * dt
+    for column, j in zip(axes.T, picked, strict=True):
+        shown = _JointPaths(
+            time,
+            dt,
+            command=arrays[f"{row}/command"][window, j],
+            recorded=recorded[window, j],
+            simulated={name: arrays[f"{row}/{name}"][window, j] for name in methods},
+            deltas={name: delta[:, j] for name, delta in deltas.items()},
+        )
         heading = joint_label(joints[j], wrapped=False)
-        column[0].set_title(f"{heading} (stands still)" if still[j] else heading)
-        column[-1].set_xlabel("time, s")
-        for ax in (column[0], *column[2:]):
-            ax.set_xlim(time[0], time[-1])
+        column[0].set_title(f"{heading} (stands still)" if is_still[j] else heading)
+        _draw_joint(column, shown)
     for line, label in zip(axes, heights, strict=True):
         line[0].set_ylabel(label)
     for line in axes[2:]:
@@ -195,32 +189,52 @@ def _trajectory(
     return fig
 
 
-def _draw_positions(
-    ax: Axes,
-    time: Array,
-    command: Array,
-    simulated: dict[str, Array],
-    recorded: Array,
-    part: slice,
-) -> None:
-    """Draw some rows of a joint's command, of its positions by each method, and as recorded, rad.
+@dataclass(frozen=True)
+class _JointPaths:
+    """Paths of one joint in the part of a motion that is drawn, (T,) each."""
 
-    All arrays are (T,).
-    """
+    time: Array  # s
+    dt: float  # s
+    command: Array  # rad
+    recorded: Array  # rad
+    simulated: dict[str, Array]  # method → rad
+    deltas: dict[str, Array]  # method → correction, rad; of methods with a network
+
+
+def _draw_joint(column: Array, paths: _JointPaths) -> None:
+    """Draw a joint into a column of axes, from top to bottom as `_trajectory` says."""
+    time = paths.time
+    zoom = _turn(paths.command, paths.dt)
+    _draw_positions(column[0], paths, slice(None))
+    _draw_positions(column[1], paths, zoom)
+    column[0].axvspan(*time[zoom][[0, -1]], color="#000000", alpha=0.06, lw=0)
+    for name, qpos in paths.simulated.items():
+        column[2].plot(time, (qpos - paths.recorded) * 1e3, color=colour(name), lw=1.0)
+    column[2].axhline(0, color="#111111", lw=0.6)
+    for name, delta in paths.deltas.items():
+        column[3].plot(time[: len(delta)], delta * 1e3, color=colour(name), lw=0.9)
+    column[-1].set_xlabel("time, s")
+    for ax in (column[0], *column[2:]):
+        ax.set_xlim(time[0], time[-1])
+
+
+def _draw_positions(ax: Axes, paths: _JointPaths, part: slice) -> None:
+    """Draw some rows of a joint's command, of its positions by each method, and as recorded."""
+    time = paths.time[part]
     ax.step(
-        time[part],
-        command[part],
+        time,
+        paths.command[part],
         where="post",
         color=colour("command"),
         ls=DOTTED,
         lw=1.1,
         label=title("command"),
     )
-    for name, qpos in simulated.items():
-        ax.plot(time[part], qpos[part], color=colour(name), label=title(name))
+    for name, qpos in paths.simulated.items():
+        ax.plot(time, qpos[part], color=colour(name), label=title(name))
     ax.plot(
-        time[part],
-        recorded[part],
+        time,
+        paths.recorded[part],
         color=colour("recorded"),
         ls=DASHED,
         lw=1.0,
@@ -266,8 +280,8 @@ def waterfall(gap: dict[str, Any]) -> Figure:
     """
     panels = {"all joints": {"left": gap["left"], "floor": gap["floor"]}} | gap["by_joint"]
     steps = list(gap["left"])
-    rows = -(-len(panels) // MAX_COLUMNS)
-    columns = -(-len(panels) // rows)
+    rows = math.ceil(len(panels) / MAX_COLUMNS)
+    columns = math.ceil(len(panels) / rows)
     fig = figure(1.2 + 2.3 * columns, (0.55 + 0.16 * len(steps)) * rows + 0.6)
     axes = fig.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
     for ax in axes.flat[len(panels) :]:
@@ -358,34 +372,41 @@ def draw_uncertainty(uncertainty: ParameterUncertainty, heading: str) -> Figure:
     summaries = [summarize(uncertainty, j) for j in joints]
     fields = [f for f in uncertainty.fields if any(s.values[f] for s in summaries)]
     columns = min(MAX_COLUMNS, len(fields))
-    rows = -(-len(fields) // columns)
+    rows = math.ceil(len(fields) / columns)
     fig = figure(2.4 * columns + 1.0, (0.24 * len(joints) + 0.8) * rows + 0.4)
     axes = fig.subplots(rows, columns, squeeze=False)
     for ax in axes.flat[len(fields) :]:
         ax.set_visible(False)
-    y = np.arange(len(joints))[::-1]
+    labels = [joint_label(joint, wrapped=False) for joint in joints]
     for place, (ax, field) in enumerate(zip(axes.flat, fields, strict=False)):
-        name = SERVO_FIELDS[field].heading
-        factor = SERVO_FIELDS[field].factor
-        values = np.array([s.values[field] * factor for s in summaries])
-        half = np.array([QUANTILE_90 * s.errors[field] * factor for s in summaries])
-        span = max(float(np.ptp(values)), float(np.abs(values).max()) * 0.1, 1e-9)
-        shown = half < MAX_INTERVAL * span
-        ax.errorbar(
-            values[shown],
-            y[shown],
-            xerr=half[shown],
-            fmt="o",
-            ms=3.5,
-            capsize=2,
-            lw=1.2,
-            color="#1f5fa8",
-        )
-        ax.plot(values[~shown], y[~shown], "o", ms=4, mfc="none", color="#999999")
         is_leftmost = place % columns == 0
-        labels = [joint_label(j, wrapped=False) if is_leftmost else "" for j in joints]
-        ax.set_yticks(y, labels)
-        ax.set_title(name)
+        _draw_parameter(ax, field, summaries)
+        y = np.arange(len(joints))[::-1]  # the first joint on top
+        ax.set_yticks(y, labels if is_leftmost else [""] * len(joints))
         ax.set_ylim(-0.6, len(joints) - 0.4)
     fig.suptitle(heading, x=0.01, ha="left", fontsize=9, fontweight="bold")
     return fig
+
+
+def _draw_parameter(ax: Axes, field: str, summaries: list[JointSummary]) -> None:
+    """Draw the values of a field, the first joint on top, with their 90 % intervals; hollow and
+    without interval where that is too wide.
+    """
+    factor = SERVO_FIELDS[field].factor
+    values = np.array([s.values[field] * factor for s in summaries])
+    half = np.array([QUANTILE_90 * s.errors[field] * factor for s in summaries])
+    span = max(float(np.ptp(values)), float(np.abs(values).max()) * 0.1, 1e-9)
+    is_known = half < MAX_INTERVAL * span
+    y = np.arange(len(summaries))[::-1]
+    ax.errorbar(
+        values[is_known],
+        y[is_known],
+        xerr=half[is_known],
+        fmt="o",
+        ms=3.5,
+        capsize=2,
+        lw=1.2,
+        color="#1f5fa8",
+    )
+    ax.plot(values[~is_known], y[~is_known], "o", ms=4, mfc="none", color="#999999")
+    ax.set_title(SERVO_FIELDS[field].heading)
