@@ -396,14 +396,18 @@ def train(
     config = config or TrainConfig()
     whole = Budget.parse(budget)
     folder = Path(out)
-    shared: dict[str, Any] = {}
+    shared: dict[str, Any] = {}  # what the trainings of several networks compute once
     with lock_folder(folder, "run"):
         data, spec = as_dataset(dataset, robot)
         require_commands(data)
         entries = used_recordings(data, training_splits(data, config, holdout_units))
         gate = pass_gate(data, entries, spec, despite_errors=despite_errors)
 
-        def one(kind: ModelKind, run: Path, share: float, spent: float, resume: bool) -> GapModel:
+        def train_network(
+            kind: ModelKind, run: Path, share: float, spent: float, resume: bool
+        ) -> GapModel:
+            """Train a network with a share of the budget, after another share was spent."""
+
             def show(status: Status) -> None:
                 progress(spent + share * status.fraction, 1.0, f"{kind}: {status.note}")
 
@@ -423,9 +427,9 @@ def train(
             return trainer.run()
 
         if model == "auto":
-            trained = train_best(folder, resume, one)
+            trained = train_best(folder, resume, train_network)
         else:
-            trained = one(model or config.model.kind, folder, 1.0, 0.0, resume)
+            trained = train_network(model or config.model.kind, folder, 1.0, 0.0, resume)
     return TrainResult(
         model=trained, card=trained.card, doctor=gate, candidates=candidate_errors(folder)
     )

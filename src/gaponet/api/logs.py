@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from gaponet.data.doctor import DoctorResult
     from gaponet.data.importer import ImportResult
     from gaponet.data.sequence import Sequence
+    from gaponet.motion.motion import Motion
     from gaponet.motion.plan import Plan
     from gaponet.sysid.uncertainty import ParameterUncertainty
     from gaponet.virtual.collect import CollectResult
@@ -348,48 +349,45 @@ def _further_motions(
     from gaponet.sysid.uncertainty import ParameterUncertainty
 
     uncertainty = ParameterUncertainty.require(spec)
-    if payloads[0] < 0 or (payloads[-1] > 0 and not spec.payload_mounts):
+    heaviest = payloads[-1]
+    if payloads[0] < 0 or (heaviest > 0 and not spec.payload_mounts):
         raise UsageError(
             f"--payloads {payloads}: give kg ≥ 0; {spec.name} has {len(spec.payload_mounts)} mounts"
         )
-    motions = candidate_motions(Library(spec, seed, payloads[-1]), progress)
-    pairs = [(mass, motion) for mass in payloads for motion in motions]
-    design = ExperimentDesign.from_recordings(
-        spec,
-        uncertainty,
-        [s for mass in payloads for s in simulated_recordings(spec, motions, mass)],
-    )
-    picks = sorted(design.choose(seconds), key=lambda i: pairs[i][0])
+    motions = candidate_motions(Library(spec, seed, heaviest), progress)
+    candidates: list[tuple[float, Motion]] = []  # payload, kg, and motion
+    recordings: list[Sequence] = []  # of the candidates, simulated
+    for mass in payloads:
+        candidates += [(mass, motion) for motion in motions]
+        recordings += simulated_recordings(spec, motions, mass)
+    design = ExperimentDesign.from_recordings(spec, uncertainty, recordings)
+    picks = sorted(design.choose(seconds), key=lambda number: candidates[number][0])
     if not picks:
         raise UsageError(
             f"--minutes {seconds / 60:g}: no motion is so short; give "
             f"{design.seconds.min() / 60:.2f}"
         )
-    before, after = (_standard_errors(uncertainty, design.after(chosen)) for chosen in ([], picks))
-    chosen = tuple(pairs[i] for i in picks)
-    return Plan(chosen), Prediction(
-        before=before,
-        after=after,
+    chosen = tuple(candidates[number] for number in picks)
+    prediction = Prediction(
+        before=_standard_errors(uncertainty, design.after([])),
+        after=_standard_errors(uncertainty, design.after(picks)),
         useful_seconds=design.worth(),
         undetermined=undetermined_gains(uncertainty, design),
         played=tuple((mass, motion.name) for mass, motion in chosen),
     )
+    return Plan(chosen), prediction
 
 
 def _standard_errors(
     uncertainty: ParameterUncertainty, covariance: np.ndarray
 ) -> dict[str, dict[str, float]]:
-    """Return joint → field → standard error, SI."""
-    return {
-        joint: dict(
-            zip(
-                uncertainty.fields,
-                np.sqrt(np.diag(uncertainty.si(joint, covariance[i])[1])).tolist(),
-                strict=True,
-            )
-        )
-        for i, joint in enumerate(uncertainty.joints)
-    }
+    """Return joint → field → standard error in SI units, of covariances (n, P, P) on the axes."""
+    errors = {}
+    for joint, of_joint in zip(uncertainty.joints, covariance, strict=True):
+        _, in_si = uncertainty.si(joint, of_joint)
+        std = np.sqrt(np.diag(in_si)).tolist()
+        errors[joint] = dict(zip(uncertainty.fields, std, strict=True))
+    return errors
 
 
 @dataclass(frozen=True)
@@ -426,26 +424,33 @@ def unit_recordings(
         UsageError: The unit is not there, or there are several and none is named.
     """
     with tempfile.TemporaryDirectory() as place:
-        if (
-            isinstance(source, (str, Path))
-            and Path(source).exists()
-            and not (Path(source) / "dataset.json").is_file()
-        ):
-            target = Path(place) / "data"
+        name = str(source.path) if isinstance(source, Dataset) else str(source)
+        if not isinstance(source, Dataset) and _holds_logs(Path(source)):
             data = import_logs(
-                source, robot=robot, out=target, unit_id=unit or None, payload_mass=payload_mass
+                source,
+                robot=robot,
+                out=Path(place) / "data",
+                unit_id=unit or None,
+                payload_mass=payload_mass,
             ).dataset
         else:
             data, _ = as_dataset(source, robot)
         data.require_robot(robot)
         unit, entries = entries_of_unit(data, unit, motions)
-        stated = max(
-            (e.meta.payload_mass for e in entries if e.meta.payload_mass != payload_mass),
-            default=None,
-        )
-        if payload_mass is not None and stated is not None:
-            raise UsageError(
-                f"--payload-mass {payload_mass:g}: {source} states {stated:g} kg; leave it out"
-            )
-        name = str(source) if isinstance(source, (str, Path)) else str(data.path)
+        if payload_mass is not None:
+            _require_payload(entries, payload_mass, name)
         yield UnitRecordings(name, unit, data, entries)
+
+
+def _holds_logs(place: Path) -> bool:
+    """Return True for a file or folder that is there and is no dataset."""
+    return place.exists() and not (place / "dataset.json").is_file()
+
+
+def _require_payload(entries: list[Entry], payload_mass: float, source: str) -> None:
+    """Refuse a payload, kg, that recordings state otherwise."""
+    others = [e.meta.payload_mass for e in entries if e.meta.payload_mass != payload_mass]
+    if others:
+        raise UsageError(
+            f"--payload-mass {payload_mass:g}: {source} states {max(others):g} kg; leave it out"
+        )

@@ -257,7 +257,8 @@ def replay(
         toml = None if described is None else Path(described)
         _, _, guessed = read_first_recording(Path(logs), spec, toml)
         if guessed:
-            write_text(toml := Path(place) / "logs.toml", guessed)
+            toml = Path(place) / "logs.toml"
+            write_text(toml, guessed)
         report = import_logs(
             logs,
             robot=spec,

@@ -50,11 +50,12 @@ def entries_of_unit(data: Dataset, unit: str, motions: tuple[str, ...]) -> tuple
         UsageError: The unit is not there, or there are several and none is named.
     """
     units = sorted({e.meta.unit_id for e in data.entries})
-    if unit not in units and (unit or len(units) != 1):
+    if not unit and len(units) == 1:
+        unit = units[0]
+    if unit not in units:
         raise UsageError(
             f"--unit {unit or '(none)'}: {data.path} holds units {', '.join(units)}; name one"
         )
-    unit = unit or units[0]
     return unit, [e for e in data.select(motions) if e.meta.unit_id == unit]
 
 
@@ -91,24 +92,22 @@ def require_torque_for_current(data: Dataset) -> None:
 
 def copies_with_torque(data: Dataset) -> bool:
     """True if torque was recorded, and the commands of the first recording are its positions, of
-    any row.
+    the same row or some rows later.
     """
     first = data.read(data.entries[0]) if data.entries else None
     return first is not None and first.tau is not None and None not in _copies(first)
 
 
 def _copies(sequence: Sequence) -> list[int | None]:
-    """Return by how many rows each moving joint repeats its command; None: it does not.
-
-    All are None if none moves.
+    """Return, for each moving joint, by how many rows its positions repeat its commands; None for
+    one whose positions do not. [None] if no joint moves.
     """
-    moving = np.flatnonzero(np.ptp(sequence.qpos, axis=0) > MOVING_RAD)
-    copies: list[int | None] = [
-        0
-        if np.array_equal(sequence.ctrl[:, j], sequence.qpos[:, j])
-        else sequence.copied.get(sequence.joint_names[j])
-        for j in moving
-    ]
+    copies: list[int | None] = []
+    for j in np.flatnonzero(np.ptp(sequence.qpos, axis=0) > MOVING_RAD):
+        if np.array_equal(sequence.ctrl[:, j], sequence.qpos[:, j]):
+            copies.append(0)
+        else:
+            copies.append(sequence.copied.get(sequence.joint_names[j]))
     return copies or [None]
 
 

@@ -165,23 +165,13 @@ def _show_formats(screen: Out) -> None:
 
 def _show_import(screen: Out, made: ImportResult) -> None:
     """Print what was added, the lag and the offsets of each joint, and the next command."""
-    entries = made.entries
     data = made.dataset
     table = made.to_dict()
-    rates = ", ".join(f"{rate:g}" for rate in table["rate_hz"])
-    units = ", ".join(dict.fromkeys(entry.meta.unit_id for entry in entries))
-    masses = sorted({entry.meta.payload_mass for entry in entries})
-    payloads = ", ".join(f"{mass:g}" for mass in masses)
-    virtual = "VIRTUAL " if any(entry.meta.virtual for entry in entries) else ""
     if made.present:
         screen.say(
             f"{len(made.present)} recordings were imported before, {len(made.added)} are new"
         )
-    screen.say(
-        f"{len(entries)} recordings, {table['minutes']:.1f} min at {rates} Hz, {virtual}robot "
-        f"{made.robot.name}, unit {units}, payload {payloads} kg; {data.path!s} now holds "
-        f"{len(data)}"
-    )
+    screen.say(f"{_inventory(made, table)}; {data.path!s} now holds {len(data)}")
     for line in _notes(made):
         screen.say(f"  {line}", "note", "cyan")
     for line in made.cut[:MAX_ROWS]:
@@ -196,6 +186,19 @@ def _show_import(screen: Out, made: ImportResult) -> None:
         )
     screen.next(f"gaponet doctor {data.path!s}")
     screen.result(table)
+
+
+def _inventory(made: ImportResult, table: dict[str, Any]) -> str:
+    """Return how many recordings of what were imported; `table` is the result as JSON has it."""
+    metas = [entry.meta for entry in made.entries]
+    rates = ", ".join(f"{rate:g}" for rate in table["rate_hz"])
+    units = ", ".join(dict.fromkeys(meta.unit_id for meta in metas))
+    payloads = ", ".join(f"{mass:g}" for mass in sorted({meta.payload_mass for meta in metas}))
+    virtual = "VIRTUAL " if any(meta.virtual for meta in metas) else ""
+    return (
+        f"{len(metas)} recordings, {table['minutes']:.1f} min at {rates} Hz, {virtual}robot "
+        f"{made.robot.name}, unit {units}, payload {payloads} kg"
+    )
 
 
 def _notes(made: ImportResult) -> list[str]:

@@ -52,9 +52,12 @@ ABOUT = "Close the gap between simulated and real motors from joint logs."
 
 
 def main(argv: Sequence[str] | None = None, begin: Callable[[], object] = lambda: None) -> int:
-    """Run a command; returns its exit code.
+    """Run a command; return its exit code.
 
-    `begin` is called once all options are understood, just before it.
+    Args:
+        argv: The command and its options; default: those of the shell.
+        begin: Called when all options are understood, just before the command runs. The console
+            script lets Ctrl-C raise KeyboardInterrupt from then on.
     """
     for stream in (sys.stdout, sys.stderr):
         # a terminal may lack our letters, and a file's name may be no text
@@ -96,6 +99,11 @@ def _error_line(error: Exception) -> str | None:
 
 
 def _run(argv: list[str], begin: Callable[[], object]) -> None:
+    """Parse the command and run it; arguments as of `main`.
+
+    Raises:
+        UsageError: There is no such command, or an option is out of range.
+    """
     if argv == ["--version"]:
         from gaponet import __version__
 
@@ -105,34 +113,35 @@ def _run(argv: list[str], begin: Callable[[], object]) -> None:
         print(_overview())
         return
     name = argv[0]
-    completing = argv[0].startswith("--tyro-")
-    if name not in COMMANDS and not completing:
+    is_completion = name.startswith("--tyro-")  # the shell asks what may follow
+    if name not in COMMANDS and not is_completion:
         close = get_close_matches(name, COMMANDS, 1)
         guess = f"do you mean {close[0]}? " if close else ""
         raise UsageError(f"no command '{name}'; {guess}gaponet --help lists them all")
     import tyro
 
+    wanted = COMMANDS if is_completion else {name: COMMANDS[name]}
+    functions = {command: _prepared(load(where), begin) for command, where in wanted.items()}
+    tyro.extras.subcommand_cli_from_dict(
+        functions, prog="gaponet", description=ABOUT, args=argv, sort_subcommands=False
+    )
+
+
+def _prepared(function: Callable[..., Any], begin: Callable[[], object]) -> Callable[..., Any]:
+    """Return the function of a command for tyro: with options explained in one line each, that are
+    checked before it begins.
+    """
     from gaponet.cli.options import join_lines
 
-    def begun(command: Callable[..., Any]) -> Callable[..., Any]:
-        join_lines(command)
+    join_lines(function)
 
-        @wraps(command)
-        def run(*args: Any, **kwargs: Any) -> Any:
-            _require_counts(kwargs)
-            begin()
-            return command(*args, **kwargs)
+    @wraps(function)
+    def run(*args: Any, **kwargs: Any) -> Any:
+        _require_counts(kwargs)
+        begin()
+        return function(*args, **kwargs)
 
-        return run
-
-    wanted = COMMANDS if completing else {name: COMMANDS[name]}
-    tyro.extras.subcommand_cli_from_dict(
-        {name: begun(load(where)) for name, where in wanted.items()},
-        prog="gaponet",
-        description=ABOUT,
-        args=argv,
-        sort_subcommands=False,
-    )
+    return run
 
 
 def _require_counts(options: dict[str, Any]) -> None:
@@ -140,13 +149,15 @@ def _require_counts(options: dict[str, Any]) -> None:
     them.
     """
     for name, value in options.items():
-        for number in value if isinstance(value, tuple) else (value,):
-            if is_dataclass(number):
-                _require_counts(vars(number))
-            elif isinstance(number, float) and math.isnan(number):
-                raise UsageError(f"--{name.replace('_', '-')} nan: give a number")
-            elif isinstance(number, int) and number < 0:
-                raise UsageError(f"--{name.replace('_', '-')} {number}: give at least 0")
+        option = f"--{name.replace('_', '-')}"
+        values = value if isinstance(value, tuple) else (value,)
+        for one in values:
+            if is_dataclass(one):
+                _require_counts(vars(one))
+            elif isinstance(one, float) and math.isnan(one):
+                raise UsageError(f"{option} nan: give a number")
+            elif isinstance(one, int) and one < 0:
+                raise UsageError(f"{option} {one}: give at least 0")
 
 
 def _overview() -> str:

@@ -1,4 +1,8 @@
-"""Options that several commands have, each said once."""
+"""Options that several commands have, each said once; and how their help reaches tyro.
+
+tyro makes the command line of a function: its parameters are the options, and its docstring is the
+help. `like` and `join_lines` change that docstring before tyro reads it.
+"""
 
 from __future__ import annotations
 
@@ -53,7 +57,10 @@ def join_lines(command: Callable[..., Any]) -> None:
 
 
 def _join_lines_of_fields(kind: Any) -> None:
-    """Write the explanations of a dataclass's fields into its docstring, each on one line."""
+    """Write the explanations of a dataclass's fields into its docstring, each on one line.
+
+    This changes the class, once; tyro reads the docstring.
+    """
     if not (isinstance(kind, type) and is_dataclass(kind)):
         return
     for base in kind.__mro__:
@@ -76,10 +83,10 @@ def like(function: Callable[..., Any]) -> Callable[[Command], Command]:
     """
 
     def decorate(command: Command) -> Command:
-        own, theirs = (inspect.getdoc(f) or "" for f in (command, function))
-        arguments = theirs.partition("Args:\n")[2].partition("\n\n")[0]
-        about, _, explained = own.partition("Args:\n")
-        # of two explanations the last counts
+        _, _, after_heading = (inspect.getdoc(function) or "").partition("Args:\n")
+        arguments, _, _ = after_heading.partition("\n\n")
+        about, _, explained = (inspect.getdoc(command) or "").partition("Args:\n")
+        # Of two explanations of one option the last counts: the command's own.
         command.__doc__ = f"{about.rstrip()}\n\nArgs:\n{arguments}\n{explained}"
         return command
 
@@ -93,16 +100,17 @@ def actions(**functions: Callable[..., Any]) -> Callable[[Command], Command]:
     Args:
         functions: Name of the action → function.
     """
-    for f in functions.values():
-        join_lines(f)
-    kinds = [
-        Annotated[None, tyro.conf.subcommand(name, constructor=f)] for name, f in functions.items()
-    ]
+    kinds = []
+    for name, function in functions.items():
+        join_lines(function)
+        kinds.append(Annotated[None, tyro.conf.subcommand(name, constructor=function)])
 
     def decorate(command: Command) -> Command:
-        union: Any = Union[tuple(kinds)]  # noqa: UP007
+        one_of_them: Any = Union[tuple(kinds)]  # noqa: UP007
         flat = tyro.conf.arg(name="")
-        command.__annotations__["action"] = Annotated[union, tyro.conf.OmitSubcommandPrefixes, flat]
+        command.__annotations__["action"] = Annotated[
+            one_of_them, tyro.conf.OmitSubcommandPrefixes, flat
+        ]
         return command
 
     return decorate

@@ -35,9 +35,13 @@ class _Console(Console):
 
 
 class Out:
-    """People read stdout; with json they read stderr, and stdout carries one object."""
+    """Output of a command.
 
-    names_next = True  # False within a command that gives the next one itself
+    People read stdout. With json they read stderr, and stdout carries one object.
+    """
+
+    # False while `gaponet start` runs commands one after the other: none of them names the next.
+    names_next = True
 
     def __init__(self, as_json: bool = False) -> None:
         self.as_json = as_json
@@ -46,32 +50,33 @@ class Out:
             self.console.width = max(self.console.width, WIDTH)
 
     def say(self, text: str, start: str = "", style: str = "bold") -> None:
-        """A line for people; `start` stands before the text, in this style.
+        """Print a line for people; neither text is markup, whatever it holds.
 
-        Neither is markup, whatever it holds.
+        Args:
+            text: What follows `start`, without a space between them: ": 3 joints", " of 7 files".
+            start: Highlighted words at the beginning of the line, such as the robot's name.
+            style: How they are highlighted.
         """
         self.console.print(Text.assemble((escape(start), style), escape(text)), soft_wrap=True)
 
     def next(self, command: str) -> None:
-        """The command that a person would give next; nothing within `gaponet start`, which gives
-        it itself.
+        """Print the command that a person would give next; nothing within `gaponet start`, which
+        gives it itself.
         """
         if self.names_next:
             self.say(f"next: {command}")
 
     def table(self, title: str, columns: list[str], rows: Iterable[list[str]]) -> None:
-        """A table for people, in as many parts as the screen is narrow; rows that are blank in a
-        part are left out.
+        """Print a table for people; on a narrow screen in parts, each without the rows that are
+        blank in it.
 
         The first column and long cells are text; the others are right-aligned numbers, which are
         never cut or wrapped.
         """
         cells = TableCells(columns, rows)
-        for count, part in enumerate(cells.parts(self.console.width)):
-            more = ", continued" if count else ""
-            table = Table(
-                title=Text(escape(title) + more), title_justify="left", title_style="bold"
-            )
+        heading = escape(title)
+        for part in cells.parts(self.console.width):
+            table = Table(title=Text(heading), title_justify="left", title_style="bold")
             fits = cells.width(part) <= self.console.width
             for i in part:
                 is_text = cells.is_text(i)
@@ -84,13 +89,14 @@ class Out:
             for line in cells.lines_of(part):
                 table.add_row(*(Text(line[i]) for i in part))
             self.console.print(table)
+            heading = f"{escape(title)}, continued"
 
     def show(self, title: str, table: ResultTable) -> None:
-        """A table of numbers, as `table`."""
+        """Print a table of numbers, as `table` does."""
         self.table(title, list(table.columns), table.texts())
 
     def findings(self, findings: Iterable[Finding]) -> None:
-        """A line each."""
+        """Print a line for each finding."""
         for finding in findings:
             self.say(
                 f"  {finding.check}: {finding.message}",
@@ -99,7 +105,7 @@ class Out:
             )
 
     def result(self, value: dict[str, Any]) -> None:
-        """The command's result as one JSON object; nothing without --json."""
+        """Print the command's result as one JSON object; nothing without --json."""
         if self.as_json:
             json.dump(json_compatible(value), sys.stdout, ensure_ascii=False, allow_nan=False)
             sys.stdout.write("\n")
