@@ -1,9 +1,8 @@
 """Parameters of a servo: one record each, which files, searches, uncertainty, tables and exports
 read.
 
-A new parameter of the servo model takes a record here, an attribute of RobotSpec (robot/spec.py),
-its torque in sim/servo.py and sim/warp.py, and a name for a table in evaluation/methods.py where it
-is a new cause.
+docs/architecture.md lists the places that a new parameter of the servo model needs ("Where a change
+goes"); its record here is the first.
 """
 
 from __future__ import annotations

@@ -4,23 +4,24 @@ imported when it reads.
 The first line of a format's docstring says what the format is. A format whose columns logs.toml
 explains has
 
-    recordings(path, specified)  yields RawRecordings (data.describe.raw_recording)
-    DEFAULT                 content of logs.toml unless the recording or the user states something
-    else; default nothing
+- `recordings(path, specified)`: yields RawRecordings (data.describe.raw_recording).
+- `DEFAULT`: content of logs.toml unless the recording or the user states something else; default:
+  nothing.
 
-and a format that says itself what its columns are has
+A format that says itself what its columns are has
 
-    read(path, robot, joint_map, **options)    yields (motion name, function that reads its Log), in
-    the order of find OPTIONS                 fields of logs.toml that it acts on beside ALWAYS;
-    default none
+- `read(path, robot, joint_map, **options)`: yields a motion's name and a function that reads its
+  Log, in the order of `find`.
+- `OPTIONS`: fields of logs.toml that it acts on beside ALWAYS; default: none.
 
-Both have SUFFIXES, of files that are recordings, at or below a folder; or, if that is not enough,
+Both have `SUFFIXES`, the ends of names of files that are recordings, at or below a folder. If that
+is not enough, they have
 
-    detects(path)           whether a file, or the files directly in a folder, look like it;
-    default: find returns any find(path)              the recordings under a path: files or folders,
-    sorted; default: files with SUFFIXES
+- `detects(path)`: whether a file, or the files directly in a folder, look like the format; default:
+  `find` returns any.
+- `find(path)`: the recordings under a path, files or folders, sorted; default: files with SUFFIXES.
 
-and, if it needs an extra of the package, EXTRA.
+A format that needs an extra of the package names it in `EXTRA`.
 
 A field of logs.toml that is neither in ALWAYS nor in OPTIONS is refused: the format fixes it. A
 file that another format detects is no `table`. The shortest readers to copy are pace.py
