@@ -7,8 +7,10 @@ from arm import TOML, XML, commands, record, write_arm
 from gaponet.sim.batch import BatchSim, Condition
 from gaponet.sim.inverse import AnalyticInverse, Inertia, Period
 from gaponet.sim.model import build_model
+from gaponet.sim.replay import replay
 
 CONDITION = Condition(0.2, "both", 0.02)
+LOADED = {"frictionloss": 0.05, "friction_motor": 0.4, "friction_external": 0.1}
 
 
 def smooth(robot):
@@ -31,6 +33,17 @@ def test_the_inverse_of_a_recording_is_its_command(tmp_path):
     sequence, inverse = smooth(robot), AnalyticInverse.of(BatchSim(robot, [CONDITION]))
     told = np.concatenate([inverse([p]) for p in periods(sequence, 0.0)])
     np.testing.assert_allclose(told, sequence.ctrl[:-1], atol=2e-4)
+
+
+def test_friction_that_grows_with_the_motors_torque_is_overcome_too(tmp_path):
+    robot = write_arm(tmp_path).with_servos(dict.fromkeys(("shoulder", "elbow"), LOADED))
+    (sequence,) = replay([smooth(robot)], robot)
+    inverse = AnalyticInverse.of(BatchSim(robot, [CONDITION]))
+    told = np.concatenate([inverse([p]) for p in periods(sequence, 1.0)])
+    speed = np.abs(sequence.qvel).astype(float)
+    moving = (speed[:-1] > 0.1) & (speed[1:] > 0.1)
+    assert moving.sum() > 50
+    assert np.abs(told - sequence.ctrl[:-1])[moving].mean() < 1e-3
 
 
 @pytest.mark.parametrize("count", [1, 2, 4, 10])

@@ -16,7 +16,7 @@ from gaponet.robot.servo_fields import SERVO_TERMS
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.batch import BatchSim
 from gaponet.sim.inverse import Inertia
-from gaponet.sim.servo import friction_limit, present
+from gaponet.sim.servo import overcome_friction, present
 
 # rad/s, rad/s²; a step of the targets would have more
 MAX_SPEED = 4.0
@@ -75,7 +75,8 @@ class Feedforward:
         """
         inertial = np.einsum("kij,kj->ki", self.inertia.matrix(len(self.qacc)), self.qacc)
         moving = inertial + self.damping * self.qvel
-        friction = friction_limit(
-            self.servo_terms, self.friction, self.qvel, holding + moving, holding
+        share = np.tanh(self.qvel / FRICTION_SPEED)
+        friction = overcome_friction(
+            self.servo_terms, self.friction, self.qvel, share, holding + moving, holding
         )
-        return np.asarray(moving + friction * np.tanh(self.qvel / FRICTION_SPEED))
+        return np.asarray(moving + friction)

@@ -19,7 +19,7 @@ from gaponet.base.arrays import Array
 from gaponet.base.errors import UsageError
 from gaponet.robot.servo_fields import SERVO_TERMS
 from gaponet.sim.batch import Batch, BatchSim
-from gaponet.sim.servo import friction_limit, present, torque_range
+from gaponet.sim.servo import overcome_friction, present, torque_range
 
 # Agreement of two simulators: largest difference of targets, and number of random motions that are
 # compared.
@@ -217,10 +217,8 @@ class AnalyticInverse:
             - self.passive[:, self.dof]
             + np.einsum("kij,kj->ki", self.inertia.matrix(self.num), qacc)
         )
-        result: Array = torque + friction * friction_limit(
-            self.terms, self.frictionloss, qvel, torque, load
-        )
-        return result
+        against = overcome_friction(self.terms, self.frictionloss, qvel, friction, torque, load)
+        return np.asarray(torque + against)
 
     def agrees_with(self, other: AnalyticInverse, limits: Array) -> bool:
         """Return True if the inverses of two simulators of the same joints, limits (n, 2) rad,

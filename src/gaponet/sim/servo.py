@@ -8,8 +8,8 @@ al. 2024). MuJoCo integrates: the model only changes the actuator's bias, its to
 limit of friction, so friction sticks as MuJoCo's does. A gear with backlash parts the motor
 (armature, damping, friction) from the link while its gap is open.
 
-The model stands here twice. `servo_torque`, `torque_limits` and `friction_limit` take arrays of
-numpy or torch, for exports and inverses. `requested_torque`, `motor_limits` and `joint_friction`
+The model stands here twice. `servo_torque`, `torque_limits`, `friction_limit` and
+`overcome_friction` take arrays, for exports and inverses. `requested_torque`, `motor_limits` and `joint_friction`
 take one servo with fields by name, for numba and Warp, which are faster. Simulations (`set_servos`)
 and the fit of single joints (`simulate_joints`) share the latter. A MuJoCo model's actuator_user
 holds the parameters; without, nothing here runs.
@@ -32,6 +32,7 @@ ServoTerms = dict[str, Any]
 
 SLOWEST = 1e-3  # rad/s: of stribeck_speed
 FINEST = 1e-9  # rad: of encoder_step
+MAX_LOAD_FRICTION = 0.9  # of the motor's torque: with 1, no torque would overcome it
 OPENED = 1 - 1e-9  # of half the width: a gap that opens
 # encoder steps: a motor with a least torque rests while it reads a smaller error
 DEADBAND_STEPS = 0.5
@@ -92,6 +93,32 @@ def friction_limit(terms: ServoTerms, frictionloss: Any, qvel: Any, torque: Any,
             terms["stribeck"], terms.get("stribeck_speed", SLOWEST), qvel
         )
     return limit
+
+
+def overcome_friction(
+    terms: ServoTerms, frictionloss: Array, qvel: Array, share: Array, torque: Array, load: Array
+) -> Array:
+    """Return the friction that a motor overcomes beside a torque, N·m; arrays of one shape.
+
+    Friction that grows with the motor's torque is part of this torque: the limit L solves
+    L = rest + |by_motor (torque + share L) + by_load load|.
+
+    Args:
+        terms: As of `present`.
+        frictionloss: Friction that does not depend on speed and torque, N·m.
+        qvel: Speeds, rad/s.
+        share: Friction over its limit, in [−1, 1].
+        torque: What the motor gives beside friction, N·m.
+        load: Gravity's torque, N·m.
+    """
+    rest = friction_limit(terms, frictionloss, qvel, 0.0, 0.0)
+    by_motor = terms.get("friction_motor", 0.0)
+    passing = by_motor * torque + terms.get("friction_external", 0.0) * load
+    grows = np.minimum(by_motor, MAX_LOAD_FRICTION) * share
+    limit = np.where(
+        passing + grows * rest >= 0, (rest + passing) / (1 - grows), (rest - passing) / (1 + grows)
+    )
+    return np.asarray(share * limit)
 
 
 def servo_torque(terms: ServoTerms, kp: Any, aim: Any, qpos: Any) -> Any:
