@@ -33,13 +33,13 @@ def write_arrays(
     vector = pa.list_(pa.field("element", pa.float32(), nullable=False), len(joint_names))
     fields = [
         pa.field("time", pa.float64(), nullable=False),
-        *(pa.field(c, vector, nullable=False) for c in columns),
+        *(pa.field(column, vector, nullable=False) for column in columns),
     ]
     arrays = [pa.array(np.arange(rows) * dt, pa.float64())]
     for values in columns.values():
         flat = pa.array(np.ascontiguousarray(values, np.float32).ravel())
         arrays.append(pa.FixedSizeListArray.from_arrays(flat, type=vector))
-    units = json.dumps({c: UNITS[c] for c in ["time", *columns]})
+    units = json.dumps({column: UNITS[column] for column in ["time", *columns]})
     table = pa.table(
         arrays, schema=pa.schema(fields, {"joint_names": ",".join(joint_names), "units": units})
     )
@@ -64,17 +64,17 @@ def read_arrays(path: Path, columns: tuple[str, ...], rows: int, n: int) -> dict
         file = pq.ParquetFile(path)
         _require_shape(path, file, columns, rows, n)
         table = file.read(columns=list(columns), use_threads=False)
-        arrays = {
-            c: table.column(c).combine_chunks().flatten().to_numpy(zero_copy_only=False)
-            for c in columns
-        }
+        arrays = {}
+        for column in columns:
+            flat = table.column(column).combine_chunks().flatten()
+            arrays[column] = flat.to_numpy(zero_copy_only=False)
     except (pa.ArrowException, OSError, KeyError, ValueError) as error:
         reason = str(error).split("\n")[0].rstrip(".")
         raise DatasetError(f"{path}: not a readable Parquet file ({reason}); {HINT}") from None
     for column, values in arrays.items():
         if len(values) != rows * n or not np.isfinite(values).all():
             raise DatasetError(f"{path}: {column} lacks values or holds NaN; {HINT}")
-    return {c: values.reshape(rows, n) for c, values in arrays.items()}
+    return {column: values.reshape(rows, n) for column, values in arrays.items()}
 
 
 def _require_shape(

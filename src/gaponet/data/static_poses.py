@@ -51,12 +51,12 @@ class StaticPoses:
         ctrl = np.zeros((len(ends), n))
         approach = np.zeros((len(ends), n), int)
         distinct = np.ones((len(ends), n), bool)
-        w = _window_rows(sequence)
+        window = _window_rows(sequence)
         starts = np.arange(0, len(sequence), BLOCK_ROWS)
         # (2, blocks, n)
         extremes = np.stack([f.reduceat(sequence.qpos, starts) for f in (np.minimum, np.maximum)])
         for i, end in enumerate(ends):
-            qpos[i] = sequence.qpos[end + 1 - w : end + 1].mean(axis=0)
+            qpos[i] = sequence.qpos[end + 1 - window : end + 1].mean(axis=0)
             ctrl[i] = sequence.ctrl[end]
             approach[i] = -_last_side(sequence.qpos[: end + 1], extremes, qpos[i])
             if i:
@@ -139,23 +139,23 @@ def _ends_of_rest(sequence: Sequence, joints: Array) -> Array:
 
     Time and memory grow with the rows only, not with the window.
     """
-    w = _window_rows(sequence)
-    if len(sequence) < 2 * w:
+    window = _window_rows(sequence)
+    if len(sequence) < 2 * window:
         return np.zeros(0, int)
     ctrl = sequence.ctrl[:, joints]
     state = sequence.qpos[:, joints].astype(float)
-    half = w // 2
-    ctrl_range = range_before(ctrl, w)[w - 1 :]
-    mean = _moving_mean(state, w)  # (T − w + 1, k), of the window that starts at the row
-    noise = np.sqrt(np.maximum(_moving_mean(state**2, w) - mean**2, 0))
+    half = window // 2
+    ctrl_range = range_before(ctrl, window)[window - 1 :]
+    mean = _moving_mean(state, window)  # (T − window + 1, k), from each row on
+    noise = np.sqrt(np.maximum(_moving_mean(state**2, window) - mean**2, 0))
     halves = _moving_mean(state, half)
-    drift = np.abs(halves[w - half :] - halves[: len(halves) - w + half])
+    drift = np.abs(halves[window - half :] - halves[: len(halves) - window + half])
     quiet = (ctrl_range < MAX_CTRL_RANGE_RAD) & (noise < MAX_NOISE_RAD) & (drift < MAX_DRIFT_RAD)
     rows = np.flatnonzero(quiet.all(axis=1))
-    return rows[np.append(np.diff(rows) > 1, True)] + w - 1 if rows.size else rows
+    return rows[np.append(np.diff(rows) > 1, True)] + window - 1 if rows.size else rows
 
 
-def _moving_mean(values: Array, w: int) -> Array:
-    """Return the mean of rows t … t + w − 1, (T, k) → (T − w + 1, k)."""
+def _moving_mean(values: Array, window: int) -> Array:
+    """Return the mean of rows t … t + window − 1, (T, k) → (T − window + 1, k)."""
     total = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(values, axis=0)])
-    return np.asarray((total[w:] - total[:-w]) / w)
+    return np.asarray((total[window:] - total[:-window]) / window)

@@ -179,7 +179,9 @@ class _Frames:
         self.options = options
         robot = options.robot
         features = self._features()
-        names = {c: self._joints(c, name, features[name]) for c, name in self.features.items()}
+        names = {}
+        for channel, feature in self.features.items():
+            names[channel] = self._joints(channel, feature, features[feature])
         self.joints = tuple(j for j in robot.joint_names if j in names["ctrl"])
         for channel, theirs in names.items():
             odd = sorted(set(theirs) - {""} ^ set(self.joints))
@@ -190,10 +192,11 @@ class _Frames:
                 )
         self.units = [self._unit_of(joint) for joint in self.joints]
         table = read_table(file, (*self.features.values(), *INDEX))
-        self.columns = {
-            c: _matrix(file, table, f, len(names[c]))[:, [names[c].index(j) for j in self.joints]]
-            for c, f in self.features.items()
-        }
+        self.columns = {}
+        for channel, feature in self.features.items():
+            theirs = names[channel]
+            order = [theirs.index(joint) for joint in self.joints]
+            self.columns[channel] = _matrix(file, table, feature, len(theirs))[:, order]
         self._require_unit()
         self.timestamp = _matrix(file, table, "timestamp", 1)[:, 0]
         self.frame = _matrix(file, table, "frame_index", 1)[:, 0]
@@ -239,7 +242,8 @@ class _Frames:
         for column, joint in enumerate(self.joints):
             if self.units[column] not in ("deg", "signed_percent"):
                 continue
-            size = np.abs(np.concatenate([self.columns[c][:, column] for c in ("ctrl", "qpos")]))
+            both = [self.columns["ctrl"][:, column], self.columns["qpos"][:, column]]
+            size = np.abs(np.concatenate(both))
             where = f"{self.file}: {joint}"
             if self.units[column] == "signed_percent" and size.max() > MAX_PERCENT:
                 raise LogError(
@@ -309,7 +313,8 @@ class _Frames:
             )
         time = self._time(where)
         channels = {
-            c: Channel(time, self._si(c, values[where])) for c, values in self.columns.items()
+            channel: Channel(time, self._si(channel, values[where]))
+            for channel, values in self.columns.items()
         }
         meta: dict[str, Any] = {
             "files": dict.fromkeys(channels, str(self.file)),

@@ -104,10 +104,12 @@ def recordings(path: Path, specified: LogsFile) -> Iterator[RawRecording]:
 
 def _usual(signals: dict[str, tuple[str, ...]]) -> LogsFile:
     """Which signals are command and state, where only one of each can be."""
-    states = [s for s in signals if s.endswith((".position", ".q")) and not _is_command(s)]
+    positions = [signal for signal in signals if signal.endswith((".position", ".q"))]
+    states = [signal for signal in positions if not _is_command(signal)]
     if len(states) > 1:  # a controller's feedback repeats what another topic says
-        states = [s for s in states if not _is_feedback(s)] or states
-    commands = [s for s in signals if s.endswith(COMMAND_FIELDS) and _is_command(s)]
+        states = [signal for signal in states if not _is_feedback(signal)] or states
+    targets = [signal for signal in signals if signal.endswith(COMMAND_FIELDS)]
+    commands = [signal for signal in targets if _is_command(signal)]
     specified: LogsFile = {}
     if len(states) == 1:
         specified |= _of_state(states[0], signals)
@@ -164,9 +166,11 @@ def _best_command(
     """
     if len(states) == 1:
         joints = set(signals[states[0]])
-        fitting = [
-            c for c in commands if joints & set(signals[c]) or len(signals[c]) == len(joints)
-        ]
+        fitting = []
+        for command in commands:
+            columns = signals[command]
+            if joints & set(columns) or len(columns) == len(joints):
+                fitting.append(command)
         commands = fitting or commands
     for endings in (
         (".reference.position", ".desired.position"),
@@ -175,7 +179,7 @@ def _best_command(
         (".point",),
         (".data",),
     ):
-        alike = [c for c in commands if c.endswith(endings)]
+        alike = [command for command in commands if command.endswith(endings)]
         if alike:
             return alike[0] if len(alike) == 1 else None
     return None
@@ -215,11 +219,12 @@ def _messages(
 
 def _known(reader: Any) -> list[Any]:
     known = reader.typestore.types
-    return [
-        c
-        for c in reader.connections
-        if c.msgcount and c.msgtype in known and not NOT_JOINTS.match(c.msgtype)
-    ]
+    connections = []
+    for connection in reader.connections:
+        kind = connection.msgtype
+        if connection.msgcount and kind in known and not NOT_JOINTS.match(kind):
+            connections.append(connection)
+    return connections
 
 
 @sandboxed(LogError, "rosbags.highlevel", 4.0)
@@ -250,7 +255,7 @@ def _peek(bag: Path, reader: Any) -> Wanted:
 
 def _no_joints(bag: Path, reader: Any) -> LogError:
     """Return the error that no topic of a bag is about joints."""
-    kinds = {c.msgtype for c in reader.connections}
+    kinds = {connection.msgtype for connection in reader.connections}
     undefined = sorted(kinds - set(reader.typestore.types))
     why = ""
     if undefined:
@@ -455,14 +460,14 @@ def _must_be_moved(stamps: dict[str, Array], lines: dict[str, Array]) -> bool:
     return any(abs(rate) * spans[topic] > DRIFT for topic, (rate, _) in lines.items())
 
 
-def _numbers(topic: str, m: Any) -> Fields:
+def _numbers(topic: str, message: Any) -> Fields:
     """Numbers of any message: its arrays of numbers, and a number of each part where it holds a
     list of parts.
     """
     messages: Fields = {}
     texts: list[tuple[str, ...]] = []
-    for name in m.__dataclass_fields__:
-        value = getattr(m, name)
+    for name in message.__dataclass_fields__:
+        value = getattr(message, name)
         if _is_numeric(value):
             messages[name] = ((), value)
         elif isinstance(value, list) and value:
@@ -518,11 +523,11 @@ def _labelled(messages: Fields, texts: list[tuple[str, ...]]) -> Fields:
     return labelled
 
 
-def _controller(topic: str, m: Any) -> Fields:
-    names = tuple(m.joint_names)
+def _controller(topic: str, message: Any) -> Fields:
+    names = tuple(message.joint_names)
     messages = {}
     for part in ("reference", "desired", "feedback", "actual"):
-        point = getattr(m, part, None)
+        point = getattr(message, part, None)
         if point is None:
             continue
         for ours, values in (
@@ -535,30 +540,33 @@ def _controller(topic: str, m: Any) -> Fields:
     return messages
 
 
-def _dynamic(topic: str, m: Any) -> Fields:
+def _dynamic(topic: str, message: Any) -> Fields:
     """Interfaces of DynamicJointState, such as position and effort, each with the joints that have
     it.
     """
     found: dict[str, dict[str, float]] = {}
-    for joint, part in zip(m.joint_names, m.interface_values, strict=True):
+    for joint, part in zip(message.joint_names, message.interface_values, strict=True):
         for interface, value in zip(part.interface_names, part.values, strict=True):
             found.setdefault(interface.rpartition("/")[2], {})[joint] = value
     return {name: (tuple(joints), list(joints.values())) for name, joints in found.items()}
 
 
-def _trajectory(topic: str, m: Any) -> Fields:
-    if len(m.points) > 1:
+def _trajectory(topic: str, message: Any) -> Fields:
+    points = message.points
+    if len(points) > 1:
         raise LogError(
-            f"{topic} sends whole trajectories ({len(m.points)} points); what the controller made "
+            f"{topic} sends whole trajectories ({len(points)} points); what the controller made "
             "of them stands in "
             'its state topic (…/controller_state): record that, and say ctrl = "…" in logs.toml'
         )
-    return {"point": (tuple(m.joint_names), m.points[0].positions)} if m.points else {}
+    if not points:
+        return {}
+    return {"point": (tuple(message.joint_names), points[0].positions)}
 
 
 def _motors(field: str, names: tuple[str, ...]) -> Callable[[str, Any], Fields]:
-    def fields(topic: str, m: Any) -> Fields:
-        motors = getattr(m, field)
+    def fields(topic: str, message: Any) -> Fields:
+        motors = getattr(message, field)
         labels = tuple(map(str, range(len(motors))))
         return {n: (labels, [getattr(x, n) for x in motors]) for n in names}
 
