@@ -96,7 +96,12 @@ def friction_limit(terms: ServoTerms, frictionloss: Any, qvel: Any, torque: Any,
 
 
 def overcome_friction(
-    terms: ServoTerms, frictionloss: Array, qvel: Array, share: Array, torque: Array, load: Array
+    terms: ServoTerms,
+    frictionloss: Array,
+    qvel: Array,
+    share: Array,
+    torque: Array,
+    load: Array | float,
 ) -> Array:
     """Return the friction that a motor overcomes beside a torque, N·m; arrays of one shape.
 
