@@ -44,12 +44,12 @@ def fitted(folder, width):
         noisy = moved.qpos + 2e-4 * rng.standard_normal(moved.qpos.shape)
         parts.append(replace(asked, qpos=noisy, qvel=moved.qvel))
     fit = JointFit(JointRollouts(parts, robot, nthread=1), robot, Bounds(robot, parts))
-    without = fit.search((), {f: np.full(1, v) for f, v in SERVO.items()})
+    without = fit.search({f: np.full(1, v) for f, v in SERVO.items()})
     fit.prior.update_correlation_time(fit.rollouts, without)
     return (
         fit,
         without,
-        fit.search(("backlash",), without | {"backlash": fit.bounds.guess["backlash"]}),
+        fit.search(without | {"backlash": fit.bounds.guess["backlash"]}),
     )
 
 

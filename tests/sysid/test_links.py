@@ -155,7 +155,7 @@ def test_masses_are_accepted_where_motions_that_were_not_fitted_gain(robot, monk
         self.bounds.first | {"kp": 1.1 * self.bounds.first["kp"]}
     )
     monkeypatch.setattr(JointFit, "search", servos)
-    monkeypatch.setattr("gaponet.sysid.problem.CHAIN_ITERATIONS", 1)
+    monkeypatch.setattr("gaponet.sysid.problem.MAX_CHAIN_ITERATIONS", 1)
     true = heavy(robot, factor) if factor != 1 else robot
     train, judges = recorded(true, 4, 200), recorded(true, 3, 200, first=50)
     fitted = identify(

@@ -51,7 +51,7 @@ def test_a_term_of_the_servo_model_is_recovered(tmp_path, law):
     start = {f: np.full(2, v) for f, v in SERVO.items()} | {
         f: fit.bounds.guess[f] for f in SERVO_TERMS if f in law
     }
-    found = fit.search(tuple(law), start)
+    found = fit.search(start)
     assert set(CLASSIC) < set(found)
     std = standard_errors(fit, found).std
     for field, value in law.items():
@@ -73,7 +73,7 @@ def test_a_torque_speed_line_is_recovered_and_none_is_seen_where_none_is(tmp_pat
     start = {f: np.full(2, v) for f, v in SERVO.items()} | {
         "no_load_speed": fit.bounds.guess["no_load_speed"]
     }
-    found = fit.search(("no_load_speed",), start)
+    found = fit.search(start)
     np.testing.assert_allclose(fit.bounds.visible("no_load_speed", found), no_load, rtol=0.1)
 
 
@@ -170,7 +170,7 @@ def test_a_kd_of_the_file_that_is_eight_times_too_low_is_overruled_and_named(tmp
         bounds = Bounds(given, sequences)
         rollouts = JointRollouts(cut(sequences, 4), given, nthread=1)
         fit = JointFit(rollouts, given, bounds)
-        found = fit.search(CLASSIC, bounds.start, fit.regressed())
+        found = fit.search(bounds.start, fit.regressed())
         np.testing.assert_allclose((found["damping"] + kd) / found["kp"], 4.0 / 20.0, rtol=0.05)
         errors.append(np.abs(rollouts.errors({f: v[None] for f, v in found.items()})).mean())
         doubts.append(contradicted_gains(bounds, found, standard_errors(fit, found).std))

@@ -91,7 +91,7 @@ def term_fit(found):
         bounds=bounds,
         robot=SimpleNamespace(operated=("elbow",)),
         rollouts=SimpleNamespace(rows=np.ones(1)),
-        search=lambda fields, start, report: start | found,
+        search=lambda start, report: start | found,
     )
 
 

@@ -51,7 +51,7 @@ def test_friction_and_damping_by_temperature_are_fitted_with_their_errors(tmp_pa
     fit = JointFit(JointRollouts(parts, robot, nthread=1), robot, Bounds(robot, parts))
     start = {f: np.full(1, v) for f, v in SERVO.items()} | {f: fit.bounds.guess[f] for f in WARM}
     assert start["friction_temperature"].tolist() == [31.0]
-    values = fit.search(WARM, start)
+    values = fit.search(start)
     assert values["friction_per_kelvin"][0] == pytest.approx(-0.02, rel=0.2)
     assert values["damping_per_kelvin"][0] == pytest.approx(-1e-3, rel=0.2)
     std = standard_errors(fit, values).std["turn"]

@@ -205,7 +205,10 @@ def execute(request: RunRequest, report: RunReporter, consent: Consent | None = 
         report.note(f"targets are expected on {live.transport.address}")
 
     def plan_and_ask(connected: Driver) -> None:
-        """Plan, show and ask: the robot has answered, and nothing was commanded."""
+        """Plan, show and ask: the robot has answered, and nothing was commanded.
+
+        The controller below calls this, and plays the plan that it is given here.
+        """
         compensation.require_gains(connected)
         if motion is not None:
             plan = planner.plan(motion, connected.read().qpos)

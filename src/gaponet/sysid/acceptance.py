@@ -26,7 +26,7 @@ Links = dict[str, Link]  # MJCF body → mass, centre of mass and inertia
 Covariance = dict[str, tuple[list[str], Array]]
 
 MIN_CROSS_VALIDATED = 4  # motions; a fit to two of three says little about a fit to all
-# motions of each set of recorded joints; fewer are too few to validate without cross-validation
+# Motions of each set of recorded joints; fewer cannot validate without cross-validation.
 MIN_JUDGES = 3
 
 
@@ -68,17 +68,20 @@ def cross_validation(
     """
     every = [*sequences, *validation]
     motions = _motions(every)
-    judges = _motions(validation)
-    several = [joints for joints, names in motions.items() if len(names) > 1]
-    enough = min((len(judges.get(joints, ())) for joints in several), default=0)
     count = min(folds, max(map(len, motions.values())))
-    few = len({s.meta.independent_motion for s in every}) < MIN_CROSS_VALIDATED
-    if not validation or enough >= MIN_JUDGES or count < 2 or few:
+    if not validation or count < 2:
+        return [(list(sequences), list(validation))]
+    if len({s.meta.independent_motion for s in every}) < MIN_CROSS_VALIDATED:
+        return [(list(sequences), list(validation))]
+    several = [unrecorded for unrecorded, names in motions.items() if len(names) > 1]
+    judges = _motions(validation)
+    fewest_judges = min((len(judges.get(unrecorded, ())) for unrecorded in several), default=0)
+    if fewest_judges >= MIN_JUDGES:
         return [(list(sequences), list(validation))]
     fold = {}
-    for joints in several:
-        for i, name in enumerate(motions[joints]):
-            fold[joints, name] = i % count
+    for unrecorded in several:
+        for i, name in enumerate(motions[unrecorded]):
+            fold[unrecorded, name] = i % count
     return [_split(every, fold, i) for i in range(count)]
 
 
@@ -92,7 +95,10 @@ def _split(
     held_out: list[Sequence] = []
     for s in sequences:
         own = fold.get((s.meta.unrecorded, s.meta.independent_motion))
-        (held_out if own == number else fitted).append(s)
+        if own == number:
+            held_out.append(s)
+        else:
+            fitted.append(s)
     return fitted, held_out
 
 
@@ -186,27 +192,16 @@ class Judge:
         """Take the recordings that judge, fold by fold; rows with a tip below `contact_height`, m,
         do not count.
         """
-        # rollouts, and the rows of each motion
-        self._folds: list[tuple[RobotRollouts, list[Array]]] = []
-        names = []
+        self._folds: list[_Fold] = []
+        names: list[str] = []
         for sequences in folds:
             touch = _contact_rows(sequences, robot, contact_height)
-            rollouts = RobotRollouts(list(sequences), robot, nthread, touch=touch)
-            # Repetitions, pieces and gains of what one unit plays with one payload are one judge.
-            metas = [s.meta for s in sequences]
-            keys = [
-                (m.independent_motion, m.unit_id, m.payload_mass, m.payload_side) for m in metas
-            ]
-            rows = {
-                one: np.array([key == one for key in keys])[rollouts.window]
-                for one in dict.fromkeys(keys)
-            }
-            rows = {key: counted for key, counted in rows.items() if counted.any()}
-            self._folds.append((rollouts, list(rows.values())))
-            names += [motion for motion, *_ in rows]
+            fold = _Fold.of(sequences, RobotRollouts(list(sequences), robot, nthread, touch=touch))
+            self._folds.append(fold)
+            names += fold.motions
         self.names = np.array(names)  # of all motions, (motions,)
         self.rows = sum(len(s) for sequences in folds for s in sequences)  # of all recordings
-        self._sums_of: dict[tuple[int, bytes], Array] = {}
+        self._simulated: dict[tuple[int, bytes], Array] = {}  # fold and candidate → its sums
 
     def _sums(self, candidate: ListOf[Values], links: ListOf[Links] = ()) -> tuple[Array, Array]:
         """Return the sums of |error| over counted rows, rad, and their numbers, by motion and
@@ -214,21 +209,14 @@ class Judge:
         """
         totals = []
         counts = []
-        for k, ((rollouts, motions), values) in enumerate(
-            zip(self._folds, candidate, strict=False)
-        ):
-            own = links[k : k + 1]
-            key = (
-                k,
-                b"".join(f.encode() + values[f].tobytes() for f in sorted(values))
-                + repr(own).encode(),
-            )
-            if key not in self._sums_of:
-                size = np.abs(rollouts.flat_errors({f: v[None] for f, v in values.items()}, own))[0]
-                self._sums_of[key] = np.stack([size[:, rows].sum(axis=1) for rows in motions])
-            totals.append(self._sums_of[key])
-            counts += [rollouts.recorded[:, rows].sum(axis=1) for rows in motions]
-        return np.concatenate(totals), np.stack(counts)
+        for number, (fold, values) in enumerate(zip(self._folds, candidate, strict=False)):
+            own_links = links[number : number + 1]
+            key = (number, _as_bytes(values, own_links))
+            if key not in self._simulated:
+                self._simulated[key] = fold.sums(values, own_links)
+            totals.append(self._simulated[key])
+            counts.append(fold.counts())
+        return np.concatenate(totals), np.concatenate(counts)
 
     def errors(self, candidate: ListOf[Values], links: ListOf[Links] = ()) -> Array:
         """Return the mean |error| of each motion, (motions,) rad; `links` of each fold, if they
@@ -240,9 +228,9 @@ class Judge:
     def errors_by_joint(self, candidate: ListOf[Values], links: ListOf[Links] = ()) -> Array:
         """Return the mean |error| of each joint, (n,) rad."""
         total, count = self._sums(candidate, links)
-        return np.asarray(
-            (total / np.maximum(count, 1)).sum(axis=0) / np.maximum((count > 0).sum(axis=0), 1)
-        )
+        of_motions = total / np.maximum(count, 1)  # (motions, n); 0 where a motion does not hold it
+        holding = (count > 0).sum(axis=0)
+        return np.asarray(of_motions.sum(axis=0) / np.maximum(holding, 1))
 
     def compare(self, name: str, before: Judged, after: Judged) -> Comparison:
         """Compare a state of the fit with the one before it."""
@@ -259,20 +247,21 @@ class Judge:
         Units and payloads of a motion count as one, since a robot that is identified already needs
         evidence to change.
         """
-        # (motions, n), NaN: not held
-        errors = {name: self._joint_errors(v) for name, v in candidates.items()}
-        given, *others = errors
-        winner = np.zeros(errors[given].shape[1], int)
+        names = list(candidates)
+        given, *others = names
+        # Name → (motions, n) rad; NaN where a motion does not hold a joint.
+        errors = {name: self._joint_errors(values) for name, values in candidates.items()}
+        winner = np.zeros(errors[given].shape[1], int)  # number of the candidate of each joint
         for i in range(len(winner)):
             held = ~np.isnan(errors[given][:, i])
-            name = min(others, key=lambda other: float(np.nansum(errors[other][:, i])))
-            if (
-                held.any()
-                and Comparison(name, errors[given][held, i], errors[name][held, i]).accepted
-            ):
-                winner[i] = list(errors).index(name)
-        mixed = [_by_joint(each, winner) for each in zip(*candidates.values(), strict=True)]
-        return ("mixed", mixed) if winner.any() else (given, candidates[given])
+            if not held.any():
+                continue
+            best = min(others, key=lambda other: float(np.nansum(errors[other][:, i])))
+            if Comparison(best, errors[given][held, i], errors[best][held, i]).accepted:
+                winner[i] = names.index(best)
+        if not winner.any():
+            return given, candidates[given]
+        return "mixed", _mixed(candidates, winner)
 
     def _joint_errors(self, candidate: ListOf[Values]) -> Array:
         """Return the mean |error| of each motion and joint, (motions, n) rad; NaN where a motion
@@ -286,37 +275,87 @@ class Judge:
     def best(self, candidates: dict[str, list[Values]]) -> tuple[str, list[Values]]:
         """Return name and values of the best candidate.
 
-        The second candidate is the default. Another one replaces it if it is accepted by
-        `Comparison`, or better by 10 %. The best values joint by joint ("mixed") replace it only if
-        they are accepted. The first candidate, the given robot, is returned if no fit is better by
-        1 %.
+        The order of the candidates counts. The second one is the default. Another one replaces it
+        if it is accepted by `Comparison`, or better by 10 %. The best values joint by joint
+        ("mixed") replace it only if they are accepted. The first candidate, the given robot, is
+        returned if no fit is better by 1 %.
         """
         given, default, *others = candidates
-        joints = np.array([self.errors_by_joint(v) for v in candidates.values()])
-        winner = joints.argmin(axis=0)
+        by_joint = np.array([self.errors_by_joint(values) for values in candidates.values()])
+        winner = by_joint.argmin(axis=0)  # number of the candidate of each joint
         if len(set(winner.tolist())) > 1:
-            mixed = [_by_joint(each, winner) for each in zip(*candidates.values(), strict=True)]
-            candidates = candidates | {"mixed": mixed}
-        errors = {name: self.errors(v) for name, v in candidates.items()}
-        name = default
-        for other in (*others, *(candidates.keys() & {"mixed"})):
-            limit = (1 - MIN_RELATIVE_GAIN_ONE_MOTION) * errors[name].mean()
-            much_better = other != "mixed" and errors[other].mean() < limit
-            name = (
-                other
-                if much_better or Comparison(other, errors[name], errors[other]).accepted
-                else name
-            )
-        name = (
-            name if errors[name].mean() < (1 - MIN_RELATIVE_GAIN) * errors[given].mean() else given
-        )
-        return name, candidates[name]
+            candidates = candidates | {"mixed": _mixed(candidates, winner)}
+            others.append("mixed")
+        errors = {name: self.errors(values) for name, values in candidates.items()}
+        best = default
+        for other in others:
+            limit = (1 - MIN_RELATIVE_GAIN_ONE_MOTION) * errors[best].mean()
+            is_much_better = other != "mixed" and errors[other].mean() < limit
+            if is_much_better or Comparison(other, errors[best], errors[other]).accepted:
+                best = other
+        if not errors[best].mean() < (1 - MIN_RELATIVE_GAIN) * errors[given].mean():
+            best = given
+        return best, candidates[best]
 
 
-def _by_joint(candidates: ListOf[Values], winner: Array) -> Values:
-    """Return the values (n,) of candidate winner[i] for joint i."""
-    fields = set.intersection(*map(set, candidates))
-    return {f: np.stack([v[f] for v in candidates])[winner, np.arange(len(winner))] for f in fields}
+@dataclass(frozen=True)
+class _Fold:
+    """Recordings that judge the candidate of one fold.
+
+    What one unit plays of a motion with one payload is one judge: its repetitions, its pieces, and
+    its recordings with other gains.
+
+    Attributes:
+        rollouts: Rollouts beside the recordings.
+        motions: Name of each judge's motion.
+        rows: Rows of each judge, (rows,) bool each.
+    """
+
+    rollouts: RobotRollouts
+    motions: list[str]
+    rows: list[Array]
+
+    @classmethod
+    def of(cls, sequences: ListOf[Sequence], rollouts: RobotRollouts) -> _Fold:
+        """Return the judges that have rows."""
+        metas = [s.meta for s in sequences]
+        judges = [(m.independent_motion, m.unit_id, m.payload_mass, m.payload_side) for m in metas]
+        motions = []
+        rows = []
+        for judge in dict.fromkeys(judges):
+            is_own = np.array([other == judge for other in judges])[rollouts.window]
+            if is_own.any():
+                motions.append(judge[0])
+                rows.append(is_own)
+        return cls(rollouts, motions, rows)
+
+    def sums(self, values: Values, links: ListOf[Links]) -> Array:
+        """Return the sums of |error| over the rows of each judge, (judges, n) rad; values (n,)."""
+        errors = self.rollouts.flat_errors({f: v[None] for f, v in values.items()}, links)
+        size = np.abs(errors)[0]  # (n, rows)
+        return np.stack([size[:, rows].sum(axis=1) for rows in self.rows])
+
+    def counts(self) -> Array:
+        """Return the number of rows of each judge that hold a joint, (judges, n)."""
+        return np.stack([self.rollouts.recorded[:, rows].sum(axis=1) for rows in self.rows])
+
+
+def _as_bytes(values: Values, links: ListOf[Links]) -> bytes:
+    """Return a candidate as bytes that no other candidate has."""
+    of_fields = [field.encode() + values[field].tobytes() for field in sorted(values)]
+    return b"".join(of_fields) + repr(links).encode()
+
+
+def _mixed(candidates: dict[str, list[Values]], winner: Array) -> list[Values]:
+    """Return the values (n,) of each fold, of candidate number winner[i] for joint i; fields that
+    all candidates have.
+    """
+    joints = np.arange(len(winner))
+    mixed = []
+    for of_fold in zip(*candidates.values(), strict=True):
+        fields = [f for f in of_fold[0] if all(f in values for values in of_fold)]
+        mixed.append({f: np.stack([v[f] for v in of_fold])[winner, joints] for f in fields})
+    return mixed
 
 
 def _contact_rows(
@@ -326,5 +365,7 @@ def _contact_rows(
     if not robot.tips:
         return None
     heights = tip_heights(sequences, robot)
-    rows = max(map(len, heights))
-    return np.array([np.r_[h < contact_height, np.zeros(rows - len(h), bool)] for h in heights])
+    touch = np.zeros((len(heights), max(map(len, heights))), bool)
+    for row, height in zip(touch, heights, strict=True):
+        row[: len(height)] = height < contact_height
+    return touch

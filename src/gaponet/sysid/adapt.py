@@ -27,19 +27,14 @@ from gaponet.sysid.robot_rollouts import WINDOW_S, RobotRollouts, cut
 Field = Literal["kp", "damping", "frictionloss", "offset", "delay"]
 FIELDS: tuple[Field, ...] = get_args(Field)
 PRIOR_RAD = 0.3  # price of a large change of one joint
-# the same where all joints change by the same share: a cold day, a slow bus
+# The same price, relative, where all joints change by the same share: a cold day, a slow bus.
 SHARED_PRIOR_RATIO = 0.05
-# such a day moves no zeros and softens no gains
-SHARED_FIELDS = (
-    "damping",
-    "frictionloss",
-    "delay",
-)
-# at most; relative decrease of the cost for another one
-ITERATIONS = 4
-MIN_DECREASE = 1e-3
+# What such a day changes: it moves no zeros and softens no gains.
+SHARED_FIELDS = ("damping", "frictionloss", "delay")
+MAX_ITERATIONS = 4
+MIN_DECREASE = 1e-3  # relative, of the cost, for another iteration
 MAX_FOLDS = 4  # of motions that judge
-MAX_SHORT_WINDOW_S = 4.0  # too short to validate another window
+MAX_SHORT_WINDOW_S = 4.0  # a window of this length is too short to validate another one
 START_DELAY_S = 0.005  # a delay of zero has no slope
 
 
@@ -83,82 +78,100 @@ def adapt(
         judge: Judge by motions that are not fitted; joints with one short motion keep their values
             then.
     """
-    parts = cut(sequences, max(1, round(seconds / WINDOW_S)))
-    judged = _cross_validated(parts, robot, corrector) if judge else (np.zeros(0), np.zeros(0))
-    accepted = not judge or parts[0].duration > MAX_SHORT_WINDOW_S
-    if len(judged[0]):
-        accepted = not Comparison("adapted", *judged).harmful
-        parts = [
-            parts[i] for motions in _motions_that_judge(parts) for motion in motions for i in motion
-        ]
-    rollouts = RobotRollouts(parts, robot, corrector=corrector)
+    windows = cut(sequences, max(1, round(seconds / WINDOW_S)))
+    judged = (np.zeros(0), np.zeros(0))
+    accepted = True
+    if judge:
+        motions_of_sets = _motions_that_judge(windows)
+        judged = _cross_validated(motions_of_sets, robot, corrector)
+        accepted = windows[0].duration > MAX_SHORT_WINDOW_S
+        if motions_of_sets:
+            accepted = not Comparison("adapted", *judged).harmful
+            windows = _windows_of(motions_of_sets)
+    rollouts = RobotRollouts(windows, robot, corrector=corrector)
     problem = _Problem(rollouts, first_values(robot), robot.kd[rollouts.op])
     done = 0
 
     def report(cost: Array) -> None:
         nonlocal done
         done += 1
-        progress(done, ITERATIONS, ERROR_SCALE_RAD * float(np.sqrt(2 * cost[0] / problem.size)))
+        rms = ERROR_SCALE_RAD * float(np.sqrt(2 * cost[0] / problem.size))
+        progress(done, MAX_ITERATIONS, rms)
 
     x, _ = descend(
         problem.changes.start(START_DELAY_S).reshape(1, 1, -1),
         problem.low,
         problem.high,
         problem.errors,
-        ITERATIONS,
+        MAX_ITERATIONS,
         report,
         min_decrease=MIN_DECREASE,
         derive=problem.slopes,
     )
-    before, after = (problem.rms(p) for p in (np.zeros_like(x[0, 0]), x[0, 0]))
-    accepted = accepted and not (judge and after > (1 - MIN_RELATIVE_GAIN) * before)
+    before = problem.rms(np.zeros_like(x[0, 0]))
+    after = problem.rms(x[0, 0])
+    if judge and after > (1 - MIN_RELATIVE_GAIN) * before:
+        accepted = False
     values = problem.values(x[0])
-    return Adapted(
-        with_values(robot, {str(f): values[f][0] for f in FIELDS}), before, after, judged, accepted
-    )
+    adapted = with_values(robot, {str(f): values[f][0] for f in FIELDS})
+    return Adapted(adapted, before, after, judged, accepted)
 
 
-def _motions_that_judge(parts: list[Sequence]) -> list[list[list[int]]]:
-    """Return the windows of each motion, for each set of joints that is recorded together.
+# Windows of a recording that belong to one motion.
+_Motion = list[Sequence]
 
-    A single motion of a set is divided into its windows where these are long. Else it is left out,
-    since nothing else can judge it.
+
+def _motions_that_judge(windows: list[Sequence]) -> list[list[_Motion]]:
+    """Return the motions of each set of joints that is recorded together.
+
+    Each window of a set's single motion counts as a motion of its own where they are long. Short
+    ones are left out, since nothing else of their set can judge them.
     """
-    groups: dict[tuple[str, ...], dict[str, list[int]]] = {}
-    for i, p in enumerate(parts):
-        groups.setdefault(p.meta.unrecorded, {}).setdefault(p.meta.motion, []).append(i)
-    every = [list(motions.values()) for motions in groups.values()]
-    every = [
-        [[i] for i in m[0]] if len(m) == 1 and parts[m[0][0]].duration > MAX_SHORT_WINDOW_S else m
-        for m in every
-    ]
-    return [motions for motions in every if len(motions) > 1]
+    groups: dict[tuple[str, ...], dict[str, _Motion]] = {}
+    for window in windows:
+        motions_of_set = groups.setdefault(window.meta.unrecorded, {})
+        motions_of_set.setdefault(window.meta.motion, []).append(window)
+    that_judge = []
+    for motions_of_set in groups.values():
+        motions = list(motions_of_set.values())
+        if len(motions) == 1 and motions[0][0].duration > MAX_SHORT_WINDOW_S:
+            motions = [[window] for window in motions[0]]
+        if len(motions) > 1:
+            that_judge.append(motions)
+    return that_judge
+
+
+def _windows_of(motions_of_sets: list[list[_Motion]]) -> list[Sequence]:
+    """Return the windows of all motions, set by set."""
+    windows: list[Sequence] = []
+    for motions in motions_of_sets:
+        for motion in motions:
+            windows += motion
+    return windows
 
 
 def _cross_validated(
-    parts: list[Sequence], robot: RobotSpec, corrector: Corrector | None
+    motions_of_sets: list[list[_Motion]], robot: RobotSpec, corrector: Corrector | None
 ) -> tuple[Array, Array]:
     """Return the mean |error| of motions, of the robot and of the fit to the other motions,
-    (motions,) rad.
+    (motions,) rad each.
     """
-    every = _motions_that_judge(parts)
-    errors = list[tuple[float, ...]]()
-    for k in range(min(MAX_FOLDS, max(map(len, every), default=0))):
-        test = [motion for motions in every for motion in motions[k::MAX_FOLDS]]
-        rest = [
-            parts[i]
-            for motions in every
-            for motion in motions
-            if motion not in test
-            for i in motion
-        ]
-        both = robot, adapt(rest, robot, len(rest) * WINDOW_S, corrector=corrector).robot
-        errors += [
-            tuple(rollout_errors([parts[i] for i in motion], r).mean() for r in both)
-            for motion in test
-        ]
-    before, after = np.array(errors).reshape(-1, 2).T
-    return before, after
+    before = []
+    after = []
+    folds = min(MAX_FOLDS, max(map(len, motions_of_sets), default=0))
+    for number in range(folds):
+        test: list[_Motion] = []
+        rest: list[Sequence] = []
+        for motions in motions_of_sets:
+            test += motions[number::MAX_FOLDS]
+            for i, motion in enumerate(motions):
+                if i % MAX_FOLDS != number:
+                    rest += motion
+        fitted = adapt(rest, robot, len(rest) * WINDOW_S, corrector=corrector).robot
+        for motion in test:
+            before.append(rollout_errors(motion, robot).mean())
+            after.append(rollout_errors(motion, fitted).mean())
+    return np.array(before), np.array(after)
 
 
 class _Problem:
@@ -175,15 +188,27 @@ class _Problem:
         self.n = rollouts.n
         self.size = int(rollouts.rows.sum())
         self.changes = Changes(first, FIELDS, kd_slack)
-        self.low, self.high = self.changes.low.reshape(1, -1), self.changes.high.reshape(1, -1)
+        self.low = self.changes.low.reshape(1, -1)
+        self.high = self.changes.high.reshape(1, -1)
+        self.prior = self._prior()
+
+    def _prior(self) -> Array:
+        """Return the errors of the prior over x, (P, P).
+
+        A change of one joint costs the price. Taking a share of the mean over joints away from it
+        makes a change that all joints share cheaper, by SHARED_PRIOR_RATIO.
+        """
         price = PRIOR_RAD / ERROR_SCALE_RAD
         single = price * np.eye(self.n)
-        common = price * (1 - SHARED_PRIOR_RATIO) / self.n
-        self.prior = np.zeros((self.low.size, self.low.size))  # errors of the prior over x
-        for i, f in enumerate(FIELDS):
-            here = np.arange(self.n) * len(FIELDS) + i
-            weight = LARGE_KP_LOG_CHANGE if f == "kp" else 1.0
-            self.prior[np.ix_(here, here)] = weight * (single - common * (f in SHARED_FIELDS))
+        of_mean = price * (1 - SHARED_PRIOR_RATIO) / self.n
+        prior = np.zeros((self.low.size, self.low.size))
+        for i, field in enumerate(FIELDS):
+            block = single - of_mean if field in SHARED_FIELDS else single
+            if field == "kp":
+                block = LARGE_KP_LOG_CHANGE * block
+            here = np.arange(self.n) * len(FIELDS) + i  # of this field in x, joint by joint
+            prior[np.ix_(here, here)] = block
+        return prior
 
     def values(self, xs: Array) -> Values:
         """Return candidates (k, P) as field → (k, n)."""
@@ -201,23 +226,24 @@ class _Problem:
         return np.concatenate([own, xs[:, 0] @ self.prior.T], axis=1)[:, None]
 
     def slopes(self, x: Array, high: Array, errors: Errors) -> tuple[Array, Array]:
-        """Return what least_squares.slopes does, for one start, by fewer candidates."""
-        here = x[0, 0]
+        """Return what least_squares.slopes does, for one start, by fewer candidates: x as it is,
+        and each field changed in all joints at once.
+        """
+        here = x[0, 0]  # (P,)
         count = len(FIELDS)
-        field = np.tile(np.arange(count), self.n)
+        field = np.tile(np.arange(count), self.n)  # number of the field of each entry of x
         step = np.where(here + DIFFERENCE_STEP > high[0], -DIFFERENCE_STEP, DIFFERENCE_STEP)
-        tried = here + np.concatenate(
-            [np.zeros((1, len(here))), (field == np.arange(count)[:, None]) * step]
-        )
-        each = self._errors(tried)  # (1 + count, n, rows)
-        jac = np.zeros((*each.shape[1:], len(here)), np.float32)
+        changes = np.zeros((1 + count, len(here)))
+        for number in range(count):
+            changes[1 + number] = np.where(field == number, step, 0.0)
+        tried = self._errors(here + changes)  # (1 + count, n, rows)
+        jac = np.zeros((*tried.shape[1:], len(here)), np.float32)
         for i in range(len(here)):
             joint = i // count
-            jac[joint, :, i] = (each[1 + field[i], joint] - each[0, joint]) / step[i]
-        base = np.concatenate([each[0].ravel(), self.prior @ here])
-        return base[None, None], np.concatenate([jac.reshape(-1, len(here)), self.prior])[
-            None, None
-        ]
+            jac[joint, :, i] = (tried[1 + field[i], joint] - tried[0, joint]) / step[i]
+        with_prior = np.concatenate([tried[0].ravel(), self.prior @ here])
+        slopes = np.concatenate([jac.reshape(-1, len(here)), self.prior])
+        return with_prior[None, None], slopes[None, None]
 
     def _errors(self, xs: Array) -> Array:
         """Return errors of rollouts, (k, n, rows) in ERROR_SCALE_RAD."""

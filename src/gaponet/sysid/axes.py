@@ -34,20 +34,15 @@ LARGE_KP_LOG_CHANGE = 0.2
 MAX_ARMATURE_TIME_S = 0.3
 MAX_ON_AXIS = {f.name: f.bounds[1] for f in SERVO_FIELDS.values() if f.bounds}
 MIN_EXCITATION_RAD = 0.01  # commands that differ by less do not excite a joint
-# of an unexcited joint, fitted as others move it
-UNEXCITED_FIELDS = (
-    "kp",
-    "offset",
-    "damping",
-    "frictionloss",
-)
+# What is fitted of an unexcited joint, as others move it.
+UNEXCITED_FIELDS = ("kp", "offset", "damping", "frictionloss")
 MIN_INVERSE = 1e-5  # on an inverse axis; less counts as none
-# share of the torque that a motor has lost at a joint's greatest speed
+# Of a torque-speed line, in the share of torque that the motor has lost at the joint's greatest
+# speed: the least that counts, and a large change.
 MIN_LINE = 0.2
 LARGE_LINE_CHANGE = 0.1
-# of a joint's recorded speeds, and rad/s: the greatest is at least this
-SPEED_QUANTILE = 0.995
-MIN_SPEED = 0.1
+GREATEST_SPEED_QUANTILE = 0.995  # of a joint's recorded speeds
+MIN_GREATEST_SPEED = 0.1  # rad/s
 BOUND_TOLERANCE = 0.02  # of a large change: a value as near to its bound is at it
 
 
@@ -66,22 +61,32 @@ def to_axis(field: str, value: Array, kp: Array) -> Array:
 
 def from_axis(x: dict[str, Array], kp: Array | None = None) -> Values:
     """Return values in SI units of fields on their axes; kp is that of `x`, or given."""
-    values = {f: np.exp(v) if SERVO_FIELDS[f].axis == "log" else v for f, v in x.items()}
-    for f in (f for f in x if SERVO_FIELDS[f].axis == "inverse"):
-        values[f] = np.divide(1.0, x[f], out=np.zeros_like(x[f], float), where=x[f] > MIN_INVERSE)
-    kp = values.get("kp", kp)
-    return {f: v * kp if SERVO_FIELDS[f].axis == "over kp" else v for f, v in values.items()}
+    if "kp" in x:
+        kp = np.exp(x["kp"])
+    values = {}
+    for field, v in x.items():
+        axis = SERVO_FIELDS[field].axis
+        if axis == "log":
+            values[field] = np.exp(v)
+        elif axis == "inverse":
+            none = np.zeros_like(v, float)
+            values[field] = np.divide(1.0, v, out=none, where=v > MIN_INVERSE)
+        elif axis == "over kp":
+            values[field] = v * kp
+        else:
+            values[field] = v
+    return values
 
 
 def greatest_speeds(sequences: ListOf[Sequence], robot: RobotSpec) -> Array:
-    """Return the greatest recorded speed of each operated joint, at least MIN_SPEED, (n,) rad/s;
-    without outliers.
+    """Return the greatest recorded speed of each operated joint, at least MIN_GREATEST_SPEED, (n,)
+    rad/s; without outliers.
     """
-    speeds = [
-        np.quantile(np.abs(s.qvel[:, robot.operated_index]), SPEED_QUANTILE, axis=0)
-        for s in sequences
-    ]
-    return np.asarray(np.maximum(np.max(speeds, axis=0), MIN_SPEED))
+    speeds = []
+    for s in sequences:
+        speed = np.abs(s.qvel[:, robot.operated_index])
+        speeds.append(np.quantile(speed, GREATEST_SPEED_QUANTILE, axis=0))
+    return np.asarray(np.maximum(np.max(speeds, axis=0), MIN_GREATEST_SPEED))
 
 
 def first_values(robot: RobotSpec) -> Values:
@@ -91,13 +96,12 @@ def first_values(robot: RobotSpec) -> Values:
     """
     model = build_model(replace(robot, table=None))
     op = robot.operated_index
-    passive = {
-        f: np.array(getattr(model, f"dof_{f}")[op]) for f in ("damping", "frictionloss", "armature")
-    }
-    return passive | {
-        f: getattr(robot, f)[op]
-        for f in ("kp", "offset", "delay", "effort_limit", *SERVO_TERMS, *WARM)
-    }
+    values = {}
+    for field in ("damping", "frictionloss", "armature"):
+        values[field] = np.array(getattr(model, f"dof_{field}")[op])
+    for field in ("kp", "offset", "delay", "effort_limit", *SERVO_TERMS, *WARM):
+        values[field] = getattr(robot, field)[op]
+    return values
 
 
 def identified_joints(robot: RobotSpec) -> set[str]:
@@ -112,12 +116,10 @@ def identified_joints(robot: RobotSpec) -> set[str]:
 
 def with_values(robot: RobotSpec, values: Mapping[str, Array]) -> RobotSpec:
     """Return the robot with values (n,) of its operated joints, rounded to 6 digits."""
-    return robot.with_servos(
-        {
-            j: {f: float(f"{v[i]:.6g}") for f, v in values.items()}
-            for i, j in enumerate(robot.operated)
-        }
-    )
+    servos = {}
+    for i, joint in enumerate(robot.operated):
+        servos[joint] = {field: float(f"{value[i]:.6g}") for field, value in values.items()}
+    return robot.with_servos(servos)
 
 
 class Changes:
@@ -130,55 +132,66 @@ class Changes:
     """
 
     def __init__(self, first: Values, fields: ListOf[str], kd_slack: Array | float = 0.0) -> None:
-        """first: Own values, (n,); kd_slack: kd that damping may take from the servos,
-        N·m·s/rad.
+        """
+        Args:
+            first: Own values, (n,).
+            kd_slack: kd that damping may take from the servos, (n,) N·m·s/rad.
         """
         self.fields = tuple(fields)
         self._first = first
         kp = first["kp"]
-        one = np.ones_like(first["kp"])
-        damping, friction, armature, delay = (
-            first[f] for f in ("damping", "frictionloss", "armature", "delay")
-        )
-        # Field → a large change, the lowest and the highest one.
-        ends: dict[str, tuple[Array, Array, Array]] = {
-            "kp": (LARGE_KP_LOG_CHANGE * one, -MAX_KP_LOG_CHANGE * one, MAX_KP_LOG_CHANGE * one),
-            "damping": (
-                np.fmax(damping, 0.01 * kp),
-                -damping - kd_slack,
-                MAX_ON_AXIS["damping"] * kp,
-            ),
-            "frictionloss": (np.fmax(friction, 0.005 * kp), -friction, kp),
-            "armature": (np.fmax(armature, 1e-3 * one), -armature, MAX_ARMATURE_TIME_S**2 * kp),
-            "offset": (0.02 * one, -MAX_ON_AXIS["offset"] * one, MAX_ON_AXIS["offset"] * one),
-            "delay": (0.02 * one, -delay, MAX_ON_AXIS["delay"] - delay),
+        damping = first["damping"]
+        friction = first["frictionloss"]
+        armature = first["armature"]
+        delay = first["delay"]
+        one = np.ones_like(kp)
+        large = {
+            "kp": LARGE_KP_LOG_CHANGE * one,
+            "damping": np.fmax(damping, 0.01 * kp),
+            "frictionloss": np.fmax(friction, 0.005 * kp),
+            "armature": np.fmax(armature, 1e-3 * one),
+            "offset": 0.02 * one,
+            "delay": 0.02 * one,
         }
-        self._large, low, high = (np.stack([ends[f][i] for f in fields], axis=1) for i in range(3))
-        self.low = low / self._large
-        self.high = high / self._large
+        lowest = {
+            "kp": -MAX_KP_LOG_CHANGE * one,
+            "damping": -damping - kd_slack,
+            "frictionloss": -friction,
+            "armature": -armature,
+            "offset": -MAX_ON_AXIS["offset"] * one,
+            "delay": -delay,
+        }
+        highest = {
+            "kp": MAX_KP_LOG_CHANGE * one,
+            "damping": MAX_ON_AXIS["damping"] * kp,
+            "frictionloss": kp,
+            "armature": MAX_ARMATURE_TIME_S**2 * kp,
+            "offset": MAX_ON_AXIS["offset"] * one,
+            "delay": MAX_ON_AXIS["delay"] - delay,
+        }
+        self._large = np.stack([large[f] for f in fields], axis=1)  # (n, P)
+        self.low = np.stack([lowest[f] for f in fields], axis=1) / self._large
+        self.high = np.stack([highest[f] for f in fields], axis=1) / self._large
 
     def start(self, delay: float) -> Array:
         """Return no change, but for a delay of at least so many seconds, (n, P)."""
         more = np.maximum(delay - self._first["delay"], 0)[:, None]
-        return np.asarray(more / self._large * (np.array(self.fields) == "delay"))
+        is_delay = np.array(self.fields) == "delay"
+        return np.where(is_delay, more / self._large, 0.0)
 
     def values(self, x: Array) -> Values:
         """Return the values of x; fields that are not changed stay.
 
         A bound of zero is met exactly.
         """
-        moved = dict(zip(self.fields, np.moveaxis(x * self._large, -1, 0), strict=True))
-        rest = {f: np.broadcast_to(v, x.shape[:-1]) for f, v in self._first.items()}
-        values = {
-            f: self._first[f] * np.exp(v) if f == "kp" else self._first[f] + v
-            for f, v in moved.items()
-        }
-        positive = {
-            f: np.maximum(values[f], 0.0)
-            for f in ("armature", "frictionloss", "delay")
-            if f in values
-        }
-        return rest | values | positive
+        changes = dict(zip(self.fields, np.moveaxis(x * self._large, -1, 0), strict=True))
+        values = {f: np.broadcast_to(v, x.shape[:-1]) for f, v in self._first.items()}
+        for field, change in changes.items():
+            own = self._first[field]
+            values[field] = own * np.exp(change) if field == "kp" else own + change
+            if field in ("armature", "frictionloss", "delay"):
+                values[field] = np.maximum(values[field], 0.0)
+        return values
 
 
 class Bounds:
@@ -192,9 +205,9 @@ class Bounds:
         inertia: Inertia of the links at the MJCF's reference pose, without armature, (n,) kg·m².
         kd: The servos' kd, (n,) N·m·s/rad. Damping may take from it, stated or not: firmware
             filters the velocity.
-        unexcited: Joints that no command moves, (n,).
-        limits: Field → lowest, highest, a large change, (n,) each, in the axes' units.
-        guess: First value of a field of the servo model.
+        unexcited: Joints that no command moves, (n,) bool.
+        limits: Field → lowest, highest, a large change on its axis, (n,) each.
+        guess: Field of the servo model → value from which its search begins, (n,) SI.
     """
 
     def __init__(self, robot: RobotSpec, sequences: ListOf[Sequence]) -> None:
@@ -209,57 +222,65 @@ class Bounds:
         self.stated = all(s.meta.recorded_gains[0] is not None for s in sequences)
         excitation = np.max([np.ptp(s.ctrl[:, op], axis=0) for s in sequences], axis=0)
         self.unexcited = excitation < MIN_EXCITATION_RAD
-        least_inertia = kp * (MIN_STEPS_PER_RADIAN * model.opt.timestep) ** 2
         self.inertia = (model.dof_M0 - model.dof_armature)[op]
-        resolved = least_inertia - self.inertia
-        self.start: Values = {f: self.first[f] for f in CLASSIC} | {
-            "delay": np.maximum(self.first["delay"], START_DELAY_S),
-            "armature": np.maximum(np.maximum(self.first["armature"], 1e-6 * kp), resolved),
-        }
-        self.start |= {
-            f: np.where(self.unexcited, self.first[f], self.start[f]) for f in ("delay", "armature")
-        }
-        self.start |= {f: self.first[f] for f in (*SERVO_TERMS, *WARM) if self.first[f].any()}
+        self.start = self._start(kp, model.opt.timestep)
         slow = 1 / greatest_speeds(sequences, robot)  # s/rad
-        counts = np.array([encoder_step([s.qpos[:, j] for s in sequences]) for j in op])
+        encoder_steps = np.array([encoder_step([s.qpos[:, j] for s in sequences]) for j in op])
         varies = temperature_varies(sequences, robot)
-        self.limits = self._limits(kp, limit, slow, counts, varies)
+        self.limits = self._limits(kp, limit, slow, encoder_steps, varies)
         self.guess = self._guess(kp, varies) | {
             "effort_limit": 0.6 * limit,  # one that is too high has no slope
-            "encoder_step": counts,
+            "encoder_step": encoder_steps,
             "no_load_speed": np.where(self.unexcited, 0.0, 2 / slow),
             WARM[2]: np.nan_to_num(recorded_temperatures(sequences, op)).mean(axis=0).round(),
         }
 
+    def _start(self, kp: Array, timestep: float) -> Values:
+        """Return the start of a search: the own values, but for delay and armature of joints that
+        are excited; kp (n,) N·m/rad.
+        """
+        delay = np.maximum(self.first["delay"], START_DELAY_S)
+        least_inertia = kp * (MIN_STEPS_PER_RADIAN * timestep) ** 2
+        lacking = least_inertia - self.inertia
+        armature = np.maximum(np.maximum(self.first["armature"], 1e-6 * kp), lacking)
+        start = {f: self.first[f] for f in CLASSIC}
+        start["delay"] = np.where(self.unexcited, self.first["delay"], delay)
+        start["armature"] = np.where(self.unexcited, self.first["armature"], armature)
+        for field in (*SERVO_TERMS, *WARM):
+            if self.first[field].any():
+                start[field] = self.first[field]
+        return start
+
     def _limits(
-        self, kp: Array, effort_limit: Array, slow: Array, counts: Array, varies: Array
+        self, kp: Array, effort_limit: Array, slow: Array, encoder_steps: Array, varies: Array
     ) -> dict[str, tuple[Array, Array, Array]]:
         """Return field → lowest, highest and a large change on its axis, (n,) each.
+
+        Bounds that do not depend on the robot are those of SERVO_FIELDS.
 
         Args:
             kp, effort_limit: The robot's own, N·m/rad and N·m.
             slow: One over the greatest speed, s/rad.
-            counts: Encoder steps, rad.
+            encoder_steps: rad; 0 where none is seen.
             varies: Whether the temperature varies; else the robot's own values by temperature stay.
         """
         one = np.ones(self.n)
-        heavy = np.maximum(self.start["armature"] / kp, 1e-6)
         limits = {}
         for f in SERVO_FIELDS.values():
             if f.bounds:
                 low, high, large = f.bounds
                 limits[f.name] = low * one, high * one, large * one
-        limits |= {
-            "kp": (np.log(kp) - MAX_KP_LOG_CHANGE, np.log(kp) + MAX_KP_LOG_CHANGE, 0.3 * one),
-            "armature": (0 * one, MAX_ARMATURE_TIME_S**2 * one, np.clip(0.4 * heavy, 1e-5, 1e-3)),
-            "effort_limit": (
-                0.05 * effort_limit / kp,
-                5 * effort_limit / kp,
-                0.2 * effort_limit / kp,
-            ),
-            "encoder_step": (counts, counts, one),
-            "no_load_speed": (0 * one, 2 * slow, LARGE_LINE_CHANGE * slow),
-        }
+        limits["kp"] = np.log(kp) - MAX_KP_LOG_CHANGE, np.log(kp) + MAX_KP_LOG_CHANGE, 0.3 * one
+        own_armature = np.maximum(self.start["armature"] / kp, 1e-6)
+        large_armature = np.clip(0.4 * own_armature, 1e-5, 1e-3)
+        limits["armature"] = 0 * one, MAX_ARMATURE_TIME_S**2 * one, large_armature
+        limits["effort_limit"] = (
+            0.05 * effort_limit / kp,
+            5 * effort_limit / kp,
+            0.2 * effort_limit / kp,
+        )
+        limits["encoder_step"] = encoder_steps, encoder_steps, one
+        limits["no_load_speed"] = 0 * one, 2 * slow, LARGE_LINE_CHANGE * slow
         for name in WARM[:2]:
             lowest, highest, change = limits[name]
             own = to_axis(name, self.first[name], kp)
@@ -267,13 +288,16 @@ class Bounds:
         return limits
 
     def _guess(self, kp: Array, varies: Array) -> Values:
-        """Return the first values of fields with a guess on their axis, (n,) each; arguments as of
-        `_limits`.
+        """Return the values of the fields that have a guess in SERVO_FIELDS, (n,) each; arguments
+        as of `_limits`.
         """
         guess = {}
         for f in SERVO_FIELDS.values():
-            if f.guess is not None:
-                guess[f.name] = f.guess * (varies if f.name in WARM else np.ones(self.n))
+            if f.guess is None:
+                continue
+            guess[f.name] = np.full(self.n, f.guess)
+            if f.name in WARM:
+                guess[f.name] = np.where(varies, guess[f.name], 0.0)
         return from_axis(guess, kp)
 
     def visible(self, field: str, values: Values) -> Array:
@@ -360,6 +384,6 @@ class Axes:
         own = dict(zip(self.names, np.moveaxis(x * self.unit, -1, 0), strict=True))
         values = {f: np.broadcast_to(v, x.shape[:-1]) for f, v in self.rest.items()}
         values |= from_axis(own, values["kp"])
-        return (
-            values | {"damping": values["damping"] - self._kd_slack} if "damping" in own else values
-        )
+        if "damping" in own:
+            values["damping"] = values["damping"] - self._kd_slack
+        return values

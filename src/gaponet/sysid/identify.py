@@ -154,24 +154,12 @@ def _fit_positions(
     without_table = robots[-1] if state.chosen != "given" else robot
     table = None
     if options.table and robot.tips:
-        fits.progress.begin_table()
-        table = fit_table(
-            low_windows(recordings.fitted, heights, contact),
-            without_table,
-            min(float(height.min()) for height in heights),
-            options.nthread,
-            fits.progress.report_table,
-            recordings.validation,
-        )
+        windows = low_windows(recordings.fitted, heights, contact)
+        lowest = min(float(height.min()) for height in heights)
+        table = _fit_table(windows, without_table, lowest, fits, recordings.validation)
     fitted = _fitted(given, without_table, state, table, keep_stops=options.stops)
-    warnings = []
-    if untried:
-        names = ", ".join(untried)
-        warnings.append(f"the time was over before {names}: give more, or no limit, to try them")
-    warnings += [w for step in steps if isinstance(step, LinkMasses) for w in step.warnings(state)]
-    values = state.values[-1]
-    warnings += fits.joints[-1].bounds.warnings(values, fitted_fields(values))
-    warnings += contradicted_gains(fits.joints[-1].bounds, values, errors.std)
+    warnings = _warnings_of_steps(steps, state, untried)
+    warnings += _warnings_of_values(fits, state, errors)
     warnings += stop_questions(given, robot)
     warnings += far_from_servo_type(fitted)
     warnings += errors.sentences
@@ -262,6 +250,44 @@ def _standard_errors(state: FitState) -> StandardErrors:
     links = state.links[-1] if state.links else whole.rollouts.robot.links
     whole.rollouts.robot = replace(whole.rollouts.robot, links=links)
     return standard_errors(whole, state.values[-1])
+
+
+def _fit_table(
+    windows: list[Sequence],
+    robot: RobotSpec,
+    lowest: float,
+    fits: Fits,
+    validation: ListOf[Sequence],
+) -> TableFit:
+    """Fit the table under a robot with fitted servos, in the time that is left.
+
+    Args:
+        windows: Those in which a tip is low.
+        lowest: Least height of a tip, m.
+    """
+    fits.progress.begin_table()
+    return fit_table(windows, robot, lowest, fits.nthread, fits.progress.report_table, validation)
+
+
+def _warnings_of_steps(steps: ListOf[Step], state: FitState, untried: ListOf[str]) -> list[str]:
+    """Return what the user has to know about steps; `untried` are the names of those without
+    time.
+    """
+    warnings = []
+    if untried:
+        names = ", ".join(untried)
+        warnings.append(f"the time was over before {names}: give more, or no limit, to try them")
+    for step in steps:
+        warnings += step.warnings(state)
+    return warnings
+
+
+def _warnings_of_values(fits: Fits, state: FitState, errors: StandardErrors) -> list[str]:
+    """Return sentences about fitted values at a bound, and values that contradict the file."""
+    bounds = fits.joints[-1].bounds
+    values = state.values[-1]
+    at_bound = bounds.warnings(values, fitted_fields(values))
+    return [*at_bound, *contradicted_gains(bounds, values, errors.std)]
 
 
 def _robots(fits: Fits, state: FitState) -> list[RobotSpec]:

@@ -29,18 +29,18 @@ from gaponet.sim.model import build_model
 from gaponet.sim.servo import JOINT_RECORD, Windows, compiled, simulate_joints
 from gaponet.sim.temperature import recorded_temperatures, warm_values
 
-# errors beyond count linearly (soft L1), so that one blocked joint does not decide
+# Larger errors count linearly (soft L1), so that one blocked joint does not decide.
 ERROR_SCALE_RAD = 0.01
 ROW_PERIOD_S = 0.01  # between rows that are compared
 SETTLE_S = 0.1  # after a window's start, where velocities are measured ones
 UNLIMITED_STOP_RAD = 7.0  # stops of a joint without any
 MAX_REGRESSION_ROWS = 20_000
 MAX_REGRESSION_DELAY_S = 0.1
+REGRESSED_FIELDS = ("kp", "damping", "frictionloss", "armature", "offset", "delay")
 SLIP_SPEED = 0.02  # rad/s, of the regression: at which friction is whole
 CUTOFF_HZ = 10.0  # of the other joints' accelerations: above the arms' bandwidth
-# of the derivative of gravity's torque; rows that share one
-GRAVITY_STEP_RAD = 0.02
-GRAVITY_ROWS = 5
+GRAVITY_STEP_RAD = 0.02  # of the derivative of gravity's torque
+GRAVITY_ROWS = 5  # rows that share one derivative
 
 
 class JointRollouts:
@@ -118,10 +118,9 @@ class JointRollouts:
         `Windows.loads`.
         """
         payloads = [(p.meta.payload_mass, p.meta.payload_side) for p in self.parts]
-        models = {
-            x: build_model(self.robot, *x, self.dt, physics_only=True)
-            for x in dict.fromkeys(payloads)
-        }
+        models = {}
+        for payload in dict.fromkeys(payloads):
+            models[payload] = build_model(self.robot, *payload, self.dt, physics_only=True)
         along = [
             _loads_along(part, models[payload], self.op, thin)
             for part, payload, thin in zip(self.parts, payloads, self._thins, strict=True)
@@ -129,8 +128,8 @@ class JointRollouts:
         inertia, weight, pull, slope = (
             _at_middle(self._stacked([loads[i] for loads in along])) for i in range(4)
         )
-        # Gravity's torque is that at an angle of zero.
-        return np.stack([inertia, weight - slope * _at_middle(self.qpos), pull, slope])
+        weight_at_zero = weight - slope * _at_middle(self.qpos)
+        return np.stack([inertia, weight_at_zero, pull, slope])
 
     def _stops(self) -> Array:
         """Return the ends of each joint's range, or of the recordings, so that no rollout
@@ -159,21 +158,15 @@ class JointRollouts:
         contacts.
         """
         rows = self.touch.shape[1]
-        after = np.round(SETTLE_S / self.periods).astype(int)
-        near = np.array(
-            [
-                np.convolve(t, np.ones(k + 1))[:rows] > 0.5
-                for t, k in zip(self.touch, after, strict=True)
-            ]
-        )
-        time = np.arange(rows)
-        thin = self._thins[:, None]
-        counted = (
-            (time > np.maximum(after, 1)[:, None])
-            & (time < self.lengths[:, None])
-            & ~near
-            & (time % thin == 0)
-        )
+        settling = np.round(SETTLE_S / self.periods).astype(int)  # rows, (windows,)
+        near = []
+        for touch, after in zip(self.touch, settling, strict=True):
+            near.append(np.convolve(touch, np.ones(after + 1))[:rows] > 0.5)
+        row = np.arange(rows)
+        has_settled = row > np.maximum(settling, 1)[:, None]
+        is_recorded = row < self.lengths[:, None]
+        is_compared = row % self._thins[:, None] == 0
+        counted = has_settled & is_recorded & ~np.array(near) & is_compared
         return np.asarray(counted[:, :: self.thin])
 
     @property
@@ -204,47 +197,68 @@ class JointRollouts:
         The regression is linear but for the delay, biased by noise, and independent of any file's
         gains. (n,) each; kp is 0 where it fails.
         """
-        n = len(self.op)
-        best = {
-            f: np.zeros(n) for f in ("kp", "damping", "frictionloss", "armature", "offset", "delay")
-        }
+        joints = [self._regressed_joint(j) for j in range(len(self.op))]
+        return {field: np.array([joint[field] for joint in joints]) for field in joints[0]}
+
+    def _regressed_joint(self, j: int) -> dict[str, float]:
+        """Return `regressed` of joint j: the fit with the delay that leaves the least residual.
+
+        A least-squares fit of non-negative factors x to
+
+            torque of the links = x0 (command − q) − x1 q̇ − x2 sign(q̇) − x3 q̈ + x4 − x5
+
+        in which x4 − x5 is kp times the offset, of either sign.
+        """
         row = np.concatenate([np.arange(length) for length in self.lengths])
         window = np.repeat(np.arange(len(self.lengths)), self.lengths)
         some = slice(None, None, max(1, len(row) // MAX_REGRESSION_ROWS))
-        for j in range(n):
-            smooth = [
-                lowpass(self.qpos[j, w, :k, None].astype(float), self.periods[w], CUTOFF_HZ)[:, 0]
-                for w, k in enumerate(self.lengths)
-            ]
-            speed = [np.gradient(x, dt) for x, dt in zip(smooth, self.periods, strict=True)]
-            q = np.concatenate(smooth)
-            v = np.concatenate(speed)
-            a = np.concatenate(
-                [np.gradient(x, dt) for x, dt in zip(speed, self.periods, strict=True)]
-            )
-            inertia, weight, pull, slope = self.tables[:, j, window, row]
-            torque = inertia * a + weight + slope * q + pull
-            least = np.inf
-            for delay in np.arange(0.0, MAX_REGRESSION_DELAY_S, max(self.dt / 2, 5e-3)):
-                late = row - delay / self.periods[window]
-                whole = np.floor(late).astype(int)
-                aim = [
-                    self.ctrl[j, window, np.clip(whole + i, 0, self.lengths[window] - 1)]
-                    for i in (0, 1)
-                ]
-                error = aim[0] + (late - whole) * (aim[1] - aim[0]) - q
-                columns = np.stack(
-                    [error, -v, -np.tanh(v / SLIP_SPEED), -a, np.ones_like(q), -np.ones_like(q)],
-                    axis=1,
-                )
-                size = np.sqrt(np.square(columns[some]).mean(axis=0)) + 1e-12
-                x, residual = nnls(columns[some] / size, torque[some])
-                x = x / size
-                if residual < least and x[0] > 0:
-                    least = residual
-                    for f, value in zip(best, (*x[:4], (x[4] - x[5]) / x[0], delay), strict=True):
-                        best[f][j] = value
+        q, v, a = self._smooth_motion(j)
+        inertia, weight, pull, slope = self.tables[:, j, window, row]
+        torque = inertia * a + weight + slope * q + pull
+        best = dict.fromkeys(REGRESSED_FIELDS, 0.0)
+        least = np.inf
+        for delay in np.arange(0.0, MAX_REGRESSION_DELAY_S, max(self.dt / 2, 5e-3)):
+            error = self._late_commands(j, delay, window, row) - q
+            one = np.ones_like(q)
+            columns = np.stack([error, -v, -np.tanh(v / SLIP_SPEED), -a, one, -one], axis=1)
+            size = np.sqrt(np.square(columns[some]).mean(axis=0)) + 1e-12
+            x, residual = nnls(columns[some] / size, torque[some])
+            x = x / size
+            if residual < least and x[0] > 0:
+                least = residual
+                offset = (x[4] - x[5]) / x[0]
+                best = dict(zip(REGRESSED_FIELDS, (*x[:4], offset, delay), strict=True))
         return best
+
+    def _smooth_motion(self, j: int) -> tuple[Array, Array, Array]:
+        """Return position, velocity and acceleration of joint j in all rows of all windows, (rows,)
+        each, SI.
+        """
+        positions = []
+        velocities = []
+        accelerations = []
+        for window, (length, dt) in enumerate(zip(self.lengths, self.periods, strict=True)):
+            recorded = self.qpos[j, window, :length, None].astype(float)
+            smooth = lowpass(recorded, dt, CUTOFF_HZ)[:, 0]
+            speed = np.gradient(smooth, dt)
+            positions.append(smooth)
+            velocities.append(speed)
+            accelerations.append(np.gradient(speed, dt))
+        position = np.concatenate(positions)
+        velocity = np.concatenate(velocities)
+        acceleration = np.concatenate(accelerations)
+        return position, velocity, acceleration
+
+    def _late_commands(self, j: int, delay: float, window: Array, row: Array) -> Array:
+        """Return the command of joint j that reaches its servo in rows of windows, (rows,) rad,
+        interpolated between the commands before and after `delay`, s.
+        """
+        late = row - delay / self.periods[window]
+        whole = np.floor(late).astype(int)
+        last = self.lengths[window] - 1
+        before = self.ctrl[j, window, np.clip(whole, 0, last)]
+        after = self.ctrl[j, window, np.clip(whole + 1, 0, last)]
+        return np.asarray(before + (late - whole) * (after - before))
 
     def errors(self, values: dict[str, Array]) -> Array:
         """Return q_sim − q_real of k candidates, (k, n, windows, rows) rad; zero where rows do not
@@ -332,7 +346,8 @@ def _loads_along(part: Sequence, model: mujoco.MjModel, op: Array, thin: int) ->
     qvel = differentiate(lowpass(part.qpos.astype(float), part.dt, CUTOFF_HZ), part.dt)
     qacc = differentiate(qvel, part.dt)
     at = np.arange(0, len(part) + thin, thin).clip(max=len(part) - 1)
-    inertia, weight, pull, slope = loads = np.empty((4, len(at), len(op)))
+    loads = np.empty((4, len(at), len(op)))
+    inertia, weight, pull, slope = loads
     for i, t in enumerate(at):
         here = bias(part.qpos[t], qvel[t])
         mujoco.mj_fullM(model, data, full)
@@ -344,15 +359,12 @@ def _loads_along(part: Sequence, model: mujoco.MjModel, op: Array, thin: int) ->
             for k, j in enumerate(op):
                 turned = part.qpos[t].astype(float)
                 turned[j] += GRAVITY_STEP_RAD
-                slope[i : i + GRAVITY_ROWS, k] = (
-                    bias(turned, qvel[t])[j] - here[j]
-                ) / GRAVITY_STEP_RAD
+                change = bias(turned, qvel[t])[j] - here[j]
+                slope[i : i + GRAVITY_ROWS, k] = change / GRAVITY_STEP_RAD
+    if thin == 1:
+        return loads[:, : len(part)]
     rows = np.arange(len(part))
-    return (
-        loads[:, : len(part)]
-        if thin == 1
-        else np.apply_along_axis(lambda y: np.interp(rows, at, y), 1, loads)
-    )
+    return np.apply_along_axis(lambda load: np.interp(rows, at, load), 1, loads)
 
 
 def _at_middle(x: Array) -> Array:

@@ -15,7 +15,9 @@ import numpy as np
 from gaponet.base.arrays import Array
 
 DIFFERENCE_STEP = 0.1  # large changes, of finite differences
-DAMPING_FACTORS = np.array([1e-3, 0.1, 1.0, 30.0])  # of the last best damping, evaluated together
+DAMPING_FACTORS = np.array([1e-3, 0.1, 1.0, 30.0])  # of the last damping, evaluated together
+DAMPING_BOUNDS = (1e-6, 1e3)
+FIRST_DAMPING = 1e-2
 MIN_RELATIVE_DECREASE = 1e-4  # of the cost, for another iteration
 
 Progress = Callable[[Array], object]  # a true answer ends the search
@@ -36,6 +38,9 @@ def descend(
     """Minimise the soft L1 costs of n problems from S starts; return the points (S, n, P) and
     their costs (S, n).
 
+    Each iteration tries the Levenberg-Marquardt steps of all DAMPING_FACTORS, and takes for every
+    problem the best one that lowers its cost.
+
     Problems may disturb each other a little. Where a start became worse in the sum over problems,
     its best earlier point is returned.
 
@@ -49,47 +54,54 @@ def descend(
         min_decrease: Ends the search when the relative decrease of every cost is smaller.
         derive: Replaces `slopes`, where it takes fewer candidates than P + 1.
     """
-    damping = np.full(x.shape[:2], 1e-2)
-    best = np.full(x.shape[:2], np.inf)
-    best_x = x
-    best_total = np.full(x.shape[:2], np.inf)
+    damping = np.full(x.shape[:2], FIRST_DAMPING)
+    best_x = x  # of each start, by the sum over problems
+    best_cost = np.full(x.shape[:2], np.inf)
     for _ in range(iterations):
         here, jac = (derive or slopes)(x, high, errors)
-        weight = 1 / np.sqrt(1 + here**2)
-        normal = (np.swapaxes(jac, -1, -2) @ (weight[..., None] * jac)).astype(float)
-        gradient = (np.swapaxes(jac, -1, -2) @ (weight * here)[..., None])[..., 0].astype(float)
-        best = soft_l1(here)
-        better = best.sum(axis=1) < best_total.sum(axis=1)
-        best_x = np.where(better[:, None, None], x, best_x)
-        best_total = np.where(better[:, None], best, best_total)
-        tried = (
-            np.stack(
-                [step(normal, gradient, low - x, high - x, s * damping) for s in DAMPING_FACTORS]
-            )
-            + x
-        )
-        costs = soft_l1(_evaluated(errors, tried))
-        choice = costs.argmin(axis=0)
-        least = costs.min(axis=0)
-        lower = least < best
-        x = np.where(
-            lower[..., None], np.take_along_axis(tried, choice[None, ..., None], axis=0)[0], x
-        )
-        damping = np.clip(
-            damping * np.where(lower, DAMPING_FACTORS[choice], DAMPING_FACTORS[-1]), 1e-6, 1e3
-        )
-        decrease = np.where(lower, 1 - least / np.maximum(best, 1e-300), 0.0)
-        best = np.minimum(least, best)
-        if progress(best.min(axis=0)) or (decrease < min_decrease).all():
+        cost = soft_l1(here)  # (S, n)
+        best_x, best_cost = _better(best_x, best_cost, x, cost)
+        normal, gradient = _normal_equations(here, jac)
+        steps = [step(normal, gradient, low - x, high - x, f * damping) for f in DAMPING_FACTORS]
+        tried = np.stack(steps) + x  # (factors, S, n, P)
+        tried_cost = soft_l1(_evaluated(errors, tried))
+        choice = tried_cost.argmin(axis=0)  # (S, n)
+        least = tried_cost.min(axis=0)
+        is_lower = least < cost
+        chosen = np.take_along_axis(tried, choice[None, ..., None], axis=0)[0]
+        x = np.where(is_lower[..., None], chosen, x)
+        factor = np.where(is_lower, DAMPING_FACTORS[choice], DAMPING_FACTORS[-1])
+        damping = np.clip(damping * factor, *DAMPING_BOUNDS)
+        decrease = np.where(is_lower, 1 - least / np.maximum(cost, 1e-300), 0.0)
+        is_over = progress(np.minimum(least, cost).min(axis=0))
+        if is_over or (decrease < min_decrease).all():
             break
-    best = soft_l1(_evaluated(errors, x[None]))[0]
-    better = best.sum(axis=1) < best_total.sum(axis=1)
-    return np.where(better[:, None, None], x, best_x), np.where(better[:, None], best, best_total)
+    cost = soft_l1(_evaluated(errors, x[None]))[0]
+    return _better(best_x, best_cost, x, cost)
+
+
+def _better(x: Array, cost: Array, other_x: Array, other_cost: Array) -> tuple[Array, Array]:
+    """Return points (S, n, P) and their costs (S, n); of each start the other ones where these
+    cost less in the sum over problems.
+    """
+    is_better = other_cost.sum(axis=1) < cost.sum(axis=1)  # (S,)
+    points = np.where(is_better[:, None, None], other_x, x)
+    return points, np.where(is_better[:, None], other_cost, cost)
+
+
+def _normal_equations(errors: Array, jac: Array) -> tuple[Array, Array]:
+    """Return curvature (S, n, P, P) and gradient (S, n, P) of soft L1 costs, from errors (S, n, m)
+    and their slopes (S, n, m, P).
+    """
+    weight = 1 / np.sqrt(1 + errors**2)
+    normal = np.swapaxes(jac, -1, -2) @ (weight[..., None] * jac)
+    gradient = (np.swapaxes(jac, -1, -2) @ (weight * errors)[..., None])[..., 0]
+    return normal.astype(float), gradient.astype(float)
 
 
 def slopes(x: Array, high: Array, errors: Errors) -> tuple[Array, Array]:
-    """Return errors (S, n, m) at x (S, n, P), and their forward differences over x, (S, n, m,
-    P).
+    """Return errors (S, n, m) at x (S, n, P), and their differences over x, (S, n, m, P): forward,
+    but backward where a step would leave `high`.
     """
     steps = np.where(x + DIFFERENCE_STEP > high, -DIFFERENCE_STEP, DIFFERENCE_STEP)
     tried = np.concatenate(
@@ -107,11 +119,12 @@ def agreed_slopes(x: Array, low: Array, high: Array, errors: Errors) -> tuple[Ar
     A joint that rests at the edge of breaking loose moves far for a step to one side; that is no
     derivative.
     """
-    ends = (high, np.where(x - DIFFERENCE_STEP < low, high, x))
-    (here, ahead), (_, behind) = (slopes(x, end, errors) for end in ends)
-    return here, np.where(
-        ahead * behind > 0, np.sign(ahead) * np.minimum(abs(ahead), abs(behind)), 0
-    )
+    here, ahead = slopes(x, high, errors)
+    # With x itself as the upper bound every step goes back; at the lower bound both go ahead.
+    backward = np.where(x - DIFFERENCE_STEP < low, high, x)
+    _, behind = slopes(x, backward, errors)
+    smaller = np.sign(ahead) * np.minimum(abs(ahead), abs(behind))
+    return here, np.where(ahead * behind > 0, smaller, 0)
 
 
 def step(normal: Array, gradient: Array, low: Array, high: Array, damping: Array) -> Array:

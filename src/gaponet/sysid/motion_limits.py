@@ -11,6 +11,7 @@ identified with it as well.
 from __future__ import annotations
 
 from collections.abc import Sequence as ListOf
+from typing import NamedTuple
 
 import numpy as np
 
@@ -20,32 +21,29 @@ from gaponet.robot.servo_fields import DEFAULT_TERMS, Term
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.batch import speed_limited
 from gaponet.sim.temperature import temperature_varies
-from gaponet.sysid.axes import greatest_speeds
+from gaponet.sysid.axes import GREATEST_SPEED_QUANTILE, greatest_speeds
 
-# of rows that are compared; lags that are tried
-MIN_PERIOD_S = 0.01
-MAX_LAG_S = 0.3
-LAGS = 16
+MIN_PERIOD_S = 0.01  # between rows that are compared
+MAX_LAG_S = 0.3  # of a state behind its ramp or command
+LAGS = 16  # that are tried
 SPEED_RATIOS = np.geomspace(0.7, 1.25, 30)  # ramps that are tried, over a joint's greatest speed
-GREATEST_SPEED_QUANTILE = 0.995
 SPEED_SPAN_S = 0.06  # over which a speed is measured
 LAG_TIME_CONSTANTS_S = (0.0, 0.02, 0.04, 0.08, 0.16, 0.32)  # of a servo without a ramp
 MAX_ERROR_RATIO = 0.8  # of a ramp over the best lag, in both halves of the recordings
-# RMS and time by which a ramp must be behind its command
-MIN_RAMP_ERROR_RAD = 0.02
-MIN_RAMP_DELAY_S = 0.3
-# that commands go beyond a stop, and further there; rows that show it
-MIN_BEYOND_STOP_RAD = 0.1
-MIN_STOP_ROWS = 50
+MIN_RAMP_ERROR_RAD = 0.02  # RMS by which a ramp must be behind its command
+MIN_RAMP_DELAY_S = 0.3  # by which it must be behind it at least once
+MIN_BEYOND_STOP_RAD = 0.1  # that commands go beyond a stop, and further there
+MIN_STOP_ROWS = 50  # that show a stop
 AT_STOP_RAD = 0.005  # from the end of a joint's path
 MIN_NARROWING_RAD = 0.01  # of the robot's range by a stop
-# of the robot's limit; of a joint's rows
+# A joint shows its torque limit if in this share of its rows this share of the limit is asked.
 AT_TORQUE_LIMIT = 0.9
 MIN_LIMITED_SHARE = 0.01
-# of a joint's greatest speed; of the robot's limit, in the direction of motion
+# It shows its motor's torque-speed line if in this share of its rows it moves at this share of its
+# greatest speed, while this share of the torque limit is asked in the direction of motion.
 FAST = 0.5
 DRIVEN_FAST = 0.8
-MIN_FAST_SHARE = 0.003  # of a joint's rows
+MIN_FAST_SHARE = 0.003
 
 
 def with_stops(robot: RobotSpec, sequences: ListOf[Sequence]) -> RobotSpec:
@@ -60,12 +58,22 @@ def with_stops(robot: RobotSpec, sequences: ListOf[Sequence]) -> RobotSpec:
         for name, sign in (("stop_low", -1.0), ("stop_high", 1.0)):
             paths = [(sign * s.ctrl[:, i], sign * s.qpos[:, i]) for s in sequences]
             end = max(float(qpos.max()) for _, qpos in paths)
-            pushes = [c for ctrl, qpos in paths for c in _pushes(ctrl, qpos, end)]
-            went_on = [c.max() - c[0] > MIN_BEYOND_STOP_RAD for c in pushes]
-            met = sum(map(len, pushes)) >= MIN_STOP_ROWS and sum(went_on) > 1
-            if met and sign * robot.qpos_range[i, int(sign > 0)] > end + MIN_NARROWING_RAD:
+            end_of_range = sign * robot.qpos_range[i, int(sign > 0)]
+            if _meets_stop(paths, end) and end_of_range > end + MIN_NARROWING_RAD:
                 servos.setdefault(joint, {})[name] = round(sign * end, 4)
     return robot.with_servos(servos) if servos else robot
+
+
+def _meets_stop(paths: list[tuple[Array, Array]], end: float) -> bool:
+    """Return True if commands and positions of a joint, (T,) rad each, show a stop at the end of
+    its path.
+    """
+    pushes: list[Array] = []
+    for ctrl, qpos in paths:
+        pushes += _pushes(ctrl, qpos, end)
+    rows = sum(len(push) for push in pushes)
+    went_on = [push for push in pushes if push.max() - push[0] > MIN_BEYOND_STOP_RAD]
+    return rows >= MIN_STOP_ROWS and len(went_on) > 1
 
 
 def _pushes(ctrl: Array, qpos: Array, end: float) -> list[Array]:
@@ -73,7 +81,10 @@ def _pushes(ctrl: Array, qpos: Array, end: float) -> list[Array]:
     push.
     """
     rows = np.flatnonzero((ctrl > end + MIN_BEYOND_STOP_RAD) & (qpos > end - AT_STOP_RAD))
-    return np.split(ctrl[rows], np.flatnonzero(np.diff(rows) > 1) + 1) if len(rows) else []
+    if not len(rows):
+        return []
+    ends = np.flatnonzero(np.diff(rows) > 1) + 1
+    return np.split(ctrl[rows], ends)
 
 
 def stop_questions(given: RobotSpec, stopped: RobotSpec) -> list[str]:
@@ -82,43 +93,63 @@ def stop_questions(given: RobotSpec, stopped: RobotSpec) -> list[str]:
     """
     questions = []
     for joint, i in zip(given.operated, given.operated_index, strict=True):
-        for name, side in (("stop_low", 0), ("stop_high", 1)):
+        for name, direction in (("stop_low", "lower"), ("stop_high", "higher")):
             stop = float(getattr(stopped, name)[i])
             if np.isfinite(stop) and stop != getattr(given, name)[i]:
                 questions.append(
                     f"{joint}: stayed at {stop:.3f} rad where commands went "
-                    f"{('lower', 'higher')[side]}: if that is a stop, identify with --stops; if "
-                    "something was in its way, leave those motions out"
+                    f"{direction}: if that is a stop, identify with --stops; if something was in "
+                    "its way, leave those motions out"
                 )
     return questions
 
 
 def default_terms(sequences: ListOf[Sequence], robot: RobotSpec) -> tuple[Term, ...]:
-    """Return DEFAULT_TERMS, after "limit" and "speed" if gains and recorded errors ask a joint for
-    such torques, and before "temperature" if recordings vary it.
+    """Return the terms that are tried without being named, in their order.
 
-    That is so if the servo asks, in MIN_LIMITED_SHARE of a joint's rows, for AT_TORQUE_LIMIT of the
-    robot's limit; for "speed", in MIN_FAST_SHARE, for DRIVEN_FAST of it while the joint moves that
-    way at FAST of its greatest speed.
+    These are "limit" and "speed", if gains and recorded errors ask some joint for such torques as
+    the constants above say; DEFAULT_TERMS; and "temperature", if recordings vary it.
     """
     op = robot.operated_index
     fast = FAST * greatest_speeds(sequences, robot)
     limit = robot.effort_limit[op]
-    reached: dict[Term, Array] = {"limit": np.zeros(len(op)), "speed": np.zeros(len(op))}
+    limited_rows = np.zeros(len(op))
+    fast_rows = np.zeros(len(op))
     rows = np.zeros(len(op))
     for s in sequences:
         own = robot.with_gains(*s.meta.recorded_gains)
         torque = (own.kp * (s.ctrl - s.qpos) - own.kd * s.qvel)[:, op]
         qvel = s.qvel[:, op]
         recorded = np.array([j not in s.meta.unrecorded for j in robot.operated])
-        reached["limit"] += recorded * (np.abs(torque) > AT_TORQUE_LIMIT * limit).sum(axis=0)
+        limited_rows += recorded * (np.abs(torque) > AT_TORQUE_LIMIT * limit).sum(axis=0)
         driven = (torque * np.sign(qvel) > DRIVEN_FAST * limit) & (np.abs(qvel) > fast)
-        reached["speed"] += recorded * driven.sum(axis=0)
+        fast_rows += recorded * driven.sum(axis=0)
         rows += len(s) * recorded
-    shares: dict[Term, float] = {"limit": MIN_LIMITED_SHARE, "speed": MIN_FAST_SHARE}
-    limited = (t for t, share in shares.items() if (reached[t] > share * rows).any())
-    warm = ("temperature",) if temperature_varies(sequences, robot).any() else ()
-    return (*limited, *DEFAULT_TERMS, *warm)
+    terms: list[Term] = []
+    if (limited_rows > MIN_LIMITED_SHARE * rows).any():
+        terms.append("limit")
+    if (fast_rows > MIN_FAST_SHARE * rows).any():
+        terms.append("speed")
+    terms += DEFAULT_TERMS
+    if temperature_varies(sequences, robot).any():
+        terms.append("temperature")
+    return tuple(terms)
+
+
+class _Part(NamedTuple):
+    """A recording of n operated joints, in rows about MIN_PERIOD_S apart."""
+
+    ctrl: Array  # commands inside the joints' ranges, (T, n) rad
+    qpos: Array  # (T, n) rad
+    dt: float  # s
+
+
+class _AimErrors(NamedTuple):
+    """Errors of k ramps, and then of the lags of LAG_TIME_CONSTANTS_S, for n joints."""
+
+    rms: Array  # of recorded positions, in every other recording, (2, k + lags, n) rad
+    rms_behind: Array  # of ramps behind their commands, (k, n) rad
+    most_behind: Array  # the same at most, (k, n) rad
 
 
 def target_speeds(sequences: ListOf[Sequence], robot: RobotSpec) -> Array:
@@ -126,77 +157,90 @@ def target_speeds(sequences: ListOf[Sequence], robot: RobotSpec) -> Array:
     as well.
     """
     op = robot.operated_index
+    parts = _parts(sequences, robot)
+    if len(parts) < 2:
+        return np.zeros(len(op))
+    tried = np.maximum(SPEED_RATIOS[:, None] * _greatest_measured(parts), 1e-6)  # (k, n) rad/s
+    errors = _aim_errors(parts, tried)
+    ramp_rms, lag_rms = np.split(errors.rms, [len(tried)], axis=1)
+    best = ramp_rms.sum(axis=0).argmin(axis=0)  # number of each joint's ramp, (n,)
+    joints = np.arange(len(op))
+    ratio = ramp_rms[:, best, joints] / np.maximum(lag_rms.min(axis=1), 1e-9)  # (2, n)
+    speed = tried[best, joints]
+    fits_better = (ratio < MAX_ERROR_RATIO).all(axis=0)
+    is_behind = errors.rms_behind[best, joints] > MIN_RAMP_ERROR_RAD
+    is_late = errors.most_behind[best, joints] > MIN_RAMP_DELAY_S * speed
+    limited = fits_better & is_behind & is_late
+    speed[~limited] = 0.0
+    if limited.any():
+        of_limited = [_Part(p.ctrl[:, limited], p.qpos[:, limited], p.dt) for p in parts]
+        speed[limited] = _speed_behind(of_limited, speed[limited])
+    return np.asarray(speed)
+
+
+def _parts(sequences: ListOf[Sequence], robot: RobotSpec) -> list[_Part]:
+    """Return the recordings that are long enough to compare."""
+    op = robot.operated_index
     low, high = robot.qpos_range[op].T
     parts = []
     for s in sequences:
         if s.duration < 2 * MAX_LAG_S:
             continue
-        every = max(1, round(MIN_PERIOD_S / s.dt))
-        ctrl = np.clip(s.ctrl[::every, op], low, high).astype(float)
-        qpos = s.qpos[::every, op].astype(float)
-        parts.append((ctrl, qpos, every * s.dt))
-    if len(parts) < 2:
-        return np.zeros(len(op))
-    span = [max(1, round(SPEED_SPAN_S / dt)) for _, _, dt in parts]
-    speeds = [
-        np.abs(q[k:] - q[:-k]) / (k * dt)
-        for (_, q, dt), k in zip(parts, span, strict=True)
-        if len(q) > k
-    ]
-    greatest = np.quantile(np.concatenate(speeds), GREATEST_SPEED_QUANTILE, axis=0)  # (n,)
-    tried = np.maximum(SPEED_RATIOS[:, None] * greatest, 1e-6)  # (k, n)
-    # Squared errors of odd and even recordings; squares and maxima of how far ramps are behind
-    # their commands.
-    error = np.zeros((2, len(SPEED_RATIOS) + len(LAG_TIME_CONSTANTS_S), len(op), LAGS))
-    behind_command = np.zeros((2, *tried.shape))
+        stride = max(1, round(MIN_PERIOD_S / s.dt))
+        ctrl = np.clip(s.ctrl[::stride, op], low, high).astype(float)
+        qpos = s.qpos[::stride, op].astype(float)
+        parts.append(_Part(ctrl, qpos, stride * s.dt))
+    return parts
+
+
+def _greatest_measured(parts: list[_Part]) -> Array:
+    """Return the greatest speed of each joint over SPEED_SPAN_S, without outliers, (n,) rad/s."""
+    speeds = []
+    for _, qpos, dt in parts:
+        span = max(1, round(SPEED_SPAN_S / dt))
+        if len(qpos) > span:
+            speeds.append(np.abs(qpos[span:] - qpos[:-span]) / (span * dt))
+    return np.asarray(np.quantile(np.concatenate(speeds), GREATEST_SPEED_QUANTILE, axis=0))
+
+
+def _aim_errors(parts: list[_Part], tried: Array) -> _AimErrors:
+    """Return the errors of ramps with speeds (k, n), rad/s, and of lags, each with the delay and
+    the offset that suit it best.
+    """
+    aims_count = len(tried) + len(LAG_TIME_CONSTANTS_S)
+    squares = np.zeros((2, aims_count, tried.shape[1], LAGS))
+    squares_behind = np.zeros(tried.shape)
+    most_behind = np.zeros(tried.shape)
     rows = np.zeros(2)
-    for i, (ctrl, qpos, dt) in enumerate(parts):
-        ramps = speed_limited(
-            np.broadcast_to(ctrl[:, None], (len(ctrl), *tried.shape)), qpos[0], tried, dt
-        )
+    for number, (ctrl, qpos, dt) in enumerate(parts):
+        half = number % 2
+        commands = np.broadcast_to(ctrl[:, None], (len(ctrl), *tried.shape))
+        ramps = speed_limited(commands, qpos[0], tried, dt)  # (T, k, n)
         behind = np.abs(ramps - ctrl[:, None])
-        squares, most = behind_command
-        behind_command = np.stack(
-            [squares + (behind**2).sum(axis=0), np.maximum(most, behind.max(axis=0))]
-        )
-        aims = np.concatenate([ramps, _lagged(ctrl, dt)], axis=1)  # (T, k and lags, n)
-        for j, lag in enumerate(np.linspace(0, MAX_LAG_S, LAGS)):
+        squares_behind += (behind**2).sum(axis=0)
+        most_behind = np.maximum(most_behind, behind.max(axis=0))
+        aims = np.concatenate([ramps, _lagged(ctrl, dt)], axis=1)  # (T, k + lags, n)
+        for i, lag in enumerate(np.linspace(0, MAX_LAG_S, LAGS)):
             late = round(lag / dt)
             away = qpos[late:, None] - aims[: len(aims) - late]
-            error[i % 2, ..., j] += ((away - away.mean(axis=0)) ** 2).sum(axis=0)
-        rows[i % 2] += len(ctrl)
-    rms = np.sqrt(error.min(axis=-1) / rows[:, None, None])  # (2, k, n)
-    ramp_rms, lag_rms = np.split(rms, [len(tried)], axis=1)
-    best = ramp_rms.sum(axis=0).argmin(axis=0)
-    lowest = np.take_along_axis(ramp_rms, best[None, None], axis=1)[:, 0]
-    ratio = lowest / np.maximum(lag_rms.min(axis=1), 1e-9)  # (2, n)
-    joints = np.arange(len(op))
-    speed = tried[best, joints]
-    squares, most = behind_command[:, best, joints]
-    limited = (ratio < MAX_ERROR_RATIO).all(axis=0) & (
-        np.sqrt(squares / rows.sum()) > MIN_RAMP_ERROR_RAD
-    )
-    limited &= most > MIN_RAMP_DELAY_S * speed
-    speed[~limited] = 0.0
-    if limited.any():
-        speed[limited] = _speed_behind(
-            [(c[:, limited], q[:, limited], dt) for c, q, dt in parts], speed[limited]
-        )
-    return np.asarray(speed)
+            squares[half, ..., i] += ((away - away.mean(axis=0)) ** 2).sum(axis=0)
+        rows[half] += len(ctrl)
+    rms = np.sqrt(squares.min(axis=-1) / rows[:, None, None])
+    return _AimErrors(rms, np.sqrt(squares_behind / rows.sum()), most_behind)
 
 
-def _speed_behind(parts: list[tuple[Array, Array, float]], speed: Array) -> Array:
-    """Return the median speed of joints well behind a ramp of about `speed` (n,) rad/s: that of
-    the ramp itself.
+def _speed_behind(parts: list[_Part], speed: Array) -> Array:
+    """Return the median speed of joints while they are well behind a ramp of about `speed` (n,)
+    rad/s: then they are as fast as their ramp.
     """
     seen = []
     for ctrl, qpos, dt in parts:
         behind = np.abs(speed_limited(ctrl, qpos[0], speed, dt) - ctrl)
-        # then it is as fast as its ramp
-        k = max(1, round(SPEED_SPAN_S / dt))
+        span = max(1, round(SPEED_SPAN_S / dt))
         late = round(MIN_RAMP_DELAY_S / 2 / dt)
-        moved = np.abs(qpos[late + k :] - qpos[late:-k]) / (k * dt)
-        seen.append(np.where(behind[: len(moved)] > MIN_RAMP_DELAY_S / 2 * speed, moved, np.nan))
+        moved = np.abs(qpos[late + span :] - qpos[late:-span]) / (span * dt)
+        is_far_behind = behind[: len(moved)] > MIN_RAMP_DELAY_S / 2 * speed
+        seen.append(np.where(is_far_behind, moved, np.nan))
     return np.asarray(np.nanmedian(np.concatenate([*seen, speed[None]]), axis=0))
 
 
@@ -204,7 +248,8 @@ def _lagged(ctrl: Array, dt: float) -> Array:
     """Return commands (T, n) behind first-order lags of LAG_TIME_CONSTANTS_S, (T, lags, n)."""
     share = np.minimum(dt / np.maximum(LAG_TIME_CONSTANTS_S, dt), 1)[:, None]
     lagged = np.empty((len(ctrl), len(LAG_TIME_CONSTANTS_S), ctrl.shape[1]))
-    at = np.repeat(ctrl[:1], len(LAG_TIME_CONSTANTS_S), axis=0)
+    aim = np.repeat(ctrl[:1], len(LAG_TIME_CONSTANTS_S), axis=0)
     for t, target in enumerate(ctrl):
-        lagged[t] = at = at + share * (target - at)
+        aim = aim + share * (target - aim)
+        lagged[t] = aim
     return lagged

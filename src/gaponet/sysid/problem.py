@@ -5,6 +5,7 @@ errors.
 from __future__ import annotations
 
 import copy
+import math
 from collections.abc import Callable
 from collections.abc import Sequence as ListOf
 from dataclasses import dataclass, replace
@@ -19,47 +20,47 @@ from gaponet.sim.model import build_model
 from gaponet.sysid.acceptance import Covariance, Std
 from gaponet.sysid.axes import CLASSIC, MIN_EXCITATION_RAD, WARM, Axes, Bounds, Values
 from gaponet.sysid.joint_rollouts import ERROR_SCALE_RAD, JointRollouts
-from gaponet.sysid.least_squares import Errors, Progress, agreed_slopes, better_half, descend
+from gaponet.sysid.least_squares import (
+    DAMPING_FACTORS,
+    Errors,
+    Progress,
+    agreed_slopes,
+    better_half,
+    descend,
+)
 from gaponet.sysid.robot_rollouts import RobotRollouts
 
 ROBOT_WINDOWS = 8  # windows of the fit in the robot's simulator
-# of each joint's search, and their standard deviation in large changes
-STARTS = 4
-START_STD = 2.0
+STARTS = 4  # of each joint's search
+START_STD = 2.0  # standard deviation of the starts around the first one, large changes
 SHORT_WINDOW_S = 0.5  # a search begins with windows this short
-# of all starts on short windows, of all on whole windows, of the better half
-SEARCH_ITERATIONS = (
-    10,
-    8,
-    15,
-)
-# at most
-CHAIN_ITERATIONS = 8
-CHAIN_CANDIDATES = 160
-# relative, for another iteration in the robot's simulator
+# Iterations of a joint's search: all starts on short windows, all on whole windows, and the better
+# half.
+SEARCH_ITERATIONS = (10, 8, 15)
+# Of the fit of kinematic chains: iterations, and candidates of each chain that they simulate.
+MAX_CHAIN_ITERATIONS = 8
+MAX_CHAIN_CANDIDATES = 160
+# Relative decrease of the cost from which another iteration in the robot's simulator follows.
 MIN_COST_DECREASE = 2e-3
 MIN_CHAIN_COST_DECREASE = 2e-4
 MIN_CLUSTERS = 24  # parts of the recordings that count as independent of each other
-CORRELATION_TIME_BOUNDS_S = (1.0, 4.0)  # least, and the value before it is estimated
+MIN_CORRELATION_TIME_S = 1.0
+FIRST_CORRELATION_TIME_S = 4.0  # before it is estimated
 MIN_CORRELATION = 0.05  # of an error with itself later; less counts as none
-# of the robot file's values; damping with kd
-PRIOR_LOG_STD = {
-    "kp": 0.5,
-    "armature": 1.5,
-    "damping": 1.0,
-}
+# Field → standard deviation of its logarithm around the robot file's value; damping counts with kd.
+PRIOR_LOG_STD = {"kp": 0.5, "armature": 1.5, "damping": 1.0}
 PRIORS = len(PRIOR_LOG_STD)
-MIN_SHARE = 1e-3  # of the file's value; less counts as this
-MAX_GAIN_RATIO = (
-    2.7  # to the file's gain, one standard deviation of damping's prior; more is doubted
-)
-STATED_KP_LOG_STD = 0.1  # of a kp that recordings state
-# of backlash, by the physics step and by what else crosses the gap (benchmarks/backlash.py)
+STATED_KP_LOG_STD = 0.1  # of a kp that recordings state, instead
+MIN_SHARE = 1e-3  # of the file's value; a smaller value counts as this
+# Of a fitted gain to the file's, or the reverse: one standard deviation of damping's prior. A
+# larger ratio is doubted.
+MAX_GAIN_RATIO = 2.7
+# Of backlash, by the physics step and by what else crosses the gap (benchmarks/backlash.py).
 RELATIVE_GAP_STD = 0.06
 UNIFORM_STD = 0.29  # of what is uniformly distributed over one step
-MIN_SLOPE = (
-    3e-5  # of all rows together over a parameter, errors a large change; less counts as none
-)
+# Root of the sum of all rows' squared slopes over a parameter, errors per large change; a parameter
+# with less counts as one that no row depends on.
+MIN_SLOPE = 3e-5
 UNKNOWN_STD = 1e3  # large changes, of a parameter that no row depends on
 DERIVATIVE_STEP = 1e-3  # large changes, of the delta method
 MAX_RELATIVE_STD = 0.15  # of a value and of its scale; beyond it the parameter is not determined
@@ -79,14 +80,20 @@ class _GainPrior:
 
     def __init__(self, bounds: Bounds, row_period: float) -> None:
         self.residual = np.full(bounds.n, 1e-3)
-        self.correlation_time = np.full(bounds.n, CORRELATION_TIME_BOUNDS_S[1])
+        self.correlation_time = np.full(bounds.n, FIRST_CORRELATION_TIME_S)
         self._row_period = max(row_period, 0.01)
         self.log_std: dict[str, float | Array] = dict(PRIOR_LOG_STD)
         if bounds.stated:
             self.log_std["kp"] = STATED_KP_LOG_STD
-        self._servo_damping = {"damping": bounds.kd}  # beside the joint's own
-        given = {f: bounds.first[f] + self._servo_damping.get(f, 0.0) for f in self.log_std}
-        self._given = {f: np.where(v > 0, v, np.nan) for f, v in given.items()}
+        self._kd = bounds.kd
+        self._given: Values = {}  # the file's values, (n,); nan where it states none
+        for field in self.log_std:
+            value = self._with_kd(field, bounds.first[field])
+            self._given[field] = np.where(value > 0, value, np.nan)
+
+    def _with_kd(self, field: str, value: Array) -> Array:
+        """Return values of a field; damping with the servo's kd, since a motion shows their sum."""
+        return value + self._kd if field == "damping" else value
 
     def error_std(self) -> Array:
         """Return the standard deviation that one row's error has beside the prior, (n,) in
@@ -98,14 +105,12 @@ class _GainPrior:
 
     def errors(self, values: Values) -> Array:
         """Return the prior's errors of candidates (k, n), (k, n, PRIORS) in ERROR_SCALE_RAD."""
-        own = {f: values[f] + self._servo_damping.get(f, 0.0) for f in self._given}
-        far = [
-            np.nan_to_num(np.log(np.maximum(own[f], MIN_SHARE * given) / given))
-            * self.error_std()
-            / self.log_std[f]
-            for f, given in self._given.items()
-        ]
-        return np.stack(far, axis=-1)
+        errors = []
+        for field, given in self._given.items():
+            value = self._with_kd(field, values[field])
+            log_change = np.log(np.maximum(value, MIN_SHARE * given) / given)
+            errors.append(np.nan_to_num(log_change) * self.error_std() / self.log_std[field])
+        return np.stack(errors, axis=-1)
 
     def state_kp(self, kp: Array, log_std: Array) -> None:
         """Let the prior of kp be around these values (n,), N·m/rad; nan where it stays."""
@@ -118,14 +123,20 @@ class _GainPrior:
         self.residual = np.maximum(ERROR_SCALE_RAD * np.sqrt(2 * cost / np.maximum(rows, 1)), 1e-5)
 
     def update_correlation_time(self, rollouts: JointRollouts, values: Values) -> None:
-        """Estimate the correlation time from the errors of values (n,)."""
+        """Estimate the correlation time from the errors of values (n,).
+
+        It is the integral of the autocorrelation over lags of both signs, up to the first lag at
+        which less than MIN_CORRELATION is left. The autocorrelation is the transform of the power
+        spectrum; zeros as long as the window keep its ends apart.
+        """
         errors = rollouts.errors({f: v[None] for f, v in values.items()})[0]  # (n, windows, rows)
-        power = (np.abs(np.fft.rfft(errors, 2 * errors.shape[-1])) ** 2).sum(axis=1)
-        correlation = np.fft.irfft(power)[:, : errors.shape[-1]]
+        rows = errors.shape[-1]
+        power = (np.abs(np.fft.rfft(errors, 2 * rows)) ** 2).sum(axis=1)
+        correlation = np.fft.irfft(power)[:, :rows]  # (n, rows), by lag
         correlation /= np.maximum(correlation[:, :1], 1e-30)
         correlation *= np.cumprod(correlation > MIN_CORRELATION, axis=1)
         seconds = rollouts.dt * rollouts.thin * (2 * correlation.sum(axis=1) - 1)
-        self.correlation_time = np.maximum(seconds, CORRELATION_TIME_BOUNDS_S[0])
+        self.correlation_time = np.maximum(seconds, MIN_CORRELATION_TIME_S)
 
 
 @dataclass
@@ -164,48 +175,55 @@ class JointFit(FitProblem):
         super().__init__(rollouts, robot, bounds, _GainPrior(bounds, rollouts.dt), step)
 
     def regressed(self) -> list[Values]:
-        """Return starts that balance the recorded accelerations, with their own and with the
-        file's kp.
+        """Return two starts that balance the recorded accelerations: with the kp of the balance,
+        and with all torques scaled to the file's kp.
         """
-        own = self.bounds.start
-        first = self.bounds.first["kp"]
+        kp_of_file = self.bounds.first["kp"]
         balanced = self.rollouts.regressed()
         valid = balanced["kp"] > 0
-        ratio = np.divide(first, balanced["kp"], out=np.ones(self.bounds.n), where=valid)
+        ratio = np.divide(kp_of_file, balanced["kp"], out=np.ones(self.bounds.n), where=valid)
         scaled = {f: x if f in ("offset", "delay") else x * ratio for f, x in balanced.items()}
-        return [
-            {
-                f: np.where(valid, x - self.bounds.kd * (f == "damping"), own[f])
-                for f, x in values.items()
-            }
-            for values in (balanced, scaled)
-        ]
+        starts = []
+        for values in (balanced, scaled):
+            own_damping = values["damping"] - self.bounds.kd
+            found = values | {"damping": own_damping}
+            starts.append({f: np.where(valid, x, self.bounds.start[f]) for f, x in found.items()})
+        return starts
 
     def search(
+        self,
+        start: Values,
+        others: ListOf[Values] = (),
+        *,
+        report: Progress = lambda cost: None,
+    ) -> Values:
+        """Fit the classic fields and those of the servo model that `start` has; return values (n,).
+
+        Arguments as of `search_fields`.
+        """
+        return self.search_fields(fitted_fields(start, encoder=True), start, others, report=report)
+
+    def search_fields(
         self,
         fields: ListOf[str],
         start: Values,
         others: ListOf[Values] = (),
         *,
-        only: bool = False,
         report: Progress = lambda cost: None,
     ) -> Values:
-        """Fit the fields, the classic ones and those of the servo model that `start` has; return
-        values (n,).
+        """Fit these fields alone; return values (n,), the others as in `start`.
 
         Args:
-            fields: Fields beside those of `start`; with `only` no others are fitted.
             start: First start, (n,); STARTS in all are drawn around it.
             others: At most two starts in place of drawn ones.
             report: Called in each iteration, as of `least_squares.descend`.
         """
-        names = fields if only else fitted_fields(dict.fromkeys([*start, *fields]), encoder=True)
-        axes = Axes(self.bounds, names, start)
+        axes = Axes(self.bounds, fields, start)
         rng = np.random.default_rng(0)
-        x = np.repeat(axes.normalize(start)[None], STARTS, axis=0)
+        x = np.repeat(axes.normalize(start)[None], STARTS, axis=0)  # (STARTS, n, P)
         x[1:] += START_STD * rng.standard_normal(x[1:].shape)
-        for i, one in enumerate(others):
-            x[2 + i] = axes.normalize(start | one)
+        for i, other in enumerate(others):
+            x[2 + i] = axes.normalize(start | other)
         x = np.clip(x, axes.low, axes.high)
         windows = (self.rollouts.shortened(SHORT_WINDOW_S), self.rollouts, self.rollouts)
         for rollouts, iterations in zip(windows, SEARCH_ITERATIONS, strict=True):
@@ -259,7 +277,8 @@ class RobotFit(FitProblem):
         x = chains.pack(axes.normalize(values)[None])
         low = chains.pack(axes.low)
         high = chains.pack(axes.high)
-        iterations = max(1, min(CHAIN_ITERATIONS, CHAIN_CANDIDATES // (x.shape[-1] + 5)))
+        candidates = x.shape[-1] + 1 + len(DAMPING_FACTORS)  # of one iteration
+        iterations = max(1, min(MAX_CHAIN_ITERATIONS, MAX_CHAIN_CANDIDATES // candidates))
         x, _ = descend(
             x, low, high, errors, iterations, report(names, rows), MIN_CHAIN_COST_DECREASE
         )
@@ -294,69 +313,78 @@ class RobotSearch:
         """
         x = better_half(self._x, self._cost)[:1]
         cost = self._cost.min(axis=0)[None]
-        of_robot = self._least()
-        if not np.array_equal(x, self._x[of_robot]):
-            x = np.concatenate([x, self._x[of_robot]])
-            cost = np.concatenate([cost, self._cost[of_robot]])
+        best = self._best()
+        if not np.array_equal(x, self._x[best]):
+            x = np.concatenate([x, self._x[best]])
+            cost = np.concatenate([cost, self._cost[best]])
         self._x = x
         self._cost = cost
 
     @property
     def values(self) -> Values:
         """Values (n,) of the best start."""
-        best = self._x[self._least()]
-        return {f: v[0].copy() for f, v in self._axes.values(best).items()}
+        x = self._x[self._best()]
+        return {f: v[0].copy() for f, v in self._axes.values(x).items()}
 
-    def _least(self) -> list[int]:
-        """Return the number of the start with the least cost in the sum over joints, alone in a
-        list.
-        """
-        return [int(self._cost.sum(axis=1).argmin())]
+    def _best(self) -> slice:
+        """Return where the start with the least cost in the sum over joints is: a slice of one."""
+        number = int(self._cost.sum(axis=1).argmin())
+        return slice(number, number + 1)
 
 
 class KinematicChains:
-    """Joints that move each other: arrays of joints (…, n, P) as arrays of chains (…, chains, most
-    · P).
+    """Kinematic chains, such as the arms of a humanoid: joints that move each other.
+
+    A chain has as many places as the longest one has joints. The values of joints, (…, n, P), are
+    packed as values of chains, (…, chains, places · P); places without a joint hold 0.
 
     Attributes:
-        joints: Joints of each chain, (chains, most); −1 for none.
+        joints: Operated joint in each place, (chains, places); −1 for none.
     """
 
     def __init__(self, robot: RobotSpec) -> None:
         model = build_model(replace(robot, table=None), physics_only=True)
         tree = model.dof_treeid[robot.operated_index]
         chains = [np.flatnonzero(tree == t) for t in np.unique(tree)]
-        most = max(map(len, chains))
-        self.joints = np.array([[*chain, *[-1] * (most - len(chain))] for chain in chains])
+        places = max(map(len, chains))
+        self.joints = np.full((len(chains), places), -1)
+        for row, chain in zip(self.joints, chains, strict=True):
+            row[: len(chain)] = chain
 
     def pack(self, x: Array) -> Array:
-        """Return values of joints as values of chains; 0 where a chain has fewer joints."""
-        padded = np.concatenate([x, np.zeros_like(x[..., :1, :])], axis=-2)[..., self.joints, :]
-        return padded.reshape(*x.shape[:-2], len(self.joints), -1)
+        """Return values of joints as values of chains."""
+        none = np.zeros_like(x[..., :1, :])  # which −1 takes
+        in_places = np.concatenate([x, none], axis=-2)[..., self.joints, :]
+        return in_places.reshape(*x.shape[:-2], len(self.joints), -1)
 
     def unpack(self, x: Array) -> Array:
         """Return values of chains as values of joints."""
-        split = x.reshape(*x.shape[:-2], self.joints.size, -1)
-        return np.asarray(
-            split[..., np.argsort(self.joints.ravel(), kind="stable")[(self.joints < 0).sum() :], :]
-        )
+        joint_in_place = self.joints.ravel().tolist()
+        joints = sum(joint >= 0 for joint in joint_in_place)
+        place_of_joint = [joint_in_place.index(joint) for joint in range(joints)]
+        in_places = x.reshape(*x.shape[:-2], self.joints.size, -1)
+        return np.asarray(in_places[..., place_of_joint, :])
 
 
 def fitted_fields(values: dict[str, object] | Values, encoder: bool = False) -> list[str]:
-    """Return the fields among values that a joint's search changes, in order; encoder_step if
-    `encoder`.
+    """Return the fields among values that a joint's search changes, in order.
+
+    Args:
+        encoder: encoder_step too. It is the recordings' own, and has no standard error.
     """
-    every = (*CLASSIC, "effort_limit", *SERVO_TERMS, *WARM[:2])
-    return [f for f in every if f in values and (encoder or f != "encoder_step")]
+    fields = []
+    for field in (*CLASSIC, "effort_limit", *SERVO_TERMS, *WARM[:2]):
+        if field == "encoder_step" and not encoder:
+            continue
+        if field in values:
+            fields.append(field)
+    return fields
 
 
 def robot_fields(values: Values) -> list[str]:
     """Return the fields among values that the fit in the robot's simulator changes."""
-    return [
-        f
-        for f in (*CLASSIC, *SERVO_TERMS, *WARM[:2])
-        if f in values and not SERVO_FIELDS[f].single_joint
-    ]
+    every = (*CLASSIC, *SERVO_TERMS, *WARM[:2])
+    return [f for f in every if f in values and not SERVO_FIELDS[f].single_joint]
 
 
 @dataclass
@@ -385,18 +413,20 @@ def standard_errors(problem: FitProblem, values: Values) -> StandardErrors:
     joints = problem.robot.operated
     axes = Axes(problem.bounds, names, values)
     x = axes.normalize(values)  # (n, P)
-    covariance, lost = _covariance(problem, axes, x)
-    std = _std_in_si(axes, x, values, covariance, lost)
+    covariance, unseen = _covariance(problem, axes, x)
+    std = _std_in_si(axes, x, values, covariance, unseen)
     for field, error in _discretisation_std(problem, values).items():
         std[field] = np.hypot(std[field], error)
-    if "no_load_speed" in std:  # a joint without a line: on its axis zero, but infinite in SI units
-        std["no_load_speed"] *= values["no_load_speed"] > 0
-    width = np.sqrt(np.einsum("...ii->...i", covariance))
-    width = width + np.where(lost & (axes.low < axes.high), UNKNOWN_STD, 0)
-    unknown = _undetermined(problem, values, axes, std, width)
+    if "no_load_speed" in std:
+        # A joint without a torque-speed line: zero on the axis, infinite in SI units.
+        std["no_load_speed"] = np.where(values["no_load_speed"] > 0, std["no_load_speed"], 0.0)
+    std_on_axes = np.sqrt(np.einsum("...ii->...i", covariance))
+    is_free = axes.low < axes.high
+    std_on_axes = std_on_axes + np.where(unseen & is_free, UNKNOWN_STD, 0)
+    unknown = _undetermined(problem, values, axes, std, std_on_axes)
     unit = axes.unit[..., None]
-    unseen = UNKNOWN_STD * np.eye(len(names)) * lost[..., None, :]
-    in_axis_units = unit * (covariance + unseen) * np.swapaxes(unit, -1, -2)
+    of_unseen = UNKNOWN_STD * np.eye(len(names)) * unseen[..., None, :]
+    in_axis_units = unit * (covariance + of_unseen) * np.swapaxes(unit, -1, -2)
     return StandardErrors(
         std={j: {f: float(std[f][i]) for f in names} for i, j in enumerate(joints)},
         covariance={j: (names, in_axis_units[i]) for i, j in enumerate(joints)},
@@ -406,8 +436,8 @@ def standard_errors(problem: FitProblem, values: Values) -> StandardErrors:
 
 
 def _covariance(problem: FitProblem, axes: Axes, x: Array) -> tuple[Array, Array]:
-    """Return the covariance of values x (n, P) in large changes, (n, P, P), and which no row
-    depends on, (n, P).
+    """Return the covariance of values x (n, P) in large changes, (n, P, P), and which of them no
+    row depends on, (n, P).
 
     This is the sandwich estimator with windows as clusters (Huber 1967; Liang and Zeger 1986):
     errors within a window are not independent, so the spread of the windows' gradients stands
@@ -416,38 +446,44 @@ def _covariance(problem: FitProblem, axes: Axes, x: Array) -> tuple[Array, Array
     The prior adds its own width where it holds a value. The square of a further Gauss-Newton step
     is added, since a search may end before the minimum.
     """
-    starts = agreed_slopes(x[None], axes.low, axes.high, problem.of_axes(axes))
-    here = starts[0][0]  # errors, (n, rows + PRIORS)
-    slopes = starts[1][0]  # (n, rows + PRIORS, P)
-    weight = 1 / np.sqrt(1 + here**2)  # of soft L1
-    gradient = slopes * (weight * here)[..., None]
-    each, _ = cluster_sums(gradient[:, :-PRIORS], problem.rollouts.window)
-    each -= each.mean(axis=1, keepdims=True)
-    clusters = each.shape[1]
-    few = clusters / max(clusters - len(axes.names), 1)
-    scatter = np.swapaxes(each, -1, -2) @ each * few**2
+    errors_of_start, slopes_of_start = agreed_slopes(
+        x[None], axes.low, axes.high, problem.of_axes(axes)
+    )
+    errors = errors_of_start[0]  # (n, rows + PRIORS)
+    slopes = slopes_of_start[0]  # (n, rows + PRIORS, P)
+    weight = 1 / np.sqrt(1 + errors**2)  # of soft L1
+    gradient = slopes * (weight * errors)[..., None]
+    by_cluster, _ = cluster_sums(gradient[:, :-PRIORS], problem.rollouts.window)  # (n, C, P)
+    by_cluster -= by_cluster.mean(axis=1, keepdims=True)
+    clusters = by_cluster.shape[1]
+    correction = clusters / max(clusters - len(axes.names), 1)
+    scatter = np.swapaxes(by_cluster, -1, -2) @ by_cluster * correction**2
     prior_slopes = slopes[:, -PRIORS:] * problem.prior.error_std()[:, None, None]
     scatter += np.swapaxes(prior_slopes, -1, -2) @ prior_slopes
     curvature = (np.swapaxes(slopes, -1, -2) @ (weight[..., None] * slopes)).astype(float)
     size = np.sqrt(np.einsum("...ii->...i", curvature))
-    lost = size < MIN_SLOPE
-    inverse = _inverse(curvature, np.where(lost | (axes.low == axes.high), np.inf, size))
+    unseen = size < MIN_SLOPE
+    is_fixed = axes.low == axes.high
+    inverse = _inverse(curvature, np.where(unseen | is_fixed, np.inf, size))
     step = np.clip((inverse @ gradient.sum(axis=1)[..., None])[..., 0], -1, 1)
-    return inverse @ scatter @ inverse + step[..., :, None] * step[..., None, :], lost
+    return inverse @ scatter @ inverse + step[..., :, None] * step[..., None, :], unseen
 
 
-def _std_in_si(axes: Axes, x: Array, values: Values, covariance: Array, lost: Array) -> Values:
-    """Return the standard errors of fields in SI units, (n,), by the delta method; arguments as of
-    `_covariance`.
+def _std_in_si(axes: Axes, x: Array, values: Values, covariance: Array, unseen: Array) -> Values:
+    """Return the standard errors of fields in SI units, (n,), by the delta method.
+
+    Args:
+        x, values: The fitted values in large changes, (n, P), and in SI units, (n,) each.
+        covariance, unseen: As of `_covariance`.
     """
     ahead = [axes.values(x + DERIVATIVE_STEP * row) for row in np.eye(len(axes.names))]
     std = {}
     for field in axes.names:
         moved = [(one[field] - values[field]) / DERIVATIVE_STEP for one in ahead]
-        slope = np.stack(moved, axis=-1)  # (n, P)
+        slope = np.stack(moved, axis=-1)  # (n, P), SI units per large change
         known = np.sqrt(np.einsum("np,npq,nq->n", slope, covariance, slope))
-        # A parameter that no row depends on is as unknown as before.
-        std[field] = known + (np.abs(slope) * lost).max(axis=1)
+        # A parameter that no row depends on may be wrong by a large change.
+        std[field] = known + (np.abs(slope) * unseen).max(axis=1)
     return std
 
 
@@ -487,19 +523,21 @@ def contradicted_gains(bounds: Bounds, values: Values, std: Std) -> list[str]:
 
 
 def cluster_sums(x: Array, window: Array) -> tuple[Array, Array]:
-    """Return sums over clusters of rows (n, rows, …), (n, C, …), and the window of each cluster,
+    """Return sums of rows (n, rows, …) over clusters, (n, C, …), and the window of each cluster,
     (C,).
 
-    Clusters are windows (rows,), or parts of them where there are fewer than MIN_CLUSTERS.
+    Clusters are windows, or equal parts of them where there are fewer windows than MIN_CLUSTERS.
+
+    Args:
+        window: Window of each row, (rows,).
     """
-    count = int(window.max()) + 1
-    parts = max(1, -(-MIN_CLUSTERS // count))
-    order = np.argsort(window, kind="stable")
-    turn = np.zeros(len(window), int)
-    turn[order] = np.concatenate(
-        [np.arange(c) * parts // c for c in np.unique(window, return_counts=True)[1]]
-    )
-    cluster = window * parts + turn
+    windows = int(window.max()) + 1
+    parts = max(1, math.ceil(MIN_CLUSTERS / windows))  # of each window
+    part = np.zeros(len(window), int)  # of each row
+    for number in np.unique(window):
+        rows = np.flatnonzero(window == number)
+        part[rows] = np.arange(len(rows)) * parts // len(rows)
+    cluster = window * parts + part
     sums = np.zeros((len(x), int(cluster.max()) + 1, *x.shape[2:]))
     np.add.at(sums, (slice(None), cluster), x)  # type: ignore[arg-type]
     return sums, np.arange(sums.shape[1]) // parts
@@ -509,17 +547,20 @@ def _discretisation_std(problem: FitProblem, values: Values) -> Values:
     """Return standard errors of damping, armature, delay, no-load speed and backlash by the
     physics step, (n,).
     """
-    h = UNIFORM_STD * problem.physics_step
-    total = values["damping"] + problem.robot.kd[problem.robot.operated_index]
-    std = {"damping": h * values["kp"], "armature": h * total, "delay": np.full(len(total), h)}
+    time_std = UNIFORM_STD * problem.physics_step  # s
+    total_damping = values["damping"] + problem.robot.kd[problem.robot.operated_index]
+    std = {
+        "damping": time_std * values["kp"],
+        "armature": time_std * total_damping,
+        "delay": np.full(len(total_damping), time_std),
+    }
     if "no_load_speed" in values:  # the limit follows the speed a step late, half a step on average
         limit = values.get("effort_limit", problem.bounds.first["effort_limit"])
-        std["no_load_speed"] = (
-            problem.physics_step / 2 * limit / (problem.bounds.inertia + values["armature"])
-        )
-    return (
-        std | {"backlash": RELATIVE_GAP_STD * values["backlash"]} if "backlash" in values else std
-    )
+        inertia = problem.bounds.inertia + values["armature"]
+        std["no_load_speed"] = problem.physics_step / 2 * limit / inertia
+    if "backlash" in values:
+        std["backlash"] = RELATIVE_GAP_STD * values["backlash"]
+    return std
 
 
 def _inverse(normal: Array, size: Array) -> Array:
@@ -532,13 +573,14 @@ def _inverse(normal: Array, size: Array) -> Array:
 
 
 def _undetermined(
-    problem: FitProblem, values: Values, axes: Axes, std: Values, width: Array
+    problem: FitProblem, values: Values, axes: Axes, std: Values, std_on_axes: Array
 ) -> dict[str, tuple[tuple[str, ...], str]]:
     """Return joint → fields that the recordings do not determine, and a sentence; all fields of
     unexcited joints.
 
-    std: Standard errors in SI units, (n,); width: those on the axes, (n, P), where torques are
-    divided by kp.
+    Args:
+        std: Standard errors in SI units, (n,) each.
+        std_on_axes: Standard errors in large changes, (n, P); torques are there divided by kp.
     """
     bounds = problem.bounds
     unknown = {}
@@ -551,7 +593,7 @@ def _undetermined(
             )
             unknown[joint] = tuple(axes.names), why
             continue
-        wide, also_over_kp = _wide_fields(values, axes, std, width, i)
+        wide, also_over_kp = _wide_fields(values, axes, std, std_on_axes, i)
         if wide:
             texts = [f"{f} {format_uncertainty(values[f][i], std[f][i])}" for f in wide]
             advice = ""
@@ -563,7 +605,7 @@ def _undetermined(
 
 
 def _wide_fields(
-    values: Values, axes: Axes, std: Values, width: Array, joint: int
+    values: Values, axes: Axes, std: Values, std_on_axes: Array, joint: int
 ) -> tuple[list[str], list[str]]:
     """Return the fields of a joint that the recordings do not determine, and which of them not
     even over kp.
@@ -586,6 +628,6 @@ def _wide_fields(
         wide.append(field)
         is_over_kp = SERVO_FIELDS[field].axis == "over kp"
         on_axis = MAX_RELATIVE_STD * max(abs(x[joint, k]), 1.0)
-        if not is_over_kp or width[joint, k] > on_axis:
+        if not is_over_kp or std_on_axes[joint, k] > on_axis:
             also_over_kp.append(field)
     return wide, also_over_kp

@@ -10,7 +10,7 @@ import numpy as np
 from gaponet.base.arrays import Array
 from gaponet.base.progress import Progress
 from gaponet.sysid.joint_rollouts import ERROR_SCALE_RAD
-from gaponet.sysid.problem import CHAIN_ITERATIONS, SEARCH_ITERATIONS
+from gaponet.sysid.problem import MAX_CHAIN_ITERATIONS, SEARCH_ITERATIONS
 
 FIRST_ROBOT_ITERATIONS = 2  # of the whole robot, from both starts
 ROBOT_ITERATIONS = 3  # of the whole robot afterwards, from the better one
@@ -35,7 +35,7 @@ class SearchProgress:
             progress: Called with iterations done, in all, and what is fitted with its error.
         """
         joints = sum(SEARCH_ITERATIONS)
-        robot = FIRST_ROBOT_ITERATIONS + ROBOT_ITERATIONS + CHAIN_ITERATIONS
+        robot = FIRST_ROBOT_ITERATIONS + ROBOT_ITERATIONS + MAX_CHAIN_ITERATIONS
         iterations = [joints] * fits
         iterations += [robot * fits]
         iterations += [joints + POLISH_ITERATIONS] * (fits * steps)

@@ -5,7 +5,6 @@ with them.
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Sequence as ListOf
 from dataclasses import fields, replace
 from typing import Any, NamedTuple
@@ -21,9 +20,12 @@ from gaponet.robot.toml_file import MEASURED_FIELDS, Spread
 from gaponet.sysid.axes import first_values, identified_joints
 from gaponet.sysid.uncertainty import ParameterUncertainty, summarize
 
-MAX_RATIO = 10.0  # to the interval of a servo type, or of it
+MAX_RATIO = 10.0  # of a value to the nearest end of its servo type's interval, or the reverse
 MIN_CHANGE = 0.01  # relative; a value that differs less from the nominal one was not determined
-NORMAL_QUANTILES = norm.ppf((np.arange(400) + 0.5) / 400)
+NORMAL_QUANTILES = norm.ppf((np.arange(400) + 0.5) / 400)  # a normal distribution as 400 numbers
+# Parts of a joint's name, separated by _, that are exchanged for its mirror image.
+SIDES = {"left": "right", "l": "r", "fl": "fr", "rl": "rr", "lf": "rf", "lh": "rh"}
+OTHER_SIDE = SIDES | {right: left for left, right in SIDES.items()}
 
 
 def servos_like(robot: RobotSpec, like: RobotSpec) -> tuple[RobotSpec, dict[str, str]]:
@@ -82,12 +84,13 @@ def _sources(robot: RobotSpec, like: RobotSpec) -> dict[str, str]:
 
 def mirrored(joint: str) -> str:
     """Return the joint's name with left and right exchanged; the name itself if it has no side."""
-    sides = {"left": "right", "l": "r", "fl": "fr", "rl": "rr", "lf": "rf", "lh": "rh"}
-    other = sides | {b: a for a, b in sides.items()}
-    words = re.split(r"(_)", joint)
-    return "".join(
-        (other.get(w.lower(), w).upper() if w.isupper() else other.get(w, w)) for w in words
-    )
+    words = []
+    for word in joint.split("_"):
+        if word.isupper():
+            words.append(OTHER_SIDE.get(word.lower(), word).upper())
+        else:
+            words.append(OTHER_SIDE.get(word, word))
+    return "_".join(words)
 
 
 def far_from_servo_type(robot: RobotSpec) -> list[str]:
@@ -97,14 +100,19 @@ def far_from_servo_type(robot: RobotSpec) -> list[str]:
     sentences = []
     for i in robot.operated_index:
         servo = robot.servos[i]
-        for f in PASSIVE_FIELDS if servo else ():
-            value = float(getattr(robot, f)[i])
-            usual = servo.measured.get(f) if servo else None
-            nearest = float(np.clip(value, usual.low, usual.high)) if usual else 0.0
-            if servo and nearest > 0 and max(value, nearest) > MAX_RATIO * min(value, nearest):
+        if servo is None:
+            continue
+        for field in PASSIVE_FIELDS:
+            usual = servo.measured.get(field)
+            if usual is None:
+                continue
+            value = float(getattr(robot, field)[i])
+            nearest = float(np.clip(value, usual.low, usual.high))
+            is_far = max(value, nearest) > MAX_RATIO * min(value, nearest)
+            if nearest > 0 and is_far:
                 sentences.append(
-                    f"{robot.joint_names[i]}: {f} {value:.3g} is {value / nearest:.2g} times the "
-                    f"{nearest:.3g} of the {servo.name} ({servo.source})"
+                    f"{robot.joint_names[i]}: {field} {value:.3g} is {value / nearest:.2g} times "
+                    f"the {nearest:.3g} of the {servo.name} ({servo.source})"
                 )
     return sentences
 
@@ -185,10 +193,10 @@ def _spread(field: str, estimates: list[tuple[float, float]]) -> Spread | None:
         return None
     values, errors = np.array(estimates).T
     draws = values[:, None] + errors[:, None] * NORMAL_QUANTILES
-    draws = draws if field == "damping" else np.maximum(draws, 0.0)
-    return Spread(
-        *(float(f"{x:.3g}") for x in (np.median(values), *np.quantile(draws, (0.05, 0.95))))
-    )
+    if field != "damping":  # which is negative where it takes from the servo's kd
+        draws = np.maximum(draws, 0.0)
+    low, high = np.quantile(draws, (0.05, 0.95))
+    return Spread(*(float(f"{x:.3g}") for x in (np.median(values), low, high)))
 
 
 def toml_entry(servo: ServoType) -> str:

@@ -8,9 +8,11 @@ there is one.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable
 from collections.abc import Sequence as ListOf
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -26,17 +28,15 @@ from gaponet.sysid.joint_rollouts import ERROR_SCALE_RAD
 from gaponet.sysid.least_squares import descend, soft_l1
 from gaponet.sysid.robot_rollouts import RobotRollouts
 
-# above the lowest tip, or the table, in which a joint's zero may hide a contact
+# Above the lowest tip, or above the table. Below this a joint's wrong zero may hide a contact.
 CONTACT_CLEARANCE_M = 0.045
 WINDOW_S = 2.5  # of a rollout; longer ones cost more and do not find a better table
 MAX_WINDOWS = 14
 MAX_WINDOWS_PER_MOTION = 2
-# from below the lowest tip upwards
-START_HEIGHTS = 10
+START_HEIGHTS = 10  # that are tried, from below the lowest tip upwards
 START_HEIGHT_STEP_M = 0.005
 ITERATIONS = 6  # of the search from one start
-# iterations after which a start goes on only if no other start cost less by then
-FIRST_COMPARISON = 2
+FIRST_COMPARISON = 2  # iterations after which a start goes on only if no other cost less by then
 HEIGHT_CHANGE_M = 0.004  # a large change
 MAX_HEIGHT_CHANGE_M = 0.03  # from the start
 ZERO_STD_RAD = 0.02  # of a usual zero
@@ -44,12 +44,20 @@ ZERO_CHANGE_RAD = 0.01  # a large change
 MAX_ZERO_RAD = 0.1
 ZERO_DECIMALS = 6  # of rad; a joint that turns no tip keeps a zero of exactly 0
 ZERO_PRICE = 2e-3  # cost of a zero of ZERO_STD_RAD, per row
-# into which the price of the zeros is divided, so that its soft L1 cost is nearly quadratic
-PRIOR_ROWS = 1000
-# Table's friction, and logarithm of its stiffness in N/m: lowest, highest, a large change, first
-# guess.
-FRICTION = (0.0, 1.5, 0.15, 0.3)
-STIFFNESS = (np.log(100.0), np.log(1e5), 0.7, np.log(2000.0))
+PRIOR_ROWS = 1000  # that share the price of the zeros, so that its soft L1 cost is nearly quadratic
+
+
+class _Search(NamedTuple):
+    """How a number of the table is searched."""
+
+    low: float
+    high: float
+    large_change: float
+    guess: float
+
+
+FRICTION = _Search(0.0, 1.5, 0.15, 0.3)
+LOG_STIFFNESS = _Search(np.log(100.0), np.log(1e5), 0.7, np.log(2000.0))  # of N/m
 START_LOG_STIFFNESS = tuple(np.log((500.0, 8000.0)))  # of searches by themselves
 
 
@@ -89,12 +97,8 @@ def contact_height(robot: RobotSpec, heights: ListOf[Array]) -> float:
     if not robot.tips or not heights:
         return -np.inf
     rows = np.concatenate(heights)
-    return float(
-        min(
-            (rows.min() if robot.table is None else robot.table.height) + CONTACT_CLEARANCE_M,
-            np.median(rows),
-        )
-    )
+    table = rows.min() if robot.table is None else robot.table.height
+    return float(min(table + CONTACT_CLEARANCE_M, np.median(rows)))
 
 
 def low_windows(
@@ -115,12 +119,15 @@ def _most_wrong(scene: _TableRollouts, away: Array) -> list[Sequence]:
     """Return at most MAX_WINDOWS, MAX_WINDOWS_PER_MOTION of a motion, whose rollouts with a table
     `away` are worst.
     """
-    order = np.argsort(-scene.mean(away[0]))
-    taken: dict[str, list[int]] = {}
-    for i in order.tolist():
-        taken.setdefault(scene.parts[i].meta.motion, []).append(i)
-    best = {i for mine in taken.values() for i in mine[:MAX_WINDOWS_PER_MOTION]}
-    return [scene.parts[i] for i in sorted([i for i in order.tolist() if i in best][:MAX_WINDOWS])]
+    worst_first = np.argsort(-scene.mean(away[0])).tolist()
+    taken = Counter[str]()  # motion → windows
+    picked: list[int] = []
+    for number in worst_first:
+        motion = scene.parts[number].meta.motion
+        if taken[motion] < MAX_WINDOWS_PER_MOTION and len(picked) < MAX_WINDOWS:
+            taken[motion] += 1
+            picked.append(number)
+    return [scene.parts[number] for number in sorted(picked)]
 
 
 def fit_table(
@@ -146,10 +153,10 @@ def fit_table(
     if not parts:
         return TableFit(robot, False, np.zeros(0), np.zeros(0), ())
     measured = robot.table
-    guess = Table(lowest, FRICTION[3], float(np.exp(STIFFNESS[3])))
+    guess = Table(lowest, FRICTION.guess, float(np.exp(LOG_STIFFNESS.guess)))
     with_table = replace(robot, table=measured or guess)
     zeros = np.zeros(len(robot.operated))
-    away = np.array([[lowest - 10.0, FRICTION[3], STIFFNESS[3], *zeros]])
+    away = np.array([[lowest - 10.0, FRICTION.guess, LOG_STIFFNESS.guess, *zeros]])
     scene = _TableRollouts(parts, with_table, nthread)
     scene = _TableRollouts(_most_wrong(scene, away), with_table, nthread)
     motions = tuple(dict.fromkeys(s.meta.independent_motion for s in scene.parts))
@@ -219,12 +226,15 @@ def _searched(
     lists such costs.
     """
     rows = len(scene.window) * scene.n
-    large_change = np.array(
-        [HEIGHT_CHANGE_M, FRICTION[2], STIFFNESS[2], *[ZERO_CHANGE_RAD] * scene.n]
-    )
+    one = np.ones(scene.n)
+    large_change = np.r_[
+        HEIGHT_CHANGE_M, FRICTION.large_change, LOG_STIFFNESS.large_change, ZERO_CHANGE_RAD * one
+    ]
     height_range = 0.0 if measured else MAX_HEIGHT_CHANGE_M
-    low = np.array([start[0] - height_range, FRICTION[0], STIFFNESS[0], *[-MAX_ZERO_RAD] * scene.n])
-    high = np.array([start[0] + height_range, FRICTION[1], STIFFNESS[1], *[MAX_ZERO_RAD] * scene.n])
+    lowest = start[0] - height_range
+    highest = start[0] + height_range
+    low = np.r_[lowest, FRICTION.low, LOG_STIFFNESS.low, -MAX_ZERO_RAD * one]
+    high = np.r_[highest, FRICTION.high, LOG_STIFFNESS.high, MAX_ZERO_RAD * one]
     price_of_zero = np.sqrt(2 * ZERO_PRICE * rows / PRIOR_ROWS) / ZERO_STD_RAD
     costs: list[float] = []
 

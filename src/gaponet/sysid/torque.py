@@ -9,10 +9,9 @@ Validation motions choose how near, and which parts are used.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from collections.abc import Sequence as ListOf
-from dataclasses import replace
-from typing import Any, NamedTuple
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -22,6 +21,7 @@ from gaponet.base.arrays import Array
 from gaponet.data.sequence import Sequence
 from gaponet.data.signals import differentiate, lowpass
 from gaponet.robot.spec import RobotSpec
+from gaponet.robot.toml_file import PayloadMount
 from gaponet.sim.dynamics import CUTOFF_HZ
 from gaponet.sim.model import build_model
 from gaponet.sysid.adapt import PRIOR_RAD
@@ -31,18 +31,18 @@ from gaponet.sysid.least_squares import descend
 from gaponet.sysid.robot_rollouts import cut
 
 MAX_WINDOWS = 80  # more than elsewhere, since they may be short
-# between rows for the payload's place, and how many
-ROW_STEP = 5
-MAX_ROWS = 6000
+ROW_STEP = 5  # at least, between rows for the payload's place
+MAX_ROWS = 6000  # for the payload's place
 MOUNT_PRIOR_NM_PER_M = 3.0  # price of moving the payload
 MIN_MOVE_RAD = 0.05  # of a command that excites a joint
 MIN_EXPLAINED = 0.9  # of a torque's variance, from which its gains are used
 INSTRUMENTS = 12  # periods whose commands are instruments for measured position and speed
 MAX_LATE = 3  # periods between a command and its torque
-# in 20 ms; of the fit of positions
-START_DELAY = 0.25
-ITERATIONS = 10
+START_DELAY = 0.25  # of the fit of positions, large changes of 20 ms
+ITERATIONS = 10  # of that fit
 MAX_HAND_MASS = 5.0  # kg
+MAX_MOVE_M = 0.3  # of the payload from where the robot's file has it, along each axis
+MAX_OWN = 20.0  # of a joint's own friction, armature and damping, SI
 
 
 class TorqueOptions(NamedTuple):
@@ -93,35 +93,130 @@ def servo_gains(recordings: ListOf[Array], last: int = 0, late: int = 1) -> Gain
     """
     sums = []
     rows = []
-    for ctrl, qpos, qvel, tau in recordings:
-        t = np.arange(len(tau) - late)
-        past = [ctrl[np.maximum(t - k, 0)] for k in range(INSTRUMENTS)]
-        channels = [ctrl[t] - qpos[late:], -qvel[late:], tau[late:], *past]
-        error, speed, torque, *commands = (
-            np.convolve(x, np.ones(5) / 5, "valid") for x in np.array(channels, float)
-        )
-        one = np.ones_like(torque)
-        x = np.stack([error, speed, one], axis=1)
-        z = np.stack([*commands, one], axis=1)
+    for recording in recordings:
+        x, torque, z = _regression_rows(recording, late)
         if last:
             x = x[-last:].mean(axis=0, keepdims=True)
             torque = torque[-last:].mean(keepdims=True)
             z = x
         sums.append(np.concatenate([z.T @ z, z.T @ x, z.T @ torque[:, None]], axis=1))
         rows.append(np.concatenate([x, torque[:, None]], axis=1))
-
-    def solved(s: Array) -> Array:
-        first = np.linalg.lstsq(s[:, :-4], s[:, -4:-1])[0]
-        return np.asarray(np.linalg.lstsq(first.T @ s[:, -4:-1], first.T @ s[:, -1])[0])
-
     every = np.concatenate(rows)
     n = len(sums)
-    kp, kd, constant = solved(np.sum(sums, axis=0))
-    without = np.array([solved(np.sum(sums, axis=0) - one)[0] for one in sums])
+    total = np.sum(sums, axis=0)
+    kp, kd, constant = _two_stage_least_squares(total)
+    # The jackknife: kp without each recording in turn.
+    kp_without = np.array([_two_stage_least_squares(total - own)[0] for own in sums])
+    error = np.sqrt((n - 1) / n * np.square(kp_without - kp_without.mean()).sum())
     left = every[:, 3] - every[:, :3] @ [kp, kd, constant]
     explained = 1 - float(left.var() / max(every[:, 3].var(), 1e-12))
-    error = np.sqrt((n - 1) / n * np.square(without - without.mean()).sum())
     return Gains(float(kp), float(error), float(kd), explained)
+
+
+def _regression_rows(recording: Array, late: int) -> tuple[Array, Array, Array]:
+    """Return the columns error of the command, −velocity and 1, (rows, 3), the torque, (rows,),
+    and the instruments, (rows, INSTRUMENTS + 1); arguments as of `servo_gains`.
+    """
+    ctrl, qpos, qvel, tau = recording
+    t = np.arange(len(tau) - late)
+    past = [ctrl[np.maximum(t - k, 0)] for k in range(INSTRUMENTS)]
+    channels = [ctrl[t] - qpos[late:], -qvel[late:], tau[late:], *past]
+    means_of_five = [np.convolve(x, np.ones(5) / 5, "valid") for x in np.array(channels, float)]
+    error, speed, torque, *commands = means_of_five
+    one = np.ones_like(torque)
+    x = np.stack([error, speed, one], axis=1)
+    return x, torque, np.stack([*commands, one], axis=1)
+
+
+def _two_stage_least_squares(sums: Array) -> Array:
+    """Return the factors (3,) of the columns x, for torque τ, from zᵀz, zᵀx and zᵀτ of instruments
+    z beside each other, (m, m + 3 + 1).
+    """
+    zz = sums[:, :-4]
+    zx = sums[:, -4:-1]
+    zt = sums[:, -1]
+    first = np.linalg.lstsq(zz, zx)[0]
+    return np.asarray(np.linalg.lstsq(first.T @ zx, first.T @ zt)[0])
+
+
+class _BalanceRow(NamedTuple):
+    """Torque of one joint in one row of a recording, and what it has to move."""
+
+    joint: int
+    mass: Array  # payload in each mount, (mounts,) kg
+    without_payload: float  # torque that the robot alone requires, N·m
+    motion: Array  # of each mount's body per radian of the joint: shift, turn, (mounts, 2, 3)
+    frame: Array  # of each mount's body, (mounts, 3, 3)
+    tau: float  # recorded torque, N·m
+    qacc: float  # rad/s²
+    qvel: float  # rad/s
+
+
+@dataclass(frozen=True)
+class _Balance:
+    """Rows of `_BalanceRow` as arrays, (k, …).
+
+    Attributes:
+        joints: Numbers of the joints that have rows.
+        column: Place of each row's joint among them, (k,).
+    """
+
+    joints: list[int]
+    column: Array
+    mass: Array
+    without_payload: Array
+    motion: Array
+    frame: Array
+    tau: Array
+    qacc: Array
+    qvel: Array
+
+    @classmethod
+    def of_rows(cls, rows: list[_BalanceRow]) -> _Balance:
+        """Stack rows."""
+        joint, *channels = zip(*rows, strict=True)
+        joints = sorted(set(joint))
+        column = np.array([joints.index(j) for j in joint])
+        return cls(joints, column, *map(np.array, channels))
+
+    def required(self, place: Array, hand: float) -> Array:
+        """Return the torques that inverse dynamics require, (k,) N·m.
+
+        Args:
+            place: Of the payload at the first mount, (3,) m.
+            hand: Mass of the hand that the model lacks, kg.
+        """
+        mounts = self.mass.shape[1]
+        places = np.array([_place(number, place) for number in range(mounts)])
+        # How far each payload moves for a radian, (k, mounts, 3) m: 0 for a joint that does not
+        # carry it.
+        lever = np.einsum("kmij,mj->kmi", self.frame, places)
+        moved = self.motion[:, :, 0] + np.cross(self.motion[:, :, 1], lever)
+        of_a_kilogram = 9.81 * moved[..., 2] + np.square(moved).sum(axis=-1) * self.qacc[:, None]
+        return np.asarray(self.without_payload + ((self.mass + hand) * of_a_kilogram).sum(axis=1))
+
+
+def _solve_balance(balance: _Balance, mount: PayloadMount) -> tuple[Array, Array]:
+    """Return the payload's place, m, and the hand's mass, kg, (4,), and the joints' own friction,
+    armature and damping, (3, joints) SI, by least squares; a place that torque does not determine
+    stays.
+    """
+    by_own = np.stack([np.tanh(balance.qvel / SLIP_SPEED), balance.qacc, balance.qvel])
+    count = 3 * len(balance.joints)
+    pos = np.array(mount.pos)
+    start = np.concatenate([pos, [mount.mass], np.zeros(count)])
+    low = np.concatenate([pos - MAX_MOVE_M, [0.0], np.zeros(count)])
+    high = np.concatenate([pos + MAX_MOVE_M, [MAX_HAND_MASS], np.full(count, MAX_OWN)])
+
+    def residual(x: Array) -> Array:
+        own = x[4:].reshape(3, -1)[:, balance.column]
+        missing = balance.required(x[:3], x[3]) + (own * by_own).sum(axis=0) - balance.tau
+        return np.concatenate([missing, MOUNT_PRIOR_NM_PER_M * (x[:3] - start[:3])])
+
+    scale = np.concatenate([0.1 * np.ones(3), [1.0], np.ones(count)])
+    first = np.clip(start, low + 1e-6, high - 1e-6)
+    solution = least_squares(residual, first, bounds=(low, high), x_scale=scale, loss="soft_l1").x
+    return solution[:4], solution[4:].reshape(3, -1)
 
 
 class TorqueFit:
@@ -158,13 +253,11 @@ class TorqueFit:
             for j in _moved(s, self.robot):
                 rows = np.stack([x[:, j] for x in (s.ctrl, s.qpos, s.qvel, s.tau)])
                 parts.setdefault(self.robot.joint_names[j], []).append(rows)
-        return {
-            joint: max(
-                (servo_gains(each, late=k) for k in range(1, MAX_LATE + 1)),
-                key=lambda g: g.explained,
-            )
-            for joint, each in parts.items()
-        }
+        gains = {}
+        for joint, each in parts.items():
+            tried = [servo_gains(each, late=late) for late in range(1, MAX_LATE + 1)]
+            gains[joint] = max(tried, key=lambda one: one.explained)
+        return gains
 
     def payload_placed(self, friction: bool = False) -> RobotSpec:
         """Return the robot with the payload's place and the mass of the hand, by least squares on
@@ -175,106 +268,71 @@ class TorqueFit:
         Every mount is moved alike, mirrored to the other side.
         """
         robot = self.robot
-        mount = self.robot.payload_mounts[0]
-        joints, column, tau, qacc, qvel, required = self._balance()
-        own = np.stack([np.tanh(qvel / SLIP_SPEED), qacc, qvel])  # friction, armature, damping
-        n = 3 * len(joints)
-        start = np.r_[mount.pos, mount.mass, np.zeros(n)]
-        low, high = (
-            np.r_[np.array(mount.pos) + a, m, np.full(n, z)]
-            for a, m, z in ((-0.3, 0, 0), (0.3, MAX_HAND_MASS, 20))
-        )
+        balance = self._balance()
+        place_and_hand, own = _solve_balance(balance, robot.payload_mounts[0])
+        x, y, z, hand = (round(float(v), 3) for v in place_and_hand)
+        mounts = []
+        for number, mount in enumerate(robot.payload_mounts):
+            mounts.append(replace(mount, pos=_place(number, (x, y, z)), mass=hand))
+        servos = {}
+        if friction:
+            of_model = build_model(robot).dof_armature
+            values = own.T.round(4).tolist()
+            for j, (dry, armature, damping) in zip(balance.joints, values, strict=True):
+                servos[robot.joint_names[j]] = {
+                    "frictionloss": dry,
+                    "armature": float(of_model[j]) + armature,
+                    "damping": damping,
+                }
+        return replace(robot.with_servos(servos), payload_mounts=tuple(mounts))
 
-        def residual(x: Array) -> Array:  # a place that torque does not determine stays
-            mine = (x[4:].reshape(3, -1)[:, column] * own).sum(axis=0)
-            moved = MOUNT_PRIOR_NM_PER_M * (x[:3] - start[:3])
-            return np.concatenate([required(x) + mine - tau, moved])
-
-        scale = np.r_[0.1 * np.ones(3), 1.0, np.ones(n)]
-        first = np.clip(start, low + 1e-6, high - 1e-6)
-        solution = least_squares(
-            residual, first, bounds=(low, high), x_scale=scale, loss="soft_l1"
-        ).x
-        x, y, z, hand = (round(float(v), 3) for v in solution[:4])
-        mounts = tuple(
-            replace(m, pos=_place(i, (x, y, z)), mass=hand)
-            for i, m in enumerate(robot.payload_mounts)
-        )
-        armature = build_model(robot).dof_armature
-        servos = {
-            robot.joint_names[j]: {
-                "frictionloss": v[0],
-                "armature": float(armature[j]) + v[1],
-                "damping": v[2],
-            }
-            for j, v in zip(joints, solution[4:].reshape(3, -1).T.round(4).tolist(), strict=True)
-        }
-        return replace(robot.with_servos(servos if friction else {}), payload_mounts=mounts)
-
-    def _balance(self) -> tuple[list[int], Array, Array, Array, Array, Callable[[Array], Array]]:
-        """Return the joints; joint, torque, acceleration and speed of each row; and the torque
-        that inverse dynamics require for a payload's place and hand x, (4,) m and kg.
-        """
-        rows = []
-        mounts = self.robot.payload_mounts
-        empty = tuple(replace(m, mass=0.0) for m in mounts)
+    def _balance(self) -> _Balance:
+        """Return the torques that inverse dynamics require, in rows of all recordings."""
+        empty = tuple(replace(mount, mass=0.0) for mount in self.robot.payload_mounts)
         model = build_model(replace(self.robot, payload_mounts=empty))
-        every = max(ROW_STEP, sum(map(len, self.sequences)) // MAX_ROWS)
+        stride = max(ROW_STEP, sum(map(len, self.sequences)) // MAX_ROWS)
+        rows: list[_BalanceRow] = []
         for s in self.sequences:
-            rows += self._balance_rows(s, model, every)
-        joints = sorted({r[0] for r in rows})
-        column = np.array([joints.index(r[0]) for r in rows])
-        mass, bias, motion, frame, tau, qacc, qvel = (
-            np.array([r[i] for r in rows]) for i in range(1, 8)
-        )
+            rows += self._balance_rows(s, model, stride)
+        return _Balance.of_rows(rows)
 
-        def required(x: Array) -> Array:
-            place = np.array([_place(i, x[:3]) for i in range(len(mounts))])
-            # How far each payload moves for a radian, (k, mounts, 3) m: 0 for a joint that does not
-            # carry it.
-            point = motion[:, :, 0] + np.cross(
-                motion[:, :, 1], np.einsum("kmij,mj->kmi", frame, place)
-            )
-            there = 9.81 * point[..., 2] + np.square(point).sum(axis=-1) * qacc[:, None]
-            return np.asarray(bias + ((mass + x[3]) * there).sum(axis=1))
-
-        return joints, column, tau, qacc, qvel, required
-
-    def _balance_rows(
-        self, s: Sequence, model: mujoco.MjModel, every: int
-    ) -> list[tuple[Any, ...]]:
-        """Return a row for each moved joint in every so many rows of a recording: its number;
-        payload in each mount, kg; torque without payloads, N·m; Jacobian and frame of each mount's
-        body; torque, N·m; acceleration; speed.
-        """
+    def _balance_rows(self, s: Sequence, model: mujoco.MjModel, stride: int) -> list[_BalanceRow]:
+        """Return a row for each moved joint in every `stride`th row of a recording."""
         assert s.tau is not None
         moved = _moved(s, self.robot)
         if not moved:
             return []
         mounts = self.robot.payload_mounts
-        carried = [s.meta.payload_side in ("both", m.side) for m in mounts]
+        carried = [s.meta.payload_side in ("both", mount.side) for mount in mounts]
         mass = s.meta.payload_mass * np.array(carried)
-        bodies = [model.body(m.body).id for m in mounts]
+        bodies = [model.body(mount.body).id for mount in mounts]
         data = mujoco.MjData(model)
-        full = np.empty((model.nv, model.nv))
+        inertia = np.empty((model.nv, model.nv))
         # Of each mount's body: position and rotation.
         jac = np.empty((len(mounts), 2, 3, model.nv))
         speed = differentiate(lowpass(s.qpos.astype(float), s.dt, CUTOFF_HZ), s.dt)
         qacc = differentiate(speed, s.dt)
         rows = []
-        for t in range(every, len(s) - 1, every):
+        for t in range(stride, len(s) - 1, stride):
             data.qpos[:] = s.qpos[t]
             data.qvel[:] = 0.0
             mujoco.mj_forward(model, data)
-            mujoco.mj_fullM(model, data, full)
+            mujoco.mj_fullM(model, data, inertia)
             for body, (shift, turn) in zip(bodies, jac, strict=True):
                 mujoco.mj_jac(model, data, shift, turn, data.xpos[body], body)
             frame = data.xmat[bodies].reshape(-1, 3, 3)
             for j in moved:
-                without = data.qfrc_bias[j] + full[j, j] * qacc[t, j]
-                motion = jac[..., j].copy()
-                tau = float(s.tau[t, j])
-                rows.append((j, mass, without, motion, frame, tau, qacc[t, j], float(s.qvel[t, j])))
+                row = _BalanceRow(
+                    joint=j,
+                    mass=mass,
+                    without_payload=data.qfrc_bias[j] + inertia[j, j] * qacc[t, j],
+                    motion=jac[..., j].copy(),
+                    frame=frame,
+                    tau=float(s.tau[t, j]),
+                    qacc=qacc[t, j],
+                    qvel=float(s.qvel[t, j]),
+                )
+                rows.append(row)
         return rows
 
     def fit(self, options: TorqueOptions) -> RobotSpec:

@@ -27,18 +27,17 @@ from gaponet.robot.spec import RobotSpec
 from gaponet.sim.dynamics import inverse_dynamics
 from gaponet.sim.model import build_model
 
-# before differentiating; of every column
-DIFFERENTIATION_CUTOFF_HZ = 25.0
-CUTOFF_HZ = 8.0
+DIFFERENTIATION_CUTOFF_HZ = 25.0  # of positions
+CUTOFF_HZ = 8.0  # of every column of the regression
 MIN_SPEED = 0.05  # rad/s of rows that show friction
 DELAYS_S = np.arange(0.0, 0.0405, 0.001)
 JACKKNIFE_BLOCKS = 10  # of the rows, each left out once
 HORIZONS_S = (0.1, 0.5, 1.0)
 PART_S = 4.0  # of recordings that fit and judge in turn
 MIN_ROWS = 20  # of a regression
-# in standard deviations, beyond which a row counts less: somebody pushed
-HUBER_SCALE = 1.345
+HUBER_SCALE = 1.345  # standard deviations, beyond which a row counts less: somebody pushed
 HUBER_ROUNDS = 10
+MAD_TO_STD = 1.4826  # standard deviation of normal numbers over their median absolute deviation
 
 
 class _Rows(NamedTuple):
@@ -96,40 +95,52 @@ def fit_torque_driven(
         train, judging = _parts_in_turn(judging)
     fitted_rows = [_rows(s, robot) for s in train]
     judging_rows = [_rows(s, robot) for s in judging]
-    names = robot.operated
-    servos: dict[str, dict[str, float]] = {}
-    std: dict[str, dict[str, float]] = {}
-    factor = np.ones(len(names))
-    bias = np.zeros(len(names))
-    lags = np.zeros(len(names), int)  # numbers of DELAYS_S
-    for j, name in enumerate(names):
-        x, lag = _joint(fitted_rows, j, constant)
-        errors = _jackknife(fitted_rows, j, constant, lag)
-        servos[name] = dict(zip(PASSIVE_FIELDS, x[:3].tolist(), strict=True))
-        servos[name]["delay"] = float(DELAYS_S[lag])
-        std[name] = dict(zip((*PASSIVE_FIELDS, "bias", "constant"), errors.tolist(), strict=True))
-        bias[j] = x[3]
-        factor[j] = x[4]
-        lags[j] = lag
-    fitted = robot.with_servos(servos)
-    one = np.ones_like(factor)
+    joints = _fit_joints(fitted_rows, robot.operated, constant)
+    fitted = robot.with_servos(joints.servos)
+    one = np.ones_like(joints.constant)
     given = build_model(robot)
     op = robot.operated_index
     old = {f: np.ravel(getattr(given, f"dof_{f}"))[op] for f in PASSIVE_FIELDS}
     new = {f: getattr(fitted, f)[op] for f in PASSIVE_FIELDS}
-    torque_before = _residual(judging_rows, old, one, 0 * lags)
-    torque_after = _residual(judging_rows, new, factor, lags)
+    torque_before = _residual(judging_rows, old, one, 0 * joints.lags)
+    torque_after = _residual(judging_rows, new, joints.constant, joints.lags)
     angle_before = _ahead(judging, robot, one)
-    angle_after = _ahead(judging, fitted, factor)
+    angle_after = _ahead(judging, fitted, joints.constant)
     return TorqueDrivenFit(
         robot=fitted,
-        constant=factor,
-        bias=bias,
-        std=std,
+        constant=joints.constant,
+        bias=joints.bias,
+        std=joints.std,
         torque=(torque_before, torque_after),
         angle={h: (angle_before[h], angle_after[h]) for h in HORIZONS_S},
         windows=sum(len(_starts(s)) for s in judging),
     )
+
+
+class _JointFits(NamedTuple):
+    """Fits of n joints one by one."""
+
+    servos: dict[str, dict[str, float]]  # joint → PASSIVE_FIELDS and delay
+    std: dict[str, dict[str, float]]  # joint → standard error of PASSIVE_FIELDS, bias and constant
+    constant: Array  # N·m per unit of the recorded torque, (n,)
+    bias: Array  # N·m, (n,)
+    lags: Array  # numbers of DELAYS_S, (n,)
+
+
+def _fit_joints(rows: ListOf[_Rows], names: ListOf[str], constant: bool) -> _JointFits:
+    """Fit the joints; `constant`: the torque per unit too."""
+    n = len(names)
+    fits = _JointFits({}, {}, np.ones(n), np.zeros(n), np.zeros(n, int))
+    for j, name in enumerate(names):
+        x, lag = _joint(rows, j, constant)
+        errors = _jackknife(rows, j, constant, lag).tolist()
+        fits.servos[name] = dict(zip(PASSIVE_FIELDS, x[:3].tolist(), strict=True))
+        fits.servos[name]["delay"] = float(DELAYS_S[lag])
+        fits.std[name] = dict(zip((*PASSIVE_FIELDS, "bias", "constant"), errors, strict=True))
+        fits.bias[j] = x[3]
+        fits.constant[j] = x[4]
+        fits.lags[j] = lag
+    return fits
 
 
 def _require_torque(sequences: ListOf[Sequence], robot: RobotSpec) -> None:
@@ -184,15 +195,20 @@ def _system(rows: ListOf[_Rows], j: int, constant: bool, lag: int) -> tuple[Arra
     """Return the regression's columns armature, damping, friction, bias and constant, and its
     right-hand side.
     """
-    parts = []
+    matrices = []
+    targets = []
     for r in rows:
         use = r.moving[:, j]
         torque = r.torque[lag][use, j]
         required = r.required[use, j]
         columns = [r.acceleration[use, j], r.velocity[use, j], r.sign[use, j], np.ones_like(torque)]
-        columns += [-torque] if constant else []
-        parts.append((np.stack(columns, axis=1), -required if constant else torque - required))
-    return np.concatenate([p[0] for p in parts]), np.concatenate([p[1] for p in parts])
+        if constant:
+            columns.append(-torque)
+            targets.append(-required)
+        else:
+            targets.append(torque - required)
+        matrices.append(np.stack(columns, axis=1))
+    return np.concatenate(matrices), np.concatenate(targets)
 
 
 def _solved(a: Array, y: Array) -> tuple[Array, float]:
@@ -207,7 +223,7 @@ def _solved(a: Array, y: Array) -> tuple[Array, float]:
         q, r = np.linalg.qr(a * weight[:, None])
         x = lsq_linear(r, q.T @ (y * weight), (low, np.inf), method="bvls").x
         residual = np.abs(a @ x - y)
-        scale = 1.4826 * float(np.median(residual))
+        scale = MAD_TO_STD * float(np.median(residual))
         weight = np.sqrt(np.minimum(1.0, HUBER_SCALE * scale / np.maximum(residual, 1e-12)))
     return np.append(x, np.ones(5 - len(x))), scale**2
 
@@ -238,9 +254,11 @@ def _residual(rows: ListOf[_Rows], terms: dict[str, Array], constant: Array, lag
 
 
 def _starts(s: Sequence) -> Array:
-    return np.arange(
-        0, len(s) - round(HORIZONS_S[-1] / s.dt) - 1, max(1, round(HORIZONS_S[1] / s.dt))
-    )
+    """Return the rows from which the simulator starts: one for each middle horizon, and the longest
+    one before the end.
+    """
+    last = len(s) - round(HORIZONS_S[-1] / s.dt) - 1
+    return np.arange(0, last, max(1, round(HORIZONS_S[1] / s.dt)))
 
 
 def _ahead(sequences: ListOf[Sequence], robot: RobotSpec, constant: Array) -> dict[float, Array]:
@@ -264,10 +282,11 @@ def _ahead(sequences: ListOf[Sequence], robot: RobotSpec, constant: Array) -> di
             mujoco.mj_resetData(model, data)
             data.qpos[:] = s.qpos[start]
             data.qvel[:] = v[start]
-            for before, h in pairwise((0.0, *HORIZONS_S)):
-                first, last = (start + round(x / s.dt) for x in (before, h))
+            for before, horizon in pairwise((0.0, *HORIZONS_S)):
+                first = start + round(before / s.dt)
+                last = start + round(horizon / s.dt)
                 for torque in tau[first:last]:
                     data.qfrc_applied[:] = torque
                     mujoco.mj_step(model, data, steps)
-                errors.setdefault(h, []).append(np.abs(data.qpos - s.qpos[last])[op])
-    return {h: np.median(each, axis=0) for h, each in errors.items()}
+                errors.setdefault(horizon, []).append(np.abs(data.qpos - s.qpos[last])[op])
+    return {horizon: np.median(each, axis=0) for horizon, each in errors.items()}

@@ -29,15 +29,17 @@ from gaponet.robot.spec import RobotSpec
 from gaponet.sim.links import LinkAxes, LinkResult
 from gaponet.sysid.axes import Values, first_values, from_axis, to_axis
 
-# of gear or motor, rad: no parameter of the simulator, but a change that later recordings may show
+# Of gear or motor, rad: no parameter of the simulator, but a change that later recordings may show.
 PLAY = "play"
-# from which no effect was seen: of a value of zero, of another
-UNOBSERVED_RELATIVE_ERROR = (1.0, 3.0)
+# Relative standard errors from which a parameter had no visible effect.
+UNSEEN_ERROR_OF_ZERO = 1.0
+UNSEEN_ERROR = 3.0  # of another value
 AT_BOUND = 0.05  # standard errors: a value nearer to zero has ended at this bound
-# from which parameters are known only as a set
+# Parameters that correlate so much, and have at least this relative error, are known only as a set.
 MIN_SET_CORRELATION = 0.9
 MIN_SET_RELATIVE_ERROR = 0.03
-OLD_KEYS = {  # of known.json → of uncertainty.json
+# Keys of known.json → of uncertainty.json.
+OLD_KEYS = {
     "step": "gauss_newton_step",
     "step_covariance": "gauss_newton_covariance",
     "scatter": "overdispersion",
@@ -49,17 +51,15 @@ OLD_KEYS = {  # of known.json → of uncertainty.json
 
 
 class Provenance(TypedDict):
-    """Origin of numbers: command, recording days, robot id, name → SHA-256 of each log, total
-    seconds; the values on the axes that were fitted then, by joint, and their covariance.
-    """
+    """Origin of numbers."""
 
-    made_by: str
-    days: tuple[str, ...]
-    unit: str
-    logs: dict[str, str]
-    seconds: float
-    values: dict[str, tuple[float, ...]]
-    covariance: dict[str, tuple[tuple[float, ...], ...]]
+    made_by: str  # command
+    days: tuple[str, ...]  # of recording
+    unit: str  # ids of the robots
+    logs: dict[str, str]  # name → SHA-256
+    seconds: float  # of all logs
+    values: dict[str, tuple[float, ...]]  # joint → values on the axes that were fitted then, (P,)
+    covariance: dict[str, tuple[tuple[float, ...], ...]]  # joint → (P, P)
 
 
 @dataclass(frozen=True)
@@ -111,19 +111,28 @@ class LinkUncertainty:
         """Return the uncertainty of a fit that began with the file's links, if the robot has the
         fitted ones.
         """
-        if (
-            result is None
-            or result.axes.links(0 * result.x)
-            or robot.links != result.axes.links(result.x)
-        ):
+        if result is None:
+            return None
+        began_with_others = bool(result.axes.links(0 * result.x))
+        if began_with_others or robot.links != result.axes.links(result.x):
             return None
         none = np.zeros((len(robot.operated), len(result.x)))
-        slopes = np.stack([result.servo_slopes.get(f, none) for f in fields], axis=1).tolist()
+        slopes = np.stack([result.servo_slopes.get(f, none) for f in fields], axis=1)  # (n, P, Q)
         return cls(
             tuple(result.x.tolist()),
             result.covariance.tolist(),
-            dict(zip(robot.operated, slopes, strict=True)),
+            dict(zip(robot.operated, slopes.tolist(), strict=True)),
         )
+
+    def are_of(self, robot: RobotSpec) -> bool:
+        """Return True if the robot's links have the masses of these values."""
+        for body, link in (
+            LinkAxes(robot.before_identification).links(np.array(self.values)).items()
+        ):
+            own_mass = robot.links[body].mass if body in robot.links else 0.0
+            if not np.isclose(link.mass, own_mass, rtol=1e-4):
+                return False
+        return True
 
 
 ArrayName = Literal[
@@ -154,8 +163,10 @@ class ParameterUncertainty:
             "identify or adapt again, or remove the file: the robot then has values without "
             "uncertainty"
         )
-        files = (robot.folder / name for name in (UNCERTAINTY_FILE, OLD_UNCERTAINTY_FILE))
-        if (file := next((f for f in files if f.is_file()), None)) is None:
+        file = robot.folder / UNCERTAINTY_FILE
+        if not file.is_file():
+            file = robot.folder / OLD_UNCERTAINTY_FILE
+        if not file.is_file():
             return None
         table = _with_new_keys(read_json(dict[str, Any], file, RobotError, hint))
         uncertainty = validated(cls, table, file, RobotError, hint)
@@ -165,19 +176,15 @@ class ParameterUncertainty:
                 raise RobotError(
                     f"{file}: its values are other values than robot.toml's, at {joint}; {hint}"
                 )
-        if uncertainty.links:
-            links = LinkAxes(robot.before_identification).links(np.array(uncertainty.links.values))
-            mass = {body: link.mass for body, link in robot.links.items()}
-            if not all(
-                np.isclose(x.mass, mass.get(body, 0.0), rtol=1e-4) for body, x in links.items()
-            ):
-                raise RobotError(f"{file}: its links are other links than robot.toml's; {hint}")
+        if uncertainty.links and not uncertainty.links.are_of(robot):
+            raise RobotError(f"{file}: its links are other links than robot.toml's; {hint}")
         return uncertainty
 
     @classmethod
     def require(cls, robot: RobotSpec) -> ParameterUncertainty:
         """Return `load`; refuse a robot whose folder has no uncertainty."""
-        if (uncertainty := cls.load(robot)) is None:
+        uncertainty = cls.load(robot)
+        if uncertainty is None:
             raise UsageError(
                 f"{robot.folder}: keeps only values (no {UNCERTAINTY_FILE}); identify or adapt it "
                 "again"
@@ -251,9 +258,8 @@ class JointSummary:
 
     def relative_error(self, field: str) -> float:
         """Return the standard error over the value, or over the field's large value."""
-        return self.errors[field] / max(
-            SERVO_FIELDS[field].large_value or abs(self.values[field]), 1e-9
-        )
+        scale = SERVO_FIELDS[field].large_value or abs(self.values[field])
+        return self.errors[field] / max(scale, 1e-9)
 
     def cell(self, field: str) -> str:
         """Return the value with its uncertainty as text; no uncertainty where the logs say
@@ -261,8 +267,10 @@ class JointSummary:
         """
         value = self.values[field] * SERVO_FIELDS[field].factor
         relative = self.relative_error(field)
-        if relative > UNOBSERVED_RELATIVE_ERROR[value != 0]:
-            return f"{value:.3g} (no log shows it)" if value else "none seen"
+        if value == 0 and relative > UNSEEN_ERROR_OF_ZERO:
+            return "none seen"
+        if value != 0 and relative > UNSEEN_ERROR:
+            return f"{value:.3g} (no log shows it)"
         error = self.errors[field] * SERVO_FIELDS[field].factor
         if not SERVO_FIELDS[field].signed and value < AT_BOUND * error:
             return f"at most {value + 2 * error:.2g}"  # a delay below zero does not exist
@@ -276,13 +284,15 @@ def summarize(uncertainty: ParameterUncertainty, joint: str) -> JointSummary:
     errors = np.sqrt(np.diag(covariance))
     summary = JointSummary(values, dict(zip(fields, errors.tolist(), strict=True)))
     size = np.where(errors > 0, errors, 1.0)
-    correlated = (np.abs(covariance / np.outer(size, size)) > MIN_SET_CORRELATION) & (errors > 0)
-    loose = np.array([summary.relative_error(f) > MIN_SET_RELATIVE_ERROR for f in fields])
-    _, group = connected_components(correlated & loose[:, None] & loose[None, :])
-    sets = (
-        tuple(f for f, g in zip(fields, group, strict=True) if g == k) for k in dict.fromkeys(group)
-    )
-    return replace(summary, sets=tuple(s for s in sets if len(s) > 1))
+    correlation = np.abs(covariance / np.outer(size, size))
+    is_correlated = (correlation > MIN_SET_CORRELATION) & (errors > 0)
+    is_loose = np.array([summary.relative_error(f) > MIN_SET_RELATIVE_ERROR for f in fields])
+    _, set_of_field = connected_components(is_correlated & is_loose[:, None] & is_loose[None, :])
+    sets: dict[int, list[str]] = {}
+    for field, number in zip(fields, set_of_field.tolist(), strict=True):
+        sets.setdefault(number, []).append(field)
+    together = [tuple(fields_of_set) for fields_of_set in sets.values() if len(fields_of_set) > 1]
+    return replace(summary, sets=tuple(together))
 
 
 def format_change(field: str, change: float, uncertainty: ParameterUncertainty, joint: str) -> str:
@@ -313,7 +323,8 @@ def sentences(uncertainty: ParameterUncertainty) -> list[str]:
     lines = []
     for s in uncertainty.sources:
         days = ", ".join(s["days"]) or "date unknown"
-        logs = f"{len(s['logs'])} log{'s' * (len(s['logs']) != 1)}"
+        count = len(s["logs"])
+        logs = "1 log" if count == 1 else f"{count} logs"
         lines.append(f"{s['made_by']}: {logs} of {s['unit']}, {s['seconds']:.0f} s, {days}")
     for joint in uncertainty.joints:
         for *some, last in summarize(uncertainty, joint).sets:

@@ -43,9 +43,10 @@ MAX_SET_ASIDE = 0.4  # of the recordings; more of them contradict the others
 COMMON_FIELDS = ("delay",)  # of one bus: those of all joints change together
 EVERY_JOINT = "every joint"
 FRICTION_FIELDS = ("damping", "frictionloss", "stribeck")
-# of half of the windows' errors over the residual of the identification: another robot
+# Of the median error of a joint's windows to the residual of the identification: a larger one says
+# that the robot is another one.
 FAR_RATIO = 2.5
-# of all joints: more with another kp or several changes are another robot's
+# Of all joints: if more have another kp or several changes, the robot is another one.
 MAX_CHANGED_JOINTS = 0.4
 
 Verdict = Literal["same", "drifted", "contradictory"]
@@ -292,10 +293,11 @@ class _Joint:
     """Gradient of one joint that changes are to explain, beyond that of the identification.
 
     Attributes:
+        fields: The fields of the axes, and play, (Q,).
         gradient: (Q,).
         columns: Gradient by a change of each parameter, (Q, Q).
         weight: Inverse of the gradient's covariance, (Q, Q).
-        effect: RMS effect of a change of one on the joint's path, (Q,) rad.
+        effect: RMS effect of a change of each parameter by one on the joint's path, (Q,) rad.
         min_effect: Least effect that counts, rad.
     """
 
@@ -319,9 +321,8 @@ class _Joint:
         step_covariance = uncertainty.array(name, "gauss_newton_covariance")
         variance = scatter + information @ step_covariance @ information
         size = np.sqrt(np.maximum(np.diag(variance), 1e-30))
-        self.weight = np.linalg.inv(
-            variance / np.outer(size, size) + 1e-9 * np.eye(len(size))
-        ) / np.outer(size, size)
+        scale = np.outer(size, size)
+        self.weight = np.linalg.inv(variance / scale + 1e-9 * np.eye(len(size))) / scale
         squares = np.maximum(np.diag(by_field.T @ information @ by_field), 0.0) / max(rows, 1)
         self.effect = ERROR_SCALE_RAD * np.sqrt(squares)
         self.min_effect = max(
@@ -333,32 +334,47 @@ class _Joint:
     def explained(self, threshold: float) -> tuple[list[ParameterChange], ParameterChange | None]:
         """Return the significant changes with enough effect, and the largest change of one
         parameter alone.
+
+        One parameter after the other is added, the one that is most significant beside those
+        before.
         """
         changes: list[ParameterChange] = []
         first: ParameterChange | None = None
         while len(changes) < MAX_CHANGES_PER_JOINT:
-            chosen = [self.fields.index(m.field) for m in changes]
-            what = list[ParameterChange]()
-            for k in np.flatnonzero(self.effect > 0).tolist():
-                if k not in chosen:
-                    tried = self._moved([*chosen, k])
-                    what = (
-                        tried if not what or abs(tried[-1].sigmas) > abs(what[-1].sigmas) else what
-                    )
-            first = first or (what[-1] if what else None)
-            if not what or abs(what[-1].sigmas) < threshold or what[-1].moves < self.min_effect:
+            with_next = self._with_next(changes)
+            if with_next is None:
                 break
-            changes = what
+            newest = with_next[-1]
+            if first is None:
+                first = newest
+            if abs(newest.sigmas) < threshold or newest.moves < self.min_effect:
+                break
+            changes = with_next
         return changes, first
 
-    def _moved(self, numbers: list[int]) -> list[ParameterChange]:
-        by, error = _solved(self.columns[:, numbers], self.weight, self.gradient)
-        return [
-            ParameterChange(
-                self.name, self.fields[i], float(b), float(e), float(abs(b) * self.effect[i])
-            )
-            for i, b, e in zip(numbers, by, error, strict=True)
-        ]
+    def _with_next(self, changes: list[ParameterChange]) -> list[ParameterChange] | None:
+        """Return changes with the most significant further one, all fitted anew; None if there is
+        no other parameter.
+        """
+        chosen = [self.fields.index(change.field) for change in changes]
+        best: list[ParameterChange] | None = None
+        for number in np.flatnonzero(self.effect > 0).tolist():
+            if number in chosen:
+                continue
+            tried = self._fitted([*chosen, number])
+            if best is None or abs(tried[-1].sigmas) > abs(best[-1].sigmas):
+                best = tried
+        return best
+
+    def _fitted(self, numbers: list[int]) -> list[ParameterChange]:
+        """Return the changes of parameters, by their numbers, that explain the gradient best."""
+        by, errors = _solved(self.columns[:, numbers], self.weight, self.gradient)
+        changes = []
+        for number, change, error in zip(numbers, by, errors, strict=True):
+            moves = float(abs(change) * self.effect[number])
+            field = self.fields[number]
+            changes.append(ParameterChange(self.name, field, float(change), float(error), moves))
+        return changes
 
 
 def _together(joints: ListOf[_Joint], number: int, threshold: float) -> ParameterChange | None:
@@ -372,20 +388,25 @@ def _together(joints: ListOf[_Joint], number: int, threshold: float) -> Paramete
     error = float(total**-0.5)
     moves = float(np.sqrt(np.mean([(by * j.effect[number]) ** 2 for j in joints])))
     change = ParameterChange(EVERY_JOINT, joints[0].fields[number], by, error, moves)
-    alone = max((abs(m.sigmas) for j in joints if (m := j.explained(np.inf)[1])), default=0.0)
-    if abs(change.sigmas) < max(threshold, alone) or moves < np.mean(
-        [j.min_effect for j in joints]
-    ):
+    if moves < np.mean([joint.min_effect for joint in joints]):
         return None
-    for j in joints:
-        j.gradient = j.gradient - by * j.columns[:, number]
+    needed = threshold
+    for joint in joints:
+        _, largest = joint.explained(np.inf)
+        if largest is not None:
+            needed = max(needed, abs(largest.sigmas))
+    if abs(change.sigmas) < needed:
+        return None
+    for joint in joints:
+        joint.gradient = joint.gradient - by * joint.columns[:, number]
     return change
 
 
 def _solved(columns: Array, weight: Array, pull: Array) -> tuple[Array, Array]:
     """Return the changes of some fields that explain a gradient best, and their standard errors."""
     covariance = np.linalg.pinv(columns.T @ weight @ columns, hermitian=True)
-    return covariance @ columns.T @ weight @ pull, np.sqrt(np.maximum(np.diag(covariance), 1e-300))
+    changes = covariance @ columns.T @ weight @ pull
+    return changes, np.sqrt(np.maximum(np.diag(covariance), 1e-300))
 
 
 def _farthest(
@@ -399,36 +420,52 @@ def _farthest(
     its field.
     """
     count = len(own.names)
-    worst = None
     rate = FALSE_CONTRADICTION_RATE / (count * len(joints) * len(fields))
     limit = float(student.isf(rate / 2, min(uncertainty.clusters, MAX_PRIOR_CLUSTERS)))
+    worst = None
     for i, joint in enumerate(joints):
-        information = own.information[i].sum(axis=0)
-        gradient = own.gradients[i].sum(axis=0)
-        for r in range(count):
-            mine = own.information[i, r]
-            rest = information - own.information[i, r]
-            carried = mine @ inverted(rest[None])[0]
-            difference = carried @ (gradient - own.gradients[i, r]) - own.gradients[i, r]
-            variance = (
-                widened(mine, overdispersion[i])
-                + carried @ widened(rest, overdispersion[i]) @ carried.T
-            )
-            weight = np.linalg.pinv(variance, rcond=1e-9, hermitian=True)
-            for k in range(len(fields)):
-                if mine[k, k] <= 0 or rest[k, k] < 0.5 * mine[k, k]:
-                    continue
-                by, error = _solved(mine[:, [k]], weight, difference)
-                sigmas = float(by[0] / error[0])
-                effect = (
-                    ERROR_SCALE_RAD
-                    * abs(by[0])
-                    * np.sqrt(mine[k, k] * count / max(float(own.rows[i]), 1))
-                )
-                farther = abs(sigmas) > max(limit, abs(worst.sigmas) if worst else 0)
-                if farther and effect > uncertainty.joints[joint].residual_rms:
-                    worst = Contradiction(own.names[r], joint, fields[k], float(by[0]), sigmas)
+        residual = uncertainty.joints[joint].residual_rms
+        for recording in range(count):
+            differences = _differences(own, i, recording, overdispersion[i])
+            for number, by, sigmas, effect in differences:
+                if abs(sigmas) > limit and effect > residual:
+                    limit = abs(sigmas)
+                    name = own.names[recording]
+                    worst = Contradiction(name, joint, fields[number], by, sigmas)
     return worst
+
+
+def _differences(
+    own: Evidence, joint: int, recording: int, overdispersion: Array
+) -> list[tuple[int, float, float, float]]:
+    """Return by how much a recording differs from all others together, for one joint: number of
+    the parameter, difference on its axis, the same in standard errors, and its RMS effect on the
+    joint's path, rad.
+
+    Parameters of which the others say too little are left out.
+    """
+    mine = own.information[joint, recording]  # (Q, Q)
+    rest = own.information[joint].sum(axis=0) - mine
+    gradient = own.gradients[joint, recording]  # (Q,)
+    gradient_of_rest = own.gradients[joint].sum(axis=0) - gradient
+    # The others' Gauss-Newton step as a gradient of this recording.
+    carried = mine @ inverted(rest[None])[0]
+    difference = carried @ gradient_of_rest - gradient
+    of_mine = widened(mine, overdispersion)
+    of_rest = carried @ widened(rest, overdispersion) @ carried.T
+    weight = np.linalg.pinv(of_mine + of_rest, rcond=1e-9, hermitian=True)
+    recordings = len(own.names)
+    rows = max(float(own.rows[joint]), 1)  # of all recordings
+    differences = []
+    for number in range(len(mine)):
+        own_information = mine[number, number]
+        if own_information <= 0 or rest[number, number] < 0.5 * own_information:
+            continue
+        by, error = _solved(mine[:, [number]], weight, difference)
+        sigmas = float(by[0] / error[0])
+        effect = ERROR_SCALE_RAD * abs(by[0]) * np.sqrt(own_information * recordings / rows)
+        differences.append((number, float(by[0]), sigmas, float(effect)))
+    return differences
 
 
 def _advice(

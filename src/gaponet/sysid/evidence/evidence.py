@@ -79,20 +79,17 @@ def gradient_covariance(gradients: Array) -> Array:
     """Return the covariance of the sum of gradients (n, C, Q) from their scatter over clusters,
     (n, Q, Q).
     """
+    clusters = gradients.shape[1]
     each = gradients - gradients.mean(axis=1, keepdims=True)
-    return np.asarray(
-        np.swapaxes(each, -1, -2) @ each * (gradients.shape[1] / max(gradients.shape[1] - 1, 1))
-    )
+    return np.asarray(np.swapaxes(each, -1, -2) @ each * (clusters / max(clusters - 1, 1)))
 
 
 def inverted(information: Array) -> Array:
     """Return inverses of (n, Q, Q); directions without information get a little."""
     size = np.sqrt(np.maximum(np.einsum("...kk->...k", information), 1e-12))
-    both = size[..., :, None] * size[..., None, :]
-    return np.asarray(
-        np.linalg.inv(information / both + MIN_RELATIVE_INFORMATION * np.eye(information.shape[-1]))
-        / both
-    )
+    scale = size[..., :, None] * size[..., None, :]
+    least = MIN_RELATIVE_INFORMATION * np.eye(information.shape[-1])
+    return np.asarray(np.linalg.inv(information / scale + least) / scale)
 
 
 def evidence(
@@ -104,41 +101,76 @@ def evidence(
 ) -> Evidence:
     """Compute the evidence of recordings by rollouts of every joint by itself, at the robot's own
     values.
+
+    Args:
+        fields: The P fields; play is the next one, so that Q = P + 1.
+        windows: Number of windows of the recordings that are used.
     """
     contact = contact_height(robot, tip_heights(sequences, robot))
     parts = cut(sequences, windows)
     rollouts = JointRollouts(parts, robot, contact, nthread)
     bounds = Bounds(robot, sequences)
     axes = Axes(bounds, fields, bounds.first)
-    x = axes.normalize(bounds.first)
-    scaled_errors = lambda xs: rollouts.flat_errors(axes.values(xs)) / np.float32(ERROR_SCALE_RAD)  # noqa: E731
-    here, jac = (y[0] for y in slopes(x[None], axes.high, scaled_errors))
-    jac = jac / axes.unit[:, None] * (axes.low < axes.high)[:, None]
-    late = np.round(bounds.first["delay"][:, None] / rollouts.periods).astype(int)
-    aim = np.array(
-        [
-            [np.roll(c, d) for c, d in zip(*j, strict=True)]
-            for j in zip(rollouts.ctrl, late, strict=True)
-        ]
+
+    def scaled_errors(x: Array) -> Array:
+        return rollouts.flat_errors(axes.values(x)) / np.float32(ERROR_SCALE_RAD)
+
+    errors_of_start, slopes_of_start = slopes(
+        axes.normalize(bounds.first)[None], axes.high, scaled_errors
     )
-    servo_error = aim + bounds.first["offset"][:, None, None].astype(np.float32) - rollouts.qpos
+    errors = errors_of_start[0]  # (n, rows) in ERROR_SCALE_RAD
+    is_free = axes.low < axes.high
+    by_field = slopes_of_start[0] / axes.unit[:, None] * is_free[:, None]  # (n, rows, P)
+    by_play = _slopes_over_play(rollouts, bounds).reshape(bounds.n, -1, 1)
+    jac = np.concatenate([by_field, by_play], axis=-1)  # (n, rows, Q)
+    weight = 1 / np.sqrt(1 + errors**2)  # of soft L1
+    gradients, window = cluster_sums(jac * (weight * errors)[..., None], rollouts.window)
+    information = []
+    for of_joint, weights in zip(jac, weight, strict=True):  # a joint at a time, for memory
+        weighted = weights[:, None] * of_joint
+        products = of_joint[None, :, :, None] * weighted[None, :, None, :]  # (1, rows, Q, Q)
+        information.append(cluster_sums(products, rollouts.window)[0])
+    names = [_window_name(part) for part in parts]
+    recordings = list(dict.fromkeys(names))
+    recording_of_window = np.array([recordings.index(name) for name in names])
+    in_windows = ERROR_SCALE_RAD * errors.reshape(bounds.n, *rollouts.counted.shape)
+    squares = np.square(in_windows).sum(axis=-1)  # (n, W)
+    rms = np.sqrt(squares / np.maximum(rollouts.counted.sum(axis=-1), 1))
+    return Evidence(
+        gradients,
+        np.concatenate(information),
+        rollouts.rows,
+        recording_of_window[window],
+        tuple(recordings),
+        rms,
+    )
+
+
+def _slopes_over_play(rollouts: JointRollouts, bounds: Bounds) -> Array:
+    """Return the slopes of errors over the width of a gap, (n, windows, rows) in ERROR_SCALE_RAD
+    per rad.
+
+    The link is half the width behind the motor, on the side on which the servo's error presses it.
+    """
+    late = np.round(bounds.first["delay"][:, None] / rollouts.periods).astype(int)  # (n, windows)
+    command = np.empty_like(rollouts.ctrl)
+    for j, of_joint in enumerate(rollouts.ctrl):
+        for window, ctrl in enumerate(of_joint):
+            command[j, window] = np.roll(ctrl, late[j, window])
+    offset = bounds.first["offset"][:, None, None].astype(np.float32)
+    servo_error = command + offset - rollouts.qpos
     side = np.tanh(servo_error / PLAY_TURN_RAD)[..., :: rollouts.thin]
-    play = 0.5 / ERROR_SCALE_RAD * side * (rollouts.counted & rollouts.recorded[..., None])
-    jac = np.concatenate([jac, play.reshape(bounds.n, -1, 1)], axis=-1)
-    weight = 1 / np.sqrt(1 + here**2)
-    gradients, window = cluster_sums(jac * (weight * here)[..., None], rollouts.window)
-    each = (
-        (j[None, :, :, None], (w[:, None] * j)[None, :, None, :])
-        for j, w in zip(jac, weight, strict=True)
-    )
-    # A joint at a time, for memory.
-    information = np.concatenate([cluster_sums(a * b, rollouts.window)[0] for a, b in each])
-    names = [f"{p.meta.motion}{f' ({p.meta.repetition})' * bool(p.meta.repetition)}" for p in parts]
-    unique = list(dict.fromkeys(names))
-    recording = np.array([unique.index(name) for name in names])
-    error = ERROR_SCALE_RAD * here.reshape(bounds.n, *rollouts.counted.shape)
-    rms = np.sqrt(np.square(error).sum(axis=-1) / np.maximum(rollouts.counted.sum(axis=-1), 1))
-    return Evidence(gradients, information, rollouts.rows, recording[window], tuple(unique), rms)
+    is_counted = rollouts.counted & rollouts.recorded[..., None]
+    return np.asarray(0.5 / ERROR_SCALE_RAD * side * is_counted)
+
+
+def _window_name(part: Sequence) -> str:
+    """Return the name of a window's recording: its motion, and its repetition unless it is the
+    first one.
+    """
+    if not part.meta.repetition:
+        return part.meta.motion
+    return f"{part.meta.motion} ({part.meta.repetition})"
 
 
 def estimate_uncertainty(
@@ -298,21 +330,21 @@ def _errors_by_joint(folds: ListOf[HeldOut], nthread: int) -> dict[str, list[Arr
     """Return joint → |error| of each rollout that holds it, rad; the worst joint's for joints that
     none holds.
     """
-    pairs = []
     robot = folds[0].robot
+    errors: dict[str, list[Array]] = {}
     for sequences, judged in folds:
         replays = replay(sequences, judged, nthread=nthread, lock_idle=True)
-        pairs += [
-            (s.meta.unrecorded, np.abs(t.qpos - s.qpos)[1:])
-            for s, t in zip(sequences, replays, strict=True)
-        ]
-    errors = {}
-    for j, i in zip(robot.operated, robot.operated_index, strict=True):
-        if mine := [error[:, i] for unrecorded, error in pairs if j not in unrecorded]:
-            errors[j] = mine
-    mean_square = lambda each: float(np.square(np.concatenate(each)).mean())  # noqa: E731
-    worst = max(errors.values(), key=mean_square, default=[np.zeros(1)])
-    return {j: errors.get(j, worst) for j in robot.operated}
+        for s, simulated in zip(sequences, replays, strict=True):
+            error = np.abs(simulated.qpos - s.qpos)[1:]
+            for joint, i in zip(robot.operated, robot.operated_index, strict=True):
+                if joint not in s.meta.unrecorded:
+                    errors.setdefault(joint, []).append(error[:, i])
+    worst = max(errors.values(), key=_mean_square, default=[np.zeros(1)])
+    return {joint: errors.get(joint, worst) for joint in robot.operated}
+
+
+def _mean_square(errors: ListOf[Array]) -> float:
+    return float(np.square(np.concatenate(errors)).mean())
 
 
 def _error_bound(motions: ListOf[Array]) -> float:

@@ -28,16 +28,16 @@ from gaponet.sim.replay import replay
 from gaponet.sysid.evidence.evidence import evidence
 from gaponet.sysid.uncertainty import ParameterUncertainty
 
-# candidates with a signal in every joint; of tours and the like
-MOTIONS_OF_ALL_JOINTS = 24
-VARIANTS = 4
+MOTIONS_OF_ALL_JOINTS = 24  # candidates with a signal in every joint
+VARIANTS = 4  # of tours and the like
 MAX_SINGLE_JOINTS = 8  # of a robot with more, no joint moves by itself
 RANGE_SHARE = 0.5  # of a joint's interval, from home, beside others
-# time that must reduce the errors by this share to be worth playing
+# Playing on is worth its time while this time reduces the errors by this share.
 WORTH_INTERVAL_S = 30.0
 MIN_WORTH = 0.05
 MAX_KP_ERROR = 0.1  # relative, after all motions; more means that they do not determine it
-EPSILON = 1e-9
+EPSILON = 1e-9  # of information, so that a parameter without any can be divided by it
+MIN_GAIN = 1e-9  # of the mean log error, by an exchange
 
 
 @dataclass(frozen=True)
@@ -74,9 +74,8 @@ class ExperimentDesign:
     def _covariance_with(self, normal: Array) -> Array:
         """Return the covariance after recordings with this information, (…, n, P, P)."""
         size = np.sqrt(np.maximum(np.einsum("...ii->...i", normal), EPSILON))
-        share = normal / (size[..., :, None] * size[..., None, :]) + EPSILON * np.eye(
-            normal.shape[-1]
-        )
+        scale = size[..., :, None] * size[..., None, :]
+        share = normal / scale + EPSILON * np.eye(normal.shape[-1])
         scaled = share / np.sqrt(self.overdispersion)[:, None, :]
         added = scaled @ np.linalg.solve(share, np.swapaxes(scaled, -1, -2))
         added = size[..., :, None] * added * size[..., None, :]
@@ -94,26 +93,37 @@ class ExperimentDesign:
         exchanges.
         """
         picks = [i for i, _ in self.greedy(seconds)]
-        best = (
-            float(self._mean_log_error(self.information[:, picks].sum(axis=1))) if picks else np.inf
-        )
+        if not picks:
+            return picks
+        error = float(self._mean_log_error(self.information[:, picks].sum(axis=1)))
         for _ in range(2 * len(picks)):
-            tried = [
-                (float(e), k, int(i))
-                for k in range(len(picks))
-                for rest in [[*picks[:k], *picks[k + 1 :]]]
-                for fits in [
-                    np.setdiff1d(
-                        np.flatnonzero(self.seconds <= seconds - self.seconds[rest].sum()), picks
-                    )
-                ]
-                for i, e in zip(fits, self._with(rest, fits), strict=True)
-            ]
-            if not tried or min(tried)[0] > best - EPSILON:
+            exchanges = self._exchanges(picks, seconds)
+            if not exchanges:
                 break
-            best, k, i = min(tried)
-            picks[k] = i
+            error_then, place, recording = min(exchanges)
+            if error_then > error - MIN_GAIN:
+                break
+            error = error_then
+            picks[place] = recording
         return picks
+
+    def _exchanges(self, picks: list[int], seconds: float) -> list[tuple[float, int, int]]:
+        """Return all exchanges of one pick for another recording in so much time, s: mean log error
+        after it, place among the picks, and recording.
+        """
+        exchanges = []
+        for place in range(len(picks)):
+            rest = [*picks[:place], *picks[place + 1 :]]
+            others = self._that_fit(rest, seconds, without=picks)
+            errors = self._errors_with(rest, others)
+            for recording, error in zip(others, errors, strict=True):
+                exchanges.append((float(error), place, int(recording)))
+        return exchanges
+
+    def _that_fit(self, picks: list[int], seconds: float, without: list[int]) -> Array:
+        """Return the recordings, without some, that fit into a time beside the picks, (more,)."""
+        left = seconds - self.seconds[picks].sum()
+        return np.setdiff1d(np.flatnonzero(self.seconds <= left), without)
 
     def greedy(self, seconds: float = np.inf) -> Iterator[tuple[int, float]]:
         """Yield the recording with the largest gain per second, one after another, and the mean
@@ -121,18 +131,17 @@ class ExperimentDesign:
         """
         picks = list[int]()
         now = float(self._mean_log_error(np.zeros_like(self.information[:, 0])))
-        while len(
-            fits := np.setdiff1d(
-                np.flatnonzero(self.seconds <= seconds - self.seconds[picks].sum()), picks
-            )
-        ):
-            then = self._with(picks, fits)
-            best = int(((now - then) / self.seconds[fits]).argmax())
-            picks = [*picks, int(fits[best])]
+        while True:
+            others = self._that_fit(picks, seconds, without=picks)
+            if not len(others):
+                return
+            then = self._errors_with(picks, others)
+            best = int(((now - then) / self.seconds[others]).argmax())
+            picks.append(int(others[best]))
             now = float(then[best])
             yield picks[-1], now
 
-    def _with(self, picks: ListOf[int], more: Array) -> Array:
+    def _errors_with(self, picks: ListOf[int], more: Array) -> Array:
         """Return the mean log error after the picks and each of some more recordings, (more,)."""
         here = self.information[:, list(picks)].sum(axis=1)
         return self._mean_log_error(here + np.swapaxes(self.information[:, more], 0, 1))

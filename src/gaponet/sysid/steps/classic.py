@@ -52,12 +52,12 @@ def _joint_candidates(joints: JointFit, progress: SearchProgress) -> dict[str, V
     residual = joints.prior.residual
     given = {f: bounds.first[f] for f in bounds.start}  # without terms that the robot does not have
     progress.begin_search()
-    late = joints.search(
-        ("offset", "delay"), given, only=True, report=lambda cost: progress.search_is_over()
+    late = joints.search_fields(
+        ("offset", "delay"), given, report=lambda cost: progress.search_is_over()
     )
     joints.prior.residual = residual  # of other fields' searches
     report = progress.reporter("each joint alone", joints.robot.operated, joints.rollouts.rows)
-    alone = joints.search(CLASSIC, bounds.start, joints.regressed(), report=report)
+    alone = joints.search(bounds.start, joints.regressed(), report=report)
     joints.prior.update_correlation_time(joints.rollouts, alone)
     return {"given": given, "joints": alone, "delay and offset": late}
 

@@ -13,6 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from gaponet.base.arrays import Array
+from gaponet.data.sequence import Sequence
 from gaponet.data.signals import differentiate, lowpass
 from gaponet.sim.dynamics import CUTOFF_HZ, inverse_dynamics
 from gaponet.sim.links import COORDINATES, LinkAxes, LinkResult
@@ -24,17 +25,14 @@ from gaponet.sysid.least_squares import DIFFERENCE_STEP, Progress
 from gaponet.sysid.problem import MIN_COST_DECREASE, PRIOR_LOG_STD, PRIORS, RobotFit, cluster_sums
 
 ROWS = 400  # of recordings, whose torques choose directions
-# of a direction over the prior's, and how many are fitted
-MIN_INFORMATION = 1.0
+MIN_INFORMATION = 1.0  # of a direction that is fitted, over the prior's
 MAX_DIRECTIONS = 12
 MIN_KP_LOG_STD = 0.05  # of a kp from recorded torque, whose scale is a motor constant
 ITERATIONS = (1, 2)  # with the first residual, and with what that leaves
 FIRST_RESIDUAL_SHARE = 0.25  # of the servos' residual, which wrong links may have caused
-# fitted with the links; of robots with more, these fields
-MAX_SERVO_NUMBERS = 36
+MAX_SERVO_NUMBERS = 36  # that are fitted with the links; of robots with more, FEW_FIELDS
 FEW_FIELDS = ("kp", "armature")
-# of a link's coordinates, in standard deviations of the prior; less is none
-MIN_CHANGE = 0.1
+MIN_CHANGE = 0.1  # of a link's coordinates, in standard deviations of the prior; less is none
 MAX_CHANGE = 6.0
 ENCODER_ZERO_STD_RAD = 0.006  # a third of a degree, as a joint's zero at its stop is set by hand
 MIN_SIGNIFICANCE = 2.0  # standard errors, of the change along some direction; else all links stay
@@ -83,63 +81,58 @@ class LinkFit:
         gains, offsets, damping, friction and armature of the joint explain as well does not count,
         so without payloads or recorded torque all masses do not change together.
         """
-        robot = replace(self.whole.robot, table=None)
         parts = self.whole.rollouts.parts
-        op = self.whole.rollouts.op
-        every = max(1, sum(map(len, parts)) // ROWS)
-        size = self.axes.scale.size
         motions = list[Array]()
         torques = list[Array]()
-        slopes = list[Array]()
-        for payload in dict.fromkeys((s.meta.payload_mass, s.meta.payload_side) for s in parts):
-            rows = []
-            for s in parts:
-                if (s.meta.payload_mass, s.meta.payload_side) == payload:
-                    qpos = lowpass(s.qpos.astype(float), s.dt, CUTOFF_HZ)
-                    qvel = differentiate(qpos, s.dt)
-                    rows.append(np.stack([qpos, qvel, differentiate(qvel, s.dt)])[:, ::every])
-            motions.append(np.concatenate(rows, axis=1))
-            model = build_model(robot, *payload)
-            torques.append(inverse_dynamics(model, *motions[-1])[:, op])
-            slopes.append(
-                np.array(
-                    [
-                        inverse_dynamics(
-                            with_links(model, replace(robot, links=self.axes.links(x))),
-                            *motions[-1],
-                        )[:, op]
-                        for x in DIFFERENCE_STEP * np.eye(size)
-                    ]
-                )
-                - torques[-1]
-            )
-        torque = np.concatenate(torques)
+        changes = list[Array]()
+        stride = max(1, sum(map(len, parts)) // ROWS)
+        for payload in dict.fromkeys(map(_payload, parts)):
+            same = [_smooth_motion(s)[:, ::stride] for s in parts if _payload(s) == payload]
+            motion = np.concatenate(same, axis=1)
+            torque, torque_changes = self._torques_by_link(motion, payload)
+            motions.append(motion)
+            torques.append(torque)
+            changes.append(torque_changes)
+        torque = np.concatenate(torques)  # (rows, n) N·m
         _, v, a = np.concatenate(motions, axis=1)
         kp = self._first["kp"]
-        moved = np.concatenate(slopes, axis=1) / DIFFERENCE_STEP / kp  # (10 L, rows, n) rad
-        # independent measurements, (n,)
-        count = sum(s.duration for s in parts) / self._prior.correlation_time
+        moved = np.concatenate(changes, axis=1) / DIFFERENCE_STEP / kp  # (10 L, rows, n) rad
+        measurements = sum(s.duration for s in parts) / self._prior.correlation_time  # (n,)
+        size = self.axes.scale.size
         information = np.zeros((size, size))
-        for i, j in enumerate(op):
-            servo = np.stack(
-                [
-                    torque[:, i] / kp[i],
-                    np.ones(len(v)),
-                    v[:, j],
-                    a[:, j],
-                    np.tanh(v[:, j] / SLIP_SPEED),
-                ],
-                axis=1,
-            )
-            weight = np.sqrt(count[i] / len(v)) / self._prior.residual[i]
-            d = weight * moved[:, :, i].T
-            s = weight * servo
+        for i, j in enumerate(self.whole.rollouts.op):
+            weight = np.sqrt(measurements[i] / len(v)) / self._prior.residual[i]
+            friction = np.tanh(v[:, j] / SLIP_SPEED)
+            own = [torque[:, i] / kp[i], np.ones(len(v)), v[:, j], a[:, j], friction]
+            by_servo = weight * np.stack(own, axis=1)  # (rows, 5)
+            by_link = weight * moved[:, :, i].T  # (rows, 10 L)
             stated = np.diag([np.nan_to_num(self._kp_std[i] ** -2), 0, 0, 0, 0])
-            information += d.T @ d - d.T @ s @ np.linalg.pinv(s.T @ s + stated) @ s.T @ d
+            # What links explain beyond the servo, by the Schur complement.
+            of_servo = np.linalg.pinv(by_servo.T @ by_servo + stated)
+            information += (
+                by_link.T @ by_link - by_link.T @ by_servo @ of_servo @ by_servo.T @ by_link
+            )
         strength, vectors = np.linalg.eigh(information)
         chosen = np.flatnonzero(strength > MIN_INFORMATION)[::-1][:MAX_DIRECTIONS]
         rest = np.delete(vectors / np.sqrt(np.maximum(strength, MIN_INFORMATION)), chosen, axis=1)
         return vectors[:, chosen], rest @ rest.T
+
+    def _torques_by_link(self, motion: Array, payload: tuple[float, str]) -> tuple[Array, Array]:
+        """Return the torques that a motion requires, (rows, n) N·m, and their changes by
+        DIFFERENCE_STEP of each link coordinate, (10 L, rows, n) N·m.
+
+        Args:
+            motion: Positions, velocities and accelerations of all joints, (3, rows, joints).
+        """
+        op = self.whole.rollouts.op
+        robot = replace(self.whole.robot, table=None)
+        model = build_model(robot, *payload)
+        torque = inverse_dynamics(model, *motion)[:, op]
+        changed = []
+        for x in DIFFERENCE_STEP * np.eye(self.axes.scale.size):
+            other = with_links(model, replace(robot, links=self.axes.links(x)))
+            changed.append(inverse_dynamics(other, *motion)[:, op])
+        return torque, np.array(changed) - torque
 
     def _unpacked(self, x: Array) -> tuple[Values, list[Array]]:
         """Return servo values (k, n) and link coordinates of candidates x (k, 1, P)."""
@@ -185,16 +178,15 @@ class LinkFit:
                 x, low, high, self.errors, count, report, MIN_COST_DECREASE
             )
         values, coordinates = self._unpacked(x[0][None])
-        own = coordinates[0].reshape(-1, COORDINATES)
+        by_link = coordinates[0].reshape(-1, COORDINATES)
         by_noise, by_zeros = self._covariances(x[0, 0])
-        z = coordinates[0] @ self.directions
-        small = np.abs(own).max(axis=1, keepdims=True) < MIN_CHANGE
-        none = (np.abs(z) <= MIN_SIGNIFICANCE * np.sqrt(np.diag(by_noise))).all()
-        changed = np.where(small | none, 0.0, own).ravel()
+        along = coordinates[0] @ self.directions  # (K,)
+        is_small = np.abs(by_link).max(axis=1, keepdims=True) < MIN_CHANGE
+        is_noise = (np.abs(along) <= MIN_SIGNIFICANCE * np.sqrt(np.diag(by_noise))).all()
+        changed = np.where(is_small | is_noise, 0.0, by_link).ravel()
         covariance = self.directions @ (by_noise + by_zeros) @ self.directions.T + self._rest
-        return LinkResult(
-            self.axes, changed, covariance, {f: v[0].copy() for f, v in values.items()}
-        )
+        fitted = {field: value[0].copy() for field, value in values.items()}
+        return LinkResult(self.axes, changed, covariance, fitted)
 
     def _slopes(self, x: Array) -> tuple[Array, Array]:
         """Return errors at x (P,) and their differences over x, (m,) and (m, P)."""
@@ -233,20 +225,30 @@ class LinkFit:
         """Return how the servos follow the links: field → its change on its axis for one of x, (n,
         L · COORDINATES).
         """
-        whole = copy.copy(self)
-        count = self._servos.unit.size
-        whole.directions = np.eye(len(result.x))
-        here, jac = whole._slopes(np.r_[self._servos.normalize(result.values).ravel(), result.x])
-        normal = jac.T @ (jac / np.sqrt(1 + here**2)[:, None])
-        slopes = (
-            -np.linalg.pinv(normal[:count, :count], rcond=1e-10, hermitian=True)
-            @ normal[:count, count:]
-        )
+        along_all = copy.copy(self)
+        along_all.directions = np.eye(len(result.x))
+        count = self._servos.unit.size  # numbers of the servos in x
+        x = np.r_[self._servos.normalize(result.values).ravel(), result.x]
+        errors, jac = along_all._slopes(x)
+        normal = jac.T @ (jac / np.sqrt(1 + errors**2)[:, None])
+        of_servos = np.linalg.pinv(normal[:count, :count], rcond=1e-10, hermitian=True)
+        slopes = -of_servos @ normal[:count, count:]
         slopes = slopes.reshape(*self._servos.unit.shape, -1) * self._servos.unit[..., None]
         by_field = dict(zip(self._servos.names, np.moveaxis(slopes, 1, 0), strict=True))
-        # the fitted sum with kd over kp keeps its value, and kd does not change with kp
         if "damping" in by_field:
-            by_field["damping"] += (self.whole.bounds.kd / result.values["kp"])[:, None] * by_field[
-                "kp"
-            ]
+            # The fitted sum with kd over kp keeps its value, and kd does not change with kp.
+            kd_over_kp = self.whole.bounds.kd / result.values["kp"]
+            by_field["damping"] += kd_over_kp[:, None] * by_field["kp"]
         return by_field
+
+
+def _payload(s: Sequence) -> tuple[float, str]:
+    """Return mass, kg, and side of a recording's payload."""
+    return s.meta.payload_mass, s.meta.payload_side
+
+
+def _smooth_motion(s: Sequence) -> Array:
+    """Return smooth positions, velocities and accelerations of a recording, (3, T, joints)."""
+    qpos = lowpass(s.qpos.astype(float), s.dt, CUTOFF_HZ)
+    qvel = differentiate(qpos, s.dt)
+    return np.stack([qpos, qvel, differentiate(qvel, s.dt)])

@@ -40,7 +40,7 @@ class LinkMasses:
             result = fit.descend(self._fits.progress.reporter(self.name, ("all joints",), rows))
             links.append(result.axes.links(result.x))
             values.append(result.values)
-        if not result.x.any():
+        if not result.x.any():  # of the last set, whose fit is kept
             return state
         return replace(state, values=values, base=values, links=links, link_fit=(fit, result))
 

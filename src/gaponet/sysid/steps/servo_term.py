@@ -30,6 +30,10 @@ class ServoTerm:
         """Return the state with the term."""
         return self._with_values(state, self._fitted(state, self._alone(state)))
 
+    def warnings(self, state: FitState) -> list[str]:
+        """Return no warning: `Bounds.warnings` has those of all values."""
+        return []
+
     def _alone(self, state: FitState) -> list[Values]:
         """Return the fits of single joints."""
         return [self._fit_joints(*one) for one in zip(self._fits.joints, state.base, strict=True)]
@@ -39,26 +43,27 @@ class ServoTerm:
         that helps.
         """
         values = alone
-        single = any(SERVO_FIELDS[f].single_joint for f in TERMS[self._term])
-        if state.together and not single and not self._fits.progress.search_is_over():
+        fields = TERMS[self._term]
+        is_of_single_joints = any(SERVO_FIELDS[field].single_joint for field in fields)
+        has_time = not self._fits.progress.search_is_over()
+        if state.together and not is_of_single_joints and has_time:
             polished = [self._polish(*one) for one in zip(state.robots, alone, strict=True)]
             judge = self._fits.judge
             if judge.errors(polished).mean() < judge.errors(alone).mean():
                 values = polished
-        first = TERMS[self._term][0]
-        return [
-            v | {first: fit.bounds.visible(first, v)}
-            for fit, v in zip(self._fits.joints, values, strict=True)
-        ]
+        strength = fields[0]  # without it the others of the term have no effect
+        visible = []
+        for fit, of_set in zip(self._fits.joints, values, strict=True):
+            visible.append(of_set | {strength: fit.bounds.visible(strength, of_set)})
+        return visible
 
     def _with_values(self, state: FitState, values: list[Values]) -> FitState:
-        """Return the state with values.
-
-        A term that is zero in every joint only gave the others more iterations.
+        """Return the state with values, without the term if it is zero in every joint: then it only
+        gave the others more iterations.
         """
         fields = TERMS[self._term]
-        if not any(v[fields[0]].any() for v in values):
-            values = [{f: x for f, x in v.items() if f not in fields} for v in values]
+        if not any(of_set[fields[0]].any() for of_set in values):
+            values = [{f: x for f, x in of_set.items() if f not in fields} for of_set in values]
         return replace(state, values=values, base=values)
 
     def _fit_joints(self, joints: JointFit, values: Values) -> Values:
@@ -67,7 +72,7 @@ class ServoTerm:
         progress.begin_search()
         report = progress.reporter(self.name, joints.robot.operated, joints.rollouts.rows)
         start = values | {f: joints.bounds.guess[f] for f in TERMS[self._term]}
-        return joints.search(TERMS[self._term], start, report=report)
+        return joints.search(start, report=report)
 
     def _polish(self, robot: RobotFit, values: Values) -> Values:
         """Fit values (n,) with the term once more, all joints together."""
@@ -98,7 +103,7 @@ class Backlash(ServoTerm):
         over = self._fits.progress.search_is_over
         alone = self._alone(state)
         values = self._fitted(state, alone)
-        without = fit.search((), state.base[-1], report=lambda cost: over())
+        without = fit.search(state.base[-1], report=lambda cost: over())
         chance = backlash.probability(fit, without, alone[-1])
         width = values[-1]["backlash"]
         probable = backlash.only_probable(state.values, values, chance)

@@ -71,7 +71,11 @@ class FitState:
 
 
 class Step(Protocol):
-    """One thing that a simulator may lack."""
+    """One thing that a simulator may lack.
+
+    A new one is a class here, a line in `_steps` of sysid/identify.py, and an option in
+    sysid/options.py. Each step may take one share of the time (`SearchProgress`).
+    """
 
     name: str
 
@@ -80,3 +84,6 @@ class Step(Protocol):
 
     def propose(self, state: FitState) -> FitState:
         """Return the state with it, fitted."""
+
+    def warnings(self, state: FitState) -> list[str]:
+        """Return what the user has to know about it in the final state."""
