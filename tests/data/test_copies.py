@@ -108,3 +108,22 @@ def test_current_beside_position_commands_is_refused_and_not_ignored(tmp_path, a
         main(["identify", str(tmp_path / "data"), "--out", str(tmp_path / "id"), "--current"]) == 2
     )
     assert "--current" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("noise", [1e-4, 1e-3])
+@pytest.mark.parametrize("rows", [-1, 0, 2])
+def test_a_copy_with_noise_on_it_is_an_error(tmp_path, arm, rows, noise):
+    qpos = led_by_hand(rows + 5)
+    told = np.roll(qpos, -rows, axis=0)
+    told += np.random.default_rng(0).normal(0, noise, told.shape)
+    (error,) = errors(imported(tmp_path / "logs", arm, clock(1, True), told, qpos), arm)
+    assert (error.check, error.joints, error.values["rows"]) == ("copied", JOINTS, rows)
+
+
+@pytest.mark.parametrize("noise", [1e-5, 1e-4, 1e-3])
+def test_a_simulated_servo_with_noisy_encoders_repeats_no_command(arm, noise):
+    rng = np.random.default_rng(0)
+    for sequence in recordings(arm, 3):
+        time = sequence.dt * np.arange(len(sequence))
+        read = sequence.qpos + rng.normal(0, noise, sequence.qpos.shape)
+        assert np.isnan(copied_rows(Channel(time, sequence.ctrl), Channel(time, read))).all()

@@ -107,7 +107,9 @@ class ImportOptions:
     logs: str | Path | None = None
     """A logs.toml: what columns, names, units, signs and clocks mean; default the one in the folder
     of the logs."""
-    position_unit: Literal["rad", "deg", "fraction", "ticks", "signed_percent"] | None = None
+    position_unit: Literal["rad", "deg", "turns", "fraction", "ticks", "signed_percent"] | None = (
+        None
+    )
     """Unit of positions, where the format leaves it open."""
     time_unit: Literal["s", "ms", "us", "ns"] | None = None
     """Unit of time, where the format leaves it open."""

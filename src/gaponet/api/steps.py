@@ -59,7 +59,9 @@ class StartOptions:
     """Torque limit, likewise, N·m."""
     format: str | None = None
     """Format of the logs; gaponet import --formats lists them."""
-    position_unit: Literal["rad", "deg", "fraction", "ticks", "signed_percent"] | None = None
+    position_unit: Literal["rad", "deg", "turns", "fraction", "ticks", "signed_percent"] | None = (
+        None
+    )
     """Unit of positions, where the format leaves it open."""
     time_unit: Literal["s", "ms", "us", "ns"] | None = None
     """Unit of time, where the format leaves it open."""

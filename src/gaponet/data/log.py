@@ -61,6 +61,7 @@ class Channel(NamedTuple):
 
 
 RESTART_PERIODS = 3  # by which clocks of recordings in one file may begin apart
+MOSTLY = 0.5  # of the rows that repeat a stamp: a clock that is too coarse
 MIN_PIECE_ROWS = 20  # of each of them
 
 
@@ -149,6 +150,14 @@ class Log:
                 f"{self.row(name, int(back[0]) + 1)}: the clock starts again at "
                 f"{time[back[0] + 1]:.6g} s: several recordings in one file; write each into a "
                 "file of its own, or number them in a column episode_index"
+            )
+        if np.mean(np.diff(time) == 0) > MOSTLY:
+            stamps = np.unique(time)
+            step = f"{stamps[1] - stamps[0]:g} s" if len(stamps) > 1 else "nothing"
+            raise LogError(
+                f"{self.row(name, int(back[0]) + 1)}: the clock is too coarse: it has "
+                f"{len(stamps)} stamps in {len(time)} rows and advances by {step}; log "
+                "milliseconds, or state the rate of even rows (rate in logs.toml, --rate)"
             )
         if back.size:
             raise LogError(

@@ -48,7 +48,7 @@ __all__ = [
 ]
 
 PACKAGE_FOLDER = Path(__file__).parent / "robots"
-LOG_UNITS = ("rad", "deg", "fraction", "percent", "signed_percent", "ticks")
+LOG_UNITS = ("rad", "deg", "fraction", "percent", "signed_percent", "ticks", "turns")
 MAX_SUGGESTIONS = 3  # similar joint names in an error
 GAIN_TOLERANCE = 1e-3  # relative; gains that differ by less are equal
 

@@ -212,3 +212,27 @@ def test_logs_behind_a_link_are_found_once_also_where_links_go_in_a_circle(tmp_p
     (tmp_path / "logs").mkdir()
     (tmp_path / "logs" / "linked").symlink_to(tmp_path / "disk")
     assert files_under(tmp_path / "logs", (".npz",)) == [tmp_path / "logs/linked/day/m.npz"]
+
+
+def test_a_joint_with_a_range_may_count_from_zero_to_a_turn(tmp_path, arm):
+    columns = arm_columns(ROWS)
+    degrees = {
+        name: values if name == "time" else np.degrees(values) % 360
+        for name, values in columns.items()
+    }
+    (tmp_path / "m.csv").write_text(table_text(degrees))
+    log = only(tmp_path / "m.csv", arm, position_unit="deg", time_unit="s")
+    assert np.allclose(log.channels["qpos"].values[:, 0], columns["qpos.shoulder"])
+    assert "shoulder" in log.meta["notes"]["turns"]
+
+
+@pytest.mark.parametrize("kind", ["speeds", "torques"])
+def test_speeds_or_torques_under_the_name_of_targets_are_named(tmp_path, arm, kind):
+    columns = arm_columns(ROWS)
+    for joint in JOINTS:
+        speed = np.gradient(columns[f"qpos.{joint}"], columns["time"])
+        driven = speed if kind == "speeds" else np.gradient(speed, columns["time"])
+        columns[f"ctrl.{joint}"] = 20.0 * driven
+    (tmp_path / "m.csv").write_text(table_text(columns))
+    with pytest.raises(LogError, match=kind):
+        only(tmp_path / "m.csv", arm, **SI)

@@ -19,6 +19,9 @@ SLOPE_BOUNDS = (0.5, 1.25)
 # of a swap that shows in several motions
 MAX_OWN_CORRELATION = 0.8
 MIN_OTHER_CORRELATION = 0.95
+# of motion against the command, also where motion along it shows; by which it must be greater
+MIN_OPPOSITION = 0.9
+MIN_OPPOSITION_MARGIN = 0.1
 MIN_MOTIONS = 3
 MAX_DISTANCE = 0.7  # of positions from position commands, in standard deviations of the positions
 MIN_KIND_CORRELATION = 0.7  # of the command with what else it may be
@@ -152,13 +155,23 @@ def _sign(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     """Does each joint move in the direction of its command?"""
     for i, name in enumerate(robot.joint_names):
         moved = _moved(surveys, i)
-        against = [s for s in moved if s.opposes[i, i] > 0.6 and s.follows[i, i] < 0.3]
+        against = [s for s in moved if _opposes(float(s.opposes[i, i]), float(s.follows[i, i]))]
         if against and 2 * len(against) >= len(moved):
             text = (
                 f"{name} moves against its command in {len(against)} of {len(moved)} motions: "
                 "command and state have opposite signs; negate one of them and import again"
             )
             yield Finding("error", "sign", text, (name,))
+
+
+def _opposes(against: float, along: float) -> bool:
+    """Return True if a joint moves against its command, by the greatest correlations of both.
+
+    Commands that come and go show some motion along them too, a part of their period later.
+    """
+    if against > 0.6 and along < 0.3:
+        return True
+    return against > MIN_OPPOSITION and against - along > MIN_OPPOSITION_MARGIN
 
 
 def _copied(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
@@ -243,19 +256,20 @@ def _copy(rows: int, motions: dict[str, list[str]], with_torque: bool) -> Findin
     count = f"{abs(rows)} row{'s' * (abs(rows) > 1)}"
     if rows == 0:
         text = (
-            f"command and state of {joints} are the same numbers in {where}: one was logged as "
-            "both; log the command that the servo was sent"
+            f"command and state of {joints} are the same numbers, to the last digit or but for "
+            f"noise, in {where}: one was logged as both; log the command that the servo was sent"
         )
     elif rows > 0:
         text = (
-            f"the command of {joints} is the recorded position {count} later, to the last digit, "
-            f"in {where}: what was sent to the servos is not in this log. Record the goal "
-            "positions that the robot was sent"
+            f"the command of {joints} is the recorded position {count} later, to the last digit or "
+            f"but for noise, in {where}: what was sent to the servos is not in this log. Record "
+            "the goal positions that the robot was sent"
         )
     else:
         text = (
-            f"the position of {joints} is the command {count} later, to the last digit, in "
-            f"{where}: the state was not measured. Record the positions of the encoders"
+            f"the position of {joints} is the command {count} later, to the last digit or "
+            f"but for noise, in {where}: the state was not measured. Record the positions of the "
+            "encoders"
         )
     if with_torque:
         text += ". Of a robot that is driven by torque or current: gaponet identify --current"

@@ -51,7 +51,7 @@ def what_it_holds(names: Sequence[str]) -> str | None:
     Args:
         names: Those that are no joints of the robot.
     """
-    words = [_words(name) for name in names]
+    words = [words_of(name) for name in names]
     every = set().union(*words)
     if every & DELTA_WORDS:
         return "steps from the present position (deltas)"
@@ -62,6 +62,7 @@ def what_it_holds(names: Sequence[str]) -> str | None:
     return None
 
 
-def _words(name: str) -> set[str]:
+def words_of(name: str) -> set[str]:
+    """Return the words of a name: obs/robot0_eef_pos → obs, robot, eef, pos."""
     apart = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name).lower()
     return set(re.split(r"[^a-z]+", apart)) - {""}

@@ -41,6 +41,8 @@ CLOCK_WORDS = {
 }
 CLOCK_ENDS = ("time", "stamp", "clock")  # of words such as realtime
 ROWS = 4000  # that are looked at
+WHOLE_SECONDS = re.compile(r"(.*?)secs?")
+NANOSECONDS = ("nanosec", "nanosecs", "nsec", "nsecs")
 MIN_ROWS = 20
 MIN_LINEARITY = 0.99  # correlation of a clock with the number of its row
 MAX_RATE_DIFFERENCE = (
@@ -68,6 +70,46 @@ def clock_periods(
         if len(values) >= MIN_ROWS and np.isfinite(values).all() and _runs(values):
             periods[name] = float(values[-1] - values[0]) / (len(values) - 1)
     return periods
+
+
+Load = Callable[[list[str]], dict[str, Any]]
+
+
+def with_whole_seconds(
+    signals: dict[str, tuple[str, ...]], load: Load
+) -> tuple[dict[str, tuple[str, ...]], Load]:
+    """Return signals, and what reads them, with one clock for each pair of columns that hold
+    seconds and the nanoseconds beyond them, as ROS writes stamps.
+    """
+    pairs: dict[str, tuple[str, str]] = {}
+    for whole in signals:
+        match = WHOLE_SECONDS.fullmatch(whole)
+        if match is None:
+            continue
+        for ending in NANOSECONDS:
+            if match[1] + ending in signals:
+                pairs[match[1].rstrip("._/ ") or "stamp"] = (whole, match[1] + ending)
+    if not pairs:
+        return signals, load
+    parts = {part for pair in pairs.values() for part in pair}
+    joined = dict.fromkeys(pairs, ()) | {n: x for n, x in signals.items() if n not in parts}
+
+    def load_joined(names: list[str]) -> dict[str, Any]:
+        wanted = [name for name in names if name not in pairs]
+        for name in names:
+            wanted += pairs.get(name, ())
+        loaded = load(wanted)
+        result = {}
+        for name in names:
+            if name not in pairs:
+                result[name] = loaded[name]
+                continue
+            whole, beyond = (loaded[part] for part in pairs[name])
+            seconds = whole.values - whole.values[0] + 1e-9 * beyond.values
+            result[name] = whole._replace(values=seconds, in_seconds=True)
+        return result
+
+    return joined, load_joined
 
 
 def named_like_a_clock(name: str) -> bool:

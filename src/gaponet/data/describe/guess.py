@@ -15,6 +15,7 @@ import numpy as np
 
 from gaponet.base.arrays import Array
 from gaponet.base.errors import JointMismatchError, LogError
+from gaponet.data.describe.actions import HAND_WORDS, words_of
 from gaponet.data.describe.clocks import (
     MAX_RATE_DIFFERENCE,
     clock_periods,
@@ -22,8 +23,8 @@ from gaponet.data.describe.clocks import (
     rate_ratio,
 )
 from gaponet.data.describe.plausibility import look_like_percent, look_like_ticks
-from gaponet.data.describe.raw_recording import SECONDS, RawRecording
-from gaponet.data.log import FEEDFORWARD
+from gaponet.data.describe.raw_recording import SECONDS, RawRecording, by_place
+from gaponet.data.log import FEEDFORWARD, REQUIRED
 from gaponet.robot.spec import RobotSpec
 
 # Words by which the world calls them; a name with a word of an earlier line is not looked for in a
@@ -39,6 +40,14 @@ WORDS = {
     "qpos": ("qpos", "pos", "position", "positions", "q", "meas", "measured", "actual", "act",
              "state", "states", "present", "angle", "enc"),
 }  # fmt: skip
+# Of positions, as names of columns say them.
+UNIT_WORDS = {
+    "deg": ("deg", "degs", "degree", "degrees", "°"),
+    "rad": ("rad", "rads", "radian", "radians"),
+    "ticks": ("ticks", "tick", "counts", "steps", "raw"),
+    "turns": ("turns", "turn", "rev", "revs", "revolutions", "rotations"),
+}
+LARGEST_RAD = 7.0  # larger positions are degrees
 CLOCKS = (
     "time",
     "t",
@@ -51,8 +60,12 @@ CLOCKS = (
     "clock",
     "ts",
 )
+FILLERS = ("joint", "joints", "data", "log")  # of files' names
 NOT_POSITIONS = ("qvel", "tau", "temperature")
 ROWS = 4000  # that are looked at
+# of the positions' own motion by which commands are apart from them; of those, correlation with speed
+NEAR_POSITIONS = 0.8
+MAX_SPEED_CORRELATION = 0.9
 APART = 0.5  # of a command's own motion by which repetitions of it differ at the most
 
 
@@ -68,7 +81,7 @@ def guess_logs(
     """
     if not recordings:
         raise LogError("no recording found")
-    family = _family([Path(r.source).name for r in recordings])
+    family = _family(list(by_place(recordings)))
     if family:
         by_kind = {kind: _first_of(recordings, pattern) for kind, pattern in family.items()}
         if "qpos" in _channels(by_kind["qpos"], robot) and "ctrl" in family:
@@ -92,6 +105,8 @@ def _guess_one_file(
         if channel in specified and _values(first, specified[channel]) is not None:
             channels[channel] = specified[channel]
     joints = _joints(first, channels)
+    _refuse_file_per_joint(recordings, joints, robot)
+    _tell_desired_from_velocity(first, channels)
     lines = [
         f"# {fmt}; the first recording: {first.place}",
         f"# its columns: {first.shown(40)}",
@@ -99,15 +114,54 @@ def _guess_one_file(
         "",
     ]
     lines += _clock(first, specified)
-    lines += _positions(first, channels)
-    lines += [_channel_line(channel, name, lines) for channel, name in channels.items()]
+    lines += _positions(first, channels, robot, specified.get("position_unit"))
+    for channel, name in channels.items():
+        lines.append(_channel_line(channel, name, lines) + _others_alike(first, channel, name))
     for need in ("ctrl", "qpos"):
         if need not in channels:
             lines.append(f'# {need} = "…"          ? none of the names looks like it')
-    lines += _names(channels, joints, robot)
-    lines += _names_of_commands(_joints(first, channels, "ctrl"), joints, robot)
-    lines += _labels([r.name for r in recordings], _repeated(recordings, channels.get("ctrl", "")))
+    if "ctrl" not in channels and "tau" in channels and "qpos" in channels:
+        lines.append("# driven by torque? then the position's name also for ctrl: docs/logs.md")
+    repeated = _repeated(recordings, channels.get("ctrl", ""))
+    names = _names(channels, joints, robot)
+    array = "{joint}" not in channels.get("ctrl", "{joint}")
+    names += _names_of_commands(_joints(first, channels, "ctrl"), joints, robot, array)
+    top = [line for line in names if line.startswith(("joints =", "ignore ="))]
+    tables = [line for line in names if line not in top]
+    lines += [*top, *_labels([r.name for r in recordings], repeated), *tables]
     return "\n".join(lines) + "\n"
+
+
+def _refuse_file_per_joint(
+    recordings: list[RawRecording], joints: list[str], robot: RobotSpec
+) -> None:
+    """Refuse files that hold one joint each and are called like it: they are one recording."""
+    names = [recording.name for recording in recordings]
+    nameless = len(joints) == 1 and joints[0].isdigit()
+    if len(names) < 2 or not nameless or not all(_is_joint(name, robot) for name in names):
+        return
+    raise LogError(
+        f"{recordings[0].place}: a file per joint ({', '.join(names[:5])}): a robot moves all its "
+        "joints at once. Write one table per motion, with columns such as "
+        f"ctrl.{names[0]} and qpos.{names[0]} of every joint"
+    )
+
+
+def _tell_desired_from_velocity(recording: RawRecording, channels: dict[str, str]) -> None:
+    """Call an array such as qd a command, where no other is one and it is near the positions
+    instead of their derivative.
+    """
+    if "ctrl" in channels or "qvel" not in channels or "qpos" not in channels:
+        return
+    near = _values(recording, channels["qvel"])
+    qpos = _values(recording, channels["qpos"])
+    if near is None or qpos is None or near.shape != qpos.shape or len(qpos) < 3:
+        return
+    apart = np.abs(near - qpos).mean()
+    moved = np.abs(qpos - qpos.mean(axis=0)).mean()
+    alike = [np.corrcoef(np.gradient(qpos[:, j]), near[:, j])[0, 1] for j in range(qpos.shape[1])]
+    if apart < NEAR_POSITIONS * moved and np.nanmean(np.abs(alike)) < MAX_SPEED_CORRELATION:
+        channels["ctrl"] = channels.pop("qvel")
 
 
 def _labels(names: list[str], repeated: bool) -> list[str]:
@@ -159,9 +213,9 @@ def _without_kind(stem: str) -> str | None:
     if not known:
         return None
     name = stem
-    for word in known:
+    for word in [*known, *(w for w in words if w.lower() in FILLERS)]:
         name = re.sub(rf"[-_. ]?{word}", "", name, count=1)
-    return name.strip("-_. ")
+    return name.strip("-_. /")
 
 
 def _guess_family(
@@ -174,8 +228,9 @@ def _guess_family(
         family: Of _family.
     """
     state = by_kind["qpos"]
-    joints = list(state.columns)
-    values = np.stack([state.load([c])[c].values[:ROWS] for c in state.signals], axis=1)
+    clocks = clock_periods(state.signals, state.load)
+    joints = [column for column in state.columns if column not in clocks]
+    values = np.stack([state.load([c])[c].values[:ROWS] for c in joints], axis=1)
     span = float(np.nanmax(np.abs(values)))
     lines = [
         f"# {fmt}; files that belong together: {', '.join(family.values())}",
@@ -192,13 +247,12 @@ def _guess_family(
             f"time_file = {_text(family['time'])}  # ?",
             _time_unit(clock.load([column])[column].values),
         ]
+    elif clocks:
+        lines += _clock(state, {})
     else:
         lines.append("rate = 50.0  # ? Hz: no file holds times")
-    unit = "rad"
-    if span > 7:
-        unit = "ticks" if look_like_ticks(values) else "deg"
     lines += [
-        f'position_unit = "{unit}"  # ? values up to {span:.3g}',
+        f'position_unit = "{_unit_of(values)}"  # ? values up to {span:.3g}',
         'ctrl = "{joint}"',
         'qpos = "{joint}"',
     ]
@@ -217,6 +271,18 @@ def _channel_line(channel: str, name: str, lines: list[str]) -> str:
     if channel == "qvel" and any(text.startswith('position_unit = "ticks"') for text in lines):
         return f"# {line}  # ? its unit is not known; velocities are computed without it"
     return line
+
+
+def _others_alike(recording: RawRecording, channel: str, name: str) -> str:
+    """A question where other arrays could be this channel, as those of a second arm; "" if none."""
+    if channel not in REQUIRED:
+        return ""
+    alike = [
+        other
+        for other, labels in recording.signals.items()
+        if labels and other != name and _kind(other) == channel
+    ]
+    return f"  # ? also: {', '.join(alike)}" if alike and "{joint}" not in name else ""
 
 
 def _state_and_command(recordings: list[RawRecording]) -> dict[str, RawRecording] | None:
@@ -258,7 +324,7 @@ def _guess_two_files(
         f"command_file = {_text(files['ctrl'])}",
     ]
     lines += _clock(state, dict(known))
-    lines += _positions(state, channels)
+    lines += _positions(state, channels, robot)
     lines += [_channel_line(channel, name, lines) for channel, name in channels.items()]
     lines.append(f"ctrl = {_text(told)}  # ? of the command's file")
     joints = _joints(state, channels)
@@ -279,8 +345,7 @@ def _numbered(recording: RawRecording) -> str:
 def _first_of(recordings: list[RawRecording], pattern: str) -> RawRecording:
     """Return the first recording whose file fits a pattern with {name}."""
     before, _, after = pattern.partition("{name}")
-    for recording in recordings:
-        file = Path(recording.source).name
+    for file, recording in by_place(recordings).items():
         if file.startswith(before) and file.endswith(after):
             return recording
     raise LogError(f"no file looks like {pattern}")
@@ -319,7 +384,8 @@ def _channels(recording: RawRecording, robot: RobotSpec) -> dict[str, str]:
     matches: dict[str, str] = {}
     arrays = [n for n, labels in recording.signals.items() if labels]
     for name in sorted(arrays, key=lambda n: -len(recording.signals[n])):
-        if kind := _kind(name):
+        kind = _kind(name)
+        if kind and not (kind == "qpos" and HAND_WORDS & words_of(name)):
             matches.setdefault(kind, name)
     singles = [
         n for n, labels in recording.signals.items() if not labels and n.lower() not in CLOCKS
@@ -421,6 +487,8 @@ def _names(channels: dict[str, str], joints: list[str], robot: RobotSpec) -> lis
     if not strange:
         return []
     left = [j for j in robot.joint_names if j not in joints]
+    if not left:
+        return [f"ignore = {json.dumps(strange)}  # ? no joints of this robot"]
     if len(left) == len(strange):
         heading = "[names]  # ? the log's = the robot's, in the order of both"
     else:
@@ -442,11 +510,19 @@ def _joints_in_order(n: int, robot: RobotSpec) -> str:
     return f"joints = {json.dumps(given + [''] * missing)}  # ? {question}"
 
 
-def _names_of_commands(told: list[str], joints: list[str], robot: RobotSpec) -> list[str]:
-    """Lines of [names] for commands that call their joints otherwise than the positions do."""
+def _names_of_commands(
+    told: list[str], joints: list[str], robot: RobotSpec, array: bool
+) -> list[str]:
+    """Lines for commands that call their joints otherwise than the positions do.
+
+    Args:
+        array: The commands are one array, whose columns a line `joints` names.
+    """
     strange = [name for name in told if name not in joints and not _is_joint(name, robot)]
     if not strange or "0" in joints:
         return []
+    if array and all(name.isdigit() for name in strange):
+        return [f"{_joints_in_order(len(strange), robot)} (of the commands)"]
     own = [name for name in robot.joint_names if len(strange) == len(robot.joint_names)]
     ours = own or ["…"] * len(strange)
     lines = [] if any(not _is_joint(joint, robot) for joint in joints) else ["", "[names]"]
@@ -489,34 +565,76 @@ def _which_clock(clock: str, period: float, others: dict[str, float]) -> list[st
     ]
 
 
-def _values(recording: RawRecording, pattern: str) -> Array | None:
-    """(rows, joints) of a channel, in the log's own order."""
+def _values(recording: RawRecording, pattern: str, robot: RobotSpec | None = None) -> Array | None:
+    """(rows, joints) of a channel, in the log's own order; of a robot, its joints where any are."""
     if pattern in recording.signals:
         values = recording.load([pattern])[pattern].values[:ROWS]
-        return values if values.ndim == 2 else values[:, None]
+        if values.ndim == 1:
+            return values[:, None]
+        labels = recording.signals[pattern]
+        joints = [i for i, label in enumerate(labels) if robot and _is_joint(label, robot)]
+        return values[:, joints] if joints else values
     if "{joint}" not in pattern:
         return None
     before, after = map(re.escape, pattern.split("{joint}"))
     fits = re.compile(f"{before}(.+?){after}")
     names = [c for c in recording.columns if c in recording.signals and fits.fullmatch(c)]
+    if robot is not None:
+        matches = {name: fits.fullmatch(name) for name in names}
+        own = [name for name, match in matches.items() if match and _is_joint(match[1], robot)]
+        names = own or names
     if not names:
         return None
     loaded = recording.load(names)
     return np.stack([loaded[n].values[:ROWS] for n in names], axis=1)
 
 
-def _positions(recording: RawRecording, channels: dict[str, str]) -> list[str]:
-    values = _values(recording, channels.get("qpos") or channels.get("ctrl") or "")
+def _positions(
+    recording: RawRecording,
+    channels: dict[str, str],
+    robot: RobotSpec,
+    stated: str | None = None,
+) -> list[str]:
+    """The line of position_unit: as names or a row of units say it, or by the size of the values.
+
+    Values of the robot's joints count; a gripper or a wheel beside them has another unit.
+    """
+    pattern = channels.get("qpos") or channels.get("ctrl") or ""
+    named = stated or _named_unit(recording, pattern)
+    if named:
+        return [f'position_unit = "{named}"']
+    values = _values(recording, pattern, robot)
     if values is None or not np.isfinite(values).any():
         return ['position_unit = "rad"  # ?']
     span = float(np.nanmax(np.abs(values)))
-    unit = "rad" if span <= 7 else "deg"
+    return [f'position_unit = "{_unit_of(values)}"  # ? values up to {span:.3g}']
+
+
+def _unit_of(values: Array) -> str:
+    """The unit that positions have by their size."""
     finite = values[np.isfinite(values)]
     if look_like_ticks(finite):
-        unit = "ticks"
-    elif look_like_percent(finite):
-        unit = "signed_percent"
-    return [f'position_unit = "{unit}"  # ? values up to {span:.3g}']
+        return "ticks"
+    if look_like_percent(finite):
+        return "signed_percent"
+    return "rad" if np.abs(finite).max() <= LARGEST_RAD else "deg"
+
+
+def _named_unit(recording: RawRecording, pattern: str) -> str | None:
+    """The unit of positions that their names say, or a second line of the header."""
+    units = recording.meta.get("notes", {}).get("units", {})
+    before, _, after = pattern.partition("{joint}")
+    of_joints = [
+        unit
+        for column, unit in units.items()
+        if column.startswith(before) and column.endswith(after)
+    ]
+    for text in (before, after, *of_joints):
+        for word in re.split(r"[^a-z°]+", text.lower()):
+            unit = next((u for u, words in UNIT_WORDS.items() if word in words), None)
+            if unit:
+                return unit
+    return None
 
 
 def _repeated(recordings: list[RawRecording], ctrl: str) -> bool:

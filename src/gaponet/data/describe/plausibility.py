@@ -31,6 +31,10 @@ FRACTIONS = {
     "signed_percent": (-100.0, 200.0),
 }
 FULL_PERCENT = 100.0
+NO_OFFSET_RAD = 3.3  # from zero: more than half a turn
+MIN_KIND = 0.5  # correlation of a command with speed or torque that tells what it is
+SAME_MOTION = 0.8  # correlation of positions in two units
+TURN_RAD = 2 * np.pi
 LARGEST_DEG = 360.0  # larger positions of a limb are no degrees
 
 
@@ -72,6 +76,8 @@ def _angles(
         return values
     if unit == "deg":
         return np.asarray(np.radians(values))
+    if unit == "turns":
+        return TURN_RAD * values
     in_range = robot.log_units[robot.joint_names.index(joint)] == "fraction"  # a gripper
     if encoder is not None and unit == "ticks" and in_range:
         values = encoder.fractions(values, speed)
@@ -104,6 +110,7 @@ def require_plausible(log: Log, robot: RobotSpec, strict: bool = False) -> Log:
             f"{moved:.3g} rad: a robot driven by torques, by velocities or by hand; such commands "
             "are no position targets to learn from"
         )
+    _require_targets(log, robot)
     channels = dict(log.channels)
     replaced = {}
     for name in UNITS:
@@ -161,6 +168,58 @@ def _note(name: str, log: Log, wrong: Array, tolerable: bool) -> dict[str, Any]:
     }
 
 
+def _require_targets(log: Log, robot: RobotSpec) -> None:
+    """Refuse commands that no joint reaches beside positions that all do: speeds, torques or
+    currents under a name of targets.
+    """
+    for column, joint in enumerate(log.joint_names):
+        low, high = robot.qpos_range[robot.joint_names.index(joint)]
+        told = log.channels["ctrl"].values[:, column]
+        at = log.channels["qpos"].values[:, column]
+        if not _beyond(told, low, high) or _beyond(at, low, high):
+            continue
+        time = log.channels["qpos"].time
+        command = np.interp(time, log.channels["ctrl"].time, told)
+        if abs(_correlation(command, at)) > SAME_MOTION:
+            return  # positions in another unit
+        speed = np.gradient(at, time)
+        acceleration = np.gradient(speed, time)
+        kinds = {
+            "speeds": abs(_correlation(command, speed)),
+            "torques or currents": abs(_correlation(command, acceleration)),
+        }
+        if "tau" in log.channels and len(log.channels["tau"].time) == len(time):
+            torque = abs(_correlation(command, log.channels["tau"].values[:, column]))
+            kinds["torques or currents"] = max(kinds["torques or currents"], torque)
+        likely = max(kinds, key=lambda kind: kinds[kind])
+        if kinds[likely] < MIN_KIND:
+            return  # a reading that is wrong in some rows
+        row = int(np.abs(told).argmax())
+        raise LogError(
+            f"{_place(log, 'ctrl', row)} of {joint} is {told[row]:.3f}, outside its range "
+            f"[{low:.2f}, {high:.2f}] rad, while its measured positions are inside: these are no "
+            f"position targets but, by how the joint moves, {likely}. Log the targets of the "
+            "position controller; of a robot that is driven by torque or current see "
+            "docs/logs.md, 'Driven by torque or current'"
+        )
+
+
+def _beyond(values: Array, low: float, high: float) -> bool:
+    """Return True if positions (k,), rad, are further from zero and from the joint's range than a
+    calibration offset.
+    """
+    far = np.abs(values) > NO_OFFSET_RAD
+    outside = (values < low - 1.0) | (values > high + 1.0)
+    return bool((far & outside).any())
+
+
+def _correlation(one: Array, other: Array) -> float:
+    spread = one.std() * other.std()
+    if not spread > 0:
+        return 0.0
+    return float(((one - one.mean()) * (other - other.mean())).mean() / spread)
+
+
 def _nonsense(name: str, log: Log, robot: RobotSpec) -> Array:
     """Where a channel holds what no joint does, (k, n)."""
     values = np.abs(log.channels[name].values)
@@ -205,7 +264,9 @@ def require_radians(
         row = int(abs(values[:, column]).argmax())
         value = values[row, column]
         low, high = robot.qpos_range[robot.joint_names.index(joint)]
-        if abs(value) > 3.3 and (not low - 1.0 <= value <= high + 1.0 or abs(value) > MOST["qpos"]):
+        if abs(value) > NO_OFFSET_RAD and (
+            not low - 1.0 <= value <= high + 1.0 or abs(value) > MOST["qpos"]
+        ):
             look_like = "degrees; logs state them with --position-unit deg"
             stated_as_degrees = np.round(np.degrees(values[:, column]), 6)
             if look_like_ticks(values[:, column]) or look_like_ticks(stated_as_degrees):

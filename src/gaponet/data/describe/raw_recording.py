@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import zipfile
 from collections.abc import Callable, Iterable, Iterator
@@ -23,6 +24,7 @@ from gaponet.data.describe.encoders import Encoder, read_encoders
 from gaponet.data.describe.joints import ignored, resolve_all
 from gaponet.data.describe.logs_file import HINT, LogsFile
 from gaponet.data.describe.plausibility import to_radians
+from gaponet.data.describe.repeats import without_equal_rows
 from gaponet.data.describe.slow_channels import sampled_channels
 from gaponet.data.log import CHANNELS, COMMANDS, DERIVED, FEEDFORWARD, REQUIRED, Channel, Log
 from gaponet.robot.spec import LOG_UNITS, RobotSpec
@@ -31,6 +33,7 @@ WIDEST = 500  # columns of an array that may be joints
 MIN_WIDTHS = 10  # by which an array with a column per sample is wider than high
 SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 SAY_UNITS = "--position-unit rad --time-unit s (or position_unit and time_unit in logs.toml)"
+MOST_ROWS_APART = 2  # of channels without a clock: the state before the first command, and the last
 COMMAND = "command:"  # before the names of signals that lie in a command_file
 TIME = "time:"  # and in a time_file
 NO_COMMANDS = (
@@ -132,6 +135,12 @@ class RawRecording:
             notes = meta.get("notes", {}) | {"transposed": turned}
             more["meta"] = meta | {"notes": notes}
         numeric = {name: array for name, array in arrays.items() if _is_signal(array)}
+        deep = [n for n, a in arrays.items() if isinstance(a, np.ndarray) and a.ndim == 3]
+        if deep and not numeric:
+            raise LogError(
+                f"{file}: {', '.join(deep)} have three axes, {arrays[deep[0]].shape}: several "
+                "recordings in one array; write each into a file of its own, with a row per sample"
+            )
         signals = {name: _column_names(array, names) for name, array in numeric.items()}
         source = f"{file}#{part}" if part else str(file)
 
@@ -167,11 +176,14 @@ class RawRecording:
         for channel, columns in chosen.items():
             time = _time(self, specified, loaded, clocks[channel], channel, columns)
             channels[channel] = Channel(time, in_si.values(channel, columns, loaded))
+        if "rate" in specified:
+            _require_one_length(channels, specified["rate"], self.place)
+        channels, repeated = _without_equal_rows(channels)
         channels, empty = sampled_channels(channels, joints, self.place)
         channels = _from_zero(channels)
         meta = self._meta(channels, specified)
-        if empty:
-            meta["notes"] = meta.get("notes", {}) | empty
+        if empty or repeated:
+            meta["notes"] = meta.get("notes", {}) | empty | repeated
         for name, columns in gains.items():
             meta[name] = [_constant(self, name, _column(loaded, *columns[j])) for j in joints]
         meta["converted_from"] = {j: units[j] for j in joints if units[j] != "rad"}
@@ -325,6 +337,16 @@ def _cut_short(file: Path, error: Exception) -> bool:
     )
 
 
+def by_place(recordings: ListOf[RawRecording]) -> dict[str, RawRecording]:
+    """Return recordings by their files, relative to the folder that holds all of them."""
+    files = [Path(recording.source) for recording in recordings]
+    if not files:
+        return {}
+    root = os.path.commonpath([file.parent for file in files])
+    places = [file.relative_to(root).as_posix() for file in files]
+    return dict(zip(places, recordings, strict=True))
+
+
 Columns = dict[str, tuple[str, int | None]]  # joint → (signal, column)
 Chosen = dict[str, Columns]  # by channel
 
@@ -354,6 +376,31 @@ class _Conversion:
             home = self.robot.qpos_home[self.robot.index(self.joints)]
             values = home + self.specified["action_scale"] * values
         return to_radians(channel, values, self.joints, self.units, self.robot, self.encoders)
+
+
+def _require_one_length(channels: dict[str, Channel], rate: float, where: str) -> None:
+    """Refuse channels without clocks that have different numbers of rows: they have other rates."""
+    rows = {name: len(channel.time) for name, channel in channels.items()}
+    if max(rows.values()) - min(rows.values()) <= MOST_ROWS_APART:
+        return
+    counted = ", ".join(f"{name} {count}" for name, count in rows.items())
+    raise LogError(
+        f"{where}: at rate = {rate:g} Hz all channels must have equally many rows; these have "
+        f"{counted}. They were logged at different rates, or parts are missing: give each its "
+        "clock (time, time_file, [clock] in logs.toml), or write them with one row per instant"
+    )
+
+
+def _without_equal_rows(
+    channels: dict[str, Channel],
+) -> tuple[dict[str, Channel], dict[str, Any]]:
+    """Return channels without rows that were written twice at one instant, and a note of them."""
+    kept = {}
+    most = 0
+    for name, channel in channels.items():
+        kept[name], dropped = without_equal_rows(channel)
+        most = max(most, dropped)
+    return kept, {"repeated": {"rows": most}} if most else {}
 
 
 def _encoders(
@@ -400,7 +447,8 @@ def _choose(
                 f"{recording.shown()}"
             )
     chosen: Chosen = {}
-    taken = {*single.values(), specified.get("time", "")}  # no pattern finds these columns
+    clocks = specified.get("clock", {}).values()
+    taken = {*single.values(), specified.get("time", ""), *clocks}  # no pattern finds these columns
     for channel in (*CHANNELS, *DERIVED):
         named = _matching(recording, specified, channel, taken)
         named += [
@@ -593,7 +641,8 @@ def _time(
     time = np.asarray(loaded[clock].values, float)
     if time.shape != (len(own.values),):
         raise LogError(
-            f"{where}: clock '{clock}' has shape {time.shape}, {channel} {len(own.values)} rows"
+            f"{where}: its clock '{clock}' has {len(time)} rows and {channel} {len(own.values)}; "
+            "cut or mend one of them"
         )
     if loaded[clock].in_seconds:
         return time

@@ -31,6 +31,20 @@ def without_repeated_rows(log: Log) -> Log:
     return replace(log, channels=channels, meta=log.meta | {"notes": notes})
 
 
+def without_equal_rows(channel: Channel) -> tuple[Channel, int]:
+    """Return a channel without rows that repeat the one before at the same instant, and how many
+    these were.
+    """
+    again = np.diff(channel.time) == 0
+    same = channel.values[1:] == channel.values[:-1]
+    both_empty = np.isnan(channel.values[1:]) & np.isnan(channel.values[:-1])
+    again &= (same | both_empty).all(axis=1)
+    if not again.any():
+        return channel, 0
+    keep = np.concatenate([[True], ~again])
+    return Channel(channel.time[keep], channel.values[keep]), int(again.sum())
+
+
 def _repeated(time: Array, values: Array) -> Array:
     """Return where a row repeats the one before, (k,); nowhere if few do."""
     nothing = np.zeros(len(time), bool)

@@ -33,6 +33,12 @@ USUAL_STEPS_RAD = sorted(
     reverse=True,
 )
 MAX_OFF_STEP = 0.02  # of a step, by which rounded readings lie beside its multiples
+# A copy may have noise on it: what is left is small, of one row unlike that of the next, and tells
+# nothing of the motion. A servo's error is none of these.
+NOISE_SHARE = 0.3  # of the usual change of the command
+MIN_NOISE_ROWS = 100
+MAX_COLOUR = 0.15  # correlation of the noise with that of the row before
+MAX_EXPLAINED = 0.05  # share of the noise that position, velocity and acceleration explain
 NO_DIGIT_RAD = 1.01e-6  # closer readings are the same one, in another precision
 
 
@@ -106,12 +112,43 @@ def _shift(told: Array, later: Array, shifts: Array, usual_change: float) -> flo
     equal = np.abs(later - told[:, None]) <= tolerance
     if usual_change >= FINE_STEPS * coarse:
         if equal.any(axis=1).mean() < FINE_SHARE:
-            return np.nan
+            return _noisy_shift(told, later, shifts, usual_change)
         return float(shifts[equal.sum(axis=0).argmax()])
     share = equal.mean(axis=0)
     if tolerance > NO_DIGIT_RAD or share.max() < COARSE_SHARE:
         return np.nan
     return float(shifts[share.argmax()])
+
+
+def _noisy_shift(told: Array, later: Array, shifts: Array, usual_change: float) -> float:
+    """Return the shift of one joint's copy that has noise on it; NaN if it is none.
+
+    Args:
+        told, later, shifts, usual_change: As of _shift.
+    """
+    if len(told) < MIN_NOISE_ROWS:
+        return np.nan
+    noise = later - told[:, None]
+    size = np.sqrt((noise**2).mean(axis=0))
+    best = int(size.argmin())
+    if size[best] > NOISE_SHARE * usual_change or size[best] <= NO_DIGIT_RAD:
+        return np.nan
+    left = noise[:, best]
+    colour = np.corrcoef(left[1:], left[:-1])[0, 1]
+    motion = np.stack(
+        [
+            np.ones(len(told)),
+            later.mean(axis=1),
+            later[:, -1] - later[:, 0],
+            later[:, -1] + later[:, 0] - 2 * later.mean(axis=1),
+        ],
+        axis=1,
+    )
+    rest = left - motion @ np.linalg.lstsq(motion, left, rcond=None)[0]
+    explained = 1 - (rest**2).sum() / (left**2).sum()
+    if abs(colour) > MAX_COLOUR or explained > MAX_EXPLAINED:
+        return np.nan
+    return float(shifts[best])
 
 
 def _step(values: Array) -> float:

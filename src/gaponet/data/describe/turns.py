@@ -11,6 +11,7 @@ from gaponet.data.log import Channel, Log
 from gaponet.robot.spec import RobotSpec
 
 TURN_RAD = 2 * np.pi
+ROUNDING_RAD = 0.1  # by which angles of one turn may pass its ends
 MAX_STEP_RAD = 1.0  # that a joint moves beside the jump, from one row to the next
 
 
@@ -42,6 +43,55 @@ def continued_turns(log: Log, robot: RobotSpec) -> Log:
     }
     notes = log.meta.get("notes", {}) | {"turns": turned}
     return replace(log, channels=log.channels | channels, meta=log.meta | {"notes": notes})
+
+
+def within_range(log: Log, robot: RobotSpec) -> Log:
+    """Return the log with joints of a limited range whose angles were written from 0 to a turn,
+    brought into this range.
+
+    Of an arm that counts from 0° to 360°, −10° is 350°. The log notes it (notes, "turns").
+    """
+    positions = {name: np.array(log.channels[name].values, float) for name in ("ctrl", "qpos")}
+    turned = {}
+    for column, joint in enumerate(log.joint_names):
+        low, high = robot.qpos_range[robot.joint_names.index(joint)]
+        if not (np.isfinite(low) and np.isfinite(high)):
+            continue
+        wraps = 0
+        inside: dict[str, Array] = {}
+        for name, values in positions.items():
+            found = _inside_range(values[:, column], low, high)
+            if found is not None:
+                inside[name] = found
+                wraps += int((np.abs(np.diff(values[:, column])) > TURN_RAD / 2).sum())
+        converted = joint in log.meta.get("converted_from", {})
+        if inside and (wraps or converted):  # radians beyond the range may be degrees
+            for name, values in inside.items():
+                positions[name][:, column] = values
+            turned[joint] = {"wraps": wraps, "turns": 0}
+    if not turned:
+        return log
+    channels = {
+        name: Channel(log.channels[name].time, values) for name, values in positions.items()
+    }
+    notes = log.meta.get("notes", {}) | {"turns": turned}
+    return replace(log, channels=log.channels | channels, meta=log.meta | {"notes": notes})
+
+
+def _inside_range(values: Array, low: float, high: float) -> Array | None:
+    """Return one joint's angles (k,) of a turn from zero inside its range; None if they are
+    inside already, no such angles, or none of it helps.
+    """
+    if values.min() < -ROUNDING_RAD or values.max() > TURN_RAD + ROUNDING_RAD:
+        return None
+    if values.max() <= high + MAX_STEP_RAD or values.max() <= TURN_RAD / 2:
+        return None
+    continued = values.copy()
+    _continue(continued)
+    middle = (continued.min() + continued.max()) / 2
+    continued -= TURN_RAD * round((middle - (low + high) / 2) / TURN_RAD)
+    reached = continued.min() >= low - MAX_STEP_RAD and continued.max() <= high + MAX_STEP_RAD
+    return continued if reached else None
 
 
 def _continue(values: Array) -> int:

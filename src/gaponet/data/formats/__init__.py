@@ -46,9 +46,10 @@ from gaponet.base.errors import LogError, UsageError
 from gaponet.base.plugins import attempt
 from gaponet.data.describe.logs_file import LogsFile, Naming, read_logs_file
 from gaponet.data.describe.plausibility import require_plausible
-from gaponet.data.describe.raw_recording import COMMAND, TIME, RawRecording
+from gaponet.data.describe.raw_recording import COMMAND, TIME, RawRecording, by_place
 from gaponet.data.describe.repeats import without_repeated_rows
-from gaponet.data.describe.turns import continued_turns
+from gaponet.data.describe.turns import continued_turns, within_range
+from gaponet.data.describe.unread import what_address, why_unread
 from gaponet.data.log import COMMANDS, Channel, Log, skipped_rows
 from gaponet.robot.spec import RobotSpec
 
@@ -139,8 +140,10 @@ def detect(path: Path) -> str:
         if attempt(where, partial(_detects, fmt, path), False):
             matches.append(fmt)
     others = [fmt for fmt in matches if fmt != "table"]
-    if others and "table" in matches and _are_of(others, module("table").find(path)):
-        matches = others
+    if others and "table" in matches:
+        tables = module("table").find(path)
+        if all(file.parent != path for file in tables) or _are_of(others, tables):
+            matches = others
     if len(matches) == 1:
         return matches[0]
     if matches:
@@ -153,26 +156,13 @@ def detect(path: Path) -> str:
         )
     raise LogError(
         f"{path}: no log of {', '.join(formats())} (gaponet import --formats explains "
-        f"them){_json_hint(path)}"
+        f"them){why_unread(path, [path] if path.is_file() else list(files_below(path)))}"
     )
 
 
 def _are_of(formats: list[str], files: list[Path]) -> bool:
     """Return True if each file is detected by one of the formats."""
     return all(any(_detects(fmt, file) for fmt in formats) for file in files)
-
-
-def _json_hint(path: Path) -> str:
-    """How JSON files become a table; "" where there are none."""
-    files = files_under(path, (".json", ".jsonl", ".ndjson"))
-    if not files:
-        return ""
-    return (
-        f'. {files[0].name} is JSON: make a table of it: python -c "import pandas; '
-        "pandas.read_json("
-        f"'{files[0].name}', "
-        f"lines={files[0].suffix != '.json'}).to_parquet('{files[0].stem}.parquet')\""
-    )
 
 
 def _detects(fmt: str, path: Path) -> bool:
@@ -255,9 +245,9 @@ def read_logs(
     bad = skipped_rows()
     for name, load in _loaders(reader, path, robot, specified, names):
         try:
-            log = _corrected(
-                require_plausible(load(), robot, options.strict), robot, specified, names
-            )
+            log = within_range(load(), robot)
+            log = require_plausible(log, robot, options.strict)
+            log = _corrected(log, robot, specified, names)
             log = without_repeated_rows(log)  # after the checks, which name lines of the file
             log = continued_turns(log, robot)
         except LogError as error:
@@ -305,7 +295,7 @@ def _require_allowed(reader: ModuleType, path: Path, allow_pickle: bool) -> str:
 
 def _reader(path: Path, fmt: str | None) -> ModuleType:
     if not path.exists():
-        raise LogError(f"{path}: does not exist")
+        raise LogError(f"{path}{what_address(path) or ': does not exist'}")
     return module(fmt or detect(path))
 
 
@@ -361,7 +351,7 @@ def _with_files(recordings: list[RawRecording], specified: LogsFile) -> Iterator
     """Join each state file with its command_file and time_file, which are then no recordings of
     their own.
     """
-    by_file = {Path(r.source).name: r for r in recordings}
+    by_file = by_place(recordings)
     states = {file: Path(file).stem for file in by_file}
     if "state_file" in specified:
         states = _named_by(specified["state_file"], by_file)

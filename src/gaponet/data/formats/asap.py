@@ -17,7 +17,7 @@ from gaponet.base.errors import LogError
 from gaponet.base.sandbox import sandboxed
 from gaponet.base.structure import MAX_ARRAYS_BYTES, read_limited
 from gaponet.data.describe.logs_file import LogsFile
-from gaponet.data.describe.raw_recording import RawRecording
+from gaponet.data.describe.raw_recording import RawRecording, require_content
 from gaponet.data.formats import files_under, pickles
 
 SUFFIXES = (".pkl",)
@@ -34,6 +34,7 @@ DEFAULT: LogsFile = {
 def recordings(path: Path, specified: LogsFile) -> Iterator[RawRecording]:
     """Every motion of every file."""
     for file in files_under(path, SUFFIXES):
+        require_content(file)
         motions = _read(file)
         motions = motions if isinstance(motions, dict) else {}
         motions = {str(k): v for k, v in motions.items() if isinstance(v, dict) and "dof" in v}

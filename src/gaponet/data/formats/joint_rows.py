@@ -15,7 +15,7 @@ from gaponet.base.errors import LogError
 from gaponet.base.structure import MAX_ARRAYS_BYTES, read_limited
 from gaponet.data.describe.logs_file import LogsFile
 from gaponet.data.describe.raw_recording import RawRecording
-from gaponet.data.formats import parquet
+from gaponet.data.formats import parquet, text
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -98,7 +98,9 @@ def _table(file: Path, names: list[str]) -> pa.Table:
     import pyarrow as pa
     import pyarrow.csv as pc
 
-    body = read_limited(file, LogError, "cut the log into shorter ones", MAX_ARRAYS_BYTES)
+    body = text.decoded(
+        read_limited(file, LogError, "cut the log into shorter ones", MAX_ARRAYS_BYTES)
+    )
     header = body.partition(b"\n")[0]
     delimiter = next((d for d in ",;\t" if d.encode() in header), " ")
     try:

@@ -28,6 +28,7 @@ import numpy as np
 from gaponet.base.arrays import Array
 from gaponet.base.errors import LogError
 from gaponet.base.sandbox import sandboxed
+from gaponet.data.describe.actions import words_of
 from gaponet.data.describe.logs_file import LogsFile
 from gaponet.data.describe.raw_recording import RawRecording, Signal, reading
 from gaponet.data.formats import files_under
@@ -40,6 +41,8 @@ PEEK = 200  # messages of a topic in which all its joints are named
 LATENCY = 0.1
 DRIFT = 0.005  # s by which a stamp may run away from the recorder's clock during a recording
 COMMANDS = ("command", "cmd", "desired", "target", "goal", "reference", "setpoint")
+# words of topics whose numbers without names are no positions
+NO_POSITIONS = {"velocity", "vel", "effort", "torque", "current", "acceleration", "cartesian"}
 COMMAND_FIELDS = (".position", ".point", ".data", ".q")  # that hold commanded positions
 # Unitree's hg messages, for bags that do not hold the definitions of their messages; fields as in
 # its public IDL.
@@ -109,7 +112,7 @@ def _usual(signals: dict[str, tuple[str, ...]]) -> LogsFile:
     if len(states) > 1:  # a controller's feedback repeats what another topic says
         states = [signal for signal in states if not _is_feedback(signal)] or states
     targets = [signal for signal in signals if signal.endswith(COMMAND_FIELDS)]
-    commands = [signal for signal in targets if _is_command(signal)]
+    commands = [signal for signal in targets if _is_command(signal) and _may_be_positions(signal)]
     specified: LogsFile = {}
     if len(states) == 1:
         specified |= _of_state(states[0], signals)
@@ -117,6 +120,11 @@ def _usual(signals: dict[str, tuple[str, ...]]) -> LogsFile:
     if command:
         specified |= _of_command(command, signals)
     return specified
+
+
+def _may_be_positions(signal: str) -> bool:
+    """Return False for numbers without names in a topic of speeds or torques."""
+    return not (signal.endswith(".data") and NO_POSITIONS & words_of(signal))
 
 
 def _is_feedback(signal: str) -> bool:

@@ -15,17 +15,23 @@ import re
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from gaponet.base.arrays import Array
 from gaponet.base.errors import LogError
 from gaponet.base.structure import MAX_ARRAYS_BYTES, read_limited
+from gaponet.data.describe.clocks import with_whole_seconds
+from gaponet.data.describe.dates import is_date, to_seconds
 from gaponet.data.describe.logs_file import LogsFile
-from gaponet.data.describe.raw_recording import RawRecording, Signal, require_content
-from gaponet.data.formats import files_under, joint_rows, parquet
-from gaponet.data.formats.dates import is_date, to_seconds
+from gaponet.data.describe.raw_recording import (
+    GIT_LFS_POINTER,
+    RawRecording,
+    Signal,
+    require_content,
+)
+from gaponet.data.formats import files_under, joint_rows, parquet, text
 from gaponet.data.formats.episodes import episodes
 from gaponet.data.log import skipped_rows
 
@@ -40,7 +46,7 @@ MIN_TRANSPOSED_CELLS = (
     20  # of the first row of a table that can be transposed; times the rows, where nothing is named
 )
 DECIMAL_SAMPLE_BYTES = 20_000  # of the first rows, by which decimal commas are told
-EMPTY = ("", "nan", "NaN", "NA", "N/A", "null", "None")  # cells without a number
+THOUSANDS = re.compile(r"[-+]?\d{1,3}([., ']\d{3})+([.,]\d*)?|[-+]?\d+,\d+")  # as 1,234.5
 DEFAULT: LogsFile = {
     "time": "time",
     "ctrl": "ctrl.{joint}",
@@ -62,15 +68,12 @@ def detects(path: Path) -> bool:
 
 
 def find(path: Path) -> list[Path]:
-    """The file, or the tables directly in the folder."""
+    """The file, or the tables directly in the folder; those below it if there are none."""
     if path.is_file():
         return files_under(path, SUFFIXES)
-    tables = [
-        f
-        for f in path.iterdir()
-        if f.is_file() and f.suffix.lower() in SUFFIXES and f.name not in NOT_OURS
-    ]
-    return sorted(f for f in tables if not f.name.startswith(".") and _is_table(f))
+    below = [file for file in files_under(path, SUFFIXES) if file.name not in NOT_OURS]
+    directly = [file for file in below if file.parent == path and _is_table(file)]
+    return directly or [file for file in below if file.parent != path and _is_table(file)]
 
 
 def recordings(path: Path, specified: LogsFile) -> Iterator[RawRecording]:
@@ -80,31 +83,42 @@ def recordings(path: Path, specified: LogsFile) -> Iterator[RawRecording]:
         raise LogError(
             f"{path}: no .csv, .txt or .parquet file in it; point at a table or a folder of tables"
         )
+    stems = [file.stem for file in files]
     for file in files:
+        name = file.stem
+        if stems.count(name) > 1:  # day1/run.csv and day2/run.csv
+            name = "-".join(file.relative_to(path).with_suffix("").parts)
         line = 1
+        meta: dict[str, Any] = {}
         signals: dict[str, tuple[str, ...]] = {}
         if file.suffix.lower() == ".parquet":
             names = _parquet_header(file)
             load = partial(_read_parquet, file)
             lists = parquet.list_widths(file).items()
-            signals = {name: tuple(map(str, range(width))) for name, width in lists}
+            signals = {column: tuple(map(str, range(width))) for column, width in lists}
         else:
-            names, first = _csv_header(file, specified.get("header"))
-            load = partial(_read_csv, file, names, first)
-            line = first + 1
+            found = _heading(file, specified.get("header"))
+            names = found.names
+            load = partial(_read_csv, file, found)
+            line = found.first + 1
+            if found.units:
+                meta = {"notes": {"units": dict(zip(names, found.units, strict=False))}}
         _refuse_twice(file, names, [name for name in names if name.split(".")[0] in DEFAULT])
         load = partial(_load_once, file, names, load)
         if joint := joint_rows.joint_column(names, specified):
             yield joint_rows.recording(file, names, joint, specified)
             continue
+        signals = dict.fromkeys(names, ()) | signals
+        signals, load_joined = with_whole_seconds(signals, load)
         whole = RawRecording(
-            file.stem,
+            name,
             str(file),
-            dict.fromkeys(names, ()) | signals,
-            load,
+            signals,
+            load_joined,
             f"{file}:1",
             (str(file),),
             line,
+            meta,
         )
         yield from episodes(whole)
 
@@ -126,22 +140,16 @@ def _load_once(
 
 def _is_table(file: Path) -> bool:
     """A manifest is none, and a text file counts when its second line is made of numbers."""
-    with file.open("rb") as stream:
-        lines = stream.read(1 << 16).decode("utf-8", "replace").splitlines()
+    beginning = text.beginning(file)
     if file.suffix.lower() not in (".txt", ".dat"):
-        return not (lines and lines[0].lstrip("\ufeff").startswith("file,"))
-    return len(lines) > 1 and _numeric(lines[1].split(_delimiter(lines[1]).strip() or None))
-
-
-def _delimiter(line: str) -> str:
-    """Return the separator of cells; a space for any white space.
-
-    Cells between semicolons can hold a decimal comma each.
-    """
-    semicolons = line.count(";")
-    if semicolons and semicolons >= line.count(",") - 1:
-        return ";"
-    return next((d for d in (",", ";", "\t") if d in line), " ")
+        return not beginning.startswith("file,")
+    if beginning.encode().startswith(GIT_LFS_POINTER):
+        return True  # refused by name when it is read
+    try:
+        cells = text.heading(beginning).cells
+    except csv.Error:
+        return False
+    return len(beginning.splitlines()) > 1 and bool(cells) and text.is_numeric(cells)
 
 
 def _has_decimal_commas(body: bytes, delimiter: str) -> bool:
@@ -154,46 +162,36 @@ def _has_decimal_commas(body: bytes, delimiter: str) -> bool:
     return b"," in first_rows and not re.search(rb"\d\.\d", first_rows)
 
 
-def _numeric(cells: list[str]) -> bool:
-    """Return True if all cells are numbers, with a decimal point or a decimal comma."""
-    try:
-        numbers = [cell for cell in cells if cell.strip() and not is_date(cell)]
-        return bool([float(cell.replace(",", ".")) for cell in numbers])
-    except ValueError:
-        return False
-
-
-def _csv_header(file: Path, given: list[str] | None) -> tuple[list[str], int]:
-    """Names of the columns, and how many lines stand before the first row."""
+def _heading(file: Path, given: list[str] | None) -> text.Heading:
+    """Where the header stands; `given` names the columns of a table without one."""
     require_content(file)
-    with file.open(encoding="utf-8-sig", errors="replace", newline="") as lines:
-        try:
-            line = lines.readline(1 << 20)
-            header = next(csv.reader([line], delimiter=_delimiter(line), skipinitialspace=True), [])
-        except csv.Error as error:
-            raise LogError(
-                f"{file}:1: not a header of a table ({error}); is it the right file?"
-            ) from None
-    header = line.split() if _delimiter(line) == " " else header
-    if not any(header):
-        raise LogError(f"{file}: empty; a table needs a header line and rows")
-    _refuse_transposed(file, header)
-    if not _numeric(header):
-        return [name.strip() for name in header], 1
-    if given is None:
-        return [str(i) for i in range(len(header))], 0
-    if len(given) != len(header):
+    try:
+        found = text.heading(text.beginning(file))
+    except csv.Error as error:
         raise LogError(
-            f"{file}:1: {len(header)} cells, header in logs.toml names {len(given)}; name each"
+            f"{file}:1: not a header of a table ({error}); is it the right file?"
+        ) from None
+    first = found.names or found.cells
+    if not any(first):
+        raise LogError(f"{file}: empty; a table needs a header line and rows")
+    _refuse_transposed(file, first)
+    if found.names:
+        return found
+    if given is None:
+        return found._replace(names=[str(i) for i in range(len(first))])
+    if len(given) != len(first):
+        raise LogError(
+            f"{file}:{found.first + 1}: {len(first)} cells, header in logs.toml names "
+            f"{len(given)}; name each"
         )
-    return given, 0
+    return found._replace(names=given)
 
 
 def _refuse_transposed(file: Path, first: list[str]) -> None:
     """Refuse a table with a row per signal, whose first row has these cells."""
-    if len(first) < MIN_TRANSPOSED_CELLS or not _numeric(first[1:]):
+    if len(first) < MIN_TRANSPOSED_CELLS or not text.is_numeric(first[1:]):
         return
-    named = not _numeric(first[:1])
+    named = not text.is_numeric(first[:1])
     with file.open("rb") as lines:
         rows = sum(1 for _ in lines)
     if named or rows * MIN_TRANSPOSED_CELLS < len(first):
@@ -208,7 +206,7 @@ def _refuse_transposed(file: Path, first: list[str]) -> None:
         )
 
 
-def _read_csv(file: Path, names: list[str], first: int, wanted: list[str]) -> dict[str, Signal]:
+def _read_csv(file: Path, found: text.Heading, wanted: list[str]) -> dict[str, Signal]:
     """{column: (k,)}; an empty cell is NaN, a short row or an unreadable cell too where rows are
     cut, else refused.
     """
@@ -216,10 +214,9 @@ def _read_csv(file: Path, names: list[str], first: int, wanted: list[str]) -> di
     import pyarrow.csv as pc
 
     body = read_limited(file, LogError, "cut the log into shorter ones", MAX_ARRAYS_BYTES)
-    line = _first_line(body)
-    delimiter = _delimiter(line.decode("utf-8", "replace"))
-    before = len(line) + 1 if first else 0
-    body = body[before:].removeprefix(b"\xef\xbb\xbf").rstrip()
+    names = found.names
+    delimiter = found.delimiter
+    body = _rows(text.decoded(body), found.first)
     if not body:
         raise LogError(f"{file}: holds a header and no rows; delete it or record again")
     if delimiter == " ":
@@ -238,19 +235,31 @@ def _read_csv(file: Path, names: list[str], first: int, wanted: list[str]) -> di
                 include_columns=wanted,
                 column_types=dict.fromkeys(wanted, pa.float64())
                 | dict.fromkeys(dates, pa.string()),
-                null_values=list(EMPTY),
+                null_values=list(text.EMPTY),
                 decimal_point="," if _has_decimal_commas(body, delimiter) else ".",
             ),
         )
         return {name: _signal(file, table.column(name), name in dates) for name in wanted}
     except pa.ArrowInvalid as error:
         reason = str(error)
-    rows = _read_slowly(file, body.decode("utf-8", "replace"), names, wanted, delimiter, first)
+    rows = _read_slowly(
+        file, body.decode("utf-8", "replace"), names, wanted, delimiter, found.first
+    )
     if not rows:
         raise LogError(f"{file}: not a readable CSV file ({reason}); export it again")
     return {
         name: Signal(column) for name, column in zip(wanted, np.array(rows, float).T, strict=True)
     }
+
+
+def _rows(body: bytes, first: int) -> bytes:
+    """Return the text behind so many lines."""
+    start = 0
+    for _ in range(first):
+        start = body.find(b"\n", start) + 1
+        if not start:
+            return b""
+    return body[start:].rstrip()
 
 
 def _first_line(body: bytes) -> bytes:
@@ -306,9 +315,20 @@ def _number(row: list[str], place: int, names: list[str], name: str) -> float:
             f"{len(row)} cells, the header has {len(names)}; the file may be cut short"
         )
     try:
-        return np.nan if row[place].strip() in EMPTY else float(row[place])
+        return np.nan if row[place].strip() in text.EMPTY else float(row[place])
     except ValueError:
-        raise ValueError(f"column '{name}' is '{row[place][:60]}', not a number") from None
+        cell = row[place].strip()[:60]
+        if THOUSANDS.fullmatch(cell):
+            raise ValueError(
+                f"column '{name}' is '{cell}': a number with separators between thousands; export "
+                "the table without them"
+            ) from None
+        if cell.startswith(("[", "(", "{")):
+            raise ValueError(
+                f"column '{name}' holds lists ({cell}); write a column per joint, or Parquet "
+                "with lists"
+            ) from None
+        raise ValueError(f"column '{name}' is '{cell}', not a number") from None
 
 
 def _parquet_header(file: Path) -> list[str]:
@@ -340,6 +360,11 @@ def _read_parquet(file: Path, wanted: list[str]) -> dict[str, Signal]:
         if name in widths:
             data[name] = Signal(_matrix(file, name, column, widths[name]))
             continue
+        if pa.types.is_struct(column.type):
+            raise LogError(
+                f"{file}: cells of '{name}' hold named values ({column.type}); make a column of "
+                "each: pyarrow.Table.flatten() does"
+            )
         if not joint_rows.is_number(column.type):
             raise LogError(
                 f"{file}: column '{name}' is {column.type}, not numbers; export it as float64"
@@ -349,11 +374,18 @@ def _read_parquet(file: Path, wanted: list[str]) -> dict[str, Signal]:
 
 
 def _matrix(file: Path, name: str, column: pa.ChunkedArray, width: int) -> Array:
-    """Return a column of lists as (k, width); refuses lists of other lengths."""
+    """Return a column of lists as (k, width), NaN for an empty cell; refuses lists of other
+    lengths.
+    """
     lists = column.combine_chunks()
-    if lists.null_count or any(len(cell) != width for cell in lists):
+    present = np.asarray(lists.is_valid())
+    lists = lists.drop_null()
+    if any(len(cell) != width for cell in lists):
         raise LogError(
             f"{file}: the lists in column '{name}' are not all {width} numbers long; repair or "
             "cut the rows"
         )
-    return np.asarray(lists.flatten().to_numpy(zero_copy_only=False), float).reshape(-1, width)
+    values = np.full((len(present), width), np.nan)
+    numbers = lists.flatten().to_numpy(zero_copy_only=False)
+    values[present] = np.asarray(numbers, float).reshape(-1, width)
+    return values

@@ -13,13 +13,19 @@ from gaponet.base.errors import LogError
 
 DAY_S = 86400.0
 DATE = re.compile(r"\d{4}-?\d\d-?\d\d[T ]\d\d:?\d\d")
+# 29.03.2026 12:00:00,125 and 03/29/2026 12:00:00.125 PM
+DAY_OR_MONTH_FIRST = re.compile(
+    r"(\d\d?)([./])(\d\d?)\2(\d{4})[T, ]+(\d\d?:\d\d(?::\d\d(?:[.,]\d+)?)?) ?([AaPp][Mm])?"
+)
 TIME_OF_DAY = re.compile(r"\d\d?:\d\d(:\d\d([.,]\d+)?)?")
 
 
 def is_date(cell: str) -> bool:
     """Return True for 2026-03-01T12:00:00.125Z, 2026-03-01 12:00:00,125+01:00 and 12:00:00.125."""
     cell = cell.strip().strip('"')
-    return bool(DATE.match(cell) or TIME_OF_DAY.fullmatch(cell))
+    if DATE.match(cell) or TIME_OF_DAY.fullmatch(cell):
+        return True
+    return DAY_OR_MONTH_FIRST.fullmatch(cell) is not None
 
 
 def to_seconds(cells: Sequence[str | None], where: str) -> Array:
@@ -28,6 +34,7 @@ def to_seconds(cells: Sequence[str | None], where: str) -> Array:
     Raises:
         LogError: A cell is no date.
     """
+    day_first = _day_comes_first(cells)
     first: datetime | None = None
     seconds = np.full(len(cells), np.nan)
     days = np.zeros(len(cells))
@@ -36,7 +43,7 @@ def to_seconds(cells: Sequence[str | None], where: str) -> Array:
         if not text:
             continue
         try:
-            at = _parse(text)
+            at = _parse(_iso(text, day_first))
         except ValueError:
             raise LogError(
                 f"{where}: the clock's cell '{text[:40]}' in row {i + 1} is no date and time as "
@@ -48,6 +55,35 @@ def to_seconds(cells: Sequence[str | None], where: str) -> Array:
         midnight = np.diff(seconds, prepend=seconds[0]) < -DAY_S / 2
         days = np.cumsum(midnight)
     return seconds + DAY_S * days
+
+
+def _day_comes_first(cells: Sequence[str | None]) -> bool:
+    """Return True if the day stands before the month: behind it there is a dot, a number above 12,
+    or the days of a recording would be months apart.
+    """
+    matches = [DAY_OR_MONTH_FIRST.fullmatch((cell or "").strip().strip('"')) for cell in cells]
+    fields = [match.groups() for match in matches if match]
+    if any(field[1] == "." for field in fields):
+        return True
+    first = {field[0] for field in fields}
+    second = {field[2] for field in fields}
+    return any(int(number) > 12 for number in first) or len(first) > len(second)
+
+
+def _iso(text: str, day_first: bool) -> str:
+    """Return a date in another form as ISO 8601."""
+    match = DAY_OR_MONTH_FIRST.fullmatch(text)
+    if match is None:
+        return text
+    one, _, other, year, clock, half = match.groups()
+    day, month = (one, other) if day_first else (other, one)
+    hours, _, rest = clock.partition(":")
+    hour = int(hours)
+    if half:
+        hour %= 12
+        if half.lower() == "pm":
+            hour += 12
+    return f"{year}-{int(month):02}-{int(day):02} {hour:02}:{rest}"
 
 
 def _parse(text: str) -> datetime:

@@ -1,0 +1,181 @@
+"""Text of tables as programs write it: its encoding, its line ends, and where its header stands."""
+
+from __future__ import annotations
+
+import codecs
+import csv
+import re
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+from gaponet.data.describe.dates import is_date
+
+HEAD_BYTES = 1 << 20  # in which header and first rows stand
+COMMENT = re.compile(r"\s*(#|%|//)+\s*")
+MAX_PREAMBLE_LINES = 100  # before the header
+MIN_ALIKE_LINES = 5  # with as many cells as the header, from which a text before it is told
+EMPTY = ("", "nan", "NaN", "NA", "N/A", "null", "None")  # cells without a number
+UTF16 = {codecs.BOM_UTF16_LE: "utf-16-le", codecs.BOM_UTF16_BE: "utf-16-be"}
+
+
+class Heading(NamedTuple):
+    """Where the header of a table stands.
+
+    Attributes:
+        names: Of the columns; empty if nothing names them.
+        first: Lines before the first row.
+        cells: Of the first row.
+        delimiter: Of the cells, as the header shows it, or the first row.
+        units: The cells of a second line of the header, which holds units; empty if there is none.
+    """
+
+    names: list[str]
+    first: int
+    cells: list[str]
+    delimiter: str
+    units: list[str]
+
+
+def decoded(body: bytes) -> bytes:
+    r"""Return the text of a file in UTF-8, without a mark of its encoding, and with \n at ends of
+    lines.
+    """
+    encoding = UTF16.get(body[:2])
+    if encoding:
+        body = body[2:].decode(encoding, "replace").encode()
+    body = body.removeprefix(codecs.BOM_UTF8)
+    if b"\n" not in body:
+        body = body.replace(b"\r", b"\n")
+    return body
+
+
+def beginning(file: Path) -> str:
+    """Return the first lines of a file."""
+    with file.open("rb") as stream:
+        body = decoded(stream.read(HEAD_BYTES))
+    lines = body.decode("utf-8", "replace").split("\n")
+    return "\n".join(lines[: MAX_PREAMBLE_LINES * 2])
+
+
+def delimiter_of(line: str) -> str:
+    """Return the separator of cells; a space for any white space.
+
+    Cells between semicolons can hold a decimal comma each.
+    """
+    semicolons = line.count(";")
+    if semicolons and semicolons >= line.count(",") - 1:
+        return ";"
+    for delimiter in ("\t", " "):
+        cells = line.split(None if delimiter == " " else delimiter)
+        ends = any(cell.strip().endswith(",") for cell in cells)
+        if "," in line and len(cells) > 1 and not ends and is_numeric(cells):
+            return delimiter
+    return next((d for d in (",", ";", "\t") if d in line), " ")
+
+
+def cells_of(line: str) -> list[str]:
+    """Return the cells of a line, by the separator that it shows.
+
+    Raises:
+        csv.Error: It is no line of a table.
+    """
+    line = line.rstrip("\r\n")
+    delimiter = delimiter_of(line)
+    cells = next(csv.reader([line], delimiter=delimiter, skipinitialspace=True), [])
+    return line.split() if delimiter == " " else cells
+
+
+def is_numeric(cells: Sequence[str]) -> bool:
+    """Return True if all cells are numbers, with a decimal point or a decimal comma, or dates."""
+    try:
+        numbers = [cell for cell in cells if cell.strip() and not is_date(cell)]
+        return bool([float(cell.replace(",", ".")) for cell in numbers])
+    except ValueError:
+        return False
+
+
+def heading(text: str) -> Heading:
+    """Return where the header of a table stands, by the beginning of its text.
+
+    Comments and other lines before it are left out. Without a header, the first row of numbers
+    counts.
+
+    Raises:
+        csv.Error: It is no table.
+    """
+    lines = text.split("\n")
+    start = _after_comments(lines)
+    named = start and _names_row_after(lines, start)
+    if named:
+        lines = [*lines[: start - 1], COMMENT.sub("", lines[start - 1], count=1), *lines[start:]]
+        start -= 1
+    else:
+        start = _after_preamble(lines, start)
+    header = lines[start] if start < len(lines) else ""
+    names = cells_of(header)
+    delimiter = delimiter_of(header)
+    if is_numeric(names):
+        return Heading([], start, names, delimiter, [])
+    units: list[str] = []
+    row, below = (_row(lines, start + i) for i in (1, 2))
+    if len(row) == len(names) and _holds_no_number(row) and is_numeric(below):
+        units = row
+        row = below
+    if len(row) == len(names) + 1 and not row[-1]:
+        names = [*names, ""]  # each row ends with a separator
+    names = [name.strip() for name in names]
+    return Heading(names, start + 1 + len(units[:1]), row, delimiter, units)
+
+
+def _after_comments(lines: list[str]) -> int:
+    """Return the first line that is no comment."""
+    for i, line in enumerate(lines):
+        if line.strip() and not COMMENT.match(line):
+            return i
+    return 0
+
+
+def _names_row_after(lines: list[str], start: int) -> bool:
+    """Return True if the comment before a row of numbers names its columns, as numpy.savetxt
+    writes it.
+    """
+    row = cells_of(lines[start])
+    names = cells_of(COMMENT.sub("", lines[start - 1], count=1))
+    return len(row) > 1 and is_numeric(row) and len(names) == len(row) and not is_numeric(names)
+
+
+def _after_preamble(lines: list[str], start: int) -> int:
+    """Return the line of the header: of text before it, lines have other numbers of cells than the
+    rows have.
+    """
+    counts = [_count(line) for line in lines[start:] if line.strip()]
+    if len(counts) <= MIN_ALIKE_LINES:
+        return start
+    usual, alike = Counter(counts).most_common(1)[0]
+    if alike < MIN_ALIKE_LINES or usual < 2 or counts[0] == usual or counts[0] == usual - 1:
+        return start
+    for i in range(start, min(len(lines), start + MAX_PREAMBLE_LINES)):
+        after = [_count(line) for line in lines[i : i + MIN_ALIKE_LINES]]
+        if after == [usual] * MIN_ALIKE_LINES:
+            return i
+    return start
+
+
+def _row(lines: list[str], at: int) -> list[str]:
+    """Return the cells of a line; none if there is no such line, or it is none of a table."""
+    if at >= len(lines) or not _count(lines[at]):
+        return []
+    return cells_of(lines[at])
+
+
+def _count(line: str) -> int:
+    try:
+        return len(cells_of(line))
+    except csv.Error:  # told with its number when the rows are read
+        return 0
+
+
+def _holds_no_number(cells: list[str]) -> bool:
+    return any(cells) and not any(is_numeric([cell]) for cell in cells if cell not in EMPTY)

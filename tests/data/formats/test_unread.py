@@ -1,0 +1,88 @@
+"""Files that are no log as they lie there: the message says what to do with them."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from logs import arm_columns, table_text
+
+from gaponet.base.errors import LogError
+from gaponet.data.describe.guess import guess_logs
+from gaponet.data.formats import ReadOptions, detect, look, read_logs
+
+SI = ReadOptions(position_unit="rad", time_unit="s")
+POINTER = "version https://git-lfs.github.com/spec/v1\noid sha256:00\nsize 1\n"
+JOINTS = ("shoulder", "elbow")
+
+
+@pytest.mark.parametrize(
+    ("name", "word"),
+    [
+        ("logs.zip", "unpack"),
+        ("m.csv.gz", "unpack"),
+        ("m.xlsx", "CSV"),
+        ("m.npy", "savez"),
+        ("m.txt", "--format table"),
+    ],
+)
+def test_what_is_no_log_yet_is_named_with_what_to_do(tmp_path, name, word):
+    (tmp_path / name).write_bytes(b"PK\x03\x04 0 0\n")
+    with pytest.raises(LogError, match=word):
+        detect(tmp_path)
+
+
+@pytest.mark.parametrize("suffix", ["csv", "txt", "json", "npz", "mat", "h5", "parquet", "tsv"])
+def test_a_git_lfs_pointer_is_named_whatever_its_suffix(tmp_path, arm, suffix):
+    (tmp_path / f"m.{suffix}").write_text(POINTER)
+    with pytest.raises(LogError, match="LFS"):
+        list(read_logs(tmp_path, arm, SI))
+
+
+def test_the_address_of_a_dataset_names_the_download(arm):
+    with pytest.raises(LogError, match="hf download user/set"):
+        list(read_logs(Path("hf://user/set"), arm, SI))
+
+
+def test_tables_in_folders_below_are_recordings_with_names_of_their_own(tmp_path, arm):
+    columns = arm_columns()
+    for day in ("monday", "tuesday"):
+        (tmp_path / day).mkdir()
+        (tmp_path / day / "run.csv").write_text(table_text(columns))
+    assert [name for name, _ in read_logs(tmp_path, arm, SI)] == ["monday-run", "tuesday-run"]
+
+
+@pytest.mark.parametrize("pattern", ["{name}/{kind}.csv", "{kind}/{name}.csv"])
+def test_files_that_belong_together_may_lie_in_folders(tmp_path, arm, pattern):
+    columns = arm_columns()
+    arrays = {
+        "time": columns["time"],
+        "desired": np.stack([columns[f"ctrl.{joint}"] for joint in JOINTS], axis=1),
+        "measured": np.stack([columns[f"qpos.{joint}"] for joint in JOINTS], axis=1),
+    }
+    for name in ("run0", "run1"):
+        for kind, values in arrays.items():
+            file = tmp_path / "logs" / pattern.format(name=name, kind=kind)
+            file.parent.mkdir(parents=True, exist_ok=True)
+            np.savetxt(file, values, delimiter=",")
+    kind, known, found = look(tmp_path / "logs")
+    (tmp_path / "logs.toml").write_text(guess_logs(found, arm, kind, dict(known)))
+    logs = dict(read_logs(tmp_path / "logs", arm, ReadOptions(logs=tmp_path / "logs.toml")))
+    assert list(logs) == ["run0", "run1"]
+    assert np.array_equal(logs["run1"].channels["ctrl"].values, arrays["desired"])
+
+
+def test_a_file_per_joint_is_refused(tmp_path, arm):
+    columns = arm_columns()
+    for joint in JOINTS:
+        one = {"t": columns["time"]}
+        one |= {"cmd": columns[f"ctrl.{joint}"], "pos": columns[f"qpos.{joint}"]}
+        (tmp_path / f"{joint}.csv").write_text(table_text(one))
+    kind, known, found = look(tmp_path)
+    with pytest.raises(LogError, match="per joint"):
+        guess_logs(found, arm, kind, dict(known))
+
+
+def test_several_recordings_in_one_array_are_named(tmp_path, arm):
+    np.savez(tmp_path / "m.npz", cmd=np.zeros((3, 50, 2)), pos=np.zeros((3, 50, 2)))
+    with pytest.raises(LogError, match="three axes"):
+        look(tmp_path)
