@@ -352,3 +352,16 @@ def test_a_mimic_joint_follows_without_a_motor(tmp_path, ratio, at_zero):
     log = Log(robot.name, ("drive",), channels, "m.csv")
     sequence = to_sequence(log, robot, SequenceMeta(robot.name, "u", "m", 0.0))
     assert np.allclose(sequence.qpos[:, led], ratio * angle[:, 0] + at_zero, atol=1e-6)
+
+
+def test_a_mimic_joint_of_a_mimic_joint_follows_the_motor(tmp_path):
+    first = '<mimic joint="drive" multiplier="-0.5" offset="0.2"/>'
+    second = '<mimic joint="led" multiplier="2" offset="0.1"/>'
+    joints = "".join(
+        FINGER.format(name=name, mimic=mimic)
+        for name, mimic in (("drive", ""), ("led", first), ("tip", second))
+    )
+    (tmp_path / "hand.urdf").write_text(MIMIC.format(joints=joints))
+    robot = make(tmp_path, tmp_path / "hand.urdf").robot
+    assert robot.operated == ("drive",)
+    assert robot.followers["tip"] == ("drive", -1.0, pytest.approx(0.5))

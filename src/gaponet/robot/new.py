@@ -172,7 +172,22 @@ def _followers(
         zero = _reference(model, name)
         leader_zero = _reference(model, leader)
         followers[name] = Follower(leader, ratio, zero + constant - ratio * leader_zero)
-    return {name: led for name, led in followers.items() if led.joint not in followers}
+    driven = {name: _behind_motor(name, followers) for name in followers}
+    return {name: follower for name, follower in driven.items() if follower is not None}
+
+
+def _behind_motor(name: str, followers: dict[str, Follower]) -> Follower | None:
+    """Return a follower by the joint with a motor at the head of its chain; None for a circle."""
+    follower = followers[name]
+    seen = {name}
+    while follower.joint in followers:
+        if follower.joint in seen:
+            return None
+        seen.add(follower.joint)
+        leader = followers[follower.joint]
+        at_zero = follower.ratio * leader.at_zero + follower.at_zero
+        follower = Follower(leader.joint, follower.ratio * leader.ratio, at_zero)
+    return follower
 
 
 def _hinge_name(model: mujoco.MjModel, joint: int) -> str:

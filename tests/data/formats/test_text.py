@@ -87,17 +87,19 @@ def test_channels_of_different_lengths_have_no_rate_in_common(tmp_path, arm):
         list(read_logs(tmp_path, arm))
 
 
+@pytest.mark.parametrize("decimal", [".", ","])
 @pytest.mark.parametrize(
     "form", ["%d.%m.%Y %H:%M:%S,%f", "%m/%d/%Y %I:%M:%S.%f %p", "%d/%m/%Y %H:%M:%S.%f"]
 )
-def test_dates_may_begin_with_the_day_or_the_month(tmp_path, arm, form):
+def test_dates_may_begin_with_the_day_or_the_month(tmp_path, arm, form, decimal):
     columns = arm_columns(ROWS)
     start = np.datetime64("2026-03-04T23:59:59.5")
     at = start + (1e6 * columns.pop("time")).round().astype("timedelta64[us]")
     names, *rows = table_text(columns).splitlines()
     lines = [f"stamp;{names.replace(',', ';')}"]
     for moment, row in zip(at, rows, strict=True):
-        lines.append(f"{moment.item().strftime(form)};{row.replace(',', ';')}")
+        cells = row.replace(",", ";").replace(".", decimal)
+        lines.append(f"{moment.item().strftime(form)};{cells}")
     (tmp_path / "m.csv").write_text("\n".join(lines) + "\n")
     (tmp_path / "logs.toml").write_text('time = "stamp"\nposition_unit = "rad"\n')
     ((_, log),) = read_logs(tmp_path, arm)

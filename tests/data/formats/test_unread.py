@@ -9,6 +9,7 @@ from logs import arm_columns, table_text
 from gaponet.base.errors import LogError
 from gaponet.data.describe.guess import guess_logs
 from gaponet.data.formats import ReadOptions, detect, look, read_logs
+from gaponet.data.importer import import_logs
 
 SI = ReadOptions(position_unit="rad", time_unit="s")
 POINTER = "version https://git-lfs.github.com/spec/v1\noid sha256:00\nsize 1\n"
@@ -49,6 +50,15 @@ def test_tables_in_folders_below_are_recordings_with_names_of_their_own(tmp_path
         (tmp_path / day).mkdir()
         (tmp_path / day / "run.csv").write_text(table_text(columns))
     assert [name for name, _ in read_logs(tmp_path, arm, SI)] == ["monday-run", "tuesday-run"]
+
+
+def test_recordings_of_a_dataset_are_no_tables(tmp_path, arm):
+    (tmp_path / "logs").mkdir()
+    (tmp_path / "logs" / "m.csv").write_text(table_text(arm_columns()))
+    units = {"position_unit": "rad", "time_unit": "s"}
+    import_logs(tmp_path / "logs", arm, "u", 0.0, tmp_path / "data", **units)
+    with pytest.raises(LogError, match="is a dataset"):
+        detect(tmp_path / "data")
 
 
 @pytest.mark.parametrize("pattern", ["{name}/{kind}.csv", "{kind}/{name}.csv"])

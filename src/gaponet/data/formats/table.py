@@ -46,6 +46,7 @@ MIN_TRANSPOSED_CELLS = (
     20  # of the first row of a table that can be transposed; times the rows, where nothing is named
 )
 DECIMAL_SAMPLE_BYTES = 20_000  # of the first rows, by which decimal commas are told
+DATES = re.compile(rb"\d\d?\.\d\d?\.\d{4}|:\d\d[.,]\d+")  # whose points and commas are no decimals
 THOUSANDS = re.compile(r"[-+]?\d{1,3}([., ']\d{3})+([.,]\d*)?|[-+]?\d+,\d+")  # as 1,234.5
 DEFAULT: LogsFile = {
     "time": "time",
@@ -73,7 +74,14 @@ def find(path: Path) -> list[Path]:
         return files_under(path, SUFFIXES)
     below = [file for file in files_under(path, SUFFIXES) if file.name not in NOT_OURS]
     directly = [file for file in below if file.parent == path and _is_table(file)]
-    return directly or [file for file in below if file.parent != path and _is_table(file)]
+    if directly:
+        return directly
+    datasets = {folder for file in below for folder in file.parents if _is_dataset(folder)}
+    return [file for file in below if not datasets & {*file.parents} and _is_table(file)]
+
+
+def _is_dataset(folder: Path) -> bool:
+    return (folder / "dataset.json").is_file()
 
 
 def recordings(path: Path, specified: LogsFile) -> Iterator[RawRecording]:
@@ -158,7 +166,7 @@ def _has_decimal_commas(body: bytes, delimiter: str) -> bool:
     """
     if delimiter == ",":
         return False
-    first_rows = body[:DECIMAL_SAMPLE_BYTES]
+    first_rows = DATES.sub(b"", body[:DECIMAL_SAMPLE_BYTES])
     return b"," in first_rows and not re.search(rb"\d\.\d", first_rows)
 
 
