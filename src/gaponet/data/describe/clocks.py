@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -81,6 +82,16 @@ def with_whole_seconds(
     """Return signals, and what reads them, with one clock for each pair of columns that hold
     seconds and the nanoseconds beyond them, as ROS writes stamps.
     """
+    pairs = _stamps(signals)
+    if not pairs:
+        return signals, load
+    parts = {part for pair in pairs.values() for part in pair}
+    joined = dict.fromkeys(pairs, ()) | {n: x for n, x in signals.items() if n not in parts}
+    return joined, partial(_load_stamps, load, pairs)
+
+
+def _stamps(signals: Collection[str]) -> dict[str, tuple[str, str]]:
+    """Return name of a stamp → columns of its seconds, and of the nanoseconds beyond them."""
     pairs: dict[str, tuple[str, str]] = {}
     for whole in signals:
         match = WHOLE_SECONDS.fullmatch(whole)
@@ -89,27 +100,21 @@ def with_whole_seconds(
         for ending in NANOSECONDS:
             if match[1] + ending in signals:
                 pairs[match[1].rstrip("._/ ") or "stamp"] = (whole, match[1] + ending)
-    if not pairs:
-        return signals, load
-    parts = {part for pair in pairs.values() for part in pair}
-    joined = dict.fromkeys(pairs, ()) | {n: x for n, x in signals.items() if n not in parts}
+    return pairs
 
-    def load_joined(names: list[str]) -> dict[str, Any]:
-        wanted = [name for name in names if name not in pairs]
-        for name in names:
-            wanted += pairs.get(name, ())
-        loaded = load(wanted)
-        result = {}
-        for name in names:
-            if name not in pairs:
-                result[name] = loaded[name]
-                continue
+
+def _load_stamps(load: Load, pairs: dict[str, tuple[str, str]], names: list[str]) -> dict[str, Any]:
+    """Load signals, and stamps of pairs as seconds after the first one."""
+    wanted = [name for name in names if name not in pairs]
+    for name in names:
+        wanted += pairs.get(name, ())
+    loaded = load(wanted)
+    for name in names:
+        if name in pairs:
             whole, beyond = (loaded[part] for part in pairs[name])
             seconds = whole.values - whole.values[0] + 1e-9 * beyond.values
-            result[name] = whole._replace(values=seconds, in_seconds=True)
-        return result
-
-    return joined, load_joined
+            loaded[name] = whole._replace(values=seconds, in_seconds=True)
+    return {name: loaded[name] for name in names}
 
 
 def named_like_a_clock(name: str) -> bool:

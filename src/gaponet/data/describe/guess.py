@@ -120,7 +120,7 @@ def _guess_one_file(
     for need in ("ctrl", "qpos"):
         if need not in channels:
             lines.append(f'# {need} = "…"          ? none of the names looks like it')
-    if "ctrl" not in channels and "tau" in channels and "qpos" in channels:
+    if "ctrl" not in channels and {"tau", "qpos"} <= channels.keys():
         lines.append("# driven by torque? then the position's name also for ctrl: docs/logs.md")
     repeated = _repeated(recordings, channels.get("ctrl", ""))
     names = _names(channels, joints, robot)
@@ -385,7 +385,7 @@ def _channels(recording: RawRecording, robot: RobotSpec) -> dict[str, str]:
     arrays = [n for n, labels in recording.signals.items() if labels]
     for name in sorted(arrays, key=lambda n: -len(recording.signals[n])):
         kind = _kind(name)
-        if kind and not (kind == "qpos" and HAND_WORDS & words_of(name)):
+        if kind and not (kind == "qpos" and _is_of_hand(name)):
             matches.setdefault(kind, name)
     singles = [
         n for n, labels in recording.signals.items() if not labels and n.lower() not in CLOCKS
@@ -401,6 +401,11 @@ def _channels(recording: RawRecording, robot: RobotSpec) -> dict[str, str]:
         joints = joints or shapes[kind][pattern]
         matches.setdefault(kind, pattern)
     return matches
+
+
+def _is_of_hand(name: str) -> bool:
+    """Return True for poses of the end effector: obs/robot0_eef_pos."""
+    return bool(HAND_WORDS & words_of(name))
 
 
 def _best_pattern(joints_of: dict[str, set[str]], joints: set[str], robot: RobotSpec) -> str:
@@ -523,9 +528,10 @@ def _names_of_commands(
         return []
     if array and all(name.isdigit() for name in strange):
         return [f"{_joints_in_order(len(strange), robot)} (of the commands)"]
-    own = [name for name in robot.joint_names if len(strange) == len(robot.joint_names)]
-    ours = own or ["…"] * len(strange)
-    lines = [] if any(not _is_joint(joint, robot) for joint in joints) else ["", "[names]"]
+    ours = ["…"] * len(strange)
+    if len(strange) == len(robot.joint_names):
+        ours = list(robot.joint_names)
+    lines = ["", "[names]"] if all(_is_joint(joint, robot) for joint in joints) else []
     lines.append("# of the commands  ? in the robot's order: is it theirs?")
     return lines + [f"{_text(a)} = {_text(b)}" for a, b in zip(strange, ours, strict=True)]
 
@@ -574,19 +580,25 @@ def _values(recording: RawRecording, pattern: str, robot: RobotSpec | None = Non
         labels = recording.signals[pattern]
         joints = [i for i, label in enumerate(labels) if robot and _is_joint(label, robot)]
         return values[:, joints] if joints else values
-    if "{joint}" not in pattern:
-        return None
-    before, after = map(re.escape, pattern.split("{joint}"))
-    fits = re.compile(f"{before}(.+?){after}")
-    names = [c for c in recording.columns if c in recording.signals and fits.fullmatch(c)]
-    if robot is not None:
-        matches = {name: fits.fullmatch(name) for name in names}
-        own = [name for name, match in matches.items() if match and _is_joint(match[1], robot)]
-        names = own or names
+    names = _columns_of(recording, pattern, robot)
     if not names:
         return None
     loaded = recording.load(names)
     return np.stack([loaded[n].values[:ROWS] for n in names], axis=1)
+
+
+def _columns_of(recording: RawRecording, pattern: str, robot: RobotSpec | None) -> list[str]:
+    """Return the columns that fit a pattern with {joint}; of a robot, its joints where any are."""
+    if "{joint}" not in pattern:
+        return []
+    before, after = map(re.escape, pattern.split("{joint}"))
+    joint_of = {}
+    for name in recording.columns:
+        match = re.fullmatch(f"{before}(.+?){after}", name)
+        if match and name in recording.signals:
+            joint_of[name] = match[1]
+    own = [name for name, joint in joint_of.items() if robot and _is_joint(joint, robot)]
+    return own or list(joint_of)
 
 
 def _positions(

@@ -72,12 +72,8 @@ def _angles(
     values: Array, joint: str, unit: str, robot: RobotSpec, encoder: Encoder | None, speed: bool
 ) -> Array:
     """Return one joint's values (k,) in rad or, if they are speeds, in rad/s."""
-    if unit == "rad":
-        return values
-    if unit == "deg":
-        return np.asarray(np.radians(values))
-    if unit == "turns":
-        return TURN_RAD * values
+    if unit in ("rad", "deg", "turns"):
+        return _from_angles(values, unit)
     in_range = robot.log_units[robot.joint_names.index(joint)] == "fraction"  # a gripper
     if encoder is not None and unit == "ticks" and in_range:
         values = encoder.fractions(values, speed)
@@ -92,6 +88,13 @@ def _angles(
     shares = values / span if speed else (values - start) / span
     zero = 0.0 if speed else low
     return np.asarray(shares * (high - low) + zero)
+
+
+def _from_angles(values: Array, unit: str) -> Array:
+    """Return angles in rad, degrees or turns in rad."""
+    if unit == "deg":
+        return np.asarray(np.radians(values))
+    return TURN_RAD * values if unit == "turns" else values
 
 
 def require_plausible(log: Log, robot: RobotSpec, strict: bool = False) -> Log:

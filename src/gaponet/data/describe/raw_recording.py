@@ -135,12 +135,8 @@ class RawRecording:
             notes = meta.get("notes", {}) | {"transposed": turned}
             more["meta"] = meta | {"notes": notes}
         numeric = {name: array for name, array in arrays.items() if _is_signal(array)}
-        deep = [n for n, a in arrays.items() if isinstance(a, np.ndarray) and a.ndim == 3]
-        if deep and not numeric:
-            raise LogError(
-                f"{file}: {', '.join(deep)} have three axes, {arrays[deep[0]].shape}: several "
-                "recordings in one array; write each into a file of its own, with a row per sample"
-            )
+        if not numeric:
+            _refuse_three_axes(file, arrays)
         signals = {name: _column_names(array, names) for name, array in numeric.items()}
         source = f"{file}#{part}" if part else str(file)
 
@@ -176,14 +172,12 @@ class RawRecording:
         for channel, columns in chosen.items():
             time = _time(self, specified, loaded, clocks[channel], channel, columns)
             channels[channel] = Channel(time, in_si.values(channel, columns, loaded))
-        if "rate" in specified:
-            _require_one_length(channels, specified["rate"], self.place)
+        _require_one_length(channels, specified, self.place)
         channels, repeated = _without_equal_rows(channels)
         channels, empty = sampled_channels(channels, joints, self.place)
         channels = _from_zero(channels)
         meta = self._meta(channels, specified)
-        if empty or repeated:
-            meta["notes"] = meta.get("notes", {}) | empty | repeated
+        meta["notes"] = meta.get("notes", {}) | empty | repeated
         for name, columns in gains.items():
             meta[name] = [_constant(self, name, _column(loaded, *columns[j])) for j in joints]
         meta["converted_from"] = {j: units[j] for j in joints if units[j] != "rad"}
@@ -337,6 +331,16 @@ def _cut_short(file: Path, error: Exception) -> bool:
     )
 
 
+def _refuse_three_axes(file: Path, arrays: dict[str, Any]) -> None:
+    """Refuse arrays of several recordings."""
+    deep = [name for name, array in arrays.items() if getattr(array, "ndim", 0) == 3]
+    if deep:
+        raise LogError(
+            f"{file}: {', '.join(deep)} have three axes, {arrays[deep[0]].shape}: several "
+            "recordings in one array; write each into a file of its own, with a row per sample"
+        )
+
+
 def by_place(recordings: ListOf[RawRecording]) -> dict[str, RawRecording]:
     """Return recordings by their files, relative to the folder that holds all of them."""
     files = [Path(recording.source) for recording in recordings]
@@ -378,14 +382,14 @@ class _Conversion:
         return to_radians(channel, values, self.joints, self.units, self.robot, self.encoders)
 
 
-def _require_one_length(channels: dict[str, Channel], rate: float, where: str) -> None:
+def _require_one_length(channels: dict[str, Channel], specified: LogsFile, where: str) -> None:
     """Refuse channels without clocks that have different numbers of rows: they have other rates."""
     rows = {name: len(channel.time) for name, channel in channels.items()}
-    if max(rows.values()) - min(rows.values()) <= MOST_ROWS_APART:
+    if "rate" not in specified or max(rows.values()) - min(rows.values()) <= MOST_ROWS_APART:
         return
     counted = ", ".join(f"{name} {count}" for name, count in rows.items())
     raise LogError(
-        f"{where}: at rate = {rate:g} Hz all channels must have equally many rows; these have "
+        f"{where}: at rate = {specified['rate']:g} Hz all channels must have equally many rows; these have "
         f"{counted}. They were logged at different rates, or parts are missing: give each its "
         "clock (time, time_file, [clock] in logs.toml), or write them with one row per instant"
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -36,13 +37,7 @@ def continued_turns(log: Log, robot: RobotSpec) -> Log:
         positions["qpos"][:, column] -= TURN_RAD * turns
         if wraps or turns:
             turned[joint] = {"wraps": wraps, "turns": turns}
-    if not turned:
-        return log
-    channels = {
-        name: Channel(log.channels[name].time, values) for name, values in positions.items()
-    }
-    notes = log.meta.get("notes", {}) | {"turns": turned}
-    return replace(log, channels=log.channels | channels, meta=log.meta | {"notes": notes})
+    return _with_positions(log, positions, turned) if turned else log
 
 
 def within_range(log: Log, robot: RobotSpec) -> Log:
@@ -69,8 +64,11 @@ def within_range(log: Log, robot: RobotSpec) -> Log:
             for name, values in inside.items():
                 positions[name][:, column] = values
             turned[joint] = {"wraps": wraps, "turns": 0}
-    if not turned:
-        return log
+    return _with_positions(log, positions, turned) if turned else log
+
+
+def _with_positions(log: Log, positions: dict[str, Array], turned: dict[str, Any]) -> Log:
+    """Return the log with other positions, and a note of them by joint."""
     channels = {
         name: Channel(log.channels[name].time, values) for name, values in positions.items()
     }

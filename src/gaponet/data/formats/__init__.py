@@ -139,11 +139,8 @@ def detect(path: Path) -> str:
     for fmt, where in formats().items():
         if attempt(where, partial(_detects, fmt, path), False):
             matches.append(fmt)
-    others = [fmt for fmt in matches if fmt != "table"]
-    if others and "table" in matches:
-        tables = module("table").find(path)
-        if all(file.parent != path for file in tables) or _are_of(others, tables):
-            matches = others
+    if "table" in matches and _tables_belong_to_others(path, matches):
+        matches.remove("table")
     if len(matches) == 1:
         return matches[0]
     if matches:
@@ -160,9 +157,15 @@ def detect(path: Path) -> str:
     )
 
 
-def _are_of(formats: list[str], files: list[Path]) -> bool:
-    """Return True if each file is detected by one of the formats."""
-    return all(any(_detects(fmt, file) for fmt in formats) for file in files)
+def _tables_belong_to_others(path: Path, formats: list[str]) -> bool:
+    """Return True if the tables at a path are parts of recordings of another format: each is
+    detected by it, or none lies directly in the folder.
+    """
+    others = [fmt for fmt in formats if fmt != "table"]
+    tables = module("table").find(path)
+    below = all(file.parent != path for file in tables)
+    alike = all(any(_detects(fmt, file) for fmt in others) for file in tables)
+    return bool(others) and (below or alike)
 
 
 def _detects(fmt: str, path: Path) -> bool:
