@@ -256,8 +256,8 @@ def _copy(rows: int, motions: dict[str, list[str]], with_torque: bool) -> Findin
     count = f"{abs(rows)} row{'s' * (abs(rows) > 1)}"
     if rows == 0:
         text = (
-            f"command and state of {joints} are the same numbers, to the last digit or but for "
-            f"noise, in {where}: one was logged as both; log the command that the servo was sent"
+            f"command and state of {joints} are the same numbers in {where}: one was logged as "
+            "both; log the command that the servo was sent"
         )
     elif rows > 0:
         text = (
