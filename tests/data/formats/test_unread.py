@@ -81,6 +81,20 @@ def test_files_that_belong_together_may_lie_in_folders(tmp_path, arm, pattern):
     assert np.array_equal(logs["run1"].channels["ctrl"].values, arrays["desired"])
 
 
+def test_a_command_and_a_state_file_may_have_clocks_of_different_rates(tmp_path, arm):
+    columns = arm_columns()
+    for kind, channel, every in (("des", "ctrl", 2), ("meas", "qpos", 1)):
+        one = {"t": columns["time"]} | {joint: columns[f"{channel}.{joint}"] for joint in JOINTS}
+        (tmp_path / f"q_{kind}_01.csv").write_text(
+            table_text({name: values[::every] for name, values in one.items()})
+        )
+    kind, known, found = look(tmp_path)
+    (tmp_path / "logs.toml").write_text(guess_logs(found, arm, kind, dict(known)))
+    ((_, log),) = read_logs(tmp_path, arm)
+    assert np.array_equal(log.channels["ctrl"].time, columns["time"][::2])
+    assert np.array_equal(log.channels["qpos"].time, columns["time"])
+
+
 def test_a_file_per_joint_is_refused(tmp_path, arm):
     columns = arm_columns()
     for joint in JOINTS:

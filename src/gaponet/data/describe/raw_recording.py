@@ -208,7 +208,7 @@ class RawRecording:
         if "rate" in specified or not chosen or len(rivals) < 2:
             return
         periods = clock_periods(self.signals, self.load)
-        used = list(specified.get("clock", {}).values())
+        used = [*specified.get("clock", {}).values(), specified.get("time", "")]
         for clock in sorted(filter(None, chosen)):
             where = self.place
             require_one_rate(periods, clock, used, specified.get("ignore", ()), where)
