@@ -262,14 +262,13 @@ def _copy(rows: int, motions: dict[str, list[str]], with_torque: bool) -> Findin
     elif rows > 0:
         text = (
             f"the command of {joints} is the recorded position {count} later, to the last digit or "
-            f"but for noise, in {where}: what was sent to the servos is not in this log. Record "
+            f"up to noise, in {where}: what was sent to the servos is not in this log. Record "
             "the goal positions that the robot was sent"
         )
     else:
         text = (
-            f"the position of {joints} is the command {count} later, to the last digit or "
-            f"but for noise, in {where}: the state was not measured. Record the positions of the "
-            "encoders"
+            f"the position of {joints} is the command {count} later, to the last digit or up to "
+            f"noise, in {where}: the state was not measured. Record the positions of the encoders"
         )
     if with_torque:
         text += ". Of a robot that is driven by torque or current: gaponet identify --current"
