@@ -6,8 +6,8 @@
     gp.identify("data", out="my_so101")
     print(gp.evaluate("./my_so101", "data").mpjae)
 
-The names below are public. `import gaponet` loads numpy alone; simulator, torch and file formats are imported by the
-functions that use them.
+The names below are public. `import gaponet` loads numpy alone; simulator, torch and file formats
+are imported by the functions that use them.
 """
 
 from __future__ import annotations
@@ -51,14 +51,15 @@ if TYPE_CHECKING:
 else:
     _MODULES = {  # public name → module
         **dict.fromkeys(
-            ("adapt_model", "adapt_robot", "check", "collect", "doctor", "evaluate", "excite", "export_network",
-             "export_robot", "gap", "identify", "identify_torque", "import_logs", "networks", "pair", "randomization",
-             "replay", "train"),
+            ("adapt_model", "adapt_robot", "check", "collect", "doctor", "evaluate", "excite",
+             "export_network", "export_robot", "gap", "identify", "identify_torque",
+             "import_logs", "networks", "pair", "randomization", "replay", "train"),
             "gaponet.api",
         ),
         **dict.fromkeys(
-            ("AdaptResult", "CheckResult", "EvalResult", "ExciteResult", "ExportResult", "GapResult",
-             "IdentifyResult", "PairResult", "ReplayResult", "RunResult", "TorqueResult", "TrainResult"),
+            ("AdaptResult", "CheckResult", "EvalResult", "ExciteResult", "ExportResult",
+             "GapResult", "IdentifyResult", "PairResult", "ReplayResult", "RunResult",
+             "TorqueResult", "TrainResult"),
             "gaponet.api.results",
         ),
         "IdentifyOptions": "gaponet.api.options",

@@ -1,4 +1,4 @@
-"""The console script and `python -m gaponet`: Ctrl-C ends it in one line while modules are imported, too."""
+"""The console script and `python -m gaponet`: Ctrl-C ends it in one line during imports too."""
 
 import os
 import signal

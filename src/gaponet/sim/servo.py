@@ -9,10 +9,10 @@ limit of friction, so friction sticks as MuJoCo's does. A gear with backlash par
 (armature, damping, friction) from the link while its gap is open.
 
 The model stands here twice. `servo_torque`, `torque_limits`, `friction_limit` and
-`overcome_friction` take arrays, for exports and inverses. `requested_torque`, `motor_limits` and `joint_friction`
-take one servo with fields by name, for numba and Warp, which are faster. Simulations (`set_servos`)
-and the fit of single joints (`simulate_joints`) share the latter. A MuJoCo model's actuator_user
-holds the parameters; without, nothing here runs.
+`overcome_friction` take arrays, for exports and inverses. `requested_torque`, `motor_limits` and
+`joint_friction` take one servo with fields by name, for numba and Warp, which are faster.
+Simulations (`set_servos`) and the fit of single joints (`simulate_joints`) share the latter. A
+MuJoCo model's actuator_user holds the parameters; without, nothing here runs.
 """
 
 from __future__ import annotations

@@ -63,7 +63,8 @@ CLOCKS = (
 FILLERS = ("joint", "joints", "data", "log")  # of files' names
 NOT_POSITIONS = ("qvel", "tau", "temperature")
 ROWS = 4000  # that are looked at
-# of the positions' own motion by which commands are apart from them; of those, correlation with speed
+# of the positions' own motion by which commands are apart from them; of those, correlation with
+# speed
 NEAR_POSITIONS = 0.8
 MAX_SPEED_CORRELATION = 0.9
 APART = 0.5  # of a command's own motion by which repetitions of it differ at the most

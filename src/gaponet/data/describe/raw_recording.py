@@ -389,8 +389,8 @@ def _require_one_length(channels: dict[str, Channel], specified: LogsFile, where
         return
     counted = ", ".join(f"{name} {count}" for name, count in rows.items())
     raise LogError(
-        f"{where}: at rate = {specified['rate']:g} Hz all channels must have equally many rows; these have "
-        f"{counted}. They were logged at different rates, or parts are missing: give each its "
+        f"{where}: at rate = {specified['rate']:g} Hz all channels must have equally many rows; "
+        f"these have {counted}. They were logged at different rates, or parts are missing: give each its "
         "clock (time, time_file, [clock] in logs.toml), or write them with one row per instant"
     )
 

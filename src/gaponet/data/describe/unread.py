@@ -1,4 +1,4 @@
-"""Why nothing under a path is a log: files that have to be unpacked, converted or downloaded first."""
+"""Why nothing under a path is a log: files to be unpacked, converted or downloaded first."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The six steps of the page of `gaponet app`: the controls of each, and the command of each button."""
+"""The six steps of the page of `gaponet app`: the controls and the commands of each."""
 
 from __future__ import annotations
 
