@@ -50,7 +50,8 @@ def import_logs(
     The same call again adds what is missing.
 
     Args:
-        src: File or folder of logs; `gaponet import --formats` lists what is read.
+        src: File or folder of logs, or hf://USER/DATASET; `gaponet import --formats` lists what is
+            read.
         robot: The robot that was recorded.
         out: Dataset folder; appended to where it exists.
         unit_id: Name of the recorded robot, the same for all its logs. Needed unless the format
@@ -61,8 +62,10 @@ def import_logs(
     Raises:
         LogError, JointMismatchError, UsageError, DatasetError: The message says which file and what
             to do.
+        RemoteError: The address cannot be reached.
     """
     from gaponet.data.importer import import_logs as read_logs
+    from gaponet.share.hub_logs import logs_folder
     from gaponet.sim.dynamics import gravity_of
     from gaponet.sim.model import model_hash
 
@@ -71,7 +74,7 @@ def import_logs(
     read_options = vars(options).copy()
     joint_map = read_options.pop("joint_map")
     return read_logs(
-        src,
+        logs_folder(src),
         spec,
         unit_id,
         payload_mass,
@@ -138,9 +141,12 @@ def guess_description(
     """
     from gaponet.data.describe.guess import guess_logs
     from gaponet.data.formats import look
+    from gaponet.share.hub_logs import logs_folder
 
     described = None if options.logs is None else Path(options.logs)
-    kind, facts, recordings = look(Path(src), options.format, described, options.allow_pickle)
+    kind, facts, recordings = look(
+        logs_folder(src), options.format, described, options.allow_pickle
+    )
     return guess_logs(recordings, as_robot(robot), kind, dict(facts))
 
 

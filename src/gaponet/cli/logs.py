@@ -65,7 +65,7 @@ def import_logs(
     If one log is bad, nothing is imported. With --skip-bad only the bad log is left out.
 
     Args:
-        src: File or folder of logs.
+        src: File or folder of logs, or hf://USER/DATASET of the Hugging Face Hub.
         robot: Robot name or folder.
         out: Dataset folder; appended to where it exists.
         unit_id: Name of the recorded robot, the same for all its logs. Needed unless the format

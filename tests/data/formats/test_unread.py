@@ -39,8 +39,8 @@ def test_a_git_lfs_pointer_is_named_whatever_its_suffix(tmp_path, arm, suffix):
         list(read_logs(tmp_path, arm, SI))
 
 
-def test_the_address_of_a_dataset_names_the_download(arm):
-    with pytest.raises(LogError, match="hf download user/set"):
+def test_an_address_that_was_not_downloaded_names_the_command_that_does_it(arm):
+    with pytest.raises(LogError, match="gaponet import hf://user/set"):
         list(read_logs(Path("hf://user/set"), arm, SI))
 
 

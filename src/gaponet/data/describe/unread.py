@@ -58,8 +58,7 @@ def what_address(path: Path) -> str:
     if match[1] != "hf":
         return ": an address; download what it names, and import the folder"
     name = match[2].removeprefix("datasets/")
-    folder = name.rpartition("/")[2]
     return (
-        f": a dataset on the Hugging Face Hub; download it, and import the folder: hf download "
-        f"{name} --repo-type dataset --local-dir {folder}"
+        f": a dataset on the Hugging Face Hub; gaponet import hf://{name} reads it, other commands "
+        "read the dataset that it makes"
     )
