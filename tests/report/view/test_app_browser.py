@@ -56,9 +56,9 @@ class Clicker:
         return self.wait(lambda: self.browser.value(box))
 
     def click(self, label):
-        element = FIND.format("'button'", json.dumps(label))
+        button = FIND.format("'button'", json.dumps(label)) + ".filter(e => !e.disabled)"
         assert self.wait(
-            lambda: self.browser.value(f"{element}.length > 0 && ({element}[0].click(), true)")
+            lambda: self.browser.value(f"{button}.length > 0 && ({button}[0].click(), true)")
         )
 
     def tab(self, label):
