@@ -150,6 +150,18 @@ def test_a_hint_names_the_next_thing_to_do(page):
         assert said in hint.content
 
 
+def test_beside_a_running_command_no_earlier_one_is_said_to_have_ended(page, monkeypatch):
+    finish(page.jobs, "gap", {}, ("gap", "data"))
+    page.refresh()
+    assert "gaponet gap** has ended" in page.controls.status.content
+    seen = []
+    monkeypatch.setattr(page.gap, "show", lambda: seen.append(page.controls.status.content))
+    page.jobs.start("robot", "robot", "list")
+    page.refresh()
+    page.jobs.cancel()
+    assert seen == [""]
+
+
 def test_the_next_step_is_offered_once_a_step_is_done(page):
     assert page.onwards["robot"].disabled
     finish(page.jobs, "robot", {}, ("robot", "check", "so101"))

@@ -206,7 +206,7 @@ def test_from_a_urdf_and_one_real_chirp_of_a_z1_to_an_export_that_agrees(page, i
         at.write("rollouts", "12")
         at.click("Identify")
         at.sees("gaponet identify, ")
-        at.sees("gaponet gap has ended")
+        at.sees("After identification the error is")
         at.tab("6 Use")
         at.click("Export")
         at.sees("robot.xml alone")

@@ -146,21 +146,20 @@ class App:
             running = self.jobs.running
             every = self.jobs.all
             elsewhere = self.jobs.running_elsewhere
-        self._show_progress(running, elsewhere)
-        self.robot.list_models()
         living = running or elsewhere
         state = (len(every), living.folder.name if living else "")
+        if living is not None and self.seen != state:
+            self.controls.say("")  # how the command before ended is no news beside a running one
+        self._show_progress(running, elsewhere)
+        self.robot.list_models()
         if self.seen == state:
             return
         self._show_results()
-        if living is not None:
-            self.controls.say("")
-        elif every:
-            self.controls.say(ending(every[-1]))
-        else:
-            self.controls.say("Six steps, from left to right.")
         if living is None and every:
+            self.controls.say(ending(every[-1]))
             self._compare(every[-1])
+        elif living is None:
+            self.controls.say("Six steps, from left to right.")
         self.seen = state  # last: after an error all is shown again
 
     def _show_progress(self, running: Job | None, elsewhere: Job | None) -> None:
