@@ -179,14 +179,14 @@ def randomization(
         UsageError: The uncertainty, days or robots are missing.
         NoGainError: The units follow the recordings worse than ± 20 % on each number.
     """
-    from gaponet.export.export_folder import ENGINE_TERMS
     from gaponet.export.plain_servos import read_recordings
     from gaponet.export.randomization import judge_units, sample_units, write_randomization
+    from gaponet.export.targets import own_terms
 
     spec = load_robot(simulator_folder(named_folder(robot)))
     made = sample_units(spec, scope, tuple(map(Path, units)), engine=engine)
     made = judge_units(
-        made, spec, read_recordings(spec.folder, data, spec), progress, ENGINE_TERMS.get(engine, ())
+        made, spec, read_recordings(spec.folder, data, spec), progress, own_terms(engine)
     )
     return write_randomization(made, engine, Path(out)), made
 
@@ -315,6 +315,8 @@ def simulator_folder(holder: Path) -> Path:
 
 
 def _exported(made: ExportedFolder, folder: Path, to: str, robot: str) -> ExportResult:
+    from gaponet.export.targets import TARGETS
+
     script = folder / "check.py"
     return ExportResult(
         path=made.file or folder,
@@ -325,6 +327,7 @@ def _exported(made: ExportedFolder, folder: Path, to: str, robot: str) -> Export
         virtual=made.virtual,
         notes=tuple(made.notes),
         check=script if script.is_file() else None,
+        checked_in=TARGETS[to].checked_in or to,
     )
 
 

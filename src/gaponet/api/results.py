@@ -518,6 +518,7 @@ class ExportResult:
         parity: Largest difference between the file and the trained network, rad; None for a robot.
         check: Script that checks the export in the other program without gaponet; None where there
             is none.
+        checked_in: Program in which it runs.
     """
 
     path: Path
@@ -529,6 +530,7 @@ class ExportResult:
     notes: tuple[str, ...] = ()
     parity: float | None = None
     check: Path | None = None
+    checked_in: str = ""
 
     def to_dict(self) -> dict[str, Any]:
         if self.parity is not None:

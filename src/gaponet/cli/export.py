@@ -46,7 +46,6 @@ OPTIONS: tuple[tuple[str, tuple[str, ...], Callable[[str], bool]], ...] = (
     ),
     ("--data", ("data",), lambda to: to not in ("onnx", "torch", LEROBOT_TARGET)),
 )
-CHECKED_IN = {"mjcf": "MuJoCo", "envhub": "MuJoCo", "actuator-net": "mjlab"}
 Holder = Annotated[
     Folder,
     tyro.conf.arg(
@@ -162,7 +161,7 @@ def _show(screen: Out, made: ExportResult) -> None:
         screen.say(f"  {line}", "warning", "yellow")
     screen.say(f"{made.path}: {made.robot} for {made.to}")
     if made.check:
-        screen.next(f"python {made.check}, in {CHECKED_IN.get(made.to, made.to)}")
+        screen.next(f"python {made.check}, in {made.checked_in}")
     screen.result(made.to_dict())
 
 

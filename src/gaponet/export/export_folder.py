@@ -37,6 +37,7 @@ from gaponet.export.plain_servos import (
 )
 from gaponet.export.shipped import mujoco_servos
 from gaponet.export.simulator_facts import control_period, mjcf_text, simulator_facts
+from gaponet.export.targets import NEWTON_CHECK, TARGETS, own_terms
 from gaponet.export.urdf_edit import MISSING_FIELDS, edit_urdf, with_urdf_fields
 from gaponet.nn.artifact import GapModel
 from gaponet.robot.spec import RobotSpec
@@ -46,35 +47,7 @@ FACTS = "facts.json"
 ROBOT = "robot.xml"
 CHECK = "check.npz"
 CONFIG = "robot_cfg.py"  # servos in the classes of Isaac Lab or Newton
-NEWTON_CHECK = "check_newton.py"
-# Engine → name in the export folder → file in SHIPPED; beside the helper file.
-CHECK_FILES: dict[str, dict[str, str]] = {
-    "mjcf": {"check.py": "check_mjcf.py"},
-    "envhub": {"check.py": "check_mjcf.py", "env.py": "env.py"},
-    "urdf": {},
-    "mjlab": {"check.py": "check_mjlab.py"},
-    "isaaclab": {"check.py": "check_isaaclab.py", "make_usd.py": "make_usd.py"},
-    "newton": {"check.py": NEWTON_CHECK},
-    "json": {},
-    "torch": {},
-    "actuator-net": {
-        "check.py": "check_mjlab.py",
-        "check_newton.py": NEWTON_CHECK,
-        "actuators.py": "actuators.py",
-    },
-}
-MJCF_TARGETS = ("mjcf", "envhub")  # an edited copy of a MuJoCo file
-WITH_TORCH = ("mjlab", "isaaclab", "torch", "actuator-net")  # engines whose helper file needs torch
-# terms of the servo model that an engine's own servos have
-ENGINE_TERMS = {"isaaclab": ("no_load_speed",)}
 ACTUATORS = re.compile(r"\s*<actuator>.*?</actuator>", re.DOTALL)
-WITHOUT_TABLE = ("isaaclab", "newton")  # engines in whose scenes robot.xml's table is not
-WITHOUT_SERVO_MODEL = ("isaaclab", "newton", "urdf")
-DELAY_NOTES = {
-    "newton": "Newton's joint targets have no delay: check.py has a buffer of five lines",
-    "mjcf": "delays need MuJoCo 3.5, and after each reset fill_delays of mujoco_servos.py; MJX "
-    "ignores them without a message",
-}
 
 
 @dataclass(frozen=True)
@@ -133,7 +106,7 @@ class _RobotExport:
 
     def write_robot(self, source: Source | None) -> Path | None:
         """Write the file of the robot, and return it; None for json, which has none."""
-        if self.to in MJCF_TARGETS:
+        if TARGETS[self.to].edits_mjcf:
             return self.write_mjcf(source.file if source else self.robot.mjcf)
         if self.to == "urdf":
             assert source is not None
@@ -230,7 +203,7 @@ def export_robot(
     if to == "urdf" and source is None:
         raise UsageError("--to urdf edits a copy of your own file: --into FILE.urdf")
     train, validation = _motions(robot, recordings, payload_mass)
-    plain = fit_plain_servos(robot, train, progress, ENGINE_TERMS.get(to, ()))
+    plain = fit_plain_servos(robot, train, progress, own_terms(to))
     dt = control_period(robot, (motion.dt for motion in validation))
     facts = simulator_facts(robot, dt, payload_mass, plain)
     facts["file"] = ROBOT
@@ -282,11 +255,11 @@ def _measured_export(
     facts: dict[str, Any],
 ) -> _RobotExport:
     """Return an export with its errors in gaponet, before anything is written."""
-    has_ramps = to in MJCF_TARGETS and MUJOCO_HAS_RAMPS
+    has_ramps = TARGETS[to].edits_mjcf and MUJOCO_HAS_RAMPS
     checked = check_motions(validation, robot, ramped=not has_ramps)
     if to == "envhub":
         facts["lerobot_units"] = envhub.lerobot_units(robot)
-    played_there = replace(plain, table=None) if to in WITHOUT_TABLE else plain
+    played_there = plain if TARGETS[to].has_table else replace(plain, table=None)
     facts["error_mrad"] = {
         "joints": 1e3 * check_error(checked, robot),
         "plain": 1e3 * check_error(checked, played_there),
@@ -302,18 +275,18 @@ def _notes(robot: RobotSpec, facts: dict[str, Any], to: str) -> list[str]:
     """Return effects that an engine's form of a robot lacks."""
     notes = []
     servos = facts["plain"].values()
-    if to in MJCF_TARGETS:
+    if TARGETS[to].edits_mjcf:
         notes += _stop_notes(robot)
     if robot.target_speed.any():
         notes.append(_ramp_note(robot, to))
     if robot.friction_per_kelvin.any():
         notes.append(_temperature_note(robot))
     is_late = any(servo["delay"] for servo in servos)
-    if is_late and to in DELAY_NOTES:
-        notes.append(DELAY_NOTES[to])
+    if is_late and TARGETS[to].delay_note:
+        notes.append(TARGETS[to].delay_note)
     if to == "urdf":
         notes.append(_urdf_note(facts))
-    if to in WITHOUT_SERVO_MODEL:
+    if not TARGETS[to].has_servo_model:
         notes += _law_notes(facts["law"], to)
     if to == "mjlab" and robot.backlash.any():
         notes.append("mjlab simulates no backlash: use the form for MuJoCo, or identify without it")
@@ -341,7 +314,7 @@ def _temperature_note(robot: RobotSpec) -> str:
 
 def _law_notes(law: ListOf[str], to: str) -> list[str]:
     """Return which terms of the servo model an engine lacks."""
-    lacking = [term for term in law if term not in ENGINE_TERMS.get(to, ())]
+    lacking = [term for term in law if term not in own_terms(to)]
     if not lacking:
         return []
     terms = ", ".join(lacking)
@@ -352,7 +325,7 @@ def _ramp_note(robot: RobotSpec, to: str) -> str:
     """Return where the servos' own limits of the speed of targets are."""
     named = zip(robot.joint_names, robot.target_speed, strict=True)
     ramps = ", ".join(f"{name} {speed:.3g}" for name, speed in named if speed)
-    if to in MJCF_TARGETS and MUJOCO_HAS_RAMPS:
+    if TARGETS[to].edits_mjcf and MUJOCO_HAS_RAMPS:
         return (
             f"servos' own ramps ({ramps} rad/s) are <pid slewmax> of MuJoCo 4: call fill_delays of "
             "mujoco_servos.py after each reset; MJX and older versions do not have them"
@@ -472,9 +445,9 @@ def _write_motions(file: Path, motions: ListOf[Sequence]) -> None:
 
 def _write_shipped(folder: Path, to: str, facts: dict[str, Any]) -> None:
     """Write facts.json, the helper file and the check of an engine; none of them needs gaponet."""
-    helper = TORCH_HELPER if to in WITH_TORCH else MUJOCO_HELPER
+    helper = TORCH_HELPER if TARGETS[to].needs_torch else MUJOCO_HELPER
     helpers = {helper}
-    for name, file in CHECK_FILES[to].items():
+    for name, file in TARGETS[to].files.items():
         of_file = helper
         if file == NEWTON_CHECK:  # Newton's environment has no torch
             of_file = MUJOCO_HELPER

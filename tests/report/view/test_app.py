@@ -162,6 +162,14 @@ def test_beside_a_running_command_no_earlier_one_is_said_to_have_ended(page, mon
     assert seen == [""]
 
 
+@pytest.mark.parametrize(("model", "offered"), [("model/arm.urdf", True), ("model/arm.xml", False)])
+def test_a_urdf_is_exported_where_the_robot_was_made_from_one(page, model, offered):
+    finish(page.jobs, "robot", {}, ("robot", "new", model, "--out", "robot1"))
+    (page.folder / "robot1").mkdir()
+    page.use.show()
+    assert ("urdf" in page.use.target.options) == offered
+
+
 def test_the_next_step_is_offered_once_a_step_is_done(page):
     assert page.onwards["robot"].disabled
     finish(page.jobs, "robot", {}, ("robot", "check", "so101"))

@@ -28,7 +28,8 @@ from gaponet.sysid.options import IdentifyOptions
 
 MODEL_SUFFIXES = (".xml", ".mjcf", ".urdf")
 POSITION_UNITS = ("as the logs state", "rad", "deg", "fraction", "ticks", "signed_percent")
-TARGETS = ("mjcf", "urdf", "mjlab", "isaaclab", "newton", "json")
+TARGETS = ("mjcf", "mjlab", "isaaclab", "newton", "json")
+URDF_TARGET = "urdf"  # for a robot that was made from one: the export is an edited copy
 NETWORK_TARGETS = ("onnx", "torch")  # of a trained network
 # Target → engine that applies parameter sets; others read a file.
 ENGINES = {"mjcf": "mujoco", "mjlab": "mjlab", "isaaclab": "isaaclab"}
@@ -91,6 +92,14 @@ class RobotStep:
         if name in packaged_robots():
             return load_robot(name)
         return load_robot(self.folder / name)
+
+    def urdf(self) -> str:
+        """Return the uploaded URDF of which the robot was made; "" for another robot."""
+        job = self.jobs.result("robot")
+        if job is None or job.words[:2] != ["robot", "new"]:
+            return ""
+        model = job.words[2]
+        return model if model.lower().endswith(".urdf") else ""
 
     def list_models(self) -> None:
         """Offer the robots of the package and the uploaded models."""
@@ -377,7 +386,10 @@ class UseStep:
             exported = self.controls.need("train").out
         else:
             exported = self._best_robot()
-        return ["export", exported, "--to", target, "--out", OUT]
+        words = ["export", exported, "--to", target, "--out", OUT]
+        if target == URDF_TARGET:
+            words += ["--into", self.logs.robot.urdf()]
+        return words
 
     def _parameter_sets(self) -> list[str]:
         engine = ENGINES.get(str(self.target.value), "json")
@@ -410,8 +422,10 @@ class UseStep:
         for step in ("export", "randomization", "new", "check", "adapt", "train"):
             self.controls.show(step)
         targets: tuple[str, ...] = TARGETS
+        if self.logs.robot.urdf():
+            targets += (URDF_TARGET,)
         if helping_network(self.controls.jobs) is not None:
-            targets = TARGETS + NETWORK_TARGETS
+            targets += NETWORK_TARGETS
         self.target.options = targets
 
 
