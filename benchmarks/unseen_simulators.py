@@ -12,10 +12,9 @@ Networks with equal data, steps and nearly equal numbers of weights (the table s
     GAPONet + context         these answers are its branch input
 
 With --payload-unknown, the networks for many simulators are also trained without the payload as an input; the
-answers are then those of simulators that carry it. With --literal, the paper's network is also trained whole in many
-simulators, of which and of whose payload it is told nothing; and one that was trained in one simulator gets its
-sensor predictor alone fitted again, in the simulators of training or in the simulator of the test. These are the two
-means that the authors name.
+answers are then those of simulators that carry it. So is the paper's network, which is told nothing of its simulator.
+With --literal, the paper's network is trained in one simulator, and its sensor predictor alone is fitted again, in the
+simulators of training or in the simulator of the test. These are the two means that the authors name.
 
 The test has twenty simulators within the ranges of training and ten beyond. Their seed was used for nothing else, and
 the motions are the test motions of training. Settings are chosen by the validation error of training, in other
@@ -103,9 +102,9 @@ def rows(arguments: argparse.Namespace) -> dict[str, Row]:
     if arguments.payload_unknown:
         for name in ("MLP", "MLP + context", "GAPONet + context"):
             chosen[f"{name}, payload unknown"] = replace(chosen[name], payload=False)
+        chosen[LITERAL_IN_MANY] = Row("paper", simulators, payload=False)
     if arguments.literal:
         chosen[LITERAL] = Row("paper", 0)
-        chosen[LITERAL_IN_MANY] = Row("paper", simulators, payload=False)
     return chosen
 
 
@@ -141,6 +140,7 @@ def train(arguments: argparse.Namespace) -> None:
                 simulators=row.simulators,
                 without_context=not row.context,
                 rates=tuple(arguments.rates),
+                train_share=arguments.share,
                 threads=1,
             )
             trained = gp.train(
@@ -185,7 +185,7 @@ def test(arguments: argparse.Namespace) -> None:
 
 
 def test_recordings(dataset: Dataset, arguments: argparse.Namespace) -> dict[float, list[Sequence]]:
-    """Return payload, kg → pieces of the test recordings, at most MAX_RECORDINGS of each."""
+    """Return payload, kg → pieces of the test recordings, at most `recordings` of each."""
     split = json.loads(next(arguments.out.glob("*/model/card.json")).read_text())["motions"]
     chosen = [e for e in dataset.entries if e.meta.motion in split["test"] or arguments.all]
     if arguments.rates:
@@ -193,7 +193,7 @@ def test_recordings(dataset: Dataset, arguments: argparse.Namespace) -> dict[flo
     by_payload: dict[float, list[Sequence]] = {}
     for kg in sorted({e.meta.payload_mass for e in chosen}):
         same = [e for e in chosen if e.meta.payload_mass == kg]
-        steps = np.linspace(0, len(same) - 1, min(MAX_RECORDINGS, len(same)))
+        steps = np.linspace(0, len(same) - 1, min(arguments.recordings, len(same)))
         cut = []
         for whole in dataset.sequences([same[round(i)] for i in steps]):
             start, end = (round(seconds / whole.dt) for seconds in PIECE_S)
@@ -368,6 +368,12 @@ def main() -> None:
         command.add_argument("--seeds", type=int, default=3)
         command.add_argument("--steps", type=int, default=240_000)
         command.add_argument("--simulators", type=int, default=200)
+        command.add_argument(
+            "--share", type=float, default=1.0, help="of the training motions that are used"
+        )
+        command.add_argument(
+            "--recordings", type=int, default=MAX_RECORDINGS, help="of the test, by payload"
+        )
         command.add_argument("--rates", type=float, nargs="*", default=[])
         command.add_argument("--identified")
         command.add_argument("--payload-unknown", action="store_true")
