@@ -7,6 +7,7 @@ from logs import arm_columns, table_text
 from gaponet.base.errors import LogError
 from gaponet.data.describe.guess import guess_logs
 from gaponet.data.formats import ReadOptions, look, read_logs
+from gaponet.data.formats.text import heading
 
 SI = {"position_unit": "rad", "time_unit": "s"}
 ROWS = 60
@@ -162,3 +163,31 @@ def test_turns_become_radians(tmp_path, arm):
     (tmp_path / "m.csv").write_text(table_text(turns))
     ((_, log),) = read_logs(tmp_path, arm, ReadOptions(position_unit="turns", time_unit="s"))
     assert np.allclose(log.channels["qpos"].values[:, 1], columns["qpos.elbow"])
+
+
+def test_a_commented_header_counts_also_where_cells_hold_text(tmp_path, arm):
+    columns = arm_columns(ROWS)
+    names, *rows = table_text(columns).splitlines()
+    lines = [f"%{names},frame", *(f"{row},base" for row in rows)]
+    (tmp_path / "m.csv").write_text("\n".join(lines) + "\n")
+    assert np.array_equal(qpos_of(tmp_path, arm), columns["qpos.elbow"])
+
+
+def test_a_commented_header_may_have_other_separators_than_the_rows(tmp_path, arm):
+    columns = arm_columns(ROWS)
+    names, *rows = table_text(columns).splitlines()
+    (tmp_path / "m.csv").write_text("\n".join(["# " + names.replace(",", " "), *rows]) + "\n")
+    assert np.array_equal(qpos_of(tmp_path, arm), columns["qpos.elbow"])
+
+
+def test_an_empty_first_row_is_no_line_of_units():
+    assert heading("ctrl.a,qpos.a\nnan,nan\n0.1,0.2\n").first == 1
+
+
+def test_comments_before_a_row_per_joint_are_left_out(tmp_path, arm):
+    lines = ["# robot: arm", "time,joint,ctrl,qpos"]
+    for row in range(ROWS):
+        lines += [f"{0.02 * row:.2f},{name},{0.01 * row:.2f},0.5" for name in arm.joint_names]
+    (tmp_path / "m.csv").write_text("\n".join(lines) + "\n")
+    (tmp_path / "logs.toml").write_text('ctrl = "ctrl"\nqpos = "qpos"\n')
+    assert np.array_equal(qpos_of(tmp_path, arm), np.full(ROWS, 0.5))

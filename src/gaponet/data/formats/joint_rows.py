@@ -98,17 +98,16 @@ def _table(file: Path, names: list[str]) -> pa.Table:
     import pyarrow as pa
     import pyarrow.csv as pc
 
+    found = text.heading(text.beginning(file))
     body = text.decoded(
         read_limited(file, LogError, "cut the log into shorter ones", MAX_ARRAYS_BYTES)
     )
-    header = body.partition(b"\n")[0]
-    delimiter = next((d for d in ",;\t" if d.encode() in header), " ")
     try:
         return pc.read_csv(
             pa.py_buffer(body),
-            pc.ReadOptions(use_threads=False),
-            pc.ParseOptions(delimiter=delimiter),
-        ).rename_columns(names)
+            pc.ReadOptions(use_threads=False, column_names=names, skip_rows=found.first),
+            pc.ParseOptions(delimiter=found.delimiter),
+        )
     except pa.ArrowInvalid as error:
         raise LogError(f"{file}: not a readable CSV file ({error}); export it again") from None
 

@@ -27,7 +27,8 @@ class Heading(NamedTuple):
         names: Of the columns; empty if nothing names them.
         first: Lines before the first row.
         cells: Of the first row.
-        delimiter: Of the cells, as the header shows it, or the first row.
+        delimiter: Of the cells, as the header shows it; as the first row does, if the header is a
+            comment or is missing.
         units: The cells of a second line of the header, which holds units; empty if there is none.
     """
 
@@ -44,7 +45,7 @@ def decoded(body: bytes) -> bytes:
     """
     encoding = UTF16.get(body[:2])
     if encoding:
-        body = body[2:].decode(encoding, "replace").encode()
+        body = str(memoryview(body)[2:], encoding, "replace").encode()  # no copy of the bytes
     body = body.removeprefix(codecs.BOM_UTF8)
     if b"\n" not in body:
         body = body.replace(b"\r", b"\n")
@@ -115,7 +116,7 @@ def heading(text: str) -> Heading:
         start = _after_preamble(lines, start)
     header = lines[start] if start < len(lines) else ""
     names = cells_of(header)
-    delimiter = delimiter_of(header)
+    delimiter = delimiter_of(lines[start + 1] if named else header)
     if is_numeric(names):
         return Heading([], start, names, delimiter, [])
     units: list[str] = []
@@ -138,12 +139,14 @@ def _after_comments(lines: list[str]) -> int:
 
 
 def _names_row_after(lines: list[str], start: int) -> bool:
-    """Return True if the comment before a row of numbers names its columns, as numpy.savetxt
-    writes it.
+    """Return True if the comment before the first row names its columns, as numpy.savetxt and
+    rostopic echo -p write it. A row begins with a number, or holds numbers and dates alone.
     """
     row = cells_of(lines[start])
     names = cells_of(COMMENT.sub("", lines[start - 1], count=1))
-    return len(row) > 1 and is_numeric(row) and len(names) == len(row) and not is_numeric(names)
+    if len(row) < 2 or len(names) != len(row) or is_numeric(names):
+        return False
+    return is_numeric(row) or is_numeric(row[:1])
 
 
 def _after_preamble(lines: list[str], start: int) -> int:
@@ -178,4 +181,5 @@ def _count(line: str) -> int:
 
 
 def _holds_no_number(cells: list[str]) -> bool:
-    return any(cells) and not any(is_numeric([cell]) for cell in cells if cell not in EMPTY)
+    words = [cell for cell in cells if cell.strip() not in EMPTY]
+    return bool(words) and not any(is_numeric([cell]) for cell in words)
