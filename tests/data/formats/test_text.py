@@ -191,3 +191,24 @@ def test_comments_before_a_row_per_joint_are_left_out(tmp_path, arm):
     (tmp_path / "m.csv").write_text("\n".join(lines) + "\n")
     (tmp_path / "logs.toml").write_text('ctrl = "ctrl"\nqpos = "qpos"\n')
     assert np.array_equal(qpos_of(tmp_path, arm), np.full(ROWS, 0.5))
+
+
+def test_a_clock_in_nanoseconds_beside_one_in_seconds_is_not_added_to_it(tmp_path, arm):
+    columns = arm_columns(ROWS)
+    time = columns.pop("time")
+    clocks = {"t_sec": time, "t_nsec": 1e9 * time}
+    (tmp_path / "m.csv").write_text(table_text(clocks | columns))
+    described = 'time = "t_sec"\ntime_unit = "s"\nposition_unit = "rad"\n'
+    (tmp_path / "logs.toml").write_text(described)
+    ((_, log),) = read_logs(tmp_path, arm)
+    assert np.array_equal(log.channels["qpos"].time, time)
+
+
+def test_raw_in_the_name_of_a_column_is_no_unit(tmp_path, arm):
+    columns = arm_columns(ROWS)
+    renamed = {"time": columns["time"]}
+    for joint in arm.joint_names:
+        renamed[f"raw_q_{joint}"] = columns[f"qpos.{joint}"]
+        renamed[f"cmd_q_{joint}"] = columns[f"ctrl.{joint}"]
+    (tmp_path / "m.csv").write_text(table_text(renamed))
+    assert 'position_unit = "rad"' in guessed(tmp_path, arm)

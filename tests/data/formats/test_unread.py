@@ -39,9 +39,10 @@ def test_a_git_lfs_pointer_is_named_whatever_its_suffix(tmp_path, arm, suffix):
         list(read_logs(tmp_path, arm, SI))
 
 
-def test_an_address_that_was_not_downloaded_names_the_command_that_does_it(arm):
-    with pytest.raises(LogError, match="gaponet import hf://user/set"):
-        list(read_logs(Path("hf://user/set"), arm, SI))
+@pytest.mark.parametrize("address", ["user/set", "datasets/user/set/data/file.parquet"])
+def test_an_address_that_was_not_downloaded_names_the_command_that_does_it(arm, address):
+    with pytest.raises(LogError, match="gaponet import hf://user/set "):
+        list(read_logs(Path(f"hf://{address}"), arm, SI))
 
 
 def test_tables_in_folders_below_are_recordings_with_names_of_their_own(tmp_path, arm):
@@ -110,3 +111,19 @@ def test_several_recordings_in_one_array_are_named(tmp_path, arm):
     np.savez(tmp_path / "m.npz", cmd=np.zeros((3, 50, 2)), pos=np.zeros((3, 50, 2)))
     with pytest.raises(LogError, match="three axes"):
         look(tmp_path)
+
+
+def test_logs_may_lie_in_folders_inside_a_dataset(tmp_path, arm):
+    (tmp_path / "dataset.json").write_text("{}")
+    day = tmp_path / "raw" / "monday"
+    day.mkdir(parents=True)
+    (day / "m.csv").write_text(table_text(arm_columns()))
+    assert len(list(read_logs(tmp_path / "raw", arm, SI))) == 1
+
+
+def test_arrays_in_files_of_commands_and_states_are_guessed_as_families(tmp_path, arm):
+    positions = 0.1 * np.ones((50, 2))
+    for name in ("walk_q", "walk_cmd", "jump_q", "jump_cmd"):
+        np.savez(tmp_path / f"{name}.npz", positions)
+    kind, known, found = look(tmp_path)
+    assert 'command_file = "{name}_cmd.npz"' in guess_logs(found, arm, kind, dict(known))

@@ -82,7 +82,10 @@ def with_whole_seconds(
     """Return signals, and what reads them, with one clock for each pair of columns that hold
     seconds and the nanoseconds beyond them, as ROS writes stamps.
     """
-    pairs = _stamps(signals)
+    pairs = {}
+    for stamp, columns in _stamps(signals).items():
+        if _are_parts_of_a_stamp(load, columns):
+            pairs[stamp] = columns
     if not pairs:
         return signals, load
     parts = {part for pair in pairs.values() for part in pair}
@@ -101,6 +104,19 @@ def _stamps(signals: Collection[str]) -> dict[str, tuple[str, str]]:
             if match[1] + ending in signals:
                 pairs[match[1].rstrip("._/ ") or "stamp"] = (whole, match[1] + ending)
     return pairs
+
+
+def _are_parts_of_a_stamp(load: Load, parts: tuple[str, str]) -> bool:
+    """Return False for two whole clocks: seconds with decimals, or more than a second of
+    nanoseconds.
+    """
+    try:
+        loaded = load(list(parts))
+    except LogError:  # text
+        return False
+    seconds, nanoseconds = (loaded[part].values for part in parts)
+    whole = np.array_equal(seconds, np.round(seconds), equal_nan=True)
+    return bool(whole and np.nanmax(nanoseconds, initial=0.0) < 1e9)
 
 
 def _load_stamps(load: Load, pairs: dict[str, tuple[str, str]], names: list[str]) -> dict[str, Any]:

@@ -44,7 +44,7 @@ WORDS = {
 UNIT_WORDS = {
     "deg": ("deg", "degs", "degree", "degrees", "°"),
     "rad": ("rad", "rads", "radian", "radians"),
-    "ticks": ("ticks", "tick", "counts", "steps", "raw"),
+    "ticks": ("ticks", "tick", "counts"),
     "turns": ("turns", "turn", "rev", "revs", "revolutions", "rotations"),
 }
 LARGEST_RAD = 7.0  # larger positions are degrees
@@ -231,8 +231,8 @@ def _guess_family(
     state = by_kind["qpos"]
     clocks = clock_periods(state.signals, state.load)
     joints = [column for column in state.columns if column not in clocks]
-    values = np.stack([state.load([c])[c].values[:ROWS] for c in joints], axis=1)
-    span = float(np.nanmax(np.abs(values)))
+    loaded = state.load([name for name in state.signals if name not in clocks])
+    values = np.concatenate([signal.values[:ROWS].ravel() for signal in loaded.values()])
     lines = [
         f"# {fmt}; files that belong together: {', '.join(family.values())}",
         "# Lines with a ? are guesses: look at them.",
@@ -253,7 +253,7 @@ def _guess_family(
     else:
         lines.append("rate = 50.0  # ? Hz: no file holds times")
     lines += [
-        f'position_unit = "{_unit_of(values)}"  # ? values up to {span:.3g}',
+        _unit_line(values),
         'ctrl = "{joint}"',
         'qpos = "{joint}"',
     ]
@@ -382,26 +382,37 @@ def _kind(name: str) -> str | None:
 
 def _channels(recording: RawRecording, robot: RobotSpec) -> dict[str, str]:
     """channel → array, or pattern of columns with {joint}."""
-    matches: dict[str, str] = {}
-    arrays = [n for n, labels in recording.signals.items() if labels]
-    for name in sorted(arrays, key=lambda n: -len(recording.signals[n])):
-        kind = _kind(name)
-        if kind and not (kind == "qpos" and _is_of_hand(name)):
-            matches.setdefault(kind, name)
-    singles = [
-        n for n, labels in recording.signals.items() if not labels and n.lower() not in CLOCKS
-    ]
-    shapes: dict[str, dict[str, set[str]]] = defaultdict(dict)  # channel → pattern → joints
-    for name in singles:
-        if kind := _kind(name):
-            for pattern, joint in _patterns(name):
-                shapes[kind].setdefault(pattern, set()).add(joint)
+    matches = _arrays_of_channels(recording)
+    shapes = _patterns_of_channels(recording)
     joints: set[str] = set()
     for kind in sorted(shapes, key=lambda k: k != "qpos"):  # the others have the joints of qpos
         pattern = _best_pattern(shapes[kind], joints, robot)
         joints = joints or shapes[kind][pattern]
         matches.setdefault(kind, pattern)
     return matches
+
+
+def _arrays_of_channels(recording: RawRecording) -> dict[str, str]:
+    """channel → the widest array that is called like it."""
+    matches: dict[str, str] = {}
+    arrays = [name for name, labels in recording.signals.items() if labels]
+    for name in sorted(arrays, key=lambda n: -len(recording.signals[n])):
+        kind = _kind(name)
+        if kind and not (kind == "qpos" and _is_of_hand(name)):
+            matches.setdefault(kind, name)
+    return matches
+
+
+def _patterns_of_channels(recording: RawRecording) -> dict[str, dict[str, set[str]]]:
+    """channel → pattern with {joint} → joints, of the columns that are no arrays."""
+    shapes: dict[str, dict[str, set[str]]] = defaultdict(dict)
+    for name, labels in recording.signals.items():
+        kind = _kind(name)
+        if kind is None or labels or name.lower() in CLOCKS:
+            continue
+        for pattern, joint in _patterns(name):
+            shapes[kind].setdefault(pattern, set()).add(joint)
+    return shapes
 
 
 def _is_of_hand(name: str) -> bool:
@@ -617,20 +628,21 @@ def _positions(
     if named:
         return [f'position_unit = "{named}"']
     values = _values(recording, pattern, robot)
-    if values is None or not np.isfinite(values).any():
-        return ['position_unit = "rad"  # ?']
-    span = float(np.nanmax(np.abs(values)))
-    return [f'position_unit = "{_unit_of(values)}"  # ? values up to {span:.3g}']
+    return [_unit_line(np.zeros(0) if values is None else values)]
 
 
-def _unit_of(values: Array) -> str:
-    """The unit that positions have by their size."""
+def _unit_line(values: Array) -> str:
+    """The line of position_unit by the size of positions of any shape."""
     finite = values[np.isfinite(values)]
+    if not len(finite):
+        return 'position_unit = "rad"  # ?'
+    largest = float(np.abs(finite).max())
+    unit = "rad" if largest <= LARGEST_RAD else "deg"
     if look_like_ticks(finite):
-        return "ticks"
-    if look_like_percent(finite):
-        return "signed_percent"
-    return "rad" if np.abs(finite).max() <= LARGEST_RAD else "deg"
+        unit = "ticks"
+    elif look_like_percent(finite):
+        unit = "signed_percent"
+    return f'position_unit = "{unit}"  # ? values up to {largest:.3g}'
 
 
 def _named_unit(recording: RawRecording, pattern: str) -> str | None:

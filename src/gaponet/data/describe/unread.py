@@ -12,7 +12,7 @@ SPREADSHEETS = (".xlsx", ".xls", ".ods")
 JSON = (".json", ".jsonl", ".ndjson")
 TEXT = (".txt", ".dat")
 MOST_FILES = 2000  # that are looked at
-ADDRESS = re.compile(r"(hf|https?|s3|gs):/+(.*)")
+ADDRESS = re.compile(r"(hf|https?|s3|gs):/+(?:datasets/)?(.*)")
 
 
 def why_unread(path: Path, files: list[Path]) -> str:
@@ -57,8 +57,8 @@ def what_address(path: Path) -> str:
         return ""
     if match[1] != "hf":
         return ": an address; download what it names, and import the folder"
-    name = match[2].removeprefix("datasets/")
+    name = "/".join(match[2].split("/")[:2])  # without a file or folder in the dataset
     return (
-        f": a dataset on the Hugging Face Hub; gaponet import hf://{name} reads it, other commands "
-        "read the dataset that it makes"
+        f": an address of the Hugging Face Hub; gaponet import hf://{name} reads the whole dataset "
+        "there, other commands read the dataset that it makes"
     )

@@ -76,7 +76,9 @@ def find(path: Path) -> list[Path]:
     directly = [file for file in below if file.parent == path and _is_table(file)]
     if directly:
         return directly
-    datasets = {folder for file in below for folder in file.parents if _is_dataset(folder)}
+    folders = {folder for file in below for folder in file.parents}
+    inside = [folder for folder in folders if folder.is_relative_to(path)]
+    datasets = {folder for folder in inside if _is_dataset(folder)}
     return [file for file in below if not datasets & {*file.parents} and _is_table(file)]
 
 
