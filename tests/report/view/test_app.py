@@ -232,6 +232,25 @@ def test_a_wide_table_is_divided_and_each_part_has_the_first_column(page):
     assert [cell for cell in found if cell != "elbow"] == values[1:]
 
 
+def test_a_heading_in_two_lines_stays_whole():
+    lines = ["┏━━┳━━┓", "┃       ┃   kp, ┃", "┃ joint ┃ N·m/rad ┃", "┡━━╇━━┩", "│ x │ 3 │", "└──┘"]
+    text = report(SimpleNamespace(command="gaponet identify data", lines=lines))
+    assert "| joint | kp, N·m/rad |" in text
+
+
+def test_tables_without_a_title_between_them_are_two():
+    table = ["┏━━┳━━┓", "┃ a ┃ b ┃", "┡━━╇━━┩", "│ x │ 3 │", "└──┴──┘"]
+    text = report(SimpleNamespace(command="gaponet gap data", lines=[*table, *table]))
+    assert text.count("| a | b |") == 2
+    assert "┏" not in text
+
+
+def test_a_box_that_is_no_table_keeps_its_words():
+    lines = ["╭──╮", "│ the robot is warm │", "╰──╯"]
+    text = report(SimpleNamespace(command="gaponet gap data", lines=lines))
+    assert "the robot is warm" in text
+
+
 def test_a_name_in_the_form_is_no_option_of_the_command(page):
     finish(page.jobs, "robot", {}, ("robot", "check", "so101"))
     (page.folder / "logs" / "logs.toml").write_text("mine")

@@ -34,9 +34,8 @@ from gaponet.robot.servo_fields import SERVO_FIELDS
 from gaponet.sysid.uncertainty import JointSummary, ParameterUncertainty, summarize
 
 SHOWN_S = 20.0  # of each motion, so that details are visible
-MIN_POSITION_SPAN = (
-    0.06  # rad of an axis, so that encoder steps of a joint at rest are not magnified
-)
+# rad of a position axis, so that encoder steps of a joint at rest are not magnified
+MIN_POSITION_SPAN = 0.06
 MIN_CORRECTION = 1e-5  # rad; smaller corrections are noise
 MAX_COLUMNS = 4
 FLOOR_COLOUR = "#1f7a56"

@@ -56,7 +56,8 @@ def report(job: Job) -> str:
             continue
         shown += table.markdown()
         table = _Table()
-        shown += _paragraph(line)
+        if not table.take(line):
+            shown += _paragraph(line)
     shown += table.markdown()
     repeat = f"To repeat it in the folder of this page: {escape_markdown(job.command)}"
     return "\n".join([*shown, "", repeat])
@@ -89,12 +90,23 @@ class _Table:
         if line.startswith("┏"):
             return not self.heads
         if line.startswith("┃"):
-            self.heads = _cells(line, "┃")
-        elif line.startswith("│") and self.heads:
+            self._add_heads(_cells(line, "┃"))
+            return True
+        if not self.heads:
+            return False
+        if line.startswith("│"):
             cells = _cells(line, "│", at_most=len(self.heads))
             missing = len(self.heads) - len(cells)
             self.rows.append(cells + [""] * missing)
-        return line.startswith(("┃", "│", "┡", "└"))
+        return line.startswith(("│", "┡", "└"))
+
+    def _add_heads(self, cells: list[str]) -> None:
+        """Add a line of headings; a long heading stands in several lines."""
+        if not self.heads:
+            self.heads = cells
+            return
+        both = zip(self.heads, cells, strict=False)
+        self.heads = [f"{above} {below}".strip() for above, below in both]
 
     def markdown(self) -> list[str]:
         """Return the table as lines of Markdown, in as many parts as the panel is narrow."""
