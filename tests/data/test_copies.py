@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from arm import recordings
 from logs import arm_columns, table_text
+from scipy.signal import lfilter
 
 from gaponet.cli.main import main
 from gaponet.data.describe.row_copies import copied_rows
@@ -127,3 +128,12 @@ def test_a_simulated_servo_with_noisy_encoders_repeats_no_command(arm, noise):
         time = sequence.dt * np.arange(len(sequence))
         read = sequence.qpos + rng.normal(0, noise, sequence.qpos.shape)
         assert np.isnan(copied_rows(Channel(time, sequence.ctrl), Channel(time, read))).all()
+
+
+def test_an_error_that_changes_over_some_rows_is_a_servos_also_in_a_long_recording():
+    rows = 400_000  # 400 s at 1 kHz
+    rng = np.random.default_rng(0)
+    told = rng.normal(size=(rows, 1)).cumsum(axis=0) * 1e-3
+    error = lfilter([1.0], [1.0, -0.8], 1e-4 * rng.normal(size=(rows, 1)), axis=0)
+    time = 1e-3 * np.arange(rows)
+    assert np.isnan(copied_rows(Channel(time, told), Channel(time, told + error))).all()

@@ -7,7 +7,7 @@ pytest.importorskip("rosbags")
 from strange_logs import motion, write_bag
 
 from gaponet.base.errors import LogError
-from gaponet.data.formats import detect, read_logs
+from gaponet.data.formats import ReadOptions, detect, read_logs
 from gaponet.data.importer import import_logs
 
 JOINTS = 'joints = ["shoulder", "elbow"]\n'
@@ -164,3 +164,9 @@ def test_publishers_of_some_joints_each_are_joined_by_name(tmp_path, arm, togeth
     assert np.allclose(
         shoulder, np.interp(states.time - start, 0.02 * np.arange(40), qpos[:, 0]), atol=1e-6
     )
+
+
+def test_topics_keep_their_own_clocks_where_a_rate_is_stated(tmp_path, arm):
+    write_bag(tmp_path / "wave")
+    ((_, log),) = read_logs(tmp_path, arm, ReadOptions(rate=50.0))
+    assert (len(log.channels["ctrl"].time), len(log.channels["qpos"].time)) == (20, 40)

@@ -164,6 +164,7 @@ class RawRecording:
         loaded = self._load_columns([*chosen.values(), *gains.values()], clocks)
         if _is_in_seconds(clocks, loaded):
             specified = LogsFile(time_unit="s") | specified
+        _require_one_length(chosen, loaded, specified, self.place)
         units = _units(robot, specified, list(chosen["ctrl"]), joint_map)
         joints = tuple(name for name in robot.joint_names if name in chosen["ctrl"])
         encoders = _encoders(robot, specified, joint_map)
@@ -172,7 +173,6 @@ class RawRecording:
         for channel, columns in chosen.items():
             time = _time(self, specified, loaded, clocks[channel], channel, columns)
             channels[channel] = Channel(time, in_si.values(channel, columns, loaded))
-        _require_one_length(channels, specified, self.place)
         channels, repeated = _without_equal_rows(channels)
         channels, empty = sampled_channels(channels, joints, self.place)
         channels = _from_zero(channels)
@@ -382,16 +382,25 @@ class _Conversion:
         return to_radians(channel, values, self.joints, self.units, self.robot, self.encoders)
 
 
-def _require_one_length(channels: dict[str, Channel], specified: LogsFile, where: str) -> None:
+def _require_one_length(
+    chosen: Chosen, loaded: dict[str, Signal], specified: LogsFile, where: str
+) -> None:
     """Refuse channels without clocks that have different numbers of rows: they have other rates."""
-    rows = {name: len(channel.time) for name, channel in channels.items()}
-    if "rate" not in specified or max(rows.values()) - min(rows.values()) <= MOST_ROWS_APART:
+    if "rate" not in specified:
+        return
+    rows = {}
+    for channel, columns in chosen.items():
+        signal = loaded[next(name for name, _ in columns.values())]
+        if signal.time is None:
+            rows[channel] = len(signal.values)
+    if max(rows.values(), default=0) - min(rows.values(), default=0) <= MOST_ROWS_APART:
         return
     counted = ", ".join(f"{name} {count}" for name, count in rows.items())
     raise LogError(
         f"{where}: at rate = {specified['rate']:g} Hz all channels must have equally many rows; "
-        f"these have {counted}. They were logged at different rates, or parts are missing: give each its "
-        "clock (time, time_file, [clock] in logs.toml), or write them with one row per instant"
+        f"these have {counted}. They were logged at different rates, or parts are missing: give "
+        "each its clock (time, time_file, [clock] in logs.toml), or write them with one row per "
+        "instant"
     )
 
 

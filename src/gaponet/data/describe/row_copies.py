@@ -15,7 +15,7 @@ from gaponet.data.signals import encoder_step
 
 MAX_COPIED_ROWS = 3  # in both directions
 MIN_COPIED_CHANGES = 20  # of the command; fewer can be equal by chance
-MAX_COMPARED_CHANGES = 20_000  # of a long recording, evenly chosen; more tell nothing new
+MAX_COMPARED_CHANGES = 20_000  # one after the other, amid a long recording; more tell nothing new
 # steps of the readings that a joint passes from row to row, from which chance repeats few of them
 FINE_STEPS = 10
 # Share of the changes that a copy repeats. Rows may be missing. A stiff servo with a coarse encoder
@@ -68,8 +68,8 @@ def copied_rows(command: Channel, state: Channel) -> Array:
         if len(changes) < MIN_COPIED_CHANGES:
             continue
         if len(changes) > MAX_COMPARED_CHANGES:
-            evenly = np.linspace(0, len(changes) - 1, MAX_COMPARED_CHANGES).round()
-            changes = changes[evenly.astype(int)]
+            start = (len(changes) - MAX_COMPARED_CHANGES) // 2
+            changes = changes[start : start + MAX_COMPARED_CHANGES]
         usual_change = float(np.median(np.abs(told[changes] - told[changes - 1])))
         later = reading[nearest[changes][:, None] + shifts]  # (changes, shifts)
         result[joint] = _shift(told[changes], later, shifts, usual_change)
