@@ -1,5 +1,7 @@
 """Feed-forward of motion: the torque that inverse dynamics asks for, less what holding takes."""
 
+from dataclasses import replace
+
 import mujoco
 import numpy as np
 import pytest
@@ -39,6 +41,17 @@ def test_feed_forward_equals_inverse_dynamics(robot):
     )
     friction = data.qfrc_constraint  # of standing still, which mj_inverse counts
     np.testing.assert_allclose(moving.torque()[0], expected + friction, atol=1e-9)
+
+
+def test_what_the_servo_brakes_itself_does_not_rub_in_the_gear(tmp_path):
+    """At an even speed without gravity and damping the motor gives no torque that could rub."""
+    arm = replace(
+        write_arm(tmp_path), kd=np.full(2, 1.5), damping=0.0, frictionloss=0.0, friction_motor=0.3
+    )
+    _, moving = make(arm)
+    moving.qvel = np.full((1, 2), 0.8)
+    moving.qacc = np.zeros((1, 2))
+    np.testing.assert_allclose(moving.torque(), 1.5 * 0.8)
 
 
 def test_a_target_that_stands_asks_for_nothing_and_a_jump_for_a_bounded_torque(robot):

@@ -48,7 +48,8 @@ class Feedforward:
         op = robot.operated_index
         self.dt = dt
         self.share = min(1.0, dt / max(acceleration_time, dt))
-        self.damping = robot.kd[op] + model.dof_damping[operated]
+        self.kd = robot.kd[op]
+        self.damping = model.dof_damping[operated]
         self.friction = model.dof_frictionloss[operated]
         self.servo_terms = present({name: getattr(robot, name)[op] for name in SERVO_TERMS})
         self.inertia = Inertia(sim.batch, model, operated)
@@ -69,9 +70,12 @@ class Feedforward:
         self.target = target.copy()
 
     def torque(self, holding: Array | float = 0.0) -> Array:
-        """Return the torque for motion, (num, n operated) N·m.
+        """Return the torque to ask of servos for motion, (num, n operated) N·m.
 
-        Holding is the torque against gravity.
+        It includes the torque that the servo's kd takes away again, which never loads the gear.
+
+        Args:
+            holding: The torque against gravity, N·m.
         """
         inertial = np.einsum("kij,kj->ki", self.inertia.matrix(len(self.qacc)), self.qacc)
         moving = inertial + self.damping * self.qvel
@@ -79,4 +83,4 @@ class Feedforward:
         friction = overcome_friction(
             self.servo_terms, self.friction, self.qvel, share, holding + moving, holding
         )
-        return np.asarray(moving + friction)
+        return np.asarray(moving + friction + self.kd * self.qvel)

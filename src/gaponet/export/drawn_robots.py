@@ -190,8 +190,9 @@ def _moved(robot: RobotSpec, base: RobotSpec, drawn: Units) -> Units:
     units: Units = dict(from_axes(fields, np.where(signed, x, np.maximum(x, 0.0))))
     op = robot.operated_index
     units["effort_limit"] = base.effort_limit[op] * units["kp"] / base.kp[op]
-    links = ParameterUncertainty.require(robot).links
-    if links and "links" in drawn:
+    if "links" in drawn:
+        links = ParameterUncertainty.require(robot).links
+        assert links is not None
         fitted = np.array(links.values)
         units["links"] = fitted + share * (drawn["links"] - fitted)
     return units

@@ -294,7 +294,7 @@ class IdentifyStep:
     def __init__(self, controls: Controls) -> None:
         self.controls = controls
         gui = controls.gui
-        # Not a limit of time, which would make the result depend on the machine.
+        # A number of rollouts: a limit of time would make the result depend on the machine.
         self.windows = gui.add_number(
             "rollouts",
             IdentifyOptions.windows,
