@@ -79,7 +79,7 @@ class Transfer:
             _require_measured(inverse, AnalyticInverse.of(sim), sim.joint_names)
         self.joint_names = sim.joint_names
         self.op = np.array([sim.joint_names.index(name) for name in robot.operated])
-        self.periods = 1  # of these in a control period of the model
+        self.periods = 1  # control periods of the target in one of the model
         self.loop: DeltaLoop | None = None
         if model is not None:
             self.periods = max(control_periods_of(model, c.dt) for c in dict.fromkeys(conditions))
