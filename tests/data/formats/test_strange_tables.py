@@ -236,3 +236,15 @@ def test_speeds_or_torques_under_the_name_of_targets_are_named(tmp_path, arm, ki
     (tmp_path / "m.csv").write_text(table_text(columns))
     with pytest.raises(LogError, match=kind):
         only(tmp_path / "m.csv", arm, **SI)
+
+
+def test_command_and_state_are_brought_into_the_range_by_the_same_turns(tmp_path):
+    arm = write_arm(tmp_path / "wide", xml=XML.replace("-1.5 1.5", "-3.14 3.14"))
+    state = np.linspace(200.0, 240.0, ROWS)  # −160° to −120°; beyond 180° and 1 rad at its end
+    columns = {"time": 0.02 * np.arange(ROWS)}
+    for joint in arm.joint_names:
+        columns |= {f"ctrl.{joint}": state - 5.0, f"qpos.{joint}": state}
+    (tmp_path / "m.csv").write_text(table_text(columns))
+    log = only(tmp_path / "m.csv", arm, position_unit="deg", time_unit="s")
+    assert np.allclose(log.channels["qpos"].values[:, 0], np.radians(state - 360.0))
+    assert np.allclose(log.channels["ctrl"].values[:, 0], np.radians(state - 365.0))

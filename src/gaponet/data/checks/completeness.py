@@ -195,11 +195,16 @@ def _absent(channel: str, hit: list[Survey]) -> Finding:
 
 def _turns(joint: str, hit: list[Survey]) -> Finding:
     notes = [survey.entry.meta.notes["turns"][joint] for survey in hit]
-    text = (
-        f"{joint} turns on: {sum(n['wraps'] for n in notes)} jumps by a whole turn in "
-        f"{_motions(hit)} were continued"
-    )
-    if any(n["turns"] for n in notes):
+    wraps = sum(n["wraps"] for n in notes)
+    moved = any(n["turns"] for n in notes)
+    if not wraps and not moved:
+        text = (
+            f"{joint} was counted from zero to a whole turn in {_motions(hit)}: its angles were "
+            "brought into its range"
+        )
+        return Finding("note", "turns", text, (joint,))
+    text = f"{joint} turns on: {wraps} jumps by a whole turn in {_motions(hit)} were continued"
+    if moved:
         text += ", and its state was moved by whole turns to its command"
     return Finding("note", "turns", text, (joint,))
 

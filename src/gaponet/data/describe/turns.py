@@ -61,8 +61,10 @@ def within_range(log: Log, robot: RobotSpec) -> Log:
                 wraps += int((np.abs(np.diff(values[:, column])) > TURN_RAD / 2).sum())
         converted = joint in log.meta.get("converted_from", {})
         if inside and (wraps or converted):  # radians beyond the range may be degrees
-            for name, values in inside.items():
-                positions[name][:, column] = values
+            reference = next(iter(inside.values()))
+            for name, values in positions.items():
+                beside = _of_same_turn(values[:, column], reference)
+                values[:, column] = inside.get(name, beside)
             turned[joint] = {"wraps": wraps, "turns": 0}
     return _with_positions(log, positions, turned) if turned else log
 
@@ -72,7 +74,8 @@ def _with_positions(log: Log, positions: dict[str, Array], turned: dict[str, Any
     channels = {
         name: Channel(log.channels[name].time, values) for name, values in positions.items()
     }
-    notes = log.meta.get("notes", {}) | {"turns": turned}
+    notes = dict(log.meta.get("notes", {}))
+    notes["turns"] = notes.get("turns", {}) | turned
     return replace(log, channels=log.channels | channels, meta=log.meta | {"notes": notes})
 
 
@@ -90,6 +93,12 @@ def _inside_range(values: Array, low: float, high: float) -> Array | None:
     continued -= TURN_RAD * round((middle - (low + high) / 2) / TURN_RAD)
     reached = continued.min() >= low - MAX_STEP_RAD and continued.max() <= high + MAX_STEP_RAD
     return continued if reached else None
+
+
+def _of_same_turn(values: Array, reference: Array) -> Array:
+    """Return one joint's angles (k,) moved by whole turns to those of its command or state."""
+    apart = float(np.median(values) - np.median(reference))
+    return np.asarray(values - TURN_RAD * round(apart / TURN_RAD))
 
 
 def _continue(values: Array) -> int:
