@@ -1,6 +1,6 @@
-"""Speed of one correction, and of the aligned simulator.
+"""Speed of one correction or compensated command, and of the aligned simulator.
 
-    python benchmarks/speed.py latency --run RUN               one correction: onnxruntime, torch, delta()
+    python benchmarks/speed.py latency --run RUN               one robot: onnxruntime, torch, delta(), Compensator
     python benchmarks/speed.py aligned --run RUN               the aligned simulator beside the nominal one
 
 All parts take turns in one run, so that a slow moment of the machine slows all of them. Of repeated turns the fastest
@@ -10,9 +10,10 @@ counts, because other programs only add time. Results are printed as JSON.
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -22,9 +23,11 @@ import torch
 
 from gaponet.base.arrays import Array
 from gaponet.deploy.aligned_sim import AlignedSim, AlignedSimOptions
+from gaponet.deploy.compensator import Compensator
 from gaponet.nn.artifact import GapModel
 from gaponet.nn.onnx_export import trained_network
 from gaponet.robot.folder import load_stored_robot
+from gaponet.robot.spec import RobotSpec
 from gaponet.sim.batch import BatchSim, Condition
 from gaponet.sim.model import idle_joints
 
@@ -37,6 +40,8 @@ CALLS = 3000  # of each runtime, in turns of a tenth
 
 def bench_latency(run: Path) -> dict[str, Any]:
     """Microseconds of one correction (p50, p99, max) on each runtime, and corrections per second in batches.
+    Beside it the Compensator of the run's simulator, with and without the network, and one control
+    period of that simulator alone.
 
     Args:
         run: Run folder of gaponet train.
@@ -50,6 +55,10 @@ def bench_latency(run: Path) -> dict[str, Any]:
         net = trained_network(run, model.config, n)
         turns["network, torch"] = torch.inference_mode()(partial(net, torch.from_numpy(x[:1])))
     turns["delta()"] = _correction(model, rng.normal(0, 0.3, (64, 3, n)))
+    robot = model.simulator()
+    turns["Compensator.step without network"] = _compensation(robot, None)
+    turns["Compensator.step"] = _compensation(robot, model)
+    turns["simulator, one control period"] = _period(robot)
     micro: dict[str, list[Array]] = {name: [] for name in turns}
     for _ in range(10):
         for name, turn in turns.items():
@@ -115,6 +124,36 @@ def _correction(model: GapModel, states: Array) -> Turn:
         return loop.delta(qpos, qvel, ctrl, 1.0)
 
     return step
+
+
+def _targets(robot: RobotSpec) -> Iterator[Array]:
+    """Yield targets of a slow motion around home, (n) rad."""
+    for t in itertools.count():
+        yield robot.qpos_home + 0.1 * np.sin(t * robot.dt * np.ones(len(robot.joint_names)))
+
+
+def _compensation(robot: RobotSpec, model: GapModel | None) -> Turn:
+    """One period of a robot that is where it should be and carries nothing, as stated."""
+    compensator = Compensator(robot, model)
+    compensator.reset(robot.qpos_home, payload_mass=0.0)
+    targets = _targets(robot)
+
+    def step() -> Array:
+        target = next(targets)
+        return compensator.step(target, target)
+
+    return step
+
+
+def _period(robot: RobotSpec) -> Turn:
+    """One control period of the simulator."""
+    locked = idle_joints(robot, robot.operated)
+    sim = BatchSim(robot, [Condition(0.0, "both", robot.dt)], 1, locked)
+    free = robot.index(sim.joint_names)
+    home = robot.qpos_home[None, free]
+    sim.reset(slice(None), home, 0.0, past=home[:, None])  # type: ignore[arg-type]
+    targets = _targets(robot)
+    return lambda: sim.step(next(targets)[None, free])
 
 
 def _durations(turn: Turn, calls: int) -> Array:

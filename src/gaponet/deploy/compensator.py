@@ -34,12 +34,12 @@ from typing import Literal
 import mujoco
 import numpy as np
 
-from gaponet.base.arrays import Array
+from gaponet.base.arrays import Array, within
 from gaponet.base.errors import ModelError, RobotError, UsageError
 from gaponet.data.describe.plausibility import require_radians
 from gaponet.deploy.feedforward import Feedforward
 from gaponet.deploy.follow import Follower
-from gaponet.deploy.payload import PayloadEstimate
+from gaponet.deploy.payload import PayloadEstimate, PayloadFields
 from gaponet.deploy.transfer import own_context
 from gaponet.nn.adaptation import Adaptation
 from gaponet.nn.artifact import GAIN_TOLERANCE, GapModel
@@ -171,10 +171,8 @@ class Compensator:
         locked = idle_joints(robot, robot.operated)
         empty = Condition(0.0, payload_side, self.dt)
         loads = [Condition(float(mass), payload_side, self.dt) for mass in self.masses]
-        # The last rows never move. Their models have one of the masses each, and are copied when a
-        # payload changes.
-        self.shadow = BatchSim(robot, [empty] * num + loads, nthread, locked)
-        self.ids = np.arange(num)
+        self.shadow = BatchSim(robot, [empty] * num, nthread, locked)
+        self._loaded = PayloadFields(self.shadow, loads, locked)
         self.op = robot.operated_index
         self.free = robot.index(self.shadow.joint_names)
         self.operated = np.searchsorted(self.free, self.op)  # operated joints among the shadow's
@@ -191,9 +189,7 @@ class Compensator:
             self.shadow, self.operated, robot, self.dt, config.acceleration_time
         )
         self.feedback = Feedback(config, self.dt)
-        self.payload_estimate = PayloadEstimate(
-            self.shadow, self.operated, robot, len(self.masses), self.dt
-        )
+        self.payload_estimate = PayloadEstimate(robot, max_mass, payload_side, self.dt, locked)
         self._carried = np.full(num, -1)  # index of the mass that each shadow carries
         self.follower: Follower | None = None
         if follow is not None:
@@ -264,9 +260,9 @@ class Compensator:
         self.offset = np.zeros(self.command.shape)
         self.feedback.reset(self.command.shape)
         self.feedforward.reset(self.command)
-        rest = np.clip(a[:, self.free], *self.shadow.range.T)
-        self.shadow.reset(self.ids, rest, 0.0, past=rest[:, None])  # type: ignore[arg-type]
-        self.shadow.batch.forward(self.ids, stage=mujoco.mjtStage.mjSTAGE_VEL.value)
+        rest = within(a[:, self.free], *self.shadow.range.T)
+        self.shadow.reset(slice(None), rest, 0.0, past=rest[:, None])  # type: ignore[arg-type]
+        self.shadow.batch.forward(stage=mujoco.mjtStage.mjSTAGE_VEL.value)
         if self.follower is not None:
             self.follower.reset(rest, SETTLING_PERIODS)
         for _ in range(SETTLING_PERIODS):
@@ -299,10 +295,10 @@ class Compensator:
         self.payload_mass = payload_mass
         nearest = np.abs(self.payload_mass[:, None] - self.masses).argmin(axis=1)
         if (nearest != self._carried).any():
-            for field in self.shadow.fields.values():
-                field[: self.num_envs] = field[self.num_envs + nearest]
+            robots = np.arange(self.num_envs)
+            self._loaded.carry(robots, nearest)
             if self.follower is not None:
-                self.follower.carry(self.ids, nearest)
+                self.follower.carry(robots, nearest)
             if self.loop is not None and self._contexts is not None:
                 self.loop.set_context(self._contexts[nearest])
             self._carried = nearest
@@ -344,13 +340,14 @@ class Compensator:
             v = np.zeros_like(q) if qvel is None else self._as_rows(qvel)[:, self.op]
             torque = None if tau is None else self._as_rows(tau)[:, self.op]
             self._process_state(q, v, torque)
-        self.feedforward.update(a)
+        if self.config.dynamics:
+            self.feedforward.update(a)
         shadow_target = self._shadow_target(targets[:, self.free])
         u = self._invert(shadow_target) + self.feedback.integral
         share = min(1.0, self.periods * self.dt / self.config.blend) if self.config.blend else 1.0
         unlimited = a + share * (u - a)
         limit = self.config.limit
-        self.command = np.clip(np.clip(unlimited, a - limit, a + limit), self.low, self.high)
+        self.command = within(within(unlimited, a - limit, a + limit), self.low, self.high)
         self.feedback.saturation = np.sign(unlimited - self.command)
         self.limited_periods += self._at_limit()
         self.periods += 1
@@ -397,11 +394,11 @@ class Compensator:
 
     def _update_deviation(self, measured: Array) -> None:
         """Update the slow deviation of robots from their shadows; (num_envs, n) rad."""
-        deviation = measured - self.shadow.qpos[: self.num_envs, self.operated]
+        deviation = measured - self.shadow.qpos[:, self.operated]
         valid = np.isfinite(deviation).all(axis=1, keepdims=True)
         limit = self.config.feedback_limit
         share = min(1.0, self.dt / max(self.config.observation_time, self.dt))
-        change = share * (np.clip(deviation, -limit, limit) - self._deviation)
+        change = share * (within(deviation, -limit, limit) - self._deviation)
         self._deviation += np.where(valid, change, 0.0)
 
     @property
@@ -459,22 +456,22 @@ class Compensator:
         """
         if self.follower is not None:
             commands = self.follower.command(targets)[:, self.operated]
-            return np.asarray(np.clip(commands, self.low, self.high))
+            return np.asarray(within(commands, self.low, self.high))
         a = targets[:, self.operated]
         if self.config.aim == "simulator":
-            return np.asarray(np.clip(a, self.low, self.high))
-        tau = self.bias[: self.num_envs, self.operated]
+            return np.asarray(within(a, self.low, self.high))
+        tau = self.bias[:, self.operated]
         if self.config.dynamics:
             tau = tau + self.feedforward.torque(tau)
         held = a + tau / self.kp - self.zero_offset
-        return np.asarray(np.clip(held, self.low, self.high))
+        return np.asarray(within(held, self.low, self.high))
 
     def _invert(self, shadow_target: Array) -> Array:
         """Return u with u + G(u) = a′. Without a model, u = a′."""
         if self.loop is None:
             return shadow_target
-        q = self.shadow.qpos[: self.num_envs, self.operated]
-        v = self.shadow.qvel[: self.num_envs, self.operated]
+        q = self.shadow.qpos[:, self.operated]
+        v = self.shadow.qvel[:, self.operated]
         gain = self.config.gain
         iterations = self.config.iterations
         return self.loop.solve(
@@ -485,17 +482,17 @@ class Compensator:
         """Update feedback and payload estimate from a measured state."""
         valid = np.isfinite(q + v + (0.0 if tau is None else tau)).all(axis=1)  # robots
         if self.periods:
-            self.feedback.update(self.shadow.qpos[: self.num_envs, self.operated] - q, valid)
+            self.feedback.update(self.shadow.qpos[:, self.operated] - q, valid)
+        doubts = self.payload_stated and self.single and len(self.masses) > 1
+        if doubts or not self.payload_stated:
+            self.payload_estimate.observe(q, v, self.command, tau, valid)
         if not self.payload_stated:
-            self._carry(self.payload_estimate.update(q, v, self.command, tau, valid))
-        elif self.single and len(self.masses) > 1:
-            self.payload_estimate.update(q, v, self.command, tau, valid)
+            self._carry(self.payload_estimate.update())
 
     def _step_shadow(self, targets: Array, operated_targets: Array) -> None:
-        full = np.zeros((self.shadow.num_envs, self.shadow.n))
-        full[: self.num_envs] = targets
-        full[: self.num_envs, self.operated] = operated_targets
-        self.shadow.step(full, self.ids)
+        full = targets.copy()
+        full[:, self.operated] = operated_targets
+        self.shadow.step(full)
 
     def _as_rows(self, values: Array) -> Array:
         """Return (n,) or (num_envs, n) as (num_envs, n)."""
@@ -534,14 +531,14 @@ class Feedback:
         config = self.config
         limit = self.config.feedback_limit
         # A blocked joint has a large error, which must not take long to decrease.
-        limited = np.clip(error, -limit, limit)
+        limited = within(error, -limit, limit)
         filtered = self._filtered + (limited - self._filtered) * min(
             1.0, self.dt / max(config.feedback_time, self.dt)
         )
         winds_up = filtered * self.saturation > 0
         integral = self.integral + config.feedback * self.dt * np.where(winds_up, 0.0, filtered)
         self._filtered = np.where(valid[:, None], filtered, self._filtered)
-        self.integral = np.where(valid[:, None], np.clip(integral, -limit, limit), self.integral)
+        self.integral = np.where(valid[:, None], within(integral, -limit, limit), self.integral)
 
 
 def _max_payload(

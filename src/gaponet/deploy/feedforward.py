@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gaponet.base.arrays import Array
+from gaponet.base.arrays import Array, within
 from gaponet.robot.servo_fields import SERVO_TERMS
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.batch import BatchSim
@@ -64,8 +64,8 @@ class Feedforward:
     def update(self, target: Array) -> None:
         """Set the targets of the coming control period, (num, n operated) rad."""
         before = self.qvel
-        self.qvel = np.clip((target - self.target) / self.dt, -MAX_SPEED, MAX_SPEED)
-        qacc = np.clip((self.qvel - before) / self.dt, -MAX_ACCELERATION, MAX_ACCELERATION)
+        self.qvel = within((target - self.target) / self.dt, -MAX_SPEED, MAX_SPEED)
+        qacc = within((self.qvel - before) / self.dt, -MAX_ACCELERATION, MAX_ACCELERATION)
         self.qacc = self.qacc + self.share * (qacc - self.qacc)
         self.target = target.copy()
 

@@ -24,7 +24,6 @@ from gaponet.deploy.transfer import Transfer, require_measured_range
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.batch import BatchSim, Condition
 from gaponet.sim.inverse import AnalyticInverse
-from gaponet.sim.model import build_model
 
 
 class Follower:
@@ -68,14 +67,8 @@ class Follower:
         self._nominal = self._transfer.sim
         if not extrapolate:
             require_measured_range(inverse, AnalyticInverse.of(self._nominal), plant.joint_names)
-        side = condition.payload_side
-        self._carried = []
-        for spec, batch in ((robot, plant.batch), (nominal, self._nominal.batch)):
-            models = []
-            for mass in masses:
-                model = build_model(spec, float(mass), side, condition.dt, locked, True)
-                models.append(model)
-            self._carried.append(PayloadFields(batch, models))
+        loads = [condition._replace(payload_mass=float(mass)) for mass in masses]
+        self._carried = [PayloadFields(sim, loads, locked) for sim in (plant, self._nominal)]
 
     @property
     def saturated(self) -> Array:

@@ -5,13 +5,16 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
-from gaponet.base.arrays import Array
+from gaponet.base.arrays import Array, within
 from gaponet.robot.spec import RobotSpec
-from gaponet.sim.batch import Batch, BatchSim, differing_fields
+from gaponet.sim.batch import BatchSim, Condition, differing_fields
+from gaponet.sim.model import build_model
 
 FORGETTING_TIME_S = 1.0  # time constant
 MAX_RATE_KG_S = 1.0  # of the estimate: a payload that appears at once must not make commands jump
 HALF_WEIGHT_SPEED = 0.5  # rad/s; samples at this speed have half the weight, faster ones less
+# Time between two samples of the torques: payloads change slowly, and control periods are short.
+SAMPLE_TIME_S = 0.06
 MIN_LEVERAGE = 0.4  # (N·m/kg)² s; below it, the estimate does not change
 # Least share of the excess torque over the empty arm's that must look like the largest payload's.
 # On a virtual H1-2, 3 kg give 0.57 to 0.97, and no payload with positions wrong by 0.12 rad up to
@@ -22,10 +25,21 @@ MIN_SIMILARITY = 0.55
 class PayloadFields:
     """Values of the model fields that depend on the payload, for each possible mass."""
 
-    def __init__(self, batch: Batch, models: list[mujoco.MjModel]) -> None:
-        """models: The batch's model with each of the masses."""
+    def __init__(self, sim: BatchSim, loads: list[Condition], locked: tuple[str, ...]) -> None:
+        """
+        Args:
+            sim: Simulations that carry one of the loads each.
+            loads: Their condition with each of the masses.
+            locked: Joints that are clamped at home in `sim`.
+        """
+        models = []
+        for load in loads:
+            model = build_model(
+                sim.robot, load.payload_mass, load.payload_side, load.dt, locked, physics_only=True
+            )
+            models.append(model)
         self._values = differing_fields(models)  # (masses, …)
-        self._fields = {name: batch.expand(name) for name in self._values}  # (simulations, …)
+        self._fields = {name: sim.batch.expand(name) for name in self._values}  # (simulations, …)
 
     def carry(self, simulations: Array, mass: Array) -> None:
         """Let simulations, (k,) indices, carry masses, (k,) indices."""
@@ -41,41 +55,50 @@ class PayloadEstimate:
 
     Attributes:
         mass: Estimate of each robot, (num,) kg, with a limited rate.
-        latest: Estimate without the limit, (num,) kg.
-        certain: Robots with enough leverage, (num,).
     """
 
     def __init__(
-        self, sim: BatchSim, operated: Array, robot: RobotSpec, num_masses: int, dt: float
+        self,
+        robot: RobotSpec,
+        max_mass: float,
+        payload_side: str,
+        dt: float,
+        locked: tuple[str, ...],
     ) -> None:
         """
         Args:
-            sim: Its last num_masses rows carry payloads from 0 to the largest. The first and last
-                of them are used.
-            operated: Operated joints among the simulation's, (n,).
+            max_mass: Largest payload per hand, kg.
+            payload_side: The hands that carry it.
             dt: Control period, s.
+            locked: Joints that are clamped at home; no operated one.
         """
-        self.sim = sim
-        self.operated = operated
-        self.dt = dt
-        self.rows = np.array([sim.num_envs - num_masses, sim.num_envs - 1])
+        self.max_mass = max_mass
         self.kp = robot.kp[robot.operated_index]
         self.kd = robot.kd[robot.operated_index]
-        self.max_mass = float(sorted(c[0] for c in sim.models)[-1])
-        self.bias: Array = sim.batch.bind("qfrc_bias")
-        self.home = robot.qpos_home[robot.index(sim.joint_names)]
-        self.mass, self._projection, self._leverage, self._energy, self.latest = np.zeros((5, 0))
-        self.certain = np.zeros(0, bool)
+        self.sample_periods = max(1, round(SAMPLE_TIME_S / dt))
+        self.dt = dt
+        self.sample_time = dt * self.sample_periods  # s
+        self.keep = np.exp(-self.sample_time / FORGETTING_TIME_S)  # share of the sums
+        # Two robots at rest, with empty hands and with the largest payload.
+        empty = Condition(0.0, payload_side, dt)
+        self.sim = BatchSim(robot, [empty, empty._replace(payload_mass=max_mass)], 1, locked)
+        self.operated = np.flatnonzero(np.isin(self.sim.joint_names, robot.operated))
+        self.bias: Array = self.sim.batch.bind("qfrc_bias")
+        self.sim.qpos[:] = robot.qpos_home[robot.index(self.sim.joint_names)]
+        self.reset(0)
 
     def reset(self, num: int) -> None:
         """Start with empty hands of num robots."""
-        self.mass, self._projection, self._leverage, self._energy, self.latest = np.zeros((5, num))
-        self.certain = np.zeros(num, bool)
+        self.mass = np.zeros(num)
+        self._period = 0
+        # Of each robot: torque that looks like a payload's per kg, N²·m²·s/kg; leverage,
+        # N²·m²·s/kg²; energy of the torque beyond the empty arm's, N²·m²·s. (3, num)
+        self._sums = np.zeros((3, num))
 
-    def update(
+    def observe(
         self, qpos: Array, qvel: Array, command: Array, tau: Array | None, valid: Array
-    ) -> Array:
-        """Process one control period of all robots; return the mass per robot, (num,) kg.
+    ) -> None:
+        """Take the torques of one control period of all robots into account.
 
         Args:
             qpos, qvel: Measured, (num, n operated) rad, rad/s.
@@ -83,29 +106,45 @@ class PayloadEstimate:
             tau: Measured torque, (num, n operated) N·m; None for the servo model's.
             valid: Robots with a finite state, (num,). The others are skipped.
         """
+        self._period += 1
+        if self._period % self.sample_periods:
+            return
         torque = self.kp * (command - qpos) - self.kd * qvel if tau is None else tau
-        keep = np.exp(-self.dt / FORGETTING_TIME_S)
-        for i in np.flatnonzero(valid):
+        for i in valid.nonzero()[0]:
             empty, full = self.gravity(qpos[i])
             per_kg = (full - empty) / self.max_mass
             excess = torque[i] - empty
-            weight = 1.0 / (1.0 + (np.abs(qvel[i]).max() / HALF_WEIGHT_SPEED) ** 2)
-            self._projection[i] = (
-                keep * self._projection[i] + weight * float(per_kg @ excess) * self.dt
+            speed = max(qvel[i].max(), -qvel[i].min())
+            weight = self.sample_time / (1.0 + (speed / HALF_WEIGHT_SPEED) ** 2)
+            self._sums[:, i] *= self.keep
+            self._sums[:, i] += (
+                weight * (per_kg @ excess),
+                weight * (per_kg @ per_kg),
+                weight * (excess @ excess),
             )
-            self._energy[i] = keep * self._energy[i] + weight * float(np.sum(excess**2)) * self.dt
-            self._leverage[i] = keep * self._leverage[i] + weight * float(per_kg @ per_kg) * self.dt
-        estimate = np.clip(self._projection / np.maximum(self._leverage, 1e-9), 0.0, self.max_mass)
-        explained = self._projection * np.abs(self._projection)
-        similarity = explained / np.maximum(self._leverage * self._energy, 1e-9)
-        estimate = np.where(
-            similarity < MIN_SIMILARITY * (estimate / self.max_mass) ** 2, 0.0, estimate
-        )
-        self.certain = self._leverage > MIN_LEVERAGE
-        self.latest = np.where(self.certain, estimate, self.mass)
+
+    def update(self) -> Array:
+        """Return the estimate after the latest torques, (num,) kg. Call this once per period."""
+        latest = np.where(self.certain, self.latest, self.mass)
         change = MAX_RATE_KG_S * self.dt
-        self.mass = self.mass + np.clip(self.latest - self.mass, -change, change)
+        self.mass = self.mass + within(latest - self.mass, -change, change)
         return self.mass
+
+    @property
+    def certain(self) -> Array:
+        """Robots whose postures had enough leverage, (num,)."""
+        _, leverage, _ = self._sums
+        return np.asarray(leverage > MIN_LEVERAGE)
+
+    @property
+    def latest(self) -> Array:
+        """Estimate without the limit of its rate, (num,) kg."""
+        projection, leverage, energy = self._sums
+        mass = within(projection / np.maximum(leverage, 1e-9), 0.0, self.max_mass)
+        explained = projection * np.abs(projection)
+        similarity = explained / np.maximum(leverage * energy, 1e-9)
+        similar = similarity >= MIN_SIMILARITY * (mass / self.max_mass) ** 2
+        return np.where(similar, mass, 0.0)
 
     def contradiction(self, stated: float) -> str:
         """Return a message if torques are those of another payload than stated, kg; else "".
@@ -122,9 +161,7 @@ class PayloadEstimate:
 
     def gravity(self, qpos: Array) -> Array:
         """Return the torques that hold a posture, empty and with most payload, (2, n) N·m."""
-        self.sim.qpos[self.rows] = self.home
-        self.sim.qvel[self.rows] = 0.0
-        self.sim.qpos[self.rows[:, None], self.operated] = qpos
-        self.sim.batch.forward(self.rows, stage=mujoco.mjtStage.mjSTAGE_VEL.value)
-        torques: Array = self.bias[self.rows][:, self.operated]
+        self.sim.qpos[:, self.operated] = qpos
+        self.sim.batch.forward(stage=mujoco.mjtStage.mjSTAGE_VEL.value)
+        torques: Array = self.bias[:, self.operated]
         return torques
