@@ -35,7 +35,7 @@ from gaponet.data.split import SPLITS
 from gaponet.evaluation.candidate import split_of_run
 from gaponet.nn.artifact import CARD, WEIGHTS, GapModel, sha256
 from gaponet.nn.network_card import HEADINGS, NetworkCard, network_cards
-from gaponet.nn.onnx_export import MAX_DIFFERENCE_RAD, with_small_matrices
+from gaponet.nn.onnx_export import MAX_DIFFERENCE_RAD
 from gaponet.nn.onnx_network import OnnxNetwork
 from gaponet.nn.packaged_networks import MAX_TOTAL_BYTES, catalogue
 from gaponet.robot.card import PUBLISHED, Published, SourceOfData, markdown_cards
@@ -47,6 +47,11 @@ from gaponet.sim.replay import replay
 PAGE = Path(__file__).parents[1] / "docs" / "network.md"
 FLOAT32_BYTES = 400_000  # a network up to this size keeps all digits of its weights
 MAX_RECORDINGS = 8  # in which the stored network is compared with the trained one
+MIN_SPARSE_ELEMENTS = 2048  # of a matrix that is stored sparsely; smaller ones need no index
+MAX_SPARSE_DENSITY = 0.1  # share of its elements that are not zero
+# Of a matrix that is stored as int16: the small first layers matter most for the output and little
+# for the size.
+MIN_INT16_ELEMENTS = 32_768
 DROPPED = ("parity_rad", "seconds")  # of a card: facts of the machine, not of the network
 
 
@@ -170,6 +175,70 @@ def visited_inputs(model: GapModel, run: Path, dataset: str) -> np.ndarray:
     simulator = load_stored_robot(run, model.card["robot"])
     replay(data.sequences(entries), simulator, observed.corrector(simulator), lock_idle=True)
     return np.concatenate(inputs)
+
+
+def with_small_matrices(content: bytes, *, int16: bool) -> bytes:
+    """Return an ONNX file whose large matrices need less space.
+
+    A matrix that selects features has few elements; only these are stored, and all outputs stay
+    equal bit for bit.
+
+    Args:
+        content: ONNX file with float32 matrices.
+        int16: Store other matrices of MIN_INT16_ELEMENTS and more as int16 with one float32 scale a
+            row. Outputs then change: a weight by up to 1/65,534 of the largest one in its row.
+            float16 would change it by up to 1/4,096 of itself, which changes outputs some eight
+            times as much.
+    """
+    model = onnx.load_model_from_string(content)
+    graph = model.graph
+    decoding = []
+    for tensor in list(graph.initializer):
+        matrix = onnx.numpy_helper.to_array(tensor)
+        if matrix.ndim != 2:
+            continue
+        few = np.count_nonzero(matrix) <= MAX_SPARSE_DENSITY * matrix.size
+        if few and matrix.size >= MIN_SPARSE_ELEMENTS:
+            graph.sparse_initializer.append(_sparse(tensor.name, matrix))
+        elif int16 and matrix.size >= MIN_INT16_ELEMENTS:
+            stored, nodes = _as_int16(tensor.name, matrix)
+            graph.initializer.extend(stored)
+            decoding += nodes
+        else:
+            continue
+        graph.initializer.remove(tensor)
+    nodes = [*decoding, *graph.node]
+    del graph.node[:]
+    graph.node.extend(nodes)
+    return bytes(model.SerializeToString())
+
+
+def _sparse(name: str, matrix: np.ndarray) -> Any:
+    """Return a matrix as a sparse tensor of ONNX."""
+    index = np.flatnonzero(matrix)
+    values = onnx.numpy_helper.from_array(matrix.ravel()[index], name)
+    indices = onnx.numpy_helper.from_array(index.astype(np.int64), f"{name}_index")
+    return onnx.helper.make_sparse_tensor(values, indices, list(matrix.shape))
+
+
+def _as_int16(name: str, matrix: np.ndarray) -> tuple[list[Any], list[Any]]:
+    """Return a matrix as int16 steps with a scale for each row, and the nodes that compute it from
+    these.
+    """
+    scale = np.abs(matrix).max(axis=1, keepdims=True) / np.iinfo(np.int16).max
+    scale = np.where(scale > 0, scale, 1.0).astype(np.float32)
+    steps = np.round(matrix / scale).astype(np.int16)
+    stored = [
+        onnx.numpy_helper.from_array(steps, f"{name}_steps"),
+        onnx.numpy_helper.from_array(scale, f"{name}_scale"),
+    ]
+    nodes = [
+        onnx.helper.make_node(
+            "Cast", [f"{name}_steps"], [f"{name}_float"], to=onnx.TensorProto.FLOAT
+        ),
+        onnx.helper.make_node("Mul", [f"{name}_float", f"{name}_scale"], [name]),
+    ]
+    return stored, nodes
 
 
 def stored_form(trained: bytes, inputs: np.ndarray) -> tuple[bytes, float]:

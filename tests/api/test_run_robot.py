@@ -15,7 +15,7 @@ from wild_model import wild_model
 
 import gaponet as gp
 from gaponet.api.record import record_motions
-from gaponet.api.run_report import SilentReporter, describe_plan
+from gaponet.api.run_report import PlanText, describe_plan
 from gaponet.api.run_robot import Compensation, RunRequest
 from gaponet.base.errors import RobotError, UsageError
 from gaponet.cli.main import main
@@ -24,7 +24,7 @@ from gaponet.hw.control.clock import SimulatedClock
 from gaponet.hw.control.hardware import hardware_robot, reference_robot
 from gaponet.hw.control.phases import ControlConfig
 from gaponet.hw.control.plan import Planner
-from gaponet.hw.control.recording import Recording
+from gaponet.hw.control.recording import Event, Recording
 from gaponet.hw.control.safety import SafetyConfig
 from gaponet.hw.drivers.open import open_driver
 from gaponet.motion.motion import Motion
@@ -47,6 +47,19 @@ def changed(name: str, old: str, new: str, folder: Path) -> Path:
     assert old in file.read_text()
     file.write_text(file.read_text().replace(old, new))
     return folder
+
+
+class SilentReporter:
+    """Shows nothing. The result of the run holds plan and events."""
+
+    def plan(self, text: PlanText) -> None:
+        pass
+
+    def note(self, text: str) -> None:
+        pass
+
+    def event(self, event: Event) -> None:
+        pass
 
 
 @pytest.fixture
@@ -112,7 +125,7 @@ def test_with_follow_the_commands_move_the_identified_robot_as_the_nominal_simul
     result = gp.run_robot(tmp_path / "soft", motion=SWAY, options=options, report=SilentReporter())
 
     assert result.recording.meta["follow"] == "nominal"
-    rows = result.recording.phase_rows("run")
+    rows = result.recording.run_rows()
     start = rows["qpos"][0]
     nominal = simulate(arm, start, rows["target"])
     followed = simulate(soft, start, rows["ctrl"])

@@ -56,7 +56,7 @@ if __name__ == "__main__":
     watchdog.wait_ready()
     watchdog.release()
     print("watched")
-    with open_pool("local", 1, 1) as pool:
+    with open_pool("local", 1) as pool:
         print(*pool.map(abs, [-3]), "computed")
 """
 

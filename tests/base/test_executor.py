@@ -27,7 +27,7 @@ def carried_out(pool, folder, numbers):
 
 def test_the_job_of_a_killed_worker_is_repeated_and_no_other_job(tmp_path, monkeypatch):
     monkeypatch.setenv("OMP_NUM_THREADS", "7")
-    with open_pool("local", 2, 1) as pool:
+    with open_pool("local", 2) as pool:
         outcomes, attempts = carried_out(pool, tmp_path, range(8))
         assert list(pool.map(abs, (-3, 2, -1))) == [3, 2, 1]
     assert attempts == {0: 2, 1: 1, 2: 2, 3: 1, 4: 2, 5: 3, 6: 2, 7: 1}
@@ -44,7 +44,7 @@ def test_the_job_of_a_killed_worker_is_repeated_and_no_other_job(tmp_path, monke
 @pytest.mark.skipif(find_spec("ray") is None, reason="needs ray")
 def test_ray_repeats_the_job_of_a_killed_worker(tmp_path, monkeypatch):
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(sys.path))  # jobs.py
-    with open_pool("ray", 2, 1) as pool:
+    with open_pool("ray", 2) as pool:
         outcomes, attempts = carried_out(pool, tmp_path, (0, 1, 7))
     assert attempts == {0: 2, 1: 1, 7: 1}
     assert [outcomes[n].result() for n in (0, 1)] == [(0, "1"), (1, "1")]
@@ -54,7 +54,7 @@ def test_ray_repeats_the_job_of_a_killed_worker(tmp_path, monkeypatch):
 
 def test_executors_of_the_standard_library_are_accepted():
     for executor in (ThreadPoolExecutor(2), ProcessPoolExecutor(2)):
-        with executor, open_pool(executor, 0, 1) as pool:
+        with executor, open_pool(executor, 0) as pool:
             assert list(pool.map(abs, range(-9, 0))) == [*range(9, 0, -1)]
 
 
@@ -64,7 +64,7 @@ def test_an_unknown_executor_is_refused_with_the_alternatives(where):
         r"--executor .*: choose local, ray or ray:ADDRESS; from Python, give a "
         r"concurrent\.futures\.Executor"
     )
-    with pytest.raises(UsageError, match=answer), open_pool(where, 0, 1):
+    with pytest.raises(UsageError, match=answer), open_pool(where, 0):
         pass
 
 

@@ -637,7 +637,7 @@ class RunResult:
         the command.
         """
         recording = self.recording
-        rows = recording.phase_rows("run")
+        rows = recording.run_rows()
         if len(rows) < 2:
             return {}
         columns = [recording.joint_names.index(name) for name in recording.commanded]
@@ -667,6 +667,6 @@ class RunResult:
         """Return the tracking errors as JSON has them: empty if the run had fewer than two
         periods.
         """
-        if len(self.recording.phase_rows("run")) < 2:
+        if len(self.recording.run_rows()) < 2:
             return {}
         return {"tracking_error_rad": {"mean": self.mean_tracking_error} | self.tracking_error}

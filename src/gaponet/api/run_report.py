@@ -70,19 +70,6 @@ class RunReporter(Protocol):
         """Show a change of phase."""
 
 
-class SilentReporter:
-    """Shows nothing. The result of the run holds plan and events."""
-
-    def plan(self, text: PlanText) -> None:
-        pass
-
-    def note(self, text: str) -> None:
-        pass
-
-    def event(self, event: Event) -> None:
-        pass
-
-
 class StderrReporter:
     """Writes everything to standard error, where the question for consent is asked too."""
 

@@ -53,11 +53,10 @@ class _Outcome(Generic[Job, Result]):
 
 @dataclass(frozen=True)
 class Pool:
-    """Executor with the number of jobs that it receives at a time, and the threads of each job."""
+    """Executor with the number of jobs that it receives at a time."""
 
     executor: Executor
     size: int
-    threads: int = 1
 
     def run(
         self,
@@ -79,7 +78,7 @@ class Pool:
         running = dict[Future[Any], tuple[Job, int]]()  # → job, and how many workers died of it
 
         def submit(job: Job, deaths: int) -> None:
-            with _child_environment(self.threads):
+            with _child_environment():
                 running[self.executor.submit(_run_job, work, job)] = job, deaths
 
         try:
@@ -116,11 +115,6 @@ class Pool:
                 yield early.pop(turn).result()
                 turn += 1
 
-    @staticmethod
-    def cores(threads: int) -> int:
-        """Return how many jobs with this many threads fit the cores of this machine."""
-        return max(1, (os.cpu_count() or 1) // threads)
-
 
 def _worker_error(last: BaseException, deaths: int) -> WorkerError:
     """Return the error of a job of which so many workers died."""
@@ -142,20 +136,21 @@ def _run_numbered(work: Callable[[Job], Result], job: tuple[int, Job]) -> Result
 
 
 @contextmanager
-def open_pool(where: str | Executor, workers: int, threads: int) -> Iterator[Pool]:
+def open_pool(where: str | Executor, workers: int) -> Iterator[Pool]:
     """Start or reach an executor; what was started here ends with the block.
+
+    A job has one thread.
 
     Args:
         where: "local"; "ray", with ":ADDRESS" of a cluster; or an executor.
         workers: Jobs at a time; 0 for as many as there are cores.
-        threads: Threads of one job.
 
     Raises:
         UsageError: There is no such executor, or no cluster at the address.
     """
     with ExitStack() as stack:
         executor = stack.enter_context(_ProcessPerWorker()) if where == LOCAL else where
-        size = workers or Pool.cores(threads)
+        size = workers or os.cpu_count() or 1
         if not isinstance(executor, Executor):
             kind, _, address = str(executor).partition(":")
             if kind != "ray":
@@ -163,9 +158,9 @@ def open_pool(where: str | Executor, workers: int, threads: int) -> Iterator[Poo
                     f"--executor {where}: choose local, ray or ray:ADDRESS; "
                     "from Python, give a concurrent.futures.Executor (docs/install.md)"
                 )
-            with _child_environment(threads):
-                executor, size = _connect_ray(stack, address, workers, threads)
-        yield Pool(executor, max(1, size), threads)
+            with _child_environment():
+                executor, size = _connect_ray(stack, address, workers)
+        yield Pool(executor, max(1, size))
 
 
 class _ProcessPerWorker(Executor):
@@ -208,16 +203,14 @@ def _call(fn: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
     return fn(*args, **kwargs)
 
 
-def _connect_ray(
-    stack: ExitStack, address: str, workers: int, threads: int
-) -> tuple[Executor, int]:
+def _connect_ray(stack: ExitStack, address: str, workers: int) -> tuple[Executor, int]:
     """Connect to the cluster at an address or $RAY_ADDRESS, or start Ray here, closed to other
     machines.
     """
     address = address or os.environ.get("RAY_ADDRESS") or LOCAL
     options: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR"}
     if address == LOCAL:
-        options |= {"include_dashboard": False, "num_cpus": workers * threads or None}
+        options |= {"include_dashboard": False, "num_cpus": workers or None}
         # Ray then binds to the loopback interface on every system.
         os.environ["RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"] = "0"
     import ray
@@ -229,17 +222,17 @@ def _connect_ray(
             raise UsageError(f"--executor ray: no cluster at {address}: {error}") from None
         stack.callback(ray.shutdown)
     cpus = int(ray.cluster_resources().get("CPU", 1))
-    task = ray.remote(num_cpus=min(threads, cpus), max_retries=0)(_call)
-    return _RayExecutor(task), workers or cpus // threads
+    task = ray.remote(num_cpus=1, max_retries=0)(_call)
+    return _RayExecutor(task), workers or cpus
 
 
 @contextmanager
-def _child_environment(threads: int) -> Iterator[None]:
+def _child_environment() -> Iterator[None]:
     """Set the environment that a process started in the block inherits.
 
     Ctrl-C reaches its parent only.
     """
-    variables = dict.fromkeys(THREAD_VARIABLES, str(threads)) | {SAFE_PATH_VARIABLE: "1"}
+    variables = dict.fromkeys(THREAD_VARIABLES, "1") | {SAFE_PATH_VARIABLE: "1"}
     before = {name: os.environ.get(name) for name in variables}
     main = threading.current_thread() is threading.main_thread()
     handler = signal.signal(signal.SIGINT, signal.SIG_IGN) if main else None

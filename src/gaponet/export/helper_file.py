@@ -5,7 +5,6 @@ from __future__ import annotations
 import ast
 import inspect
 from collections.abc import Callable
-from collections.abc import Sequence as ListOf
 from pathlib import Path
 from typing import Any
 
@@ -71,19 +70,6 @@ def without_gaponet(text: str, helper: str) -> str:
             old = f"from {node.module} import"
             lines[node.lineno - 1] = lines[node.lineno - 1].replace(old, f"from {helper} import")
     return "".join(lines)
-
-
-def defined_names(text: str) -> ListOf[str]:
-    """Return the names that a module binds at its top level, in order, as often as it does."""
-    names = []
-    for node in ast.parse(text).body:
-        if isinstance(node, ast.FunctionDef | ast.ClassDef):
-            names.append(node.name)
-        if isinstance(node, ast.Assign):
-            for part in ast.walk(node):
-                if isinstance(part, ast.Name) and isinstance(part.ctx, ast.Store):
-                    names.append(part.id)
-    return names
 
 
 def _is_own(node: ast.ImportFrom) -> bool:

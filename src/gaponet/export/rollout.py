@@ -37,15 +37,13 @@ class RolloutPrediction:
         return np.asarray(np.abs(self.rollout - self.robot) <= self.half_width)
 
 
-def sample_robots(
-    robot: RobotSpec, samples: int = SAMPLED_ROBOTS, seed: int = 0
-) -> list[RobotSpec]:
+def sample_robots(robot: RobotSpec) -> list[RobotSpec]:
     """Sample robots from the uncertainty of this robot's values today (export/randomization.py).
 
     Raises:
         UsageError: The robot folder has no uncertainties.
     """
-    return robots_of(robot, sample_units(robot, samples=samples, seed=seed).units)
+    return robots_of(robot, sample_units(robot, samples=SAMPLED_ROBOTS, seed=0).units)
 
 
 def validation_error(robot: RobotSpec, recordings: ListOf[Sequence]) -> Array:

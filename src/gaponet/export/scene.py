@@ -20,7 +20,7 @@ from gaponet.base.errors import RobotError
 from gaponet.export.shipped.mujoco_servos import Servos
 from gaponet.export.simulator_facts import simulator_facts
 from gaponet.robot.spec import RobotSpec
-from gaponet.sim.model import STIFF_SOLIMP, STIFF_SOLREF, TOLERANCE, build_model
+from gaponet.sim.model import STIFF_SOLIMP, STIFF_SOLREF, TOLERANCE, build_model, write_link
 
 MAX_AXIS_DIFFERENCE_RAD = 0.02  # between two joints' axes, in the scene and in the robot
 MAX_RANGE_DIFFERENCE_RAD = (
@@ -95,7 +95,8 @@ def apply(robot: RobotSpec, spec: mujoco.MjSpec, *, prefix: str = "") -> Applied
         i = robot.joint_names.index(name)
         _write_joint(spec, spec.joint(prefix + name), robot, i)
         _write_servo(spec, _servo_of(spec, prefix + name), robot, i)
-    _write_links(robot, spec, prefix)
+    for name, link in robot.links.items():
+        write_link(spec.body(prefix + name), link)
     notes = _notes(robot, spec, model)
     spec.option.tolerance = min(spec.option.tolerance, TOLERANCE)
     facts = simulator_facts(robot, robot.dt)
@@ -293,18 +294,6 @@ def _write_servo(
         steps = math.ceil(robot.delay[i] / spec.option.timestep - 1e-9)
         actuator.nsample = steps + DELAY_SAMPLES
         actuator.interp = 1
-
-
-def _write_links(robot: RobotSpec, spec: mujoco.MjSpec, prefix: str) -> None:
-    """Write identified masses, centres of mass and inertias."""
-    for name, link in robot.links.items():
-        body = spec.body(prefix + name)
-        body.explicitinertial = True
-        body.mass = link.mass
-        body.ipos = link.pos
-        body.iquat = (1, 0, 0, 0)
-        body.inertia = (0, 0, 0)
-        body.fullinertia = link.inertia
 
 
 def _notes(robot: RobotSpec, spec: mujoco.MjSpec, own: mujoco.MjModel) -> tuple[str, ...]:

@@ -29,6 +29,7 @@ MAX_IK_ITERATIONS = 80
 MAX_IK_STEP_RAD = 0.3  # of a joint in one iteration
 IK_TOLERANCE_M = 1e-4
 DURATION_S = 8.0  # of most whole-body motions
+BOX_SHARE = 0.3  # of a joint's range, half the width of a box of targets
 # Rows between postures that are computed on a path of the hands; a spline goes through them.
 KNOT_ROWS = 10
 ROLES = ("shoulder_pitch", "shoulder_roll", "shoulder_yaw", "elbow", "wrist_roll")
@@ -396,7 +397,7 @@ def tour(kit: Kit, rng: np.random.Generator) -> Array:
     """Move all joints at once from one random posture to the next, a third of the range around the
     ready posture.
     """
-    low, high = _box(kit, 0.3)
+    low, high = _box(kit)
     stops = np.array([kit.ready, *rng.uniform(low, high, (4, len(low))), kit.ready])
     return through(stops, rng.uniform(1.0, 1.4, 5), np.full(6, 0.3), GRID)
 
@@ -404,7 +405,7 @@ def tour(kit: Kit, rng: np.random.Generator) -> Array:
 def limber(kit: Kit, rng: np.random.Generator) -> Array:
     """Move all joints at once on slow sines with random phases."""
     time, ctrl, window = _start(kit)
-    low, high = _box(kit, 0.3)
+    low, high = _box(kit)
     for j in range(ctrl.shape[1]):
         wave = _sines(time, 0.5, rng)
         away = (low[j] + high[j]) / 2 - kit.ready[j] + wave * (high[j] - low[j]) / 2
@@ -454,10 +455,10 @@ def _start(kit: Kit) -> tuple[Array, Array, Array]:
     return time, ctrl, fade(steps, GRID, 1.5)
 
 
-def _box(kit: Kit, share: float) -> tuple[Array, Array]:
-    """A share of every joint's range around the ready posture, at most 0.8 rad to either side."""
+def _box(kit: Kit) -> tuple[Array, Array]:
+    """BOX_SHARE of every joint's range around the ready posture, at most 0.8 rad to either side."""
     low = kit.limits.low
     high = kit.limits.high
     width = np.where(np.isfinite(high - low), high - low, 2.0)
-    half = np.minimum(share * width, 0.8)
+    half = np.minimum(BOX_SHARE * width, 0.8)
     return np.maximum(kit.ready - half, low), np.minimum(kit.ready + half, high)

@@ -75,16 +75,14 @@ class DelayOffset:
         return DelayOffset(best_delays, best_offsets)
 
     @staticmethod
-    def pieces(
-        sequences: ListOf[Sequence], seconds: float = PIECE_S, max_rows: int = MAX_FIT_ROWS
-    ) -> list[Sequence]:
-        """Cut sequences into pieces, and take an even subset with about max_rows rows."""
+    def pieces(sequences: ListOf[Sequence]) -> list[Sequence]:
+        """Cut sequences into pieces, and take an even subset with about MAX_FIT_ROWS rows."""
         pieces = []
         for s in sequences:
-            rows = round(seconds / s.dt)
+            rows = round(PIECE_S / s.dt)
             for start in range(0, max(len(s) - rows // 2, 0) + 1, rows):
                 pieces.append(s.rows(slice(start, start + rows)))
-        return pieces[:: max(1, round(sum(map(len, pieces)) / max_rows))]
+        return pieces[:: max(1, round(sum(map(len, pieces)) / MAX_FIT_ROWS))]
 
 
 def _joint_errors(

@@ -24,11 +24,6 @@ from gaponet.nn.networks import build_network
 from gaponet.nn.onnx_network import CARD_FACTS, TRUSTED, OnnxNetwork
 
 MAX_DIFFERENCE_RAD = 1e-5  # between ONNX and torch
-MIN_SPARSE_ELEMENTS = 2048  # of a matrix that is stored sparsely; smaller ones need no index
-MAX_SPARSE_DENSITY = 0.1  # share of its elements that are not zero
-# Of a matrix that is stored as int16: the small first layers matter most for the output and little
-# for the size.
-MIN_INT16_ELEMENTS = 32_768
 
 
 def export(net: DeltaNet, folder: Path, card: dict[str, Any], samples: Array) -> float:
@@ -127,76 +122,6 @@ def _with_facts(content: bytes, card: dict[str, Any]) -> bytes:
     return result
 
 
-def with_small_matrices(content: bytes, *, int16: bool) -> bytes:
-    """Return an ONNX file whose large matrices need less space.
-
-    A matrix that selects features has few elements; only these are stored, and all outputs stay
-    equal bit for bit.
-
-    Args:
-        content: ONNX file with float32 matrices.
-        int16: Store other matrices of MIN_INT16_ELEMENTS and more as int16 with one float32 scale a
-            row. Outputs then change: a weight by up to 1/65,534 of the largest one in its row.
-            float16 would change it by up to 1/4,096 of itself, which changes outputs some eight
-            times as much.
-    """
-    import onnx
-
-    model = onnx.load_model_from_string(content)
-    graph = model.graph
-    decoding = []
-    for tensor in list(graph.initializer):
-        matrix = onnx.numpy_helper.to_array(tensor)
-        if matrix.ndim != 2:
-            continue
-        few = np.count_nonzero(matrix) <= MAX_SPARSE_DENSITY * matrix.size
-        if few and matrix.size >= MIN_SPARSE_ELEMENTS:
-            graph.sparse_initializer.append(_sparse(tensor.name, matrix))
-        elif int16 and matrix.size >= MIN_INT16_ELEMENTS:
-            stored, nodes = _as_int16(tensor.name, matrix)
-            graph.initializer.extend(stored)
-            decoding += nodes
-        else:
-            continue
-        graph.initializer.remove(tensor)
-    nodes = [*decoding, *graph.node]
-    del graph.node[:]
-    graph.node.extend(nodes)
-    return bytes(model.SerializeToString())
-
-
-def _sparse(name: str, matrix: Array) -> Any:
-    """Return a matrix as a sparse tensor of ONNX."""
-    import onnx
-
-    index = np.flatnonzero(matrix)
-    values = onnx.numpy_helper.from_array(matrix.ravel()[index], name)
-    indices = onnx.numpy_helper.from_array(index.astype(np.int64), f"{name}_index")
-    return onnx.helper.make_sparse_tensor(values, indices, list(matrix.shape))
-
-
-def _as_int16(name: str, matrix: Array) -> tuple[list[Any], list[Any]]:
-    """Return a matrix as int16 steps with a scale for each row, and the nodes that compute it from
-    these.
-    """
-    import onnx
-
-    scale = np.abs(matrix).max(axis=1, keepdims=True) / np.iinfo(np.int16).max
-    scale = np.where(scale > 0, scale, 1.0).astype(np.float32)
-    steps = np.round(matrix / scale).astype(np.int16)
-    stored = [
-        onnx.numpy_helper.from_array(steps, f"{name}_steps"),
-        onnx.numpy_helper.from_array(scale, f"{name}_scale"),
-    ]
-    nodes = [
-        onnx.helper.make_node(
-            "Cast", [f"{name}_steps"], [f"{name}_float"], to=onnx.TensorProto.FLOAT
-        ),
-        onnx.helper.make_node("Mul", [f"{name}_float", f"{name}_scale"], [name]),
-    ]
-    return stored, nodes
-
-
 def trained_network(run: Path, config: ModelConfig, n: int) -> DeltaNet:
     """Load the best network of a run from its checkpoint.
 
@@ -218,13 +143,13 @@ def trained_network(run: Path, config: ModelConfig, n: int) -> DeltaNet:
     return net.eval()
 
 
-def sample_inputs(net: DeltaNet, count: int = 256, seed: int = 0) -> Array:
+def sample_inputs(net: DeltaNet, count: int = 256) -> Array:
     """Return inputs x with the statistics of the training data, (count, dim) float32.
 
     Sensor values are 0.
     """
     features = net.features
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(0)
     z = torch.randn(count, features.dim, generator=generator)
     relative = features.standardise.mean + features.standardise.std * z
     # relative(x) is linear in x.

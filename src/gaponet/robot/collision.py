@@ -166,12 +166,12 @@ class Collision:
         return f"{self.names[self.above[at - len(self.pairs)]]} and the plane at {self.height:g} m"
 
 
-def thinned(ctrl: Array, step: float = POSTURE_STEP_RAD) -> Array:
-    """Select rows of a command (T, n) rad, so that no joint moves more than `step` rad between
-    them if possible.
+def thinned(ctrl: Array) -> Array:
+    """Select rows of a command (T, n) rad, so that no joint moves more than POSTURE_STEP_RAD
+    between them if possible.
     """
     travelled = np.concatenate([[0.0], np.abs(np.diff(ctrl, axis=0)).max(axis=1).cumsum()])
-    marks = np.searchsorted(travelled, np.arange(0.0, travelled[-1], step))
+    marks = np.searchsorted(travelled, np.arange(0.0, travelled[-1], POSTURE_STEP_RAD))
     result: Array = ctrl[np.unique(np.append(marks, len(ctrl) - 1))]
     return result
 

@@ -256,12 +256,17 @@ def _set_links(spec: mujoco.MjSpec, robot: RobotSpec) -> None:
             raise RobotError(
                 f"{robot.mjcf}: an [identified_link] names body '{name}', which is missing"
             )
-        body.explicitinertial = True
-        body.mass = link.mass
-        body.ipos = link.pos
-        body.iquat = (1, 0, 0, 0)
-        body.inertia = (0, 0, 0)
-        body.fullinertia = link.inertia
+        write_link(body, link)
+
+
+def write_link(body: mujoco.MjsBody, link: Link) -> None:
+    """Write the mass, centre of mass and inertia of an identified link."""
+    body.explicitinertial = True
+    body.mass = link.mass
+    body.ipos = link.pos
+    body.iquat = (1, 0, 0, 0)
+    body.inertia = (0, 0, 0)
+    body.fullinertia = link.inertia
 
 
 # Fields of a model that follow from its links; body_sameframe is a shortcut for links whose centre

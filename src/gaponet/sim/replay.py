@@ -287,7 +287,7 @@ def pair_dataset(
                 work(part, progress=lambda k, of: progress(done + k, total)) for part in sequences
             )
         else:
-            replayed = stack.enter_context(open_pool(executor, 0, 1)).map(
+            replayed = stack.enter_context(open_pool(executor, 0)).map(
                 partial(work, nthread=1), sequences
             )
         for part, replays in zip(parts, replayed, strict=True):

@@ -7,6 +7,7 @@ recording continues if it is started again, and gives the same samples.
 from __future__ import annotations
 
 import json
+import os
 import time
 from collections.abc import Iterator
 from concurrent.futures import Executor
@@ -15,7 +16,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from gaponet.base.errors import DatasetError, UsageError
-from gaponet.base.executor import LOCAL, MAX_WORKERS, Pool, open_pool
+from gaponet.base.executor import LOCAL, MAX_WORKERS, open_pool
 from gaponet.base.files import lock_folder, write_text
 from gaponet.base.progress import Progress, no_progress
 from gaponet.base.structure import read_json, validated
@@ -109,7 +110,7 @@ def collect(
         require_stored_robot(dataset.path, robot, DatasetError, MOVE_STORED_ROBOT)
         _require_same_source(dataset, robot, fleet, recipe, seed)
         missing = _missing(wanted, dataset)
-        batches = _batches(missing, nproc or Pool.cores(1))
+        batches = _batches(missing, nproc or os.cpu_count() or 1)
         jobs = [Job(robot, fleet, recipe, files, seed, tuple(batch)) for batch in batches]
         # A run that was killed may have stored sequences without their replays.
         pair_dataset(dataset, robot, lock_idle=True)
@@ -223,11 +224,11 @@ def _play_jobs(
     jobs: list[Job], nproc: int, executor: str | Executor
 ) -> Iterator[tuple[Sequence, SimulatedReplay]]:
     """Yield sequences and their replays in the order of the jobs."""
-    if executor == LOCAL and (len(jobs) < 2 or (nproc or Pool.cores(1)) == 1):
+    if executor == LOCAL and (len(jobs) < 2 or (nproc or os.cpu_count() or 1) == 1):
         for job in jobs:
             yield from _play_job(job)
         return
-    with open_pool(executor, nproc, 1) as pool:
+    with open_pool(executor, nproc) as pool:
         for played in pool.map(_play_job, jobs):
             yield from played
 

@@ -173,21 +173,18 @@ def _meta(job: Job, take: Take, level: str, notes: dict[str, Any]) -> SequenceMe
     )
 
 
-def equivalent_torque(
-    model: mujoco.MjModel, qpos: Array, dt: float, cutoff: float = CUTOFF_HZ
-) -> tuple[Array, Array]:
+def equivalent_torque(model: mujoco.MjModel, qpos: Array, dt: float) -> tuple[Array, Array]:
     """Return the torque that the nominal model with the payload needs for a recorded motion.
 
     Args:
         model: Nominal simulator with the recording's payload (sim.model.build_model).
         qpos: Recorded, (T, n) rad.
         dt: s.
-        cutoff: Cut-off of the zero-phase filter before differentiating, Hz.
 
     Returns:
         Torque (T, n) N·m, and the accelerations (T, n) rad/s² in it.
     """
-    smooth = lowpass(qpos.astype(float), dt, cutoff)
+    smooth = lowpass(qpos.astype(float), dt, CUTOFF_HZ)
     qvel = differentiate(smooth, dt)
     qacc = differentiate(qvel, dt)
     return inverse_dynamics(model, smooth, qvel, qacc), qacc

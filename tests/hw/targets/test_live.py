@@ -194,9 +194,7 @@ def test_a_second_sender_during_the_run_is_remarked_once_and_moves_nothing(arm):
     assert remarks == ["targets of a second sender, b, are rejected"]
     assert recording.fault is None
     assert targets.counts["sender"] == "a"
-    np.testing.assert_array_equal(
-        alone.phase_rows("run")["ctrl"], recording.phase_rows("run")["ctrl"]
-    )
+    np.testing.assert_array_equal(alone.run_rows()["ctrl"], recording.run_rows()["ctrl"])
 
 
 @pytest.mark.parametrize("what", WRONG)

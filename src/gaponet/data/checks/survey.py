@@ -251,7 +251,7 @@ def _measure(dataset: Dataset, robot: RobotSpec, executor: str | Executor) -> It
             yield Survey.of(entry, dataset.read(entry), robot)
         return
     loaded = ([(entry, dataset.read(entry)) for entry in job] for job in jobs)
-    with open_pool(executor, 0, 1) as pool:
+    with open_pool(executor, 0) as pool:
         for surveys in pool.map(partial(_survey_job, robot=robot), loaded):
             yield from surveys
 

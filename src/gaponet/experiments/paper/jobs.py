@@ -168,7 +168,7 @@ def run_jobs(jobs: list[Job], show: Show) -> list[str]:
                 running[job.name] = (job.progress(), "")
         show(running, done_before + len(ended))
 
-    with open_pool(study.options.executor, study.options.workers, threads=1) as pool:
+    with open_pool(study.options.executor, study.options.workers) as pool:
         for outcome in pool.run(do_job, todo, poll, request_stop):
             ended.add(outcome.job.name)
             if outcome.error is not None:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-PAYLOADS = (0.0, 1.0, 2.0, 3.0)  # kg per hand
 AXES = ("X", "Y", "Z")  # forward, left, up
 
 # Claims of the text: reduction of an error, %.

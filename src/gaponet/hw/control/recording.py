@@ -104,7 +104,7 @@ class Recording:
         return self._log(source)
 
     def _log(self, source: str) -> Log:
-        rows = self.phase_rows("run")
+        rows = self.run_rows()
         if len(rows) < 2:
             last = self.events[-1] if self.events else None
             why = f"; it ended with: {last.text}" if last else ""
@@ -121,10 +121,10 @@ class Recording:
         channels = {name: Channel(time - time[0], value) for name, value in values.items()}
         return Log(self.robot, self.commanded, channels, source, {"files": {}, **self.summary()})
 
-    def phase_rows(self, phase: str) -> Array:
-        """Return the rows of Rows.table of a phase in which a position was commanded."""
+    def run_rows(self) -> Array:
+        """Return the rows of Rows.table of phase run in which a position was commanded."""
         table = self.rows.table()
-        at = np.flatnonzero((table["phase"] == phase) & ~np.isnan(table["ctrl"]).all(axis=1))
+        at = np.flatnonzero((table["phase"] == "run") & ~np.isnan(table["ctrl"]).all(axis=1))
         if len(at) and at[-1] - at[0] + 1 == len(at):  # a slice, which copies nothing
             return table[at[0] : at[-1] + 1]
         return table[at]
@@ -173,7 +173,7 @@ class Recording:
             self.rows.save(folder / f"{name}{ROWS_SUFFIX}")
             path = folder / f"{name}.parquet"
             try:
-                if len(self.phase_rows("run")) >= 2:
+                if len(self.run_rows()) >= 2:
                     log = self._log(str(path))
                     columns = {"time": log.channels["ctrl"].time}
                     for channel, (_, values) in log.channels.items():

@@ -176,7 +176,6 @@ def write_setup(
     write_json(run / "split.json", split)
 
 
-LOG_KINDS = ("tensorboard", "wandb")
 # write(numbers, steps), close()
 Writer = tuple[Callable[[dict[str, float], int], None], Callable[[], None]]
 
@@ -187,7 +186,7 @@ class Loggers:
     def __init__(self, kinds: tuple[str, ...], out: Path, config: dict[str, Any]) -> None:
         """
         Args:
-            kinds: Any of LOG_KINDS.
+            kinds: Any of tensorboard and wandb.
             out: Run folder. TensorBoard's files go to out/tensorboard.
             config: Configuration of the run, for Weights & Biases.
 

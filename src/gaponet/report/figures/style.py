@@ -16,7 +16,6 @@ from gaponet.base.result_table import MeanStd
 from gaponet.base.text import escape
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 P = ParamSpec("P")
@@ -148,15 +147,6 @@ def bars(groups: ListOf[str], methods: Bars, axis: str, title: str) -> Figure:
     width_of_labels = (LETTER_WIDTH_INCH * longest + 0.05) * len(groups) + 1.3
     fig = figure(max(5.2, width_of_bars, width_of_labels), 3.3)
     ax = fig.subplots()
-    draw_bars(ax, groups, methods)
-    ax.set_ylabel(axis)
-    ax.set_title(title)
-    legend(fig)
-    return fig
-
-
-def draw_bars(ax: Axes, groups: ListOf[str], methods: Bars, size: float | None = None) -> None:
-    """Draw the bars into existing axes; size is the font size of the group labels."""
     width = 0.84 / len(methods)
     for i, (label, (colour, values)) in enumerate(methods.items()):
         x = np.arange(len(groups)) + (i - (len(methods) - 1) / 2) * width
@@ -170,9 +160,13 @@ def draw_bars(ax: Axes, groups: ListOf[str], methods: Bars, size: float | None =
             label=label,
             error_kw={"lw": 0.7, "capsize": 1.2, "capthick": 0.6},
         )
-    ax.set_xticks(np.arange(len(groups)), groups, fontsize=size)
+    ax.set_xticks(np.arange(len(groups)), groups)
     ax.tick_params(axis="x", length=0)
     ax.grid(axis="x", visible=False)
+    ax.set_ylabel(axis)
+    ax.set_title(title)
+    legend(fig)
+    return fig
 
 
 def joint_label(joint: str, wrapped: bool = True) -> str:
