@@ -128,6 +128,14 @@ def test_a_scene_that_does_not_fit_is_refused(robot, model):
         MujocoAligner(model, mj_model, 0.02, 0.0, prefix="left/")
 
 
+def test_a_scene_without_actuators_is_refused(robot):
+    scene = mujoco.MjModel.from_xml_path(str(robot.mjcf))
+    assert scene.nu == 0
+
+    with pytest.raises(ModelError, match="actuator"):
+        MujocoAligner(robot, scene, 0.02, 0.0)
+
+
 def test_a_scene_moves_like_an_identified_robot_without_a_model(robot):
     law = {"kp": 15.0, "frictionloss": 0.05, "stribeck": 0.05, "stribeck_speed": 0.1}
     known = robot.with_servos(dict.fromkeys(robot.joint_names, law))

@@ -41,7 +41,8 @@ def check(
 ) -> None:
     """Is this still the robot that was identified? What changed?
 
-    The exit code is 0 if the robot is unchanged, 1 if it changed, and 2 if that cannot be decided.
+    The exit code is 0 if the robot is unchanged, 1 if it changed or its recordings contradict each
+    other, and 2 if that cannot be decided.
     """
     screen = Out(json)
     made = api.check(

@@ -113,14 +113,20 @@ class MujocoAligner:
 
 
 def _require_joints(scene: mujoco.MjModel, robot: RobotSpec, model: Reference, prefix: str) -> None:
-    """Refuse a scene that lacks an operated joint."""
+    """Refuse a scene that lacks an operated joint or its actuator."""
+    source = model.path if isinstance(model, GapModel) else model.folder
     joints = [scene.joint(j).name for j in range(scene.njnt)]
     for name in robot.operated:
         if prefix + name not in joints:
-            source = model.path if isinstance(model, GapModel) else model.folder
             raise ModelError(
                 f"{source}: moves joint '{prefix + name}', the scene has {', '.join(joints)}; give "
                 "prefix"
+            )
+    for name in robot.operated:
+        if name in _undriven(scene, robot, prefix):
+            raise ModelError(
+                f"{source}: moves joint '{prefix + name}', which has no actuator in the scene; "
+                "give each operated joint a position actuator"
             )
 
 

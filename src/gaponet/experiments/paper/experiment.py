@@ -119,8 +119,7 @@ def prepare(
         unit = study.virtual_unit()
         require_unseen(unit.motions, dataset, nominal, study.dt)
     if options.quick:
-        unseen_unit = study.unit_name if study.virtual else ""
-        small = quick_dataset(dataset, nominal, out / "data", unseen_unit)
+        small = quick_dataset(dataset, nominal, out / "data", study.training_units)
         study = replace(study, dataset=str(small.path.resolve()))
     splits = study.splits()  # refuses what cannot be split
     if not study.has_results:

@@ -184,27 +184,26 @@ class Study:
             )
 
 
-def quick_dataset(data: Dataset, robot: RobotSpec, out: Path, unit: str) -> Dataset:
+def quick_dataset(
+    data: Dataset, robot: RobotSpec, out: Path, training_units: tuple[str, ...]
+) -> Dataset:
     """Write a few whole recordings of every rate as a dataset; the same call again finds it."""
     part = Dataset.create(out, robot)
-    for entry in _quick_entries(data, unit):
+    for entry in _quick_entries(data, training_units[:QUICK_UNITS]):
         sequence = data.read(entry)
         if part.find(sequence.content_hash()) is None:
             part.append(sequence)
     return part
 
 
-def _quick_entries(data: Dataset, unseen_unit: str) -> list[Entry]:
-    """Return recordings of the shortest motions, with the least and the largest payload, on few
-    units.
-    """
+def _quick_entries(data: Dataset, units: tuple[str, ...]) -> list[Entry]:
+    """Return recordings of the shortest motions, with the least and the largest payload."""
     rows: dict[str, int] = {}
     for entry in data.entries:
         rows[entry.meta.motion] = max(rows.get(entry.meta.motion, 0), entry.rows)
     motions = sorted(rows, key=lambda motion: (rows[motion], motion))[:QUICK_MOTIONS]
     payloads = sorted({entry.meta.payload_mass for entry in data.entries})
     payloads = [payloads[0], payloads[-1]]
-    units = sorted({entry.meta.unit_id for entry in data.entries} - {unseen_unit})[:QUICK_UNITS]
     repetition = min(entry.meta.repetition for entry in data.entries)
     chosen = []
     for entry in data.entries:
