@@ -242,6 +242,13 @@ def _replace_files(source: Path, target: Path, last: str, obsolete: tuple[str, .
     flush_to_disk(target)
 
 
+def clear_folder(folder: Path, keep: str = "") -> None:
+    """Delete the content of a folder, except its marker and one child."""
+    for child in folder.iterdir():
+        if child.name not in (FOLDER_MARKER, keep):
+            shutil.rmtree(child) if child.is_dir() else child.unlink()
+
+
 def _holds_marker_alone(folder: Path) -> bool:
     return [path.name for path in folder.iterdir()] == [FOLDER_MARKER]
 

@@ -65,22 +65,27 @@ def _flatten(inputs: list[Any], attributes: Attributes) -> Tensor:
     return result
 
 
+def _axes(inputs: list[Any], attributes: Attributes) -> list[int]:
+    """Return the axes: an input since opset 13, an attribute before."""
+    axes: list[int] = attributes["axes"] if len(inputs) < 2 else inputs[1]
+    return axes
+
+
 def _reduce_sum(inputs: list[Any], attributes: Attributes) -> Tensor:
-    axes = attributes["axes"] if len(inputs) < 2 else inputs[1]
-    result: Tensor = inputs[0].sum(axes, keepdim=bool(attributes.get("keepdims", 1)))
+    result: Tensor = inputs[0].sum(
+        _axes(inputs, attributes), keepdim=bool(attributes.get("keepdims", 1))
+    )
     return result
 
 
 def _squeeze(inputs: list[Any], attributes: Attributes) -> Tensor:
-    axes = attributes["axes"] if len(inputs) < 2 else inputs[1]
-    result: Tensor = inputs[0].squeeze(tuple(axes))
+    result: Tensor = inputs[0].squeeze(tuple(_axes(inputs, attributes)))
     return result
 
 
 def _unsqueeze(inputs: list[Any], attributes: Attributes) -> Tensor:
-    axes = attributes["axes"] if len(inputs) < 2 else inputs[1]
     result: Tensor = inputs[0]
-    for axis in sorted(axes):
+    for axis in sorted(_axes(inputs, attributes)):
         result = result.unsqueeze(axis)
     return result
 

@@ -118,6 +118,11 @@ def move_time(distance: Array, speed: float, least: float = 0.5) -> Array:
     return result
 
 
+def extended(ctrl: Array, rows: int) -> Array:
+    """Return targets (T, n) with their last row repeated, (rows, n)."""
+    return np.concatenate([ctrl, np.repeat(ctrl[-1:], rows - len(ctrl), axis=0)])
+
+
 def fade(steps: int, dt: float, ramp: float) -> Array:
     """A window (steps,) that rises from 0 to 1 within `ramp` s, stays, and falls back: oscillations
     start at rest.

@@ -17,7 +17,7 @@ from tempfile import gettempdir
 from typing import Any
 
 from gaponet.base.errors import UsageError
-from gaponet.base.files import FOLDER_MARKER, lock_folder, write_text
+from gaponet.base.files import FOLDER_MARKER, clear_folder, lock_folder, write_text
 from gaponet.base.network import RemoteError
 from gaponet.data.store import Dataset
 from gaponet.share import dataset as datasets
@@ -83,7 +83,7 @@ def push(
     if earlier is not None and _is_up_to_date(path, kind, hub, earlier):
         return TransferResult(kind, len(earlier.files), earlier.size(earlier.files))
     with _work_folder(path, "push") as folder:
-        _clear(folder)  # files of a killed push
+        clear_folder(folder)  # files of a killed push
         files = folder / "files"
         files.mkdir()
         try:
@@ -98,7 +98,7 @@ def push(
             write_text(files / INDEX, index.text())
             hub.store(files, index, private)
         finally:
-            _clear(folder)
+            clear_folder(folder)
     return TransferResult(kind, len(index.files), index.size(index.files))
 
 
@@ -154,7 +154,7 @@ def pull(address: str, out: str | Path) -> TransferResult:
     with _work_folder(out.absolute(), "pull") as folder:
         # A killed pull goes on in the folder of the state that it pulled; others are removed.
         state = hashlib.sha256(index.text().encode()).hexdigest()[:16]
-        _clear(folder, keep=state)
+        clear_folder(folder, keep=state)
         work = folder / state
         work.mkdir(exist_ok=True)
         if index.kind == "dataset":
@@ -165,7 +165,7 @@ def pull(address: str, out: str | Path) -> TransferResult:
             if out.exists():
                 out.rmdir()
             new.rename(out)
-        _clear(folder)
+        clear_folder(folder)
     return TransferResult(index.kind, len(fetched), index.size(fetched))
 
 
@@ -246,10 +246,3 @@ def _work_folder(path: Path, purpose: str) -> Iterator[Path]:
     with lock_folder(folder, purpose):
         yield folder
     shutil.rmtree(folder)
-
-
-def _clear(folder: Path, keep: str = "") -> None:
-    """Delete the content of a work folder, except its lock and one child."""
-    for child in folder.iterdir():
-        if child.name not in (FOLDER_MARKER, keep):
-            shutil.rmtree(child) if child.is_dir() else child.unlink()

@@ -12,7 +12,7 @@ from gaponet.base.arrays import Array
 from gaponet.data.sequence import Sequence, SequenceMeta
 from gaponet.data.signals import differentiate, lowpass
 from gaponet.motion.library import Library
-from gaponet.motion.motion import Motion
+from gaponet.motion.motion import Motion, extended
 from gaponet.motion.recipe import Recipe, Take
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.dynamics import CUTOFF_HZ, inverse_dynamics
@@ -134,7 +134,7 @@ def _readings(robots: VirtualRobot, ctrl: list[Array], seeds: list[int], warmth:
     mean nothing.
     """
     lengths = np.array([len(targets) for targets in ctrl])
-    targets = np.stack([_extended(c, lengths[0]) for c in ctrl], axis=1)  # (rows, k, n) rad
+    targets = np.stack([extended(c, lengths[0]) for c in ctrl], axis=1)  # (rows, k, n) rad
     robots.reset(targets[0], seeds, warmth)
     readings = np.empty((4, *targets.shape), np.float32)
     for t in range(lengths[0]):
@@ -143,11 +143,6 @@ def _readings(robots: VirtualRobot, ctrl: list[Array], seeds: list[int], warmth:
         running = int((lengths > t).sum())
         robots.step(targets[t], rows=np.arange(running))
     return readings
-
-
-def _extended(ctrl: Array, rows: int) -> Array:
-    """Return targets (T, n) with their last row repeated, (rows, n)."""
-    return np.concatenate([ctrl, np.repeat(ctrl[-1:], rows - len(ctrl), axis=0)])
 
 
 def _warmth(unit: Physics, seed: int) -> float:

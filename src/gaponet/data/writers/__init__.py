@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import shutil
 from dataclasses import replace
 from pathlib import Path
 
 from gaponet.base.errors import DatasetError
-from gaponet.base.files import FOLDER_MARKER, flush_to_disk, lock_folder
+from gaponet.base.files import FOLDER_MARKER, clear_folder, flush_to_disk, lock_folder
 from gaponet.base.progress import Progress, no_progress
 from gaponet.data.store import Dataset
 from gaponet.data.writers.lerobot import Written, write
@@ -35,7 +34,7 @@ def export(dataset: Dataset, out: str | Path, progress: Progress = no_progress) 
 
     temporary = out.with_name(f"{FOLDER_MARKER}-{out.name}")
     with lock_folder(temporary, "export"):
-        _empty(temporary)  # of an export that was killed
+        clear_folder(temporary)  # of an export that was killed
         try:
             written = write(dataset, temporary, tell)
             for path in temporary.rglob("*"):
@@ -44,13 +43,7 @@ def export(dataset: Dataset, out: str | Path, progress: Progress = no_progress) 
                 out.rmdir()
             temporary.rename(out)
         except BaseException:
-            _empty(temporary)
+            clear_folder(temporary)
             raise
         (out / FOLDER_MARKER).unlink()
     return [replace(w, path=out / w.path) for w in written]
-
-
-def _empty(folder: Path) -> None:
-    for child in folder.iterdir():
-        if child.name != FOLDER_MARKER:
-            shutil.rmtree(child) if child.is_dir() else child.unlink()

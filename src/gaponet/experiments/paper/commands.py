@@ -22,6 +22,7 @@ import numpy as np
 
 from gaponet.base.arrays import Array
 from gaponet.deploy.compensator import Compensator, CompensatorConfig
+from gaponet.motion.motion import extended
 from gaponet.nn.artifact import GapModel
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.model import idle_joints
@@ -92,7 +93,7 @@ def play(
     """
     count = len(targets)
     lengths = np.array([len(target) for target in targets])
-    padded = np.stack([_padded(target, lengths[0]) for target in targets], axis=1)  # (T, N, n) rad
+    padded = np.stack([extended(target, lengths[0]) for target in targets], axis=1)  # (T, N, n) rad
     # Limbs without an operated joint stay at home: with a fixed base they share no dynamics with
     # the others.
     robots = VirtualRobot(
@@ -127,8 +128,3 @@ def make_compensator(
     """
     config = replace(config, payload_max=max(*payloads, MIN_PAYLOAD_KG))
     return Compensator(robot, model, config, num_envs=len(payloads), nthread=1)
-
-
-def _padded(target: Array, rows: int) -> Array:
-    """Return a motion of this many rows, with its last row repeated."""
-    return np.concatenate([target, np.repeat(target[-1:], rows - len(target), axis=0)])

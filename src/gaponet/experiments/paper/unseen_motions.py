@@ -14,7 +14,7 @@ from gaponet.base.errors import UsageError
 from gaponet.data.store import Dataset
 from gaponet.motion.coordinated import BUILDERS, available
 from gaponet.motion.library import Library
-from gaponet.motion.motion import Motion
+from gaponet.motion.motion import Motion, extended
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.model import idle_joints
 
@@ -112,10 +112,5 @@ def rms_difference(first: Array, second: Array) -> float:
     meanwhile.
     """
     rows = max(len(first), len(second))
-    difference = _extended(first, rows) - _extended(second, rows)
+    difference = extended(first, rows) - extended(second, rows)
     return float(np.sqrt(np.mean(difference**2)))
-
-
-def _extended(ctrl: Array, rows: int) -> Array:
-    """Return a motion of this many rows, with its last row repeated."""
-    return np.concatenate([ctrl, np.repeat(ctrl[-1:], rows - len(ctrl), axis=0)])
