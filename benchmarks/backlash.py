@@ -193,7 +193,7 @@ def result(robot: PlayRobot, terms: tuple[Term, ...] | None = None) -> dict[str,
     )
     return {
         "seed": robot.seed, "true_rad": robot.backlash.tolist(), "findings": fit.findings,
-        "rad": fit.robot.backlash[fit.robot.operated_index].tolist(),
+        "rad": fit.robot.servo.backlash[fit.robot.operated_index].tolist(),
         "std_rad": [fit.std[joint].get("backlash", 0.0) for joint in fit.robot.operated],
         "test_rad": motion_errors(logs[VALIDATED:], fit.robot).tolist(),
     }  # fmt: skip
@@ -206,14 +206,14 @@ def hinge_result(seed: int) -> dict[str, float]:
     servo = {f: float(getattr(robot, f)[0]) for f in fields} | {
         "frictionloss": float(robot.friction[0])
     }
-    spec, none = robot.spec().with_servos({"j0": servo}), np.zeros(1)
+    spec, none = robot.spec().with_identified({"j0": servo}), np.zeros(1)
     commands = [robot.commands(k) for k in range(MOTIONS - VALIDATED)]
     motions = [
         replace(robot.log(c, c, f"m{k}", k), qpos=0 * c + c[0], qvel=0 * c)
         for k, c in enumerate(commands)
     ]
     ours = np.array([one.qpos for one in replay(motions, spec)])
-    plain = np.array([one.qpos for one in replay(motions, replace(spec, backlash=none))])
+    plain = np.array([one.qpos for one in replay(motions, spec.with_servo(backlash=none))])
     model = build_model(spec)
     hinges = [
         np.array([play_hinge(robot, spec.timestep, m, model, link) for m in motions])

@@ -386,7 +386,7 @@ def main(
         rate: Hz, of logs without a clock.
     """
     spec = load_robot(robot)
-    gain = dict(zip(spec.joint_names, spec.kp.tolist(), strict=True))
+    gain = dict(zip(spec.joint_names, spec.servo.kp.tolist(), strict=True))
     labels = estimate(read_logs(logs, spec, ReadOptions(rate=rate)), payloads, units, gain)
     write(labels, out, rate)
     print("held torque at equal commands:")

@@ -60,7 +60,7 @@ def plain_rate(robot: RobotSpec, num_envs: int, device: str, seconds: float) -> 
     import warp
 
     spec = mujoco.MjSpec.from_file(str(robot.mjcf))
-    for name, kp, kd in zip(robot.joint_names, robot.kp, robot.kd, strict=True):
+    for name, kp, kd in zip(robot.joint_names, robot.servo.kp, robot.servo.kd, strict=True):
         servo = spec.add_actuator(target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
         servo.set_to_position(kp=kp, kv=kd)
     model = spec.compile()
@@ -140,7 +140,7 @@ def main() -> None:
     for size in args.sizes:
         for servo, robot in (
             ("stated", stated),
-            ("law", stated.with_servos(dict.fromkeys(stated.operated, SERVO_TERMS))),
+            ("law", stated.with_identified(dict.fromkeys(stated.operated, SERVO_TERMS))),
         ):
             found = {
                 k: round(v) for k, v in measure(robot, size, args.device, args.seconds).items()

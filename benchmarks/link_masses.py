@@ -81,7 +81,7 @@ def draw_physics(
     n, one = JOINTS, np.ones(JOINTS)
     physics = replace(
         neutral(n), kp_scale=np.exp(0.15 * rng.standard_normal(n)), kd_scale=np.exp(0.3 * rng.standard_normal(n)),
-        friction=hold * rng.uniform(0.02, 0.1, n), damping=robot.kp * rng.uniform(0, 0.03, n),
+        friction=hold * rng.uniform(0.02, 0.1, n), damping=robot.servo.kp * rng.uniform(0, 0.03, n),
         delay=np.full(1, rng.uniform(0.01, 0.04)), zero_offset=0.005 * rng.standard_normal(n),
         encoder_step=0.0015 * one, velocity_noise=0.02 * one, encoder_noise=2e-4 * one,
     )  # fmt: skip

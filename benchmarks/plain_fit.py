@@ -79,7 +79,10 @@ class Problem:
         ]
         of = robot.operated_index
         self.gains = np.array(
-            [[r.kp[of], r.kd[of]] for r in (robot.with_gains(*c.meta.recorded_gains) for c in cuts)]
+            [
+                [r.servo.kp[of], r.servo.kd[of]]
+                for r in (robot.with_gains(*c.meta.recorded_gains) for c in cuts)
+            ]
         )
         self.states = np.array(
             [[0.0, *c.qpos[0, self.free], *c.qvel[0, self.free]] for c in cuts], float
@@ -87,9 +90,9 @@ class Problem:
         self.ticks = np.arange(max((len(c) - 1) * k for c, k in zip(cuts, self.steps, strict=True)))
         own, n = self.specs[0].compile(), len(of)
         self.kp, self.kd, damping = (
-            robot.kp[of],
-            robot.kd[of],
-            own.dof_damping[self.op] + robot.kd[of],
+            robot.servo.kp[of],
+            robot.servo.kd[of],
+            own.dof_damping[self.op] + robot.servo.kd[of],
         )
         # Stiff joints are unstable with less armature at this step.
         armature, late = np.maximum(own.dof_armature[self.op], 2.5e-5 * self.kp), np.full(n, 0.02)
@@ -145,7 +148,7 @@ class Problem:
         servo = {"kp": kp, "damping": total - self.kd, "frictionloss": friction, "armature": armature, "delay": delay,
                  "offset": offset}  # fmt: skip
         names = self.robot.operated
-        return self.robot.with_servos(
+        return self.robot.with_identified(
             {j: {f: float(v[i]) for f, v in servo.items()} for i, j in enumerate(names)}
         )
 

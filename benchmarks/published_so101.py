@@ -68,7 +68,7 @@ def hand_tuned(question: Question) -> FittedSim:
 def published(robot: RobotSpec, name: str) -> RobotSpec:
     """Return the robot with a published set."""
     joints = {j: SETS[name].get(j, SETS[name].get(EVERY, ())) for j in robot.operated}
-    return robot.with_servos({
+    return robot.with_identified({
         j: {f: v for f, v in zip(FIELDS, values, strict=False) if not isnan(v)} for j, values in joints.items()
     })  # fmt: skip
 

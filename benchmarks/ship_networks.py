@@ -143,7 +143,7 @@ def packaged_robot(model: GapModel) -> PackagedRobot:
         UsageError: There is none: it was identified, or its figures were changed.
     """
     simulator = model.simulator()
-    named = PackagedRobot(model.card["robot"], simulator.gain_scale)
+    named = PackagedRobot(model.card["robot"], simulator.servo.gain_scale)
     found = model_hash(named.load())
     if found != model.card["simulator"]:
         raise UsageError(

@@ -68,8 +68,9 @@ def draw(seed: int) -> tuple[RobotSpec, Physics, np.ndarray]:
     passive = rng.uniform(0.3, 0.6) * half * has
     held = kp * 0.1  # N·m: heats the winding by about 10 K
     unit = replace(
-        neutral(n), kp_scale=kp / robot.kp, kd_scale=(1 - passive) * total / robot.kd, damping=passive * total,
-        friction=friction, stribeck=np.full(n, rng.choice([0.0, 0.5])), stribeck_speed=np.full(n, 0.1),
+        neutral(n), kp_scale=kp / robot.servo.kp, kd_scale=(1 - passive) * total / robot.servo.kd,
+        damping=passive * total, friction=friction, stribeck=np.full(n, rng.choice([0.0, 0.5])),
+        stribeck_speed=np.full(n, 0.1),
         thinning=thinning, motor_constant=held / np.sqrt(10.0), winding_time=np.full(n, 30.0),
         kt_drift=np.full(n, KT_PER_KELVIN * (half and not has)),
         derating=np.full(n, DERATING_PER_KELVIN * (half and not has)), delay=np.array([rng.uniform(0, 0.02)]),
@@ -134,13 +135,14 @@ def result(seed: int) -> dict[str, object]:
             options=IdentifyOptions(terms=OTHER_TERMS, table=False, folds=1, nthread=1),
         )
     return {
-        "seed": seed, "true_per_kelvin": (-thinning).tolist(), "per_kelvin": fit.robot.friction_per_kelvin.tolist(),
-        "damping_per_kelvin": fit.robot.damping_per_kelvin.tolist(),
+        "seed": seed, "true_per_kelvin": (-thinning).tolist(),
+        "per_kelvin": fit.robot.servo.friction_per_kelvin.tolist(),
+        "damping_per_kelvin": fit.robot.servo.damping_per_kelvin.tolist(),
         "true_damping_per_kelvin": (-thinning * unit.damping).tolist(),
         "std": [fit.std[j].get("friction_per_kelvin", 0.0) for j in robot.operated], "tried": term is not None,
         "accepted": bool(term and term.accepted), "gain_rad": term.gain if term else None, "seconds": seconds,
         "temperatures": [s.temperatures for s in logs], "findings": fit.findings, "chosen": fit.chosen,
-        "friction": fit.robot.frictionloss.tolist(), "true_friction": unit.friction.tolist(),
+        "friction": fit.robot.servo.frictionloss.tolist(), "true_friction": unit.friction.tolist(),
         "test_rad": motion_errors(logs[VALIDATED:], fit.robot).tolist(),
         "test_without_rad": motion_errors(logs[VALIDATED:], without.robot).tolist(),
     }  # fmt: skip

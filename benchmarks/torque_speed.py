@@ -123,12 +123,12 @@ def play_package(arm: Arm, robot: RobotSpec, ctrl: np.ndarray, seed: int) -> np.
     """Play commands (motions, ROWS, n) on a virtual robot of the package; return positions and speeds, (2, …)."""
     n = len(arm.kp)
     unit = replace(
-        neutral(n), kp_scale=arm.kp / robot.kp, kd_scale=1 / arm.stated_kd, stribeck=arm.stribeck,
+        neutral(n), kp_scale=arm.kp / robot.servo.kp, kd_scale=1 / arm.stated_kd, stribeck=arm.stribeck,
         stribeck_speed=np.full(n, 0.1), no_load_speed=arm.no_load, corner=np.full(n, arm.corner),
         delay=np.array([arm.delay]), encoder_noise=np.full(n, arm.noise), velocity_noise=np.full(n, 20 * arm.noise),
         backlash=np.full(n, arm.backlash), current_time=np.full(n, arm.current_time),
     )  # fmt: skip
-    true = replace(robot, effort_limit=arm.limit)
+    true = robot.with_servo(effort_limit=arm.limit)
     virtual = VirtualRobot(true, [unit] * len(ctrl), [(0.0, "both")] * len(ctrl), dt=DT)
     virtual.reset(ctrl[:, 0], list(range(seed, seed + len(ctrl))))
     out = np.empty((2, *ctrl.shape))
@@ -236,14 +236,15 @@ def measure(seed: int, work: Path, timestep: float) -> dict[str, object]:
         replace(options, terms=(*limits, "speed", *base[len(limits) :])),
     )
     row["seconds"] = time.perf_counter() - began
-    if rich.robot.no_load_speed.any():  # else nothing of the term is left in the robot
+    if rich.robot.servo.no_load_speed.any():  # else nothing of the term is left in the robot
         plain = identify(train, robot, validation, replace(options, terms=base))
     errors = [1e3 * np.array(motion_errors(test, one.robot)) for one in (plain, rich)]
     row |= {
         "accepted": [c.name for c in rich.comparisons if c.accepted], "without": errors[0].tolist(),
         "with": errors[1].tolist(), "no_load": [float(v) if np.isfinite(v) else 0.0 for v in arm.no_load],
-        "estimate": rich.robot.no_load_speed.tolist(), "limit": (rich.robot.effort_limit / arm.limit).tolist(),
-        "plain_limit": (plain.robot.effort_limit / arm.limit).tolist(),
+        "estimate": rich.robot.servo.no_load_speed.tolist(),
+        "limit": (rich.robot.servo.effort_limit / arm.limit).tolist(),
+        "plain_limit": (plain.robot.servo.effort_limit / arm.limit).tolist(),
     }  # fmt: skip
     return row | {"std": [rich.std[joint].get("no_load_speed", 0.0) for joint in robot.operated]}
 

@@ -177,7 +177,7 @@ def inside(
     for field in FIELDS:
         for j, joint in enumerate(robot.joints):
             i = spec.joint_names.index(joint.replace("/", "_"))
-            value = getattr(spec, field)[i] + (spec.kd[i] if field == "damping" else 0.0)
+            value = spec.servo[field][i] + (spec.servo.kd[i] if field == "damping" else 0.0)
             far, error = (
                 abs(float(value - truth[field][j])),
                 std.get(joint.replace("/", "_"), {}).get(field),

@@ -170,7 +170,7 @@ def _evaluated(
     mine = estimate_uncertainty(right, train, val, fit.covariance, nthread=1)
     op = robot.operated_index
     truth = {
-        "kp": robot.kp[op] * unit.kp_scale * unit.kt_scale, "damping": 0.5 + unit.damping,
+        "kp": robot.servo.kp[op] * unit.kp_scale * unit.kt_scale, "damping": 0.5 + unit.damping,
         "frictionloss": 0.05 + unit.friction, "delay": unit.delay + 0 * op, "armature": 0.02 + 0.0 * op,
         "offset": 0.0 * op,
     }  # fmt: skip

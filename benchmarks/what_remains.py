@@ -33,8 +33,8 @@ def main(dataset: str, folder: str) -> None:
     for s, simulated in zip(test, replay(test, robot), strict=True):
         error = 1e3 * np.abs(simulated.qpos - s.qpos)[:, op]
         low = np.zeros(len(s), bool)
-        if heights is not None and robot.table is not None:
-            low = heights(s.ctrl) < robot.table.height
+        if heights is not None and robot.scene.table is not None:
+            low = heights(s.ctrl) < robot.scene.table.height
         speed = np.abs(np.gradient(s.qpos[:, op].astype(float), s.dt, axis=0))
         rest = uniform_filter1d(speed, max(1, round(REST_SPAN_S / s.dt)), axis=0) < REST_SPEED
         at_table = np.broadcast_to(low[:, None], rest.shape)

@@ -97,10 +97,10 @@ class Task:
                 for c in ctrls
             ]
             torque = np.concatenate([inverse_dynamics(model, *move) for move in moves])
-            damped = robot.kd * np.concatenate(
+            damped = robot.servo.kd * np.concatenate(
                 [move[1] for move in moves]
             )  # the servo damps its own motion
-            loads.append(((torque + damped) / robot.kp)[:, operated])
+            loads.append(((torque + damped) / robot.servo.kp)[:, operated])
         self.load = np.array(loads)
 
     def observe(

@@ -7,7 +7,6 @@ the simulator's answers to fixed probes, and with the exact transfer.
 """
 
 import sys
-from dataclasses import replace
 
 import numpy as np
 
@@ -15,7 +14,7 @@ import gaponet as gp
 
 robot = gp.load_robot("so101")
 friction = np.full(len(robot.joint_names), 0.156)  # N·m; the file has 0.052
-mine = replace(robot, kp=2.2 * robot.kp, frictionloss=friction)
+mine = robot.with_servo(kp=2.2 * robot.servo.kp, frictionloss=friction)
 methods = gp.evaluate("so101-simulators", sys.argv[1], robot=mine).methods
 for name in ("uncorrected", "told", "transfer"):
     print(f"{name:12} {1e3 * methods[name]['mpjae']:.2f} mrad")

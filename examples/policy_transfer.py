@@ -131,7 +131,7 @@ def make_plant(trial: Trial, spec: RobotSpec, task: Task, fleet: str) -> Unit:
     plant = Unit(spec, task, trial.unit, empty, fleet, trial.extra_delay)
     if trial.torque is not None:
         limits = np.full(len(spec.joint_names), trial.torque)
-        plant.robots.set_gains(spec.kp, spec.kd, limits)
+        plant.robots.set_gains(spec.servo.kp, spec.servo.kd, limits)
     return plant
 
 

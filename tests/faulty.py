@@ -110,7 +110,8 @@ def examine(robot: RobotSpec, logs: list[Recording], folder: Path, damage: Calla
                 ()
                 if gain is None
                 else tuple(
-                    f"{n}={gain * k}" for n, k in zip(robot.joint_names, robot.kp, strict=True)
+                    f"{n}={gain * k}"
+                    for n, k in zip(robot.joint_names, robot.servo.kp, strict=True)
                 )
             )
             report = import_logs(folder / f"{mass:g}", robot, "a", mass, folder / "data", kp=kp)

@@ -43,7 +43,8 @@ MODULES = {
     ".".join(file.relative_to(PACKAGE.parent).with_suffix("").parts).removesuffix(".__init__"): file
     for file in PACKAGE.rglob("*.py")
 }
-MOST = {"api": 19, "cli": 31, "data": 17, "export": 17}  # files in a folder; 16 in all others
+# files in a folder; 16 in all others
+MOST = {"api": 19, "cli": 31, "data": 17, "export": 17, "robot": 18}
 
 
 def rank(module: str) -> int:

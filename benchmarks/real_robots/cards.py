@@ -120,7 +120,7 @@ def prepare(card: Card, data: Path, work: Path) -> tuple[Dataset, RobotSpec, Lab
         for file in sorted((data / card.folder).glob(card.files)):
             shutil.copy2(file, source)
     if card.labels:
-        gain = dict(zip(robot.joint_names, robot.kp.tolist(), strict=True))
+        gain = dict(zip(robot.joint_names, robot.servo.kp.tolist(), strict=True))
         labels = estimate(
             read_logs(source, robot, ReadOptions(rate=card.rate)),
             card.labels.payloads,

@@ -44,6 +44,7 @@ if TYPE_CHECKING:
     from gaponet.nn.config import ModelConfig as ModelConfig
     from gaponet.nn.network_card import NetworkCard as NetworkCard
     from gaponet.nn.training.config import TrainConfig as TrainConfig
+    from gaponet.robot.servo_parameters import ServoParameters as ServoParameters
     from gaponet.robot.spec import RobotSpec as RobotSpec
     from gaponet.robot.spec import load_robot as load_robot
     from gaponet.sim.dataset_robot import open_dataset as open_dataset
@@ -78,6 +79,7 @@ else:
         "open_dataset": "gaponet.sim.dataset_robot",
         "load_robot": "gaponet.robot.spec",
         "RobotSpec": "gaponet.robot.spec",
+        "ServoParameters": "gaponet.robot.servo_parameters",
         "ModelConfig": "gaponet.nn.config",
         "TrainConfig": "gaponet.nn.training.config",
         "GapModel": "gaponet.nn.artifact",

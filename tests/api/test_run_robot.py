@@ -90,7 +90,7 @@ def test_a_virtual_robot_plays_a_motion_and_the_result_has_its_errors(arm):
 
 
 def test_compensation_by_an_identified_folder_reduces_the_error(arm, tmp_path):
-    soft = arm.with_servos({joint: {"kp": 10.0} for joint in arm.joint_names})
+    soft = arm.with_identified({joint: {"kp": 10.0} for joint in arm.joint_names})
     save_robot(soft, tmp_path / "soft")
     errors = {}
     for compensate in (False, True):
@@ -117,7 +117,7 @@ def simulate(robot, qpos, targets):
 
 
 def test_with_follow_the_commands_move_the_identified_robot_as_the_nominal_simulator(arm, tmp_path):
-    soft = arm.with_servos({joint: {"kp": 14.0, "delay": 0.01} for joint in arm.joint_names})
+    soft = arm.with_identified({joint: {"kp": 14.0, "delay": 0.01} for joint in arm.joint_names})
     save_robot(soft, tmp_path / "soft")
     open_loop = CompensatorConfig(feedback=0.0)
     options = replace(FAST, follow="nominal", compensation=open_loop)
@@ -317,7 +317,7 @@ def open_in(way: str, kind: str, folder: Path) -> None:
 
 
 def test_a_robot_changed_in_memory_is_refused_though_its_folder_is_the_packages(so101):
-    strong = replace(so101, kp=1.5 * so101.kp)
+    strong = so101.with_servo(kp=1.5 * so101.servo.kp)
     with pytest.raises(RobotError, match=r"kp of .* the known robot has"):
         hardware_robot(strong, reference_robot("so101", None))
 
@@ -334,7 +334,7 @@ def test_a_folder_that_the_user_names_may_have_other_gains_also_in_the_watchdog(
     folder = changed("so101", "kp = 17.8", "kp = 26.7", tmp_path / "strong")
     driver = open_driver("so101", folder, limits_from=str(folder))
     watchdog = open_driver(**driver.watchdog())
-    np.testing.assert_allclose(watchdog.kp, 1.5 * load_robot("so101").kp)
+    np.testing.assert_allclose(watchdog.kp, 1.5 * load_robot("so101").servo.kp)
 
 
 def test_no_folder_lifts_the_limits_of_the_motors(tmp_path):

@@ -22,7 +22,7 @@ POLICY = {
 
 @pytest.fixture
 def known(tmp_path):
-    robot = write_arm(tmp_path / "arm").with_servos(
+    robot = write_arm(tmp_path / "arm").with_identified(
         {"elbow": {"kp": 14.0, "delay": 0.03, "frictionloss": 0.2}}
     )
     save_robot(robot, tmp_path / "known")

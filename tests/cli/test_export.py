@@ -2,7 +2,6 @@
 
 import json
 import shutil
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -48,7 +47,7 @@ def test_an_export_elsewhere_can_be_transferred_without_the_run(run, tmp_path):
     robot = load_robot(tmp_path / "arm")
     save_robot(robot, run / "robot")
     assert main(["export", str(run), "--out", str(tmp_path / "shipped")]) == 0
-    stiff = replace(robot, kp=2.0 * robot.kp)
+    stiff = robot.with_servo(kp=2.0 * robot.servo.kp)
     there = AlignedSim(stiff, GapModel.load(run), 0.1)
     shutil.rmtree(run)
     sim = AlignedSim(stiff, GapModel.load(tmp_path / "shipped"), 0.1)

@@ -31,7 +31,7 @@ def place(tmp_path_factory):
     """A robot that was identified rightly, a dataset of it, and two rollouts: the nominal simulator's, the robot's."""
     folder = tmp_path_factory.mktemp("replay")
     robot = write_arm(folder / "arm")
-    save_robot(robot.with_servos(dict.fromkeys(robot.operated, FOUND)), folder / "found")
+    save_robot(robot.with_identified(dict.fromkeys(robot.operated, FOUND)), folder / "found")
     (folder / "logs").mkdir()
     for seed in range(4):
         write_rollout(
@@ -93,7 +93,7 @@ def test_what_the_robot_would_do_can_be_kept(place, capsys, tmp_path):
 
 
 def test_a_band_holds_nine_tenths_of_what_a_robot_does_that_was_identified_a_little_wrong(arm):
-    wrong = arm.with_servos(
+    wrong = arm.with_identified(
         {j: {"kp": 14.5, "delay": 0.038, "frictionloss": 0.06} for j in arm.operated}
     )
     known = validation_error(
@@ -107,8 +107,8 @@ def test_a_band_holds_nine_tenths_of_what_a_robot_does_that_was_identified_a_lit
 
 def test_what_is_not_known_widens_a_band_where_motion_shows_it(arm):
     still, moving = (record(arm, ctrl, "x") for ctrl in (np.zeros((100, 2)), commands(100, 1)))
-    known, robot = 1e-3, arm.with_servos({"elbow": {"delay": 0.02}})
-    drawn = [robot.with_servos({"elbow": {"delay": delay}}) for delay in (0.01, 0.03)]
+    known, robot = 1e-3, arm.with_identified({"elbow": {"delay": 0.02}})
+    drawn = [robot.with_identified({"elbow": {"delay": delay}}) for delay in (0.01, 0.03)]
     first, second = predict(robot, [still, moving], np.full(2, known), drawn)
     assert first.half_width.max() < 1.5 * known
     assert second.half_width[:, 1].max() > 3 * known

@@ -77,7 +77,7 @@ def test_record_makes_a_dataset_with_unit_payload_and_gains(arm, motion, tmp_pat
         True,
     )
     assert (first.meta.repetition, second.meta.repetition) == (0, 1)
-    assert first.meta.notes["controller"]["kp"] == arm.kp.tolist()
+    assert first.meta.notes["controller"]["kp"] == arm.servo.kp.tolist()
     sequence = data.read(first)
     assert sequence.dt == 0.02
     assert np.abs(sequence.qpos - sequence.ctrl).max() < 0.3
@@ -189,7 +189,7 @@ def test_a_model_runs_on_the_robot_that_its_run_keeps_and_on_no_other(
 
 
 def test_compensation_needs_a_robot_folder_and_no_model(arm, motion, tmp_path, capsys):
-    soft = arm.with_servos({joint: {"kp": 10.0} for joint in arm.joint_names})
+    soft = arm.with_identified({joint: {"kp": 10.0} for joint in arm.joint_names})
     save_robot(soft, tmp_path / "soft")
     missed = {}
     for name, words in (("raw", []), ("compensated", ["--compensate"])):
@@ -198,7 +198,7 @@ def test_compensation_needs_a_robot_folder_and_no_model(arm, motion, tmp_path, c
         )
         result = json.loads(capsys.readouterr().out)
         assert (
-            result["kp"] == arm.kp.tolist()
+            result["kp"] == arm.servo.kp.tolist()
         )  # the servos are told their own gains, not what was identified
         missed[name] = result["tracking_error_rad"]["mean"]
     assert missed["compensated"] < 0.7 * missed["raw"]

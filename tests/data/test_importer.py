@@ -232,14 +232,15 @@ def test_a_source_named_by_a_dot_is_known_by_its_folder(so101, tmp_path, monkeyp
 
 def test_gains_are_the_robots_unless_said_by_joint_or_for_all(logs, so101, tmp_path):
     first = import_logs(logs, so101, "lab", 0.0, tmp_path / "a").entries[0].meta
-    assert first.kp == tuple(so101.kp)
+    assert first.kp == tuple(so101.servo.kp)
     said = import_logs(
         logs, so101, "lab", 0.0, tmp_path / "b", kp=("elbow_flex=9", "gripper=4"), kd=("0.1",)
     )
     meta = Dataset(tmp_path / "b").entries[0].meta
     assert meta == said.entries[0].meta
     assert dict(zip(so101.joint_names, meta.kp, strict=True)) == (
-        dict(zip(so101.joint_names, so101.kp, strict=True)) | {"elbow_flex": 9.0, "gripper": 4.0}
+        dict(zip(so101.joint_names, so101.servo.kp, strict=True))
+        | {"elbow_flex": 9.0, "gripper": 4.0}
     )
     assert meta.kd == (0.1,) * 6
 

@@ -20,7 +20,7 @@ def static_poses(robot, offset: float, mass: float) -> StaticPoses:
     """Static poses of a robot with an offset, stiction and half a milliradian of noise."""
     rng = np.random.default_rng(0)
     qpos, approach = rng.uniform(-1.2, 1.2, (120, 2)), rng.choice([-1, 1], (120, 2))
-    sag = -gravity_of(robot)(qpos, mass, "both") / robot.kp
+    sag = -gravity_of(robot)(qpos, mass, "both") / robot.servo.kp
     ctrl = qpos - (sag + offset - BAND * approach + 5e-4 * rng.normal(size=(120, 2)))
     return StaticPoses(qpos, ctrl, approach, np.ones((120, 2), bool))
 

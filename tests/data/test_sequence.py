@@ -170,7 +170,7 @@ def test_identity_is_samples_unit_and_payload_and_not_the_name(arm):
 def test_a_recording_keeps_the_gains_that_are_stated_else_the_logs_else_the_robots(arm):
     time = 0.02 * np.arange(ROWS)
     robots = to_sequence(arm_log(time), arm, META).meta
-    assert (robots.kp, robots.notes["gains"]) == (tuple(arm.kp), "of robot.toml")
+    assert (robots.kp, robots.notes["gains"]) == (tuple(arm.servo.kp), "of robot.toml")
     logged = to_sequence(arm_log(time, kp=[7, 8], kd=[0.5, 0.6]), arm, META).meta
     assert (logged.kp, logged.kd, logged.notes["gains"]) == ((7.0, 8.0), (0.5, 0.6), "as recorded")
     stated = to_sequence(arm_log(time, kp=[7, 8]), arm, replace(META, kp=(9.0, 9.5))).meta

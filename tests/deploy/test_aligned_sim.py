@@ -1,7 +1,5 @@
 """The aligned simulator is the replay with the model's corrector, whichever way it is stepped."""
 
-from dataclasses import replace
-
 import mujoco
 import numpy as np
 import pytest
@@ -76,7 +74,7 @@ def test_one_of_several_simulations_can_be_reset(robot, model):
 
 
 def test_late_servos_follow_the_target_in_force_at_the_start(robot, tmp_path):
-    late = replace(robot, delay=[0.05, 0.0])
+    late = robot.with_servo(delay=[0.05, 0.0])
     model = small_model(late, tmp_path)
     sequences = recordings(robot, 1, rows=20)
     simulated = replay(sequences, late, model.corrector(late))[0]
@@ -138,7 +136,7 @@ def test_a_scene_without_actuators_is_refused(robot):
 
 def test_a_scene_moves_like_an_identified_robot_without_a_model(robot):
     law = {"kp": 15.0, "frictionloss": 0.05, "stribeck": 0.05, "stribeck_speed": 0.1}
-    known = robot.with_servos(dict.fromkeys(robot.joint_names, law))
+    known = robot.with_identified(dict.fromkeys(robot.joint_names, law))
     mj_model = build_model(robot, 0.2)
     data, align, sim = (
         mujoco.MjData(mj_model),

@@ -24,7 +24,7 @@ class WeakArm:
     masses = (0.0, 0.4)
 
     def __init__(self, robot, payload=0.0, late=0, lost=0.0, seed=0):
-        weak = replace(robot, kp=WEAK * robot.kp)
+        weak = robot.with_servo(kp=WEAK * robot.servo.kp)
         self.sim = BatchSim(weak, [(m, "both", robot.dt) for m in (payload, *self.masses)], 1)
         self.late, self.lost, self.rng = late, lost, np.random.default_rng(seed)
 
@@ -95,7 +95,7 @@ def test_with_aim_simulator_the_robot_moves_like_the_nominal_simulator(robot, mo
 
 @pytest.mark.parametrize("given", [{}, {"limit": 0.05}])
 def test_a_command_is_no_further_from_its_target_than_the_limit(robot, given):
-    soft = robot.with_servos(
+    soft = robot.with_identified(
         {name: {"kp": 1.0} for name in robot.joint_names}
     )  # gravity asks for more than 0.5 rad
     compensate = Compensator(soft, config=CompensatorConfig(blend=0.0, **given))
@@ -327,7 +327,10 @@ def test_dynamic_feed_forward_reduces_the_error_of_a_moving_arm(robot, model):
 def test_without_a_model_what_was_identified_is_fed_forward(robot):
     """Weak servos with friction at rest: known, they follow."""
     law = {"kp": 16.0, "offset": 0.03, "frictionloss": 0.1, "stribeck": 0.1, "stribeck_speed": 0.05}
-    identified, targets = robot.with_servos(dict.fromkeys(robot.joint_names, law)), commands(150, 1)
+    identified, targets = (
+        robot.with_identified(dict.fromkeys(robot.joint_names, law)),
+        commands(150, 1),
+    )
     missed = {}
     for name, known in (("raw", None), ("nominal", robot), ("identified", identified)):
         arm = BatchSim(identified, [(0.2, "both", 0.02)], 1)
@@ -345,7 +348,7 @@ def test_without_a_model_what_was_identified_is_fed_forward(robot):
 
 def test_without_a_model_servos_with_other_gains_and_absurd_payloads_are_refused(robot):
     compensator = Compensator(
-        robot.with_servos({"elbow": {"kp": 12.0}}), config=CompensatorConfig(payload_max=0.5)
+        robot.with_identified({"elbow": {"kp": 12.0}}), config=CompensatorConfig(payload_max=0.5)
     )
     joints, kd = robot.joint_names, np.zeros(2)
     compensator.require_gains(
@@ -415,7 +418,7 @@ def test_an_adapted_unit_follows_where_the_model_alone_does_not(robot):
     still = replace(NOW, feedback=0.0)
     servos = {
         j: {"kp": WEAK * float(k), "delay": 0.0}
-        for j, k in zip(robot.joint_names, robot.kp, strict=True)
+        for j, k in zip(robot.joint_names, robot.servo.kp, strict=True)
     }
     unit = Adaptation("a", "weights", servos, (), 30.0, 0.0, 0.0)
     error = {}

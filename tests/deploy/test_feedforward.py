@@ -1,7 +1,5 @@
 """Feed-forward of motion: the torque that inverse dynamics asks for, less what holding takes."""
 
-from dataclasses import replace
-
 import mujoco
 import numpy as np
 import pytest
@@ -45,8 +43,8 @@ def test_feed_forward_equals_inverse_dynamics(robot):
 
 def test_what_the_servo_brakes_itself_does_not_rub_in_the_gear(tmp_path):
     """At an even speed without gravity and damping the motor gives no torque that could rub."""
-    arm = replace(
-        write_arm(tmp_path), kd=np.full(2, 1.5), damping=0.0, frictionloss=0.0, friction_motor=0.3
+    arm = write_arm(tmp_path).with_servo(
+        kd=np.full(2, 1.5), damping=0.0, frictionloss=0.0, friction_motor=0.3
     )
     _, moving = make(arm)
     moving.qvel = np.full((1, 2), 0.8)

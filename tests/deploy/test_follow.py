@@ -22,7 +22,7 @@ def robot(tmp_path_factory):
 
 
 def identified(robot, **other):
-    return robot.with_servos(dict.fromkeys(robot.joint_names, SERVO | other))
+    return robot.with_identified(dict.fromkeys(robot.joint_names, SERVO | other))
 
 
 def play(robot, targets, compensator=None, payload=0.0):
@@ -150,7 +150,7 @@ def test_a_robot_that_is_not_identified_has_nobody_to_follow(robot):
 
 
 def test_a_robot_far_from_its_nominal_simulator_is_refused_without_extrapolate(robot):
-    far = robot.with_servos({"elbow": {"kp": 200.0}})
+    far = robot.with_identified({"elbow": {"kp": 200.0}})
     with pytest.raises(ModelError, match="elbow"):
         Compensator(far, follow="nominal")
     Compensator(far, follow="nominal", extrapolate=True)
@@ -158,7 +158,7 @@ def test_a_robot_far_from_its_nominal_simulator_is_refused_without_extrapolate(r
 
 def test_a_limit_of_the_correction_holds_while_following(robot):
     strong = write_arm(robot.folder.parent / "strong", TOML.replace("kp = 20.0", "kp = 80.0"))
-    soft = strong.with_servos(dict.fromkeys(strong.joint_names, SERVO | {"kp": 20.0}))
+    soft = strong.with_identified(dict.fromkeys(strong.joint_names, SERVO | {"kp": 20.0}))
     follower = Compensator(soft, config=replace(NOW, limit=0.05), follow="nominal")
     target = np.zeros(2)
     follower.reset(target, 0.0)

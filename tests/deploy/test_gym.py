@@ -1,6 +1,5 @@
 """gymnasium environments on the aligned simulator."""
 
-from dataclasses import replace
 from types import SimpleNamespace
 
 import mujoco
@@ -83,7 +82,7 @@ def test_a_wrapped_environment_moves_as_the_aligned_simulator(robot, model, stif
     class Plain(gymnasium.Env):
         """A MuJoCo environment as users write them."""
 
-        model, dt = build_model(replace(robot, kp=stiffer * robot.kp)), 0.02
+        model, dt = build_model(robot.with_servo(kp=stiffer * robot.servo.kp)), 0.02
         data = mujoco.MjData(model)
         action_space = observation_space = gymnasium.spaces.Box(-2, 2, (2,))
         spec = SimpleNamespace(id="plain")

@@ -48,12 +48,12 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
 
 def with_kp(robot: RobotSpec, factor: float) -> RobotSpec:
     """Return the robot as another simulator has it, with other stiffness."""
-    return replace(robot, kp=factor * robot.kp)
+    return robot.with_servo(kp=factor * robot.servo.kp)
 
 
 def late(robot: RobotSpec) -> RobotSpec:
     """Return the robot with servos that are later than a transfer allows."""
-    return replace(with_kp(robot, OTHER_KP), delay=robot.delay + 0.012)
+    return with_kp(robot, OTHER_KP).with_servo(delay=robot.servo.delay + 0.012)
 
 
 def positions(robot: RobotSpec, step) -> np.ndarray:
@@ -102,7 +102,7 @@ def test_a_simulator_that_cannot_be_transferred_is_corrected_by_its_answers(trai
 
 
 def test_a_simulator_with_neither_is_refused(trained) -> None:
-    far = replace(with_kp(trained.robot, 4.0), delay=trained.robot.delay + 0.1)
+    far = with_kp(trained.robot, 4.0).with_servo(delay=trained.robot.servo.delay + 0.1)
 
     with pytest.raises(ModelError, match="later"):
         AlignedSim(far, trained.model)

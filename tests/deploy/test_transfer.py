@@ -12,7 +12,7 @@ from gaponet.base.errors import ModelError
 from gaponet.deploy.aligned_sim import AlignedSim, AlignedSimOptions
 from gaponet.deploy.compensator import Compensator, CompensatorConfig
 from gaponet.deploy.mujoco_loop import MujocoAligner
-from gaponet.robot.spec import Table, Tip
+from gaponet.robot.spec import Scene, Table, Tip
 from gaponet.sim.model import build_model
 
 STRONG = TOML.replace("effort_limit = 5.0", "effort_limit = 50.0")
@@ -38,9 +38,9 @@ def other(robot, **factors):
     """The robot with some of its numbers multiplied."""
     model = build_model(robot)
     own = {f: getattr(model, f"dof_{f}") for f in ("damping", "frictionloss", "armature")} | {
-        "kp": robot.kp
+        "kp": robot.servo.kp
     }
-    return replace(robot, **{f: factor * own[f] for f, factor in factors.items()})
+    return robot.with_servo(**{f: factor * own[f] for f, factor in factors.items()})
 
 
 def follow(sim, targets=TARGETS, push=0.0, repeat=1):
@@ -120,22 +120,24 @@ def test_at_twice_the_control_rate_the_model_keeps_its_own_rate(robot, model):
 def test_another_integrator_and_offsets(robot, model, tmp_path):
     there = follow(AlignedSim(robot, model))
     euler = write_arm(tmp_path, STRONG, HEAVY.replace("implicitfast", "Euler"))
-    for target in (euler, replace(robot, offset=np.array([0.05, -0.03]))):
+    for target in (euler, robot.with_servo(offset=np.array([0.05, -0.03]))):
         assert np.abs(follow(AlignedSim(target, model)) - there).mean() < 0.001
 
 
 def test_servos_that_are_late_like_the_reference_and_those_that_are_later(robot):
-    reference = replace(robot, delay=np.array([0.03, 0.02]))
+    reference = robot.with_servo(delay=np.array([0.03, 0.02]))
     there = follow(AlignedSim(reference, None))
-    same = follow(AlignedSim(replace(other(robot, kp=1.5), delay=reference.delay), reference))
+    same = follow(
+        AlignedSim(other(robot, kp=1.5).with_servo(delay=reference.servo.delay), reference)
+    )
     assert (
         np.abs(same - there).mean() < 0.2 * np.abs(follow(AlignedSim(robot, None)) - there).mean()
     )
-    later = replace(robot, delay=np.array([0.03, 0.06]))
+    later = robot.with_servo(delay=np.array([0.03, 0.06]))
     with pytest.raises(ModelError, match=r"40 ms later than the reference's, and cannot follow it"):
         AlignedSim(later, reference)
-    late = replace(
-        robot, delay=np.array([0.06, 0.06])
+    late = robot.with_servo(
+        delay=np.array([0.06, 0.06])
     )  # whoever wants it so all the same is not made worse
     sims = (AlignedSim(late, given, extrapolate=True) for given in (reference, None))
     apart = [np.abs(follow(sim) - there).mean() for sim in sims]
@@ -153,12 +155,12 @@ def test_transfer_is_causal(robot, model):
 
 @pytest.mark.parametrize("factors", [{"kp": 2.0}, {"damping": 0.5}, {"frictionloss": 3.0}])
 def test_transfer_reduces_the_difference_in_contact_and_under_a_push(robot, factors):
-    tipped = replace(robot, tips=(Tip("fore", (0.2, 0.0, 0.0), 0.01),))
+    tipped = replace(robot, scene=Scene(tips=(Tip("fore", (0.2, 0.0, 0.0), 0.01),)))
     reference, target = other(tipped, kp=0.8, damping=1.5), other(tipped, **factors)
     for plane, push in ((Table(-0.1, 0.3, 2e3), 0.0), (None, 1.0)):
-        there = follow(AlignedSim(replace(reference, table=plane), None), push=push)
+        there = follow(AlignedSim(reference.with_table(plane), None), push=push)
         given, alone = (
-            np.abs(follow(AlignedSim(replace(target, table=plane), like), push=push) - there).mean()
+            np.abs(follow(AlignedSim(target.with_table(plane), like), push=push) - there).mean()
             for like in (reference, None)
         )
         assert given < 0.2 * alone
@@ -214,6 +216,6 @@ def test_in_a_scene_equal_to_the_simulator_of_training_nothing_is_transferred(ro
 
 def test_the_compensator_takes_the_simulator_of_the_run(robot, model):
     stiff = other(robot, kp=2.0)
-    assert Compensator(stiff, model).robot.kp[0] == robot.kp[0]
+    assert Compensator(stiff, model).robot.servo.kp[0] == robot.servo.kp[0]
     with pytest.raises(ModelError, match="aim simulator is the simulator trained in"):
         Compensator(stiff, model, CompensatorConfig(aim="simulator"))

@@ -27,7 +27,9 @@ def data(arm, tmp_path):
 @pytest.fixture
 def fitted(arm, data, tmp_path):
     """Identified on motion0, judged on motion1."""
-    robot = arm.with_servos({"elbow": {"kp": 10.0}, "shoulder": {"kp": 10.0, "frictionloss": 0.06}})
+    robot = arm.with_identified(
+        {"elbow": {"kp": 10.0}, "shoulder": {"kp": 10.0, "frictionloss": 0.06}}
+    )
     save_robot(robot, tmp_path / "fitted")
     parts = {p: {e.id: e.hash} for p, e in zip(("train", "val", "test"), data.entries, strict=True)}
     motions = {part: [f"motion{i}"] for i, part in enumerate(parts)}

@@ -80,7 +80,7 @@ def test_another_robots_simulator_is_refused_whatever_its_name(data, run, tmp_pa
 def test_an_identified_simulator_of_the_same_robot_is_another_start_and_the_same_baseline(
     arm, data, run, tmp_path
 ):
-    fitted = arm.with_servos({"elbow": {"kp": 11.0}})
+    fitted = arm.with_identified({"elbow": {"kp": 11.0}})
     second = untrained(
         tmp_path / "fitted", fitted, data, kind="mlp", train=("m0", "m1"), val=("m2",), test=("m3",)
     )
@@ -95,7 +95,7 @@ def test_the_dataset_keeps_its_robot_and_takes_no_recordings_of_another_one(
 ):
     assert model_hash(load_stored_robot(data.path, "arm")) == model_hash(arm)
     shutil.rmtree(arm.folder)
-    assert open_dataset(data.path, None)[1].kp.tolist() == [20.0, 20.0]
+    assert open_dataset(data.path, None)[1].servo.kp.tolist() == [20.0, 20.0]
     stranger = write_arm(tmp_path / "other" / "arm", toml=STIFF)
     (tmp_path / "new.csv").write_text("time,ctrl.elbow\n")
     words = [
@@ -124,11 +124,11 @@ def test_the_dataset_keeps_its_robot_and_takes_no_recordings_of_another_one(
     assert main([*words, "--robot", str(stranger.folder)]) == 2
     assert "its nominal simulator is" in " ".join(capsys.readouterr().err.split())
     assert not (data.path / "recordings").exists()
-    assert load_stored_robot(data.path, "arm").kp.tolist() == [20.0, 20.0]
+    assert load_stored_robot(data.path, "arm").servo.kp.tolist() == [20.0, 20.0]
 
 
 def test_a_dataset_keeps_the_nominal_robot_where_an_identified_one_is_given(arm, tmp_path):
-    made = Dataset.create(tmp_path / "d", arm.with_servos({"elbow": {"kp": 11.0}}))
+    made = Dataset.create(tmp_path / "d", arm.with_identified({"elbow": {"kp": 11.0}}))
     assert model_hash(load_robot(made.path / "robot")) == model_hash(arm)
 
 

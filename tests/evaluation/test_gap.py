@@ -94,21 +94,21 @@ def test_bars_and_floor_carry_their_values():
 
 def test_causes_lead_from_the_nominal_simulator_to_the_identified_one(tmp_path):
     robot = write_arm(tmp_path / "arm")
-    found = robot.with_servos(
+    found = robot.with_identified(
         {"elbow": {"kp": 15.0, "frictionloss": 0.1, "stribeck": 0.05, "stribeck_speed": 0.1}}
     )
     steps = cause_steps(found)
     assert [step.name for step in steps] == ["gain", "friction", "creep", "stribeck"]
     assert model_hash(steps[-1].simulator) == model_hash(found)
-    assert steps[0].simulator.frictionloss[1] != 0.1
+    assert steps[0].simulator.servo.frictionloss[1] != 0.1
     assert cause_steps(robot) == []
 
 
 def test_a_servo_with_less_damping_than_its_files_kd_is_the_last_step_too(tmp_path):
     robot = write_arm(tmp_path / "arm")
-    robot = replace(robot, kd=np.full_like(robot.kd, 0.5))
-    found = robot.with_servos({"elbow": {"damping": -0.3}})
-    assert found.kd[1] == pytest.approx(0.2)
+    robot = robot.with_servo(kd=np.full_like(robot.servo.kd, 0.5))
+    found = robot.with_identified({"elbow": {"damping": -0.3}})
+    assert found.servo.kd[1] == pytest.approx(0.2)
     assert model_hash(cause_steps(found)[-1].simulator) == model_hash(found)
 
 
@@ -147,7 +147,7 @@ def test_a_motion_that_repeats_itself_tells_repeatability(tmp_path):
 def test_friction_creeps_only_with_the_option(tmp_path):
     robot = write_arm(tmp_path / "arm")
     stiff = {"kp": 20.0, "frictionloss": 2.0, "armature": 0.002}
-    heavy = robot.with_servos(dict.fromkeys(robot.joint_names, stiff))
+    heavy = robot.with_identified(dict.fromkeys(robot.joint_names, stiff))
     still = recordings(robot, 1, rows=100)[0]
     held = replace(
         still, ctrl=np.repeat(still.qpos[:1] + 0.05, 100, axis=0), qvel=np.zeros_like(still.qvel)
@@ -181,7 +181,7 @@ def test_a_joint_that_nobody_recorded_has_no_bar_and_dilutes_nothing(tmp_path):
     data = Dataset.create(tmp_path / "data", robot)
     for s in recordings(robot, 3, rows=200):
         data.append(replace(s, meta=replace(s.meta, notes={"posture": {"elbow": 0.0}})))
-    stiffer = robot.with_servos({"shoulder": {"kp": 30.0}})
+    stiffer = robot.with_identified({"shoulder": {"kp": 30.0}})
     found = gap_by_step(Candidate(stiffer.folder, stiffer, None), data)
     assert list(found["by_joint"]) == ["shoulder"]
     assert found["removed"]["gain"] == pytest.approx(
@@ -199,7 +199,7 @@ def test_a_gap_that_is_measured_again_simulates_nothing(tmp_path, monkeypatch):
     for sequence in recordings(robot, 3, rows=60, kp=0.5):
         data.append(sequence)
     changed = {"kp": 15.0, "frictionloss": 0.1}
-    fitted = robot.with_servos(dict.fromkeys(robot.joint_names, changed))
+    fitted = robot.with_identified(dict.fromkeys(robot.joint_names, changed))
     save_robot(fitted, tmp_path / "fitted")
     candidate = Candidate.load(tmp_path / "fitted", robot)
     first = gap_by_step(candidate, data)

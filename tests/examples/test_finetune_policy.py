@@ -1,7 +1,6 @@
 """The fine-tuning example on a two-joint arm."""
 
 import importlib.util
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -68,7 +67,7 @@ def test_ppo_learns_to_hold_the_arm_up_and_hands_its_policy_on(robot, task):
     learnt = example.follow(task, sim, policy)
     assert learnt.mean() < 0.9 * example.follow(task, sim, None).mean()
     weaker = AlignedSim(
-        replace(robot, kp=0.8 * robot.kp), None, mass, num_envs=32, options=ONE_THREAD
+        robot.with_servo(kp=0.8 * robot.servo.kp), None, mass, num_envs=32, options=ONE_THREAD
     )
     on = example.make_runner(example.TrackingEnv(task, weaker, seed=0), policy)
     np.testing.assert_array_equal(example.follow(task, sim, on), learnt)

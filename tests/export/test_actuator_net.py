@@ -32,7 +32,7 @@ ADDED = 0.05
 def run(tmp_path_factory):
     """A robot that moves as if every target were 50 mrad higher, and a run that has learned just that."""
     folder = tmp_path_factory.mktemp("actuator")
-    robot = write_arm(folder / "arm").with_servos(LATE)
+    robot = write_arm(folder / "arm").with_identified(LATE)
     asked = [s.rows(slice(0, 150)) for s in own_motions(robot, count=4)]
     told = [replace(s, ctrl=s.ctrl + ADDED) for s in asked]
     moved = zip(asked, replay(told, robot), strict=True)

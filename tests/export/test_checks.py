@@ -42,7 +42,7 @@ def exported(tmp_path_factory: pytest.TempPathFactory) -> Path:
     found = {
         j: {"delay": 0.006 * i, "offset": 0.01 * i} | law for i, j in enumerate(robot.operated, 1)
     }
-    robot = robot.with_servos(found)
+    robot = robot.with_identified(found)
     motions = [s.rows(slice(0, 100 + 27 * i)) for i, s in enumerate(own_motions(robot, count=5))]
     with (
         pytest.MonkeyPatch.context() as patch
@@ -50,7 +50,7 @@ def exported(tmp_path_factory: pytest.TempPathFactory) -> Path:
         patch.setattr(
             exporting,
             "fit_plain_servos",
-            lambda r, *_, **__: r.with_servos({j: dict.fromkeys(law, 0.0) for j in found}),
+            lambda r, *_, **__: r.with_identified({j: dict.fromkeys(law, 0.0) for j in found}),
         )
         for to in {to for to, *_ in ENGINES.values()}:
             exporting.export_robot(robot, to, folder / to, (motions, motions))
@@ -101,7 +101,7 @@ def test_a_drawn_unit_moves_in_an_engine_as_in_gaponet(
     said = subprocess.run(
         command, cwd=exported / to, capture_output=True, text=True, check=True
     ).stdout
-    unit = load_robot("so101").with_servos(
+    unit = load_robot("so101").with_identified(
         {j: {f: x[2][i] for f, x in units.items()} for i, j in enumerate(joints)}
     )
     meta = SequenceMeta(unit.name, "itself", "m", 0.0, virtual=True)

@@ -45,7 +45,7 @@ LATE = {
 def place(tmp_path_factory):
     """A run in a simulator with late servos, and its export."""
     folder = tmp_path_factory.mktemp("engine")
-    robot = write_arm(folder / "arm").with_servos(LATE)
+    robot = write_arm(folder / "arm").with_identified(LATE)
     model = random_run(folder / "run", robot)
     assert export_model(model, folder / "run", folder / "torch", payload_mass=0.1) <= 1e-5
     return folder
@@ -53,7 +53,7 @@ def place(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def model(place):
-    return random_run(place / "run", write_arm(place / "arm").with_servos(LATE))
+    return random_run(place / "run", write_arm(place / "arm").with_identified(LATE))
 
 
 def drawn(num_envs, columns=2, seed=0):
@@ -181,7 +181,7 @@ def test_an_mjcf_with_servos_is_the_simulator(name):
         "friction_external": 0.1,
         "damping": 0.7,
     }
-    robot = robot.with_servos({robot.operated[1]: found})
+    robot = robot.with_identified({robot.operated[1]: found})
     dt = 1 / 60  # no round number of physics steps: all digits count
     again = mujoco.MjModel.from_xml_string(mjcf_text(robot, dt, 0.5))
     own = build_model(robot, 0.5, dt=dt)
@@ -306,7 +306,7 @@ def test_an_action_term_corrects_what_was_processed_in_the_present_state(place):
 def test_a_servos_law_in_torch_is_the_simulators(tmp_path):
     rng, values = np.random.default_rng(0), (0.1, 0.2, 0.05, 0.08, 0.3, 0.02, 3.0, 0.0)
     law = dict(zip(SERVO_TERMS, values, strict=True))
-    robot = write_arm(tmp_path / "arm").with_servos(
+    robot = write_arm(tmp_path / "arm").with_identified(
         {"elbow": law | {"offset": 0.1}, "shoulder": {"kp": 11.0}}
     )
     q, v, torque, load, ctrl = rng.uniform(-0.2, 0.2, (5, 20, 2))
@@ -315,10 +315,10 @@ def test_a_servos_law_in_torch_is_the_simulators(tmp_path):
     vars(data).update({name: torch.tensor(x).float() for name, x in seen.items()})
     found.after_step(data)
     found.before_step(model, data, torch.tensor(ctrl).float())
-    terms, kp = {name: getattr(robot, name) for name in SERVO_TERMS}, robot.kp
+    terms, kp = {name: robot.servo[name] for name in SERVO_TERMS}, robot.servo.kp
     friction = friction_limit(terms, np.full(2, 0.05), v, torque, load)
     np.testing.assert_allclose(model.dof_frictionloss, friction, atol=1e-6)
-    asked = servo_torque(terms, kp, ctrl + robot.offset, q)
+    asked = servo_torque(terms, kp, ctrl + robot.servo.offset, q)
     np.testing.assert_allclose(model.actuator_biasprm[:, :, 0], asked - kp * (ctrl - q), atol=1e-5)
     limits = np.stack([np.full(20, 5.0), 5.0 * np.minimum(1 - v[:, 1] / 3.0, 1)], axis=1)
     np.testing.assert_allclose(model.actuator_forcerange[:, :, 1], limits, atol=1e-5)
@@ -326,12 +326,12 @@ def test_a_servos_law_in_torch_is_the_simulators(tmp_path):
     found.starts_under_command = True
     found.before_step(model, data, data.qpos + 0.01)
     np.testing.assert_allclose(
-        found.torque, np.tile(kp * (robot.offset + 0.01), (20, 1)), atol=1e-6
+        found.torque, np.tile(kp * (robot.servo.offset + 0.01), (20, 1)), atol=1e-6
     )
 
 
 def test_worlds_that_share_one_friction_are_refused(place):
-    robot = write_arm(place / "arm_with_law").with_servos({"elbow": {"friction_motor": 0.1}})
+    robot = write_arm(place / "arm_with_law").with_identified({"elbow": {"friction_motor": 0.1}})
     servos, model, data = mjlab_servos_of(robot, worlds=2)
     model.dof_frictionloss = torch.zeros(1, 2).expand(2, 2)
     with pytest.raises(ValueError, match="mjlab_events"):
@@ -389,7 +389,9 @@ def test_isaac_labs_classes_are_found_by_name_as_hydra_looks_for_them(place, mon
 
 def test_a_joint_with_a_no_load_speed_is_isaac_labs_dc_motor(tmp_path, monkeypatch):
     isaac_lab(monkeypatch)
-    robot = write_arm(tmp_path / "arm").with_servos({"elbow": {"no_load_speed": 4.0, "kp": 11.0}})
+    robot = write_arm(tmp_path / "arm").with_identified(
+        {"elbow": {"no_load_speed": 4.0, "kp": 11.0}}
+    )
     export_robot(robot, "isaaclab", tmp_path / "out")
     servos, motor = isaaclab_actuators(tmp_path / "out").values()
     assert servos.joint_names_expr == ["shoulder"]

@@ -89,12 +89,12 @@ WEDGE = "v 0 0 0\nv .1 0 0\nv 0 .1 0\nv 0 0 .1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3
 
 @pytest.fixture(scope="module")
 def robot(tmp_path_factory):
-    return write_arm(tmp_path_factory.mktemp("arm") / "arm").with_servos(FOUND)
+    return write_arm(tmp_path_factory.mktemp("arm") / "arm").with_identified(FOUND)
 
 
 @pytest.fixture(scope="module")
 def lawful(robot):
-    return robot.with_servos(LAWS)
+    return robot.with_identified(LAWS)
 
 
 @pytest.fixture
@@ -114,7 +114,7 @@ def quick(monkeypatch, robot):
     monkeypatch.setattr(
         exporting,
         "fit_plain_servos",
-        lambda r, *a, **k: r.with_servos({j: dict.fromkeys(SERVO_TERMS, 0.0) for j in FOUND}),
+        lambda r, *a, **k: r.with_identified({j: dict.fromkeys(SERVO_TERMS, 0.0) for j in FOUND}),
     )
 
 
@@ -206,7 +206,7 @@ def test_a_joint_that_turns_without_end_leaves_beside_one_that_does_not(tmp_path
     xml = XML.replace(' range="-1.5 1.5"/>', "/>", 1).replace(
         "<option ", '<option timestep="0.005" '
     )
-    endless = write_arm(tmp_path / "arm", xml=xml).with_servos(LAWS)
+    endless = write_arm(tmp_path / "arm", xml=xml).with_identified(LAWS)
     made = export_robot(endless, "mjcf", tmp_path / "out")
     assert made.errors["robot.xml with mujoco_servos.py"] < 2e-5
 
@@ -308,9 +308,9 @@ def test_a_delay_buffer_of_five_lines_is_mujocos_own_delay(robot, tmp_path):
 
 def test_the_nearest_servos_without_a_law_are_nearer_than_those_with_the_law_struck_out(lawful):
     motions = [s.rows(slice(0, 150)) for s in own_motions(lawful, count=4)]
-    struck = lawful.with_servos({j: dict.fromkeys(SERVO_TERMS, 0.0) for j in FOUND})
+    struck = lawful.with_identified({j: dict.fromkeys(SERVO_TERMS, 0.0) for j in FOUND})
     plain = fit_plain_servos(lawful, motions[:2])
-    assert not plain.has_servo_model
+    assert not plain.servo.has_terms
     assert rollout_error(motions[2:], plain) < 0.8 * rollout_error(motions[2:], struck)
     assert fit_plain_servos(struck, motions) is struck
 
@@ -319,7 +319,7 @@ def test_an_export_of_an_unchanged_robot_does_not_fit_again(lawful, tmp_path, mo
     save_robot(lawful, tmp_path / "identified")
     fits, motions = [], own_motions(lawful, count=2)
     fitted = lambda sequences, start, **_: SimpleNamespace(  # noqa: E731
-        robot=start.with_servos({"elbow": {"kp": 23.0}})
+        robot=start.with_identified({"elbow": {"kp": 23.0}})
     )
     monkeypatch.setattr(
         plain_servos, "identify", lambda *given, **how: fits.append(given) or fitted(*given, **how)
@@ -328,10 +328,8 @@ def test_an_export_of_an_unchanged_robot_does_not_fit_again(lawful, tmp_path, mo
         fit_plain_servos(load_robot(tmp_path / "identified"), motions) for _ in range(2)
     )
     assert len(fits) == 1
-    assert not first.has_servo_model
-    assert all(
-        np.array_equal(getattr(first, f), getattr(again, f), equal_nan=True) for f in SERVO_FIELDS
-    )
+    assert not first.servo.has_terms
+    assert all(np.array_equal(first.servo[f], again.servo[f], equal_nan=True) for f in SERVO_FIELDS)
     assert model_hash(first) == model_hash(again)
     assert again.nominal is not None
     fit_plain_servos(
@@ -394,7 +392,7 @@ def test_a_robot_folder_leaves_by_the_command_and_without_torch(robot, tmp_path,
 
 
 def test_facts_hold_both_forms(robot, lawful):
-    facts = simulator_facts(lawful, 0.02, plain=replace(robot, kp=robot.kp + 1))
+    facts = simulator_facts(lawful, 0.02, plain=robot.with_servo(kp=robot.servo.kp + 1))
     assert facts["law"] == ["stribeck", "stribeck_speed", "friction_motor"]
     assert (facts["joints"]["elbow"]["kp"], facts["plain"]["elbow"]["kp"]) == (24.0, 25.0)
     assert replay(own_motions(robot, count=1), robot)[0].qpos.shape[1] == 2
@@ -404,12 +402,14 @@ def test_an_export_takes_the_fit_without_terms_that_identify_kept(lawful, tmp_pa
     folder = tmp_path / "identified"
     save_robot(lawful, folder)
     motions = own_motions(lawful, count=2)
-    without = lawful.with_servos({j: dict.fromkeys(SERVO_TERMS, 0.0) | {"kp": 23.0} for j in FOUND})
+    without = lawful.with_identified(
+        {j: dict.fromkeys(SERVO_TERMS, 0.0) | {"kp": 23.0} for j in FOUND}
+    )
     keep_plain_servos(folder, without, motions)
     monkeypatch.delattr(plain_servos, "identify")  # no fit is possible
     plain = fit_plain_servos(load_robot(folder), motions[::-1])
-    assert not plain.has_servo_model
-    assert plain.kp[plain.operated_index].tolist() == [23.0] * len(plain.operated)
+    assert not plain.servo.has_terms
+    assert plain.servo.kp[plain.operated_index].tolist() == [23.0] * len(plain.operated)
 
 
 @pytest.mark.skipif(not hasattr(mujoco.MjsActuator, "set_to_pid"), reason="needs MuJoCo 4")
@@ -417,7 +417,7 @@ def test_the_mjcf_limits_the_speed_of_targets_by_itself(tmp_path):
     """gaponet moves a target once per period of 20 ms, MuJoCo in each step of 5 ms: up to 0.5 · 0.02 rad apart."""
     speed = 0.5
     slow = {joint: {"target_speed": speed} for joint in FOUND}
-    robot = write_arm(tmp_path / "arm").with_servos(slow)
+    robot = write_arm(tmp_path / "arm").with_identified(slow)
 
     exported = export_robot(robot, "mjcf", tmp_path / "out")
 

@@ -64,7 +64,7 @@ def exported_config(robot, folder, monkeypatch):
 def test_a_late_servo_is_isaac_labs_delayed_actuator_in_whole_steps(arm, tmp_path, monkeypatch):
     found = {"shoulder": {"delay": 0.012, "kp": 21.0, "offset": 0.02}, "elbow": {"delay": 0.001}}
 
-    config = exported_config(arm.with_servos(found), tmp_path / "out", monkeypatch)
+    config = exported_config(arm.with_identified(found), tmp_path / "out", monkeypatch)
 
     shoulder, elbow = config["ACTUATORS"].values()
     assert isinstance(shoulder, DelayedPDActuatorCfg)
@@ -77,7 +77,7 @@ def test_a_late_servo_is_isaac_labs_delayed_actuator_in_whole_steps(arm, tmp_pat
 def test_a_servo_with_a_no_load_speed_is_a_dc_motor_unless_it_is_late(arm, tmp_path, monkeypatch):
     found = {"shoulder": {"no_load_speed": 4.0, "delay": 0.01}, "elbow": {"no_load_speed": 5.0}}
 
-    config = exported_config(arm.with_servos(found), tmp_path / "out", monkeypatch)
+    config = exported_config(arm.with_identified(found), tmp_path / "out", monkeypatch)
 
     shoulder, elbow = config["ACTUATORS"].values()
     assert isinstance(shoulder, DelayedPDActuatorCfg)
@@ -88,8 +88,10 @@ def test_a_servo_with_a_no_load_speed_is_a_dc_motor_unless_it_is_late(arm, tmp_p
 def test_the_losses_name_each_effect_that_isaac_labs_classes_lack(arm):
     stribeck = {"stribeck": 0.3, "stribeck_speed": 0.1}
     found = {"delay": 0.012, "target_speed": 1.0} | stribeck
-    robot = arm.with_servos(dict.fromkeys(arm.joint_names, found))
-    plain = robot.with_servos({joint: dict.fromkeys(stribeck, 0.0) for joint in arm.joint_names})
+    robot = arm.with_identified(dict.fromkeys(arm.joint_names, found))
+    plain = robot.with_identified(
+        {joint: dict.fromkeys(stribeck, 0.0) for joint in arm.joint_names}
+    )
     motions = own_motions(robot, count=2)
 
     form = native_form(robot, plain, STEP, motions)
@@ -99,11 +101,11 @@ def test_the_losses_name_each_effect_that_isaac_labs_classes_lack(arm):
     assert model > 0.0
     assert model != delays
     assert speed > delays
-    assert form.robot.delay == pytest.approx([0.01, 0.01])
+    assert form.robot.servo.delay == pytest.approx([0.01, 0.01])
 
 
 def test_a_robot_that_isaac_labs_classes_hold_loses_nothing(arm):
-    robot = arm.with_servos({"elbow": {"delay": 2 * STEP, "offset": 0.01, "damping": 0.8}})
+    robot = arm.with_identified({"elbow": {"delay": 2 * STEP, "offset": 0.01, "damping": 0.8}})
 
     form = native_form(robot, robot, STEP, own_motions(robot, count=1))
 
@@ -111,7 +113,7 @@ def test_a_robot_that_isaac_labs_classes_hold_loses_nothing(arm):
 
 
 def test_the_readme_states_both_forms_and_facts_have_the_native_servos(arm, tmp_path):
-    robot = arm.with_servos({"elbow": {"delay": 0.012}})
+    robot = arm.with_identified({"elbow": {"delay": 0.012}})
 
     folder = tmp_path / "out"
 

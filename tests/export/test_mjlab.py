@@ -123,7 +123,7 @@ def test_identified_servos_move_in_mjlab_as_here(python, tmp_path):
     found = {
         j: {"delay": 0.006 * i, "offset": 0.01 * i} | law for i, j in enumerate(robot.operated, 1)
     }
-    model = random_run(tmp_path / "run", robot.with_servos(found))
+    model = random_run(tmp_path / "run", robot.with_identified(found))
     compare(
         python,
         model,

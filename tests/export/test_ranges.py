@@ -50,7 +50,9 @@ def source(values, unit="a", days=()):
 def written(arm, folder, servo=SERVO_FIELDS, errors=ERRORS, sources=1, links=None):
     """A robot folder that knows its values; friction and damping err together."""
     moved = LinkAxes(arm).links(np.array(links.values)) if links else {}
-    save_robot(replace(arm.with_servos(dict.fromkeys(arm.joint_names, servo)), links=moved), folder)
+    save_robot(
+        replace(arm.with_identified(dict.fromkeys(arm.joint_names, servo)), links=moved), folder
+    )
     robot = load_robot(folder)
     values = to_axes(robot, FIELDS)
     like = np.eye(6)
@@ -107,7 +109,9 @@ def test_units_scatter_as_the_values_err_and_together(arm, tmp_path, capsys):
     np.testing.assert_allclose([np.log(low / 16), np.log(high / 16)], [-0.0822, 0.0822], atol=0.006)
     assert min(np.min(made["units"][f]) for f in FIELDS if f != "offset") >= 0
     np.testing.assert_allclose(
-        np.array(made["units"]["effort_limit"])[:, 1] / arm.effort_limit[1], kp / 16, rtol=1e-5
+        np.array(made["units"]["effort_limit"])[:, 1] / arm.servo.effort_limit[1],
+        kp / 16,
+        rtol=1e-5,
     )
 
 
@@ -277,8 +281,8 @@ def test_units_for_an_engine_with_a_torque_speed_line_have_one_each(arm, tmp_pat
         written(arm, tmp_path / "known", errors=np.array([0.3, 0.01, 1e-3, 1e-4, 1e-2, 5e-3]))
     )
     drawn = {field: values[:8] for field, values in sample_units(robot).units.items()}
-    plain = replace(robot, no_load_speed=np.array([3.0, 0.0]))
-    robot = replace(plain, stribeck=np.full(2, 0.01), stribeck_speed=np.full(2, 0.05))
+    plain = robot.with_servo(no_load_speed=np.array([3.0, 0.0]))
+    robot = plain.with_servo(stribeck=np.full(2, 0.01), stribeck_speed=np.full(2, 0.05))
     monkeypatch.setattr(
         drawn_robots, "fit_plain_servos", lambda robot, recordings, progress, terms: plain
     )

@@ -1,7 +1,5 @@
 """Servos in somebody else's scene: by joint name, as our own replay, refused where they contradict."""
 
-from dataclasses import replace
-
 import mujoco
 import numpy as np
 import pytest
@@ -25,7 +23,7 @@ def arm(tmp_path_factory):
 
 
 def identified(arm, **other):
-    return arm.with_servos(dict.fromkeys(arm.joint_names, SERVO | other))
+    return arm.with_identified(dict.fromkeys(arm.joint_names, SERVO | other))
 
 
 def scene(arm, xml=None):
@@ -201,7 +199,7 @@ def test_identified_inertias_of_links_are_written(arm, tmp_path):
 
 
 def test_what_the_scene_lacks_is_said(arm):
-    stopped = replace(identified(arm), stop_low=np.array([-1.0, np.nan]))
+    stopped = identified(arm).with_servo(stop_low=np.array([-1.0, np.nan]))
     spec = scene(arm)
     spec.option.timestep = 0.01
     notes = " ".join(gp.apply(stopped, spec, prefix=PREFIX).notes)

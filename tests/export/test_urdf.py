@@ -35,7 +35,7 @@ URDF = f"""<robot name="arm"><!-- by hand -->
 
 @pytest.fixture(scope="module")
 def robot(tmp_path_factory):
-    return write_arm(tmp_path_factory.mktemp("arm") / "arm").with_servos(FOUND)
+    return write_arm(tmp_path_factory.mktemp("arm") / "arm").with_identified(FOUND)
 
 
 def test_a_urdf_keeps_all_but_its_dynamics_and_efforts_and_the_loss_has_its_price(robot, tmp_path):

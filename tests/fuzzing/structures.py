@@ -80,7 +80,14 @@ def _use_robot(source: Path, out: Path) -> None:
     robot = load_robot(source)
     model = build_model(robot, 0.5)
     Collision(robot, model).distance(np.zeros((1, model.nq)))
-    numbers = [robot.kp, robot.kd, robot.effort_limit, robot.qpos_home, robot.delay, robot.offset]
+    numbers = [
+        robot.servo.kp,
+        robot.servo.kd,
+        robot.servo.effort_limit,
+        robot.qpos_home,
+        robot.servo.delay,
+        robot.servo.offset,
+    ]
     if (
         not all(np.isfinite(x).all() and (np.abs(x) <= 1e6).all() for x in numbers)
         or np.isnan(robot.qpos_range).any()

@@ -53,7 +53,7 @@ def found(model, robot, logs):
 
 def test_gain_and_delay_of_the_unit_are_estimated(found, robot):
     for i, joint in enumerate(robot.operated):
-        assert found.servos[joint]["kp"] == pytest.approx(0.6 * robot.kp[i], rel=0.2)
+        assert found.servos[joint]["kp"] == pytest.approx(0.6 * robot.servo.kp[i], rel=0.2)
         assert found.servos[joint]["delay"] == pytest.approx(0.04, abs=0.008)
         assert abs(found.servos[joint]["offset"]) < 0.01
     assert found.after < 0.1 * found.before
@@ -112,8 +112,8 @@ def test_a_robot_folder_is_adapted_without_a_model_or_not_at_all(robot, logs, tm
     found = api.adapt_robot(robot, data, out=tmp_path / "today", seconds=16.0)
     assert found.after < 0.2 * found.before
     written = load_robot(tmp_path / "today")
-    np.testing.assert_allclose(written.kp, 0.6 * robot.kp, rtol=0.2)
-    np.testing.assert_array_equal(written.nominal.kp, robot.kp)
+    np.testing.assert_allclose(written.servo.kp, 0.6 * robot.servo.kp, rtol=0.2)
+    np.testing.assert_array_equal(written.nominal.servo.kp, robot.servo.kp)
     same = Dataset.create(tmp_path / "same", robot)
     same.append(record(robot, commands(450, 0), "m0"))
     with pytest.raises(NoGainError, match="nothing"):

@@ -109,7 +109,7 @@ def test_the_simulator_has_the_gains_that_the_file_states(tmp_path, monkeypatch)
     use_package_folder(monkeypatch, small.folder.parent)
     simulator = gp.GapModel.load(NAME).simulator()
     joint = simulator.operated_index[0]
-    assert simulator.kp[joint] == pytest.approx(3 * gp.load_robot("so101").kp[joint])
+    assert simulator.servo.kp[joint] == pytest.approx(3 * gp.load_robot("so101").servo.kp[joint])
 
 
 # ---- use
@@ -222,7 +222,7 @@ def test_a_large_network_has_its_torch_program_too(tmp_path, monkeypatch):
 
 
 def test_a_network_of_an_identified_robot_is_not_shipped(tmp_path):
-    robot = gp.load_robot("so101").with_servos({"elbow_flex": {"damping": 1.0}})
+    robot = gp.load_robot("so101").with_identified({"elbow_flex": {"damping": 1.0}})
     data = make_dataset(tmp_path / "data", gp.load_robot("so101"))
     run = make_run(tmp_path / "run", robot, data)
     with pytest.raises(UsageError, match="nominal"):

@@ -27,7 +27,7 @@ def evaluated(tmp_path_factory):
     """An evaluated run whose model corrects an identified simulator."""
     folder = tmp_path_factory.mktemp("report")
     arm = write_arm(folder / "arm")
-    fitted = arm.with_servos({"elbow": {"kp": 11.0}})
+    fitted = arm.with_identified({"elbow": {"kp": 11.0}})
     return evaluated_run(arm, Dataset.create(folder / "data", arm), folder / "run", fitted)
 
 
@@ -150,7 +150,7 @@ def test_trajectories_show_the_command_and_errors_of_a_motion_on_one_scale_movin
 
 def test_an_identified_robot_has_a_page_without_training(evaluated, tmp_path):
     arm = load_robot(evaluated.parent / "arm")
-    save_robot(arm.with_servos({"elbow": {"kp": 11.0}}), tmp_path / "fitted")
+    save_robot(arm.with_identified({"elbow": {"kp": 11.0}}), tmp_path / "fitted")
     page = write_report(tmp_path / "fitted", evaluated.parent / "data").read_text()
     assert "After identification the error is" in page
     assert "not a test result" in page  # the folder does not say what it was identified from

@@ -100,7 +100,9 @@ def test_an_export_needs_no_recordings(place):
     made = gp.export_robot(NAME, to="json", out="exported")
     facts = json.loads((made.path / "facts.json").read_text())
     robot = gp.load_robot(NAME)
-    assert [facts["joints"][j]["delay"] for j in robot.joint_names] == pytest.approx(robot.delay)
+    assert [facts["joints"][j]["delay"] for j in robot.joint_names] == pytest.approx(
+        robot.servo.delay
+    )
     assert "recordings that were not fitted" in made.notes[-1]
 
 

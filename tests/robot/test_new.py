@@ -133,7 +133,7 @@ def test_the_payload_hangs_at_the_tool_s_site(tmp_path):
 
 def test_contacts_are_an_option(tmp_path):
     made = make(tmp_path, contacts=True)
-    assert made.robot.contacts
+    assert made.robot.scene.contacts
     assert any(g.contype for g in read_mjcf(made.robot.mjcf).geoms)
 
 
@@ -162,7 +162,7 @@ def test_names_with_a_slash_and_classes_with_a_material_are_accepted(tmp_path):
 def test_a_urdf_in_its_package_becomes_a_robot(tmp_path):
     made = make(tmp_path, write_urdf(tmp_path), kp=("50",))
     assert made.robot.joint_names == ("lift", "bend")
-    assert made.robot.effort_limit.tolist() == [30.0, 12.0]
+    assert made.robot.servo.effort_limit.tolist() == [30.0, 12.0]
     assert max(furthest(made)) < 1e-9
     assert made.robot.payload_mounts[0].body == "tool0"
     assert made.vendor.nmesh == 1  # of package://
@@ -340,7 +340,7 @@ def test_a_mimic_joint_follows_without_a_motor(tmp_path, ratio, at_zero):
     robot = make(tmp_path, tmp_path / "hand.urdf").robot
     assert robot.operated == ("drive",)
     led, drive = robot.index(["led"])[0], robot.index(["drive"])[0]
-    assert robot.kp[led] == 0
+    assert robot.servo.kp[led] == 0
     model = build_model(robot)
     data = mujoco.MjData(model)
     data.ctrl[drive] = 0.6
@@ -364,4 +364,4 @@ def test_a_mimic_joint_of_a_mimic_joint_follows_the_motor(tmp_path):
     (tmp_path / "hand.urdf").write_text(MIMIC.format(joints=joints))
     robot = make(tmp_path, tmp_path / "hand.urdf").robot
     assert robot.operated == ("drive",)
-    assert robot.followers["tip"] == ("drive", -1.0, pytest.approx(0.5))
+    assert robot.log_joints.followers["tip"] == ("drive", -1.0, pytest.approx(0.5))

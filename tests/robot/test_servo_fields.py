@@ -1,4 +1,4 @@
-"""Records of servo parameters: the robot has an attribute for each, and every reader gets what it needs."""
+"""Records of servo parameters: the servos have an attribute for each, and every reader gets what it needs."""
 
 import dataclasses
 
@@ -8,12 +8,13 @@ from arm import recordings
 
 from gaponet.robot.folder import save_robot
 from gaponet.robot.servo_fields import SERVO_FIELDS, TERMS
-from gaponet.robot.spec import RobotSpec, load_robot
+from gaponet.robot.servo_parameters import ServoParameters
+from gaponet.robot.spec import load_robot
 from gaponet.sysid.axes import Bounds, from_axis, to_axis
 
 
-def test_a_robot_has_an_attribute_with_the_default_of_each_record():
-    attributes = {f.name: f for f in dataclasses.fields(RobotSpec)}
+def test_servos_have_an_attribute_with_the_default_of_each_record():
+    attributes = {f.name: f for f in dataclasses.fields(ServoParameters)}
     for name, record in SERVO_FIELDS.items():
         if record.default is not None:
             np.testing.assert_equal(attributes[name].default_factory(), record.default)
@@ -21,10 +22,10 @@ def test_a_robot_has_an_attribute_with_the_default_of_each_record():
 
 def test_a_value_of_each_record_survives_robot_toml(arm, tmp_path):
     values = {name: 0.5 * min(field.limits[1], 2.0) for name, field in SERVO_FIELDS.items()}
-    save_robot(arm.with_servos(dict.fromkeys(arm.joint_names, values)), tmp_path / "out")
+    save_robot(arm.with_identified(dict.fromkeys(arm.joint_names, values)), tmp_path / "out")
     back = load_robot(tmp_path / "out")
     for name, value in values.items():
-        np.testing.assert_allclose(getattr(back, name), value, err_msg=name)
+        np.testing.assert_allclose(back.servo[name], value, err_msg=name)
 
 
 MEASURED = "friction_temperature"

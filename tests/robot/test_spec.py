@@ -30,13 +30,13 @@ def test_h1_2_operates_the_ten_arm_joints_of_27():
 def test_so101_does_not_operate_its_gripper(so101):
     assert so101.joint_names[-1] == "gripper"
     assert "gripper" not in so101.operated
-    assert so101.log_units[-1] == "fraction"
+    assert so101.log_joints.units[-1] == "fraction"
     assert so101.decimation == 4  # 20 ms in steps of 5 ms
 
 
 def test_gains_cannot_be_changed_after_loading(so101):
     with pytest.raises(ValueError, match="read-only"):
-        so101.kp[0] = 1.0
+        so101.servo.kp[0] = 1.0
 
 
 def test_an_unlimited_joint_has_an_infinite_range(tmp_path):
@@ -129,7 +129,7 @@ def test_a_missing_mjcf_error_names_its_place(tmp_path):
 
 def test_a_folder_stores_identified_values_and_the_nominal_robot(tmp_path):
     robot = write_arm(tmp_path / "arm")
-    fitted = robot.with_servos(
+    fitted = robot.with_identified(
         {"elbow": {"kp": 12.5, "frictionloss": 0.11, "delay": 0.03, "offset": -0.01}}
     )
     save_robot(fitted, tmp_path / "fitted")
@@ -145,11 +145,16 @@ def test_a_folder_stores_identified_values_and_the_nominal_robot(tmp_path):
 
 
 def test_a_folder_stores_scaled_gains_once(tmp_path):
-    fitted = write_arm(tmp_path / "arm").with_servos({"elbow": {"kp": 12.5}}).with_gain_scale(10.0)
+    fitted = (
+        write_arm(tmp_path / "arm").with_identified({"elbow": {"kp": 12.5}}).with_gain_scale(10.0)
+    )
     save_robot(fitted, tmp_path / "firm")
     back = load_robot(tmp_path / "firm").with_gain_scale(10.0)
     assert model_hash(back) == model_hash(fitted)
-    assert (back.kp.tolist(), back.nominal.kp.tolist()) == ([200.0, 125.0], [200.0, 200.0])
+    assert (back.servo.kp.tolist(), back.nominal.servo.kp.tolist()) == (
+        [200.0, 125.0],
+        [200.0, 200.0],
+    )
 
 
 def test_an_unknown_identified_joint_or_field_is_refused(tmp_path):
@@ -202,14 +207,17 @@ def test_identified_tables_belong_to_the_identified_robot_only(tmp_path):
     )
     save_robot(robot, tmp_path / "both")
     save_robot(robot.nominal, tmp_path / "nominal")
-    assert load_robot(tmp_path / "both").kp.tolist() == [20.0, 9.0]
-    assert load_robot(tmp_path / "nominal").kp.tolist() == [20.0, 20.0]
+    assert load_robot(tmp_path / "both").servo.kp.tolist() == [20.0, 9.0]
+    assert load_robot(tmp_path / "nominal").servo.kp.tolist() == [20.0, 20.0]
     assert load_robot(tmp_path / "nominal").payload_mounts == robot.payload_mounts
 
 
 def test_a_saved_robot_has_the_gains_of_its_recordings(arm, tmp_path):
     recorded = arm.with_gains((30.0, 20.0), (1.5, 0.5))
-    save_robot(recorded.with_servos({"elbow": {"kp": 25.0}}), tmp_path / "fitted")
+    save_robot(recorded.with_identified({"elbow": {"kp": 25.0}}), tmp_path / "fitted")
     back = load_robot(tmp_path / "fitted")
-    assert (back.nominal.kp.tolist(), back.nominal.kd.tolist()) == ([30.0, 20.0], [1.5, 0.5])
-    assert back.kp.tolist() == [30.0, 25.0]
+    assert (back.nominal.servo.kp.tolist(), back.nominal.servo.kd.tolist()) == (
+        [30.0, 20.0],
+        [1.5, 0.5],
+    )
+    assert back.servo.kp.tolist() == [30.0, 25.0]

@@ -22,7 +22,7 @@ def robot(tmp_path):
     """A robot folder as gaponet identify writes it."""
     folder = tmp_path / "my_arm"
     arm = write_arm(tmp_path / "nominal")
-    save_robot(arm.with_servos({"elbow": {"damping": 0.25}}), folder)
+    save_robot(arm.with_identified({"elbow": {"damping": 0.25}}), folder)
     parts = {part: {part: "0" * 64} for part in ("train", "val", "test")}
     origin = {
         "dataset": NOWHERE,
@@ -44,7 +44,7 @@ def header(hub, repository):
 def test_a_robot_is_loaded_by_its_address(hub, robot):
     push(robot, "me/arm")
     loaded = gp.load_robot("hf://me/arm")
-    np.testing.assert_array_equal(loaded.damping, gp.load_robot(robot).damping)
+    np.testing.assert_array_equal(loaded.servo.damping, gp.load_robot(robot).servo.damping)
     assert loaded.nominal is not None
 
 
@@ -58,22 +58,28 @@ def test_a_command_takes_the_address_though_paths_lose_a_slash(hub, robot, tmp_p
 def test_an_older_state_is_loaded_by_its_commit(hub, robot):
     push(robot, "me/arm")
     commit = hub.repos["models/me/arm"][-1][0]
-    save_robot(gp.load_robot(robot).with_servos({"elbow": {"damping": 0.5}}), robot.parent / "new")
+    save_robot(
+        gp.load_robot(robot).with_identified({"elbow": {"damping": 0.5}}), robot.parent / "new"
+    )
     push(robot.parent / "new", "me/arm", replace=True)
-    assert gp.load_robot(f"hf://me/arm@{commit}").damping[1] == 0.25
-    assert gp.load_robot("hf://me/arm").damping[1] == 0.5
+    assert gp.load_robot(f"hf://me/arm@{commit}").servo.damping[1] == 0.25
+    assert gp.load_robot("hf://me/arm").servo.damping[1] == 0.5
 
 
 def test_a_robot_comes_back_with_all_its_files(hub, robot, tmp_path):
     push(robot, "me/arm")
     pull("me/arm", tmp_path / "back")
-    np.testing.assert_array_equal(gp.load_robot(tmp_path / "back").kp, gp.load_robot(robot).kp)
+    np.testing.assert_array_equal(
+        gp.load_robot(tmp_path / "back").servo.kp, gp.load_robot(robot).servo.kp
+    )
     push(tmp_path / "back", "me/arm")
 
 
 def test_another_robot_replaces_it_only_when_asked(hub, robot):
     push(robot, "me/arm")
-    save_robot(gp.load_robot(robot).with_servos({"elbow": {"damping": 0.5}}), robot.parent / "new")
+    save_robot(
+        gp.load_robot(robot).with_identified({"elbow": {"damping": 0.5}}), robot.parent / "new"
+    )
     with pytest.raises(RemoteError, match="another robot"):
         push(robot.parent / "new", "me/arm")
 

@@ -65,7 +65,7 @@ def test_joint_and_robot_move_as_a_play_hinge(pendulum):
     rollouts, errors = JointRollouts([recorded], pendulum), []
     for width in (0.0, WIDTH):
         servo = SERVO | {"backlash": width}
-        (whole,) = replay([recorded], pendulum.with_servos({"swing": servo}))
+        (whole,) = replay([recorded], pendulum.with_identified({"swing": servo}))
         values = {f: np.full((1, 1), v) for f, v in servo.items()}
         alone = rollouts.errors(values)[0, 0, 0]
         errors.append([np.abs(whole.qpos - real)[20:].mean(), np.abs(alone[20:]).mean()])
@@ -79,7 +79,7 @@ def test_a_constant_load_hides_the_gap(arm):
     paths = []
     for width in (0.0, 0.05):
         servos = {joint: {"backlash": width} for joint in arm.joint_names}
-        sim = BatchSim(arm.with_servos(servos), [(0.0, "both", 0.02)], 1)
+        sim = BatchSim(arm.with_identified(servos), [(0.0, "both", 0.02)], 1)
         sim.reset(slice(None), target, 0.0 * target)
         for _ in range(50):
             sim.step(target)
@@ -88,7 +88,7 @@ def test_a_constant_load_hides_the_gap(arm):
 
 
 def test_a_state_goes_on_with_its_gap(pendulum):
-    sim = BatchSim(pendulum.with_servos({"swing": SERVO}), [(0.0, "both", 0.01)], 1)
+    sim = BatchSim(pendulum.with_identified({"swing": SERVO}), [(0.0, "both", 0.01)], 1)
     sim.reset(slice(None), np.zeros((1, 1)), np.zeros((1, 1)))
     ctrl, ends = command(), []
     for target in ctrl[:37]:
@@ -103,7 +103,7 @@ def test_a_state_goes_on_with_its_gap(pendulum):
 
 
 def test_exported_servos_move_as_the_simulator(pendulum):
-    robot = pendulum.with_servos({"swing": SERVO})
+    robot = pendulum.with_identified({"swing": SERVO})
     ctrl = command()[:100]
     meta = SequenceMeta(robot.name, "a", "swing", 0.0, virtual=True)
     (simulated,) = replay([Sequence(meta, robot.joint_names, 0.01, ctrl, ctrl, 0.0 * ctrl)], robot)

@@ -1,7 +1,5 @@
 """Many simulations step exactly as one does."""
 
-from dataclasses import replace
-
 import mujoco
 import numpy as np
 import pytest
@@ -49,7 +47,7 @@ def test_simulations_left_out_of_a_step_stand_still(tmp_path, rates):
 
 def test_a_delayed_servo_moves_as_one_without_delay_under_earlier_commands(tmp_path):
     robot = write_arm(tmp_path)
-    late = replace(robot, delay=[0.04, 0.0])
+    late = robot.with_servo(delay=[0.04, 0.0])
     targets = np.random.default_rng(1).uniform(-1, 1, (25, 2))
     shifted = targets.copy()
     shifted[2:, 0] = targets[:-2, 0]
@@ -70,7 +68,7 @@ def test_a_delayed_servo_moves_as_one_without_delay_under_earlier_commands(tmp_p
 
 
 def test_delayed_servos_at_two_rates_step_together_as_each_does_alone(tmp_path):
-    late = replace(write_arm(tmp_path), delay=[0.05, 0.013])
+    late = write_arm(tmp_path).with_servo(delay=[0.05, 0.013])
     conditions = [(0.0, "both", 0.02), (0.2, "both", 0.01), (0.0, "both", 0.02006)]
     rng = np.random.default_rng(2)
     past, targets = rng.uniform(-1, 1, (3, 6, 2)), rng.uniform(-1, 1, (20, 3, 2))
@@ -87,7 +85,7 @@ def test_delayed_servos_at_two_rates_step_together_as_each_does_alone(tmp_path):
 
 
 def test_delayed_servos_need_past_targets(tmp_path):
-    sim = BatchSim(replace(write_arm(tmp_path), delay=0.03), [(0.0, "both", 0.02)])
+    sim = BatchSim(write_arm(tmp_path).with_servo(delay=0.03), [(0.0, "both", 0.02)])
     with pytest.raises(UsageError, match="past"):
         sim.reset(slice(None), np.zeros((1, 2)), np.zeros((1, 2)))
 
@@ -96,8 +94,8 @@ def test_delayed_servos_need_past_targets(tmp_path):
 def test_one_by_one_is_bit_identical_to_mujocos_batch(tmp_path, monkeypatch, delay):
     """Payloads, rates, laws, late servos, steps of some, forces: all that gaponet writes into a batch."""
     pytest.importorskip("mujoco.batch")
-    robot = replace(
-        write_arm(tmp_path), delay=list(delay), stribeck=[0.1, 0.2], friction_motor=[0.1, 0.0]
+    robot = write_arm(tmp_path).with_servo(
+        delay=list(delay), stribeck=[0.1, 0.2], friction_motor=[0.1, 0.0]
     )
     conditions = [(0.0, "both", 0.02), (0.3, "both", 0.02), (0.3, "both", 0.01)]
     rng = np.random.default_rng(3)
@@ -135,7 +133,7 @@ def test_one_by_one_is_bit_identical_to_mujocos_batch(tmp_path, monkeypatch, del
 @pytest.mark.parametrize("rates", [(0.02, 0.02), (0.01, 0.02)])
 def test_a_speed_limited_servo_moves_as_another_under_ramped_commands(tmp_path, rates):
     robot = write_arm(tmp_path)
-    slow = replace(robot, target_speed=[0.5, 0.0])
+    slow = robot.with_servo(target_speed=[0.5, 0.0])
     jumps = np.repeat(np.random.default_rng(2).uniform(-1, 1, (3, 2, 2)), 30, axis=0)
     speed = np.array([0.5, np.inf])
     ramps = np.stack(
@@ -156,7 +154,9 @@ def test_a_speed_limited_servo_moves_as_another_under_ramped_commands(tmp_path, 
 
 
 def test_ramps_of_simulations_left_out_of_a_step_stand_still(tmp_path):
-    sim = BatchSim(replace(write_arm(tmp_path), target_speed=[0.5, 0.5]), [(0.0, "both", 0.02)] * 2)
+    sim = BatchSim(
+        write_arm(tmp_path).with_servo(target_speed=[0.5, 0.5]), [(0.0, "both", 0.02)] * 2
+    )
     sim.reset(slice(None), np.zeros(2), 0.0)
     sim.step(np.ones((2, 2)), np.array([1]))
     np.testing.assert_allclose(sim.ctrl, [[0, 0], [0.01, 0.01]])
@@ -178,12 +178,12 @@ def test_servos_set_in_a_batch_move_as_a_robot_made_with_them(tmp_path, field):
     base |= (
         dict.fromkeys(SERVO_TERMS, 0.02) | {"no_load_speed": 9.0} if field in SERVO_TERMS else {}
     )
-    robot = robot.with_servos(dict.fromkeys(robot.joint_names, base))
-    other, one = robot.with_servos({"elbow": {field: OTHER[field]}}), (0.0, "both", 0.02)
+    robot = robot.with_identified(dict.fromkeys(robot.joint_names, base))
+    other, one = robot.with_identified({"elbow": {field: OTHER[field]}}), (0.0, "both", 0.02)
     sims = {
         name: BatchSim(r, [one]) for name, r in (("own", robot), ("set", robot), ("made", other))
     }
-    given = {f: getattr(other, f)[1:][None] for f in (*base, "kp", "offset", field)}
+    given = {f: other.servo[f][1:][None] for f in (*base, "kp", "offset", field)}
     sims["set"].set_servos(("elbow",), given)
     targets = np.repeat(np.random.default_rng(5).uniform(-1, 1, (4, 1, 2)), 15, axis=0)
     path = {}

@@ -30,16 +30,16 @@ def rebuilt(robot: RobotSpec, change: SimulatorChange) -> RobotSpec:
     mounts = tuple(
         replace(mount, pos=tuple(np.add(mount.pos, change.mount))) for mount in robot.payload_mounts
     )
-    return replace(
-        robot,
-        kp=robot.kp * change.kp,
-        kd=robot.kd * change.damping,
-        damping=model.dof_damping.reshape(len(robot.kp), -1)[:, 0] * change.damping,
+    servo = replace(
+        robot.servo,
+        kp=robot.servo.kp * change.kp,
+        kd=robot.servo.kd * change.damping,
+        damping=model.dof_damping.reshape(len(robot.joint_names), -1)[:, 0] * change.damping,
         armature=model.dof_armature * change.armature,
         frictionloss=model.dof_frictionloss * change.friction,
-        delay=robot.delay + change.delay,
-        payload_mounts=mounts,
+        delay=robot.servo.delay + change.delay,
     )
+    return replace(robot, servo=servo, payload_mounts=mounts)
 
 
 def swing(sim: BatchSim, robot: RobotSpec) -> np.ndarray:
@@ -48,7 +48,7 @@ def swing(sim: BatchSim, robot: RobotSpec) -> np.ndarray:
     sim.reset(slice(None), home, 0 * home, past=home[:, None])
     positions = []
     for t in range(25):
-        sim.step(home + 0.3 * np.sin(0.4 * t + np.arange(len(robot.kp))))
+        sim.step(home + 0.3 * np.sin(0.4 * t + np.arange(len(robot.servo.kp))))
         positions.append(sim.qpos.copy())
     return np.array(positions)
 
@@ -97,7 +97,7 @@ def test_a_change_for_another_number_of_joints_is_refused() -> None:
 
 
 def test_a_robot_with_a_servo_model_has_no_changed_simulators() -> None:
-    sticky = load_robot("so101").with_servos(
+    sticky = load_robot("so101").with_identified(
         {"shoulder_pan": {"stribeck": 0.1, "stribeck_speed": 0.1}}
     )
     condition = Condition(0.0, "both", sticky.dt, simulator=CHANGE)

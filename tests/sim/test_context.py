@@ -70,7 +70,7 @@ def test_a_scene_answers_as_the_simulator_that_it_was_built_from() -> None:
 
 
 def test_a_scene_with_late_servos_answers_as_the_simulator_that_it_was_built_from() -> None:
-    late = replace(ROBOT, delay=np.full(6, 0.015))
+    late = ROBOT.with_servo(delay=np.full(6, 0.015))
 
     in_scene = scene_context(build_model(late), late, late.dt)
 

@@ -36,7 +36,7 @@ def test_the_inverse_of_a_recording_is_its_command(tmp_path):
 
 
 def test_friction_that_grows_with_the_motors_torque_is_overcome_too(tmp_path):
-    robot = write_arm(tmp_path).with_servos(dict.fromkeys(("shoulder", "elbow"), LOADED))
+    robot = write_arm(tmp_path).with_identified(dict.fromkeys(("shoulder", "elbow"), LOADED))
     (sequence,) = replay([smooth(robot)], robot)
     inverse = AnalyticInverse.of(BatchSim(robot, [CONDITION]))
     told = np.concatenate([inverse([p]) for p in periods(sequence, 1.0)])
@@ -83,7 +83,7 @@ def test_torque_limits_bound_the_targets(tmp_path):
 def test_a_torque_speed_line_bounds_the_targets_of_a_moving_joint(tmp_path):
     """At half of its no-load speed a motor has half of its torque, however fast it is to become."""
     robot = write_arm(tmp_path, TOML.replace("effort_limit = 5.0", "effort_limit = 0.4"))
-    robot = robot.with_servos({joint: {"no_load_speed": 2.0} for joint in robot.joint_names})
+    robot = robot.with_identified({joint: {"no_load_speed": 2.0} for joint in robot.joint_names})
     inverse = AnalyticInverse.of(BatchSim(robot, [CONDITION]))
     at, speed = np.zeros((1, 2)), np.ones((1, 2))
     targets = inverse([Period(at, speed, at + 0.02, speed + 1.0, at)])

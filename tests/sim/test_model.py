@@ -13,7 +13,7 @@ from files_arm import XML as FILES_XML
 from gaponet.base.errors import RobotError, UsageError
 from gaponet.robot.fingerprint import model_fingerprint
 from gaponet.robot.folder import save_robot
-from gaponet.robot.spec import Table, load_robot
+from gaponet.robot.spec import Scene, Table, load_robot
 from gaponet.sim.batch import BatchSim
 from gaponet.sim.dataset_robot import dataset_robot
 from gaponet.sim.dynamics import inverse_dynamics
@@ -47,7 +47,9 @@ def test_a_loaded_joint_held_for_a_minute_does_not_creep(name, mass):
 def test_friction_holds_half_its_limit_for_two_minutes_with_the_smallest_armature(name, armature):
     robot = load_robot(name)
     if armature is not None:
-        robot = robot.with_servos({joint: {"armature": armature} for joint in robot.joint_names})
+        robot = robot.with_identified(
+            {joint: {"armature": armature} for joint in robot.joint_names}
+        )
     model = build_model(robot)
     model.actuator_gainprm[:] = model.actuator_biasprm[:] = 0.0
     data = mujoco.MjData(model)
@@ -232,7 +234,7 @@ def test_a_model_in_degrees_moves_as_the_same_one_in_radians(tmp_path):
     for name, text in (("radians", XML), ("degrees", xml)):
         robot = write_arm(tmp_path / name, TOML, text)
         stops = {"stop_low": -0.3, "stop_high": 0.4}
-        known = robot.with_servos({"shoulder": {"zero": 0.1} | stops, "elbow": {"zero": -0.2}})
+        known = robot.with_identified({"shoulder": {"zero": 0.1} | stops, "elbow": {"zero": -0.2}})
         models += [build_model(known), build_model(known, locked=("elbow",))]
     for ours, theirs in zip(models[:2], models[2:], strict=True):
         for field in ("jnt_range", "qpos0", "body_quat", "body_pos"):
@@ -283,12 +285,12 @@ def test_nothing_touches_without_a_table(tipped):
     assert build_model(tipped).npair == 0
     assert (
         build_model(tipped).opt.disableflags
-        == build_model(replace(tipped, tips=())).opt.disableflags
+        == build_model(replace(tipped, scene=Scene())).opt.disableflags
     )
 
 
 def test_the_tip_presses_into_the_table_by_force_over_stiffness(tipped):
-    model = build_model(replace(tipped, table=Table(-0.05, 0.3, 3000.0)), physics_only=True)
+    model = build_model(tipped.with_table(Table(-0.05, 0.3, 3000.0)), physics_only=True)
     model.dof_frictionloss[:] = 0.0
     data = mujoco.MjData(model)
     data.ctrl[:] = [0.3, 0.3]  # far below the table
@@ -303,7 +305,7 @@ def test_the_tip_presses_into_the_table_by_force_over_stiffness(tipped):
 
 
 def test_a_batch_has_tables_of_its_own(tipped):
-    sim = BatchSim(replace(tipped, table=Table(-0.05, 0.3, 3000.0)), [(0.0, "both", 0.02)] * 3, 1)
+    sim = BatchSim(tipped.with_table(Table(-0.05, 0.3, 3000.0)), [(0.0, "both", 0.02)] * 3, 1)
     heights = np.array([-0.05, -0.03, -9.0])
     write_table(
         sim.batch, next(iter(sim.models.values())), heights, np.full(3, 0.3), np.full(3, 3000.0)
@@ -318,17 +320,16 @@ def test_a_batch_has_tables_of_its_own(tipped):
 
 
 def test_an_identified_table_is_saved_and_changes_the_simulator(tipped, tmp_path):
-    found = replace(
-        tipped.with_servos({"elbow": {"stribeck": 0.1, "zero": 0.02}}),
-        table=Table(-0.05, 0.3, 3000.0),
+    found = tipped.with_identified({"elbow": {"stribeck": 0.1, "zero": 0.02}}).with_table(
+        Table(-0.05, 0.3, 3000.0),
     )
     save_robot(found, tmp_path / "found")
     again = load_robot(tmp_path / "found")
-    assert again.table == found.table
-    assert (again.stribeck[1], again.zero[1]) == (0.1, 0.02)
-    assert again.nominal.table is None
+    assert again.scene.table == found.scene.table
+    assert (again.servo.stribeck[1], again.servo.zero[1]) == (0.1, 0.02)
+    assert again.nominal.scene.table is None
     assert model_hash(again) == model_hash(found) != model_hash(tipped)
-    assert model_hash(replace(found, table=None)) != model_hash(found)
+    assert model_hash(found.with_table(None)) != model_hash(found)
 
 
 def test_a_table_that_nothing_may_touch_is_refused(tmp_path):
@@ -349,14 +350,14 @@ def test_a_datasets_robot_has_the_gains_that_all_recordings_state(tmp_path):
         recorded, meta=replace(recorded.meta, kp=(15.0, 15.0), notes={"gains": "as recorded"})
     )
     data = write_dataset(tmp_path / "data", robot, [recorded])
-    assert dataset_robot(data).kp.tolist() == [15.0, 15.0]
+    assert dataset_robot(data).servo.kp.tolist() == [15.0, 15.0]
     for name, nominal, kp in (
         ("with", soft, 15.0),
         ("before", robot, 20.0),
     ):  # fitted with these gains, or without
-        save_robot(nominal.with_servos({"elbow": {"delay": 0.01}}), tmp_path / name)
-        assert dataset_robot(data, tmp_path / name).kp.tolist() == [kp, kp]
+        save_robot(nominal.with_identified({"elbow": {"delay": 0.01}}), tmp_path / name)
+        assert dataset_robot(data, tmp_path / name).servo.kp.tolist() == [kp, kp]
     data.append(
         replace(recorded.rows(slice(50)), meta=replace(recorded.meta, motion="n", kp=(9.0, 9.0)))
     )
-    assert dataset_robot(data).kp.tolist() == [20.0, 20.0]
+    assert dataset_robot(data).servo.kp.tolist() == [20.0, 20.0]

@@ -8,7 +8,7 @@ from arm import commands, record, recordings, write_arm
 from gaponet.data.sequence import Sequence, SequenceMeta
 from gaponet.data.store import Dataset
 from gaponet.robot.folder import save_robot
-from gaponet.robot.spec import load_robot
+from gaponet.robot.spec import Scene, load_robot
 from gaponet.sim.model import build_model, model_hash
 from gaponet.sim.replay import idle_limbs, pair_dataset, replay
 
@@ -55,10 +55,10 @@ def test_each_recording_runs_at_its_own_gains(tmp_path):
 
 def test_an_identified_gain_scales_with_the_recorded_one(tmp_path):
     robot = write_arm(tmp_path)
-    found = robot.with_servos({"elbow": {"kp": 16.0}})
+    found = robot.with_identified({"elbow": {"kp": 16.0}})
     set_to = found.with_gains((10.0, 10.0), None)
-    np.testing.assert_allclose(set_to.kp, [10.0, 8.0])
-    np.testing.assert_allclose(set_to.nominal.kp, 10.0)
+    np.testing.assert_allclose(set_to.servo.kp, [10.0, 8.0])
+    np.testing.assert_allclose(set_to.nominal.servo.kp, 10.0)
     assert found.with_gains((20.0, 20.001), (0.0, 0.0)) is found
 
 
@@ -96,7 +96,7 @@ def test_clamping_idle_limbs_changes_nothing_for_the_others():
 
 def test_a_simulator_without_payload_ignores_the_recorded_payload(arm):
     empty, laden = (record(arm, commands(60, 1), "m", payload=p) for p in (0.0, 0.2))
-    bare = replace(arm, carries_payload=False)
+    bare = replace(arm, scene=Scene(carries_payload=False))
     own, told = (replay([laden], r)[0].qpos for r in (bare, arm))
     assert np.abs(own - told).max() > 1e-3
     same = replace(laden, meta=empty.meta, qpos=laden.qpos, qvel=laden.qvel)
@@ -104,10 +104,10 @@ def test_a_simulator_without_payload_ignores_the_recorded_payload(arm):
 
 
 def test_a_simulator_without_payload_has_another_hash_and_survives_its_folder(arm, tmp_path):
-    bare = replace(arm, carries_payload=False)
+    bare = replace(arm, scene=Scene(carries_payload=False))
     assert model_hash(bare) != model_hash(arm)
     save_robot(bare, tmp_path / "bare")
     again = load_robot(tmp_path / "bare")
-    assert not again.carries_payload
+    assert not again.scene.carries_payload
     assert model_hash(again) == model_hash(bare)
     assert build_model(again, 0.2).body_mass.sum() == build_model(arm).body_mass.sum()

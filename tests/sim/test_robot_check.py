@@ -8,6 +8,7 @@ import pytest
 from arm import TOML, XML, write_arm
 
 from gaponet.robot.finding import Finding
+from gaponet.robot.spec import Scene
 from gaponet.sim.robot_check import check_robot
 
 LIGHT = XML.replace('damping="0.5" armature="0.02" frictionloss="0.05"', "")
@@ -64,14 +65,14 @@ def test_links_inside_each_other_touch_by_choice_alone(tmp_path):
     assert said(check_robot(off), "contacts", "ok")[0].startswith(
         "at home base and upper lie inside each other"
     )
-    on = replace(off, contacts=True)
+    on = replace(off, scene=Scene(contacts=True))
     (text,) = said(check_robot(on), "contacts", "warning")
     assert "contacts = false in robot.toml" in text
     excluded = WELDED.replace(
         "</mujoco>", '<contact><exclude body1="base" body2="upper"/></contact></mujoco>'
     )
     assert not said(
-        check_robot(replace(write_arm(tmp_path / "x", TOML, excluded), contacts=True)),
+        check_robot(replace(write_arm(tmp_path / "x", TOML, excluded), scene=Scene(contacts=True))),
         "contacts",
         "warning",
     )
@@ -79,7 +80,7 @@ def test_links_inside_each_other_touch_by_choice_alone(tmp_path):
 
 def test_postures_of_the_logs_in_which_links_meet_are_counted(tmp_path):
     xml = WELDED.replace('pos="0.02 0 0"', 'pos="0 0 -0.2"')  # reached with the arm hanging down
-    robot = replace(write_arm(tmp_path / "arm", TOML, xml), contacts=True)
+    robot = replace(write_arm(tmp_path / "arm", TOML, xml), scene=Scene(contacts=True))
     postures = np.array([[0.0, 0.0], [1.5, 0.0], [0.2, 0.0], [1.45, 0.1]])
     (text,) = said(check_robot(robot, postures=postures), "contacts", "warning")
     assert text.startswith("in 50% of the logs' postures base and ")

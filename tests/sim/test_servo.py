@@ -23,7 +23,7 @@ from gaponet.sim.servo import (
 
 
 def servo_model(robot, **values):
-    return robot.with_servos(dict.fromkeys(robot.joint_names, values))
+    return robot.with_identified(dict.fromkeys(robot.joint_names, values))
 
 
 def pull(robot, torque, seconds=0.3):
@@ -165,7 +165,7 @@ def test_a_torque_falls_with_speed_and_brakes_whole(arm):
         "damping": 0.1,
         "frictionloss": 0.0,
     }
-    robot = replace(servo_model(arm, **values), kd=np.full(2, kd), timestep=0.0005)
+    robot = replace(servo_model(arm, **values).with_servo(kd=np.full(2, kd)), timestep=0.0005)
     sim = BatchSim(robot, [(0.0, "both", 0.02)], 1)
     targets = np.repeat(np.random.default_rng(0).uniform(-1, 1, (rows // 30, 2)), 30, axis=0)
     sim.reset(slice(None), targets[:1], np.zeros((1, 2)))
@@ -204,7 +204,7 @@ def test_the_mujoco_model_holds_the_servo_model(arm):
 
 def test_a_zero_turns_the_arm_under_the_same_reading(tmp_path):
     robot = write_arm(tmp_path / "arm", toml=TOML)
-    turned = robot.with_servos({"shoulder": {"zero": 0.3}})
+    turned = robot.with_identified({"shoulder": {"zero": 0.3}})
     places = []
     for r, angle in ((robot, 0.3), (turned, 0.0)):
         model = build_model(r)

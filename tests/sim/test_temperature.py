@@ -42,9 +42,9 @@ def test_every_simulation_has_the_friction_of_the_recorded_temperature(tmp_path,
         "frictionloss": 0.2 * (1 - 0.02 * (celsius - 30)),
         "damping": 0.5 - 0.005 * (celsius - 30),
     }
-    expected = replay([real], robot.with_servos(dict.fromkeys(robot.joint_names, SERVO | now)))
+    expected = replay([real], robot.with_identified(dict.fromkeys(robot.joint_names, SERVO | now)))
     warm = at(real, celsius)
-    (moved,) = replay([warm], robot.with_servos(both))
+    (moved,) = replay([warm], robot.with_identified(both))
     np.testing.assert_allclose(moved.qpos, expected[0].qpos, atol=1e-6)
     values = {f: np.full((1, 2), v) for f, v in (SERVO | WARM).items()}
     plain = {f: np.full((1, 2), v) for f, v in (SERVO | now).items()}
@@ -56,24 +56,26 @@ def test_a_simulation_without_temperature_is_at_the_reference(tmp_path):
     robot = write_arm(tmp_path / "arm")
     (real,) = recordings(robot, 1, rows=100)
     made = [
-        robot.with_servos(dict.fromkeys(robot.joint_names, SERVO | more)) for more in (WARM, {})
+        robot.with_identified(dict.fromkeys(robot.joint_names, SERVO | more)) for more in (WARM, {})
     ]
     (one,), (other,) = (replay([real], r) for r in made)
     np.testing.assert_array_equal(one.qpos, other.qpos)
     assert model_hash(made[0]) != model_hash(made[1])  # stored replays of one are not the other's
     assert Condition.of(at(real, 50.0), made[1]).temperature is None
-    assert (made[0].at_temperature((300.0, 300.0)).frictionloss > 0).all()
+    assert (made[0].at_temperature((300.0, 300.0)).servo.frictionloss > 0).all()
     one_known = made[0].at_temperature((float("nan"), 50.0))
-    assert one_known.frictionloss[0] == made[0].frictionloss[0]
-    assert one_known.frictionloss[1] < made[0].frictionloss[1]
+    assert one_known.servo.frictionloss[0] == made[0].servo.frictionloss[0]
+    assert one_known.servo.frictionloss[1] < made[0].servo.frictionloss[1]
 
 
 def test_the_term_is_in_the_robot_folder(tmp_path):
     robot = write_arm(tmp_path / "arm")
-    save_robot(robot.with_servos(dict.fromkeys(robot.joint_names, SERVO | WARM)), tmp_path / "out")
+    save_robot(
+        robot.with_identified(dict.fromkeys(robot.joint_names, SERVO | WARM)), tmp_path / "out"
+    )
     again = load_robot(tmp_path / "out")
-    assert again.friction_per_kelvin.tolist() == [-0.02] * 2
-    assert again.friction_temperature.tolist() == [30.0] * 2
+    assert again.servo.friction_per_kelvin.tolist() == [-0.02] * 2
+    assert again.servo.friction_temperature.tolist() == [30.0] * 2
 
 
 def test_the_term_is_tried_where_the_temperature_varies_and_no_gain_with_it(tmp_path):
@@ -97,7 +99,7 @@ def test_the_term_is_tried_where_the_temperature_varies_and_no_gain_with_it(tmp_
     assert all(
         "varies with gains or payload" in s for s in temperature_findings(rising, robot, std)
     )
-    warm = robot.with_servos({robot.operated[0]: SERVO | WARM})
+    warm = robot.with_identified({robot.operated[0]: SERVO | WARM})
     (sentence,) = temperature_findings(mixed, warm, std)
     assert "friction falls by 2.00 ± 0.20 % per K, recorded at 25 to 39 °C" in sentence
     assert sentence.endswith("the stated value is that at 30 °C")

@@ -29,7 +29,7 @@ def worlds(robot, friction=True, both_rates=True):
     shipped = Condition(0.0, "both", robot.dt)
     laden = shipped._replace(payload_mass=0.3 if robot.payload_mounts else 0.0)
     fast = shipped._replace(dt=robot.dt / 2 if both_rates and robot.decimation > 1 else robot.dt)
-    soft = shipped._replace(kp=tuple(0.7 * robot.kp), kd=tuple(1.3 * robot.kd))
+    soft = shipped._replace(kp=tuple(0.7 * robot.servo.kp), kd=tuple(1.3 * robot.servo.kd))
     sim = BatchSim(robot, [shipped, laden, fast, soft, laden, fast], nthread=1)
     rng = np.random.default_rng(0)
     factor = rng.uniform(0.5, 1.5, sim.n)
@@ -70,7 +70,7 @@ class Both:
 def test_a_second_of_motion_agrees_with_mujoco(name, friction):
     robot = load_robot(name)
     if not friction:
-        robot = replace(robot, delay=np.linspace(0.004, 0.015, len(robot.joint_names)))
+        robot = robot.with_servo(delay=np.linspace(0.004, 0.015, len(robot.joint_names)))
     both = Both(robot, friction=friction)
     both.put(slice(None), both.at)
     phase = np.arange(both.ours.n)
@@ -95,7 +95,7 @@ def test_holding_for_ten_seconds_agrees_with_mujoco(name):
 
 @pytest.mark.parametrize("rates", [(0.02, 0.02, 0.02), (0.01, 0.02, 0.01)])
 def test_some_simulations_step_alone_and_a_state_is_restored(tmp_path, rates):
-    robot = replace(write_arm(tmp_path), delay=[0.03, 0.0], target_speed=[0.0, 0.8])
+    robot = write_arm(tmp_path).with_servo(delay=[0.03, 0.0], target_speed=[0.0, 0.8])
     sim = WarpSim(BatchSim(robot, [Condition(0.0, "both", dt) for dt in rates], 1), DEVICE)
     sim.reset(slice(None), np.zeros((3, 2)), np.zeros((3, 2)), past=np.zeros((3, 4, 2)))
     for _ in range(3):
@@ -115,16 +115,16 @@ def test_some_simulations_step_alone_and_a_state_is_restored(tmp_path, rates):
 def test_the_servo_model_agrees_with_mujoco(tmp_path, rates, delay):
     law = {"stribeck": 0.05, "stribeck_speed": 0.2, "friction_motor": 0.1, "friction_external": 0.1}
     law["no_load_speed"] = 1.0
-    robot = replace(
-        write_arm(tmp_path), delay=[delay, 0.0], encoder_step=1e-3, min_torque=0.02, **law
+    robot = write_arm(tmp_path).with_servo(
+        delay=[delay, 0.0], encoder_step=1e-3, min_torque=0.02, **law
     )
-    robot = robot.with_servos({"elbow": {"offset": 0.1}})
+    robot = robot.with_identified({"elbow": {"offset": 0.1}})
     ours = BatchSim(robot, [Condition(0.0, "both", dt) for dt in rates], 1)
     for x in ours.servo_model.values.values():
         x *= np.array([[1.0], [0.5], [2.0]])
     theirs, apart, still = WarpSim(ours, DEVICE), 0.0, 0.0
     plain = BatchSim(
-        replace(robot, encoder_step=0.0, min_torque=0.0, **dict.fromkeys(law, 0.0)),
+        robot.with_servo(encoder_step=0.0, min_torque=0.0, **dict.fromkeys(law, 0.0)),
         [(0.0, "both", 0.02)],
     )
     at = np.full((3, 2), 0.3)
@@ -155,8 +155,9 @@ def test_the_servo_model_agrees_with_mujoco(tmp_path, rates, delay):
 )
 def test_the_servo_model_of_a_physics_step_agrees_with_mujoco_up_to_rounding(tmp_path, parts):
     law = dict(zip(SERVO_TERMS, (0.05, 0.2, 0.1, 0.2, 0.02, 1e-3, 1.0, 0.0), strict=True))
-    robot = replace(write_arm(tmp_path), timestep=0.02, **{name: law[name] for name in parts})
-    robot = robot.with_servos({"elbow": {"offset": 0.1}})
+    robot = replace(write_arm(tmp_path), timestep=0.02)
+    robot = robot.with_servo(**{name: law[name] for name in parts})
+    robot = robot.with_identified({"elbow": {"offset": 0.1}})
     ours = BatchSim(robot, [Condition(0.0, "both", robot.dt)] * 3, 1)
     for x in ours.servo_model.values.values():
         x[:, 0] *= [0.0, 1.0, 2.0]

@@ -40,7 +40,7 @@ def fitted(folder, width):
         asked = Sequence(
             replace(meta, motion=f"m{number}"), robot.joint_names, 0.01, ctrl, ctrl, 0.0 * ctrl
         )
-        (moved,) = replay([asked], robot.with_servos({"turn": SERVO | {"backlash": width}}))
+        (moved,) = replay([asked], robot.with_identified({"turn": SERVO | {"backlash": width}}))
         noisy = moved.qpos + 2e-4 * rng.standard_normal(moved.qpos.shape)
         parts.append(replace(asked, qpos=noisy, qvel=moved.qvel))
     fit = JointFit(JointRollouts(parts, robot, nthread=1), robot, Bounds(robot, parts))

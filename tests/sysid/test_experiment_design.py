@@ -36,7 +36,8 @@ def identified(place, xml=XML):
         for s in logs
     ]
     save_robot(
-        robot.with_servos({j: {"kp": 16.0, "delay": 0.02} for j in robot.operated}), place / "known"
+        robot.with_identified({j: {"kp": 16.0, "delay": 0.02} for j in robot.operated}),
+        place / "known",
     )
     estimate_uncertainty(load_robot(place / "known"), logs, [], nthread=1).save(place / "known")
     return load_robot(place / "known")

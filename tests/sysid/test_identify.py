@@ -40,17 +40,17 @@ def found(tmp_path_factory):
 
 def test_gain_and_delay_are_found(found):
     robot, fit = found
-    np.testing.assert_allclose(fit.robot.kp, 0.6 * robot.kp, rtol=0.03)
-    np.testing.assert_allclose(fit.robot.delay, 0.04, atol=0.004)
-    np.testing.assert_allclose(fit.robot.offset, 0.0, atol=0.002)
+    np.testing.assert_allclose(fit.robot.servo.kp, 0.6 * robot.servo.kp, rtol=0.03)
+    np.testing.assert_allclose(fit.robot.servo.delay, 0.04, atol=0.004)
+    np.testing.assert_allclose(fit.robot.servo.offset, 0.0, atol=0.002)
     assert fit.after < 0.05 * fit.before
 
 
 def test_damping_below_zero_is_fitted_if_no_recording_states_kd_and_the_nominal_kd_stays(found):
     robot, fit = found
-    damping = np.nan_to_num(fit.robot.damping)
-    np.testing.assert_allclose(fit.robot.kd + damping, 0.5, rtol=0.05)
-    np.testing.assert_array_equal(fit.robot.nominal.kd, robot.kd)
+    damping = np.nan_to_num(fit.robot.servo.damping)
+    np.testing.assert_allclose(fit.robot.servo.kd + damping, 0.5, rtol=0.05)
+    np.testing.assert_array_equal(fit.robot.nominal.servo.kd, robot.servo.kd)
     assert fit.improved
 
 
@@ -74,10 +74,10 @@ def test_a_joint_that_never_moves_is_reported_as_undetermined(tmp_path):
 def test_terms_of_the_robot_are_part_of_the_start(tmp_path):
     robot = write_arm(tmp_path)
     logs = recordings(robot, 3, rows=100)
-    begun = robot.with_servos(
+    begun = robot.with_identified(
         {j: {"stribeck": 0.05, "stribeck_speed": 0.1} for j in robot.operated}
     )
-    warm = robot.with_servos({j: {"friction_per_kelvin": -0.01} for j in robot.operated})
+    warm = robot.with_identified({j: {"friction_per_kelvin": -0.01} for j in robot.operated})
     for start in (begun, warm):
         assert (
             identify(

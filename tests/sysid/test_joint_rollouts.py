@@ -45,7 +45,7 @@ def test_a_single_joint_rollout_is_the_robots_rollout(tmp_path, changed):
     kd = f"effort_limit = 5.0\nkd = {changed.pop('kd', 0.0)}"
     robot = write_arm(tmp_path / "arm", TOML.replace("effort_limit = 5.0", kd))
     servos = FIRST | changed
-    acting = robot.with_servos(dict.fromkeys(robot.joint_names, servos))
+    acting = robot.with_identified(dict.fromkeys(robot.joint_names, servos))
     real = recordings(robot, 1, rows=200, kp=0.7)
     whole = [t.qpos for t in replay(real, acting)]
     runs = JointRollouts(real, robot)
@@ -60,7 +60,7 @@ def test_a_single_joint_rollout_is_the_robots_rollout(tmp_path, changed):
 def test_numba_compiles_once_for_all_numbers_of_windows_joints_and_candidates(tmp_path):
     robot = write_arm(tmp_path)
     real = recordings(robot, 2, rows=60)
-    ramped = replace(robot, target_speed=np.full(2, 0.8))
+    ramped = robot.with_servo(target_speed=np.full(2, 0.8))
     before = len(compiled(simulate_joints).signatures)
     for parts, one, count in ((real, robot, 3), (real[:1], robot, 1), (real, ramped, 2)):
         runs = JointRollouts(parts, one)
@@ -91,7 +91,7 @@ def test_recordings_at_several_gains_have_one_servo(tmp_path):
             joint: {"kp": v}
             for joint, v in zip(robot.joint_names, (0.8 * kp, 0.8 * kp), strict=True)
         }
-        made = recordings(set_to.with_servos(motor), 1, rows=200)[0]
+        made = recordings(set_to.with_identified(motor), 1, rows=200)[0]
         told.append(replace(made, meta=replace(made.meta, kp=(kp, kp), kd=(0.0, 0.0))))
     values = {f: np.full((1, 2), v) for f, v in (FIRST | {"kp": 0.8 * 20.0}).items()}
     assert np.abs(JointRollouts(told, robot).errors(values)).mean() < 1e-3
@@ -109,14 +109,14 @@ def test_unrecorded_joints_stand_still_and_are_not_counted(tmp_path):
         meta = replace(real.meta, notes=real.meta.notes | {"posture": {robot.joint_names[0]: 0.4}})
         whole = replace(real, meta=meta, qpos=qpos, ctrl=ctrl, qvel=qvel)
         (moved,) = replay(
-            [whole], robot.with_servos({robot.joint_names[1]: {"kp": 0.7 * robot.kp[1]}})
+            [whole], robot.with_identified({robot.joint_names[1]: {"kp": 0.7 * robot.servo.kp[1]}})
         )
         assert np.array_equal(moved.qpos[:, 0], np.full(250, np.float32(0.4)))
         seen = replace(whole, qpos=moved.qpos, qvel=moved.qvel)
         windows += [seen.rows(slice(a, a + 50)) for a in range(0, 250, 50)]
     found = identify(windows, robot, options=IdentifyOptions(terms=()))
-    assert found.robot.kp[1] == pytest.approx(0.7 * robot.kp[1], rel=0.02)
-    assert found.robot.kp[0] == pytest.approx(robot.kp[0], rel=1e-3)
+    assert found.robot.servo.kp[1] == pytest.approx(0.7 * robot.servo.kp[1], rel=0.02)
+    assert found.robot.servo.kp[0] == pytest.approx(robot.servo.kp[0], rel=1e-3)
     assert found.after < 0.2 * found.before
     total = summary(runs(windows, [t.qpos for t in replay(windows, robot)], robot), robot)
     assert total["mpjae"] == total["by_joint"][robot.joint_names[1]]["mpjae"]
@@ -146,7 +146,7 @@ def test_a_single_joint_rollout_stays_within_the_joints_range():
 def test_windows_of_several_control_rates_are_fitted_together(tmp_path):
     """Two seconds of one servo, recorded at 50, at 100 and at 400 Hz: its numbers explain all of them."""
     robot = write_arm(tmp_path)
-    acting = robot.with_servos(
+    acting = robot.with_identified(
         {j: FIRST | {"kp": 14.0, "delay": 0.03, "damping": 0.8} for j in robot.joint_names}
     )
     template, parts = recordings(robot, 1)[0], []
@@ -159,7 +159,7 @@ def test_windows_of_several_control_rates_are_fitted_together(tmp_path):
         (simulated,) = replay([asked], acting)
         parts.append(replace(asked, qpos=simulated.qpos, qvel=simulated.qvel))
     runs = JointRollouts(parts, robot)
-    values = {f: np.array([getattr(acting, f)]) for f in FIRST}
+    values = {f: np.array([acting.servo[f]]) for f in FIRST}
     first = np.abs(runs.errors({f: np.full((1, 2), v) for f, v in FIRST.items()})).mean(
         axis=(0, 1, 3)
     )

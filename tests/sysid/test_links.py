@@ -140,7 +140,7 @@ def test_a_gain_from_torque_separates_masses_from_gains_without_a_second_payload
 
 
 def test_a_centre_of_mass_is_no_surer_than_the_zeros_of_the_encoders(robot, monkeypatch):
-    train = recorded(replace(robot, zero=np.array([0.006, 0.006])), 2, 150)
+    train = recorded(robot.with_servo(zero=np.array([0.006, 0.006])), 2, 150)
     fit = link_fit(robot, train)
     result = fit.descend(lambda cost: None)
     _, now, std, _ = result.moments()
@@ -179,7 +179,7 @@ def test_where_masses_and_gains_are_known_together_gains_follow_masses(robot):
     masses[:, 0] = np.log(1.2) / 2 / fit.axes.scale[:, 0]
     slopes = fit.servo_slopes(replace(result, x=0 * result.x))
     np.testing.assert_allclose(slopes["kp"] @ masses.ravel(), np.log(1.2), rtol=0.15)
-    kd_over_kp = robot.kd / result.values["kp"]
+    kd_over_kp = robot.servo.kd / result.values["kp"]
     np.testing.assert_allclose(
         slopes["damping"] @ masses.ravel(), kd_over_kp * np.log(1.2), rtol=0.5, atol=2e-3
     )

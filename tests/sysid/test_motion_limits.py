@@ -49,7 +49,7 @@ def servos():
 def test_the_speed_of_a_ramp_is_estimated_from_recordings(tmp_path, servos):
     robot = write_arm(tmp_path)
     servos["elbow"]["target_speed"] = 0.7
-    assert target_speeds(recorded(robot.with_servos(servos)), robot) == pytest.approx(
+    assert target_speeds(recorded(robot.with_identified(servos)), robot) == pytest.approx(
         [0.0, 0.7], rel=0.04
     )
 
@@ -58,38 +58,38 @@ def test_the_speed_of_a_ramp_is_estimated_from_recordings(tmp_path, servos):
 def test_slow_and_stiff_servos_are_not_taken_for_ramps(tmp_path, servos, wrong):
     robot = write_arm(tmp_path)
     servos["elbow"] |= wrong
-    assert not target_speeds(recorded(robot.with_servos(servos)), robot).any()
+    assert not target_speeds(recorded(robot.with_identified(servos)), robot).any()
 
 
 def test_identification_finds_a_ramp_and_warns(tmp_path, servos):
     robot = write_arm(tmp_path)
     servos["shoulder"]["target_speed"] = 0.6
-    logs = recorded(robot.with_servos(servos), 5, rows=240)
+    logs = recorded(robot.with_identified(servos), 5, rows=240)
     found = identify(
         logs[:3],
         robot,
         logs[3:],
         options=IdentifyOptions(windows=3, terms=(), table=False, nthread=1, folds=1),
     )
-    assert found.robot.target_speed == pytest.approx([0.6, 0.0], rel=0.04)
+    assert found.robot.servo.target_speed == pytest.approx([0.6, 0.0], rel=0.04)
     assert found.after < 0.1 * found.before
     assert found.comparisons[-1].name == "ramp"
     assert "profile velocity" in found.warnings[0]
-    assert found.robot.before_identification.target_speed.max() == 0
+    assert found.robot.before_identification.servo.target_speed.max() == 0
 
 
 @pytest.mark.parametrize(
     ("limit", "terms"), [(3.0, ("limit", "speed", *DEFAULT_TERMS)), (50.0, DEFAULT_TERMS)]
 )
 def test_a_torque_limit_is_fitted_where_recordings_reach_it(tmp_path, servos, limit, terms):
-    logs = recorded(write_arm(tmp_path).with_servos(servos), 3, rows=240)
+    logs = recorded(write_arm(tmp_path).with_identified(servos), 3, rows=240)
     limits = {j: {"effort_limit": limit} for j in servos}
-    assert default_terms(logs, write_arm(tmp_path).with_servos(limits)) == terms
+    assert default_terms(logs, write_arm(tmp_path).with_identified(limits)) == terms
 
 
 def test_single_joint_rollouts_follow_ramps(tmp_path, servos):
     servos["shoulder"]["target_speed"] = 0.6
-    robot = write_arm(tmp_path).with_servos(servos)
+    robot = write_arm(tmp_path).with_identified(servos)
     runs = JointRollouts(recorded(robot), robot, nthread=1)
     values = {
         f: np.array([[s[f] for s in servos.values()]])

@@ -46,7 +46,9 @@ def played(robot, acting, count, rows):
 )
 def test_a_term_of_the_servo_model_is_recovered(tmp_path, law):
     robot = write_arm(tmp_path / "arm")
-    parts = played(robot, robot.with_servos(dict.fromkeys(robot.joint_names, SERVO | law)), 3, 120)
+    parts = played(
+        robot, robot.with_identified(dict.fromkeys(robot.joint_names, SERVO | law)), 3, 120
+    )
     fit = JointFit(JointRollouts(parts, robot), robot, Bounds(robot, parts))
     start = {f: np.full(2, v) for f, v in SERVO.items()} | {
         f: fit.bounds.guess[f] for f in SERVO_TERMS if f in law
@@ -62,11 +64,11 @@ def test_a_term_of_the_servo_model_is_recovered(tmp_path, law):
 
 @pytest.mark.parametrize("no_load", [1.5, 0.0])
 def test_a_torque_speed_line_is_recovered_and_none_is_seen_where_none_is(tmp_path, no_load):
-    robot = replace(write_arm(tmp_path / "arm"), effort_limit=np.full(2, 2.5), kd=np.full(2, 0.5))
+    robot = write_arm(tmp_path / "arm").with_servo(effort_limit=np.full(2, 2.5), kd=np.full(2, 0.5))
     template, true = recordings(robot, 1, rows=80)[0], SERVO | {"no_load_speed": no_load}
     jumps = np.random.default_rng(0).uniform(-1, 1, (2, 4, 2)).repeat(20, axis=1)
     asked = [replace(template, ctrl=c) for c in jumps]
-    replays = replay(asked, robot.with_servos(dict.fromkeys(robot.joint_names, true)))
+    replays = replay(asked, robot.with_identified(dict.fromkeys(robot.joint_names, true)))
     parts = [replace(s, qpos=t.qpos, qvel=t.qvel) for s, t in zip(asked, replays, strict=True)]
     assert "speed" in default_terms(parts, robot)
     fit = JointFit(JointRollouts(parts, robot), robot, Bounds(robot, parts))
@@ -87,7 +89,7 @@ def test_a_torque_limit_of_half_the_files_is_recovered(tmp_path):
         replace(template, ctrl=c, meta=replace(template.meta, motion=f"m{i}"))
         for i, c in enumerate(jumps)
     ]
-    weak = robot.with_servos({joint: {"effort_limit": 2.5} for joint in robot.joint_names})
+    weak = robot.with_identified({joint: {"effort_limit": 2.5} for joint in robot.joint_names})
     parts = [
         replace(s, qpos=t.qpos, qvel=t.qvel)
         for s, t in zip(asked, replay(asked, weak), strict=True)
@@ -99,7 +101,7 @@ def test_a_torque_limit_of_half_the_files_is_recovered(tmp_path):
         options=IdentifyOptions(windows=4, terms=("limit",), table=False, folds=1),
     )
     assert [c.name for c in found.comparisons if c.accepted] == ["limit"]
-    np.testing.assert_allclose(found.robot.effort_limit, 2.5, rtol=0.05)
+    np.testing.assert_allclose(found.robot.servo.effort_limit, 2.5, rtol=0.05)
     assert found.after < 0.1 * found.before
 
 
@@ -107,7 +109,9 @@ def test_damping_of_an_unmoved_joint_is_recovered_from_the_motion_of_another(tmp
     """The file's damping of the shoulder, which no command moves, is ten times too much."""
     robot = write_arm(tmp_path / "arm")
     swung = [replace(s, ctrl=s.ctrl * [0, 1]) for s in played(robot, robot, 3, 200)]
-    true, told = (robot.with_servos({"shoulder": {"damping": d, "kp": 20.0}}) for d in (0.2, 2.0))
+    true, told = (
+        robot.with_identified({"shoulder": {"damping": d, "kp": 20.0}}) for d in (0.2, 2.0)
+    )
     parts = [
         replace(s, qpos=t.qpos, qvel=t.qvel)
         for s, t in zip(swung, replay(swung, true), strict=True)
@@ -128,15 +132,15 @@ TIP = '[[tip]]\nbody = "fore"\npos = [0.2, 0.0, 0.0]\n'
 
 def test_a_table_is_recovered(tmp_path):
     robot = write_arm(tmp_path / "arm", toml=TOML + TIP)
-    parts = played(robot, replace(robot, table=Table(-0.02, 0.3, 2000.0)), 3, 100)
+    parts = played(robot, robot.with_table(Table(-0.02, 0.3, 2000.0)), 3, 100)
     heights = table_contact.tip_heights(parts, robot)
     found = table_contact.fit_table(
         parts, robot, min(h.min() for h in heights), 1, lambda error: None
     )
     assert found.accepted
     assert found.after.mean() < 0.2 * found.before.mean()
-    assert found.robot.table.height == pytest.approx(-0.02, abs=0.004)
-    assert np.abs(found.robot.zero).max() < 0.02
+    assert found.robot.scene.table.height == pytest.approx(-0.02, abs=0.004)
+    assert np.abs(found.robot.servo.zero).max() < 0.02
     free = played(robot, robot, 2, 100)
     assert not table_contact.fit_table(free, robot, -0.1, 1, lambda error: None).accepted
 

@@ -1,7 +1,5 @@
 """Candidates for the servos of a whole robot beside recordings."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from arm import recordings, write_arm
@@ -70,15 +68,15 @@ def test_a_rollout_restarts_from_the_recording_after_a_possible_contact(robot, p
 
 
 def test_damping_below_zero_is_taken_from_the_servo(robot, parts):
-    less, softer = (replace(robot, kd=np.array([kd, kd])) for kd in (0.4, 0.1))
+    less, softer = (robot.with_servo(kd=np.array([kd, kd])) for kd in (0.4, 0.1))
     values = own(less, parts)
     np.testing.assert_allclose(
         RobotRollouts(parts, less).flat_errors(values | {"damping": np.full((1, 2), -0.3)}),
         RobotRollouts(parts, softer).flat_errors(values | {"damping": np.zeros((1, 2))}), atol=1e-6,
     )  # fmt: skip
-    written = less.with_servos({"elbow": {"damping": -0.3}})
-    assert written.kd.tolist() == pytest.approx([0.4, 0.1])
-    assert (written.damping[1], written.nominal.kd[1]) == (0.0, 0.4)
+    written = less.with_identified({"elbow": {"damping": -0.3}})
+    assert written.servo.kd.tolist() == pytest.approx([0.4, 0.1])
+    assert (written.servo.damping[1], written.nominal.servo.kd[1]) == (0.0, 0.4)
 
 
 def test_a_search_goes_on_with_the_better_of_its_starts(robot, parts):

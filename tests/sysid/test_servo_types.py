@@ -25,7 +25,7 @@ TWO = (
 def test_a_value_an_order_of_magnitude_off_is_named(tmp_path):
     robot = write_arm(tmp_path, TWO)
     assert far_from_servo_type(robot) == []
-    odd = robot.with_servos({"elbow": {"armature": 0.25, "damping": 0.4}})
+    odd = robot.with_identified({"elbow": {"armature": 0.25, "damping": 0.4}})
     assert far_from_servo_type(odd) == [
         "elbow: armature 0.25 is 12 times the 0.02 of the S1 (a bench)"
     ]
@@ -51,7 +51,7 @@ def test_an_entry_from_an_identified_folder_has_the_values_of_its_joints_and_loa
     values = {"shoulder": (0.8, 0.1, 0.03), "elbow": (1.2, 0.3, 0.05)}
     fields = ("damping", "frictionloss", "armature")
     save_robot(
-        robot.with_servos({j: dict(zip(fields, v, strict=True)) for j, v in values.items()}),
+        robot.with_identified({j: dict(zip(fields, v, strict=True)) for j, v in values.items()}),
         tmp_path / "id",
     )
     command = ["robot", "servos", "--from", str(tmp_path / "id")]
@@ -60,7 +60,7 @@ def test_an_entry_from_an_identified_folder_has_the_values_of_its_joints_and_loa
     command += ["--source", "my logs", "--licence", "CC0-1.0"]
     assert main(command) == 0
     entry = capsys.readouterr().out
-    (servo, _) = write_arm(tmp_path / "used", TWO.replace(SERVO, entry)).servos
+    (servo, _) = write_arm(tmp_path / "used", TWO.replace(SERVO, entry)).servo.types
     assert (servo.name, servo.source, servo.licence, servo.joints, servo.robots) == (
         "S1",
         "my logs",
@@ -81,7 +81,7 @@ def test_an_entry_from_an_identified_folder_has_the_values_of_its_joints_and_loa
 
 
 def test_the_interval_of_a_single_joint_is_that_of_its_standard_error(tmp_path):
-    robot = write_arm(tmp_path / "nominal", TWO).with_servos({"elbow": {"frictionloss": 0.2}})
+    robot = write_arm(tmp_path / "nominal", TWO).with_identified({"elbow": {"frictionloss": 0.2}})
     save_robot(robot, tmp_path / "id")
     fields, std = ("kp", "frictionloss"), 0.02 / 20.0  # on the axis: friction over kp
     rest = ((0.0,) * 3, ((0.0,) * 3,) * 3, (1.0,) * 3, 0.0, 0.0, 0.0)
@@ -97,10 +97,10 @@ def test_the_interval_of_a_single_joint_is_that_of_its_standard_error(tmp_path):
 def test_a_robot_s_own_servo_type_comes_before_the_table_s(tmp_path):
     used = TWO.replace('"S1"', '"STS3215"')
     own, packaged = (
-        write_arm(tmp_path, toml).servos[0] for toml in (used, used.split("[[servo]]")[0])
+        write_arm(tmp_path, toml).servo.types[0] for toml in (used, used.split("[[servo]]")[0])
     )
     assert (own.source, own.measured["armature"].value) == ("a bench", 0.02)
-    assert packaged == load_robot("so101").servos[0]
+    assert packaged == load_robot("so101").servo.types[0]
 
 
 def test_an_undefined_servo_type_is_refused(tmp_path):
@@ -123,14 +123,17 @@ def test_a_joint_starts_from_the_identified_servo_of_its_type_or_mirror_image_an
     tmp_path,
 ):
     robot = write_arm(tmp_path / "a", TWO)
-    identified = robot.with_servos(
+    identified = robot.with_identified(
         {"elbow": {"kp": 15.0, "frictionloss": 0.2, "offset": 0.03, "delay": 0.01}}
     )
     stiff = write_arm(tmp_path / "b", TWO.replace("kp = 20.0", "kp = 40.0"))
     started, sources = servos_like(stiff, identified)
     assert sources == {"shoulder": "elbow", "elbow": "elbow"}  # the shoulder was not identified
-    assert started.kp.tolist() == [30.0, 30.0]  # the ratio to the nominal gain
-    assert (started.frictionloss.tolist(), started.delay.tolist()) == ([0.2, 0.2], [0.01, 0.01])
-    assert started.offset.tolist() == [0.0, 0.0]
+    assert started.servo.kp.tolist() == [30.0, 30.0]  # the ratio to the nominal gain
+    assert (started.servo.frictionloss.tolist(), started.servo.delay.tolist()) == (
+        [0.2, 0.2],
+        [0.01, 0.01],
+    )
+    assert started.servo.offset.tolist() == [0.0, 0.0]
     with pytest.raises(UsageError, match="no identified joint"):
         servos_like(stiff, robot)

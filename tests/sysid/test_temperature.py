@@ -39,7 +39,7 @@ def recorded(robot, celsius):
         command = Sequence(
             meta, robot.joint_names, 0.01, ctrl, 0 * ctrl, 0 * ctrl, temperature=0 * ctrl + warm
         )
-        (moved,) = replay([command], robot.with_servos({"turn": SERVO | TRUE}))
+        (moved,) = replay([command], robot.with_identified({"turn": SERVO | TRUE}))
         noisy = moved.qpos + 2e-4 * rng.standard_normal(moved.qpos.shape)
         parts.append(replace(command, qpos=noisy, qvel=moved.qvel))
     return parts
@@ -69,17 +69,17 @@ def test_recordings_at_one_temperature_leave_the_term_at_zero(tmp_path):
     bounds = Bounds(robot, parts)
     assert [bounds.limits[f][1][0] for f in WARM[:2]] == [0.0, 0.0]
     assert bounds.guess["friction_per_kelvin"][0] == 0
-    low, high, _ = Bounds(robot.with_servos({"turn": SERVO | TRUE}), parts).limits[
+    low, high, _ = Bounds(robot.with_identified({"turn": SERVO | TRUE}), parts).limits[
         "friction_per_kelvin"
     ]
     assert low == high == -0.02  # a robot that has the term keeps it
 
 
 def test_the_temperature_is_the_last_cause_of_the_joint_itself(tmp_path):
-    robot = write_arm(tmp_path / "disc", TOML, XML).with_servos(
+    robot = write_arm(tmp_path / "disc", TOML, XML).with_identified(
         {"turn": SERVO | {"frictionloss": 0.04} | TRUE}
     )
     steps = cause_steps(robot)
     assert [step.name for step in steps] == ["friction", "creep", "temperature"]
-    assert steps[1].simulator.friction_per_kelvin[0] == 0
+    assert steps[1].simulator.servo.friction_per_kelvin[0] == 0
     assert identified_joints(robot) == {"turn"}

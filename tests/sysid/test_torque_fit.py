@@ -68,8 +68,8 @@ def test_gains_are_estimated_from_torque_of_a_pd_servo_and_from_no_other(arm):
     assert (kp, kd) == (pytest.approx(7.0, rel=0.03), pytest.approx(0.3, rel=0.1))
     assert explained > 0.95 > 0.5 > noise
     assert set(said.known) == {arm.operated[0]}
-    assert said.robot.kp[0] == pytest.approx(7.0, rel=0.03)
-    assert said.robot.kp[1] == arm.kp[1]
+    assert said.robot.servo.kp[0] == pytest.approx(7.0, rel=0.03)
+    assert said.robot.servo.kp[1] == arm.servo.kp[1]
     assert not TorqueFit([replace(s, tau=None) for s in made], arm).known
 
 
@@ -91,7 +91,9 @@ def test_measurement_noise_does_not_lower_the_estimated_gains(arm):
 def loaded(robot):
     """Six motions with three payloads each, of an arm with softer servos, a hand, and a payload hung elsewhere."""
     true, windows = (
-        moved(robot, -0.06, 0.3).with_servos({j: {"kp": 12.0, "kd": 0.4} for j in robot.operated}),
+        moved(robot, -0.06, 0.3).with_identified(
+            {j: {"kp": 12.0, "kd": 0.4} for j in robot.operated}
+        ),
         [],
     )
     for motion in range(6):
@@ -117,10 +119,10 @@ def test_the_fit_from_torque_is_used_if_validation_motions_accept_it(tmp_path):
         True,
         6,
     )
-    assert found.robot.kp == pytest.approx([12.0, 12.0], rel=0.03)
+    assert found.robot.servo.kp == pytest.approx([12.0, 12.0], rel=0.03)
     assert found.robot.payload_mounts[0].mass == pytest.approx(0.3, abs=0.05)
     assert not (
-        found.held_out[0].robot.kp == found.robot.kp
+        found.held_out[0].robot.servo.kp == found.robot.servo.kp
     ).all()  # fitted once more, to the motions that judged it
     assert found.after == pytest.approx(tried.after.mean())
     assert tried.after.mean() < tried.before.mean()
@@ -135,7 +137,7 @@ def test_a_refit_with_the_validation_motions_is_dropped_if_it_follows_them_worse
     def astray(self, how):
         found = own(self, how)
         return (
-            found.with_servos({"elbow": {"offset": 0.1}})
+            found.with_identified({"elbow": {"offset": 0.1}})
             if len(self.sequences) == len(windows)
             else found
         )
@@ -144,7 +146,7 @@ def test_a_refit_with_the_validation_motions_is_dropped_if_it_follows_them_worse
     found = identify(windows[:12], robot, windows[12:], options=IdentifyOptions(terms=(), folds=1))
     assert found.chosen == "torque"
     assert found.held_out[0].robot is found.robot
-    assert abs(found.robot.offset).max() < 0.05
+    assert abs(found.robot.servo.offset).max() < 0.05
 
 
 def test_identified_payload_mounts_are_stored_in_the_folder(tmp_path):

@@ -88,7 +88,7 @@ def test_a_torque_driven_arm_is_identified(robot, tmp_path, capsys, unit, words)
     before, after = said["angle"]["0.5"]
     assert np.mean(after) < 0.05 * np.mean(before)
     again = load_robot(tmp_path / "found")
-    assert again.damping[0] == said["joints"]["shoulder"]["damping"]
+    assert again.servo.damping[0] == said["joints"]["shoulder"]["damping"]
     assert (
         main(["export", str(tmp_path / "found"), "--to", "json"]) == 0
     )  # judged by what the robot itself answers

@@ -53,7 +53,7 @@ def arm(tmp_path_factory):
 @pytest.fixture(scope="module")
 def folder(arm, tmp_path_factory):
     """As if it had been identified."""
-    right = arm.with_servos(dict.fromkeys(arm.joint_names, TRUE))
+    right = arm.with_identified(dict.fromkeys(arm.joint_names, TRUE))
     place = tmp_path_factory.mktemp("know") / "right"
     save_robot(right, place)
     estimate_uncertainty(load_robot(place), played(arm), played(arm, 20, 3), nthread=1).save(place)
@@ -136,7 +136,7 @@ def test_residuals_use_recordings_that_hold_the_joint_and_the_robot_that_was_jud
         one["elbow"].residual_rms > 0.5 * both["elbow"].residual_rms
     )  # rows that do not hold it are no zeros
     assert none["elbow"].residual_p90 == none["shoulder"].residual_p90 > 0.0
-    off = robot.with_servos({"elbow": {"offset": 0.05}})
+    off = robot.with_identified({"elbow": {"offset": 0.05}})
     judged = estimate_uncertainty(
         robot, judges, judges, held_out=[HeldOut(judges, off)], nthread=1
     ).joints["elbow"]
@@ -172,7 +172,7 @@ def test_a_change_by_adaptation_increases_the_variance(arm, folder):
     robot = load_robot(folder)
     mine, found = ParameterUncertainty.load(robot), []
     for by in (0.0, -0.05):
-        there = robot.with_servos({"elbow": {"offset": by}})
+        there = robot.with_identified({"elbow": {"offset": by}})
         seen = [replace(s, qpos=s.qpos + np.array([0.0, by])) for s in played(arm, 40, 2)]
         found.append(
             estimate_uncertainty(there, seen, [], before=mine, nthread=1).array(
@@ -185,7 +185,7 @@ def test_a_change_by_adaptation_increases_the_variance(arm, folder):
 
 def test_an_edited_folder_is_refused(folder, tmp_path):
     robot = load_robot(folder)
-    save_robot(robot.with_servos({"elbow": {"kp": 30.0}}), tmp_path / "edited")
+    save_robot(robot.with_identified({"elbow": {"kp": 30.0}}), tmp_path / "edited")
     with pytest.raises(
         RobotError, match=r"other values than robot\.toml's, at elbow; identify or adapt again"
     ):
@@ -312,8 +312,8 @@ def test_a_change_smaller_than_the_difference_between_repetitions_is_no_drift(
 
 def test_recordings_of_joints_that_were_never_identified_are_not_called_the_same(arm, folder):
     robot = load_robot(folder)
-    half = replace(
-        robot, **{f: np.where([True, False], getattr(robot, f), getattr(arm, f)) for f in TRUE}
+    half = robot.with_servo(
+        **{f: np.where([True, False], robot.servo[f], arm.servo[f]) for f in TRUE}
     )
     logs = [
         replace(s, meta=replace(s.meta, notes={"held_at_home": ("shoulder",)}))

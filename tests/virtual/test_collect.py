@@ -187,7 +187,7 @@ def test_a_dataset_keeps_the_robot_with_the_gains_that_its_fleet_sets(spec, flee
     less = replace(RECIPE, motions=("steps-elbow",), rates=(50.0,), repetitions=1)
     collect(spec, firm, less, tmp_path, seed=5, nproc=1)
     kept = load_robot(tmp_path / "robot")
-    assert kept.kp.tolist() == list(Dataset(tmp_path).entries[0].meta.kp) == [60.0, 60.0]
+    assert kept.servo.kp.tolist() == list(Dataset(tmp_path).entries[0].meta.kp) == [60.0, 60.0]
     assert collect(kept, firm, less, tmp_path, seed=5, nproc=1).written == 0
 
 

@@ -22,8 +22,8 @@ def test_four_numbers_leave_of_the_hard_fleet_what_real_arms_leave():
     )
     recorded = [s.rows(slice(0, 250)) for s in recorded]
     fitted = {"frictionloss": 1.74, "damping": 1.007, "delay": 0.011}
-    gains = zip(robot.operated, robot.kp[robot.operated_index], strict=True)
-    four_numbers = robot.with_servos({joint: fitted | {"kp": 0.79 * kp} for joint, kp in gains})
+    gains = zip(robot.operated, robot.servo.kp[robot.operated_index], strict=True)
+    four_numbers = robot.with_identified({joint: fitted | {"kp": 0.79 * kp} for joint, kp in gains})
     for simulator, least, most in ((robot, 0.010, 0.030), (four_numbers, 0.004, 0.015)):
         rollouts = replay(recorded, simulator, lock_idle=True)
         pairs = list(zip(recorded, rollouts, strict=True))

@@ -10,7 +10,6 @@ import shutil
 import typing
 from collections.abc import Callable, Iterator
 from contextlib import nullcontext, redirect_stdout, suppress
-from dataclasses import replace
 from functools import wraps
 from pathlib import Path
 from types import SimpleNamespace
@@ -216,7 +215,7 @@ def names_of_a_reader(page: str, folder: Path) -> dict[str, Any]:
     at_home = {"qpos": robot.qpos_home, "qvel": 0 * robot.qpos_home, "target": robot.qpos_home}
     return at_home | {
         "mj_model": mj_model, "data": data, "mujoco": mujoco, "targets": [robot.qpos_home] * 3, "model": model,
-        "mine": replace(robot, kp=1.1 * robot.kp),
+        "mine": robot.with_servo(kp=1.1 * robot.servo.kp),
     }  # fmt: skip
 
 

@@ -90,8 +90,8 @@ def test_a_section_does_what_it_says(place, monkeypatch, capsys, page):
         assert (place / "started/identified/report.html").is_file()
         assert (place / "today/robot.toml").is_file()
         found = load_robot(place / "started/identified")
-        assert found.kp[found.operated_index] == pytest.approx([14.0, 14.0], rel=0.1)
-        assert found.delay[found.operated_index] == pytest.approx([0.04, 0.04], abs=0.008)
+        assert found.servo.kp[found.operated_index] == pytest.approx([14.0, 14.0], rel=0.1)
+        assert found.servo.delay[found.operated_index] == pytest.approx([0.04, 0.04], abs=0.008)
         here, there = map(
             float, re.search(r"the MJCF alone: ([\d.]+) mrad; in gaponet ([\d.]+)", said).groups()
         )

@@ -73,7 +73,7 @@ class GaponetRobot(Robot):
         """Return robot.toml's name of a joint of LeRobot, or the name itself."""
         spec = self.corrector.spec
         name = self.config.joints.get(name, name)
-        return spec.aliases.get(name, name)
+        return spec.log_joints.aliases.get(name, name)
 
     @cached_property
     def observation_features(self) -> dict[str, Any]:

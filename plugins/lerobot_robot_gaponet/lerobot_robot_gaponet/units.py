@@ -26,7 +26,7 @@ class Units:
         low, high = robot.qpos_range.T
         scales = {"deg": np.pi / 180, "rad": 1.0, "signed_percent": (high - low) / 200}
         zero = (low + high) / 2 if unit == "signed_percent" else 0.0
-        fraction = np.array([given == "fraction" for given in robot.log_units])
+        fraction = np.array([given == "fraction" for given in robot.log_joints.units])
         self.scale = np.where(fraction, (high - low) / 100, scales[unit])
         self.zero = np.where(fraction, low, zero)
 

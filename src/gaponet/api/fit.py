@@ -575,7 +575,7 @@ def adapt_robot(
         _write_adapted(folder, spec, fitted.robot, sequences, adapted, uncertainty)
     servos: dict[str, dict[str, float]] = {}
     for joint, i in zip(fitted.robot.operated, fitted.robot.operated_index, strict=True):
-        servos[joint] = {name: float(getattr(fitted.robot, name)[i]) for name in FIELDS}
+        servos[joint] = fitted.robot.servo.of_joint(i, FIELDS)
     return AdaptResult(
         unit_id=recorded.unit_id,
         servos=servos,

@@ -162,14 +162,11 @@ class IdentifyResult:
 
     def values(self) -> dict[str, dict[str, float]]:
         """Operated joint → servo field → value, SI; fields without information are left out."""
-        from gaponet.robot.servo_fields import SERVO_FIELDS
-
         robot = self.robot
         found: dict[str, dict[str, float]] = {}
         for joint, i in zip(robot.operated, robot.operated_index, strict=True):
             found[joint] = {}
-            for name in SERVO_FIELDS:
-                value = float(getattr(robot, name)[i])
+            for name, value in robot.servo.of_joint(i).items():
                 stated = name == "effort_limit" and name not in self.fit.std[joint]
                 if np.isfinite(value) and not stated:
                     found[joint][name] = value
@@ -201,7 +198,7 @@ class IdentifyResult:
     def servo_types(self) -> list[ServoType]:
         """Return the servo types of the operated joints, each once."""
         robot = self.robot
-        types = dict.fromkeys(robot.servos[i] for i in robot.operated_index)
+        types = dict.fromkeys(robot.servo.types[i] for i in robot.operated_index)
         return [servo for servo in types if servo is not None]
 
     def to_dict(self) -> dict[str, Any]:
@@ -218,7 +215,7 @@ class IdentifyResult:
             "val_mpjae": self.val_mpjae,
             "val_standard_error": self.standard_errors(),
             "terms": terms,
-            "table": vars(self.robot.table) if self.robot.table else None,
+            "table": vars(self.robot.scene.table) if self.robot.scene.table else None,
             "links": {body: vars(link) for body, link in self.robot.links.items()},
             "touching": list(fit.table_fit.motions) if fit.table_fit else [],
             "warnings": list(fit.warnings),
@@ -266,11 +263,11 @@ class TorqueResult:
         i = self.robot.operated_index[j]
         row = [joint]
         for name in PASSIVE_FIELDS:
-            value = float(getattr(fit.robot, name)[i])
+            value = float(fit.robot.servo[name][i])
             factor = SERVO_FIELDS[name].factor
             shown = format_uncertainty(factor * value, factor * fit.std[joint][name])
             row.append(shown if value else "0")
-        row += [f"{1e3 * fit.robot.delay[i]:.0f}", f"{fit.bias[j]:+.2g}"]
+        row += [f"{1e3 * fit.robot.servo.delay[i]:.0f}", f"{fit.bias[j]:+.2g}"]
         if with_constant:
             row.append(format_uncertainty(float(fit.constant[j]), fit.std[joint]["constant"]))
         return [*row, *(f"{errors[j]:.3g}" for errors in fit.torque)]
@@ -282,7 +279,7 @@ class TorqueResult:
         robot = self.robot
         joints = {}
         for j, (joint, i) in enumerate(zip(robot.operated, robot.operated_index, strict=True)):
-            values = {name: float(getattr(robot, name)[i]) for name in (*PASSIVE_FIELDS, "delay")}
+            values = robot.servo.of_joint(i, (*PASSIVE_FIELDS, "delay"))
             values["bias"] = float(fit.bias[j])
             values["constant"] = float(fit.constant[j])
             joints[joint] = values

@@ -74,12 +74,12 @@ class RobotCheck:
             joint = {
                 "name": name,
                 "operated": name in robot.operated,
-                "kp": robot.kp[i],
-                "kd": robot.kd[i],
-                "effort_limit": robot.effort_limit[i],
+                "kp": robot.servo.kp[i],
+                "kd": robot.servo.kd[i],
+                "effort_limit": robot.servo.effort_limit[i],
                 "range": robot.qpos_range[i],
                 "home": robot.qpos_home[i],
-                "log_unit": robot.log_units[i],
+                "log_unit": robot.log_joints.units[i],
             }
             joints.append(joint)
         mounts = [{"side": m.side, "body": m.body, "pos": m.pos} for m in robot.payload_mounts]

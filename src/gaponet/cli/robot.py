@@ -135,11 +135,11 @@ def _show_check(screen: Out, made: RobotCheck) -> None:
     title = f"{robot.name}: {robot.description}; N·m/rad, N·m·s/rad, N·m, rad"
     rows = [_joint_row(robot, i) for i in range(len(robot.joint_names))]
     screen.table(title, CHECK_COLUMNS, rows)
-    for name, unit in zip(robot.joint_names, robot.log_units, strict=True):
+    for name, unit in zip(robot.joint_names, robot.log_joints.units, strict=True):
         if unit != "rad":
             screen.say(f"{name} is expected as {unit} in SAGE logs")
     mounts = ", ".join(f"{m.side} on {m.body}" for m in robot.payload_mounts) or "none"
-    contacts = "on" if robot.contacts else "off"
+    contacts = "on" if robot.scene.contacts else "off"
     screen.say(
         f"control period {robot.dt * 1e3:g} ms, physics step {robot.timestep * 1e3:g} ms "
         f"({robot.decimation} a period); payload mounts: {mounts}; contacts {contacts}; "
@@ -163,9 +163,9 @@ def _joint_row(robot: RobotSpec, i: int) -> list[str]:
     return [
         name,
         "yes" if name in robot.operated else "no",
-        f"{robot.kp[i]:g}",
-        f"{robot.kd[i]:g}",
-        f"{robot.effort_limit[i]:g}",
+        f"{robot.servo.kp[i]:g}",
+        f"{robot.servo.kd[i]:g}",
+        f"{robot.servo.effort_limit[i]:g}",
         f"{low:.2f}…{high:.2f}",
     ]
 

@@ -110,7 +110,7 @@ def _show_terms(screen: Out, made: IdentifyResult) -> None:
 def _show_table(screen: Out, made: IdentifyResult) -> None:
     """Print the table under the robot, if a tip came near one."""
     touch = made.fit.table_fit
-    table = made.robot.table
+    table = made.robot.scene.table
     if touch is None or not touch.motions:
         return
     what = "none that explains them"

@@ -118,7 +118,7 @@ def _show_inspection(screen: Out, task: Start, inspection: Inspection) -> None:
     log = inspection.log
     robot = inspection.robot
     options = task.options
-    gains = ", ".join(f"{kp:g}" for kp in robot.kp)
+    gains = ", ".join(f"{kp:g}" for kp in robot.servo.kp)
     source = inspection.packaged or task.model
     channels = ", ".join(log.channels)
     first = f"{inspection.seconds:.1f} s at {inspection.rate:g} Hz, {channels}"

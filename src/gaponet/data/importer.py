@@ -321,7 +321,7 @@ def _parse_gains(name: str, words: tuple[str, ...], robot: RobotSpec) -> tuple[f
     """Parse ("17.8",) or ("elbow=9", …) to gains of all joints, (n); the others are the robot's."""
     if not words:
         return None
-    gains = np.array(getattr(robot.nominal or robot, name), float)
+    gains = np.array(robot.before_identification.servo[name])
     for word in words:
         joint, equals, number = word.rpartition("=")
         try:

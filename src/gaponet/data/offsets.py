@@ -68,7 +68,7 @@ def unit_offsets(
         meta = entry.meta
         if meta.unit_id == unit_id:
             own = known.get(entry.hash) or StaticPoses.of(dataset.read(entry), robot.operated_index)
-            kp = robot.with_gains(meta.recorded_gains[0], None).kp
+            kp = robot.with_gains(meta.recorded_gains[0], None).servo.kp
             torque = gravity(own.qpos, meta.payload_mass, meta.payload_side)
             poses.append(own)
             sags.append(-torque / np.where(kp > 0, kp, np.inf))

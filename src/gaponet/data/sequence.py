@@ -16,8 +16,9 @@ from gaponet.base.structure import Json
 from gaponet.data.describe.row_copies import copied_rows
 from gaponet.data.log import COMMANDS, FEEDFORWARD, Log
 from gaponet.data.signals import SAME_INSTANT, differentiate, resample_linear, resample_zoh
+from gaponet.robot.log_joints import Follower
 from gaponet.robot.simulator_change import SimulatorChange
-from gaponet.robot.spec import GAIN_TOLERANCE, Follower, RobotSpec
+from gaponet.robot.spec import GAIN_TOLERANCE, RobotSpec
 
 ARRAYS = ("ctrl", "qpos", "qvel", "qacc", "tau", "tau_eq", "temperature")
 OPTIONAL = ("qacc", "tau", "tau_eq", "temperature")
@@ -202,7 +203,7 @@ class Sequence:
 
 def _recorded(name: str, log: Log, robot: RobotSpec) -> tuple[float, ...]:
     """Gains (n) that a log says, the robot's own for joints of which it says none."""
-    gains = np.array(getattr(robot.nominal or robot, name), float)
+    gains = np.array(robot.before_identification.servo[name])
     if name in log.meta:
         gains[robot.index(log.joint_names)] = _gains(name, log.meta[name], log.source)
     return tuple(gains.tolist())
@@ -543,7 +544,7 @@ def _feedforward_position(
 def _led(log: Log, robot: RobotSpec) -> dict[str, Follower]:
     """Mimic joints that a log lacks, and whose leading joint it holds."""
     led = {}
-    for name, follower in robot.followers.items():
+    for name, follower in robot.log_joints.followers.items():
         if name not in log.joint_names and follower.joint in log.joint_names:
             led[name] = follower
     return led

@@ -179,7 +179,7 @@ class AlignedSim:
         Args:
             qpos: Positions, rad; default home.
             qvel: Velocities, rad/s.
-            ctrl: Target in force before, rad, which delayed servos (robot.delay) still follow;
+            ctrl: Target in force before, rad, which delayed servos (robot.servo.delay) still follow;
                 default qpos.
             ids: Which simulations, (k,); arrays are then (k, n).
         """

@@ -177,8 +177,8 @@ class Compensator:
         self.free = robot.index(self.shadow.joint_names)
         self.operated = np.searchsorted(self.free, self.op)  # operated joints among the shadow's
         self.low, self.high = robot.qpos_range[self.op].T
-        self.kp = robot.kp[self.op]
-        self.zero_offset = robot.offset[self.op]
+        self.kp = robot.servo.kp[self.op]
+        self.zero_offset = robot.servo.offset[self.op]
         self.bias: Array = self.shadow.batch.bind("qfrc_bias")
         self.loop: DeltaLoop | None = None
         self._contexts: Array | None = None
@@ -219,7 +219,7 @@ class Compensator:
         nominal = self.robot.nominal or self.robot
         for joint, i in zip(nominal.operated, nominal.operated_index, strict=True):
             for name, gains in (("kp", kp), ("kd", kd)):
-                was = float(getattr(nominal, name)[i])
+                was = float(nominal.servo[name][i])
                 now = float(gains[joint_names.index(joint)])
                 if abs(now - was) > GAIN_TOLERANCE * max(was, now):
                     raise RobotError(

@@ -48,10 +48,10 @@ class Feedforward:
         op = robot.operated_index
         self.dt = dt
         self.share = min(1.0, dt / max(acceleration_time, dt))
-        self.kd = robot.kd[op]
+        self.kd = robot.servo.kd[op]
         self.damping = model.dof_damping[operated]
         self.friction = model.dof_frictionloss[operated]
-        self.servo_terms = present({name: getattr(robot, name)[op] for name in SERVO_TERMS})
+        self.servo_terms = present({name: robot.servo[name][op] for name in SERVO_TERMS})
         self.inertia = Inertia(sim.batch, model, operated)
         self.target, self.qvel, self.qacc = np.zeros((3, 0, len(op)))
 

@@ -134,7 +134,7 @@ def _can_agree(model: Reference, dt: float) -> bool:
     """Return true if a scene of plain MuJoCo can move like the model's simulator."""
     if isinstance(model, GapModel):
         return control_periods_of(model, dt) == 1
-    return not model.has_servo_model
+    return not model.servo.has_terms
 
 
 def _undriven(scene: mujoco.MjModel, robot: RobotSpec, prefix: str) -> tuple[str, ...]:

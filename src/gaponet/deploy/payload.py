@@ -73,8 +73,8 @@ class PayloadEstimate:
             locked: Joints that are clamped at home; no operated one.
         """
         self.max_mass = max_mass
-        self.kp = robot.kp[robot.operated_index]
-        self.kd = robot.kd[robot.operated_index]
+        self.kp = robot.servo.kp[robot.operated_index]
+        self.kd = robot.servo.kd[robot.operated_index]
         self.sample_periods = max(1, round(SAMPLE_TIME_S / dt))
         self.dt = dt
         self.sample_time = dt * self.sample_periods  # s

@@ -246,8 +246,6 @@ def _fields_by_cause() -> dict[str, list[str]]:
 
 # Fields in which an identified simulator differs from the nominal one, in the order of the steps.
 CAUSES = _fields_by_cause()
-# Cause → what else of the robot it changes.
-BESIDE_SERVOS = {"contact": "table", "hand": "payload_mounts", "links": "links"}
 
 
 def cause_steps(simulator: RobotSpec) -> list[GapStep]:
@@ -272,16 +270,16 @@ def _with_cause(
     """Return a robot that takes what a cause changes from the identified one."""
     servos: dict[str, dict[str, float]] = {}
     for row, joint in enumerate(identified.joint_names):
-        servos[joint] = {}
-        for field in fields:
-            value = float(getattr(identified, field)[row])
-            if np.isfinite(value):
-                servos[joint][field] = value
-    changed = robot.with_servos(servos)
-    if cause not in BESIDE_SERVOS:
-        return changed
-    other = BESIDE_SERVOS[cause]
-    return replace(changed, **{other: getattr(identified, other)})
+        values = identified.servo.of_joint(row, fields)
+        servos[joint] = {field: value for field, value in values.items() if np.isfinite(value)}
+    changed = robot.with_identified(servos)
+    if cause == "contact":
+        return changed.with_table(identified.scene.table)
+    if cause == "hand":
+        return replace(changed, payload_mounts=identified.payload_mounts)
+    if cause == "links":
+        return replace(changed, links=identified.links)
+    return changed
 
 
 def reductions(

@@ -165,7 +165,7 @@ def robots_of(base: RobotSpec, units: Mapping[str, Array]) -> list[RobotSpec]:
         servos = {}
         for i, joint in enumerate(base.operated):
             servos[joint] = {field: float(units[field][k, i]) for field in fields}
-        robots.append(base.with_servos(servos))
+        robots.append(base.with_identified(servos))
     if "links" not in units:
         return robots
     axes = LinkAxes(base.before_identification)
@@ -180,7 +180,7 @@ def _moved(robot: RobotSpec, base: RobotSpec, drawn: Units) -> Units:
     """
     fields = [field for field in drawn if field not in ("effort_limit", "links")]
     if base is not robot:
-        lacking = [term for term in SERVO_TERMS if not getattr(base, term).any()]
+        lacking = [term for term in SERVO_TERMS if not base.servo[term].any()]
         fields = [field for field in fields if field not in lacking]
     own = _on_axes(robot, fields)
     axes = np.stack([_on_axes(unit, fields) for unit in robots_of(robot, drawn)])
@@ -189,7 +189,7 @@ def _moved(robot: RobotSpec, base: RobotSpec, drawn: Units) -> Units:
     signed = [SERVO_FIELDS[field].axis == "log" or SERVO_FIELDS[field].signed for field in fields]
     units: Units = dict(from_axes(fields, np.where(signed, x, np.maximum(x, 0.0))))
     op = robot.operated_index
-    units["effort_limit"] = base.effort_limit[op] * units["kp"] / base.kp[op]
+    units["effort_limit"] = base.servo.effort_limit[op] * units["kp"] / base.servo.kp[op]
     if "links" in drawn:
         links = ParameterUncertainty.require(robot).links
         assert links is not None
@@ -218,7 +218,7 @@ def _by_hand(base: RobotSpec, rng: np.random.Generator) -> list[RobotSpec]:
     """Return robots with a few fields drawn within ± BY_HAND of their values."""
     units = {}
     for field in BY_HAND_FIELDS:
-        values = getattr(base, field)[base.operated_index]
+        values = base.servo[field][base.operated_index]
         units[field] = values * rng.uniform(1 - BY_HAND, 1 + BY_HAND, (JUDGED, len(values)))
     return robots_of(base, units)
 

@@ -40,6 +40,7 @@ from gaponet.export.simulator_facts import control_period, mjcf_text, simulator_
 from gaponet.export.targets import NEWTON_CHECK, TARGETS, own_terms
 from gaponet.export.urdf_edit import MISSING_FIELDS, edit_urdf, with_urdf_fields
 from gaponet.nn.artifact import GapModel
+from gaponet.robot.servo_fields import STOP_FIELDS
 from gaponet.robot.spec import RobotSpec
 
 FOLDER_KIND = "engine"
@@ -119,7 +120,7 @@ class _RobotExport:
         """Write an edited copy of an MJCF, and measure it in plain MuJoCo."""
         file, not_rad = edit_mjcf(source, self.out, self.plain, self.facts, self.payload_mass)
         forms = {"plain": "alone"}
-        if self.robot.has_servo_model:
+        if self.robot.servo.has_terms:
             forms = {"joints": "with mujoco_servos.py", **forms}
         for form, what in forms.items():
             error = _error_in_mujoco(file, self.facts, self.validation, self.robot, form)
@@ -234,7 +235,7 @@ def _motions(
     Without recordings, both are simulated motions of the robot itself.
     """
     if recordings is None:
-        count = 24 if robot.has_servo_model else 2
+        count = 24 if robot.servo.has_terms else 2
         motions = own_motions(robot, payload_mass, count)
         recordings = motions[::2], motions[1::2] or motions
     train, played = recordings
@@ -259,13 +260,13 @@ def _measured_export(
     checked = check_motions(validation, robot, ramped=not has_ramps)
     if to == "envhub":
         facts["lerobot_units"] = envhub.lerobot_units(robot)
-    played_there = plain if TARGETS[to].has_table else replace(plain, table=None)
+    played_there = plain if TARGETS[to].has_table else plain.with_table(None)
     facts["error_mrad"] = {
         "joints": 1e3 * check_error(checked, robot),
         "plain": 1e3 * check_error(checked, played_there),
     }
     errors = {"in gaponet": rollout_error(validation, robot)}
-    if robot.has_servo_model:
+    if robot.servo.has_terms:
         errors["in gaponet, without the servo model"] = rollout_error(validation, plain)
     notes = _notes(robot, facts, to)
     return _RobotExport(robot, plain, to, out, validation, checked, facts, errors, notes)
@@ -277,9 +278,9 @@ def _notes(robot: RobotSpec, facts: dict[str, Any], to: str) -> list[str]:
     servos = facts["plain"].values()
     if TARGETS[to].edits_mjcf:
         notes += _stop_notes(robot)
-    if robot.target_speed.any():
+    if robot.servo.target_speed.any():
         notes.append(_ramp_note(robot, to))
-    if robot.friction_per_kelvin.any():
+    if robot.servo.friction_per_kelvin.any():
         notes.append(_temperature_note(robot))
     is_late = any(servo["delay"] for servo in servos)
     if is_late and TARGETS[to].delay_note:
@@ -288,7 +289,7 @@ def _notes(robot: RobotSpec, facts: dict[str, Any], to: str) -> list[str]:
         notes.append(_urdf_note(facts))
     if not TARGETS[to].has_servo_model:
         notes += _law_notes(facts["law"], to)
-    if to == "mjlab" and robot.backlash.any():
+    if to == "mjlab" and robot.servo.backlash.any():
         notes.append("mjlab simulates no backlash: use the form for MuJoCo, or identify without it")
     return notes
 
@@ -296,8 +297,9 @@ def _notes(robot: RobotSpec, facts: dict[str, Any], to: str) -> list[str]:
 def _stop_notes(robot: RobotSpec) -> list[str]:
     """Return a question for each joint with stops, which the MJCF of the user does not get."""
     notes = []
-    for name, low, high in zip(robot.joint_names, robot.stop_low, robot.stop_high, strict=True):
-        stops = " and ".join(f"{stop:.2f}" for stop in (low, high) if np.isfinite(stop))
+    for i, name in enumerate(robot.joint_names):
+        both = robot.servo.of_joint(i, STOP_FIELDS).values()
+        stops = " and ".join(f"{stop:.2f}" for stop in both if np.isfinite(stop))
         if stops:
             notes.append(
                 f"{name} met something at {stops} rad in the recordings; the file keeps its range: "
@@ -308,7 +310,7 @@ def _stop_notes(robot: RobotSpec) -> list[str]:
 
 def _temperature_note(robot: RobotSpec) -> str:
     """Return at which temperatures friction and damping are those of the export."""
-    warm = ", ".join(f"{t:.0f}" for t in robot.friction_temperature[robot.operated_index])
+    warm = ", ".join(f"{t:.0f}" for t in robot.servo.friction_temperature[robot.operated_index])
     return f"friction and damping are those at {warm} °C: no engine has a temperature"
 
 
@@ -323,7 +325,7 @@ def _law_notes(law: ListOf[str], to: str) -> list[str]:
 
 def _ramp_note(robot: RobotSpec, to: str) -> str:
     """Return where the servos' own limits of the speed of targets are."""
-    named = zip(robot.joint_names, robot.target_speed, strict=True)
+    named = zip(robot.joint_names, robot.servo.target_speed, strict=True)
     ramps = ", ".join(f"{name} {speed:.3g}" for name, speed in named if speed)
     if TARGETS[to].edits_mjcf and MUJOCO_HAS_RAMPS:
         return (

@@ -7,7 +7,7 @@ and a delay in whole physics steps, or a DC motor without a delay.
 from __future__ import annotations
 
 from collections.abc import Sequence as ListOf
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -112,12 +112,14 @@ def native_form(
         step: Physics step, s.
         motions: Validation motions, on which the errors are measured.
     """
-    steps = np.rint(plain.delay / step).astype(int)
-    rounded = replace(plain, delay=steps * step)
+    delay = plain.servo.delay
+    steps = np.rint(delay / step).astype(int)
+    rounded = plain.with_servo(delay=steps * step)
     # A DCMotorCfg has no delay, and a DelayedPDActuatorCfg no torque-speed line.
-    one_class = replace(rounded, no_load_speed=np.where(steps > 0, 0.0, plain.no_load_speed))
-    without_table = replace(one_class, table=None)
-    native = replace(without_table, target_speed=np.array(0.0))
+    no_load_speed = np.where(steps > 0, 0.0, plain.servo.no_load_speed)
+    one_class = rounded.with_servo(no_load_speed=no_load_speed)
+    without_table = one_class.with_table(None)
+    native = without_table.with_servo(target_speed=0.0)
 
     losses = {"as identified": rollout_error(motions, robot)}
 
@@ -125,12 +127,13 @@ def native_form(
         if is_less:
             losses[what] = rollout_error(motions, form)
 
-    lose("without the servo model, fitted again", plain, robot.has_servo_model)
-    lose("with delays in whole physics steps", rounded, not np.allclose(plain.delay, rounded.delay))
-    has_line = bool((plain.no_load_speed > 0).any())
+    lose("without the servo model, fitted again", plain, robot.servo.has_terms)
+    is_rounded = not np.allclose(delay, rounded.servo.delay)
+    lose("with delays in whole physics steps", rounded, is_rounded)
+    has_line = bool((plain.servo.no_load_speed > 0).any())
     lose("without torque-speed lines of late servos", one_class, has_line)
-    lose("without the table", without_table, robot.table is not None)
-    lose("without the limits of the speed of targets", native, bool(robot.target_speed.any()))
+    lose("without the table", without_table, robot.scene.table is not None)
+    lose("without the limits of the speed of targets", native, bool(robot.servo.target_speed.any()))
     return NativeForm(native, steps.tolist(), losses)
 
 

@@ -391,11 +391,11 @@ def _add_surroundings(
     option = {}
     if model.opt.tolerance > TOLERANCE:
         option["tolerance"] = text_of(TOLERANCE)
-    if robot.table is not None and _may_touch_table(model):
+    if robot.scene.table is not None and _may_touch_table(model):
         option["cone"] = "elliptic"  # a pyramid's stiffness depends on friction
         if not _has_contacts(model):  # the pairs with the table are then the only ones
             source.append("option", '    <flag contact="enable"/>\n')
-        _add_table(source, robot, robot.table.height, prefix)
+        _add_table(source, robot, robot.scene.table.height, prefix)
     for name, link in robot.links.items():
         tag = _body(source, prefix + name, "identified_link")
         _write_inertia(source, tag, link)
@@ -436,7 +436,7 @@ def _add_table(source: Source, robot: RobotSpec, height: float, prefix: str) -> 
         f'pos="0 0 {text_of(height)}" rgba="0.55 0.5 0.45 1"/>'
     )
     source.append("worldbody", f"    {plane}\n")
-    for i, tip in enumerate(robot.tips):
+    for i, tip in enumerate(robot.scene.tips):
         name = f"{table}_tip_{i}"
         sphere = (
             f'<geom name="{name}" type="sphere" size="{text_of(tip.radius)}" '

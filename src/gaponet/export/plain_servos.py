@@ -106,14 +106,14 @@ def fit_plain_servos(
         return robot
     if _ships_plain_servos(robot, engine_terms):
         stored = read_json(_Stored, robot.folder / CACHE, RobotError)
-        return start.with_servos(validated(PlainServos, stored["content"], CACHE, RobotError))
+        return start.with_identified(validated(PlainServos, stored["content"], CACHE, RobotError))
 
     def fit() -> PlainServos:
         options = IdentifyOptions(terms=(), table=False)
         return _servos(identify(recordings, start, options=options, progress=progress).robot)
 
     servos = stored_result(robot.folder / CACHE, PlainServos, fit, start, recordings)
-    return start.with_servos(servos)
+    return start.with_identified(servos)
 
 
 def keep_plain_servos(folder: Path, fitted: RobotSpec, recordings: ListOf[Sequence]) -> None:
@@ -134,17 +134,16 @@ def _without_terms(robot: RobotSpec, engine_terms: tuple[str, ...] = ()) -> Robo
     `robot` itself if it has none.
     """
     names = [name for name in SERVO_TERMS if name not in engine_terms]
-    if not any(getattr(robot, name).any() for name in names):
+    if not robot.servo.has(names):
         return robot
-    without: dict[str, Any] = {name: np.array(0.0) for name in names}
-    return replace(robot, **without)
+    return robot.with_servo(**dict.fromkeys(names, 0.0))
 
 
 def _servos(robot: RobotSpec) -> PlainServos:
     """Return the parameters of all servos that have a value."""
     servos: PlainServos = {}
     for i, joint in enumerate(robot.joint_names):
-        values = {name: float(getattr(robot, name)[i]) for name in SERVO_FIELDS}
+        values = robot.servo.of_joint(i)
         servos[joint] = {name: value for name, value in values.items() if np.isfinite(value)}
     return servos
 
@@ -159,7 +158,7 @@ def _key(robot: RobotSpec, recordings: ListOf[Sequence], *other: Array) -> str:
     )
     for one in (robot, robot.before_identification):
         for name in SERVO_FIELDS:
-            key.update(getattr(one, name).tobytes())
+            key.update(one.servo[name].tobytes())
     for digest in sorted(_recording_digest(recording) for recording in recordings):
         key.update(digest)
     for values in other:
@@ -179,7 +178,7 @@ def _recording_digest(sequence: Sequence) -> bytes:
 def _ships_plain_servos(robot: RobotSpec, engine_terms: tuple[str, ...]) -> bool:
     """Return True for a robot of the package, beside which its nearest plain servos lie."""
     packaged = identified_catalogue().holds(robot.folder) and (robot.folder / CACHE).is_file()
-    return packaged and not any(getattr(robot, name).any() for name in engine_terms)
+    return packaged and not robot.servo.has(engine_terms)
 
 
 def stored_result(
@@ -278,8 +277,8 @@ def check_motions(
     """
     first = {recording.meta.motion: recording for recording in reversed(recordings)}
     low, high = robot.qpos_range.T
-    limited = ramped & (robot.target_speed > 0)
-    speed = np.where(limited, robot.target_speed, np.inf)
+    limited = ramped & (robot.servo.target_speed > 0)
+    speed = np.where(limited, robot.servo.target_speed, np.inf)
     motions = []
     for recording in list(first.values())[:MAX_CHECK_MOTIONS]:
         cut = recording.rows(slice(0, round(MAX_CHECK_MOTION_S / recording.dt)))

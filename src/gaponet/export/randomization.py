@@ -105,7 +105,7 @@ def sample_units(
     fields = uncertainty.fields
     units = from_axes(fields, _bounded(fields, centers + errors, mean))
     kp_errors = errors[:, :, fields.index("kp")]
-    units["effort_limit"] = spec.effort_limit[spec.operated_index] * np.exp(kp_errors)
+    units["effort_limit"] = spec.servo.effort_limit[spec.operated_index] * np.exp(kp_errors)
     if drawn_links is not None:
         units["links"] = drawn_links
     return Randomization(
@@ -228,7 +228,7 @@ def judge_units(
         return _not_judged(made, "no recording with the robot's own gains")
     judged = draw_robots(robot, made.units, (train, validation), progress=progress)
     plain = judged
-    if robot.has_servo_model:
+    if robot.servo.has_terms:
         plain = draw_robots(robot, made.units, (train, validation), True, progress, engine_terms)
     units = {field: np.array(rows) for field, rows in judged.units.items()}
     values = {}

@@ -121,7 +121,7 @@ def _joint_problems(robot: RobotSpec, spec: mujoco.MjSpec, prefix: str) -> list[
         if spec.joint(full).type != mujoco.mjtJoint.mjJNT_HINGE:
             problems.append(f"joint '{full}' is no hinge")
         problems += _actuator_problems(spec, full)
-    if robot.target_speed.any() and not hasattr(mujoco.MjsActuator, "set_to_pid"):
+    if robot.servo.target_speed.any() and not hasattr(mujoco.MjsActuator, "set_to_pid"):
         problems.append(
             f"MuJoCo {mujoco.__version__} cannot limit the speed of targets; install a newer one"
         )
@@ -256,16 +256,17 @@ def _servo_of(spec: mujoco.MjSpec, joint: str) -> mujoco.MjsActuator:
 
 def _write_joint(spec: mujoco.MjSpec, joint: mujoco.MjsJoint, robot: RobotSpec, i: int) -> None:
     """Write armature, damping, friction and zero of joint i; NaN leaves what the scene has."""
-    if np.isfinite(robot.armature[i]):
-        joint.armature = robot.armature[i]
-    if np.isfinite(robot.frictionloss[i]):
-        joint.frictionloss = robot.frictionloss[i]
-    if np.isfinite(robot.damping[i]):
+    servo = robot.servo
+    if np.isfinite(servo.armature[i]):
+        joint.armature = servo.armature[i]
+    if np.isfinite(servo.frictionloss[i]):
+        joint.frictionloss = servo.frictionloss[i]
+    if np.isfinite(servo.damping[i]):
         higher_orders = np.zeros(np.size(joint.damping) - 1)
-        joint.damping = np.concatenate([[robot.damping[i]], higher_orders])
+        joint.damping = np.concatenate([[servo.damping[i]], higher_orders])
     # A joint that was attached from another file keeps the unit of that file.
     in_degrees = getattr(joint, "compiler", spec.compiler).degree
-    joint.ref -= math.degrees(robot.zero[i]) if in_degrees else robot.zero[i]
+    joint.ref -= math.degrees(servo.zero[i]) if in_degrees else servo.zero[i]
     joint.solref_friction = STIFF_SOLREF
     joint.solimp_friction = STIFF_SOLIMP
 
@@ -274,24 +275,25 @@ def _write_servo(
     spec: mujoco.MjSpec, actuator: mujoco.MjsActuator, robot: RobotSpec, i: int
 ) -> None:
     """Write gains, limits, offset, delay and speed of targets of joint i."""
-    kp = robot.kp[i]
-    limit = robot.effort_limit[i]
-    if robot.target_speed[i] > 0:
-        speed = robot.target_speed[i]
-        actuator.set_to_pid(kp=kp, kv=robot.kd[i], slewmax=speed, ctrlspec=POSITION_INPUT)
+    servo = robot.servo
+    kp = servo.kp[i]
+    limit = servo.effort_limit[i]
+    if servo.target_speed[i] > 0:
+        speed = servo.target_speed[i]
+        actuator.set_to_pid(kp=kp, kv=servo.kd[i], slewmax=speed, ctrlspec=POSITION_INPUT)
     else:
-        actuator.set_to_position(kp=kp, kv=robot.kd[i])
-    actuator.biasprm[0] = kp * robot.offset[i]
+        actuator.set_to_position(kp=kp, kv=servo.kd[i])
+    actuator.biasprm[0] = kp * servo.offset[i]
     actuator.forcelimited = True
     actuator.forcerange = (-limit, limit)
     low, high = robot.qpos_range[i]
     if np.isfinite([low, high]).all():
         actuator.ctrllimited = True
         actuator.ctrlrange = (low, high)
-    actuator.delay = robot.delay[i]
+    actuator.delay = servo.delay[i]
     actuator.nsample = 0
-    if robot.delay[i] > 0:
-        steps = math.ceil(robot.delay[i] / spec.option.timestep - 1e-9)
+    if servo.delay[i] > 0:
+        steps = math.ceil(servo.delay[i] / spec.option.timestep - 1e-9)
         actuator.nsample = steps + DELAY_SAMPLES
         actuator.interp = 1
 
@@ -305,15 +307,14 @@ def _notes(robot: RobotSpec, spec: mujoco.MjSpec, own: mujoco.MjModel) -> tuple[
     if spec.option.timestep > own.opt.timestep * (1 + 1e-6):
         step = 1e3 * own.opt.timestep
         notes.append(f"the robot was identified with a physics step of {step:g} ms, not longer")
-    if robot.table is not None:
-        notes.append(
-            f"the identified table (height {robot.table.height:.3f} m) was not added to the scene"
-        )
-    stopped = np.isfinite(robot.stop_low) | np.isfinite(robot.stop_high)
+    if robot.scene.table is not None:
+        height = robot.scene.table.height
+        notes.append(f"the identified table (height {height:.3f} m) was not added to the scene")
+    stopped = np.isfinite(robot.servo.stop_low) | np.isfinite(robot.servo.stop_high)
     if stopped.any():
-        names = ", ".join(np.array(robot.joint_names)[np.broadcast_to(stopped, len(robot.kp))])
+        names = ", ".join(np.array(robot.joint_names)[stopped])
         notes.append(f"identified stops of {names} limit targets, not the ranges of joints")
-    if robot.target_speed.any():
+    if robot.servo.target_speed.any():
         notes.append(
             "the speed of targets is limited in each physics step, in gaponet in each control "
             "period: targets differ by up to the way of one period"

@@ -63,8 +63,8 @@ def simulator_facts(
     without_model: dict[str, Any] = {}
     for i, name in enumerate(robot.joint_names):
         joints[name] = servo_facts(robot, model, i) | {"mujoco": joint_fields(model, name)}
-        if robot.has_servo_model:
-            joints[name] |= {term: float(getattr(robot, term)[i]) for term in SERVO_TERMS}
+        if robot.servo.has_terms:
+            joints[name] |= robot.servo.of_joint(i, SERVO_TERMS)
         without_model[name] = servo_facts(plain or robot, plain_model, i)
     return {
         "format": 2,
@@ -79,7 +79,7 @@ def simulator_facts(
         "corrected": list(robot.operated),
         "options": solver_options(model),
         "dof_invweight0_factor": STIFF_MOBILITY,
-        "law": [term for term in SERVO_TERMS if getattr(robot, term).any()],
+        "law": [term for term in SERVO_TERMS if robot.servo[term].any()],
         "joints": joints,
         "plain": without_model,
     }
@@ -92,19 +92,19 @@ def servo_facts(robot: RobotSpec, model: mujoco.MjModel, i: int) -> dict[str, An
     servo = {
         "home": float(robot.qpos_home[i]),
         "range": model.jnt_range[joint.id].tolist() if model.jnt_limited[joint.id] else None,
-        "kp": float(robot.kp[i]),
-        "kd": float(robot.kd[i]),
-        "effort_limit": float(robot.effort_limit[i]),
+        "kp": float(robot.servo.kp[i]),
+        "kd": float(robot.servo.kd[i]),
+        "effort_limit": float(robot.servo.effort_limit[i]),
         "armature": float(model.dof_armature[dof]),
         "damping": float(np.ravel(model.dof_damping[dof])[0]),
         "frictionloss": float(model.dof_frictionloss[dof]),
-        "delay": float(robot.delay[i]),
-        "offset": float(robot.offset[i]),
-        "zero": float(robot.zero[i]),
-        "target_speed": float(robot.target_speed[i]),
+        "delay": float(robot.servo.delay[i]),
+        "offset": float(robot.servo.offset[i]),
+        "zero": float(robot.servo.zero[i]),
+        "target_speed": float(robot.servo.target_speed[i]),
     }
-    if robot.no_load_speed[i]:
-        servo["no_load_speed"] = float(robot.no_load_speed[i])
+    if robot.servo.no_load_speed[i]:
+        servo["no_load_speed"] = float(robot.servo.no_load_speed[i])
     return servo
 
 

@@ -16,6 +16,7 @@ import numpy as np
 from gaponet.base.errors import RobotError
 from gaponet.base.files import lock_folder, write_text
 from gaponet.export.mjcf_edit import Source, text_of
+from gaponet.robot.servo_fields import STOP_FIELDS
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.model import build_model
 
@@ -111,5 +112,5 @@ def with_urdf_fields(plain: RobotSpec) -> RobotSpec:
     Gains, armature, delays, offsets and stops are the nominal ones.
     """
     nominal = plain.before_identification
-    missing = {f: getattr(nominal, f) for f in (*MISSING_FIELDS, "stop_low", "stop_high")}
-    return replace(plain, **missing, nominal=nominal)
+    missing = {name: nominal.servo[name] for name in (*MISSING_FIELDS, *STOP_FIELDS)}
+    return replace(plain.with_servo(**missing), nominal=nominal)

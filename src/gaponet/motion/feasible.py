@@ -75,7 +75,7 @@ class Feasibility:
         self.models: list[mujoco.MjModel] = []
         for payload in sorted({0.0, self.max_payload}):
             self.models.append(build_model(robot, payload, dt=GRID))
-        self.limit = TORQUE_SHARE * robot.effort_limit
+        self.limit = TORQUE_SHARE * robot.servo.effort_limit
         self.collision = Collision(robot, self.models[0], height, unchecked)
 
     def reach(self) -> tuple[Array, Array]:

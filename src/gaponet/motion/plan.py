@@ -125,7 +125,7 @@ def sheet(
     gains = []
     for i, joint in enumerate(robot.joint_names):
         if joint in robot.operated:
-            gains.append(f"{short(joint)} {robot.kp[i]:g}/{robot.kd[i]:g}")
+            gains.append(f"{short(joint)} {robot.servo.kp[i]:g}/{robot.servo.kd[i]:g}")
     masses = ", ".join(f"{mass:g}" for mass in plan.payloads)
     size = (
         f"On virtual H1-2 robots {MIN_TRAINING_MINUTES:g} minutes left a third of the simulator's "

@@ -56,7 +56,7 @@ class Adaptation:
         servos = {}
         for joint, servo in self.servos.items():
             servos[joint] = {str(field): value for field, value in servo.items()}
-        return simulator.with_servos(servos)
+        return simulator.with_identified(servos)
 
     def save(self, run: Path) -> Path:
         """Write RUN/adaptation/UNIT.json and return its path.
@@ -97,7 +97,7 @@ class Adaptation:
         servos = {}
         for joint in simulator.operated:
             j = simulator.joint_names.index(joint)
-            servos[joint] = {field: float(getattr(fitted.robot, field)[j]) for field in FIELDS}
+            servos[joint] = {field: float(fitted.robot.servo[field][j]) for field in FIELDS}
         logs = tuple(s.content_hash() for s in sequences)
         weights = model.weights_hash()
         return Adaptation(units[0], weights, servos, logs, seconds, fitted.before, fitted.after)

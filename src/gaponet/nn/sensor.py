@@ -7,8 +7,6 @@ answers.
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from gaponet.base.arrays import Array
@@ -39,7 +37,7 @@ class ProbeOracle:
         self.dt = np.array([c[2] for c in conditions])
         self.absolute = config.sensor_target == "absolute"
         # A delayed servo would not respond within the control period.
-        no_delay = replace(robot, delay=np.zeros(len(robot.joint_names)))
+        no_delay = robot.with_servo(delay=np.zeros(len(robot.joint_names)))
         copies = []  # a simulation for each probe of each state
         for condition in conditions:
             copies += [condition] * len(self.offsets)

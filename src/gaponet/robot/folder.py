@@ -20,7 +20,7 @@ from gaponet.base.errors import RobotError, UsageError
 from gaponet.base.files import lock_folder, write_json, write_text
 from gaponet.base.structure import Name, read_json
 from gaponet.robot.by_name import FILE_REFERENCES
-from gaponet.robot.servo_fields import SERVO_FIELDS, SERVO_TERMS, TERMS
+from gaponet.robot.servo_fields import SERVO_TERMS, TERMS
 from gaponet.robot.spec import PACKAGE_FOLDER, RobotSpec, load_robot, packaged_robots
 
 STORED_ROBOT = "robot"  # subfolder of a run or a dataset
@@ -95,7 +95,7 @@ def save_robot(robot: RobotSpec, folder: Path) -> None:
     An MJCF that includes or names files is written without them (gaponet.robot.self_contained).
 
     Args:
-        robot: Result of load_robot, or derived from one by with_servos.
+        robot: Result of load_robot, or derived from one by with_identified.
         folder: Destination; a folder that gaponet has not made is refused.
 
     Raises:
@@ -117,7 +117,7 @@ def save_robot(robot: RobotSpec, folder: Path) -> None:
             write_text(folder / name, file.read_text(encoding="utf-8"))
         write_text(folder / "robot.toml", text)
     written = load_robot(folder).before_identification
-    if not np.allclose(written.kd, robot.before_identification.kd, rtol=1e-4):
+    if not np.allclose(written.servo.kd, robot.before_identification.servo.kd, rtol=1e-4):
         raise RobotError(
             f"{robot.folder}/robot.toml: write each joint as a [[joint]] table of its own"
         )
@@ -129,8 +129,10 @@ def _nominal_text(robot: RobotSpec) -> str:
     text = re.sub(r"(?m)^mjcf\s*=.*\n", "", text)
     text = IDENTIFIED_TABLES.sub("", text).rstrip() + "\n"
     text = _with_gains(text, robot.before_identification)
-    for name, default in (("carries_payload", True), ("gain_scale", 1.0)):
-        value = getattr(robot, name)
+    for name, value, default in (
+        ("carries_payload", robot.scene.carries_payload, True),
+        ("gain_scale", robot.servo.gain_scale, 1.0),
+    ):
         text = re.sub(rf"(?m)^{name}\s*=.*\n", "", text)
         if value != default:
             text = f"{name} = {str(value).lower()}\n{text}"
@@ -142,9 +144,9 @@ def _identified_text(robot: RobotSpec) -> str:
     if robot.nominal is None:
         return ""
     parts = [f"\n{IDENTIFIED_HEADING}\n", *(_servo(robot, joint) for joint in robot.operated)]
-    if robot.table is not None and robot.table != robot.nominal.table:
+    if robot.scene.table is not None and robot.scene.table != robot.nominal.scene.table:
         parts.append("[identified_table]\n")
-        parts += [f"{name} = {value!r}\n" for name, value in vars(robot.table).items()]
+        parts += [f"{name} = {value!r}\n" for name, value in vars(robot.scene.table).items()]
     if robot.payload_mounts != robot.nominal.payload_mounts:
         for mount in robot.payload_mounts:
             heading = f"[identified_mount.{_key(mount.side)}]"
@@ -201,11 +203,11 @@ def _with_gains(text: str, robot: RobotSpec) -> str:
     """Return the text of a robot.toml with kp and kd of this robot in its [[joint]] tables where
     they differ.
     """
-    scale = np.where(np.isin(robot.joint_names, robot.operated), robot.gain_scale, 1.0)
+    scale = np.where(np.isin(robot.joint_names, robot.operated), robot.servo.gain_scale, 1.0)
     tables = re.split(r"(?m)^(?=\[)", text)
     joints = [i for i, table in enumerate(tables) if table.startswith("[[joint]]")]
     for n, (i, table) in enumerate(zip(joints, tomllib.loads(text)["joint"], strict=False)):
-        for name, values in (("kp", robot.kp), ("kd", robot.kd)):
+        for name, values in (("kp", robot.servo.kp), ("kd", robot.servo.kd)):
             value = float(values[n] / scale[n])
             if not np.isclose(value, table.get(name, 0.0), rtol=1e-6):
                 rest = re.sub(rf"(?m)^{name}\s*=.*\n", "", tables[i])
@@ -217,8 +219,7 @@ def _servo(robot: RobotSpec, joint: str) -> str:
     i = robot.joint_names.index(joint)
     optional = (*SERVO_TERMS, *TERMS["temperature"], "target_speed")  # 0 if absent
     lines = []
-    for name in SERVO_FIELDS:
-        value = float(getattr(robot, name)[i])
+    for name, value in robot.servo.of_joint(i).items():
         is_absent = value == 0 and name in optional
         if np.isfinite(value) and not is_absent:
             lines.append(f"{name} = {value!r}\n")

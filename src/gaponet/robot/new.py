@@ -20,9 +20,10 @@ from gaponet.base.errors import RobotError, UsageError
 from gaponet.base.files import whole_folder, write_text
 from gaponet.robot.drives import ON_JOINT, Drive, drives
 from gaponet.robot.freeze import freeze
+from gaponet.robot.log_joints import Follower
 from gaponet.robot.mjcf import compile_spec
 from gaponet.robot.self_contained import self_contained_text
-from gaponet.robot.spec import Follower, RobotSpec, load_robot
+from gaponet.robot.spec import RobotSpec, load_robot
 from gaponet.robot.toml_file import RobotOptions
 from gaponet.robot.vendor import read_vendor
 

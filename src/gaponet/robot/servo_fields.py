@@ -41,7 +41,7 @@ class ServoField:
     """One parameter of a servo.
 
     Attributes:
-        name: Attribute of RobotSpec, and key of [identified.JOINT] in robot.toml.
+        name: Attribute of ServoParameters, and key of [identified.JOINT] in robot.toml.
         unit: SI unit.
         heading, factor: Heading of a column, which ends in the column's unit, and factor from SI to
             that unit.

@@ -10,22 +10,22 @@ from __future__ import annotations
 
 import atexit
 import dataclasses
-import difflib
 import functools
-import re
 import shutil
 import tempfile
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from gaponet.base.arrays import Array
 from gaponet.base.errors import JointMismatchError, RobotError
 from gaponet.base.structure import read_toml
 from gaponet.robot.by_name import hub_folder, identified_catalogue
-from gaponet.robot.servo_fields import SERVO_FIELDS, SERVO_TERMS, warmed
+from gaponet.robot.log_joints import Follower, LogJoints, nearest
+from gaponet.robot.servo_parameters import ServoParameters
 from gaponet.robot.toml_file import (
     Link,
     PayloadMount,
@@ -48,17 +48,24 @@ __all__ = [
 ]
 
 PACKAGE_FOLDER = Path(__file__).parent / "robots"
-LOG_UNITS = ("rad", "deg", "fraction", "percent", "signed_percent", "ticks", "turns")
-MAX_SUGGESTIONS = 3  # similar joint names in an error
 GAIN_TOLERANCE = 1e-3  # relative; gains that differ by less are equal
 
 
-class Follower(NamedTuple):
-    """A mimic joint: its angle is ratio · (angle of the joint that it follows) + at_zero, rad."""
+@dataclass(frozen=True)
+class Scene:
+    """What the simulated robot touches and carries.
 
-    joint: str
-    ratio: float
-    at_zero: float
+    Attributes:
+        tips, table: Tips that can touch a table, and the table; all other contacts are then off.
+        contacts: True if links collide as the MJCF states. It is off by default, because links
+            welded to the world collide permanently with their neighbours, which looks like a gap.
+        carries_payload: True if the simulated robot carries the payload of the recordings.
+    """
+
+    tips: tuple[Tip, ...] = ()
+    table: Table | None = None
+    contacts: bool = False
+    carries_payload: bool = True
 
 
 @dataclass(frozen=True)
@@ -69,48 +76,19 @@ class RobotSpec:
 
     Attributes:
         name: Folder name, e.g. "so101".
+        description: What the robot is, in a few words.
         mjcf: Path of the MJCF.
         folder: Folder of robot.toml.
         joint_names: All actuated joints, (n).
         operated: The subset that the operator corrects, in the same order.
-        kp, kd: PD gains, (n), N·m/rad and N·m·s/rad.
-        effort_limit: Torque limit, (n), N·m.
+        log_joints: How logs name and measure the joints.
+        servo: Gains, torque limits, friction, delays and all else of the servos.
         qpos_home: Rest position, (n), rad.
-        log_units: Unit of each joint in public logs, (n), one of LOG_UNITS; a fraction is 0..1 of
-            the MJCF range.
-        aliases: Other names of a joint in logs → its name here.
         payload_mounts: Places where payloads are attached.
         dt: Control period, s.
         timestep: Physics step at that control period, s; dt / timestep is an exact integer.
-        damping, armature, frictionloss: Identified values that replace the MJCF's, (n), N·m·s/rad,
-            kg·m², N·m; NaN keeps the MJCF's value.
-        delay: Time from command to servo, (n), s.
-        offset: Offset of the servo's zero, (n), rad: its goal is command + offset.
-        zero: Offset of the encoder, (n), rad: the MJCF's angle is reading + zero.
-        target_speed: Speed of the servo's own trajectory generator, (n), rad/s; 0 without one.
-        stop_low, stop_high: Joint stops that narrow the MJCF's range, (n), rad; NaN keeps the
-            MJCF's limit.
-        stribeck, stribeck_speed: Friction at rest beyond frictionloss, (n), N·m, and the speed at
-            which it has decreased to 1/e, rad/s.
-        friction_motor, friction_external: Friction per N·m of the motor's torque and of gravity's,
-            (n).
-        min_torque: Smallest torque that turns the motor, (n), N·m.
-        encoder_step: Resolution of the servo's angle, (n), rad; 0 if it has no effect.
-        no_load_speed: Speed at which the motor has no torque left, (n), rad/s at the nominal
-            supply; 0 without effect.
-        backlash: Width of the gap between motor and link, (n), rad.
-        friction_per_kelvin, damping_per_kelvin: Relative change of frictionloss, (n), 1/K, and
-            change of damping, (n), N·m·s/(rad·K); 0 without effect.
-        friction_temperature: Temperature at which frictionloss and damping hold, (n), °C.
-        servos: Servo type of each joint, (n), of robot.toml or servos.toml; None if robot.toml
-            names none.
-        tips, table: Tips that can touch a table, and the table; all other contacts are then off.
+        scene: What the simulated robot touches and carries.
         links: MJCF body → identified mass, centre of mass and inertia, which replace the MJCF's.
-        carries_payload: True if the simulated robot carries the payload of the recordings.
-        gain_scale: Factor on kp and kd of operated joints in [[joint]]; kp and kd include it.
-        contacts: True if links collide as the MJCF states. It is off by default, because links
-            welded to the world collide permanently with their neighbours, which looks like a gap.
-        followers: Mimic joints: they move with another joint, and have no motor.
         nominal: The robot before identification; None if no parameter was identified
             (sysid/identify.py).
         limits_accepted: True if the user stated that this folder's gains and ranges hold on
@@ -123,57 +101,29 @@ class RobotSpec:
     folder: Path
     joint_names: tuple[str, ...]
     operated: tuple[str, ...]
-    kp: Array
-    kd: Array
-    effort_limit: Array
+    log_joints: LogJoints
+    servo: ServoParameters
     qpos_home: Array
-    log_units: tuple[str, ...]
-    aliases: dict[str, str]
     payload_mounts: tuple[PayloadMount, ...]
     dt: float
     timestep: float
-    damping: Array = field(default_factory=lambda: np.array(np.nan))
-    armature: Array = field(default_factory=lambda: np.array(np.nan))
-    frictionloss: Array = field(default_factory=lambda: np.array(np.nan))
-    stop_low: Array = field(default_factory=lambda: np.array(np.nan))
-    stop_high: Array = field(default_factory=lambda: np.array(np.nan))
-    delay: Array = field(default_factory=lambda: np.array(0.0))
-    offset: Array = field(default_factory=lambda: np.array(0.0))
-    zero: Array = field(default_factory=lambda: np.array(0.0))
-    target_speed: Array = field(default_factory=lambda: np.array(0.0))
-    stribeck: Array = field(default_factory=lambda: np.array(0.0))
-    stribeck_speed: Array = field(default_factory=lambda: np.array(0.0))
-    friction_motor: Array = field(default_factory=lambda: np.array(0.0))
-    friction_external: Array = field(default_factory=lambda: np.array(0.0))
-    min_torque: Array = field(default_factory=lambda: np.array(0.0))
-    encoder_step: Array = field(default_factory=lambda: np.array(0.0))
-    no_load_speed: Array = field(default_factory=lambda: np.array(0.0))
-    backlash: Array = field(default_factory=lambda: np.array(0.0))
-    friction_per_kelvin: Array = field(default_factory=lambda: np.array(0.0))
-    damping_per_kelvin: Array = field(default_factory=lambda: np.array(0.0))
-    friction_temperature: Array = field(default_factory=lambda: np.array(0.0))
-    servos: tuple[ServoType | None, ...] = ()
-    tips: tuple[Tip, ...] = ()
-    table: Table | None = None
+    scene: Scene = field(default_factory=Scene)
     links: dict[str, Link] = field(default_factory=dict)
-    contacts: bool = False
-    carries_payload: bool = True
-    gain_scale: float = 1.0
-    followers: dict[str, Follower] = field(default_factory=dict)
     nominal: RobotSpec | None = None
     limits_accepted: bool = False
 
     def __post_init__(self) -> None:
         n = len(self.joint_names)
-        for name in ("kp", "kd", "effort_limit", "qpos_home"):
-            shape = np.shape(getattr(self, name))
-            if shape != (n,):
-                raise RobotError(
-                    f"{self.name}: {name} must be {n} finite numbers, got shape {shape}"
-                )
-        for name in ("qpos_home", *SERVO_FIELDS):
-            object.__setattr__(self, name, self._read_only(name))
-        object.__setattr__(self, "servos", self.servos or (None,) * n)
+        home = np.array(self.qpos_home, float)
+        if home.shape != (n,) or not np.isfinite(home).all():
+            raise RobotError(f"{self.name}: qpos_home must be {n} finite numbers, got {home}")
+        home.flags.writeable = False
+        object.__setattr__(self, "qpos_home", home)
+        if self.servo.kp.shape != (n,):
+            raise RobotError(
+                f"{self.name}: {len(self.servo.kp)} servos, but {n} joints; give a value of kp for "
+                "each joint"
+            )
         if not self.operated:
             raise RobotError(
                 f"{self.name}: no joint has operated = true; the operator needs at least one"
@@ -184,24 +134,6 @@ class RobotSpec:
                 f"{self.name}: dt / timestep = {self.dt} / {self.timestep} = {ratio:.4g} is not a "
                 "whole number; choose a timestep that divides the control period"
             )
-
-    def _read_only(self, name: str) -> Array:
-        """Return a field as a read-only array with a value for each joint, (n).
-
-        Raises:
-            RobotError: A value is infinite, or NaN or negative where it must not be.
-        """
-        n = len(self.joint_names)
-        value = np.array(np.broadcast_to(np.asarray(getattr(self, name), float), n))
-        record = SERVO_FIELDS.get(name)
-        may_be_nan = record is not None and record.from_mjcf
-        may_be_negative = record is None or record.signed
-        if np.isinf(value).any() or (np.isnan(value).any() and not may_be_nan):
-            raise RobotError(f"{self.name}: {name} must be {n} finite numbers, got {value}")
-        if not may_be_negative and (value < 0).any():
-            raise RobotError(f"{self.name}: {name} must not be negative, got {value}")
-        value.flags.writeable = False
-        return value
 
     def __getstate__(self) -> dict[str, Any]:
         """Include the files: another process may run on a machine without this folder."""
@@ -229,11 +161,6 @@ class RobotSpec:
         return max(1, round(dt / self.timestep))
 
     @property
-    def has_servo_model(self) -> bool:
-        """True if a servo has terms beyond MuJoCo's position actuator (sim/servo.py)."""
-        return any(getattr(self, name).any() for name in SERVO_TERMS)
-
-    @property
     def is_identified(self) -> bool:
         """True if at least one parameter was identified."""
         return self.nominal is not None
@@ -243,20 +170,25 @@ class RobotSpec:
         """The nominal robot: this one, or the one before identification."""
         return self.nominal or self
 
-    def with_servos(self, servos: dict[str, dict[str, float]]) -> RobotSpec:
+    def with_servo(self, **values: ArrayLike) -> RobotSpec:
+        """Return the robot with other values of its servos: field of SERVO_FIELDS → (n), or one
+        number for all joints.
+        """
+        changed: dict[str, Any] = values
+        return dataclasses.replace(self, servo=dataclasses.replace(self.servo, **changed))
+
+    def with_table(self, table: Table | None) -> RobotSpec:
+        """Return the robot above another table, or above none."""
+        return dataclasses.replace(self, scene=dataclasses.replace(self.scene, table=table))
+
+    def with_identified(self, servos: dict[str, dict[str, float]]) -> RobotSpec:
         """Return the robot with identified values: joint → any of SERVO_FIELDS.
 
         Negative damping reduces kd instead.
         """
-        changed: dict[str, Any] = {name: np.array(getattr(self, name)) for name in SERVO_FIELDS}
-        for joint, values in servos.items():
-            i = self.index([joint])[0]
-            for name, value in values.items():
-                changed[name][i] = value
-            if changed["damping"][i] < 0:
-                changed["kd"][i] = max(changed["kd"][i] + changed["damping"][i], 0.0)
-                changed["damping"][i] = 0.0
-        return dataclasses.replace(self, **changed, nominal=self.before_identification)
+        joints = {int(self.index([joint])[0]): values for joint, values in servos.items()}
+        servo = self.servo.with_joints(joints)
+        return dataclasses.replace(self, servo=servo, nominal=self.before_identification)
 
     def with_gains(self, kp: tuple[float, ...] | None, kd: tuple[float, ...] | None) -> RobotSpec:
         """Return the robot with other nominal gains, (n) N·m/rad and N·m·s/rad; None keeps the
@@ -267,17 +199,14 @@ class RobotSpec:
         if kp is None and kd is None:
             return self
         nominal = self.before_identification
-        new_kp = np.array(nominal.kp if kp is None else kp)
-        new_kd = np.array(nominal.kd if kd is None else kd)
-        if np.allclose((new_kp, new_kd), (nominal.kp, nominal.kd), rtol=GAIN_TOLERANCE, atol=0.0):
+        old = nominal.servo
+        new_kp = np.array(old.kp if kp is None else kp)
+        new_kd = np.array(old.kd if kd is None else kd)
+        if np.allclose((new_kp, new_kd), (old.kp, old.kd), rtol=GAIN_TOLERANCE, atol=0.0):
             return self
-        kp_ratio = np.divide(new_kp, nominal.kp, out=np.ones_like(nominal.kp), where=nominal.kp > 0)
-        kd_ratio = np.divide(
-            self.kd, nominal.kd, out=np.ones_like(nominal.kd), where=nominal.kd > 0
-        )
-        nominal = dataclasses.replace(nominal, kp=new_kp, kd=new_kd)
-        own = self.nominal and nominal
-        return dataclasses.replace(self, kp=self.kp * kp_ratio, kd=new_kd * kd_ratio, nominal=own)
+        servo = self.servo.with_gains(new_kp, new_kd, old)
+        own = self.nominal and nominal.with_servo(kp=new_kp, kd=new_kd)
+        return dataclasses.replace(self, servo=servo, nominal=own)
 
     def at_temperature(self, temperature: tuple[float, ...] | None) -> RobotSpec:
         """Return the robot with friction and damping at joint temperatures, (n) °C; None or NaN:
@@ -285,24 +214,15 @@ class RobotSpec:
         """
         if temperature is None:
             return self
-        warming = np.nan_to_num(np.array(temperature) - self.friction_temperature)
-        values = self.damping, self.frictionloss, self.friction_per_kelvin, self.damping_per_kelvin
-        damping, friction = warmed(warming, *values)
-        kd = np.maximum(self.kd + np.fmin(damping, 0.0), 0.0)
-        return dataclasses.replace(
-            self, frictionloss=friction, damping=np.maximum(damping, 0.0), kd=kd
-        )
+        return dataclasses.replace(self, servo=self.servo.at_temperature(np.array(temperature)))
 
     def with_gain_scale(self, scale: float) -> RobotSpec:
         """Return the same robot with the operated joints set to `scale` times the kp and kd of
         [[joint]].
         """
-        ratio = np.ones(len(self.joint_names))
-        ratio[self.operated_index] = scale / self.gain_scale
+        servo = self.servo.with_gain_scale(scale, self.operated_index)
         nominal = self.nominal and self.nominal.with_gain_scale(scale)
-        return dataclasses.replace(
-            self, kp=self.kp * ratio, kd=self.kd * ratio, gain_scale=scale, nominal=nominal
-        )
+        return dataclasses.replace(self, servo=servo, nominal=nominal)
 
     @functools.cached_property
     def qpos_range(self) -> Array:
@@ -318,12 +238,8 @@ class RobotSpec:
         except KeyError as error:
             raise RobotError(f"{self.mjcf}: lacks a joint of robot.toml: {error.args[0]}") from None
         limited = np.array([model.jnt_limited[j.id] for j in joints], bool)[:, None]
-        return self.stopped(np.where(limited, [j.range for j in joints], [-np.inf, np.inf]))
-
-    def stopped(self, ranges: Array) -> Array:
-        """Narrow joint ranges (n, 2) of the MJCF, rad, by identified stops."""
-        return np.stack(
-            [np.fmax(ranges[:, 0], self.stop_low), np.fmin(ranges[:, 1], self.stop_high)], axis=1
+        return self.servo.within_stops(
+            np.where(limited, [j.range for j in joints], [-np.inf, np.inf])
         )
 
     @property
@@ -337,54 +253,35 @@ class RobotSpec:
         """
         for name in names:
             if name not in self.joint_names:
-                raise JointMismatchError(self._unknown(name, "a request")[0])
+                raise JointMismatchError(self._unknown(name, "a request"))
         return np.array([self.joint_names.index(name) for name in names], int)
 
-    def resolve(self, name: str, where: str, extra: dict[str, str] | None = None) -> str:
+    def resolve(self, name: str, where: str, joint_map: dict[str, str] | None = None) -> str:
         """Return the robot's name of a joint in a log.
 
         Args:
-            name: Name in the log. left/waist matches left_waist or else waist; kLeftElbow and
-                left_elbow match left_elbow_joint.
+            name: Name in the log, as LogJoints.find reads it.
             where: File, for the error.
-            extra: The user's --map, which has priority.
+            joint_map: The user's --map, which has priority.
 
         Raises:
             JointMismatchError: No joint or several joints match.
         """
-        full = name.strip()
-        short = name.strip().split("/")[-1]
-        for table in (extra or {}, self.aliases):
-            mapped = table.get(full, table.get(short))
-            if mapped is not None:
-                full = mapped
-                short = mapped
-        exact = [name for name in (full.replace("/", "_"), short) if name in self.joint_names]
-        matches = exact[:1]
-        if not exact:
-            letters = _letters(short)
-            matches = [joint for joint in self.joint_names if _letters(joint) == letters]
+        asked, matches = self.log_joints.find(name, self.joint_names, joint_map or {})
         if len(matches) != 1:
-            message, nearest = self._unknown(short, where)
             raise JointMismatchError(
-                f"{message}. Map it with --map {short}={nearest}, or leave it out with "
-                f'ignore = ["{short}"] in logs.toml (--logs)'
+                f"{self._unknown(asked, where)}. Map it with --map "
+                f"{asked}={nearest(asked, self.joint_names)[0]}, or leave it out with "
+                f'ignore = ["{asked}"] in logs.toml (--logs)'
             )
         return matches[0]
 
-    def _unknown(self, name: str, where: str) -> tuple[str, str]:
-        """Return the error text for an unknown joint name, and the most similar joint."""
-        near = difflib.get_close_matches(name, self.joint_names, n=MAX_SUGGESTIONS, cutoff=0.0)
-        message = (
+    def _unknown(self, name: str, where: str) -> str:
+        """Return the error text for an unknown joint name."""
+        return (
             f"{where} names joint '{name}', which robot '{self.name}' does not have; nearest: "
-            f"{', '.join(near)}"
+            f"{', '.join(nearest(name, self.joint_names))}"
         )
-        return message, near[0]
-
-
-def _letters(joint: str) -> str:
-    """Return the letters that a joint name shares between the styles of C, ROS and Python."""
-    return re.sub(r"[^a-z0-9]|joint", "", re.sub(r"^k(?=[A-Z])", "", joint).lower())
 
 
 @functools.cache
@@ -490,7 +387,7 @@ def servo_type(name: str, where: str, own: tuple[ServoType, ...] = ()) -> ServoT
     if sum(servo.name == name for servo in own) > 1:
         raise RobotError(f"{where}: two [[servo]] have the name '{name}'")
     if name not in types:
-        near = " or ".join(difflib.get_close_matches(name, types, n=MAX_SUGGESTIONS, cutoff=0.0))
+        near = " or ".join(nearest(name, types))
         raise RobotError(
             f"{where}: servo '{name}' is no [[servo]], nor in gaponet robot servos; nearest: {near}"
         )
@@ -508,10 +405,10 @@ def _spec(table: RobotTable, mjcf: Path, folder: Path) -> RobotSpec:
     identified = robot
     servos = _identified_servos(table)
     if servos:
-        identified = robot.with_servos(servos)
+        identified = robot.with_identified(servos)
     changed: dict[str, Any] = {}
     if table.identified_table is not None:
-        changed["table"] = table.identified_table
+        changed["scene"] = dataclasses.replace(robot.scene, table=table.identified_table)
     if table.identified_mount:
         changed["payload_mounts"] = _identified_mounts(table)
     if table.identified_link:
@@ -530,6 +427,13 @@ def _nominal(table: RobotTable, mjcf: Path, folder: Path) -> RobotSpec:
         aliases.update(dict.fromkeys(joint.aliases, joint.name))
         if joint.follows:
             followers[joint.name] = Follower(joint.follows, joint.ratio, joint.at_zero)
+    servo = ServoParameters(
+        kp=np.array([joint.kp for joint in joints]),
+        kd=np.array([joint.kd for joint in joints]),
+        effort_limit=np.array([joint.effort_limit for joint in joints]),
+        types=_servo_types(table),
+    )
+    units = tuple(joint.log_unit for joint in joints)
     robot = RobotSpec(
         name=table.name,
         description=table.description or table.name,
@@ -537,26 +441,18 @@ def _nominal(table: RobotTable, mjcf: Path, folder: Path) -> RobotSpec:
         folder=folder.absolute(),  # other processes may have another current folder
         joint_names=tuple(joint.name for joint in joints),
         operated=tuple(joint.name for joint in joints if joint.operated),
-        kp=np.array([joint.kp for joint in joints]),
-        kd=np.array([joint.kd for joint in joints]),
-        effort_limit=np.array([joint.effort_limit for joint in joints]),
+        log_joints=LogJoints(units, aliases, followers),
+        servo=servo,
         qpos_home=np.array([joint.home for joint in joints]),
-        log_units=tuple(joint.log_unit for joint in joints),
-        followers=followers,
-        aliases=aliases,
         payload_mounts=table.payload_mount,
         dt=table.dt,
         timestep=table.timestep,
-        servos=_servos(table),
-        tips=table.tip,
-        table=table.table,
-        contacts=table.contacts,
-        carries_payload=table.carries_payload,
+        scene=Scene(table.tip, table.table, table.contacts, table.carries_payload),
     )
     return robot.with_gain_scale(table.gain_scale)
 
 
-def _servos(table: RobotTable) -> tuple[ServoType | None, ...]:
+def _servo_types(table: RobotTable) -> tuple[ServoType | None, ...]:
     """Return the servo type of each joint; None where robot.toml names none."""
     servos: list[ServoType | None] = []
     for joint in table.joint:

@@ -7,7 +7,6 @@ from __future__ import annotations
 import copy
 import os
 from collections.abc import Callable
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import mujoco
@@ -155,7 +154,7 @@ class Condition(NamedTuple):
         meta = sequence.meta
         gains = sequence.meta.recorded_gains
         other = (None, None) if robot.with_gains(*gains) is robot else gains
-        warm = any(robot.friction_per_kelvin) or any(robot.damping_per_kelvin)
+        warm = any(robot.servo.friction_per_kelvin) or any(robot.servo.damping_per_kelvin)
         return cls(
             meta.payload_mass,
             meta.payload_side,
@@ -199,7 +198,7 @@ class BatchSim:
         conditions = [Condition(*condition) for condition in conditions]
         robots = _under_conditions(robot, conditions)
         added_delay = _largest_added_delay(conditions)
-        self.longest_delay = float(robot.delay.max()) + added_delay  # s
+        self.longest_delay = float(robot.servo.delay.max()) + added_delay  # s
         self.models = _compiled(robots, self.joint_names, locked, added_delay)
         models = [self.models[condition] for condition in conditions]
         first = models[0]
@@ -218,7 +217,7 @@ class BatchSim:
         self.torque = bind("actuator_force")
         self._warmstart = bind("qacc_warmstart")
         self.servo_model: ServoModel | None = None
-        if robot.has_servo_model or servo_model:
+        if robot.servo.has_terms or servo_model:
             self.servo_model = ServoModel(self.batch, first)
         self._history: CommandHistory | None = None
         if first.nhistory:
@@ -229,8 +228,8 @@ class BatchSim:
         self.timestep = np.array([model.opt.timestep for model in models])
         self.range = qpos_range(first)
         self.max_change: Array | None = None  # without speed limits
-        if robot.target_speed[free].any():
-            self.max_change = self._max_change(robot.target_speed[free])
+        if robot.servo.target_speed[free].any():
+            self.max_change = self._max_change(robot.servo.target_speed[free])
 
     def array(self, values: Any) -> Array:
         """Return values as an array of this simulator: numpy here, torch in sim/warp.py."""
@@ -242,7 +241,7 @@ class BatchSim:
         """Put simulations `ids` into a state, (k, n) rad and rad/s.
 
         `past` are the targets of the control periods before, newest first, (k, depth, n) rad, for
-        servos with a delay (robot.delay). The oldest counts for all before it.
+        servos with a delay (robot.servo.delay). The oldest counts for all before it.
         """
         self.qpos[ids] = qpos
         self.qvel[ids] = qvel
@@ -326,9 +325,11 @@ class BatchSim:
         if "delay" in values and model.nhistory:
             batch.expand("actuator_delay")[:, at] = values["delay"]
         if "zero" in values:
-            batch.expand("qpos0")[:, at] = model.qpos0[at] + self.robot.zero[own] - values["zero"]
+            batch.expand("qpos0")[:, at] = (
+                model.qpos0[at] + self.robot.servo.zero[own] - values["zero"]
+            )
         if "target_speed" in values:
-            speed = self.robot.target_speed[self.robot.index(self.joint_names)]
+            speed = self.robot.servo.target_speed[self.robot.index(self.joint_names)]
             each = np.tile(speed, (self.num_envs, 1))
             each[:, at] = values["target_speed"]
             self.max_change = self._max_change(each)
@@ -347,7 +348,7 @@ class BatchSim:
         if refused:
             raise UsageError(
                 f"{', '.join(refused)} cannot differ between simulations of {self.robot.name}: "
-                "give them to the robot (with_servos) that BatchSim is made with"
+                "give them to the robot (with_identified) that BatchSim is made with"
             )
 
     def _max_change(self, speed: Array) -> Array:
@@ -398,9 +399,9 @@ def _largest_added_delay(conditions: list[Condition]) -> float:
 
 def _recorded_gains(robot: RobotSpec, robots: list[RobotSpec]) -> tuple[Array, Array]:
     """Return kp as a ratio to the robot's own, and kd, of each simulation, (num_envs, n)."""
-    own_kp = np.where(robot.kp > 0, robot.kp, 1.0)
-    ratio = np.array([one.kp / own_kp for one in robots])
-    kd = np.array([one.kd for one in robots])
+    own_kp = np.where(robot.servo.kp > 0, robot.servo.kp, 1.0)
+    ratio = np.array([one.servo.kp / own_kp for one in robots])
+    kd = np.array([one.servo.kd for one in robots])
     return ratio, kd
 
 
@@ -436,15 +437,15 @@ def _compiled(
         if own not in unchanged:
             buffered = robot
             if added_delay:
-                longest = float(robot.delay.max()) + added_delay
-                buffered = replace(robot, delay=np.full(len(robot.joint_names), longest))
+                longest = float(robot.servo.delay.max()) + added_delay
+                buffered = robot.with_servo(delay=np.full(len(robot.joint_names), longest))
             model = build_model(buffered, *condition[:3], locked, physics_only=True)
-            model.actuator_delay[:] = robot.delay[robot.index(joint_names)]
+            model.actuator_delay[:] = robot.servo.delay[robot.index(joint_names)]
             unchanged[own] = model
         models[condition] = unchanged[own]
         if condition.simulator is None:
             continue
-        if robot.has_servo_model:
+        if robot.servo.has_terms:
             raise UsageError(
                 f"{robot.name} has a servo model (friction at rest or by load, backlash, …), "
                 "which other simulators do not have: train in many simulators with the robot "

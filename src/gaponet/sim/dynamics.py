@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from functools import partial
 
 import mujoco
@@ -94,10 +93,10 @@ def tips_of(robot: RobotSpec) -> Callable[[Array], Array] | None:
     """Return the height of the lowest tip by postures (k, n), (k,) m; None if robot.toml names no
     tip.
     """
-    if not robot.tips:
+    if not robot.scene.tips:
         return None
     return partial(
-        _lowest_tip, build_model(replace(robot, table=None), physics_only=True), robot.tips
+        _lowest_tip, build_model(robot.with_table(None), physics_only=True), robot.scene.tips
     )
 
 

@@ -8,7 +8,7 @@ and Wensing 2022). They have a Gaussian prior around zero.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import mujoco
 import numpy as np
@@ -38,7 +38,7 @@ class LinkAxes:
 
     def __init__(self, robot: RobotSpec) -> None:
         self._robot = robot
-        model = build_model(replace(robot, table=None))
+        model = build_model(robot.with_table(None))
         data = mujoco.MjData(model)
         data.qpos[:] = model.qpos0
         mujoco.mj_kinematics(model, data)

@@ -124,7 +124,7 @@ def build_spec(
     for joint in spec.joints:
         joint.solref_friction = STIFF_SOLREF
         joint.solimp_friction = STIFF_SOLIMP
-    if not robot.contacts:
+    if not robot.scene.contacts:
         spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
     _set_joints(spec, robot)
     _set_links(spec, robot)
@@ -168,12 +168,12 @@ def model_hash(robot: RobotSpec) -> str:
         text = [
             f"step {robot.timestep:.7g} density {PAYLOAD_DENSITY:g} mobility {STIFF_MOBILITY:g}"
         ]
-        if not robot.carries_payload:
+        if not robot.scene.carries_payload:
             text.append("carries no payload")
-        if robot.target_speed.any():
-            text.append(f"target speed {robot.target_speed}")
-        if robot.friction_per_kelvin.any():
-            warm = [getattr(robot, name).tolist() for name in TERMS["temperature"]]
+        if robot.servo.target_speed.any():
+            text.append(f"target speed {robot.servo.target_speed}")
+        if robot.servo.friction_per_kelvin.any():
+            warm = [robot.servo[name].tolist() for name in TERMS["temperature"]]
             text.append(f"friction per kelvin {warm}")
         text += model_fingerprint(build_model(robot))
         digest = hashlib.sha256("\n".join(text).encode()).hexdigest()[:12]
@@ -221,12 +221,12 @@ def _set_joints(spec: mujoco.MjSpec, robot: RobotSpec) -> None:
     for i, name in enumerate(robot.joint_names):
         joint = spec.joint(name)
         for field in ("armature", "frictionloss"):
-            value = getattr(robot, field)[i]
+            value = robot.servo[field][i]
             if np.isfinite(value):
                 setattr(joint, field, value)
         unit = units_per_si(spec, joint)
-        joint.ref -= unit * robot.zero[i]
-        stops = unit * robot.stop_low[i], unit * robot.stop_high[i]
+        joint.ref -= unit * robot.servo.zero[i]
+        stops = unit * robot.servo.stop_low[i], unit * robot.servo.stop_high[i]
         if np.isfinite(stops).any():
             low, high = joint.range if joint.range[0] < joint.range[1] else (-np.inf, np.inf)
             # a stop only narrows the range
@@ -235,9 +235,9 @@ def _set_joints(spec: mujoco.MjSpec, robot: RobotSpec) -> None:
                 np.fmin(high, stops[1]),
             ]
             joint.limited = True
-        if np.isfinite(robot.damping[i]):
+        if np.isfinite(robot.servo.damping[i]):
             joint.damping = np.concatenate(
-                [[robot.damping[i]], np.zeros(np.size(joint.damping) - 1)]
+                [[robot.servo.damping[i]], np.zeros(np.size(joint.damping) - 1)]
             )
 
 
@@ -328,30 +328,31 @@ def _remove_fixed(spec: mujoco.MjSpec, body: mujoco.MjsBody, keep: set[str]) -> 
 
 
 def _add_actuators(spec: mujoco.MjSpec, robot: RobotSpec, locked: tuple[str, ...]) -> None:
+    servo = robot.servo
     for actuator in list(spec.actuators):
         spec.delete(actuator)
-    if robot.has_servo_model:
+    if servo.has_terms:
         spec.nuser_actuator = len(SERVO_TERMS)
     # One buffer length at all control periods, so that models of one robot share a layout; none
     # where nothing is late.
     shortest = min(0.75 * robot.timestep, spec.option.timestep)
-    samples = math.ceil(robot.delay.max() / shortest - 1e-9) + 1 if robot.delay.any() else 0
+    samples = math.ceil(servo.delay.max() / shortest - 1e-9) + 1 if servo.delay.any() else 0
     for i, name in enumerate(robot.joint_names):
         if name in locked:
             continue
-        kp = robot.kp[i]
-        limit = robot.effort_limit[i]
+        kp = servo.kp[i]
+        limit = servo.effort_limit[i]
         actuator = spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
-        actuator.set_to_position(kp=kp, kv=robot.kd[i])
-        actuator.biasprm[0] = kp * robot.offset[i]
+        actuator.set_to_position(kp=kp, kv=servo.kd[i])
+        actuator.biasprm[0] = kp * servo.offset[i]
         actuator.forcelimited = True
         actuator.forcerange = (-limit, limit)
-        if robot.has_servo_model:
-            actuator.userdata = [getattr(robot, term)[i] for term in SERVO_TERMS]
+        if servo.has_terms:
+            actuator.userdata = [servo[term][i] for term in SERVO_TERMS]
         if samples:
             actuator.nsample = samples
             actuator.interp = 1
-            actuator.delay = robot.delay[i]
+            actuator.delay = servo.delay[i]
 
 
 def _add_payload(spec: mujoco.MjSpec, robot: RobotSpec, mass: float, side: str) -> None:
@@ -371,7 +372,7 @@ def _add_payload(spec: mujoco.MjSpec, robot: RobotSpec, mass: float, side: str) 
         # An empty hand carries a massless ball: all payloads share one MjData layout, so one Batch
         # steps them together.
         carried = mount.mass
-        if robot.carries_payload and side in ("both", mount.side):
+        if robot.scene.carries_payload and side in ("both", mount.side):
             carried += mass
         radius = max((3 * carried / (4 * math.pi * PAYLOAD_DENSITY)) ** (1 / 3), 1e-3)
         parent = spec.body(mount.body)
@@ -399,7 +400,7 @@ SIZE = 2.0  # m, for looking at
 
 def _add_table(spec: mujoco.MjSpec, robot: RobotSpec) -> None:
     """Add a plane, a sphere per tip, and contacts between them alone, if the robot has a table."""
-    if robot.table is None:
+    if robot.scene.table is None:
         return
     spec.option.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC  # a pyramid's stiffness depends on friction
@@ -414,12 +415,12 @@ def _add_table(spec: mujoco.MjSpec, robot: RobotSpec) -> None:
         name=TABLE,
         type=mujoco.mjtGeom.mjGEOM_PLANE,
         size=(SIZE, SIZE, 0.1),
-        pos=(0, 0, robot.table.height),
+        pos=(0, 0, robot.scene.table.height),
         contype=2,
         conaffinity=0,
         rgba=(0.55, 0.5, 0.45, 1),
     )
-    for i, tip in enumerate(robot.tips):
+    for i, tip in enumerate(robot.scene.tips):
         body = spec.body(tip.body)
         if body is None:
             raise RobotError(f"{robot.mjcf}: a [[tip]] names body '{tip.body}', which is missing")
@@ -434,7 +435,7 @@ def _add_table(spec: mujoco.MjSpec, robot: RobotSpec) -> None:
             conaffinity=4,
             rgba=(0.3, 0.3, 0.3, 1),
         )
-        slide = robot.table.friction
+        slide = robot.scene.table.friction
         spec.add_pair(
             geomname1=name,
             geomname2=TABLE,
@@ -446,8 +447,8 @@ def _add_table(spec: mujoco.MjSpec, robot: RobotSpec) -> None:
 
 def soften_table(model: mujoco.MjModel, robot: RobotSpec) -> None:
     """Give the contacts of a compiled model the table's stiffness, critically damped."""
-    if robot.table is not None:
-        model.pair_solref[:] = _solref(model, np.array(robot.table.stiffness))
+    if robot.scene.table is not None:
+        model.pair_solref[:] = _solref(model, np.array(robot.scene.table.stiffness))
 
 
 def write_table(

@@ -59,14 +59,14 @@ def check_robot(
     Raises:
         RobotError: It does not compile.
     """
-    prompt = replace(robot, delay=np.zeros(len(robot.kp)))
+    prompt = robot.with_servo(delay=np.zeros(len(robot.joint_names)))
     models = {mass: build_model(prompt, mass) for mass in payloads}
     model = models[payloads[0]]
     if (robot.folder / "collision.toml").is_file():
         Collision(robot, model)  # raises where it is wrong
     low, high = np.clip(robot.qpos_range.T, -np.pi, np.pi)
     places = (
-        np.random.default_rng(0).uniform(low, high, (100, len(robot.kp)))
+        np.random.default_rng(0).uniform(low, high, (100, len(robot.joint_names)))
         if postures is None
         else postures
     )
@@ -92,9 +92,9 @@ def check_robot(
 def _joints(robot: RobotSpec) -> Iterator[Finding]:
     for i, name in enumerate(robot.joint_names):
         low, high = robot.qpos_range[i]
-        if name not in robot.followers and robot.kp[i] <= 0:
+        if name not in robot.log_joints.followers and robot.servo.kp[i] <= 0:
             text = (
-                f"{name}: kp is {robot.kp[i]:g}; a position-controlled joint needs kp > 0 in "
+                f"{name}: kp is {robot.servo.kp[i]:g}; a position-controlled joint needs kp > 0 in "
                 "robot.toml"
             )
             yield Finding("warning", "gains", text, (name,))
@@ -124,11 +124,11 @@ def _loads(robot: RobotSpec, models: dict[float, mujoco.MjModel]) -> Iterator[Fi
     """Find joints whose torque limit is less than the torque that holds home."""
     for mass, model in models.items():
         load = np.abs(static_torque(model, robot.qpos_home[None])[0])
-        for i in np.flatnonzero(load > robot.effort_limit):
+        for i in np.flatnonzero(load > robot.servo.effort_limit):
             carrying = f" with {mass:g} kg" if mass else ""
             text = (
                 f"{robot.joint_names[i]}: needs {load[i]:.3g} N·m to hold its home{carrying}, its "
-                f"limit is {robot.effort_limit[i]:g}: check effort_limit in robot.toml, masses "
+                f"limit is {robot.servo.effort_limit[i]:g}: check effort_limit in robot.toml, masses "
                 "and home"
             )
             yield Finding(
@@ -145,10 +145,10 @@ def _limits(robot: RobotSpec, model: mujoco.MjModel) -> Iterator[Finding]:
     for i, name in enumerate(robot.joint_names):
         j = model.joint(name).id
         most = np.abs(model.jnt_actfrcrange[j]).min() if model.jnt_actfrclimited[j] else np.inf
-        if most < 0.999 * robot.effort_limit[i]:
+        if most < 0.999 * robot.servo.effort_limit[i]:
             text = (
                 f"{name}: actuatorfrcrange in robot.xml stops the motor at {most:g} N·m, before "
-                f"effort_limit = {robot.effort_limit[i]:g} in robot.toml does: delete one, or "
+                f"effort_limit = {robot.servo.effort_limit[i]:g} in robot.toml does: delete one, or "
                 "write the right figure at both"
             )
             yield Finding("warning", "limits", text, (name,), {"actuatorfrcrange": most})
@@ -192,8 +192,10 @@ def _couplings(robot: RobotSpec, model: mujoco.MjModel) -> Iterator[Finding]:
             "finds it"
         )
         yield Finding("note", "inertia", text, tuple(light))
-    led = np.isin(names, list(robot.followers))
-    free = names[(model.dof_damping + robot.kd < 1e-9) & (model.dof_frictionloss < 1e-9) & ~led]
+    led = np.isin(names, list(robot.log_joints.followers))
+    free = names[
+        (model.dof_damping + robot.servo.kd < 1e-9) & (model.dof_frictionloss < 1e-9) & ~led
+    ]
     if len(free):
         text = (
             f"no damping, kd or friction at {abbreviate(free.tolist())}: it swings for ever; "
@@ -204,7 +206,8 @@ def _couplings(robot: RobotSpec, model: mujoco.MjModel) -> Iterator[Finding]:
 
 def _contacts(robot: RobotSpec, postures: Array, logged: bool) -> Iterator[Finding]:
     """Find links that lie inside each other."""
-    model = build_model(replace(robot, contacts=True, table=None))
+    scene = replace(robot.scene, contacts=True, table=None)
+    model = build_model(replace(robot, scene=scene))
     if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONTACT:
         yield Finding(
             "ok", "contacts", "robot.xml has contacts off: nothing touches but tips a table"
@@ -219,7 +222,7 @@ def _contacts(robot: RobotSpec, postures: Array, logged: bool) -> Iterator[Findi
     if always:
         yield _lasting_contact(robot, sorted(always))
     share = float(np.mean([bool(pairs - always) for pairs in seen])) if seen else 0.0
-    if share and (logged or robot.contacts):
+    if share and (logged or robot.scene.contacts):
         often = sorted(set().union(*seen) - always)
         yield _passing_contact(robot, often, share, logged=logged)
     if not always and not share:
@@ -246,7 +249,7 @@ def _lasting_contact(robot: RobotSpec, pairs: list[str]) -> Finding:
     """Return the finding about links that lie inside each other at home or in every posture."""
     level = "ok"
     effect = "they do not touch: contacts are off in robot.toml"
-    if robot.contacts:
+    if robot.scene.contacts:
         level = "warning"
         effect = (
             "joints carry that for ever: write <exclude> in robot.xml, or contacts = false in "
@@ -260,10 +263,10 @@ def _passing_contact(robot: RobotSpec, pairs: list[str], share: float, *, logged
     """Return the finding about links that lie inside each other in a share of the postures."""
     what = "of the logs' postures" if logged else "of random postures"
     does = "(contacts are off)"
-    if robot.contacts:
+    if robot.scene.contacts:
         does = "and touch: the logs' robot did not go through itself"
     text = f"in {share:.0%} {what} {abbreviate(pairs)} lie inside each other {does}"
-    level = "warning" if robot.contacts and logged else "note"
+    level = "warning" if robot.scene.contacts and logged else "note"
     return Finding(level, "contacts", text, values={"pairs": pairs, "share": share})
 
 
@@ -285,7 +288,7 @@ def _steps(
     elif not oscillates:
         load = f" with {mass:g} kg" if mass else ""
         text = (
-            f"{name}: kp {robot.kp[joint]:g} is too little to hold it up{load}: it falls away "
+            f"{name}: kp {robot.servo.kp[joint]:g} is too little to hold it up{load}: it falls away "
             "from its target; check kp in robot.toml"
         )
         yield Finding("warning", "step", text, (name,), {"growth": growth})
@@ -316,7 +319,7 @@ def _unstable_step(
     cures.append("a smaller kp")
     name = robot.joint_names[joint]
     text = (
-        f"{name}: kp {robot.kp[joint]:g} and kd {robot.kd[joint]:g} on so little inertia are "
+        f"{name}: kp {robot.servo.kp[joint]:g} and kd {robot.servo.kd[joint]:g} on so little inertia are "
         f"unstable in physics steps of {robot.timestep * 1e3:g} ms: write {' or '.join(cures)}"
     )
     values = {"growth": growth, "timestep": step, "armature": armature}
@@ -385,7 +388,7 @@ def _held(robot: RobotSpec, payloads: tuple[float, ...]) -> _Hold:
         sim.step(home)
         if t >= rows * 5 // 6:
             speed = np.fmax(speed, np.abs(sim.qvel))
-            saturated |= np.abs(sim.torque) > 0.999 * robot.effort_limit
+            saturated |= np.abs(sim.torque) > 0.999 * robot.servo.effort_limit
         if t == rows // 2:
             middle = sim.qpos.copy()
     return _Hold(speed, saturated, np.abs(sim.qpos - middle), np.abs(sim.qpos - home))

@@ -79,7 +79,7 @@ def temperature_findings(
     warm = recorded_temperatures(sequences, robot.operated_index)
     whole, among = temperature_spread(sequences, robot)
     for i, (joint, at) in enumerate(zip(robot.operated, robot.operated_index, strict=True)):
-        per_kelvin = robot.friction_per_kelvin[at]
+        per_kelvin = robot.servo.friction_per_kelvin[at]
         error = std[joint].get("friction_per_kelvin", 0.0)
         between = f"{warm[:, i].min():.0f} to {warm[:, i].max():.0f} °C"
         if per_kelvin:
@@ -87,7 +87,7 @@ def temperature_findings(
             size = format_uncertainty(1e2 * abs(per_kelvin), 1e2 * error)
             sentences.append(
                 f"{joint}: friction {change} by {size} % per K, recorded at {between}; the stated "
-                f"value is that at {robot.friction_temperature[at]:.0f} °C"
+                f"value is that at {robot.servo.friction_temperature[at]:.0f} °C"
             )
         elif whole[i] > MIN_STD_K and among[i] ** 2 <= (1 - MAX_CONFOUNDED) * whole[i] ** 2:
             sentences.append(

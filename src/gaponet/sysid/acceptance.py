@@ -362,7 +362,7 @@ def _contact_rows(
     sequences: ListOf[Sequence], robot: RobotSpec, contact_height: float
 ) -> Array | None:
     """Return the rows in which a tip is below a height, (sequences, rows)."""
-    if not robot.tips:
+    if not robot.scene.tips:
         return None
     heights = tip_heights(sequences, robot)
     touch = np.zeros((len(heights), max(map(len, heights))), bool)

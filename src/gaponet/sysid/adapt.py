@@ -89,7 +89,7 @@ def adapt(
             accepted = not Comparison("adapted", *judged).harmful
             windows = _windows_of(motions_of_sets)
     rollouts = RobotRollouts(windows, robot, corrector=corrector)
-    problem = _Problem(rollouts, first_values(robot), robot.kd[rollouts.op])
+    problem = _Problem(rollouts, first_values(robot), robot.servo.kd[rollouts.op])
     done = 0
 
     def report(cost: Array) -> None:

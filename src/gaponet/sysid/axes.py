@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from collections.abc import Sequence as ListOf
-from dataclasses import replace
 
 import numpy as np
 
@@ -94,13 +93,13 @@ def first_values(robot: RobotSpec) -> Values:
 
     Damping is the MJCF's; below zero it is taken from the servo's kd.
     """
-    model = build_model(replace(robot, table=None))
+    model = build_model(robot.with_table(None))
     op = robot.operated_index
     values = {}
     for field in ("damping", "frictionloss", "armature"):
         values[field] = np.array(getattr(model, f"dof_{field}")[op])
     for field in ("kp", "offset", "delay", "effort_limit", *SERVO_TERMS, *WARM):
-        values[field] = getattr(robot, field)[op]
+        values[field] = robot.servo[field][op]
     return values
 
 
@@ -119,7 +118,7 @@ def with_values(robot: RobotSpec, values: Mapping[str, Array]) -> RobotSpec:
     servos = {}
     for i, joint in enumerate(robot.operated):
         servos[joint] = {field: float(f"{value[i]:.6g}") for field, value in values.items()}
-    return robot.with_servos(servos)
+    return robot.with_identified(servos)
 
 
 class Changes:
@@ -214,10 +213,10 @@ class Bounds:
         op = robot.operated_index
         self.n = len(robot.operated)
         self._joints = robot.operated
-        self.kd = robot.kd[op]
-        model = build_model(replace(robot, table=None))
-        kp = robot.kp[op]
-        limit = robot.effort_limit[op]
+        self.kd = robot.servo.kd[op]
+        model = build_model(robot.with_table(None))
+        kp = robot.servo.kp[op]
+        limit = robot.servo.effort_limit[op]
         self.first = first_values(robot)
         self.stated = all(s.meta.recorded_gains[0] is not None for s in sequences)
         excitation = np.max([np.ptp(s.ctrl[:, op], axis=0) for s in sequences], axis=0)

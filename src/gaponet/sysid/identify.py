@@ -118,7 +118,7 @@ def identify(
     if options.seconds is not None:
         options = replace(options, seconds=options.seconds / 2)
     plain = _identify(recordings, robot, options, progress)
-    limited = _identify(recordings, robot.with_servos(limits), options, progress)
+    limited = _identify(recordings, robot.with_identified(limits), options, progress)
     return better_of(plain, limited, limits)
 
 
@@ -153,7 +153,7 @@ def _fit_positions(
     robots = _robots(fits, state)
     without_table = robots[-1] if state.chosen != "given" else robot
     table = None
-    if options.table and robot.tips:
+    if options.table and robot.scene.tips:
         windows = low_windows(recordings.fitted, heights, contact)
         lowest = min(float(height.min()) for height in heights)
         table = _fit_table(windows, without_table, lowest, fits, recordings.validation)
@@ -314,21 +314,20 @@ def _fitted(
         return fitted
     if state.chosen == "given" and not (table and table.accepted):
         return given
-    return replace(fitted, stop_low=given.stop_low, stop_high=given.stop_high)
+    return fitted.with_servo(stop_low=given.servo.stop_low, stop_high=given.servo.stop_high)
 
 
 def _without_terms(fits: Fits, classic: FitState, fitted: RobotSpec) -> RobotSpec | None:
     """Return the classic fit with the table, zeros and stops of `fitted`, which has terms of the
     servo model.
     """
-    if not fitted.has_servo_model or fitted.links != fits.given.links or fits.given.has_servo_model:
+    if not fitted.servo.has_terms or fitted.links != fits.given.links or fits.given.servo.has_terms:
         return None
-    return replace(
-        with_values(fits.joints[-1].robot, classic.base[-1]),
-        table=fitted.table,
-        zero=fitted.zero,
-        stop_low=fitted.stop_low,
-        stop_high=fitted.stop_high,
+    plain = with_values(fits.joints[-1].robot, classic.base[-1]).with_table(fitted.scene.table)
+    return plain.with_servo(
+        zero=fitted.servo.zero,
+        stop_low=fitted.servo.stop_low,
+        stop_high=fitted.servo.stop_high,
     )
 
 
@@ -340,7 +339,9 @@ def _held_out(
         return [HeldOut(recordings.validation, fitted)] if recordings.validation else []
     folds = []
     for (_, part), one in zip(recordings.splits, robots, strict=False):
-        own = replace(one, table=fitted.table, stop_low=fitted.stop_low, stop_high=fitted.stop_high)
+        own = one.with_table(fitted.scene.table).with_servo(
+            stop_low=fitted.servo.stop_low, stop_high=fitted.servo.stop_high
+        )
         folds.append(HeldOut(part, own))
     return folds
 

@@ -88,8 +88,8 @@ class JointRollouts:
         self.counted = self._counted()
         # Gains of each recording: kp over the robot's own, kd in N·m·s/rad, (windows, n).
         acting = [robot.with_gains(*p.meta.recorded_gains) for p in parts]
-        self.kp_ratio = np.array([(r.kp / robot.kp)[self.op] for r in acting])
-        self.kd = np.array([r.kd[self.op] for r in acting])
+        self.kp_ratio = np.array([(r.servo.kp / robot.servo.kp)[self.op] for r in acting])
+        self.kd = np.array([r.servo.kd[self.op] for r in acting])
         self.temperature = recorded_temperatures(parts, self.op).T  # (n, windows) °C
 
     def _stacked(self, windows: list[Array]) -> Array:
@@ -106,7 +106,7 @@ class JointRollouts:
         """
         low, high = self.robot.qpos_range[self.op].T
         ctrl = self._stacked([np.clip(p.ctrl[:, self.op], low, high) for p in self.parts])
-        speed = self.robot.target_speed[self.op]
+        speed = self.robot.servo.target_speed[self.op]
         if not speed.any():
             return ctrl
         limit = np.where(speed > 0, speed, np.inf)[:, None]
@@ -297,7 +297,7 @@ class JointRollouts:
         """
         damping, frictionloss = warm_values(values, self.temperature)  # (k, n, windows)
         k, n, windows = damping.shape
-        own = {"effort_limit": self.robot.effort_limit[self.op]} | values
+        own = {"effort_limit": self.robot.servo.effort_limit[self.op]} | values
         each = {f: np.broadcast_to(x, (k, n))[..., None] for f, x in own.items()}
         each["kp"] = each["kp"] * self.kp_ratio.T
         each["kd"] = np.maximum(self.kd.T + np.minimum(damping, 0.0), 0.0)

@@ -61,7 +61,7 @@ def with_stops(robot: RobotSpec, sequences: ListOf[Sequence]) -> RobotSpec:
             end_of_range = sign * robot.qpos_range[i, int(sign > 0)]
             if _meets_stop(paths, end) and end_of_range > end + MIN_NARROWING_RAD:
                 servos.setdefault(joint, {})[name] = round(sign * end, 4)
-    return robot.with_servos(servos) if servos else robot
+    return robot.with_identified(servos) if servos else robot
 
 
 def _meets_stop(paths: list[tuple[Array, Array]], end: float) -> bool:
@@ -94,8 +94,8 @@ def stop_questions(given: RobotSpec, stopped: RobotSpec) -> list[str]:
     questions = []
     for joint, i in zip(given.operated, given.operated_index, strict=True):
         for name, direction in (("stop_low", "lower"), ("stop_high", "higher")):
-            stop = float(getattr(stopped, name)[i])
-            if np.isfinite(stop) and stop != getattr(given, name)[i]:
+            stop = float(stopped.servo[name][i])
+            if np.isfinite(stop) and stop != given.servo[name][i]:
                 questions.append(
                     f"{joint}: stayed at {stop:.3f} rad where commands went "
                     f"{direction}: if that is a stop, identify with --stops; if something was in "
@@ -112,13 +112,13 @@ def default_terms(sequences: ListOf[Sequence], robot: RobotSpec) -> tuple[Term, 
     """
     op = robot.operated_index
     fast = FAST * greatest_speeds(sequences, robot)
-    limit = robot.effort_limit[op]
+    limit = robot.servo.effort_limit[op]
     limited_rows = np.zeros(len(op))
     fast_rows = np.zeros(len(op))
     rows = np.zeros(len(op))
     for s in sequences:
         own = robot.with_gains(*s.meta.recorded_gains)
-        torque = (own.kp * (s.ctrl - s.qpos) - own.kd * s.qvel)[:, op]
+        torque = (own.servo.kp * (s.ctrl - s.qpos) - own.servo.kd * s.qvel)[:, op]
         qvel = s.qvel[:, op]
         recorded = np.array([j not in s.meta.unrecorded for j in robot.operated])
         limited_rows += recorded * (np.abs(torque) > AT_TORQUE_LIMIT * limit).sum(axis=0)

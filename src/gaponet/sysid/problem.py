@@ -8,7 +8,7 @@ import copy
 import math
 from collections.abc import Callable
 from collections.abc import Sequence as ListOf
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -343,7 +343,7 @@ class KinematicChains:
     """
 
     def __init__(self, robot: RobotSpec) -> None:
-        model = build_model(replace(robot, table=None), physics_only=True)
+        model = build_model(robot.with_table(None), physics_only=True)
         tree = model.dof_treeid[robot.operated_index]
         chains = [np.flatnonzero(tree == t) for t in np.unique(tree)]
         places = max(map(len, chains))
@@ -548,7 +548,7 @@ def _discretisation_std(problem: FitProblem, values: Values) -> Values:
     physics step, (n,).
     """
     time_std = UNIFORM_STD * problem.physics_step  # s
-    total_damping = values["damping"] + problem.robot.kd[problem.robot.operated_index]
+    total_damping = values["damping"] + problem.robot.servo.kd[problem.robot.operated_index]
     std = {
         "damping": time_std * values["kp"],
         "armature": time_std * total_damping,

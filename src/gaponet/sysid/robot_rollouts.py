@@ -6,7 +6,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence as ListOf
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -126,13 +125,12 @@ class RobotRollouts:
 
     def _simulations(self, values: dict[str, Array]) -> tuple[BatchSim, list[Condition]]:
         """Return simulations of all windows for each candidate, and the windows' conditions."""
-        delay = np.array(self.robot.delay)
+        delay = np.array(self.robot.servo.delay)
         delay[self.op] = max(float(values["delay"].max()), self.robot.dt / self.robot.decimation)
-        acting = replace(self.robot, delay=delay)
+        acting = self.robot.with_servo(delay=delay)
         has_terms = any(values[f].any() for f in SERVO_TERMS if f in values)
         if not has_terms:
-            plain: dict[str, Any] = dict.fromkeys(SERVO_TERMS, np.array(0.0))
-            acting = replace(acting, **plain)
+            acting = acting.with_servo(**dict.fromkeys(SERVO_TERMS, 0.0))
         conditions = [Condition.of(s, self.robot)._replace(temperature=None) for s in self.parts]
         every = conditions * len(values["kp"])
         sim = BatchSim(acting, every, self.nthread, self.locked, servo_model=has_terms)

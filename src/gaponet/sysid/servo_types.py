@@ -53,15 +53,15 @@ def servos_like(robot: RobotSpec, like: RobotSpec) -> tuple[RobotSpec, dict[str,
     for joint, source in sources.items():
         i = robot.joint_names.index(joint)
         k = like.joint_names.index(source)
-        servos[joint] = {f: float(getattr(like, f)[k]) for f in taken}
+        servos[joint] = like.servo.of_joint(k, taken)
         for gain in ("kp", "kd"):
-            own = float(getattr(robot, gain)[i])
-            theirs = float(getattr(before, gain)[k])
+            own = float(robot.servo[gain][i])
+            theirs = float(before.servo[gain][k])
             if own > 0 and theirs > 0:
                 servos[joint][gain] *= own / theirs
     same = like if like.name == robot.name else robot
     taken_over = replace(
-        robot.with_servos(servos), payload_mounts=same.payload_mounts, links=same.links
+        robot.with_identified(servos), payload_mounts=same.payload_mounts, links=same.links
     )
     return taken_over, sources
 
@@ -69,11 +69,11 @@ def servos_like(robot: RobotSpec, like: RobotSpec) -> tuple[RobotSpec, dict[str,
 def _sources(robot: RobotSpec, like: RobotSpec) -> dict[str, str]:
     """Return joint of `robot` → identified joint of `like` that its values come from."""
     identified = identified_joints(like)
-    types = dict(zip(like.joint_names, like.servos, strict=True))
+    types = dict(zip(like.joint_names, like.servo.types, strict=True))
     sources: dict[str, str] = {}
     for i, joint in zip(robot.operated_index, robot.operated, strict=True):
         candidates = [joint, mirrored(joint)]
-        servo = robot.servos[i]
+        servo = robot.servo.types[i]
         if servo is not None:
             candidates += [j for j, other in types.items() if other and other.name == servo.name]
         found = [j for j in candidates if j in identified]
@@ -99,14 +99,14 @@ def far_from_servo_type(robot: RobotSpec) -> list[str]:
     """
     sentences = []
     for i in robot.operated_index:
-        servo = robot.servos[i]
+        servo = robot.servo.types[i]
         if servo is None:
             continue
         for field in PASSIVE_FIELDS:
             usual = servo.measured.get(field)
             if usual is None:
                 continue
-            value = float(getattr(robot, field)[i])
+            value = float(robot.servo[field][i])
             nearest = float(np.clip(value, usual.low, usual.high))
             is_far = max(value, nearest) > MAX_RATIO * min(value, nearest)
             if nearest > 0 and is_far:
@@ -167,13 +167,13 @@ def _measured_servos(number: int, robot: RobotSpec) -> list[_MeasuredServo]:
     op = robot.operated_index
     now = first_values(robot)
     then = first_values(nominal)
-    now["damping"] = now["damping"] + robot.kd[op] - nominal.kd[op]
+    now["damping"] = now["damping"] + robot.servo.kd[op] - nominal.servo.kd[op]
     sources = known.sources if known else ({"unit": ""},)
     units = {(number, unit) for source in sources for unit in source["unit"].split(", ")}
     identified = identified_joints(robot)
     servos = []
     for k, joint in enumerate(robot.operated):
-        servo = robot.servos[op[k]]
+        servo = robot.servo.types[op[k]]
         if servo is None or joint not in identified:
             continue
         errors = summarize(known, joint).errors if known else {}

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable
 from collections.abc import Sequence as ListOf
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -94,10 +94,10 @@ def contact_height(robot: RobotSpec, heights: ListOf[Array]) -> float:
     At most half of the rows are lower, so that rows to fit remain for motions close to the table or
     to nothing.
     """
-    if not robot.tips or not heights:
+    if not robot.scene.tips or not heights:
         return -np.inf
     rows = np.concatenate(heights)
-    table = rows.min() if robot.table is None else robot.table.height
+    table = rows.min() if robot.scene.table is None else robot.scene.table.height
     return float(min(table + CONTACT_CLEARANCE_M, np.median(rows)))
 
 
@@ -152,9 +152,9 @@ def fit_table(
     """
     if not parts:
         return TableFit(robot, False, np.zeros(0), np.zeros(0), ())
-    measured = robot.table
+    measured = robot.scene.table
     guess = Table(lowest, FRICTION.guess, float(np.exp(LOG_STIFFNESS.guess)))
-    with_table = replace(robot, table=measured or guess)
+    with_table = robot.with_table(measured or guess)
     zeros = np.zeros(len(robot.operated))
     away = np.array([[lowest - 10.0, FRICTION.guess, LOG_STIFFNESS.guess, *zeros]])
     scene = _TableRollouts(parts, with_table, nthread)
@@ -273,12 +273,12 @@ def _searched(
 
 def _with_table(robot: RobotSpec, x: Array) -> RobotSpec:
     """Return the robot with a table and zeros (3 + n,)."""
-    zeros = robot.zero[robot.operated_index] + x[3:]
+    zeros = robot.servo.zero[robot.operated_index] + x[3:]
     servos = {}
     for joint, zero in zip(robot.operated, zeros, strict=True):
         servos[joint] = {"zero": round(float(zero), ZERO_DECIMALS)}
     height, friction, stiffness = (float(f"{v:.4g}") for v in (x[0], x[1], np.exp(x[2])))
-    return replace(robot.with_servos(servos), table=Table(height, friction, stiffness))
+    return robot.with_identified(servos).with_table(Table(height, friction, stiffness))
 
 
 class _TableRollouts(RobotRollouts):

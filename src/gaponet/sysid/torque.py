@@ -239,7 +239,7 @@ class TorqueFit:
         ]
         gains = self.gains() if len(self.sequences) == len(sequences) else {}
         self.known = {joint: g for joint, g in gains.items() if g.trusted}
-        self.robot = robot.with_servos(
+        self.robot = robot.with_identified(
             {joint: {"kp": g.kp, "kd": g.kd} for joint, g in self.known.items()}
         )
         masses = {s.meta.payload_mass for s in self.sequences}
@@ -284,7 +284,7 @@ class TorqueFit:
                     "armature": float(of_model[j]) + armature,
                     "damping": damping,
                 }
-        return replace(robot.with_servos(servos), payload_mounts=tuple(mounts))
+        return replace(robot.with_identified(servos), payload_mounts=tuple(mounts))
 
     def _balance(self) -> _Balance:
         """Return the torques that inverse dynamics require, in rows of all recordings."""

@@ -96,12 +96,12 @@ def fit_torque_driven(
     fitted_rows = [_rows(s, robot) for s in train]
     judging_rows = [_rows(s, robot) for s in judging]
     joints = _fit_joints(fitted_rows, robot.operated, constant)
-    fitted = robot.with_servos(joints.servos)
+    fitted = robot.with_identified(joints.servos)
     one = np.ones_like(joints.constant)
     given = build_model(robot)
     op = robot.operated_index
     old = {f: np.ravel(getattr(given, f"dof_{f}"))[op] for f in PASSIVE_FIELDS}
-    new = {f: getattr(fitted, f)[op] for f in PASSIVE_FIELDS}
+    new = {f: fitted.servo[f][op] for f in PASSIVE_FIELDS}
     torque_before = _residual(judging_rows, old, one, 0 * joints.lags)
     torque_after = _residual(judging_rows, new, joints.constant, joints.lags)
     angle_before = _ahead(judging, robot, one)
@@ -276,7 +276,7 @@ def _ahead(sequences: ListOf[Sequence], robot: RobotSpec, constant: Array) -> di
         time = np.arange(len(s)) * s.dt
         tau = s.tau.astype(float)
         for j, i in enumerate(op):
-            tau[:, i] = constant[j] * np.interp(time - robot.delay[i], time, tau[:, i])
+            tau[:, i] = constant[j] * np.interp(time - robot.servo.delay[i], time, tau[:, i])
         v = differentiate(lowpass(s.qpos.astype(float), s.dt, DIFFERENTIATION_CUTOFF_HZ), s.dt)
         for start in _starts(s):
             mujoco.mj_resetData(model, data)

@@ -93,7 +93,7 @@ def collect(
     Arguments and errors as of gaponet.api.collect. No folder is shared with the executor.
     """
     start = time.monotonic()
-    robot = robot.with_gain_scale(fleet.gain_scale or robot.gain_scale)
+    robot = robot.with_gain_scale(fleet.gain_scale or robot.servo.gain_scale)
     # Options of the command line may have changed the recipe.
     recipe = validated(Recipe, asdict(recipe), "recipe", UsageError)
     if not 0 <= nproc <= MAX_WORKERS or not 0 <= seed < 2**63:

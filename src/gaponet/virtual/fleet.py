@@ -86,7 +86,7 @@ class Fleet:
     seed: int
     distributions: tuple[Distribution, ...]
     units: dict[str, Physics]  # hidden physics by unit id
-    # gain scale of the robot (RobotSpec.gain_scale); None for the robot's own
+    # gain scale of the robot (ServoParameters.gain_scale); None for the robot's own
     gain_scale: float | None = None
 
     def unit(self, unit_id: str) -> Physics:
@@ -170,7 +170,7 @@ def sample_unit(
         )
         value = np.clip(d.mean + deviation, d.low, d.high)
         if d.of_effort:
-            value = value * robot.effort_limit
+            value = value * robot.servo.effort_limit
         values[d.name] = np.array([float(f"{v:.{SIGNIFICANT_DIGITS}g}") for v in value])
     return replace(neutral(n), **values)
 

@@ -163,8 +163,8 @@ def _meta(job: Job, take: Take, level: str, notes: dict[str, Any]) -> SequenceMe
         virtual=True,
         source=f"virtual fleet '{job.fleet.name}'",
         notes=notes,
-        kp=tuple(job.robot.kp.tolist()),
-        kd=tuple(job.robot.kd.tolist()),
+        kp=tuple(job.robot.servo.kp.tolist()),
+        kd=tuple(job.robot.servo.kd.tolist()),
     )
 
 

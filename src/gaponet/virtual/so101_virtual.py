@@ -11,7 +11,6 @@ import os
 import select
 import time
 import tty
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -58,7 +57,7 @@ class VirtualSO101:
             frame: Simulated time per goal position, s; default: real time.
         """
         # The arm rests on a table while its torque is off.
-        robot = replace(robot, table=robot.table or Table(height=0.0))
+        robot = robot.with_table(robot.scene.table or Table(height=0.0))
         self.robot = robot
         self._frame = None if frame is None else round(frame / PERIOD)
         self.live = LiveUnit(robot, physics, payload, period=PERIOD)
@@ -177,7 +176,7 @@ class VirtualSO101:
         qpos, qvel, tau, temperature = self.live.read()
         calibration = self.calibration
         steps = np.rint(qpos / (STEP_RAD * calibration.sign) + calibration.zero)[order]
-        share = (tau / self.robot.effort_limit)[order]
+        share = (tau / self.robot.servo.effort_limit)[order]
         values = {
             reg.PRESENT_POSITION: np.clip(steps, 0, STEPS_PER_TURN - 1),  # beyond its limits too
             reg.PRESENT_VELOCITY: np.rint(qvel[order] / STEP_RAD),
@@ -191,9 +190,9 @@ class VirtualSO101:
 
     def _apply(self) -> None:
         """Set targets, gains and torque limits from the registers."""
-        kp = self.robot.kp.copy()
-        kd = self.robot.kd.copy()
-        effort = self.robot.effort_limit.copy()
+        kp = self.robot.servo.kp.copy()
+        kd = self.robot.servo.kd.copy()
+        effort = self.robot.servo.effort_limit.copy()
         goals = self.calibration.steps(self.live.ctrl)
         for joint, memory in zip(self._order, self.memory, strict=True):
             kp[joint] = STIFFNESS_PER_P * _get(memory, reg.P)

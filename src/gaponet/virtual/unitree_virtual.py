@@ -159,12 +159,12 @@ class VirtualH12:
         torque = np.where(enabled, command.tau + command.kd * command.dq, 0.0)
         robot = self.robot
         self.live.ctrl[self._order] = self._blend(robot.qpos_home, command.q, share)
-        blended_kp = robot.kp.copy()
-        blended_kd = robot.kd.copy()
-        blended_torque = np.zeros_like(robot.kp)
-        blended_kp[self._order] = self._blend(robot.kp, kp, share)
-        blended_kd[self._order] = self._blend(robot.kd, kd, share)
-        blended_torque[self._order] = self._blend(np.zeros_like(robot.kp), torque, share)
+        blended_kp = robot.servo.kp.copy()
+        blended_kd = robot.servo.kd.copy()
+        blended_torque = np.zeros_like(robot.servo.kp)
+        blended_kp[self._order] = self._blend(robot.servo.kp, kp, share)
+        blended_kd[self._order] = self._blend(robot.servo.kd, kd, share)
+        blended_torque[self._order] = self._blend(np.zeros_like(robot.servo.kp), torque, share)
         self.live.set_gains(blended_kp, blended_kd, torque=blended_torque)
 
     def _blend(self, own: Array, commanded: Array, share: Array) -> Array:

@@ -48,7 +48,8 @@ class LiveUnit:
         self.unit = VirtualRobot(robot, [physics], [payload], dt=period, locked=locked)
         self.ctrl = robot.qpos_home.copy()
         self.unit.reset(self.ctrl[None], [seed])
-        self._gains = np.array([robot.kp, robot.kd, robot.effort_limit, np.zeros_like(robot.kp)])
+        servo = robot.servo
+        self._gains = np.array([servo.kp, servo.kd, servo.effort_limit, np.zeros_like(servo.kp)])
         self.steps = 0
 
     def set_gains(
@@ -61,7 +62,7 @@ class LiveUnit:
             effort: Torque limits, N·m; default the robot's.
             torque: Added torque, N·m.
         """
-        limit = self.robot.effort_limit if effort is None else effort
+        limit = self.robot.servo.effort_limit if effort is None else effort
         gains = np.array([kp, kd, limit, np.broadcast_to(torque, len(kp))], float)
         if not np.array_equal(gains, self._gains):
             self._gains = gains
@@ -110,8 +111,8 @@ class VirtualDriver:
             period: Time between two states, s.
         """
         robot = robot.before_identification  # the hidden physics replaces what was identified
-        self.kp = robot.kp
-        self.kd = robot.kd
+        self.kp = robot.servo.kp
+        self.kd = robot.servo.kd
         self.facts: dict[str, Any] = {}
         self.address = f"virtual {robot.name} {name} in process {os.getpid()}"
         self.joint_names = robot.joint_names

@@ -127,10 +127,10 @@ class VirtualRobot:
         self._limits = qpos_range(model)  # (active, 2) rad
 
         physics = self.physics
-        effort = robot.effort_limit[self.active]
+        effort = robot.servo.effort_limit[self.active]
         self._thermal = motor.Thermal(physics)
         self._drives = Drives(
-            physics, self._thermal, robot.kp[self.active], robot.kd[self.active], effort
+            physics, self._thermal, robot.servo.kp[self.active], robot.servo.kd[self.active], effort
         )
         self._transmission = Transmission(physics, effort)
         self._friction = motor.Friction(physics, model.dof_frictionloss.copy())

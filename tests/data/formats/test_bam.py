@@ -19,6 +19,11 @@ def bench():
     return load_robot("xl330_bench")
 
 
+def with_type(bench, servo):
+    """Return the bench with another type of servo."""
+    return replace(bench, servo=replace(bench.servo, types=(servo,)))
+
+
 def test_a_recording_says_its_gain_and_its_load(tmp_path, bench):
     write_bam(tmp_path / "a.json")
     write_bam(tmp_path / "b.json", kp=100, vin=5.0, trajectory="up", length=0.15, arm_mass=0.02)
@@ -29,11 +34,11 @@ def test_a_recording_says_its_gain_and_its_load(tmp_path, bench):
     assert first.meta.motion == "sin_sin"
     assert (first.meta.payload_mass, first.meta.payload_side) == (0.49, "100mm")
     np.testing.assert_allclose(
-        first.meta.kp, bench.kp, rtol=1e-3
+        first.meta.kp, bench.servo.kp, rtol=1e-3
     )  # robot.toml is at the factory's gain and 7.4 V
     assert Condition.of(first, bench).kp is None
     assert (second.meta.payload_mass, second.meta.payload_side) == (0.5, "150mm")
-    np.testing.assert_allclose(second.meta.kp, bench.kp / 4 * 5.0 / 7.4, rtol=1e-3)
+    np.testing.assert_allclose(second.meta.kp, bench.servo.kp / 4 * 5.0 / 7.4, rtol=1e-3)
     np.testing.assert_allclose(Condition.of(second, bench).kp, second.meta.kp)
     np.testing.assert_allclose(first.qpos[:, 0], late(wave(60, 1, 0.0053), 3)[:, 0], atol=1e-6)
     assert sorted(report.entries[0].channels) == ["ctrl", "qpos", "qvel", "temperature"]
@@ -77,9 +82,10 @@ def test_what_cannot_be_a_recording_is_refused(tmp_path, bench, changes, message
 
 def test_any_servo_comes_in_whose_gain_law_robot_toml_states(tmp_path, bench):
     servo = replace(
-        bench.servos[0], gain=0.02, gain_volts=None
+        bench.servo.types[0], gain=0.02, gain_volts=None
     )  # one whose current follows the error
-    mine = replace(bench, servos=(servo,), aliases={"mx64": "motor"})
+    log_joints = replace(bench.log_joints, aliases={"mx64": "motor"})
+    mine = replace(with_type(bench, servo), log_joints=log_joints)
     ((_, log),) = read_logs(write_bam(tmp_path / "a.json", motor="mx64", kp=50, vin=12.0), mine)
     assert log.meta["kp"] == [pytest.approx(1.0)]
     with pytest.raises(
@@ -90,7 +96,7 @@ def test_any_servo_comes_in_whose_gain_law_robot_toml_states(tmp_path, bench):
         LogError,
         match=r"what its kp 50 means .* write gain \(and gain_volts\) into the \[\[servo\]\]",
     ):
-        list(read_logs(tmp_path, replace(mine, servos=(replace(servo, gain=None),))))
+        list(read_logs(tmp_path, with_type(mine, replace(servo, gain=None))))
 
 
 def test_an_arm_of_another_length_is_named(tmp_path, bench):

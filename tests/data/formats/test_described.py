@@ -374,7 +374,7 @@ def test_a_feedforward_torque_is_the_position_command_by_which_a_pd_servo_gives_
 def test_a_simulated_pd_servo_does_the_same_with_the_torque_as_with_the_equivalent_command(arm):
     model, rows = build_model(arm), 300
     torque, states = np.array([0.8, -0.3]), []
-    for further, force in ((torque / arm.kp, 0.0), (0.0, torque)):
+    for further, force in ((torque / arm.servo.kp, 0.0), (0.0, torque)):
         data = mujoco.MjData(model)
         data.qfrc_applied[:] = force
         for t in range(rows):

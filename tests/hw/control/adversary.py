@@ -92,8 +92,8 @@ class Adversary:
         self.rng = rng
         self.count = count
         self.joint_names = robot.joint_names
-        self.kp = robot.kp
-        self.kd = robot.kd
+        self.kp = robot.servo.kp
+        self.kd = robot.servo.kd
         self.facts = {}
         self.commanded = MOTOR_NAMES[13:]
         self.at = robot.index(self.commanded)
@@ -175,7 +175,9 @@ class Adversary:
         believed = self.last is not None and np.abs(self.last.qpos[self.at] - q).max() < 1.0
         count.commands += 1
         if believed:
-            count.share = max(count.share, float((torque / self.robot.effort_limit[self.at]).max()))
+            count.share = max(
+                count.share, float((torque / self.robot.servo.effort_limit[self.at]).max())
+            )
         wrong = {
             "nan": not np.isfinite(ctrl[self.at]).all() or not 0 <= weight <= 1,
             "range": bool(((u < self.low) | (u > self.high)).any()),

@@ -207,7 +207,7 @@ def judge(
     assert (sent <= limits.high + 1e-6).all()
     assert (np.abs(np.diff(sent, axis=0)) <= limits.speed * recording.dt + 1e-6).all()
     np.testing.assert_array_equal(kp[:, :12], 0.0)  # legs are never commanded
-    assert (kp[:, torso] == robot.kp[torso]).all(), "the torso is held"
+    assert (kp[:, torso] == robot.servo.kp[torso]).all(), "the torso is held"
     assert np.ptp(ctrl[:, torso]) == 0, "where it was found"
     for row in recording.rows:
         if row.ctrl is not None:

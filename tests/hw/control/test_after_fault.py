@@ -134,7 +134,9 @@ def test_a_watchdog_holds_the_torso_where_it_is_and_not_where_it_was_at_its_conn
         clock.wait_until(clock.now() + 0.02)
 
     damping = clock.robot.heard[-10:]
-    assert {row["kp"][TORSO] for row in damping} == {robot.kp[robot.index(["torso_joint"])[0]]}
+    assert {row["kp"][TORSO] for row in damping} == {
+        robot.servo.kp[robot.index(["torso_joint"])[0]]
+    }
     assert damping[0]["ctrl"][TORSO] == pytest.approx(damping[0]["qpos"][TORSO], abs=0.02)
     np.testing.assert_array_equal(np.ptp([row["ctrl"] for row in damping], axis=0), 0.0)
 

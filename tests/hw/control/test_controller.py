@@ -523,7 +523,7 @@ def test_limits_are_those_of_the_servos_once_they_are_connected(arm):
     driver = Soft(arm)
     controller = control(driver)
     controller.run(motion_policy(MOTION, DT))
-    np.testing.assert_array_equal(controller.limits.kp, arm.kp / 2)
+    np.testing.assert_array_equal(controller.limits.kp, arm.servo.kp / 2)
     assert max(abs(ctrl[0]) for _, ctrl in driver.commands) <= 0.08 + 1e-12
 
 

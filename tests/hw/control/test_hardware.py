@@ -96,7 +96,7 @@ def test_a_run_that_differs_from_the_known_robot_is_refused(h1_2, tmp_path, caps
 
 def test_a_folder_supplies_identified_values_and_the_known_robot_all_else(h1_2, tmp_path):
     save_robot(
-        h1_2.with_servos({JOINT: {"kp": 90.0, "stop_low": -0.5, "stop_high": 0.5}}),
+        h1_2.with_identified({JOINT: {"kp": 90.0, "stop_low": -0.5, "stop_high": 0.5}}),
         tmp_path / "identified",
     )
     file = tmp_path / "identified" / "robot.toml"
@@ -106,7 +106,7 @@ def test_a_folder_supplies_identified_values_and_the_known_robot_all_else(h1_2, 
     robot = hardware_robot(sent, known)
     assert robot.folder == h1_2.folder
     assert robot.nominal is known
-    assert robot.kp[robot.index([JOINT])] == 90.0
+    assert robot.servo.kp[robot.index([JOINT])] == 90.0
     assert not np.array_equal(sent.qpos_home, h1_2.qpos_home)
     np.testing.assert_array_equal(robot.qpos_home, h1_2.qpos_home)
     limits = Limits.from_robot(robot, (JOINT,), SafetyConfig(margin=0.0))
@@ -114,7 +114,7 @@ def test_a_folder_supplies_identified_values_and_the_known_robot_all_else(h1_2, 
 
 
 def test_an_identified_stop_does_not_widen_a_range(h1_2):
-    wide = h1_2.with_servos({JOINT: {"stop_low": -50.0, "stop_high": 50.0}})
+    wide = h1_2.with_identified({JOINT: {"stop_low": -50.0, "stop_high": 50.0}})
     np.testing.assert_array_equal(wide.qpos_range, h1_2.qpos_range)
 
 
@@ -130,7 +130,7 @@ def test_an_identified_stop_does_not_widen_a_range(h1_2):
 )  # fmt: skip
 def test_identified_values_beyond_what_servos_have_are_refused_on_hardware(h1_2, values, said):
     with pytest.raises(RobotError, match=said):
-        hardware_robot(h1_2.with_servos({JOINT: values}), h1_2)
+        hardware_robot(h1_2.with_identified({JOINT: values}), h1_2)
 
 
 def test_identified_masses_beyond_what_motors_carry_are_refused_on_hardware(h1_2):
@@ -146,8 +146,8 @@ def test_identified_masses_beyond_what_motors_carry_are_refused_on_hardware(h1_2
 
 def test_an_identified_effort_limit_does_not_widen_that_of_the_plan(h1_2):
     at = h1_2.index([JOINT])
-    strong = hardware_robot(h1_2.with_servos({JOINT: {"effort_limit": 1e5}}), h1_2)
-    assert strong.effort_limit[at] == h1_2.effort_limit[at]
+    strong = hardware_robot(h1_2.with_identified({JOINT: {"effort_limit": 1e5}}), h1_2)
+    assert strong.servo.effort_limit[at] == h1_2.servo.effort_limit[at]
 
 
 def test_limits_may_come_from_a_folder_that_the_user_names_but_not_beyond_the_motors(
@@ -157,11 +157,11 @@ def test_limits_may_come_from_a_folder_that_the_user_names_but_not_beyond_the_mo
     soft = hardware_robot(load_robot(folder), reference_robot("unitree", str(folder)))
     assert UnitreeDriver(soft).kp.tolist() == [40.0] * 27
     with pytest.raises(RobotError, match="kp"):
-        UnitreeDriver(replace(h1_2, kp=np.full(27, 1000.0)))
+        UnitreeDriver(h1_2.with_servo(kp=np.full(27, 1000.0)))
     with pytest.raises(RobotError, match="kd"):
-        UnitreeDriver(replace(h1_2, kd=np.full(27, 11.0)))
+        UnitreeDriver(h1_2.with_servo(kd=np.full(27, 11.0)))
     with pytest.raises(RobotError, match="effort_limit"):
-        UnitreeDriver(replace(h1_2, effort_limit=1.01 * h1_2.effort_limit))
+        UnitreeDriver(h1_2.with_servo(effort_limit=1.01 * h1_2.servo.effort_limit))
 
 
 def test_the_robot_of_an_extensions_driver_must_be_named(h1_2):
@@ -205,7 +205,7 @@ def test_the_plan_judges_the_commands_that_a_compensator_makes(so101):
 def test_a_run_with_compensation_says_how_far_commands_lead_and_whose_limits_hold(
     so101, tmp_path, capsys
 ):
-    save_robot(so101.with_servos({"elbow_flex": {"kp": 12.0}}), tmp_path / "identified")
+    save_robot(so101.with_identified({"elbow_flex": {"kp": 12.0}}), tmp_path / "identified")
     words = [
         "run",
         "--robot",

@@ -104,7 +104,7 @@ def test_gaponet_run_moves_a_robot_on_the_sdks_dds_and_leaves_it_alive(start, tm
     assert heard["commands"] > 0.9 * rows
     assert heard["wrong_crc"] == 0
     assert heard["last_weight"] == 0.0
-    assert heard["largest_kp"] == robot.kp[12:].max()  # the torso is held as well
+    assert heard["largest_kp"] == robot.servo.kp[12:].max()  # the torso is held as well
 
 
 def test_a_client_of_the_sdk_finds_virtual_serve_on_loopback_and_moves_it(start):

@@ -154,7 +154,7 @@ def test_a_command_is_refused_only_where_the_three_intervals_do_not_meet(limits)
 
 
 def test_identified_gains_are_not_those_of_the_real_servo(arm):
-    identified = arm.with_servos({"elbow": {"kp": 3.0}})
+    identified = arm.with_identified({"elbow": {"kp": 3.0}})
     assert Limits.from_robot(identified, arm.joint_names, SafetyConfig()).kp.tolist() == [
         20.0,
         20.0,

@@ -85,7 +85,7 @@ def test_a_servo_that_is_set_otherwise_is_named(so101, wire, servos):
     servos.set(3, "speed", 200)
     driver = SO101Driver(so101, timeout=SILENCE)
     driver.connect()
-    np.testing.assert_allclose(driver.kp, so101.kp)
+    np.testing.assert_allclose(driver.kp, so101.servo.kp)
     i, limit, speed = driver.facts["remarks"]
     assert i.startswith("shoulder_lift: I is not 0")
     assert limit.startswith("gripper: the torque limit")
@@ -493,7 +493,7 @@ def test_a_virtual_servo_has_the_stiffness_and_the_torque_of_its_registers(
     for memory in arm.memory:
         memory[register.address : register.address + register.size] = register.encode(value)
     driver = connect()
-    np.testing.assert_allclose(driver.kp, so101.kp / (2 if register is reg.P else 1))
+    np.testing.assert_allclose(driver.kp, so101.servo.kp / (2 if register is reg.P else 1))
     assert abs(follow(driver, lift, by)) > ratio * abs(before)  # it sags, or does not lift
 
 

@@ -138,19 +138,19 @@ def test_on_arm_sdk_the_torso_is_held_where_it_was_found_with_its_gains(robot):
             for name in ("q", "kp", "kd", "mode")
         )
         if held:
-            assert (q, kp, mode) == (pytest.approx([0.3] * 3), [robot.kp[torso]] * 3, [1] * 3)
-            assert kd == [robot.kd[torso]] * 3
+            assert (q, kp, mode) == (pytest.approx([0.3] * 3), [robot.servo.kp[torso]] * 3, [1] * 3)
+            assert kd == [robot.servo.kd[torso]] * 3
         else:
             assert kp[-1] == 0, "what is commanded is damped, what is not is off"
 
 
 def test_an_identified_robot_is_commanded_with_the_gains_of_its_real_servos(robot):
-    driver, sent = unplugged(robot.with_servos({"left_elbow_joint": {"kp": 60.0}}))
+    driver, sent = unplugged(robot.with_identified({"left_elbow_joint": {"kp": 60.0}}))
     driver.write(robot.qpos_home)
     at = MOTOR_NAMES.index("left_elbow_joint")
     assert (
         hg.LowCmd.motors(sent[0], "kp")[at]
-        == robot.kp[robot.index(["left_elbow_joint"])[0]]
+        == robot.servo.kp[robot.index(["left_elbow_joint"])[0]]
         != 60.0
     )
 
@@ -165,7 +165,7 @@ def test_damping_gains_are_four_times_the_robots_but_no_more_than_the_effort_lim
         order = robot.index(MOTOR_NAMES)
         np.testing.assert_array_equal(kp, 0.0)
         believed = min(max(speed, 1e-6), 12.0)  # a wrong speed must not take the brake away
-        most = np.minimum(4 * robot.kd, robot.effort_limit / believed)[order]
+        most = np.minimum(4 * robot.servo.kd, robot.servo.effort_limit / believed)[order]
         np.testing.assert_allclose(kd, most, rtol=1e-6)
 
 

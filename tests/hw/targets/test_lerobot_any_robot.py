@@ -26,7 +26,7 @@ def arm(tmp_path):
 @pytest.fixture
 def soft(arm, tmp_path):
     """The arm as identified, stored in `tmp_path / "soft"`."""
-    robot = arm.with_servos(dict.fromkeys(arm.joint_names, SOFT))
+    robot = arm.with_identified(dict.fromkeys(arm.joint_names, SOFT))
     save_robot(robot, tmp_path / "soft")
     return robot
 

@@ -128,7 +128,7 @@ def test_following_without_an_identified_robot_is_refused_before_anything_moves(
 
 def test_the_processor_commands_an_arm_as_its_nominal_simulator_moves(plugin, so101, tmp_path):
     servo = {"kp": 14.0, "offset": 0.05}
-    soft = so101.with_servos(dict.fromkeys(so101.operated, servo))
+    soft = so101.with_identified(dict.fromkeys(so101.operated, servo))
     save_robot(soft, tmp_path / "soft")
     target = so101.qpos_home + 0.1
     sent = {}

@@ -23,7 +23,7 @@ def world(tmp_path_factory):
     place = tmp_path_factory.mktemp("world")
     robot = write_arm(place / "arm")
     data = write_dataset(place / "data", robot, recordings(robot, 8, rows=60, kp=0.5))
-    late = robot.with_servos({j: {"delay": 0.03} for j in robot.operated})
+    late = robot.with_identified({j: {"delay": 0.03} for j in robot.operated})
     Trainer(data, late, place / "whole", TINY_TRAINING, STEPS).run()
     return data, late, read_checkpoint(place / "whole")
 

@@ -2,8 +2,6 @@
 go to the host.
 """
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
@@ -29,7 +27,7 @@ CASTS = ("array", "bool", "float", "int", "index")
 
 
 def make(folder, device, servo=None, **model):
-    robot = replace(write_arm(folder), **servo or {})
+    robot = write_arm(folder).with_servo(**servo or {})
     sequences = recordings(robot, 4, rows=60, kp=0.6)
     options = EnvOptions(num_envs=8, episode_steps=90, nthread=1, device=device)
     return DeltaEnv(sequences, robot, ModelConfig(**model), options)

@@ -98,7 +98,7 @@ def test_rows_with_a_tip_at_the_table_have_no_label(tmp_path):
     sequences = recordings(robot, 2, rows=100)
     q = np.concatenate([s.qpos for s in sequences])
     tip = -0.2 * (np.sin(q[:, 0]) + np.sin(q.sum(1)))
-    table = replace(robot, table=Table(float(np.median(tip)) - 0.01))
+    table = robot.with_table(Table(float(np.median(tip)) - 0.01))
     labels = trajectory_labels(sequences, table, 0.5)
     assert (np.isnan(labels).all(1) == (tip < np.median(tip))).mean() > 0.98
     assert np.isfinite(trajectory_labels(sequences, robot, 0.5)).all()

@@ -143,7 +143,7 @@ def write_z1_urdf(path):
 
     model = mujoco.MjModel.from_xml_path(str(ROBOTS / "z1" / "robot.xml"))
     robot = load_robot(ROBOTS / "z1")
-    effort = dict(zip(robot.joint_names, robot.effort_limit, strict=True))
+    effort = dict(zip(robot.joint_names, robot.servo.effort_limit, strict=True))
     lines = ['<robot name="z1"><link name="world"/>']
 
     def origin(position, quaternion):

@@ -105,10 +105,7 @@ def test_the_box_holds_the_robot_in_every_frame(four):
 
 def test_a_robot_with_a_table_can_be_drawn(arm):
     assert (
-        visual_spec(dataclasses.replace(arm, table=Table(-0.05, 0.3, 3000.0)), "#c8102e", 0.0)
-        .compile()
-        .npair
-        == 0
+        visual_spec(arm.with_table(Table(-0.05, 0.3, 3000.0)), "#c8102e", 0.0).compile().npair == 0
     )
 
 

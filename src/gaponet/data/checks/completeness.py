@@ -261,13 +261,13 @@ def _saturation(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
         yield from [*_flat_torque(recorded, robot)] or [ok]
         return
     worst = np.max([np.maximum(-t.low, t.high) for _, t in over], axis=0)  # (n,) N·m
-    i = int((worst / robot.effort_limit).argmax())
+    i = int((worst / robot.servo.effort_limit).argmax())
     rows = sum(int(t.over_limit.sum()) for _, t in over)
     motions = _motions([survey for survey, _ in over])
     text = (
         f"torque beyond the limit of robot.toml in {rows} rows of "
         f"{motions}; worst {worst[i]:.2f} N·m on {robot.joint_names[i]} "
-        f"(limit {robot.effort_limit[i]:.2f}): a collision, a spike or a wrong limit"
+        f"(limit {robot.servo.effort_limit[i]:.2f}): a collision, a spike or a wrong limit"
     )
     yield Finding(
         "warning",
@@ -284,7 +284,7 @@ def _flat_torque(recorded: list[tuple[Survey, Torque]], robot: RobotSpec) -> Ite
         top = max((max(-float(t.low[i]), float(t.high[i])) for _, t in recorded), default=0.0)
         near = [(survey, t) for survey, t in recorded if max(-t.low[i], t.high[i]) > 0.999 * top]
         rows = sum(int(t.flat[i]) for _, t in near)
-        if top > MIN_FLAT_SHARE * robot.effort_limit[i] and rows >= MIN_FLAT_ROWS:
+        if top > MIN_FLAT_SHARE * robot.servo.effort_limit[i] and rows >= MIN_FLAT_ROWS:
             motions = _motions([survey for survey, _ in near])
             text = (
                 f"torque of {name} is cut off flat at {top:.3g} N·m in {rows} rows of "

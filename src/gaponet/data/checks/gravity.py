@@ -122,7 +122,7 @@ def _best(loads: Loads, robot: RobotSpec, model: Gravity, centred: bool) -> _Bes
     loads = _thinned(loads, max(1, _count_rows(loads) // MAX_ROWS))
     as_logged = {key: model(qpos, *key) for key, (qpos, _) in loads.items()}
     rms = np.sqrt(np.mean(np.concatenate(list(as_logged.values())) ** 2, axis=0))  # (n) N·m
-    loaded = np.flatnonzero(rms > MIN_LOAD * robot.effort_limit)
+    loaded = np.flatnonzero(rms > MIN_LOAD * robot.servo.effort_limit)
     unexplained = _unexplained(as_logged, loads, loaded, centred)
     best = _Best(0.0, None, 1 - float(unexplained.mean()) if len(unexplained) else 0.0, 0.0)
     for hypothesis in [*_joint_faults(robot, loaded), *_order_faults(robot)]:
@@ -208,7 +208,7 @@ def _servo_torques(surveys: list[Survey], robot: RobotSpec) -> Loads:
     """Return the torques of the servos at rest, from their distance to the command."""
     samples = []
     for survey in surveys:
-        kp = robot.with_gains(*survey.entry.meta.recorded_gains).kp
+        kp = robot.with_gains(*survey.entry.meta.recorded_gains).servo.kp
         poses = survey.static_poses
         samples.append((survey, poses.qpos, kp * (poses.ctrl - poses.qpos)))
     return _by_payload(samples)

@@ -128,11 +128,11 @@ def _expected_lag(robot: RobotSpec) -> dict[str, tuple[float, float]]:
     mujoco.mj_forward(model, data)
     mujoco.mj_fullM(model, data, full)
     dofs = [model.joint(name).dofadr[0] for name in robot.joint_names]
-    damping = (
-        np.where(np.isfinite(robot.damping), robot.damping, model.dof_damping[dofs]) + robot.kd
-    )
+    servo = robot.servo
+    passive = np.where(np.isfinite(servo.damping), servo.damping, model.dof_damping[dofs])
+    damping = passive + servo.kd
     inertia = np.diag(full)[dofs]
-    stiff = np.where(robot.kp > 0, robot.kp, np.inf)
+    stiff = np.where(servo.kp > 0, servo.kp, np.inf)
     lags = np.stack([damping / stiff, np.pi / 2 * np.sqrt(inertia / stiff)], axis=1)
     return {
         name: (float(slow), float(near))

@@ -172,7 +172,7 @@ def _collect(surveys: list[Survey], robot: RobotSpec, model: Gravity) -> _Poses:
         poses = survey.static_poses
         if not len(poses):
             continue
-        kp = np.where(robot.kp > 0, robot.with_gains(*meta.recorded_gains).kp, np.inf)
+        kp = np.where(robot.servo.kp > 0, robot.with_gains(*meta.recorded_gains).servo.kp, np.inf)
         load = model(poses.qpos, meta.payload_mass, meta.payload_side) / kp
         heavier = np.zeros_like(load)
         if robot.payload_mounts:
@@ -516,7 +516,7 @@ def _shares(
     # (k,); torques over kp, rad
     recording, torque, weight, error, qpos = _holds_of(surveys, robot, model, joint).T
     numbers, fold = np.unique(recording, return_inverse=True)
-    least = MIN_LOAD * robot.effort_limit[joint] / max(robot.kp[joint], 1e-9)
+    least = MIN_LOAD * robot.servo.effort_limit[joint] / max(robot.servo.kp[joint], 1e-9)
     if len(torque) < MIN_POSES or len(numbers) < MIN_RECORDINGS or np.std(weight) < least:
         return None
     fold = fold % MAX_FOLDS
@@ -542,7 +542,7 @@ def _holds_of(surveys: list[Survey], robot: RobotSpec, model: Gravity, joint: in
         if not len(own):
             continue
         meta = survey.entry.meta
-        kp = max(float(robot.with_gains(*meta.recorded_gains).kp[joint]), 1e-9)
+        kp = max(float(robot.with_gains(*meta.recorded_gains).servo.kp[joint]), 1e-9)
         weight = model(own[:, 3:], meta.payload_mass, meta.payload_side)[:, joint]
         numbers = np.full(len(own), number)
         columns = (numbers, own[:, 2] / kp, weight / kp, own[:, 1], own[:, 3 + joint])

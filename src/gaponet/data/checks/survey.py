@@ -533,11 +533,13 @@ def _torque(sequence: Sequence, robot: RobotSpec) -> Torque | None:
         > COMMAND_STEP_RAD
     )
     calm = maximum_filter1d(steps, 2 * window + 1) == 0
+    limit = robot.servo.effort_limit
+    spikes = (magnitude - usual > SPIKE_SHARE * limit) & calm[:, None]
     return Torque(
         low=tau.min(axis=0),
         high=tau.max(axis=0),
-        over_limit=(magnitude > robot.effort_limit * (1 + TORQUE_TOLERANCE)).sum(axis=0),
-        spikes=((magnitude - usual > SPIKE_SHARE * robot.effort_limit) & calm[:, None]).sum(axis=0),
+        over_limit=(magnitude > limit * (1 + TORQUE_TOLERANCE)).sum(axis=0),
+        spikes=spikes.sum(axis=0),
         flat=(magnitude == magnitude.max(axis=0)).sum(axis=0),
     )
 

@@ -74,7 +74,7 @@ def _angles(
     """Return one joint's values (k,) in rad or, if they are speeds, in rad/s."""
     if unit in ("rad", "deg", "turns"):
         return _from_angles(values, unit)
-    in_range = robot.log_units[robot.joint_names.index(joint)] == "fraction"  # a gripper
+    in_range = robot.log_joints.units[robot.joint_names.index(joint)] == "fraction"  # a gripper
     if encoder is not None and unit == "ticks" and in_range:
         values = encoder.fractions(values, speed)
         unit = "fraction"
@@ -228,7 +228,7 @@ def _nonsense(name: str, log: Log, robot: RobotSpec) -> Array:
     values = np.abs(log.channels[name].values)
     if name in ("tau", FEEDFORWARD):
         return np.asarray(
-            values > np.maximum(20 * robot.effort_limit[robot.index(log.joint_names)], 100.0)
+            values > np.maximum(20 * robot.servo.effort_limit[robot.index(log.joint_names)], 100.0)
         )
     if name != "qvel":
         return np.asarray(values > MOST[name])

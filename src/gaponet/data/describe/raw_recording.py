@@ -27,7 +27,8 @@ from gaponet.data.describe.plausibility import to_radians
 from gaponet.data.describe.repeats import without_equal_rows
 from gaponet.data.describe.slow_channels import sampled_channels
 from gaponet.data.log import CHANNELS, COMMANDS, DERIVED, FEEDFORWARD, REQUIRED, Channel, Log
-from gaponet.robot.spec import LOG_UNITS, RobotSpec
+from gaponet.robot.log_joints import LOG_UNITS
+from gaponet.robot.spec import RobotSpec
 
 WIDEST = 500  # columns of an array that may be joints
 MIN_WIDTHS = 10  # by which an array with a column per sample is wider than high

@@ -484,7 +484,7 @@ def _gains(
         robot.resolve(j, f"{name} of logs.toml", names) if j else "": value
         for j, value in option.items()
     }
-    own = getattr(robot.nominal or robot, name)[robot.index(log.joint_names)]
+    own = robot.before_identification.servo[name][robot.index(log.joint_names)]
     return [
         given.get(j, given.get("", float(o))) for j, o in zip(log.joint_names, own, strict=True)
     ]

@@ -98,7 +98,7 @@ def read(
 
 def _log(file: Path, log_data: BamFile, robot: RobotSpec, joint_map: dict[str, str] | None) -> Log:
     joint = robot.resolve(log_data["motor"], str(file), joint_map)
-    servo = robot.servos[robot.index([joint])[0]]
+    servo = robot.servo.types[robot.index([joint])[0]]
     if servo is None or servo.gain is None:
         raise LogError(
             f"{file}: motor is '{log_data['motor']}': what its kp {log_data['kp']:g} means in "

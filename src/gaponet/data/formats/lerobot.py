@@ -233,7 +233,7 @@ class _Frames:
         """
         robot = self.options.robot
         unit = self.options.unit
-        in_range = robot.log_units[robot.joint_names.index(joint)] == "fraction"
+        in_range = robot.log_joints.units[robot.joint_names.index(joint)] == "fraction"
         raw = unit == "ticks" and self.options.encoders is not None
         return "percent" if in_range and unit in NO_SI and not raw else unit
 

@@ -77,7 +77,7 @@ def _read_motion(folder: Path, robot: RobotSpec, joint_map: dict[str, str] | Non
     state = folder / "state_motor.csv"
     ctrl_time, ctrl = _read_csv(control, len(names), "control")
     state_time, values = _read_csv(state, len(names), "state_motor")
-    units = [robot.log_units[robot.joint_names.index(name)] for name in names]
+    units = [robot.log_joints.units[robot.joint_names.index(name)] for name in names]
     channels = {COLUMNS[k]: Channel(state_time, v) for k, v in values.items() if k in COLUMNS}
     channels["ctrl"] = Channel(ctrl_time, ctrl["positions"])
     return Log(

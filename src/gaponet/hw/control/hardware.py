@@ -69,9 +69,9 @@ def hardware_robot(robot: RobotSpec, reference: RobotSpec) -> RobotSpec:
     require_plausible(robot)
     if not robot.is_identified:
         return reference
-    values = {name: getattr(robot, name) for name in SERVO_FIELDS}
-    values["effort_limit"] = np.minimum(robot.effort_limit, reference.effort_limit)
-    return replace(reference, **values, nominal=reference)
+    effort = np.minimum(robot.servo.effort_limit, reference.servo.effort_limit)
+    values = {name: robot.servo[name] for name in SERVO_FIELDS} | {"effort_limit": effort}
+    return replace(reference.with_servo(**values), nominal=reference)
 
 
 def robot_hash(robot: RobotSpec) -> str:
@@ -86,14 +86,12 @@ def _require_equal(robot: RobotSpec, reference: RobotSpec) -> None:
     use = _advice(reference)
     if robot.joint_names != reference.joint_names:
         raise RobotError(f"{robot.folder}: its joints are not those of {reference.folder}. {use}")
-    for name, unit in (
-        ("kp", "N·m/rad"),
-        ("kd", "N·m·s/rad"),
-        ("effort_limit", "N·m"),
-        ("qpos_range", "rad"),
+    for name, unit, theirs, ours in (
+        ("kp", "N·m/rad", robot.servo.kp, reference.servo.kp),
+        ("kd", "N·m·s/rad", robot.servo.kd, reference.servo.kd),
+        ("effort_limit", "N·m", robot.servo.effort_limit, reference.servo.effort_limit),
+        ("qpos_range", "rad", robot.qpos_range, reference.qpos_range),
     ):
-        theirs = getattr(robot, name)
-        ours = getattr(reference, name)
         differ = ~np.isclose(theirs, ours, rtol=RELATIVE_TOLERANCE, atol=1e-9).reshape(
             len(ours), -1
         ).all(axis=1)
@@ -127,19 +125,20 @@ def require_plausible(robot: RobotSpec) -> None:
         RobotError: With the folder, the joint and the bounds.
     """
     nominal = robot.before_identification
+    n = len(robot.joint_names)
     bounds = {
-        "kp": np.outer(KP_RATIO_BOUNDS, nominal.kp),
-        "armature": np.outer((0, MAX_ARMATURE_TIME_S**2), robot.kp),
+        "kp": np.outer(KP_RATIO_BOUNDS, nominal.servo.kp),
+        "armature": np.outer((0, MAX_ARMATURE_TIME_S**2), robot.servo.kp),
     }
     bounds |= dict.fromkeys(
-        ("offset", "zero"), np.outer((-MAX_OFFSET_RAD, MAX_OFFSET_RAD), np.ones(len(robot.kp)))
+        ("offset", "zero"), np.outer((-MAX_OFFSET_RAD, MAX_OFFSET_RAD), np.ones(n))
     )
     for name, field in SERVO_FIELDS.items():
         if field.bounds and field.axis in ("value", "over kp") and name not in bounds:
-            scale = robot.kp if field.axis == "over kp" else np.ones(len(robot.kp))
+            scale = robot.servo.kp if field.axis == "over kp" else np.ones(n)
             bounds[name] = np.outer(field.bounds[:2], scale)
     for name, (low, high) in bounds.items():
-        values = getattr(robot, name)
+        values = robot.servo[name]
         field = SERVO_FIELDS[name]
         # NaN: the MJCF's; other fields have none
         beyond = ~((values >= low) & (values <= high) | np.isnan(values))
@@ -159,10 +158,10 @@ def _require_light(robot: RobotSpec, nominal: RobotSpec) -> None:
     effort limit.
     """
     low, high = np.clip(nominal.qpos_range.T, -np.pi, np.pi)
-    postures = np.random.default_rng(0).uniform(low, high, (POSTURES, len(robot.kp)))
-    with_mass = static_torque(build_model(replace(robot, table=None)), postures)
-    without = static_torque(build_model(replace(nominal, table=None)), postures)
-    share = np.abs(with_mass - without).max(axis=0) / nominal.effort_limit
+    postures = np.random.default_rng(0).uniform(low, high, (POSTURES, len(robot.joint_names)))
+    with_mass = static_torque(build_model(robot.with_table(None)), postures)
+    without = static_torque(build_model(nominal.with_table(None)), postures)
+    share = np.abs(with_mass - without).max(axis=0) / nominal.servo.effort_limit
     if not share.max() <= MAX_WEIGHT_SHARE:
         joint = robot.joint_names[int(share.argmax())]
         raise RobotError(
@@ -193,8 +192,8 @@ def require_known_limits(robot: RobotSpec, packaged: str) -> None:
         return
     known = load_robot(PACKAGE_FOLDER / packaged)
     columns = known.index(nominal.joint_names)
-    _require_within(nominal, "kp", "N·m/rad", known.kp[columns], known)
-    _require_within(nominal, "kd", "N·m·s/rad", known.kd[columns], known)
+    _require_within(nominal, "kp", "N·m/rad", known.servo.kp[columns], known)
+    _require_within(nominal, "kd", "N·m·s/rad", known.servo.kd[columns], known)
     low, high = known.qpos_range[columns].T
     lowest, highest = nominal.qpos_range.T
     wider = ~((lowest >= low - RANGE_TOLERANCE_RAD) & (highest <= high + RANGE_TOLERANCE_RAD))
@@ -220,7 +219,7 @@ def _require_within(
     robot: RobotSpec, name: str, unit: str, bounds: Array, known: RobotSpec
 ) -> None:
     """Refuse gains above the known robot's, (n,); NaN too."""
-    values = getattr(robot, name)
+    values = robot.servo[name]
     beyond = ~(values <= bounds * (1 + RELATIVE_TOLERANCE))
     if beyond.any():
         joint = int(beyond.argmax())
@@ -241,9 +240,9 @@ def _require_motor_limits(robot: RobotSpec, packaged: str) -> None:
     """Refuse gains and effort limits beyond those of a packaged robot's motors."""
     nominal = robot.before_identification
     motors = load_robot(PACKAGE_FOLDER / packaged)
-    effort = motors.effort_limit[motors.index(robot.joint_names)] * (1 + RELATIVE_TOLERANCE)
+    effort = motors.servo.effort_limit[motors.index(robot.joint_names)] * (1 + RELATIVE_TOLERANCE)
     for name, most in (("kp", MAX_KP), ("kd", MAX_KD), ("effort_limit", effort)):
-        values = getattr(nominal, name)
+        values = nominal.servo[name]
         bounds = np.broadcast_to(most, len(effort))
         beyond = ~(values <= bounds)  # NaN too
         if beyond.any():

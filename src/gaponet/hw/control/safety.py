@@ -150,7 +150,7 @@ class Limits:
             UsageError: The margin is wider than the range of a joint.
         """
         nominal = robot.before_identification
-        kp, kd = gains or (nominal.kp, nominal.kd)
+        kp, kd = gains or (nominal.servo.kp, nominal.servo.kd)
         at = robot.index(joints)
         low, high = robot.qpos_range[at].T
         if qpos_range is not None:
@@ -169,7 +169,7 @@ class Limits:
             low=low,
             high=high,
             speed=np.full(n, config.speed),
-            effort=config.torque_share * nominal.effort_limit[at],
+            effort=config.torque_share * nominal.servo.effort_limit[at],
             kp=kp[at],
             kd=kd[at],
             delta=np.full(n, config.delta),

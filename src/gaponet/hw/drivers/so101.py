@@ -156,8 +156,8 @@ class SO101Driver:
         self.file_calibration = read_calibration(calibration, robot) if calibration else None
         self.arm = self.file_calibration or uncalibrated(robot)
         self._nominal = robot.before_identification
-        self.kp = self._nominal.kp
-        self.kd = self._nominal.kd
+        self.kp = self._nominal.servo.kp
+        self.kd = self._nominal.servo.kd
         self.qpos_range: Array | None = None
         self.facts: dict[str, Any] = {}
         self._serial: Serial | None = None
@@ -309,7 +309,7 @@ class SO101Driver:
     def _remarks(self, facts: dict[str, list[int]]) -> list[str]:
         """Return how the servos' settings differ from the robot's, in sentences."""
         notes = []
-        nominal = self._nominal.kp
+        nominal = self._nominal.servo.kp
         odd = np.flatnonzero(np.abs(self.kp - nominal) > RELATIVE_KP_TOLERANCE * nominal)
         if odd.size:
             joints = ", ".join(self.joint_names[i] for i in odd)
@@ -365,7 +365,7 @@ class SO101Driver:
             time=now,
             qpos=self.arm.qpos(raw["qpos"]),
             qvel=raw["qvel"] * STEP_RAD * sign,
-            tau=share * self._nominal.effort_limit * sign,
+            tau=share * self._nominal.servo.effort_limit * sign,
             temperature=raw["temperature"],
             refused=bus.refused,
             fault=self._fault(bus),

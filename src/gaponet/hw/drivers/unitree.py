@@ -126,9 +126,9 @@ class UnitreeDriver:
         self.robot = robot
         self.topic = topic
         self.joints = joints
-        self.kp = nominal.kp
-        self.kd = nominal.kd
-        self._effort_limit = nominal.effort_limit
+        self.kp = nominal.servo.kp
+        self.kd = nominal.servo.kd
+        self._effort_limit = nominal.servo.effort_limit
         self.qpos_range: Array | None = None
         self.facts: dict[str, Any] = {}
         self.at_end: EndAction = "hand_over" if topic == "arm_sdk" else "damp"

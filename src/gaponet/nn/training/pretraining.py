@@ -129,9 +129,9 @@ def _unlabelled(sequences: ListOf[Sequence], robot: RobotSpec) -> Array:
         unrecorded = [joint in sequence.meta.unrecorded for joint in robot.operated]
         parts.append(np.tile(unrecorded, (len(sequence), 1)))
     unlabelled = np.concatenate(parts)
-    if robot.table is not None:
+    if robot.scene.table is not None:
         heights = np.concatenate(tip_heights(sequences, robot))
-        unlabelled[heights < robot.table.height + TABLE_CLEARANCE_M] = True
+        unlabelled[heights < robot.scene.table.height + TABLE_CLEARANCE_M] = True
     return unlabelled
 
 

@@ -125,7 +125,7 @@ class LinkFit:
             motion: Positions, velocities and accelerations of all joints, (3, rows, joints).
         """
         op = self.whole.rollouts.op
-        robot = replace(self.whole.robot, table=None)
+        robot = self.whole.robot.with_table(None)
         model = build_model(robot, *payload)
         torque = inverse_dynamics(model, *motion)[:, op]
         changed = []
@@ -203,7 +203,8 @@ class LinkFit:
         here, jac = self._slopes(x)
         count = self.directions.shape[1]
         n = self._n
-        zeros = self.whole.robot.zero[self.whole.rollouts.op] + ENCODER_ZERO_STD_RAD * np.eye(n)
+        own_zeros = self.whole.robot.servo.zero[self.whole.rollouts.op]
+        zeros = own_zeros + ENCODER_ZERO_STD_RAD * np.eye(n)
         by_zero = self.errors(np.repeat(x[None, None], n, axis=0), zero=zeros)[:, 0] - here
         weighted = jac / np.sqrt(1 + here**2)[:, None]
         rows = (len(here) - count) // n

@@ -18,7 +18,7 @@ def seen_speed_limits(sequences: ListOf[Sequence], robot: RobotSpec) -> SpeedLim
     """Return the speed limits that recordings show; none of a robot that has some, since these are
     taken as true.
     """
-    if robot.target_speed.any():
+    if robot.servo.target_speed.any():
         return {}
     speeds = dict(zip(robot.operated, target_speeds(sequences, robot), strict=True))
     return {joint: {"target_speed": float(f"{v:.3g}")} for joint, v in speeds.items() if v}
