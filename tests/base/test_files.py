@@ -122,7 +122,7 @@ def test_a_folder_of_an_older_version_is_recognised_by_its_files(tmp_path, kind,
         pass
     assert names(tmp_path)[0] == FOLDER_MARKER
     (tmp_path / FOLDER_MARKER).unlink()
-    with pytest.raises(FolderError, match="no run"):
+    with pytest.raises(FolderError, match="run"):
         require_own_folder(tmp_path, "run")
 
 

@@ -76,7 +76,7 @@ def test_copies_of_a_recording_are_found_and_two_moving_joints_are_refused():
     both = Log(
         "arm", ("elbow", "wrist"), {"ctrl": Channel(time, two), "qpos": Channel(time, two)}, "both"
     )
-    with pytest.raises(LogError, match="2 joints are commanded to move"):
+    with pytest.raises(LogError, match="joints"):
         estimate([("both", both)], MASSES, UNITS, {})
 
 

@@ -49,7 +49,7 @@ def test_only_adaptation_uses_recordings_of_a_unit_left_out_and_none_of_the_test
         assert unit not in {s.meta.unit_id for s in question.train}
         assert {s.meta.unit_id for s in question.few} == {unit}
         assert not {s.meta.motion for s in question.few} & {s.meta.motion for s in question.test}
-    with pytest.raises(UsageError, match="question 'of life' is not known"):
+    with pytest.raises(UsageError, match="life"):
         list(questions("of life", played, arm, None))
 
 
@@ -112,7 +112,7 @@ def test_networks_are_trained_once_and_rejected_without_a_gain_over_identificati
         for title, method in module.network_methods(240).values()
         if title.endswith("GAPONet")
     }
-    with pytest.raises(UsageError, match="networks need a folder"):
+    with pytest.raises(UsageError, match="folder"):
         methods["GAPONet"](question)
     question = replace(question, work=tmp_path)
     save_robot(arm, tmp_path / "identified")
@@ -148,7 +148,7 @@ def test_the_method_on_the_page_runs(arm, played, tmp_path):
     moved = method(question).positions(question.test)
     assert name == "late_targets"
     assert [q.shape for q in moved] == [s.qpos.shape for s in question.test]
-    with pytest.raises(UsageError, match=r"no such file; give FILE\.py:FUNCTION"):
+    with pytest.raises(UsageError, match="FUNCTION"):
         load_method("nothing.py:f")
 
 

@@ -83,7 +83,7 @@ def test_a_chunk_is_corrected_as_its_rows_would_be_and_the_next_goes_on_where_it
     second = many({"action": rows[None, 40:]})["action"]  # ten rows of the first were not sent
     jump = ((second[0, 0] - rows[40]) - (first[0, 39] - rows[39])).abs().max()
     assert jump < 0.2
-    with pytest.raises(ValueError, match="one robot's chunk"):
+    with pytest.raises(ValueError, match="chunk"):
         many({"action": torch.zeros(2, 5, 2)})
 
 
@@ -94,7 +94,5 @@ def test_the_arms_calibration_is_found_by_the_id_it_was_calibrated_under(tmp_pat
     (tmp_path / "so_follower" / "mine.json").write_text("{}")
     words = robot._command("ipc://x")
     assert words[words.index("--calibration") + 1] == str(tmp_path / "so_follower" / "mine.json")
-    with pytest.raises(
-        NotImplementedError, match=r"--robot.type=so101_follower, with --robot.id=mine"
-    ):
+    with pytest.raises(NotImplementedError, match=r"--robot\.id=mine"):
         robot.calibrate()

@@ -68,7 +68,7 @@ def test_the_word_consents(person, answer):
 @pytest.mark.parametrize("answer", NO.values(), ids=NO)
 def test_nothing_but_the_word_consents(person, answer):
     person.will(answer)
-    with pytest.raises(UsageError, match="not 'yes'; nothing was commanded"):
+    with pytest.raises(UsageError, match="'yes'"):
         require_consent("It will move.")
 
 
@@ -77,13 +77,13 @@ def test_what_was_typed_before_the_question_is_no_answer(person, early):
     person.type(early + "\n")
     assert select.select([person.slave], [], [], 10)[0]
     person.will("s\n")
-    with pytest.raises(UsageError, match="the answer was 's'"):
+    with pytest.raises(UsageError, match="'s'"):
         require_consent("It will move.")
 
 
 def test_a_word_of_its_own_is_asked_for_and_yes_is_not_it(person):
     person.will("yes\n")
-    with pytest.raises(UsageError, match="not 'it hangs'"):
+    with pytest.raises(UsageError, match="hangs"):
         require_consent("Legs go off.", "Does it hang?", "it hangs")
     assert "Does it hang? Type 'it hangs' to start" in person.getvalue()
 
@@ -91,9 +91,7 @@ def test_a_word_of_its_own_is_asked_for_and_yes_is_not_it(person):
 def test_without_a_terminal_nobody_consents_and_the_option_is_named(monkeypatch):
     for stream in (io.StringIO("yes\n"), None):
         monkeypatch.setattr("sys.stdin", stream)
-        with pytest.raises(
-            UsageError, match="no terminal to ask on, so nothing was commanded; give --free"
-        ):
+        with pytest.raises(UsageError, match="--free"):
             require_consent("It will move.", option="--free")
 
 

@@ -94,7 +94,7 @@ def test_one_recording_under_two_labels_is_refused(arm, tmp_path):
     logs = motions(arm)
     twice = replace(logs[0], meta=replace(logs[0].meta, payload_mass=0.2))
     data = write_dataset(tmp_path / "data", arm, [*logs, twice])
-    with pytest.raises(DatasetError, match="labels: same samples under different labels"):
+    with pytest.raises(DatasetError, match="labels"):
         pass_gate(data, data.entries, arm)
 
 
@@ -108,7 +108,7 @@ def test_clocks_that_drift_apart_are_refused(arm, tmp_path):
         fast_clock = np.stack([np.interp(1.003 * rows, rows, q) for q in qpos.T], axis=1)
         logs.append(arm_sequence(arm, ctrl, fast_clock, motion=f"m{seed}"))
     data = write_dataset(tmp_path / "data", arm, logs)
-    with pytest.raises(DatasetError, match="clock: to its end each recording follows"):
+    with pytest.raises(DatasetError, match="clock"):
         pass_gate(data, data.entries, arm)
 
 

@@ -16,7 +16,5 @@ def test_the_gap_is_real_minus_simulated(arm):
 
 def test_a_replay_of_another_length_is_refused(arm):
     ctrl = wave(20, 2)
-    with pytest.raises(
-        DatasetError, match=r"replay of 'm' has shape \(19, 2\), recording \(20, 2\)"
-    ):
+    with pytest.raises(DatasetError, match=r"\(19, 2\)"):
         Pair(arm_sequence(arm, ctrl, ctrl), SimulatedReplay("abc", ctrl[1:], ctrl[1:], ctrl[1:]))

@@ -54,9 +54,7 @@ def test_commands_and_states_on_different_clocks_meet_where_they_overlap(arm):
 
 def test_channels_that_do_not_overlap_are_refused(arm):
     time = 0.02 * np.arange(ROWS)
-    with pytest.raises(
-        LogError, match=r"command and state channels overlap for .* s only; check the clocks"
-    ):
+    with pytest.raises(LogError, match="overlap"):
         to_sequence(arm_log(time, ctrl_time=time + 10), arm, META)
 
 
@@ -71,20 +69,11 @@ BURSTS = (
 @pytest.mark.parametrize(
     ("time", "complaint"),
     [
-        (
-            JUMPED,
-            r"wave\.csv:26: 3600 s after the row before it; longer gaps than 2 s are not filled: cut the log there",
-        ),
-        (
-            BURSTS,
-            r"wave\.csv: 50 rows lie in bursts over 0\.9008 s: at their median period of 0\.2 ms there would be 4504",
-        ),
-        (
-            2e-8 * np.arange(ROWS),
-            r"wave\.csv: the median period is 2e-08 s, expected 0\.0001 to 1; is the unit of time",
-        ),
-        (5.0 * np.arange(ROWS), r"wave\.csv: the median period is 5 s"),
-        (np.r_[0.02 * np.arange(49), 1e13], r"wave\.csv:50: 1e\+13 s after the row before it"),
+        (JUMPED, r"wave\.csv:26: 3600"),
+        (BURSTS, "bursts"),
+        (2e-8 * np.arange(ROWS), "2e-08"),
+        (5.0 * np.arange(ROWS), "period is 5"),
+        (np.r_[0.02 * np.arange(49), 1e13], r"wave\.csv:50:"),
     ],
     ids=["clock jumps an hour", "bursts", "seconds read as microseconds", "too slow", "633 GiB"],
 )
@@ -101,7 +90,7 @@ def test_half_a_second_without_samples_is_still_filled(arm):
 def test_a_stated_period_that_the_timestamps_contradict_is_refused(arm):
     with pytest.raises(
         LogError,
-        match=r"the period is said to be 0\.0333333 s, but the timestamps are 0\.02 s apart",
+        match=r"0\.02",
     ):
         to_sequence(arm_log(0.02 * np.arange(ROWS), dt=1 / 30), arm, META)
 
@@ -136,11 +125,8 @@ def test_velocity_of_a_joint_logged_as_a_fraction_is_computed_too(arm):
 @pytest.mark.parametrize(
     ("field", "value", "message"),
     [
-        *(
-            ("payload_mass", mass, r"payload_mass is .*; give kg, 0 when empty")
-            for mass in (-0.1, np.nan, 1000.0)
-        ),
-        ("level", "legs", "level 'legs' is not one of joint, upper_body, whole_body"),
+        *(("payload_mass", mass, "payload_mass") for mass in (-0.1, np.nan, 1000.0)),
+        ("level", "legs", "'legs'"),
     ],
 )
 def test_labels_that_make_no_sense_are_refused(field, value, message):
@@ -150,7 +136,7 @@ def test_labels_that_make_no_sense_are_refused(field, value, message):
 
 def test_samples_that_are_not_numbers_are_refused(arm):
     bad = np.full((5, 2), np.nan)
-    with pytest.raises(LogError, match=r"wave\.csv: ctrl has shape \(5, 2\) or holds NaN"):
+    with pytest.raises(LogError, match="ctrl"):
         Sequence(META, arm.joint_names, 0.02, bad, bad, bad)
 
 
@@ -191,9 +177,7 @@ def test_recordings_with_different_gains_are_not_taken_together_unless_they_do_n
     joints = ("shoulder", "elbow")
     require_same_gains([soft, META, replace(soft, kp=(5.0, 5.0 * (1 + 1e-5)))], joints, joints)
     require_same_gains([soft, stiff], joints, ("shoulder",))
-    with pytest.raises(
-        UsageError, match=r"kp of elbow was 5 in 'wave' of a and 10 in 'stiff' of b.*--mixed-gains"
-    ):
+    with pytest.raises(UsageError, match="--mixed-gains"):
         require_same_gains([soft, stiff], joints, joints)
 
 

@@ -104,25 +104,23 @@ def test_a_users_mujoco_loop_is_aligned_by_one_call_per_period(robot, model):
 
 
 def test_other_rates_simulators_and_locked_joints_are_refused(robot, model, tmp_path):
-    with pytest.raises(ModelError, match=r"trained at 50\.0 Hz, the loop has 40\.0 Hz"):
+    with pytest.raises(ModelError, match=r"40\.0"):
         AlignedSim(robot, model, dt=0.025)
     bare, other = (
         small_model(robot, tmp_path / "model"),
         write_arm(tmp_path, TOML.replace("kp = 20.0", "kp = 21.0")),
     )
-    with pytest.raises(ModelError, match="which does not lie beside it"):
+    with pytest.raises(ModelError, match="beside"):
         AlignedSim(other, bare)
-    with pytest.raises(UsageError, match="'elbow' is corrected by the model and cannot be locked"):
+    with pytest.raises(UsageError, match="locked"):
         AlignedSim(robot, model, options=AlignedSimOptions(locked=("elbow",)))
 
 
 def test_a_scene_that_does_not_fit_is_refused(robot, model):
     mj_model = build_model(robot)
-    with pytest.raises(ModelError, match=r"trained at 50\.0 Hz"):
+    with pytest.raises(ModelError, match=r"50\.0"):
         MujocoAligner(model, mj_model, 0.025, 0.0)
-    with pytest.raises(
-        ModelError, match="moves joint 'left/shoulder', the scene has shoulder, elbow"
-    ):
+    with pytest.raises(ModelError, match="left/shoulder"):
         MujocoAligner(model, mj_model, 0.02, 0.0, prefix="left/")
 
 

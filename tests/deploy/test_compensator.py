@@ -287,22 +287,20 @@ def test_several_robots_are_compensated_as_each_alone(robot, model):
 
 
 def test_a_step_before_a_start_is_refused(robot):
-    with pytest.raises(UsageError, match="call reset"):
+    with pytest.raises(UsageError, match="reset"):
         Compensator(robot).step(np.zeros(2), np.zeros(2))
 
 
 def test_other_arrays_and_robots_are_refused(robot, model):
-    with pytest.raises(UsageError, match="all 2 joints of arm"):
+    with pytest.raises(UsageError, match="joints"):
         Compensator(robot, model).reset(np.zeros(3), 0.0)
-    with pytest.raises(UsageError, match="target to begin at"):
+    with pytest.raises(UsageError, match="target"):
         Compensator(robot, model).reset(np.array([0.0, np.nan]), 0.0)
-    with pytest.raises(
-        LogError, match=r"target to begin at of shoulder is 45\.000.* look like degrees"
-    ):
+    with pytest.raises(LogError, match=r"shoulder .*degrees"):
         Compensator(robot, model).reset(np.array([45.0, 0.0]), 0.0)
     in_degrees = Compensator(robot, model)
     in_degrees.reset(np.zeros(2), 0.0)
-    with pytest.raises(LogError, match=r"the position of elbow is -45\.000.* look like degrees"):
+    with pytest.raises(LogError, match=r"elbow .*degrees"):
         in_degrees.step(np.zeros(2), np.array([0.0, -45.0]))
     for name, wrong in {
         "gain": 0.0,
@@ -310,7 +308,7 @@ def test_other_arrays_and_robots_are_refused(robot, model):
         "feedback_time": np.nan,
         "aim": "Simulator",
     }.items():
-        with pytest.raises(UsageError, match="gain must be"):
+        with pytest.raises(UsageError, match="gain"):
             CompensatorConfig(**{name: wrong})
 
 
@@ -354,10 +352,10 @@ def test_without_a_model_servos_with_other_gains_and_absurd_payloads_are_refused
     compensator.require_gains(
         joints, np.array([20.0, 20.1]), kd
     )  # as robot.toml says, not as identified
-    with pytest.raises(RobotError, match="kp of elbow is 20 there, the servo has 12"):
+    with pytest.raises(RobotError, match="12"):
         compensator.require_gains(joints, np.array([20.0, 12.0]), kd)
     for mass in (np.nan, -1.0, 0.6):
-        with pytest.raises(UsageError, match=r"payload_mass is .* up to 0\.5"):
+        with pytest.raises(UsageError, match="payload_mass"):
             compensator.reset(np.zeros(2), mass)
 
 
@@ -374,12 +372,12 @@ def test_payloads_beyond_the_training_data_are_refused_without_extrapolate(robot
     light.reset(np.zeros(2), 0.2)
     assert light.masses.max() == 0.2
     for compensator, mass in ((light, 0.3), (loaded, 0.0), (loaded, 0.3)):
-        with pytest.raises(ModelError, match=r"kg is outside.*extrapolate"):
+        with pytest.raises(ModelError, match="extrapolate"):
             compensator.reset(np.zeros(2), mass)
-    with pytest.raises(ModelError, match=r"0\.3 kg is outside"):
+    with pytest.raises(ModelError, match=r"0\.3"):
         light.set_payload(0.3)
     for mass in (np.nan, -1.0):
-        with pytest.raises(UsageError, match="payload_mass is"):
+        with pytest.raises(UsageError, match="payload_mass"):
             light.set_payload(mass)
     beyond = Compensator(robot, trained(0.0, 0.2), extrapolate=True)
     beyond.reset(np.zeros(2), 0.4)
@@ -438,6 +436,6 @@ def test_servos_with_other_gains_than_the_data_are_refused_without_extrapolate(r
     model = GapModel(Path("exact"), card, CONFIG, Operator(1.0))
     joints, kd = robot.joint_names, np.zeros(2)
     Compensator(robot, model).require_gains(joints, np.array([20.0, 20.1]), kd)
-    with pytest.raises(ModelError, match="kp 20 of elbow, the servo has 10"):
+    with pytest.raises(ModelError, match="elbow"):
         Compensator(robot, model).require_gains(joints, np.array([20.0, 10.0]), kd)
     Compensator(robot, model, extrapolate=True).require_gains(joints, np.array([20.0, 10.0]), kd)

@@ -71,7 +71,7 @@ def test_action_zero_follows_the_reference(robot, model):
 def test_motions_of_another_width_are_refused(robot, model):
     from gaponet.deploy.gym import TrackingEnv
 
-    with pytest.raises(UsageError, match=r"motions \(T, 2\)"):
+    with pytest.raises(UsageError, match="motions"):
         TrackingEnv(AlignedSim(robot, model), [np.zeros((10, 3))])
 
 

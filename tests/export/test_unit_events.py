@@ -222,7 +222,7 @@ def test_delayed_actuators_are_late_by_whole_steps_where_no_action_term_delays(f
     elbow = robot.actuators["group1"]
     assert elbow.positions_delay_buffer.time_lags.tolist() == [1, 2, 3, 0, 0, 0]
     assert elbow.efforts_delay_buffer.time_lags.tolist() == [1, 2, 3, 0, 0, 0]
-    with pytest.raises(ValueError, match="'shoulder' needs a delay: take DelayedPDActuatorCfg"):
+    with pytest.raises(ValueError, match="DelayedPDActuatorCfg"):
         apply_units(
             environment(Robot3(group("elbow", "shoulder")), None), None, ROBOT, file, term=None
         )
@@ -230,7 +230,7 @@ def test_delayed_actuators_are_late_by_whole_steps_where_no_action_term_delays(f
     content["plain_units"]["delay"][0][1] = 0.05
     Path(file + "2").write_text(json.dumps(content))
     both = Robot3(group("elbow", "shoulder", delayed=True))
-    with pytest.raises(ValueError, match="make an actuator group for each joint"):
+    with pytest.raises(ValueError, match="group"):
         apply_units(environment(both, None), None, ROBOT, file + "2", term=None, rows=[0] * WORLDS)
 
 
@@ -263,9 +263,7 @@ def test_dc_motors_of_isaac_lab_get_the_torque_speed_line_of_a_unit(file, execut
         assert (made._saturation_effort[[2, 3, 5]] == 7.0).all()
     if executors:
         assert (whole.velocity_limit[[0, 1, 4], 0] == torch.inf).all()  # a speed of 0 is no line
-    with pytest.raises(
-        ValueError, match="joint 'shoulder' needs a torque-speed line: take isaaclab_actuators"
-    ):
+    with pytest.raises(ValueError, match="isaaclab_actuators"):
         apply_units(environment(Robot3(group("shoulder", "elbow")), Action()), None, ROBOT, file)
 
 
@@ -339,7 +337,5 @@ def test_mjlab_s_own_position_servos_get_units_without_the_servo_model_by_joint_
     torch.testing.assert_close(worlds["body_subtreemass"][3, :2], link[:, 0].sum().expand(2))
     assert worlds["body_mass"][0, 1] == float(scene.body_mass[1])  # a world that was not reset
     scene.actuator_biastype[:] = 0
-    with pytest.raises(
-        ValueError, match="has joint 'robot/shoulder'; joints with position servos:"
-    ):
+    with pytest.raises(ValueError, match="robot/shoulder"):
         event(env, None)

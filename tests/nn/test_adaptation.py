@@ -90,13 +90,10 @@ def test_recordings_of_two_units_are_refused(model, robot, logs):
 @pytest.mark.parametrize(
     ("changed", "said"),
     [
-        (
-            {"servos": {"elbow": {"kp": float("nan")}}},
-            r"servos\.elbow\.kp: should be a finite number",
-        ),
+        ({"servos": {"elbow": {"kp": float("nan")}}}, r"servos\.elbow\.kp:"),
         ({"servos": {"elbow": {"mass": 1.0}}}, "servos.elbow.mass"),
-        ({"servos": []}, "servos: should be an object"),
-        ({"logs": "abc"}, "logs: should be"),
+        ({"servos": []}, "servos:"),
+        ({"logs": "abc"}, "logs:"),
         ({"payload_mass": -1}, "payload_mass: "),
     ],
 )

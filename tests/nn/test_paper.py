@@ -334,13 +334,13 @@ def test_the_predictor_of_equation_1_is_fitted_and_ppo_does_not_train_it(tmp_pat
 
 @pytest.mark.parametrize(
     ("how", "word"),
-    [({"sensor_source": "none", "sensor_hold": 3}, "no sensor values to hold"),
-     ({"sensor_source": "none", "sensor_target": "absolute"}, "no sensor values"),
-     ({"predictor_inputs": "equation_1", "sensor_hold": 3}, "cannot be held"),
-     ({"predictor_inputs": "equation_1", "payload_input": False}, "leave payload_input on"),
-     ({"predictor_inputs": "equation_1", "sensor_source": "none"}, "use sensor_source predicted"),
-     ({"predictor_inputs": "equation_1", "sensor_source": "fixed"}, "use sensor_source predicted"),
-     ({"predictor_inputs": "equation_1", "sensor_source": "learned"}, "use sensor_source predicted")],
+    [({"sensor_source": "none", "sensor_hold": 3}, "hold"),
+     ({"sensor_source": "none", "sensor_target": "absolute"}, "sensor"),
+     ({"predictor_inputs": "equation_1", "sensor_hold": 3}, "held"),
+     ({"predictor_inputs": "equation_1", "payload_input": False}, "payload_input"),
+     ({"predictor_inputs": "equation_1", "sensor_source": "none"}, "predicted"),
+     ({"predictor_inputs": "equation_1", "sensor_source": "fixed"}, "predicted"),
+     ({"predictor_inputs": "equation_1", "sensor_source": "learned"}, "predicted")],
 )  # fmt: skip
 def test_switches_that_contradict_each_other_are_refused(how, word):
     with pytest.raises(UsageError, match=word):

@@ -67,18 +67,16 @@ def test_a_negative_radius_is_an_error(arm):
     file.write_text(
         'capsule = [{ body = "upper", from = [0, 0, 0], to = [0, 0, 1], radius = -50.0 }]'
     )
-    with pytest.raises(RobotError, match=r"collision.toml.*radius"):
+    with pytest.raises(RobotError, match="radius"):
         read_shapes(arm.folder)
-    with pytest.raises(RobotError, match=r"collision.toml.*radius"):
+    with pytest.raises(RobotError, match="radius"):
         check_robot(arm)
 
 
 def test_a_shape_on_an_unknown_body_is_an_error(arm):
     file = arm.mjcf.parent / "collision.toml"
     file.write_text('capsule = [{ body = "nose", from = [0, 0, 0], to = [0, 0, 1], radius = 0.1 }]')
-    with pytest.raises(
-        RobotError, match="capsule names body 'nose', the MJCF has: world, upper, fore"
-    ):
+    with pytest.raises(RobotError, match="nose"):
         Collision(arm, build_model(arm))
 
 
@@ -108,9 +106,7 @@ def test_distances_agree_with_contacts_of_mujoco(so101):
 def test_the_height_of_the_plane_can_be_set(so101):
     down = so101.qpos_home.copy()
     down[so101.index(["shoulder_lift"])] = 1.0
-    with pytest.raises(
-        RobotError, match=r"the plane is at -75 m; give its height in metres, up to 10 \(--plane\)"
-    ):
+    with pytest.raises(RobotError, match="--plane"):
         Collision(so101, build_model(so101), height=-75.0)
     lower = Collision(so101, build_model(so101), height=-0.2)
     (free,) = lower.distances(down[None])

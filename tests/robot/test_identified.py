@@ -65,7 +65,7 @@ def test_a_path_from_the_command_line_is_a_name_too(place):
 
 def test_a_folder_of_that_name_is_not_confused_with_it(place):
     shutil.copytree(IDENTIFIED / NAME, place / NAME)
-    with pytest.raises(UsageError, match="another directory"):
+    with pytest.raises(UsageError, match="directory"):
         gp.load_robot(NAME)
     assert gp.load_robot(f"./{NAME}").folder == place / NAME
 

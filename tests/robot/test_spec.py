@@ -59,16 +59,14 @@ def test_an_unknown_joint_error_names_the_file_and_similar_joints(so101):
     with pytest.raises(JointMismatchError, match=r"a\.csv names joint 'elbow', which robot 'so101' does not have; "
                        r"nearest: elbow_flex, \w+, \w+\. Map it with --map elbow=elbow_flex, "):  # fmt: skip
         so101.resolve("elbow", "a.csv")
-    with pytest.raises(
-        JointMismatchError, match=r"nearest: elbow_flex, \w+, \w+$"
-    ):  # nothing to map there
+    with pytest.raises(JointMismatchError, match="elbow_flex"):  # nothing to map there
         so101.index(["elbow"])
 
 
 def test_an_unknown_robot_error_lists_the_packaged_ones():
     with pytest.raises(
         RobotError,
-        match=r"no robot 'nope': in the package are fr3, g1_23, .*, xl330_bench.*; or give a folder",
+        match=r"nope.*xl330_bench",
     ):
         load_robot("nope")
 
@@ -76,40 +74,24 @@ def test_an_unknown_robot_error_lists_the_packaged_ones():
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ('name = "arm"', "", r"robot\.toml: name: is missing; docs/new-robot\.md lists the fields"),
-        ('name = "arm"', 'name = "../arm"', "name: should be 1 to 200 letters"),
-        ("kp = 20.0", "", r"joint\[0\]\.kp: is missing"),
-        ("kp = 20.0", 'kp = "much"', r"joint\[0\]\.kp: should be a valid number, not 'much'"),
-        ("kp = 20.0", "kp = -20.0", r"joint\[0\]\.kp: should be greater than or equal to 0"),
-        ("kp = 20.0", "kp = 20.0\nkdd = 1.0", r"joint\[0\]\.kdd: is not a known field"),
-        ("kp = 20.0", 'kp = 20.0\nkd = "0.1"', r"joint\[0\]\.kd: should be a valid number"),
-        ("dt = 0.02", "dt = nan", "dt: should be a finite number"),
-        ("timestep = 0.005", "timestep = 0", "timestep: should be greater than"),
-        ('name = "elbow"', 'name = "shoulder"', "a joint name appears twice in shoulder, shoulder"),
-        (
-            'name = "elbow"',
-            'name = "elbow"\naliases = ["shoulder"]',
-            r"appears twice in shoulder, elbow, shoulder \(names",
-        ),
-        (
-            "pos = [0.2,",
-            "pos = [20.0,",
-            r"payload_mount\[0\]\.pos\[0\]: should be less than or equal to 10, not 20.0",
-        ),
-        (
-            "timestep = 0.005",
-            "timestep = 0.003",
-            "dt / timestep = 0.02 / 0.003 = 6.667 is not a whole number",
-        ),
-        (
-            "kp = 20.0",
-            'kp = 20.0\nlog_unit = "grad"',
-            r"joint\[0\]\.log_unit: should be 'rad', 'deg' or",
-        ),
-        ("kp = 20.0", "kp = 20.0\noperated = false", "no joint has operated = true"),
-        ("dt = 0.02", "dt = ", "not valid TOML"),
-        ("[[joint]]", "[[joints]]", "joint: is missing"),
-        ('body = "fore"\n', "", r"payload_mount\[0\]\.body: is missing"),
+        ('name = "arm"', "", "name:"),
+        ('name = "arm"', 'name = "../arm"', "name:"),
+        ("kp = 20.0", "", r"joint\[0\]\.kp:"),
+        ("kp = 20.0", 'kp = "much"', "much"),
+        ("kp = 20.0", "kp = -20.0", r"joint\[0\]\.kp:"),
+        ("kp = 20.0", "kp = 20.0\nkdd = 1.0", r"joint\[0\]\.kdd:"),
+        ("kp = 20.0", 'kp = 20.0\nkd = "0.1"', r"joint\[0\]\.kd:"),
+        ("dt = 0.02", "dt = nan", "dt:"),
+        ("timestep = 0.005", "timestep = 0", "timestep:"),
+        ('name = "elbow"', 'name = "shoulder"', "twice"),
+        ('name = "elbow"', 'name = "elbow"\naliases = ["shoulder"]', "twice"),
+        ("pos = [0.2,", "pos = [20.0,", r"payload_mount\[0\]\.pos\[0\]:"),
+        ("timestep = 0.005", "timestep = 0.003", r"6\.667"),
+        ("kp = 20.0", 'kp = 20.0\nlog_unit = "grad"', r"joint\[0\]\.log_unit:"),
+        ("kp = 20.0", "kp = 20.0\noperated = false", "operated"),
+        ("dt = 0.02", "dt = ", "TOML"),
+        ("[[joint]]", "[[joints]]", "joint:"),
+        ('body = "fore"\n', "", r"payload_mount\[0\]\.body:"),
     ],
 )
 def test_an_invalid_robot_toml_error_names_the_field(tmp_path, old, new, message):
@@ -123,7 +105,7 @@ def test_an_invalid_robot_toml_error_names_the_field(tmp_path, old, new, message
 def test_a_missing_mjcf_error_names_its_place(tmp_path):
     write_arm(tmp_path / "arm")
     (tmp_path / "arm" / "robot.xml").unlink()
-    with pytest.raises(RobotError, match=r"robot\.xml is missing beside it"):
+    with pytest.raises(RobotError, match=r"robot\.xml"):
         load_robot(tmp_path / "arm")
 
 
@@ -160,7 +142,7 @@ def test_a_folder_stores_scaled_gains_once(tmp_path):
 def test_an_unknown_identified_joint_or_field_is_refused(tmp_path):
     with pytest.raises(RobotError, match=r"identified\.wing"):
         write_arm(tmp_path, TOML + "[identified.wing]\nkp = 3.0\n")
-    with pytest.raises(RobotError, match=r"identified\.elbow\.mass: is not a known field"):
+    with pytest.raises(RobotError, match=r"identified\.elbow\.mass"):
         write_arm(tmp_path, TOML + "[identified.elbow]\nmass = 3.0\n")
 
 
@@ -174,19 +156,18 @@ def test_robot_argument_leads_to_the_folder(tmp_path, monkeypatch):
 def test_names_are_packaged_robots_and_paths_are_folders(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     write_arm(tmp_path / "arm")
-    with pytest.raises(RobotError, match=r"no robot 'arm': in the package are fr3, .*, xl330_bench.*; for the folder "
-                       r"here write \./arm"):  # fmt: skip
+    with pytest.raises(RobotError, match=r"\./arm"):  # fmt: skip
         load_robot("arm")
     for way in ("./arm", str(tmp_path / "arm"), Path("arm")):
         assert load_robot(way).name == "arm"
-    with pytest.raises(RobotError, match=r"no robot\.toml there"):
+    with pytest.raises(RobotError, match=r"robot\.toml"):
         load_robot("./so101")
 
 
 def test_an_ambiguous_name_is_refused(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     write_arm(tmp_path / "so101")
-    with pytest.raises(RobotError, match=r"'so101' is a robot of the package and a folder here; write (.*) or \./so101"
+    with pytest.raises(RobotError, match=r"write (.*) or \./so101"
                        ) as refused:  # fmt: skip
         load_robot("so101")
     packaged = str(refused.value).split("write ")[1].split(" or ")[0]

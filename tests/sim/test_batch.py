@@ -204,5 +204,5 @@ def test_a_value_that_simulations_cannot_take_is_refused(tmp_path, field):
         f: np.full((1, 1), 0.1)
         for f in ("kp", "damping", "frictionloss", "armature", "offset", field)
     }
-    with pytest.raises(UsageError, match=f"{field} cannot differ between simulations of arm"):
+    with pytest.raises(UsageError, match=field):
         BatchSim(robot, [(0.0, "both", 0.02)]).set_servos(("elbow",), values)

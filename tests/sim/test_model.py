@@ -97,26 +97,18 @@ def test_the_physics_step_is_nearly_the_same_at_any_rate(arm):
 
 
 def test_a_timestep_that_does_not_divide_the_control_period_is_refused(tmp_path):
-    with pytest.raises(
-        RobotError, match="is not a whole number; choose a timestep that divides the control period"
-    ):
+    with pytest.raises(RobotError, match="timestep"):
         write_arm(tmp_path / "arm", toml=TOML.replace("timestep = 0.005", "timestep = 0.007"))
 
 
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (
-            {"payload_mass": -1.0},
-            r"payload_mass is -1\.0; give the mass in kg, 0 for an empty hand",
-        ),
-        ({"payload_mass": float("nan")}, "payload_mass is nan"),
-        (
-            {"payload_side": "foot"},
-            "payload side 'foot' is unknown to arm; use both or one of hand",
-        ),
-        ({"dt": 50.0}, "dt is 50.0; the control period in seconds must be positive and at most 1"),
-        ({"dt": 0.0}, "the control period in seconds must be positive"),
+        ({"payload_mass": -1.0}, "payload_mass"),
+        ({"payload_mass": float("nan")}, "nan"),
+        ({"payload_side": "foot"}, "'foot'"),
+        ({"dt": 50.0}, "dt"),
+        ({"dt": 0.0}, "dt"),
     ],
 )
 def test_invalid_payload_side_and_period_are_refused(arm, options, message):
@@ -127,13 +119,13 @@ def test_invalid_payload_side_and_period_are_refused(arm, options, message):
 @pytest.mark.parametrize(
     ("toml", "xml", "message"),
     [
-        (TOML, "<mujoco>", "not valid MJCF"),
-        (TOML.replace('"elbow"', '"knee"'), XML, r"robot.toml names joint 'knee', the MJCF has: elbow, shoulder"),
-        (TOML.replace('"fore"', '"hand"'), XML, "payload mount 'hand' names body 'hand', which is missing"),
-        ("[[joint]]".join(TOML.split("[[joint]]")[:2]), XML, "has 2 degrees of freedom .* names 1 hinge"),
+        (TOML, "<mujoco>", "MJCF"),
+        (TOML.replace('"elbow"', '"knee"'), XML, "'knee'"),
+        (TOML.replace('"fore"', '"hand"'), XML, "body 'hand'"),
+        ("[[joint]]".join(TOML.split("[[joint]]")[:2]), XML, "freedom"),
         (TOML.replace("shoulder", "x").replace("elbow", "shoulder").replace('"x"', '"elbow"'), XML,
-         "must list the joints in the MJCF's order: shoulder, elbow"),
-        (TOML, XML.replace('mass="0.3"', 'mass="-1"'), "does not compile|not valid MJCF"),
+         "order"),
+        (TOML, XML.replace('mass="0.3"', 'mass="-1"'), "compile|MJCF"),
     ],
 )  # fmt: skip
 def test_a_broken_robot_folder_says_what_is_wrong(tmp_path, toml, xml, message):
@@ -147,7 +139,7 @@ def test_a_robot_without_a_mount_carries_nothing(tmp_path):
     assert build_model(robot).nv == 2
     with pytest.raises(
         RobotError,
-        match=r"arm has no \[\[payload_mount\]\]; add one to robot.toml to attach 1.0 kg",
+        match="payload_mount",
     ):
         build_model(robot, 1.0)
 
@@ -333,12 +325,12 @@ def test_an_identified_table_is_saved_and_changes_the_simulator(tipped, tmp_path
 
 
 def test_a_table_that_nothing_may_touch_is_refused(tmp_path):
-    with pytest.raises(RobotError, match=r"\[table\]: no \[\[tip\]\] can touch it"):
+    with pytest.raises(RobotError, match="tip"):
         write_arm(tmp_path / "arm", toml=TOML + "[table]\nheight = -0.05\n")
     stranger = write_arm(
         tmp_path / "b", toml=TOML + TIP.replace("fore", "jaw") + "[table]\nheight = -0.05\n"
     )
-    with pytest.raises(RobotError, match=r"a \[\[tip\]\] names body 'jaw', which is missing"):
+    with pytest.raises(RobotError, match="jaw"):
         build_model(stranger)
 
 

@@ -104,7 +104,7 @@ def test_windows_cover_all_recordings(tmp_path):
     parts = cut(sequences, 5)
     assert len(parts) == 5
     assert {p.meta.motion for p in parts} == {s.meta.motion for s in sequences}
-    with pytest.raises(UsageError, match="--windows 0: give at least 1"):
+    with pytest.raises(UsageError, match="--windows"):
         cut(sequences, 0)
     with pytest.raises(UsageError, match="longer"):
         identify([s.rows(slice(0, 20)) for s in sequences], robot)

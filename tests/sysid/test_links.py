@@ -84,9 +84,7 @@ def test_a_robot_folder_has_its_links_and_the_robot_before_them(robot, tmp_path)
         != model_hash(robot)
         == model_hash(loaded.before_identification)
     )
-    with pytest.raises(
-        RobotError, match=r"an \[identified_link\] names body 'hand', which is missing"
-    ):
+    with pytest.raises(RobotError, match="'hand'"):
         build_model(replace(robot, links={"hand": Link(1.0, (0, 0, 0), (1, 1, 1, 0, 0, 0))}))
 
 

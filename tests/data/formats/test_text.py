@@ -84,7 +84,7 @@ def test_channels_of_different_lengths_have_no_rate_in_common(tmp_path, arm):
         'rate = 50.0\nctrl = "cmd"\nqpos = "pos"\nposition_unit = "rad"\n'
         'joints = ["shoulder", "elbow"]\n'
     )
-    with pytest.raises(LogError, match="equally many rows"):
+    with pytest.raises(LogError, match="rows"):
         list(read_logs(tmp_path, arm))
 
 

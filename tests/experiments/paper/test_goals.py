@@ -46,8 +46,8 @@ def test_the_same_seed_gives_the_same_goals(robot):
 
 
 def test_a_robot_without_hands_and_a_place_out_of_reach_are_refused(robot, tmp_path, monkeypatch):
-    with pytest.raises(UsageError, match="no hand that could deliver"):
+    with pytest.raises(UsageError, match="hand"):
         GoalPlanner(write_arm(tmp_path, TOML.split("[[payload_mount]]")[0]), 0.0, 0)
     monkeypatch.setattr(goals, "MIN_FRONT_M", 0.5)
-    with pytest.raises(UsageError, match="no hand reaches"):
+    with pytest.raises(UsageError, match="reaches"):
         GoalPlanner(robot, 0.4, 0)

@@ -84,9 +84,7 @@ def test_what_cannot_be_is_refused_with_what_is_in_the_way(so101, planner):
     under = np.array([0.0, 1.2, 0.6, 0.0, 0.0, 0.0])
     with pytest.raises(UsageError, match="found"):
         planner.plan(motion(so101, OVER), under)
-    with pytest.raises(
-        UsageError, match=r"'swing' begins with .* and the plane at 0 m .* into each other"
-    ):
+    with pytest.raises(UsageError, match="plane"):
         planner.plan(motion(so101, under), FOLDED)
     with pytest.raises(UsageError, match="target"):
         finish_search(planner.begin(under, FOLDED))

@@ -95,24 +95,15 @@ def test_a_servo_that_is_set_otherwise_is_named(so101, wire, servos):
 @pytest.mark.parametrize(
     ("change", "complaint"),
     [
-        (
-            lambda servos: servos.set(4, "model", 1284),
-            r"servo 4 \(wrist_flex\) is model 1284 in mode 0",
-        ),
-        (
-            lambda servos: servos.set(1, "mode", 1),
-            r"servo 1 \(shoulder_pan\) is model 777 in mode 1",
-        ),
-        (lambda servos: servos.silence(4), r"servo 4 \(wrist_flex\) does not answer"),
-        (
-            lambda servos: servos.status.__setitem__(0, 1 << 2),
-            r"servo 1 \(shoulder_pan\): overheat",
-        ),
+        (lambda servos: servos.set(4, "model", 1284), "model 1284"),
+        (lambda servos: servos.set(1, "mode", 1), "mode 1"),
+        (lambda servos: servos.silence(4), "wrist_flex"),
+        (lambda servos: servos.status.__setitem__(0, 1 << 2), "overheat"),
         (
             lambda servos: [
                 servos.set(n, end, v) for n in (1, 2) for end, v in (("low", 0), ("high", 4095))
             ],
-            r"no limits in shoulder_pan, shoulder_lift\).*--calibration FILE",
+            "--calibration",
         ),
     ],
     ids=["model", "mode", "missing", "error", "no calibration"],

@@ -99,7 +99,7 @@ def test_a_motion_that_goes_into_the_table_is_refused_before_a_row_is_said(plugi
     motion = plugin.GaponetMotion(plugin.GaponetMotionConfig(motions=str(tmp_path)))
     motion.connect()
     plugin.set_observation(seen(gripper=10.0))
-    with pytest.raises(UsageError, match=r"'shove' begins with .* and the plane at 0 m"):
+    with pytest.raises(UsageError, match="plane"):
         motion.get_action()
 
 
