@@ -40,4 +40,4 @@ def test_what_start_is_told_reaches_the_commands():
     assert words[:4] == ["--unit-id", "lab", "--payload-mass", "0"]
     assert set(words[4:]) == {"--map=a=b", "--time-unit=ms", "--cut=3.0", "--skip-bad"}
     assert options.identify_words() == ["--budget", "4m"]
-    assert options.read_options()["joint_map"] == {"a": "b"}
+    assert options.read_options().joint_map == {"a": "b"}

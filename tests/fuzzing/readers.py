@@ -233,7 +233,7 @@ TARGETS = (
     Target("asap", written(write_asap), importing(arm, allow_pickle=True), 1.0, (".pkl",)),
     Target("lerobot", written(lambda f: stock(f / "set", rows=(25, 15))), importing(so101, position_unit="deg"), 2.5),
     Target("bam", written(lambda f: write_bam(f / "a.json", ROWS, 30)), importing(bench, stated="payload"), 1.0),
-    Target("export", written(_export), importing(arm, "set", stated="all", fmt="lerobot"), 2.0),
+    Target("export", written(_export), importing(arm, "set", stated="all", format="lerobot"), 2.0),
     Target("motion", written(_motions), _read_motions, 1.5),
     Target("recipe", written(lambda f: (f / "mine.toml").write_text(RECIPE)), _read_recipe, 0.7, (".toml",)),
 )  # fmt: skip

@@ -71,20 +71,16 @@ def import_logs(
 
     spec = as_robot(robot)
     require_robot_of_folder(Path(out), spec)
-    read_options = vars(options).copy()
-    joint_map = read_options.pop("joint_map")
     return read_logs(
         logs_folder(src),
         spec,
         unit_id,
         payload_mass,
         out,
-        fmt=read_options.pop("format"),
-        joint_map=None if joint_map is None else dict(joint_map),
         gravity=gravity_of(spec),
         simulator=model_hash(spec),
         progress=progress,
-        **read_options,
+        **vars(options),
     )
 
 
@@ -143,10 +139,7 @@ def guess_description(
     from gaponet.data.formats import look
     from gaponet.share.hub_logs import logs_folder
 
-    described = None if options.logs is None else Path(options.logs)
-    kind, facts, recordings = look(
-        logs_folder(src), options.format, described, options.allow_pickle
-    )
+    kind, facts, recordings = look(logs_folder(src), options)
     return guess_logs(recordings, as_robot(robot), kind, dict(facts))
 
 

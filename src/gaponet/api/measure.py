@@ -235,6 +235,7 @@ def replay(
         UsageError: Neither recordings nor an uncertainty of the robot exist.
     """
     from gaponet.data.describe.preview import read_first_recording
+    from gaponet.data.formats import ReadOptions
     from gaponet.export.plain_servos import read_recordings
     from gaponet.export.rollout import BAND_SHARE, predict, sample_robots, summary, validation_error
     from gaponet.sysid.uncertainty import ParameterUncertainty
@@ -255,7 +256,7 @@ def replay(
         )
     with tempfile.TemporaryDirectory() as place:
         toml = None if described is None else Path(described)
-        _, _, guessed = read_first_recording(Path(logs), spec, toml)
+        _, _, guessed = read_first_recording(Path(logs), spec, ReadOptions(logs=toml))
         if guessed:
             toml = Path(place) / "logs.toml"
             write_text(toml, guessed)

@@ -6,12 +6,12 @@ run_options.py.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 from gaponet.base.errors import UsageError
+from gaponet.data.formats import ReadOptions
 from gaponet.robot.servo_fields import Term
 from gaponet.sysid.options import IdentifyOptions as SearchOptions
 
@@ -95,26 +95,11 @@ class IdentifyOptions:
 
 
 @dataclass(frozen=True)
-class ImportOptions:
-    """How logs are read."""
+class ImportOptions(ReadOptions):
+    """How logs are read, and what they are of."""
 
     payload_side: str | None = None
     """Hand that carries the payload: both (default), or the side of one payload mount."""
-    format: str | None = None
-    """Format of the logs; default by inspection; gaponet import --formats lists them."""
-    joint_map: Mapping[str, str] | None = None
-    """Joint name in the logs → joint name of the robot."""
-    logs: str | Path | None = None
-    """A logs.toml: what columns, names, units, signs and clocks mean; default the one in the folder
-    of the logs."""
-    position_unit: Literal["rad", "deg", "turns", "fraction", "ticks", "signed_percent"] | None = (
-        None
-    )
-    """Unit of positions, where the format leaves it open."""
-    time_unit: Literal["s", "ms", "us", "ns"] | None = None
-    """Unit of time, where the format leaves it open."""
-    rate: float | None = None
-    """Hz, of logs without a clock."""
     cut: float | None = None
     """Cut long recordings into equal pieces of about this length, s; each is a motion of its
     own."""
@@ -127,10 +112,6 @@ class ImportOptions:
     """Damping gain while recording, N·m·s/rad, likewise."""
     skip_bad: bool = False
     """Cut bad rows and leave out unreadable logs, instead of refusing all."""
-    strict: bool = False
-    """Refuse logs with implausible velocity, torque or temperature, instead of repairing them."""
-    allow_pickle: bool = False
-    """Open pickled files (ASAP), with an unpickler that makes arrays, numbers and text only."""
 
 
 def parse_joint_map(pairs: tuple[str, ...]) -> dict[str, str] | None:

@@ -11,7 +11,7 @@ import shlex
 import tempfile
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from typing_extensions import TypedDict
@@ -21,6 +21,7 @@ from gaponet.base.errors import LogError, UsageError
 from gaponet.base.files import lock_folder, write_json, write_text
 from gaponet.base.progress import Progress, no_progress
 from gaponet.base.structure import read_json
+from gaponet.data.formats import PositionUnit, ReadOptions, TimeUnit
 from gaponet.data.store import Dataset, dataset_hash
 from gaponet.robot.finding import abbreviate
 from gaponet.robot.spec import RobotSpec, load_robot, named_robots, robot_argument
@@ -59,11 +60,9 @@ class StartOptions:
     """Torque limit, likewise, N·m."""
     format: str | None = None
     """Format of the logs; gaponet import --formats lists them."""
-    position_unit: Literal["rad", "deg", "turns", "fraction", "ticks", "signed_percent"] | None = (
-        None
-    )
+    position_unit: PositionUnit | None = None
     """Unit of positions, where the format leaves it open."""
-    time_unit: Literal["s", "ms", "us", "ns"] | None = None
+    time_unit: TimeUnit | None = None
     """Unit of time, where the format leaves it open."""
     rate: float | None = None
     """Hz, of logs without a clock."""
@@ -107,17 +106,17 @@ class StartOptions:
         words = ["--budget", self.budget] if self.budget else []
         return [*words, "--despite-errors"] if self.despite_errors else words
 
-    def read_options(self) -> dict[str, Any]:
-        """Return how the first recording is read, as read_first_recording takes it."""
-        return {
-            "fmt": self.format,
-            "joint_map": parse_joint_map(self.map),
-            "skip_bad": self.skip_bad,
-            "allow_pickle": self.allow_pickle,
-            "position_unit": self.position_unit,
-            "time_unit": self.time_unit,
-            "rate": self.rate,
-        }
+    def read_options(self, logs: Path | None = None) -> ReadOptions:
+        """Return how a recording is read, by this logs.toml if there is one."""
+        return ReadOptions(
+            format=self.format,
+            joint_map=parse_joint_map(self.map),
+            logs=logs,
+            position_unit=self.position_unit,
+            time_unit=self.time_unit,
+            rate=self.rate,
+            allow_pickle=self.allow_pickle,
+        )
 
 
 # ---- the list of steps
@@ -269,8 +268,9 @@ class Start:
                 robot = new_robot(self.model, Path(place) / "robot", self.options.robot).robot
             checked = self.logs_toml if self.logs_toml.is_file() else None
             try:
+                read_options = self.options.read_options(checked)
                 log, recordings, guessed = read_first_recording(
-                    self.logs, robot, checked, guess_joints, **self.options.read_options()
+                    self.logs, robot, read_options, guess_joints, self.options.skip_bad
                 )
             except DescriptionNeededError as error:
                 raise UnclearLogsError(str(error), error.text) from None

@@ -96,7 +96,6 @@ def import_logs(
     *,
     payload_side: str | None = None,
     level: str | None = None,
-    fmt: str | None = None,
     gravity: Gravity | None = None,
     simulator: str = "",
     progress: Progress = no_progress,
@@ -116,8 +115,8 @@ def import_logs(
         gravity: Gravity of the nominal model, to measure offsets (data.offsets); default: no
             offsets.
         simulator: Hash of that model, recorded beside the offsets.
-        options: The other fields of data.formats.ReadOptions. All other arguments are those of
-            gaponet.api.logs.import_logs, `fmt` its `format`.
+        options: Fields of data.formats.ReadOptions. All other arguments are those of
+            gaponet.api.logs.import_logs.
 
     Raises:
         LogError, JointMismatchError: A recording cannot be read; the message names file and line.
@@ -145,7 +144,7 @@ def import_logs(
         existing = Dataset.open_existing(out, robot)
         if existing is not None:
             read_offsets(existing)  # a damaged file is refused before anything is read
-        source = _Source(src, robot, labels, cut, ReadOptions(fmt, **options))
+        source = _Source(src, robot, labels, cut, ReadOptions(**options))
         with skip_bad_rows(skip_bad) as skipped:
             source.check(existing, progress)
             dataset = Dataset.create(out, robot)
@@ -186,7 +185,7 @@ class _Source:
 
     def check(self, existing: Dataset | None, progress: Progress) -> None:
         """Read and check every recording."""
-        total = len(find_logs(self.src, self.options.fmt))
+        total = len(find_logs(self.src, self.options.format))
         source_of: dict[str, str] = {}  # content hash → source
         duplicates: list[tuple[str, str]] = []
         size = 0

@@ -46,7 +46,7 @@ def dataset(arm, tmp_path):
 
 
 def back(lerobot, robot, out, **options):
-    return import_logs(lerobot, robot, None, None, out, fmt="lerobot", **options).dataset
+    return import_logs(lerobot, robot, None, None, out, format="lerobot", **options).dataset
 
 
 def same(one, other):

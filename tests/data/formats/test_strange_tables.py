@@ -168,7 +168,7 @@ def test_files_that_belong_together_are_proposed_and_then_read_as_one_recording(
         (tmp_path / "logs.toml").write_text('format = "table"\n')
     kind, known, found = look(tmp_path)
     (tmp_path / "logs.toml").write_text(guess_logs(found, arm, kind, dict(known)))
-    logs = dict(read_logs(tmp_path, arm, ReadOptions(fmt="table")))
+    logs = dict(read_logs(tmp_path, arm, ReadOptions(format="table")))
     assert list(logs) == ["run1", "run2"]
     assert np.array_equal(logs["run1"].channels["ctrl"].values, command)
     assert np.array_equal(logs["run1"].channels["qpos"].values, state)

@@ -6,8 +6,8 @@ from __future__ import annotations
 
 import re
 import tempfile
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from gaponet.base.errors import GAPONetError, LogError, UsageError
 from gaponet.base.files import write_text
@@ -33,41 +33,37 @@ class DescriptionNeededError(LogError):
 def read_first_recording(
     logs: Path,
     robot: RobotSpec,
-    specified: Path | None = None,
+    options: ReadOptions,
     anyhow: bool = False,
     skip_bad: bool = False,
-    **options: Any,
 ) -> tuple[Log, int, str]:
     """The first recording, how many there are, and the logs.toml that was guessed; "" where none
     was needed.
 
     Args:
         logs: File or folder.
-        specified: A logs.toml; nothing is guessed beside it.
+        options: With a logs.toml, nothing is guessed beside it.
         anyhow: Also by a guess of which joint is which.
         skip_bad: Leave out recordings that cannot be read.
-        options: The other fields of ReadOptions.
 
     Raises:
         DescriptionNeededError, LogError, UsageError: The message says what is missing.
     """
 
-    def by(file: Path | None, described: str = "") -> tuple[Log, int, str]:
+    def read(options: ReadOptions, described: str = "") -> tuple[Log, int, str]:
         with skip_bad_rows(skip_bad):
-            first = next(iter(read_logs(logs, robot, ReadOptions(logs=file, **options))), None)
+            first = next(iter(read_logs(logs, robot, options)), None)
         if first is None:
             raise UsageError(f"{logs}: holds no recording")
-        return first[1], len(find_logs(logs, options.get("fmt"))), described
+        return first[1], len(find_logs(logs, options.format)), described
 
-    if specified is not None:
-        return by(specified)
     try:
-        return by(None)
+        return read(options)
     except GAPONetError as error:
+        if options.logs is not None:
+            raise
         try:
-            kind, known, recordings = look(
-                logs, options.get("fmt"), allow_pickle=options.get("allow_pickle", False)
-            )
+            kind, known, recordings = look(logs, options)
         except GAPONetError:
             raise error from None
     text = guess_logs(recordings, robot, kind, dict(known))
@@ -75,7 +71,7 @@ def read_first_recording(
         file = Path(place) / "logs.toml"
         write_text(file, text)
         try:
-            matches = by(file, text)
+            matches = read(replace(options, logs=file), text)
         except GAPONetError as again:
             raise DescriptionNeededError(str(again), text) from None
     if NAMED.search(text) and not anyhow:

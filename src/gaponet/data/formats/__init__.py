@@ -37,7 +37,7 @@ from functools import partial
 from itertools import islice
 from pathlib import Path
 from types import ModuleType
-from typing import Any, cast
+from typing import Any, Literal, cast
 
 import numpy as np
 
@@ -182,30 +182,35 @@ def find_logs(path: Path, fmt: str | None = None) -> list[Path]:
     return _find(_reader(path, fmt or read_logs_file(path)[0].get("format")), path)
 
 
+PositionUnit = Literal["rad", "deg", "turns", "fraction", "ticks", "signed_percent"]
+TimeUnit = Literal["s", "ms", "us", "ns"]
+
+
 @dataclass(frozen=True)
 class ReadOptions:
-    """What is said of logs beside logs.toml, and what is allowed; as in gaponet.api.ImportOptions.
+    """What is said of logs beside logs.toml, and what is allowed.
 
     joint_map, position_unit, time_unit and rate win over logs.toml; the last three are refused
     where the format itself fixes them.
     """
 
-    fmt: str | None = None
-    """Name of the format; default logs.toml's, or by inspection."""
-    joint_map: dict[str, str] | None = None
+    format: str | None = None
+    """Format of the logs; default by inspection; gaponet import --formats lists them."""
+    joint_map: Mapping[str, str] | None = None
     """Joint name in the logs → joint name of the robot."""
     logs: str | Path | None = None
-    """A logs.toml; default the one beside the logs."""
-    position_unit: str | None = None
-    """Unit of positions, as in logs.toml."""
-    time_unit: str | None = None
-    """Unit of the clock, as in logs.toml."""
-    allow_pickle: bool = False
-    """Open pickled files, with data.formats.pickles."""
+    """A logs.toml: what columns, names, units, signs and clocks mean; default the one in the folder
+    of the logs."""
+    position_unit: PositionUnit | None = None
+    """Unit of positions, where the format leaves it open."""
+    time_unit: TimeUnit | None = None
+    """Unit of time, where the format leaves it open."""
     rate: float | None = None
     """Hz, of logs without a clock."""
     strict: bool = False
-    """Refuse implausible channels instead of making up for them."""
+    """Refuse logs with implausible velocity, torque or temperature, instead of repairing them."""
+    allow_pickle: bool = False
+    """Open pickled files (ASAP), with an unpickler that makes arrays, numbers and text only."""
 
     def as_logs_file(self) -> LogsFile:
         """Return what is said here of fields of logs.toml."""
@@ -232,7 +237,7 @@ def read_logs(
     out, and both are listed there.
     """
     specified, file = read_logs_file(path, options.logs)
-    reader = _reader(path, options.fmt or specified.get("format"))
+    reader = _reader(path, options.format or specified.get("format"))
     kind = _require_allowed(reader, path, options.allow_pickle)
     by_hand = options.as_logs_file()
     specified = specified | by_hand
@@ -242,7 +247,7 @@ def read_logs(
             raise UsageError(
                 f"{option} means nothing to the {kind} format, which fixes it itself; leave it out"
             )
-    names = specified.get("names", {}) | (options.joint_map or {})
+    names = {**specified.get("names", {}), **(options.joint_map or {})}
     naming = Naming(specified, file)
     root = path if path.is_dir() else path.parent
     bad = skipped_rows()
@@ -272,14 +277,14 @@ def _place_below(root: Path, source: str) -> str:
 
 
 def look(
-    path: Path, fmt: str | None = None, logs: str | Path | None = None, allow_pickle: bool = False
+    path: Path, options: ReadOptions = DEFAULT_OPTIONS
 ) -> tuple[str, LogsFile, list[RawRecording]]:
     """The format, what is said of it already, and the first recordings as they lie there;
     arguments as of read_logs.
     """
-    specified, _ = read_logs_file(path, logs)
-    reader = _reader(path, fmt or specified.get("format"))
-    kind = _require_allowed(reader, path, allow_pickle)
+    specified, _ = read_logs_file(path, options.logs)
+    reader = _reader(path, options.format or specified.get("format"))
+    kind = _require_allowed(reader, path, options.allow_pickle)
     if not hasattr(reader, "recordings"):
         raise UsageError(f"{path}: {about(kind)}: the format says itself what its columns are")
     return kind, specified, list(islice(_recordings(reader, path, specified), LOOK))
