@@ -48,7 +48,6 @@ class ResultTable:
     rows: tuple[tuple[Any, ...], ...]  # cells: text, numbers, MeanStd, or None for a blank
     caption: str = ""
     digits: int = 2  # digits behind the decimal point in text; CSV and JSON have full precision
-    shown: bool = True  # False for a table that is written as CSV only
 
     def __post_init__(self) -> None:
         for row in self.rows:

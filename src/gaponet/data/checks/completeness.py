@@ -10,6 +10,7 @@ from itertools import chain
 
 import numpy as np
 
+from gaponet.base.arrays import Array
 from gaponet.data.checks.check import Check
 from gaponet.data.checks.survey import Survey, Torque
 from gaponet.data.log import COMMANDS
@@ -21,6 +22,7 @@ MIN_BLOCKED_S = 0.5
 MIN_STANDSTILL_S = 1.0
 MIN_REPEATED_S = 0.25
 MAX_CUT_SHARE = 0.02  # of the rows that are left, from which cut rows are told
+MIN_USED_RAD = 0.05  # range of a joint whose torque is judged
 MIN_COMMANDED_RAD = 0.1  # range of a command that moves a joint
 MAX_RESOLUTION_RAD = 3e-3  # step between positions; twice as much is a warning
 RESOLUTION_TOLERANCE = 0.02  # relative difference of an encoder's steps
@@ -241,10 +243,17 @@ def unsigned_torque(recorded: list[tuple[Survey, Torque]], robot: RobotSpec) -> 
     """
     if not recorded:
         return ()
+    low, high, used = torque_limits(recorded)
+    alive = used & (low < high)
+    return () if (alive & (low < 0)).any() else masked_names(robot, alive)
+
+
+def torque_limits(recorded: list[tuple[Survey, Torque]]) -> tuple[Array, Array, Array]:
+    """Return each joint's least and greatest torque, N·m, and whether it moves, (n)."""
     low = np.min([t.low for _, t in recorded], axis=0)
     high = np.max([t.high for _, t in recorded], axis=0)
-    alive = (np.max([survey.qpos_range for survey, _ in recorded], axis=0) > 0.05) & (low < high)
-    return () if (alive & (low < 0)).any() else masked_names(robot, alive)
+    moved = np.max([survey.qpos_range for survey, _ in recorded], axis=0) > MIN_USED_RAD
+    return low, high, moved
 
 
 def _saturation(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:

@@ -8,7 +8,7 @@ import numpy as np
 
 from gaponet.base.arrays import Array
 from gaponet.data.checks.check import Check
-from gaponet.data.checks.completeness import unsigned_torque
+from gaponet.data.checks.completeness import torque_limits, unsigned_torque
 from gaponet.data.checks.survey import Survey, Torque
 from gaponet.data.signals import FAST_COMMAND_RAD_S, Response
 from gaponet.data.static_poses import StaticError, StaticPoses
@@ -196,9 +196,7 @@ def _torque(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
             "note", "torque", "no torque recorded; equivalent torque comes from inverse dynamics"
         )
         return
-    low = np.min([t.low for _, t in recorded], axis=0)
-    high = np.max([t.high for _, t in recorded], axis=0)
-    used = np.max([survey.qpos_range for survey, _ in recorded], axis=0) > 0.05
+    low, high, used = torque_limits(recorded)
     constant = masked_names(robot, used & (low == high))
     unsigned = unsigned_torque(recorded, robot)
     if constant:

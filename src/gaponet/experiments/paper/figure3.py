@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence as ListOf
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,6 +14,7 @@ from gaponet.experiments.paper.results import Results
 from gaponet.report.figures.style import figure, joint_label, legend, styled
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 # Curve → grey-proof style: line, marker, colour.
@@ -41,19 +43,8 @@ def draw_figure_3(results: Results, block: Block) -> Figure:
     for panel, joint in enumerate(joints):
         ax = axes.flat[panel]
         for name, q_dis in curves.items():
-            line, marker, colour = CURVES[name]
             values = [_over_motions(results, q_dis, joint, mass) for mass in results.masses]
-            ax.errorbar(
-                results.masses,
-                [value.mean for value in values],
-                yerr=[value.standard_error for value in values],
-                linestyle=line,
-                marker=marker,
-                markersize=3.5,
-                color=colour,
-                capsize=1.5,
-                label=name,
-            )
+            _draw_curve(ax, results.masses, values, name, markersize=3.5)
         ax.set_title(joint_label(results.study.robot.operated[joint], wrapped=False))
     axes.flat[0].set_ylim(bottom=0)  # of all panels, after the last curve
     for ax in axes.flat[len(joints) :]:
@@ -72,24 +63,32 @@ def _draw_joints(results: Results, curves: dict[str, Array]) -> Figure:
     fig = figure(max(4.5, 0.8 * len(joints) + 1.5), 2.8)
     ax = fig.subplots()
     for name, q_dis in curves.items():
-        line, marker, colour = CURVES[name]
         values = [_over_motions(results, q_dis, joint, results.masses[0]) for joint in joints]
-        ax.errorbar(
-            np.arange(len(joints)),
-            [value.mean for value in values],
-            yerr=[value.standard_error for value in values],
-            linestyle=line,
-            marker=marker,
-            color=colour,
-            capsize=1.5,
-            label=name,
-        )
+        _draw_curve(ax, range(len(joints)), values, name)
     names = [joint_label(results.study.robot.operated[joint]) for joint in joints]
     ax.set_xticks(np.arange(len(joints)), names)
     ax.set_ylabel("Q_dis, rad·s")
     ax.set_ylim(bottom=0)
     legend(fig)
     return fig
+
+
+def _draw_curve(
+    ax: Axes, x: ListOf[float], values: list[MeanStd], name: str, markersize: float | None = None
+) -> None:
+    """Draw the means of a curve of CURVES with their standard errors."""
+    line, marker, colour = CURVES[name]
+    ax.errorbar(
+        x,
+        [value.mean for value in values],
+        yerr=[value.standard_error for value in values],
+        linestyle=line,
+        marker=marker,
+        color=colour,
+        capsize=1.5,
+        label=name,
+        markersize=markersize,
+    )
 
 
 def _curves(results: Results, block: Block) -> dict[str, Array]:
