@@ -101,12 +101,14 @@ class VirtualDriver:
         payload: tuple[float, str] = (0.0, "both"),
         name: str = "unit",
         seed: int = 0,
+        period: float = STATE_PERIOD_S,
     ) -> None:
         """
         Args:
             physics: Hidden parameters (virtual.fleet).
             clock: Clock of the controller.
             payload: kg per hand, and side.
+            period: Time between two states, s.
         """
         robot = robot.before_identification  # the hidden physics replaces what was identified
         self.kp = robot.servo.kp
@@ -115,7 +117,8 @@ class VirtualDriver:
         self.address = f"virtual {robot.name} {name} in process {os.getpid()}"
         self.joint_names = robot.joint_names
         self.clock = clock
-        self._new_unit = partial(LiveUnit, robot, physics, payload, seed)
+        self.period = period
+        self._new_unit = partial(LiveUnit, robot, physics, payload, seed, period)
         self._live: LiveUnit | None = None  # from the connection on
         self._state: State | None = None  # the newest one, from the connection on
         self._begun = 0.0  # clock's time at the connection, s
@@ -146,7 +149,7 @@ class VirtualDriver:
         if not self._commanded:
             self._skipped += due - 1
             due = 1
-        if due * STATE_PERIOD_S > MAX_LAG_S:
+        if due * self.period > MAX_LAG_S:
             raise DriverError(
                 f"{self.address}: this machine cannot simulate it in real time; run without real "
                 "time (--fast)"
@@ -164,11 +167,11 @@ class VirtualDriver:
 
     def _periods_due(self) -> int:
         """Return how many state periods the simulation is behind the clock."""
-        elapsed = int((self.clock.now() - self._begun) / STATE_PERIOD_S + 1e-6)
+        elapsed = int((self.clock.now() - self._begun) / self.period + 1e-6)
         return elapsed - self._skipped - self.live.steps
 
     def _measure(self) -> State:
-        time = self._begun + (self._skipped + self.live.steps) * STATE_PERIOD_S
+        time = self._begun + (self._skipped + self.live.steps) * self.period
         return State(time, *self.live.read())
 
     def write(self, ctrl: Array, weight: float = 1.0) -> None:
