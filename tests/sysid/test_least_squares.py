@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from gaponet.sysid.least_squares import agreed_slopes, better_half, descend, step
+from gaponet.sysid.least_squares import Problems, agreed_slopes, better_half, descend, step
 
 POINTS = np.linspace(-1, 1, 60)
 
@@ -21,7 +21,8 @@ def test_problems_that_share_candidates_have_separate_minima():
     tried = []
     starts = np.random.default_rng(0).uniform(0, 2, (4, 2, 3))
     low, high = np.full((2, 3), -3.0), np.full((2, 3), 3.0)
-    x, cost = descend(starts, low, high, lambda x: tried.append(x.shape) or valley(x), 40)
+    problems = Problems(lambda x: tried.append(x.shape) or valley(x), low, high)
+    x, cost = descend(problems, starts, 40)
     best = better_half(x, cost)
     assert best.shape == (2, 2, 3)
     np.testing.assert_allclose(best[0], ENDS, atol=1e-3)
@@ -30,9 +31,9 @@ def test_problems_that_share_candidates_have_separate_minima():
 
 def test_several_starts_find_the_deeper_minimum():
     waves = lambda x: np.concatenate([0.3 * x, 2 * np.sin(3 * x)], axis=-1)  # noqa: E731
-    low, high = np.full((1, 1), -9.0), np.full((1, 1), 9.0)
-    one, worse = descend(np.full((1, 1, 1), 6.0), low, high, waves, 30)
-    many, cost = descend(np.array([6.0, 4.0, 0.4, 0.1]).reshape(4, 1, 1), low, high, waves, 30)
+    problems = Problems(waves, np.full((1, 1), -9.0), np.full((1, 1), 9.0))
+    one, worse = descend(problems, np.full((1, 1, 1), 6.0), 30)
+    many, cost = descend(problems, np.array([6.0, 4.0, 0.4, 0.1]).reshape(4, 1, 1), 30)
     assert cost.min() < 0.5 * worse.min()
     assert abs(better_half(many, cost)[0].item()) < 1e-2 < abs(one.item())
 

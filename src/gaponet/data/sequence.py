@@ -87,6 +87,11 @@ class SequenceMeta:
         """Joints of which nothing was recorded: they stand where they were said to, or at home."""
         return (*self.notes.get("posture", {}), *self.notes.get("held_at_home", ()))
 
+    def records(self, joints: Iterable[str]) -> Array:
+        """Return which of these joints were recorded, (n,)."""
+        unrecorded = self.unrecorded
+        return np.array([joint not in unrecorded for joint in joints], bool)
+
     @property
     def independent_motion(self) -> str:
         """The motion; of a piece of a longer recording (gaponet import --cut) that recording's

@@ -52,8 +52,8 @@ def temperature_spread(sequences: ListOf[Sequence], robot: RobotSpec) -> Array:
     for key in set(alike):
         rows = [i for i, one in enumerate(alike) if one == key]
         among[rows] -= warm[rows].mean(axis=0)
-    missing = [any(j in s.meta.unrecorded for s in sequences) for j in robot.operated]
-    return np.where(missing, 0.0, np.nan_to_num([warm.std(axis=0), among.std(axis=0)]))
+    recorded = np.all([s.meta.records(robot.operated) for s in sequences], axis=0)
+    return np.where(recorded, np.nan_to_num([warm.std(axis=0), among.std(axis=0)]), 0.0)
 
 
 def temperature_varies(sequences: ListOf[Sequence], robot: RobotSpec) -> Array:

@@ -193,14 +193,15 @@ class Judge:
         do not count.
         """
         self._folds: list[_Fold] = []
+        self.rows = 0  # of all recordings
         names: list[str] = []
         for sequences in folds:
             touch = _contact_rows(sequences, robot, contact_height)
             fold = _Fold.of(sequences, RobotRollouts(list(sequences), robot, nthread, touch=touch))
             self._folds.append(fold)
             names += fold.motions
+            self.rows += sum(map(len, sequences))
         self.names = np.array(names)  # of all motions, (motions,)
-        self.rows = sum(len(s) for sequences in folds for s in sequences)  # of all recordings
         self._simulated: dict[tuple[int, bytes], Array] = {}  # fold and candidate → its sums
 
     def _sums(self, candidate: ListOf[Values], links: ListOf[Links] = ()) -> tuple[Array, Array]:
@@ -353,8 +354,12 @@ def _mixed(candidates: dict[str, list[Values]], winner: Array) -> list[Values]:
     joints = np.arange(len(winner))
     mixed = []
     for of_fold in zip(*candidates.values(), strict=True):
-        fields = [f for f in of_fold[0] if all(f in values for values in of_fold)]
-        mixed.append({f: np.stack([v[f] for v in of_fold])[winner, joints] for f in fields})
+        values = {}
+        for name in of_fold[0]:
+            if all(name in candidate for candidate in of_fold):
+                by_candidate = np.stack([candidate[name] for candidate in of_fold])
+                values[name] = by_candidate[winner, joints]
+        mixed.append(values)
     return mixed
 
 

@@ -21,7 +21,7 @@ from gaponet.sim.metrics import MIN_RELATIVE_GAIN, Comparison
 from gaponet.sim.replay import Corrector, rollout_errors
 from gaponet.sysid.axes import LARGE_KP_LOG_CHANGE, Changes, Values, first_values, with_values
 from gaponet.sysid.joint_rollouts import ERROR_SCALE_RAD
-from gaponet.sysid.least_squares import DIFFERENCE_STEP, Errors, descend
+from gaponet.sysid.least_squares import DIFFERENCE_STEP, Errors, Problems, descend
 from gaponet.sysid.robot_rollouts import WINDOW_S, RobotRollouts, cut
 
 Field = Literal["kp", "damping", "frictionloss", "offset", "delay"]
@@ -98,16 +98,9 @@ def adapt(
         rms = ERROR_SCALE_RAD * float(np.sqrt(2 * cost[0] / problem.size))
         progress(done, MAX_ITERATIONS, rms)
 
-    x, _ = descend(
-        problem.changes.start(START_DELAY_S).reshape(1, 1, -1),
-        problem.low,
-        problem.high,
-        problem.errors,
-        MAX_ITERATIONS,
-        report,
-        min_decrease=MIN_DECREASE,
-        derive=problem.slopes,
-    )
+    start = problem.changes.start(START_DELAY_S).reshape(1, 1, -1)
+    problems = Problems(problem.errors, problem.low, problem.high, problem.slopes)
+    x, _ = descend(problems, start, MAX_ITERATIONS, report, MIN_DECREASE)
     before = problem.rms(np.zeros_like(x[0, 0]))
     after = problem.rms(x[0, 0])
     if judge and after > (1 - MIN_RELATIVE_GAIN) * before:

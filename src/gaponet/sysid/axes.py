@@ -357,9 +357,8 @@ class Axes:
         self.names = list(dict.fromkeys(fields))
         self.rest = rest
         self._kd_slack = bounds.kd
-        low, high, self.unit = (
-            np.stack([bounds.limits[f][i] for f in self.names], axis=1) for i in range(3)
-        )
+        limits = [bounds.limits[field] for field in self.names]
+        low, high, self.unit = np.stack(limits, axis=-1)  # (n, P) each
         self.low = low / self.unit
         self.high = high / self.unit
         here = self._unclipped(rest)

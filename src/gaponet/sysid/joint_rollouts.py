@@ -82,9 +82,7 @@ class JointRollouts:
         self.stops = self._stops()
         self.touch = self._touch(contact_height)  # (windows, rows)
         # Joints that a window does not hold have no error, (n, windows).
-        self.recorded = np.array(
-            [[j not in p.meta.unrecorded for p in parts] for j in robot.operated]
-        )
+        self.recorded = np.stack([p.meta.records(robot.operated) for p in parts], axis=1)
         self.counted = self._counted()
         # Gains of each recording: kp over the robot's own, kd in N·m·s/rad, (windows, n).
         acting = [robot.with_gains(*p.meta.recorded_gains) for p in parts]
@@ -121,13 +119,13 @@ class JointRollouts:
         models = {}
         for payload in dict.fromkeys(payloads):
             models[payload] = build_model(self.robot, *payload, self.dt, physics_only=True)
-        along = [
-            _loads_along(part, models[payload], self.op, thin)
-            for part, payload, thin in zip(self.parts, payloads, self._thins, strict=True)
-        ]
-        inertia, weight, pull, slope = (
-            _at_middle(self._stacked([loads[i] for loads in along])) for i in range(4)
-        )
+        along = []
+        for part, payload, thin in zip(self.parts, payloads, self._thins, strict=True):
+            along.append(_loads_along(part, models[payload], self.op, thin))
+        stacked = []
+        for of_windows in zip(*along, strict=True):
+            stacked.append(_at_middle(self._stacked(list(of_windows))))
+        inertia, weight, pull, slope = stacked
         weight_at_zero = weight - slope * _at_middle(self.qpos)
         return np.stack([inertia, weight_at_zero, pull, slope])
 
@@ -198,7 +196,8 @@ class JointRollouts:
         gains. (n,) each; kp is 0 where it fails.
         """
         joints = [self._regressed_joint(j) for j in range(len(self.op))]
-        return {field: np.array([joint[field] for joint in joints]) for field in joints[0]}
+        by_field = np.array([list(joint.values()) for joint in joints]).T
+        return dict(zip(REGRESSED_FIELDS, by_field, strict=True))
 
     def _regressed_joint(self, j: int) -> dict[str, float]:
         """Return `regressed` of joint j: the fit with the delay that leaves the least residual.
@@ -211,19 +210,16 @@ class JointRollouts:
         """
         row = np.concatenate([np.arange(length) for length in self.lengths])
         window = np.repeat(np.arange(len(self.lengths)), self.lengths)
-        some = slice(None, None, max(1, len(row) // MAX_REGRESSION_ROWS))
         q, v, a = self._smooth_motion(j)
         inertia, weight, pull, slope = self.tables[:, j, window, row]
         torque = inertia * a + weight + slope * q + pull
+        one = np.ones_like(q)
         best = dict.fromkeys(REGRESSED_FIELDS, 0.0)
         least = np.inf
         for delay in np.arange(0.0, MAX_REGRESSION_DELAY_S, max(self.dt / 2, 5e-3)):
             error = self._late_commands(j, delay, window, row) - q
-            one = np.ones_like(q)
             columns = np.stack([error, -v, -np.tanh(v / SLIP_SPEED), -a, one, -one], axis=1)
-            size = np.sqrt(np.square(columns[some]).mean(axis=0)) + 1e-12
-            x, residual = nnls(columns[some] / size, torque[some])
-            x = x / size
+            x, residual = _nonnegative_factors(columns, torque)
             if residual < least and x[0] > 0:
                 least = residual
                 offset = (x[4] - x[5]) / x[0]
@@ -365,6 +361,16 @@ def _loads_along(part: Sequence, model: mujoco.MjModel, op: Array, thin: int) ->
         return loads[:, : len(part)]
     rows = np.arange(len(part))
     return np.apply_along_axis(lambda load: np.interp(rows, at, load), 1, loads)
+
+
+def _nonnegative_factors(columns: Array, torque: Array) -> tuple[Array, float]:
+    """Return the non-negative factors of columns (rows, 6) that balance a torque (rows,) N·m, and
+    the residual; at most MAX_REGRESSION_ROWS rows count.
+    """
+    some = slice(None, None, max(1, len(torque) // MAX_REGRESSION_ROWS))
+    size = np.sqrt(np.square(columns[some]).mean(axis=0)) + 1e-12
+    x, residual = nnls(columns[some] / size, torque[some])
+    return x / size, float(residual)
 
 
 def _at_middle(x: Array) -> Array:

@@ -9,6 +9,7 @@ valley that random candidates miss.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -25,15 +26,42 @@ Progress = Callable[[Array], object]  # a true answer ends the search
 Errors = Callable[[Array], Array]
 
 
+def slopes(x: Array, high: Array, errors: Errors) -> tuple[Array, Array]:
+    """Return errors (S, n, m) at x (S, n, P), and their differences over x, (S, n, m, P): forward,
+    but backward where a step would leave `high`.
+    """
+    steps = np.where(x + DIFFERENCE_STEP > high, -DIFFERENCE_STEP, DIFFERENCE_STEP)
+    tried = np.concatenate(
+        [x[None], x + np.moveaxis(steps[..., None] * np.eye(x.shape[-1]), -1, 0)]
+    )
+    values = _evaluated(errors, tried)
+    jac = (values[1:] - values[0]) / np.moveaxis(steps, -1, 0)[..., None].astype(values.dtype)
+    return values[0], np.moveaxis(jac, 0, -1)
+
+
+@dataclass(frozen=True)
+class Problems:
+    """n problems of P parameters, whose errors are evaluated together.
+
+    Attributes:
+        errors: Function of candidates.
+        low, high: Bounds, (n, P), in units in which a change of one is a large one.
+        derive: Computes errors and slopes, as `slopes` does; another function may take fewer
+            candidates than P + 1.
+    """
+
+    errors: Errors
+    low: Array
+    high: Array
+    derive: Callable[[Array, Array, Errors], tuple[Array, Array]] = slopes
+
+
 def descend(
+    problems: Problems,
     x: Array,
-    low: Array,
-    high: Array,
-    errors: Errors,
     iterations: int,
     progress: Progress = lambda cost: None,
     min_decrease: float = MIN_RELATIVE_DECREASE,
-    derive: Callable[[Array, Array, Errors], tuple[Array, Array]] | None = None,
 ) -> tuple[Array, Array]:
     """Minimise the soft L1 costs of n problems from S starts; return the points (S, n, P) and
     their costs (S, n).
@@ -45,26 +73,21 @@ def descend(
     its best earlier point is returned.
 
     Args:
-        x: Starts, (S, n, P), in units in which a change of one is a large one.
-        low, high: Bounds, (n, P).
-        errors: Function of candidates.
+        x: Starts, (S, n, P).
         iterations: At most; each evaluates S·(P + 1 + len(DAMPING_FACTORS)) candidates.
         progress: Called after each iteration with the least cost of every problem, (n,); True ends
             the search.
         min_decrease: Ends the search when the relative decrease of every cost is smaller.
-        derive: Replaces `slopes`, where it takes fewer candidates than P + 1.
     """
     damping = np.full(x.shape[:2], FIRST_DAMPING)
     best_x = x  # of each start, by the sum over problems
     best_cost = np.full(x.shape[:2], np.inf)
     for _ in range(iterations):
-        here, jac = (derive or slopes)(x, high, errors)
-        cost = soft_l1(here)  # (S, n)
+        errors, jac = problems.derive(x, problems.high, problems.errors)
+        cost = soft_l1(errors)  # (S, n)
         best_x, best_cost = _better(best_x, best_cost, x, cost)
-        normal, gradient = _normal_equations(here, jac)
-        steps = [step(normal, gradient, low - x, high - x, f * damping) for f in DAMPING_FACTORS]
-        tried = np.stack(steps) + x  # (factors, S, n, P)
-        tried_cost = soft_l1(_evaluated(errors, tried))
+        tried = _damped_steps(problems, x, errors, jac, damping)
+        tried_cost = soft_l1(_evaluated(problems.errors, tried))  # (factors, S, n)
         choice = tried_cost.argmin(axis=0)  # (S, n)
         least = tried_cost.min(axis=0)
         is_lower = least < cost
@@ -76,8 +99,23 @@ def descend(
         is_over = progress(np.minimum(least, cost).min(axis=0))
         if is_over or (decrease < min_decrease).all():
             break
-    cost = soft_l1(_evaluated(errors, x[None]))[0]
+    cost = soft_l1(_evaluated(problems.errors, x[None]))[0]
     return _better(best_x, best_cost, x, cost)
+
+
+def _damped_steps(problems: Problems, x: Array, errors: Array, jac: Array, damping: Array) -> Array:
+    """Return the points after the Levenberg-Marquardt steps of all DAMPING_FACTORS from x (S, n,
+    P), (factors, S, n, P).
+
+    Args:
+        errors, jac: At x, as of `slopes`.
+        damping: The last one, (S, n).
+    """
+    normal, gradient = _normal_equations(errors, jac)
+    low = problems.low - x
+    high = problems.high - x
+    steps = [step(normal, gradient, low, high, factor * damping) for factor in DAMPING_FACTORS]
+    return np.asarray(np.stack(steps) + x)
 
 
 def _better(x: Array, cost: Array, other_x: Array, other_cost: Array) -> tuple[Array, Array]:
@@ -97,19 +135,6 @@ def _normal_equations(errors: Array, jac: Array) -> tuple[Array, Array]:
     normal = np.swapaxes(jac, -1, -2) @ (weight[..., None] * jac)
     gradient = (np.swapaxes(jac, -1, -2) @ (weight * errors)[..., None])[..., 0]
     return normal.astype(float), gradient.astype(float)
-
-
-def slopes(x: Array, high: Array, errors: Errors) -> tuple[Array, Array]:
-    """Return errors (S, n, m) at x (S, n, P), and their differences over x, (S, n, m, P): forward,
-    but backward where a step would leave `high`.
-    """
-    steps = np.where(x + DIFFERENCE_STEP > high, -DIFFERENCE_STEP, DIFFERENCE_STEP)
-    tried = np.concatenate(
-        [x[None], x + np.moveaxis(steps[..., None] * np.eye(x.shape[-1]), -1, 0)]
-    )
-    values = _evaluated(errors, tried)
-    jac = (values[1:] - values[0]) / np.moveaxis(steps, -1, 0)[..., None].astype(values.dtype)
-    return values[0], np.moveaxis(jac, 0, -1)
 
 
 def agreed_slopes(x: Array, low: Array, high: Array, errors: Errors) -> tuple[Array, Array]:

@@ -120,7 +120,7 @@ def default_terms(sequences: ListOf[Sequence], robot: RobotSpec) -> tuple[Term, 
         own = robot.with_gains(*s.meta.recorded_gains)
         torque = (own.servo.kp * (s.ctrl - s.qpos) - own.servo.kd * s.qvel)[:, op]
         qvel = s.qvel[:, op]
-        recorded = np.array([j not in s.meta.unrecorded for j in robot.operated])
+        recorded = s.meta.records(robot.operated)
         limited_rows += recorded * (np.abs(torque) > AT_TORQUE_LIMIT * limit).sum(axis=0)
         driven = (torque * np.sign(qvel) > DRIVEN_FAST * limit) & (np.abs(qvel) > fast)
         fast_rows += recorded * driven.sum(axis=0)

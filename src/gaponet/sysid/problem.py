@@ -23,6 +23,7 @@ from gaponet.sysid.joint_rollouts import ERROR_SCALE_RAD, JointRollouts
 from gaponet.sysid.least_squares import (
     DAMPING_FACTORS,
     Errors,
+    Problems,
     Progress,
     agreed_slopes,
     better_half,
@@ -228,7 +229,7 @@ class JointFit(FitProblem):
         windows = (self.rollouts.shortened(SHORT_WINDOW_S), self.rollouts, self.rollouts)
         for rollouts, iterations in zip(windows, SEARCH_ITERATIONS, strict=True):
             errors = self.of_axes(axes, rollouts)
-            x, cost = descend(x, axes.low, axes.high, errors, iterations, report)
+            x, cost = descend(Problems(errors, axes.low, axes.high), x, iterations, report)
             self.prior.update_residual(cost.min(axis=0), rollouts.rows)
             if rollouts is self.rollouts:
                 x = better_half(x, cost)
@@ -280,7 +281,11 @@ class RobotFit(FitProblem):
         candidates = x.shape[-1] + 1 + len(DAMPING_FACTORS)  # of one iteration
         iterations = max(1, min(MAX_CHAIN_ITERATIONS, MAX_CHAIN_CANDIDATES // candidates))
         x, _ = descend(
-            x, low, high, errors, iterations, report(names, rows), MIN_CHAIN_COST_DECREASE
+            Problems(errors, low, high),
+            x,
+            iterations,
+            report(names, rows),
+            MIN_CHAIN_COST_DECREASE,
         )
         return {f: v[0].copy() for f, v in axes.values(chains.unpack(x)).items()}
 
@@ -301,10 +306,9 @@ class RobotSearch:
 
     def iterate(self, count: int, report: Progress = lambda cost: None) -> None:
         """Go on for at most `count` iterations."""
-        errors = self._fit.of_axes(self._axes)
-        low = self._axes.low
-        high = self._axes.high
-        self._x, self._cost = descend(self._x, low, high, errors, count, report, MIN_COST_DECREASE)
+        axes = self._axes
+        problems = Problems(self._fit.of_axes(axes), axes.low, axes.high)
+        self._x, self._cost = descend(problems, self._x, count, report, MIN_COST_DECREASE)
         self._fit.prior.update_residual(self._cost.min(axis=0), self._fit.rollouts.rows)
 
     def keep_better_starts(self) -> None:
@@ -410,7 +414,6 @@ def standard_errors(problem: FitProblem, values: Values) -> StandardErrors:
     units.
     """
     names = fitted_fields(values)
-    joints = problem.robot.operated
     axes = Axes(problem.bounds, names, values)
     x = axes.normalize(values)  # (n, P)
     covariance, unseen = _covariance(problem, axes, x)
@@ -427,12 +430,13 @@ def standard_errors(problem: FitProblem, values: Values) -> StandardErrors:
     unit = axes.unit[..., None]
     of_unseen = UNKNOWN_STD * np.eye(len(names)) * unseen[..., None, :]
     in_axis_units = unit * (covariance + of_unseen) * np.swapaxes(unit, -1, -2)
-    return StandardErrors(
-        std={j: {f: float(std[f][i]) for f in names} for i, j in enumerate(joints)},
-        covariance={j: (names, in_axis_units[i]) for i, j in enumerate(joints)},
-        undetermined={j: fields for j, (fields, _) in unknown.items()},
-        sentences=tuple(text for _, text in unknown.values()),
-    )
+    result = StandardErrors({}, {}, {}, tuple(text for _, text in unknown.values()))
+    for i, joint in enumerate(problem.robot.operated):
+        result.std[joint] = {field: float(std[field][i]) for field in names}
+        result.covariance[joint] = (names, in_axis_units[i])
+        if joint in unknown:
+            result.undetermined[joint], _ = unknown[joint]
+    return result
 
 
 def _covariance(problem: FitProblem, axes: Axes, x: Array) -> tuple[Array, Array]:

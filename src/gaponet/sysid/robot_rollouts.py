@@ -82,8 +82,8 @@ class RobotRollouts:
             self.touch = touch.T[:rows]
         self.counted = self._counted()  # (rows − 1, windows): of the state after each step
         self.window = np.broadcast_to(np.arange(len(parts)), self.counted.shape)[self.counted]
-        held = [[j not in p.meta.unrecorded for p in parts] for j in robot.operated]
-        self.recorded = np.array(held)[:, self.window]
+        recorded = np.stack([p.meta.records(robot.operated) for p in parts], axis=1)
+        self.recorded = recorded[:, self.window]
         self.rows = self.recorded.sum(axis=1)
         self._standing = self._standing_joints()
 

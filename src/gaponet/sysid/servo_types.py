@@ -169,7 +169,9 @@ def _measured_servos(number: int, robot: RobotSpec) -> list[_MeasuredServo]:
     then = first_values(nominal)
     now["damping"] = now["damping"] + robot.servo.kd[op] - nominal.servo.kd[op]
     sources = known.sources if known else ({"unit": ""},)
-    units = {(number, unit) for source in sources for unit in source["unit"].split(", ")}
+    units = set[tuple[int, str]]()
+    for source in sources:
+        units.update((number, unit) for unit in source["unit"].split(", "))
     identified = identified_joints(robot)
     servos = []
     for k, joint in enumerate(robot.operated):

@@ -25,7 +25,7 @@ from gaponet.sim.metrics import Comparison, by_motion
 from gaponet.sim.model import write_table
 from gaponet.sim.replay import rollout_errors
 from gaponet.sysid.joint_rollouts import ERROR_SCALE_RAD
-from gaponet.sysid.least_squares import descend, soft_l1
+from gaponet.sysid.least_squares import Problems, descend, soft_l1
 from gaponet.sysid.robot_rollouts import RobotRollouts
 
 # Above the lowest tip, or above the table. Below this a joint's wrong zero may hide a contact.
@@ -109,9 +109,10 @@ def low_windows(
     for s, height in zip(sequences, heights, strict=True):
         rows = min(round(WINDOW_S / s.dt), len(s))
         starts = range(0, len(s) - rows + 1, rows)
-        windows += [
-            s.rows(slice(a, a + rows)) for a in starts if (height[a : a + rows] < below).any()
-        ]
+        for start in starts:
+            window = slice(start, start + rows)
+            if (height[window] < below).any():
+                windows.append(s.rows(window))
     return sorted(windows, key=lambda s: -len(s))
 
 
@@ -153,13 +154,9 @@ def fit_table(
     if not parts:
         return TableFit(robot, False, np.zeros(0), np.zeros(0), ())
     measured = robot.scene.table
-    guess = Table(lowest, FRICTION.guess, float(np.exp(LOG_STIFFNESS.guess)))
-    with_table = robot.with_table(measured or guess)
     zeros = np.zeros(len(robot.operated))
     away = np.array([[lowest - 10.0, FRICTION.guess, LOG_STIFFNESS.guess, *zeros]])
-    scene = _TableRollouts(parts, with_table, nthread)
-    scene = _TableRollouts(_most_wrong(scene, away), with_table, nthread)
-    motions = tuple(dict.fromkeys(s.meta.independent_motion for s in scene.parts))
+    scene = _most_wrong_windows(parts, robot, away, lowest, nthread)
     heights = lowest + START_HEIGHT_STEP_M * np.arange(-2, START_HEIGHTS - 2)
     if measured is not None:
         heights = np.array([measured.height])
@@ -169,11 +166,24 @@ def fit_table(
     if validation:
         errors = [float(rollout_errors(validation, one, nthread).mean()) for one in tables]
     best = int(np.argmin(errors))
-    without = scene.mean(away[0])
-    within = scene.mean(results[best][0])
+    before = scene.mean(away[0])
+    after = scene.mean(results[best][0])
     metas = [s.meta for s in scene.parts]
-    accepted = Comparison("table", by_motion(metas, without), by_motion(metas, within)).accepted
-    return TableFit(tables[best] if accepted else robot, accepted, without, within, motions)
+    motions = tuple(dict.fromkeys(meta.independent_motion for meta in metas))
+    accepted = Comparison("table", by_motion(metas, before), by_motion(metas, after)).accepted
+    return TableFit(tables[best] if accepted else robot, accepted, before, after, motions)
+
+
+def _most_wrong_windows(
+    parts: list[Sequence], robot: RobotSpec, away: Array, lowest: float, nthread: int
+) -> _TableRollouts:
+    """Return rollouts of the windows that go most wrong with a table `away`, on a robot with a
+    table: its own, or one at `lowest`, m.
+    """
+    guess = Table(lowest, FRICTION.guess, float(np.exp(LOG_STIFFNESS.guess)))
+    with_table = robot.with_table(robot.scene.table or guess)
+    every = _TableRollouts(parts, with_table, nthread)
+    return _TableRollouts(_most_wrong(every, away), with_table, nthread)
 
 
 def _starts(scene: _TableRollouts, away: Array, heights: Array) -> Array:
@@ -260,14 +270,10 @@ def _searched(
             pace.append(costs[-1])
         return behind or over
 
-    changes, cost = descend(
-        np.zeros((1, 1, len(start))),
-        ((low - start) / large_change)[None],
-        ((high - start) / large_change)[None],
-        errors,
-        ITERATIONS,
-        ends,
+    problems = Problems(
+        errors, ((low - start) / large_change)[None], ((high - start) / large_change)[None]
     )
+    changes, cost = descend(problems, np.zeros((1, 1, len(start))), ITERATIONS, ends)
     return start + large_change * changes[0, 0], float(cost[0, 0])
 
 

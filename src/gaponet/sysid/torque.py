@@ -27,7 +27,7 @@ from gaponet.sim.model import build_model
 from gaponet.sysid.adapt import PRIOR_RAD
 from gaponet.sysid.axes import CLASSIC, Changes, first_values, with_values
 from gaponet.sysid.joint_rollouts import ERROR_SCALE_RAD, SLIP_SPEED, JointRollouts
-from gaponet.sysid.least_squares import descend
+from gaponet.sysid.least_squares import Problems, descend
 from gaponet.sysid.robot_rollouts import cut
 
 MAX_WINDOWS = 80  # more than elsewhere, since they may be short
@@ -348,7 +348,7 @@ class TorqueFit:
 
         first = np.zeros((1, *changes.low.shape))
         first[..., fields.index("delay")] = START_DELAY
-        x, _ = descend(first, changes.low, changes.high, errors, ITERATIONS)
+        x, _ = descend(Problems(errors, changes.low, changes.high), first, ITERATIONS)
         values = changes.values(x)
         return with_values(start, {f: values[f][0] for f in fields})
 
@@ -360,9 +360,7 @@ def _place(mount: int, first: ListOf[float] | Array) -> tuple[float, float, floa
 
 def _moved(sequence: Sequence, robot: RobotSpec) -> list[int]:
     """Return the operated joints that a recording holds and whose command moves."""
-    moved = np.ptp(sequence.ctrl, axis=0) > MIN_MOVE_RAD
-    return [
-        int(i)
-        for i in robot.operated_index
-        if moved[i] and robot.joint_names[i] not in sequence.meta.unrecorded
-    ]
+    op = robot.operated_index
+    is_moved = np.ptp(sequence.ctrl[:, op], axis=0) > MIN_MOVE_RAD
+    moved: list[int] = op[is_moved & sequence.meta.records(robot.operated)].tolist()
+    return moved

@@ -179,16 +179,20 @@ def _rows(s: Sequence, robot: RobotSpec) -> _Rows:
     assert s.tau is not None
     time = np.arange(len(s)) * dt
     tau = s.tau[:, op].astype(float)
-    late = [np.stack([np.interp(time - d, time, x) for x in tau.T], axis=1) for d in DELAYS_S]
-    columns = (
-        inverse_dynamics(model, smooth, v, a)[:, op],
-        a[:, op],
-        v[:, op],
-        np.tanh(v[:, op] / MIN_SPEED),
+    torques = []
+    for delay in DELAYS_S:
+        late = [np.interp(time - delay, time, torque) for torque in tau.T]
+        torques.append(lowpass(np.stack(late, axis=1), dt, CUTOFF_HZ))
+    required = inverse_dynamics(model, smooth, v, a)[:, op]
+    v = v[:, op]
+    return _Rows(
+        np.array(torques),
+        lowpass(required, dt, CUTOFF_HZ),
+        lowpass(a[:, op], dt, CUTOFF_HZ),
+        lowpass(v, dt, CUTOFF_HZ),
+        lowpass(np.tanh(v / MIN_SPEED), dt, CUTOFF_HZ),
+        np.abs(v) > MIN_SPEED,
     )
-    required, acceleration, velocity, sign = (lowpass(x, dt, CUTOFF_HZ) for x in columns)
-    torque = np.array([lowpass(x, dt, CUTOFF_HZ) for x in late])
-    return _Rows(torque, required, acceleration, velocity, sign, np.abs(v[:, op]) > MIN_SPEED)
 
 
 def _system(rows: ListOf[_Rows], j: int, constant: bool, lag: int) -> tuple[Array, Array]:

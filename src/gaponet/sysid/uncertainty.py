@@ -221,9 +221,10 @@ def _with_new_keys(table: dict[str, Any]) -> dict[str, Any]:
     renamed = {OLD_KEYS.get(key, key): value for key, value in table.items()}
     joints = renamed.get("joints")
     if isinstance(joints, dict):
-        renamed["joints"] = {
-            j: _with_new_keys(v) if isinstance(v, dict) else v for j, v in joints.items()
-        }
+        renamed["joints"] = joints.copy()
+        for joint, values in joints.items():
+            if isinstance(values, dict):
+                renamed["joints"][joint] = _with_new_keys(values)
     return renamed
 
 
@@ -312,8 +313,11 @@ def format_change(field: str, change: float, uncertainty: ParameterUncertainty, 
 
 def table_rows(uncertainty: ParameterUncertainty, fields: tuple[str, ...]) -> list[list[str]]:
     """Return a row for each joint: its name, then a cell for each field."""
-    summaries = {joint: summarize(uncertainty, joint) for joint in uncertainty.joints}
-    return [[joint, *(one.cell(f) for f in fields)] for joint, one in summaries.items()]
+    rows = []
+    for joint in uncertainty.joints:
+        summary = summarize(uncertainty, joint)
+        rows.append([joint, *map(summary.cell, fields)])
+    return rows
 
 
 def sentences(uncertainty: ParameterUncertainty) -> list[str]:

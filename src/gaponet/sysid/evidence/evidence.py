@@ -109,41 +109,63 @@ def evidence(
     contact = contact_height(robot, tip_heights(sequences, robot))
     parts = cut(sequences, windows)
     rollouts = JointRollouts(parts, robot, contact, nthread)
-    bounds = Bounds(robot, sequences)
+    errors, jac = _slopes_of_joints(rollouts, Bounds(robot, sequences), fields)
+    weight = 1 / np.sqrt(1 + errors**2)  # of soft L1
+    gradients, window = cluster_sums(jac * (weight * errors)[..., None], rollouts.window)
+    names = [_window_name(part) for part in parts]
+    recordings = list(dict.fromkeys(names))
+    recording_of_window = np.array([recordings.index(name) for name in names])
+    return Evidence(
+        gradients=gradients,
+        information=_information(jac, weight, rollouts.window),
+        rows=rollouts.rows,
+        recording=recording_of_window[window],
+        names=tuple(recordings),
+        window_rms=_window_rms(rollouts, errors),
+    )
+
+
+def _slopes_of_joints(
+    rollouts: JointRollouts, bounds: Bounds, fields: ListOf[str]
+) -> tuple[Array, Array]:
+    """Return the errors at the robot's own values, (n, rows) in ERROR_SCALE_RAD, and their slopes
+    over the fields on their axes and over play, (n, rows, Q).
+    """
     axes = Axes(bounds, fields, bounds.first)
 
     def scaled_errors(x: Array) -> Array:
         return rollouts.flat_errors(axes.values(x)) / np.float32(ERROR_SCALE_RAD)
 
-    errors_of_start, slopes_of_start = slopes(
-        axes.normalize(bounds.first)[None], axes.high, scaled_errors
-    )
-    errors = errors_of_start[0]  # (n, rows) in ERROR_SCALE_RAD
+    # of one start
+    errors, by_change = slopes(axes.normalize(bounds.first)[None], axes.high, scaled_errors)
     is_free = axes.low < axes.high
-    by_field = slopes_of_start[0] / axes.unit[:, None] * is_free[:, None]  # (n, rows, P)
+    by_field = by_change[0] / axes.unit[:, None] * is_free[:, None]  # (n, rows, P)
     by_play = _slopes_over_play(rollouts, bounds).reshape(bounds.n, -1, 1)
-    jac = np.concatenate([by_field, by_play], axis=-1)  # (n, rows, Q)
-    weight = 1 / np.sqrt(1 + errors**2)  # of soft L1
-    gradients, window = cluster_sums(jac * (weight * errors)[..., None], rollouts.window)
+    return errors[0], np.concatenate([by_field, by_play], axis=-1)
+
+
+def _information(jac: Array, weight: Array, window: Array) -> Array:
+    """Return the Gauss-Newton information in each cluster, (n, C, Q, Q).
+
+    Args:
+        jac: Slopes of errors, (n, rows, Q).
+        weight: Weight of each error, (n, rows).
+        window: Window of each row, (rows,).
+    """
     information = []
     for of_joint, weights in zip(jac, weight, strict=True):  # a joint at a time, for memory
         weighted = weights[:, None] * of_joint
         products = of_joint[None, :, :, None] * weighted[None, :, None, :]  # (1, rows, Q, Q)
-        information.append(cluster_sums(products, rollouts.window)[0])
-    names = [_window_name(part) for part in parts]
-    recordings = list(dict.fromkeys(names))
-    recording_of_window = np.array([recordings.index(name) for name in names])
-    in_windows = ERROR_SCALE_RAD * errors.reshape(bounds.n, *rollouts.counted.shape)
-    squares = np.square(in_windows).sum(axis=-1)  # (n, W)
-    rms = np.sqrt(squares / np.maximum(rollouts.counted.sum(axis=-1), 1))
-    return Evidence(
-        gradients,
-        np.concatenate(information),
-        rollouts.rows,
-        recording_of_window[window],
-        tuple(recordings),
-        rms,
-    )
+        of_clusters, _ = cluster_sums(products, window)
+        information.append(of_clusters)
+    return np.concatenate(information)
+
+
+def _window_rms(rollouts: JointRollouts, errors: Array) -> Array:
+    """Return the RMS error of each window, (n, W) rad; errors (n, rows) in ERROR_SCALE_RAD."""
+    in_windows = ERROR_SCALE_RAD * errors.reshape(len(errors), *rollouts.counted.shape)
+    squares = np.square(in_windows).sum(axis=-1)
+    return np.asarray(np.sqrt(squares / np.maximum(rollouts.counted.sum(axis=-1), 1)))
 
 
 def _slopes_over_play(rollouts: JointRollouts, bounds: Bounds) -> Array:

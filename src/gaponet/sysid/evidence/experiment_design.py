@@ -166,10 +166,11 @@ def candidate_motions(library: Library, progress: Progress = no_progress) -> lis
     """
     robot = library.robot
     single = robot.operated if len(robot.operated) <= MAX_SINGLE_JOINTS else ()
-    names = [
-        *(f"{s}-{short(j)}" for j in single for s in SIGNALS),
-        *(f"{kind.__name__}-all-{v}" for kind in ANY for v in range(VARIANTS)),
-    ]
+    names = []
+    for joint in single:
+        names += [f"{signal}-{short(joint)}" for signal in SIGNALS]
+    for kind in ANY:
+        names += [f"{kind.__name__}-all-{variant}" for variant in range(VARIANTS)]
     motions = []
     for k in range(len(names) + MOTIONS_OF_ALL_JOINTS):
         progress(k, len(names) + MOTIONS_OF_ALL_JOINTS, "which motions fit the robot's limits")
@@ -233,11 +234,13 @@ def undetermined_gains(
     """
     kp = uncertainty.fields.index("kp")
     after = design.after(range(len(design.seconds)))
-    errors = dict(zip(uncertainty.joints, np.sqrt(after[:, kp, kp]).tolist(), strict=True))
-    return {
-        joint: "nothing loads it, so no motion separates kp from friction and damping (± "
-        f"{error:.0%} after all of them); take its numbers as a set, or load it: weigh a payload, "
-        "--payloads 0 KG"
-        for joint, error in errors.items()
-        if error > MAX_KP_ERROR
-    }
+    errors = np.sqrt(after[:, kp, kp]).tolist()
+    advice = {}
+    for joint, error in zip(uncertainty.joints, errors, strict=True):
+        if error > MAX_KP_ERROR:
+            advice[joint] = (
+                "nothing loads it, so no motion separates kp from friction and damping "
+                f"(± {error:.0%} after all of them); take its numbers as a set, or load it: weigh "
+                "a payload, --payloads 0 KG"
+            )
+    return advice

@@ -44,25 +44,33 @@ def probability(fit: JointFit, without: Values, values: Values) -> Array:
     Args:
         without, values: Best values (n,) without and with backlash, of the same search.
     """
-    square = [
-        np.square(fit.rollouts.flat_errors({f: v[None] for f, v in one.items()})[0]).sum(axis=1)
-        for one in (without, values)
-    ]
+    square_without = _squared_error(fit, without)
+    square = _squared_error(fit, values)
     seconds = fit.rollouts.rows * fit.rollouts.dt * fit.rollouts.thin
     clusters = np.maximum(seconds / fit.prior.correlation_time, 1.0)
-    gain = np.log(np.maximum(square[0], 1e-12) / np.maximum(square[1], 1e-12))
+    gain = np.log(np.maximum(square_without, 1e-12) / np.maximum(square, 1e-12))
     return np.asarray(expit(0.5 * (clusters * gain - np.log(clusters))))
+
+
+def _squared_error(fit: JointFit, values: Values) -> Array:
+    """Return the sum of squared errors of each joint at values (n,), (n,) rad²."""
+    one_candidate = {field: value[None] for field, value in values.items()}
+    errors = fit.rollouts.flat_errors(one_candidate)[0]
+    return np.asarray(np.square(errors).sum(axis=1))
 
 
 def only_probable(without: ListOf[Values], values: ListOf[Values], chance: Array) -> list[Values]:
     """Return values (n,) with backlash at the joints where it is probable, and the others'
     without.
     """
-    pairs = zip(without, values, strict=True)
-    return [
-        {f: np.where(chance >= MIN_PROBABILITY, v, a.get(f, 0.0)) for f, v in b.items()}
-        for a, b in pairs
-    ]
+    is_probable = chance >= MIN_PROBABILITY
+    chosen = []
+    for otherwise, with_backlash in zip(without, values, strict=True):
+        mixed = {}
+        for field, value in with_backlash.items():
+            mixed[field] = np.where(is_probable, value, otherwise.get(field, 0.0))
+        chosen.append(mixed)
+    return chosen
 
 
 def findings(

@@ -113,7 +113,7 @@ def _has_time_for_iterations(fits: Fits, robots: list[RobotFit], alone: list[Val
     seconds_per_row = (time.monotonic() - began) / fits.judge.rows
     starts = 2
     candidates = starts * (len(CLASSIC) + 1 + len(DAMPING_FACTORS))
-    rows = sum(len(part) for robot in robots for part in robot.rollouts.parts)
+    rows = sum(sum(map(len, robot.rollouts.parts)) for robot in robots)
     return fits.progress.has_time_for(seconds_per_row * rows * candidates * FIRST_ROBOT_ITERATIONS)
 
 

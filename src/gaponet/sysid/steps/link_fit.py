@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import copy
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,10 +19,16 @@ from gaponet.data.signals import differentiate, lowpass
 from gaponet.sim.dynamics import CUTOFF_HZ, inverse_dynamics
 from gaponet.sim.links import COORDINATES, LinkAxes, LinkResult
 from gaponet.sim.model import build_model, with_links
-from gaponet.sysid import least_squares
 from gaponet.sysid.axes import CLASSIC, Axes, Values
 from gaponet.sysid.joint_rollouts import ERROR_SCALE_RAD, SLIP_SPEED
-from gaponet.sysid.least_squares import DIFFERENCE_STEP, Progress
+from gaponet.sysid.least_squares import (
+    DIFFERENCE_STEP,
+    Problems,
+    Progress,
+    descend,
+    slopes,
+    soft_l1,
+)
 from gaponet.sysid.problem import MIN_COST_DECREASE, PRIOR_LOG_STD, PRIORS, RobotFit, cluster_sums
 
 ROWS = 400  # of recordings, whose torques choose directions
@@ -36,6 +43,15 @@ MIN_CHANGE = 0.1  # of a link's coordinates, in standard deviations of the prior
 MAX_CHANGE = 6.0
 ENCODER_ZERO_STD_RAD = 0.006  # a third of a degree, as a joint's zero at its stop is set by hand
 MIN_SIGNIFICANCE = 2.0  # standard errors, of the change along some direction; else all links stay
+
+
+class _DynamicsRows(NamedTuple):
+    """Rows of recordings, with what the links' inertias do in them."""
+
+    qvel: Array  # of operated joints, (rows, n) rad/s
+    qacc: Array  # (rows, n) rad/s²
+    torque: Array  # that the motion requires, (rows, n) N·m
+    moved: Array  # angle over kp by which each link coordinate moves joints, (10 L, rows, n) rad
 
 
 class LinkFit:
@@ -81,41 +97,53 @@ class LinkFit:
         gains, offsets, damping, friction and armature of the joint explain as well does not count,
         so without payloads or recorded torque all masses do not change together.
         """
-        parts = self.whole.rollouts.parts
-        motions = list[Array]()
-        torques = list[Array]()
-        changes = list[Array]()
-        stride = max(1, sum(map(len, parts)) // ROWS)
-        for payload in dict.fromkeys(map(_payload, parts)):
-            same = [_smooth_motion(s)[:, ::stride] for s in parts if _payload(s) == payload]
-            motion = np.concatenate(same, axis=1)
-            torque, torque_changes = self._torques_by_link(motion, payload)
-            motions.append(motion)
-            torques.append(torque)
-            changes.append(torque_changes)
-        torque = np.concatenate(torques)  # (rows, n) N·m
-        _, v, a = np.concatenate(motions, axis=1)
-        kp = self._first["kp"]
-        moved = np.concatenate(changes, axis=1) / DIFFERENCE_STEP / kp  # (10 L, rows, n) rad
-        measurements = sum(s.duration for s in parts) / self._prior.correlation_time  # (n,)
         size = self.axes.scale.size
+        rows = self._dynamics_rows()
         information = np.zeros((size, size))
-        for i, j in enumerate(self.whole.rollouts.op):
-            weight = np.sqrt(measurements[i] / len(v)) / self._prior.residual[i]
-            friction = np.tanh(v[:, j] / SLIP_SPEED)
-            own = [torque[:, i] / kp[i], np.ones(len(v)), v[:, j], a[:, j], friction]
-            by_servo = weight * np.stack(own, axis=1)  # (rows, 5)
-            by_link = weight * moved[:, :, i].T  # (rows, 10 L)
-            stated = np.diag([np.nan_to_num(self._kp_std[i] ** -2), 0, 0, 0, 0])
-            # What links explain beyond the servo, by the Schur complement.
-            of_servo = np.linalg.pinv(by_servo.T @ by_servo + stated)
-            information += (
-                by_link.T @ by_link - by_link.T @ by_servo @ of_servo @ by_servo.T @ by_link
-            )
+        for i in range(self._n):
+            information += self._information_beyond_servo(i, rows)
         strength, vectors = np.linalg.eigh(information)
         chosen = np.flatnonzero(strength > MIN_INFORMATION)[::-1][:MAX_DIRECTIONS]
         rest = np.delete(vectors / np.sqrt(np.maximum(strength, MIN_INFORMATION)), chosen, axis=1)
         return vectors[:, chosen], rest @ rest.T
+
+    def _dynamics_rows(self) -> _DynamicsRows:
+        """Return some rows of the recordings, about ROWS, those of one payload after another."""
+        parts = self.whole.rollouts.parts
+        stride = max(1, sum(map(len, parts)) // ROWS)
+        motions = list[Array]()
+        torques = list[Array]()
+        changes = list[Array]()
+        for payload in dict.fromkeys(map(_payload, parts)):
+            with_payload = [part for part in parts if _payload(part) == payload]
+            smooth = [_smooth_motion(part)[:, ::stride] for part in with_payload]
+            motion = np.concatenate(smooth, axis=1)
+            torque, torque_changes = self._torques_by_link(motion, payload)
+            motions.append(motion)
+            torques.append(torque)
+            changes.append(torque_changes)
+        _, qvel, qacc = np.concatenate(motions, axis=1)
+        op = self.whole.rollouts.op
+        moved = np.concatenate(changes, axis=1) / DIFFERENCE_STEP / self._first["kp"]
+        return _DynamicsRows(qvel[:, op], qacc[:, op], np.concatenate(torques), moved)
+
+    def _information_beyond_servo(self, i: int, rows: _DynamicsRows) -> Array:
+        """Return the information that errors of joint i hold about link coordinates and that its
+        servo does not explain as well, (10 L, 10 L): the Schur complement.
+        """
+        qvel = rows.qvel[:, i]
+        seconds = sum(part.duration for part in self.whole.rollouts.parts)
+        measurements = seconds / self._prior.correlation_time[i]
+        weight = np.sqrt(measurements / len(qvel)) / self._prior.residual[i]
+        by_gain = rows.torque[:, i] / self._first["kp"][i]
+        friction = np.tanh(qvel / SLIP_SPEED)
+        columns = [by_gain, np.ones(len(qvel)), qvel, rows.qacc[:, i], friction]
+        by_servo = weight * np.stack(columns, axis=1)  # (rows, 5)
+        by_link = weight * rows.moved[:, :, i].T  # (rows, 10 L)
+        stated = np.diag([np.nan_to_num(self._kp_std[i] ** -2), 0, 0, 0, 0])
+        of_servo = np.linalg.pinv(by_servo.T @ by_servo + stated)
+        explained = by_link.T @ by_servo @ of_servo @ by_servo.T @ by_link
+        return np.asarray(by_link.T @ by_link - explained)
 
     def _torques_by_link(self, motion: Array, payload: tuple[float, str]) -> tuple[Array, Array]:
         """Return the torques that a motion requires, (rows, n) N·m, and their changes by
@@ -154,43 +182,53 @@ class LinkFit:
 
     def descend(self, report: Progress) -> LinkResult:
         """Fit links and servos together; return them with the links' covariance."""
-        first = np.r_[
-            self._servos.normalize(self._first).ravel(), np.zeros(self.directions.shape[1])
-        ]
         if not self.directions.size:
-            return LinkResult(
-                self.axes, np.zeros(self.axes.scale.size), np.eye(self.axes.scale.size), self._first
-            )
-        x = first[None, None]
-        ends = np.full(self.directions.shape[1], MAX_CHANGE)
-        low = np.r_[self._servos.low.ravel(), -ends][None]
-        high = np.r_[self._servos.high.ravel(), ends][None]
-        for i, count in enumerate(ITERATIONS):
-            if i:
-                values, coordinates = self._unpacked(x[0][None])
-                errors = self.whole.rollouts.flat_errors(
-                    values, [self.axes.links(c) for c in coordinates]
-                )
-                cost = least_squares.soft_l1(errors[0] / ERROR_SCALE_RAD)
-                self._prior.update_residual(cost, self.whole.rollouts.rows)
-                self._weigh()
-            x, _ = least_squares.descend(
-                x, low, high, self.errors, count, report, MIN_COST_DECREASE
-            )
-        values, coordinates = self._unpacked(x[0][None])
-        by_link = coordinates[0].reshape(-1, COORDINATES)
+            unchanged = np.zeros(self.axes.scale.size)
+            return LinkResult(self.axes, unchanged, np.eye(len(unchanged)), self._first)
+        x = self._searched(report)
+        values, links = self._unpacked(x)
         by_noise, by_zeros = self._covariances(x[0, 0])
-        along = coordinates[0] @ self.directions  # (K,)
-        is_small = np.abs(by_link).max(axis=1, keepdims=True) < MIN_CHANGE
-        is_noise = (np.abs(along) <= MIN_SIGNIFICANCE * np.sqrt(np.diag(by_noise))).all()
-        changed = np.where(is_small | is_noise, 0.0, by_link).ravel()
+        changed = self._significant(links[0], by_noise)
         covariance = self.directions @ (by_noise + by_zeros) @ self.directions.T + self._rest
         fitted = {field: value[0].copy() for field, value in values.items()}
         return LinkResult(self.axes, changed, covariance, fitted)
 
+    def _searched(self, report: Progress) -> Array:
+        """Return servos and links that follow the recordings best, (1, 1, P)."""
+        servos = self._servos.normalize(self._first).ravel()
+        ends = np.full(self.directions.shape[1], MAX_CHANGE)
+        x = np.r_[servos, np.zeros(len(ends))][None, None]
+        low = np.r_[self._servos.low.ravel(), -ends][None]
+        high = np.r_[self._servos.high.ravel(), ends][None]
+        problems = Problems(self.errors, low, high)
+        for i, count in enumerate(ITERATIONS):
+            if i:
+                self._update_residual(x)
+            x, _ = descend(problems, x, count, report, MIN_COST_DECREASE)
+        return np.asarray(x)
+
+    def _update_residual(self, x: Array) -> None:
+        """Take the residual that x (1, 1, P) leaves, and weigh joints by it."""
+        values, coordinates = self._unpacked(x)
+        links = [self.axes.links(c) for c in coordinates]
+        errors = self.whole.rollouts.flat_errors(values, links)
+        cost = soft_l1(errors[0] / ERROR_SCALE_RAD)
+        self._prior.update_residual(cost, self.whole.rollouts.rows)
+        self._weigh()
+
+    def _significant(self, coordinates: Array, covariance: Array) -> Array:
+        """Return link coordinates (L · COORDINATES,) with 0 for links that hardly change, and for
+        all links where no direction changes by more than noise of this covariance, (K, K).
+        """
+        by_link = coordinates.reshape(-1, COORDINATES)
+        is_small = np.abs(by_link).max(axis=1, keepdims=True) < MIN_CHANGE
+        along = np.abs(coordinates @ self.directions)  # (K,)
+        is_noise = (along <= MIN_SIGNIFICANCE * np.sqrt(np.diag(covariance))).all()
+        return np.where(is_small | is_noise, 0.0, by_link).ravel()
+
     def _slopes(self, x: Array) -> tuple[Array, Array]:
         """Return errors at x (P,) and their differences over x, (m,) and (m, P)."""
-        here, jac = least_squares.slopes(x[None, None], np.full((1, len(x)), np.inf), self.errors)
+        here, jac = slopes(x[None, None], np.full((1, len(x)), np.inf), self.errors)
         return here[0, 0], jac[0, 0]
 
     def _covariances(self, x: Array) -> tuple[Array, Array]:
@@ -200,27 +238,42 @@ class LinkFit:
         A wrong zero turns gravity as another centre of mass does, and no recorded position shows
         which it is.
         """
-        here, jac = self._slopes(x)
+        errors, jac = self._slopes(x)  # (m,) and (m, P)
         count = self.directions.shape[1]
-        n = self._n
-        own_zeros = self.whole.robot.servo.zero[self.whole.rollouts.op]
-        zeros = own_zeros + ENCODER_ZERO_STD_RAD * np.eye(n)
-        by_zero = self.errors(np.repeat(x[None, None], n, axis=0), zero=zeros)[:, 0] - here
-        weighted = jac / np.sqrt(1 + here**2)[:, None]
-        rows = (len(here) - count) // n
-        mine, by_joint = (
-            y[: n * rows].reshape(n, rows, -1) for y in (weighted * here[:, None], jac)
-        )
-        each = cluster_sums(mine[:, :-PRIORS], self.whole.rollouts.window)[0].sum(axis=0)
-        each -= each.mean(axis=0)
-        held = np.concatenate([*by_joint[:, -PRIORS:], jac[n * rows :]])
-        scatter = (
-            each.T @ each * (len(each) / max(len(each) - count, 1)) ** 2
-            + self._level**2 * held.T @ held
-        )
+        weighted = jac / np.sqrt(1 + errors**2)[:, None]
+        scatter = self._scatter(jac, weighted * errors[:, None])
         inverse = np.linalg.pinv(jac.T @ weighted, rcond=1e-10, hermitian=True)
+        by_zero = self._errors_by_zeros(x) - errors  # (n, m)
         shifted = (inverse @ weighted.T @ by_zero.T)[-count:]
         return (inverse @ scatter @ inverse)[-count:, -count:], shifted @ shifted.T
+
+    def _scatter(self, jac: Array, gradient: Array) -> Array:
+        """Return the scatter of the cost's gradient over windows, and that of the prior, (P, P);
+        see `_covariance` of problem.py.
+
+        Args:
+            jac, gradient: Slopes of all errors and of their costs, (m, P).
+        """
+        count = self.directions.shape[1]
+        own = len(jac) - count  # errors of joints; those of the directions' prior follow
+        jac_by_joint = jac[:own].reshape(self._n, own // self._n, -1)
+        gradient_by_joint = gradient[:own].reshape(jac_by_joint.shape)
+        window = self.whole.rollouts.window
+        by_joint, _ = cluster_sums(gradient_by_joint[:, :-PRIORS], window)
+        by_window = by_joint.sum(axis=0)  # (windows, P)
+        by_window -= by_window.mean(axis=0)
+        correction = len(by_window) / max(len(by_window) - count, 1)
+        of_prior = np.concatenate([*jac_by_joint[:, -PRIORS:], jac[own:]])
+        of_windows = by_window.T @ by_window * correction**2
+        return np.asarray(of_windows + self._level**2 * of_prior.T @ of_prior)
+
+    def _errors_by_zeros(self, x: Array) -> Array:
+        """Return the errors at x (P,) with each joint's encoder zero off by its standard deviation,
+        (n, m).
+        """
+        zero = self.whole.robot.servo.zero[self.whole.rollouts.op]
+        zeros = zero + ENCODER_ZERO_STD_RAD * np.eye(self._n)
+        return self.errors(np.repeat(x[None, None], self._n, axis=0), zero=zeros)[:, 0]
 
     def servo_slopes(self, result: LinkResult) -> dict[str, Array]:
         """Return how the servos follow the links: field → its change on its axis for one of x, (n,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence as ListOf
 from dataclasses import replace
 
 from gaponet.robot.servo_fields import SERVO_FIELDS, TERMS, Term
@@ -63,7 +64,7 @@ class ServoTerm:
         """
         fields = TERMS[self._term]
         if not any(of_set[fields[0]].any() for of_set in values):
-            values = [{f: x for f, x in of_set.items() if f not in fields} for of_set in values]
+            values = [_without(fields, of_set) for of_set in values]
         return replace(state, values=values, base=values)
 
     def _fit_joints(self, joints: JointFit, values: Values) -> Values:
@@ -108,3 +109,8 @@ class Backlash(ServoTerm):
         width = values[-1]["backlash"]
         probable = backlash.only_probable(state.values, values, chance)
         return replace(self._with_values(state, probable), gaps=(width, chance))
+
+
+def _without(fields: ListOf[str], values: Values) -> Values:
+    """Return values without these fields."""
+    return {field: value for field, value in values.items() if field not in fields}
