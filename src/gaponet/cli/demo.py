@@ -21,6 +21,7 @@ from gaponet.cli.experiment import share_bar, show_paper_result
 from gaponet.cli.gap import show_steps
 from gaponet.cli.options import Flag, Json
 from gaponet.cli.out import Out, writes
+from gaponet.data.store import Dataset
 from gaponet.evaluation.tables import mrad
 
 FLEET = "firm"
@@ -61,18 +62,13 @@ def identify_real_arm(screen: Out, out: Path) -> dict[str, object]:
         logs, origin = public_recordings(update)
     screen.say(f"{origin}.", "Recordings: ")
     folder = out / REAL_ROBOT
-    data = folder / "data"
     robot = folder / "identified"
     import_words = ["--unit-id", REAL_ROBOT, "--payload-mass", "0"]
     steps = steps_from_logs(logs, REAL_ROBOT, import_words, folder, [], "mjcf")
     read, _, measure, fit, causes, export, _ = steps
 
     _announce(screen, 1, read)
-    with progress_bar("importing") as update:
-        imported = api.import_logs(
-            logs, robot=REAL_ROBOT, out=data, unit_id=REAL_ROBOT, payload_mass=0.0, progress=update
-        )
-    dataset = imported.dataset
+    dataset = _imported(logs, folder / "data")
     motions = test_motions(dataset)
     screen.say(
         f": the simulator gets the commands alone, on {len(motions)} motions that stay out of the "
@@ -81,9 +77,7 @@ def identify_real_arm(screen: Out, out: Path) -> dict[str, object]:
     )
     with progress_bar("gap") as update:
         nominal = api.gap(dataset, motions=motions, progress=update)
-    by_joint = nominal.methods["nominal"]["by_joint"]
-    rows = [[joint, mrad(errors["mpjae"])] for joint, errors in by_joint.items()]
-    screen.table("Nominal simulator beside the real robot", ["joint", "mean |error|, mrad"], rows)
+    _show_errors_by_joint(screen, nominal)
     _announce(screen, 3, fit)
     with progress_bar("identifying") as update:
         api.identify(dataset, out=robot, progress=update)
@@ -112,6 +106,22 @@ def identify_real_arm(screen: Out, out: Path) -> dict[str, object]:
         "picture": str(picture),
         "export": str(exported.path),
     }
+
+
+def _imported(logs: Path, out: Path) -> Dataset:
+    """Import the recordings of the SO-101."""
+    with progress_bar("importing") as update:
+        imported = api.import_logs(
+            logs, robot=REAL_ROBOT, out=out, unit_id=REAL_ROBOT, payload_mass=0.0, progress=update
+        )
+    return imported.dataset
+
+
+def _show_errors_by_joint(screen: Out, nominal: GapResult) -> None:
+    """Print the error of the nominal simulator by joint."""
+    by_joint = nominal.methods["nominal"]["by_joint"]
+    rows = [[joint, mrad(errors["mpjae"])] for joint, errors in by_joint.items()]
+    screen.table("Nominal simulator beside the real robot", ["joint", "mean |error|, mrad"], rows)
 
 
 def _announce(screen: Out, number: int, step: Step) -> None:

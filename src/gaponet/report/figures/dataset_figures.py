@@ -118,20 +118,10 @@ def draw_joint_ranges(
     ax = fig.subplots()
     rng = np.random.default_rng(0)
     for row, (joint, values) in enumerate(positions.items()):
-        y = -row
-        tint = _side_colour(joint)
         lowest, highest = limits[joint]
         if np.isfinite([lowest, highest]).all():
-            ax.barh(y, highest - lowest, 0.86, lowest, color="#000000", alpha=0.05, lw=0)
-        x, density = _density(values)
-        ax.fill_between(x, y + 0.06, y + 0.06 + 0.36 * density, color=tint, alpha=0.75, lw=0)
-        low, q1, middle, q3, high = np.percentile(values, [1, 25, 50, 75, 99])
-        ax.plot([low, high], [y, y], color=tint, lw=1)
-        ax.plot([q1, q3], [y, y], color=tint, lw=4, solid_capstyle="butt")
-        ax.plot(middle, y, "o", ms=3.2, mfc="white", mec=tint, mew=1)
-        rain = rng.choice(values, min(SINGLE_POINTS, len(values)), replace=False)
-        heights = y - 0.23 + rng.uniform(-0.12, 0.12, len(rain))
-        ax.plot(rain, heights, ".", ms=1.6, mew=0, color=tint, alpha=0.5)
+            ax.barh(-row, highest - lowest, 0.86, lowest, color="#000000", alpha=0.05, lw=0)
+        _draw_raincloud(ax, -row, values, _side_colour(joint), rng)
     ax.set_yticks(-np.arange(len(positions)), [joint_label(j, wrapped=False) for j in positions])
     ax.tick_params(axis="y", length=0)
     ax.grid(axis="y", visible=False)
@@ -149,6 +139,21 @@ def draw_joint_ranges(
     degrees.spines["top"].set_visible(True)
     fig.suptitle(title, x=0.01, ha="left", fontsize=9, fontweight="bold")
     return fig
+
+
+def _draw_raincloud(
+    ax: Axes, y: float, values: Array, colour: str, rng: np.random.Generator
+) -> None:
+    """Draw values (k,) at height y: density above, quartiles with 1 % and 99 %, single values below."""
+    x, density = _density(values)
+    ax.fill_between(x, y + 0.06, y + 0.06 + 0.36 * density, color=colour, alpha=0.75, lw=0)
+    low, q1, middle, q3, high = np.percentile(values, [1, 25, 50, 75, 99])
+    ax.plot([low, high], [y, y], color=colour, lw=1)
+    ax.plot([q1, q3], [y, y], color=colour, lw=4, solid_capstyle="butt")
+    ax.plot(middle, y, "o", ms=3.2, mfc="white", mec=colour, mew=1)
+    rain = rng.choice(values, min(SINGLE_POINTS, len(values)), replace=False)
+    heights = y - 0.23 + rng.uniform(-0.12, 0.12, len(rain))
+    ax.plot(rain, heights, ".", ms=1.6, mew=0, color=colour, alpha=0.5)
 
 
 def _side_colour(joint: str) -> str:

@@ -7,6 +7,7 @@ instead.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import mujoco
@@ -135,37 +136,42 @@ class Scene:
         robot = self.shown.robot
         meta = self.shown.real.meta
         model = visual_spec(robot, "#808080", meta.payload_mass, meta.payload_side).compile()
-        data = mujoco.MjData(model)
-        seen = np.flatnonzero(
-            (model.geom_group < 3) & (model.geom_type != mujoco.mjtGeom.mjGEOM_PLANE)
-        )
-        if not len(seen):
+        geoms = _visible_geoms(model)
+        if not len(geoms):
             raise UsageError(
                 f"{robot.mjcf}: has no visible geom; add one to each body to look at it"
             )
         near = _operated_bodies(model, robot) if closeup else set(range(model.nbody))
-        fits = np.array([model.geom_bodyid[g] in near for g in seen])
-        middle = model.geom_aabb[seen, None, :3]
-        half = model.geom_aabb[seen, None, 3:]
-        corners = middle + half * np.array(np.meshgrid(*[[-1, 1]] * 3)).reshape(3, 8).T  # (k, 8, 3)
-        address = [model.joint(name).qposadr[0] for name in robot.joint_names]
+        fits = np.array([body in near for body in model.geom_bodyid[geoms]])
         low = np.full(2, np.inf)
         high = np.full(2, -np.inf)
         floor = np.inf
         axes = np.stack(self.view.axes)
+        for points in self._corners(model, geoms, rows):
+            floor = min(floor, float(points[..., 2].min()))
+            places = points[fits].reshape(-1, 3) @ axes.T
+            low = np.minimum(low, places.min(axis=0))
+            high = np.maximum(high, places.max(axis=0))
+        return (float(low[0]), float(high[0]), float(low[1]), float(high[1])), floor
+
+    def _corners(self, model: mujoco.MjModel, geoms: Array, rows: slice) -> Iterator[Array]:
+        """Yield the corners of the boxes around geoms, (k, 8, 3) m, in FITTED_FRAMES of every
+        motion.
+        """
+        data = mujoco.MjData(model)
+        address = [model.joint(name).qposadr[0] for name in self.shown.robot.joint_names]
+        middle = model.geom_aabb[geoms, None, :3]
+        half = model.geom_aabb[geoms, None, 3:]
+        signs = np.array(np.meshgrid(*[[-1, 1]] * 3)).reshape(3, 8).T
+        corners = middle + half * signs  # in the geom's frame
         for motion in self.shown.motions:
             part = motion.qpos[rows]
-            for q in part[np.unique(np.linspace(0, len(part) - 1, FITTED_FRAMES).astype(int))]:
+            frames = np.linspace(0, len(part) - 1, FITTED_FRAMES).astype(int)
+            for q in part[np.unique(frames)]:
                 data.qpos[address] = q
                 mujoco.mj_kinematics(model, data)
-                points = (
-                    data.geom_xpos[seen, None] + corners @ data.geom_xmat[seen].reshape(-1, 3, 3).mT
-                )
-                floor = min(floor, float(points[..., 2].min()))
-                places = points[fits].reshape(-1, 3) @ axes.T
-                low = np.minimum(low, places.min(axis=0))
-                high = np.maximum(high, places.max(axis=0))
-        return (float(low[0]), float(high[0]), float(low[1]), float(high[1])), floor
+                rotation = data.geom_xmat[geoms].reshape(-1, 3, 3)
+                yield data.geom_xpos[geoms, None] + corners @ rotation.mT
 
     def _compose(self, base: Array, behind: Array) -> mujoco.MjModel:
         scene = mujoco.MjSpec()
@@ -182,6 +188,12 @@ class Scene:
                 scene.nuser_actuator = spec.nuser_actuator
                 scene.attach(spec, prefix=f"{prefix}/", frame=scene.worldbody.add_frame(pos=pos))
         return scene.compile()
+
+
+def _visible_geoms(model: mujoco.MjModel) -> Array:
+    """Return the numbers of the geoms that belong to the picture of the robot, (k,)."""
+    is_plane = model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
+    return np.flatnonzero((model.geom_group < 3) & ~is_plane)
 
 
 def visual_spec(
