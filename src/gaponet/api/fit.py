@@ -602,7 +602,7 @@ def _require_adaptation(
 
     if not fitted.accepted:
         why = "no joint has a motion that the fit does not see"
-        before, after = (1e3 * float(e.mean()) if len(e) else 0.0 for e in fitted.judged)
+        before, after = map(_mean_mrad, fitted.judged)
         if before:
             why = (
                 f"the error of motions that the fit does not see is {after:.2f} mrad, and "
@@ -621,6 +621,11 @@ def _require_adaptation(
             "give longer logs (--seconds), or keep the robot"
         )
     return before, after
+
+
+def _mean_mrad(errors: Array) -> float:
+    """Return the mean of errors (motions,) rad, in mrad; 0 without any."""
+    return 1e3 * float(errors.mean()) if len(errors) else 0.0
 
 
 def _write_adapted(

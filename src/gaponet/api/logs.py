@@ -314,10 +314,9 @@ def excite(
             plan, prediction = _further_motions(spec, seconds, masses, seed, progress)
         else:
             plan = make_plan(spec, DEFAULT_MINUTES if minutes is None else minutes, masses, seed)
-        files = {
-            motion.name: f"{i:02d}_{motion.name}.{format}"
-            for i, motion in enumerate(plan.motions, 1)
-        }
+        files = {}
+        for i, motion in enumerate(plan.motions, 1):
+            files[motion.name] = f"{i:02d}_{motion.name}.{format}"
         for motion in plan.motions:
             write_motion(folder / files[motion.name], motion, spec, rate)
         write_text(

@@ -63,7 +63,9 @@ class ResultTable:
 
     def record(self) -> dict[str, Any]:
         """Return the table as JSON values; a MeanStd becomes an object."""
-        rows = [[asdict(c) if isinstance(c, MeanStd) else c for c in row] for row in self.rows]
+        rows = []
+        for row in self.rows:
+            rows.append([asdict(cell) if isinstance(cell, MeanStd) else cell for cell in row])
         return {
             "name": self.name,
             "caption": self.caption,

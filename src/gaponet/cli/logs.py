@@ -193,7 +193,8 @@ def _inventory(made: ImportResult, table: dict[str, Any]) -> str:
     metas = [entry.meta for entry in made.entries]
     rates = ", ".join(f"{rate:g}" for rate in table["rate_hz"])
     units = ", ".join(dict.fromkeys(meta.unit_id for meta in metas))
-    payloads = ", ".join(f"{mass:g}" for mass in sorted({meta.payload_mass for meta in metas}))
+    masses = {meta.payload_mass for meta in metas}
+    payloads = ", ".join(f"{mass:g}" for mass in sorted(masses))
     virtual = "VIRTUAL " if any(meta.virtual for meta in metas) else ""
     return (
         f"{len(metas)} recordings, {table['minutes']:.1f} min at {rates} Hz, {virtual}robot "

@@ -15,6 +15,7 @@ from dataclasses import is_dataclass
 from difflib import get_close_matches
 from functools import wraps
 from importlib.util import find_spec
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -43,9 +44,8 @@ ELSEWHERE = {
 }
 # Command → module:function. A module is imported when its command runs.
 COMMANDS = {
-    name: f"gaponet.cli.{ELSEWHERE.get(name, f'{name}:{name}')}"
-    for names in TASKS.values()
-    for name in names
+    name: "gaponet.cli." + ELSEWHERE.get(name, f"{name}:{name}")
+    for name in chain.from_iterable(TASKS.values())
 }
 SIGPIPE = 13  # Windows does not have it
 ABOUT = "Close the gap between simulated and real motors from joint logs."

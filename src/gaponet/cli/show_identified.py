@@ -71,7 +71,10 @@ def _show_errors(screen: Out, made: IdentifyResult) -> None:
 def _show_servos(screen: Out, made: IdentifyResult) -> None:
     """Print the parameters of each joint, and those of its servo type with their source."""
     values = made.values()
-    shown = [field for field in SERVO_FIELDS if any(v.get(field) for v in values.values())]
+    shown = []
+    for field in SERVO_FIELDS:
+        if any(servo.get(field) for servo in values.values()):
+            shown.append(field)
     rows = made.rows(shown)
     sources = []
     for servo in made.servo_types():

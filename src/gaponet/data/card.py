@@ -155,7 +155,11 @@ def _by_joint(
         "max": pooled["max"],
         "std": pooled["std"],
     }
-    return {j: {k: float(f"{v[i]:.6g}") for k, v in columns.items()} for i, j in enumerate(names)}
+    by_joint: dict[str, dict[str, float]] = {name: {} for name in names}
+    for statistic, values in columns.items():
+        for name, value in zip(names, values, strict=True):
+            by_joint[name][statistic] = float(f"{value:.6g}")
+    return by_joint
 
 
 def _number_or_name(text: str) -> tuple[float, str]:
@@ -187,12 +191,11 @@ def headline(card: dict[str, Any]) -> str:
 
 def count_table(card: dict[str, Any], by: str) -> ResultTable:
     """Return sequences, hours, frames and motions by one of PROPERTIES."""
-    counts = card["shares"][by]
-    rows = tuple(
-        (value, c["sequences"], c["hours"], c["frames"], c["motions"])
-        for value, c in counts.items()
-    )
-    return ResultTable(by, (PROPERTIES[by][0], "sequences", "hours", "frames", "motions"), rows)
+    columns = ("sequences", "hours", "frames", "motions")
+    rows = []
+    for value, counts in card["shares"][by].items():
+        rows.append((value, *(counts[column] for column in columns)))
+    return ResultTable(by, (PROPERTIES[by][0], *columns), tuple(rows))
 
 
 def paper_table(card: dict[str, Any]) -> ResultTable:
@@ -267,9 +270,10 @@ def _repeatability(card: dict[str, Any]) -> Iterator[str]:
     joints: dict[str, None] = {}
     for channel in channels.values():
         joints |= dict.fromkeys(channel["joints"])
-    rows = [
-        (joint, *(_digits(c["joints"].get(joint)) for c in channels.values())) for joint in joints
-    ]
+    rows = []
+    for joint in joints:
+        values = [channel["joints"].get(joint) for channel in channels.values()]
+        rows.append((joint, *map(_digits, values)))
     mean = ("mean", *(_digits(c["mean"]) for c in channels.values()))
     headings = ("joint", *(f"{name}, {c['unit']}" for name, c in channels.items()))
     yield "\n" + ResultTable("repeatability", headings, (*rows, mean)).markdown() + "\n"

@@ -230,7 +230,8 @@ class _Source:
         """
         if self.provenance and not dataset.entries:
             dataset.set_provenance(**self.provenance)
-        present = [entry for content_hash in self.hashes if (entry := dataset.find(content_hash))]
+        found = map(dataset.find, self.hashes)
+        present = [entry for entry in found if entry is not None]
         repetitions = Counter(entry.meta.repetition_key for entry in dataset.entries)
         sequences = self.held if self.held is not None else (s for s, _ in self.sequences())
         added = []

@@ -79,10 +79,13 @@ def unit_offsets(
         error = joined.static_error(j)
         beyond = joined.static_error(j, sag[:, j])
         values = (error.middle, beyond.half_band, error.middle - beyond.middle, beyond.middle)
-        offsets[name] = JointOffset(
-            error.up, error.down, *(round(x, 6) if math.isfinite(x) else None for x in values)
-        )
+        offsets[name] = JointOffset(error.up, error.down, *map(_rounded, values))
     return offsets
+
+
+def _rounded(value: float) -> float | None:
+    """Return a value in rad to the microradian; None if it is not known."""
+    return round(value, 6) if math.isfinite(value) else None
 
 
 def record_offsets(

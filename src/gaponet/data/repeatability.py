@@ -110,7 +110,11 @@ class Repetitions:
 
     def add(self, sequence: Sequence) -> None:
         """Add a repetition (Welford's update: only sums are stored)."""
-        arrays = {c: x.astype(float) for c in CHANNELS if (x := getattr(sequence, c)) is not None}
+        arrays = {}
+        for channel in CHANNELS:
+            values = getattr(sequence, channel)
+            if values is not None:
+                arrays[channel] = values.astype(float)
         if self.count == 0:
             self.count = 1
             self._ctrl = sequence.ctrl

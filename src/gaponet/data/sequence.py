@@ -191,7 +191,11 @@ class Sequence:
 
     def rows(self, part: slice) -> Sequence:
         """The same recording, only these rows."""
-        cut = {name: value[part] for name in ARRAYS if (value := getattr(self, name)) is not None}
+        cut = {}
+        for name in ARRAYS:
+            value = getattr(self, name)
+            if value is not None:
+                cut[name] = value[part]
         return replace(self, **cut)
 
     def content_hash(self) -> str:

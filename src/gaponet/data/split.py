@@ -12,7 +12,7 @@ from __future__ import annotations
 import hashlib
 import itertools
 import re
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable
 from collections.abc import Sequence as ListOf
 from pathlib import Path
@@ -181,12 +181,13 @@ def _require_present(
         (payloads, known_payloads, "with {:g} kg", 0.0),
         (rates, known_rates, "at {:g} Hz", RATE_TOLERANCE),
     ):
-        if missing := [x for x in wanted if not any(abs(x - k) <= tolerance * x for k in known)]:
-            present = ", ".join(f"{k:g}" for k in sorted(known))
+        for value in wanted:
+            if any(abs(value - other) <= tolerance * value for other in known):
+                continue
+            present = ", ".join(f"{other:g}" for other in sorted(known))
             unit = text[-2:]
             raise UsageError(
-                f"no recording {text.format(missing[0])} in {dataset.path}; it holds {present} "
-                f"{unit}"
+                f"no recording {text.format(value)} in {dataset.path}; it holds {present} {unit}"
             )
 
 
@@ -381,13 +382,13 @@ def _split_by_joints(unrecorded: dict[str, frozenset[str]]) -> dict[str, list[st
     Args:
         unrecorded: Motion → joints that it does not hold.
     """
-    groups = [
-        [m for m in unrecorded if unrecorded[m] == joints] for joints in set(unrecorded.values())
-    ]
-    if len(groups) == 1 or max(map(len, groups)) < MIN_MOTIONS:
+    groups = defaultdict[frozenset[str], list[str]](list)
+    for motion, joints in unrecorded.items():
+        groups[joints].append(motion)
+    if len(groups) == 1 or max(map(len, groups.values())) < MIN_MOTIONS:
         return split_motions(unrecorded)
     splits: dict[str, list[str]] = {s: [] for s in SPLITS}
-    for names in map(hash_order, groups):
+    for names in map(hash_order, groups.values()):
         few = {"train": names[-1:], "val": names[:-1], "test": []}
         for s, part in (split_motions(names) if len(names) >= MIN_MOTIONS else few).items():
             splits[s] += part
@@ -439,6 +440,11 @@ def require_distinct_samples(
             progress(done, total, entry.meta.motion)
 
 
+def _hashes(entries: list[Entry]) -> dict[str, str]:
+    """Return id → hash of entries."""
+    return {entry.id: entry.hash for entry in entries}
+
+
 def write_split(dataset: Dataset, splits: Splits, by: str, holdout: tuple[str, ...] = ()) -> Path:
     """Write splits/<by>[-<held out>].json in the dataset folder; return its path."""
     name = re.sub(r"[^A-Za-z0-9_.-]", "_", "-".join([by, *holdout]))[:100]
@@ -450,7 +456,7 @@ def write_split(dataset: Dataset, splits: Splits, by: str, holdout: tuple[str, .
         "by": by,
         "held_out": sorted({PROPERTIES[by](entry) for entry in splits["test"]}),
         "virtual": any(entry.meta.virtual for entry in dataset.entries),
-        "parts": {s: {entry.id: entry.hash for entry in splits[s]} for s in SPLITS},
+        "parts": {split: _hashes(splits[split]) for split in SPLITS},
     }
     with dataset.writing():
         path.parent.mkdir(exist_ok=True)

@@ -60,8 +60,9 @@ class StaticPoses:
             ctrl[i] = sequence.ctrl[end]
             approach[i] = -_last_side(sequence.qpos[: end + 1], extremes, qpos[i])
             if i:
-                moved = [np.abs(x[i] - x[i - 1]) > MIN_MOTION_RAD for x in (qpos, ctrl)]
-                distinct[i] = moved[0] | moved[1]
+                state_moved = np.abs(qpos[i] - qpos[i - 1]) > MIN_MOTION_RAD
+                command_moved = np.abs(ctrl[i] - ctrl[i - 1]) > MIN_MOTION_RAD
+                distinct[i] = state_moved | command_moved
         distinct[:, [name in sequence.copied for name in sequence.joint_names]] = False
         return cls(qpos, ctrl, approach, distinct)
 
@@ -71,7 +72,10 @@ class StaticPoses:
         empty = cls(
             np.zeros((0, n)), np.zeros((0, n)), np.zeros((0, n), int), np.zeros((0, n), bool)
         )
-        return cls(*(np.concatenate([getattr(p, f) for p in (empty, *parts)]) for f in vars(empty)))
+        fields = {}
+        for name in vars(empty):
+            fields[name] = np.concatenate([getattr(part, name) for part in (empty, *parts)])
+        return cls(**fields)
 
     def static_error(self, joint: int, expected: Array | float = 0.0) -> StaticError:
         """Return the static error of a joint over its distinct poses, both approaches weighed

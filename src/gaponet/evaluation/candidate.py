@@ -151,7 +151,8 @@ def _unseen_entries(
         return test
     if unused:
         return unused
-    return [entry for entry in available if not any(entry.hash in data.hashes for data in fitted)]
+    used = frozenset[str]().union(*(data.hashes for data in fitted))
+    return [entry for entry in available if entry.hash not in used]
 
 
 @dataclass(frozen=True)

@@ -341,9 +341,12 @@ def _ramp_note(robot: RobotSpec, to: str) -> str:
 def _urdf_note(facts: dict[str, Any]) -> str:
     """Return what a URDF has no place for."""
     servos = facts["plain"].values()
-    missing = ", ".join(field for field in MISSING_FIELDS if any(servo[field] for servo in servos))
+    missing = []
+    for field in MISSING_FIELDS:
+        if any(servo[field] for servo in servos):
+            missing.append(field)
     return (
-        f"the file has no place for {missing}: they are in facts.json (plain), kp and kd for your "
+        f"the file has no place for {', '.join(missing)}: they are in facts.json (plain), kp and kd for your "
         "controller; files that it names stay where they were"
     )
 

@@ -148,7 +148,9 @@ class OnnxModule(nn.Module):
                 known[node.output[0]] = operator([known[name] for name in names], attributes)
             else:
                 self.steps.append((operator, names, attributes, node.output[0]))
-        used = {name for _, names, _, _ in self.steps for name in names}
+        used = set[str]()
+        for _, names, _, _ in self.steps:
+            used.update(names)
         # name in the file → shape, axes, or places of a slice
         self.sizes: dict[str, list[int]] = {}
         self.buffer_names: dict[str, str] = {}  # name in the file → name of the buffer

@@ -290,7 +290,10 @@ def _days(uncertainty: ParameterUncertainty, joints: tuple[str, ...]) -> Array:
             "any-day: this robot is known from one day; adapt it with logs of another one "
             "(gaponet adapt ROBOT LOGS --out ROBOT_2) and export that"
         )
-    return np.array([[s["values"][j] for j in joints] for s in days.values()])
+    values = []
+    for source in days.values():
+        values.append([source["values"][joint] for joint in joints])
+    return np.array(values)
 
 
 def _robots(spec: RobotSpec, fields: tuple[str, ...], others: ListOf[Path]) -> Array:
@@ -398,8 +401,11 @@ def _written(units: Mapping[str, Any], axes: LinkAxes | None) -> dict[str, Any]:
 def table_rows(made: Randomization) -> tuple[list[str], list[list[str]]]:
     """Return headings and rows: joint, and low … high of numbers that are not all zero."""
     names = next(iter(made.ranges.values()))
-    used = [f for f in names if any(by_field[f][2] for by_field in made.ranges.values())]
-    fields = [SERVO_FIELDS[f] for f in used]
+    fields = []
+    for name in names:
+        highest = [by_field[name][2] for by_field in made.ranges.values()]
+        if any(highest):
+            fields.append(SERVO_FIELDS[name])
     rows = []
     for joint, by_field in made.ranges.items():
         row = [joint]

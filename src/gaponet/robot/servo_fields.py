@@ -314,9 +314,13 @@ SERVO_FIELDS: dict[str, ServoField] = {
 PASSIVE_FIELDS = ("armature", "damping", "frictionloss")  # that a joint has without a motor
 SERVO_TERMS = tuple(f.name for f in SERVO_FIELDS.values() if f.in_servo_model)
 STOP_FIELDS = ("stop_low", "stop_high")
-TERMS: dict[Term, tuple[str, ...]] = {
-    term: tuple(f.name for f in SERVO_FIELDS.values() if f.term == term) for term in get_args(Term)
-}
+
+
+def _fields_of(term: Term) -> tuple[str, ...]:
+    return tuple(field.name for field in SERVO_FIELDS.values() if field.term == term)
+
+
+TERMS: dict[Term, tuple[str, ...]] = {term: _fields_of(term) for term in get_args(Term)}
 
 
 def warmed(

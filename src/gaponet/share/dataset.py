@@ -120,7 +120,9 @@ def missing_files(files: Path, index: Index, present: Dataset | None) -> list[st
         GAPONetError: The files do not list the sequences of the index.
     """
     sets = sets_under(files)
-    listed = [str(episode.get("content_hash")) for part in sets for episode in part.episodes]
+    listed = []
+    for part in sets:
+        listed += [str(episode.get("content_hash")) for episode in part.episodes]
     if sorted(listed) != sorted(index.contents):
         raise RemoteError(f"the sequences listed are not those of {INDEX}; {AGAIN}")
     wanted = set()

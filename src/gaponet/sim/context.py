@@ -56,7 +56,10 @@ def _of_simulators(robot: RobotSpec, conditions: list[Condition], nthread: int) 
     """Return the answers of simulations with one control period, (conditions, 8n) float32."""
     count = len(conditions)
     probes = len(robot.operated) + 1
-    sim = BatchSim(robot, [condition for condition in conditions for _ in range(probes)], nthread)
+    by_simulation = []
+    for condition in conditions:
+        by_simulation += [condition] * probes
+    sim = BatchSim(robot, by_simulation, nthread)
     home = np.tile(robot.qpos_home, (count * probes, 1))
     moved, towards = _probe_targets(robot.qpos_home, robot.operated_index, sim.range)
     target = np.tile(moved, (count, 1))

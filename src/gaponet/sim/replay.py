@@ -160,9 +160,14 @@ def _held(sequence: Sequence, robot: RobotSpec, idle: tuple[str, ...]) -> Clampe
     unrecorded joints where the recording says that they stood.
     """
     unknown = sequence.meta.unrecorded
+    held = []
     angles = zip(robot.joint_names, sequence.qpos[0], robot.qpos_home, strict=True)
-    at = {j: float(seen if j in unknown else home) for j, seen, home in angles}
-    return tuple((j, angle) for j, angle in at.items() if j in idle or j in unknown)
+    for joint, recorded, home in angles:
+        if joint in unknown:
+            held.append((joint, float(recorded)))
+        elif joint in idle:
+            held.append((joint, float(home)))
+    return tuple(held)
 
 
 def _idle_limbs(sequences: ListOf[Sequence], robot: RobotSpec) -> list[tuple[str, ...]]:

@@ -27,8 +27,11 @@ def recorded_temperatures(parts: ListOf[Sequence], op: Array) -> Array:
     """Return the mean temperature of joints `op` in each recording, (recordings, n) °C; NaN where
     it is unknown.
     """
-    none = np.full(len(parts[0].joint_names), np.nan)
-    return np.array([none if p.temperatures is None else p.temperatures for p in parts])[:, op]
+    temperatures = np.full((len(parts), len(parts[0].joint_names)), np.nan)
+    for row, part in zip(temperatures, parts, strict=True):
+        if part.temperatures is not None:
+            row[:] = part.temperatures
+    return np.asarray(temperatures[:, op])
 
 
 def warm_values(values: Mapping[str, Array], temperature: Array) -> tuple[Array, Array]:

@@ -31,7 +31,8 @@ JOINT_FAULTS = [
     (-1, 0.0, -1),
     (-1, 0.0, 1),
     (1, 0.0, -1),
-    *((1, sign * t, 1) for sign in (1, -1) for t in TURNS_RAD),
+    *((1, turn, 1) for turn in TURNS_RAD),
+    *((1, -turn, 1) for turn in TURNS_RAD),
 ]
 MAX_ROWS = 120  # gravity is evaluated some fifteen times for each joint
 MIN_ROWS = 20
@@ -218,10 +219,11 @@ def _by_payload(samples: Iterable[tuple[Survey, Array, Array]]) -> Loads:
     parts: dict[Payload, list[tuple[Array, Array]]] = defaultdict(list)
     for survey, qpos, torque in samples:
         parts[survey.entry.meta.payload_mass, survey.entry.meta.payload_side].append((qpos, torque))
-    return {
-        key: (np.concatenate([q for q, _ in p]), np.concatenate([t for _, t in p]))
-        for key, p in parts.items()
-    }
+    loads = {}
+    for payload, pairs in parts.items():
+        qpos_of_parts, torque_of_parts = zip(*pairs, strict=True)
+        loads[payload] = (np.concatenate(qpos_of_parts), np.concatenate(torque_of_parts))
+    return loads
 
 
 def _unexplained(

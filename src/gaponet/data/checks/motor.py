@@ -133,11 +133,9 @@ def _expected_lag(robot: RobotSpec) -> dict[str, tuple[float, float]]:
     damping = passive + servo.kd
     inertia = np.diag(full)[dofs]
     stiff = np.where(servo.kp > 0, servo.kp, np.inf)
-    lags = np.stack([damping / stiff, np.pi / 2 * np.sqrt(inertia / stiff)], axis=1)
-    return {
-        name: (float(slow), float(near))
-        for name, (slow, near) in zip(robot.joint_names, lags, strict=True)
-    }
+    slow = (damping / stiff).tolist()
+    near = (np.pi / 2 * np.sqrt(inertia / stiff)).tolist()
+    return dict(zip(robot.joint_names, zip(slow, near, strict=True), strict=True))
 
 
 def _sag(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
@@ -147,7 +145,9 @@ def _sag(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     for payload in (payloads[0], payloads[-1]):
         same = [survey for survey in surveys if survey.entry.meta.payload_mass == payload]
         errors[payload] = static_errors(same, robot)
-    largest = {name: max(abs(e[name].middle) for e in errors.values()) for name in robot.operated}
+    largest = {}
+    for name in robot.operated:
+        largest[name] = max(abs(by_joint[name].middle) for by_joint in errors.values())
     sagging = [name for name in robot.operated if largest[name] >= MIN_SAG_RAD]
     sagging.sort(key=lambda name: -largest[name])
     if sagging:
@@ -260,10 +260,8 @@ def lag_values(lags: Array) -> dict[str, float]:
 def static_errors(surveys: list[Survey], robot: RobotSpec) -> dict[str, StaticError]:
     """Return the static error of each operated joint over all static poses."""
     poses = StaticPoses.joined([survey.static_poses for survey in surveys], len(robot.joint_names))
-    return {
-        name: poses.static_error(j)
-        for name, j in zip(robot.operated, robot.operated_index, strict=True)
-    }
+    errors = map(poses.static_error, robot.operated_index)
+    return dict(zip(robot.operated, errors, strict=True))
 
 
 def _mrad(error: StaticError) -> str:

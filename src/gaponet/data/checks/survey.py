@@ -473,8 +473,11 @@ def _all_repeated(sequence: Sequence) -> float:
     """A resting robot repeats its positions; if every signal repeats while the command moves,
     nothing was read.
     """
-    state = [getattr(sequence, name) for name in ("qpos", "qvel", "tau", "temperature")]
-    same = np.all([(np.diff(x, axis=0) == 0).all(axis=1) for x in state if x is not None], axis=0)
+    same = np.ones(len(sequence) - 1, bool)
+    for name in ("qpos", "qvel", "tau", "temperature"):
+        signal = getattr(sequence, name)
+        if signal is not None:
+            same &= (np.diff(signal, axis=0) == 0).all(axis=1)
     late = round(MAX_LAG_S / 2 / sequence.dt)
     longest = 0
     for run in _runs(same):

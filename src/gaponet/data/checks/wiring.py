@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterator
+from itertools import chain
 
 import numpy as np
 
@@ -185,7 +186,7 @@ def _copied(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
         yield Finding("warning", "copied", text)
         return
     copies = _copies(surveys, robot)
-    copied = {name for motions in copies.values() for name in motions}
+    copied = set[str]().union(*copies.values())
     usual: list[int] = []  # joints that follow their commands in most recordings
     for i, name in enumerate(robot.joint_names):
         if name in copied:
@@ -252,7 +253,7 @@ def _copy(rows: int, motions: dict[str, list[str]], with_torque: bool) -> Findin
     motions: joint → motions.
     """
     joints = abbreviate(list(motions))
-    where = abbreviate([motion for of_joint in motions.values() for motion in of_joint])
+    where = abbreviate(list(chain.from_iterable(motions.values())))
     count = f"{abs(rows)} row{'s' * (abs(rows) > 1)}"
     if rows == 0:
         text = (
@@ -279,10 +280,9 @@ def _moves_first(survey: Survey, joints: list[int]) -> bool:
     """True if several of the joints move before their commands in a recording, and most of those
     that move.
     """
-    leads = [
-        bool(np.isfinite(survey.lead[i])) for i in joints if survey.ctrl_range[i] > MIN_COMMAND_RAD
-    ]
-    return sum(leads) >= 2 and 2 * sum(leads) > len(leads)
+    moved = [i for i in joints if survey.ctrl_range[i] > MIN_COMMAND_RAD]
+    first = int(np.isfinite(survey.lead[moved]).sum())
+    return first >= 2 and 2 * first > len(moved)
 
 
 def _unit(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:

@@ -88,7 +88,7 @@ def with_whole_seconds(
             pairs[stamp] = columns
     if not pairs:
         return signals, load
-    parts = {part for pair in pairs.values() for part in pair}
+    parts = set[str]().union(*pairs.values())
     joined = dict.fromkeys(pairs, ()) | {n: x for n, x in signals.items() if n not in parts}
     return joined, partial(_load_stamps, load, pairs)
 

@@ -278,11 +278,8 @@ def _others_alike(recording: RawRecording, channel: str, name: str) -> str:
     """A question where other arrays could be this channel, as those of a second arm; "" if none."""
     if channel not in REQUIRED:
         return ""
-    alike = [
-        other
-        for other, labels in recording.signals.items()
-        if labels and other != name and _kind(other) == channel
-    ]
+    arrays = [array for array, labels in recording.signals.items() if labels]
+    alike = [array for array in arrays if array != name and _kind(array) == channel]
     return f"  # ? also: {', '.join(alike)}" if alike and "{joint}" not in name else ""
 
 
@@ -371,7 +368,7 @@ def _kind(name: str) -> str | None:
     """Which channel a name speaks of; of a command's, positions only."""
     parts = re.split(r"[^a-z0-9]+", re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name).lower())
     parts += [part.rstrip("0123456789") for part in parts]  # q1, cmd2
-    matches = [channel for channel, words in WORDS.items() if any(part in words for part in parts)]
+    matches = [channel for channel, words in WORDS.items() if not set(words).isdisjoint(parts)]
     excluded = {"ctrl": NOT_POSITIONS, FEEDFORWARD: ("qpos", "qvel", "temperature")}.get(
         matches[0] if matches else ""
     )
@@ -649,12 +646,11 @@ def _named_unit(recording: RawRecording, pattern: str) -> str | None:
     """The unit of positions that their names say, or a second line of the header."""
     units = recording.meta.get("notes", {}).get("units", {})
     before, _, after = pattern.partition("{joint}")
-    of_joints = [
-        unit
-        for column, unit in units.items()
-        if column.startswith(before) and column.endswith(after)
-    ]
-    for text in (before, after, *of_joints):
+    texts = [before, after]
+    for column, unit in units.items():
+        if column.startswith(before) and column.endswith(after):
+            texts.append(unit)
+    for text in texts:
         for word in re.split(r"[^a-z°]+", text.lower()):
             unit = next((u for u, words in UNIT_WORDS.items() if word in words), None)
             if unit:

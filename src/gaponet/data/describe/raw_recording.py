@@ -93,9 +93,9 @@ class RawRecording:
 
     def shown(self, most: int = 12) -> str:
         """The signals, for an error."""
-        names = [
-            f"{name}[{len(labels)}]" if labels else name for name, labels in self.signals.items()
-        ]
+        names = []
+        for name, labels in self.signals.items():
+            names.append(f"{name}[{len(labels)}]" if labels else name)
         return ", ".join(names[:most]) + (", …" if len(names) > most else "")
 
     def beside(self, other: RawRecording, prefix: str = COMMAND) -> RawRecording:
@@ -198,8 +198,10 @@ class RawRecording:
         self, columns: list[Columns], clocks: dict[str, str | None]
     ) -> dict[str, Signal]:
         """Load the signals of some columns, and those that are clocks."""
-        names = {signal for joints in columns for signal, _ in joints.values()}
-        of_time = {c for c in clocks.values() if c in self.signals and c not in names}
+        names = set[str]()
+        for joints in columns:
+            names.update(signal for signal, _ in joints.values())
+        of_time = {clock for clock in clocks.values() if clock in self.signals} - names
         return self.load([*names, *of_time])
 
     def _require_one_clock(self, clocks: dict[str, str | None], specified: LogsFile) -> None:
@@ -326,10 +328,12 @@ def _cut_short(file: Path, error: Exception) -> bool:
         stop = stream.read(8)
     if start.startswith(b"PK\x03\x04"):
         return not zipfile.is_zipfile(file)
-    return any(
-        start == begin[: len(start)] or (start.startswith(begin) and not stop.endswith(end))
-        for begin, end in ENDS.items()
-    )
+    for begin, end in ENDS.items():
+        if start == begin[: len(start)]:
+            return True
+        if start.startswith(begin) and not stop.endswith(end):
+            return True
+    return False
 
 
 def _refuse_three_axes(file: Path, arrays: dict[str, Any]) -> None:
@@ -465,16 +469,11 @@ def _choose(
     taken = {*single.values(), specified.get("time", ""), *clocks}  # no pattern finds these columns
     for channel in (*CHANNELS, *DERIVED):
         named = _matching(recording, specified, channel, taken)
-        named += [
-            (ours.partition(".")[2], theirs)
-            for ours, theirs in single.items()
-            if ours.startswith(f"{channel}.")
-        ]
-        named = [
-            (joint, column)
-            for joint, column in named
-            if not ignored(joint, specified.get("ignore", ()))
-        ]
+        for ours, theirs in single.items():
+            if ours.startswith(f"{channel}."):
+                named.append((ours.partition(".")[2], theirs))
+        ignore = specified.get("ignore", ())
+        named = [(joint, column) for joint, column in named if not ignored(joint, ignore)]
         if not named:
             continue
         joints = resolve_all([joint for joint, _ in named], robot, where, joint_map)
@@ -606,23 +605,22 @@ def _units(
     robot: RobotSpec, specified: LogsFile, joints: list[str], joint_map: dict[str, str] | None
 ) -> dict[str, str]:
     """The unit of each joint's positions; refuses one that nobody specified."""
-    single = {
-        robot.resolve(j, "[joint_units] of logs.toml", joint_map): u
-        for j, u in specified.get("joint_units", {}).items()
-    }
-    for what, unit, known in (
-        (
-            "time unit",
-            specified.get("time_unit", "s" if "rate" in specified else ""),
-            tuple(SECONDS),
-        ),
-        ("position unit", specified.get("position_unit", ""), LOG_UNITS),
-        *((f"unit of {joint}", unit, LOG_UNITS) for joint, unit in single.items()),
-    ):
-        if unit not in known:
-            given = f"'{unit}' is not one of {', '.join(known)}" if unit else "is not given"
-            raise UsageError(f"the table's {what} {given}; say it with {SAY_UNITS}")
+    single = {}
+    for name, unit in specified.get("joint_units", {}).items():
+        single[robot.resolve(name, "[joint_units] of logs.toml", joint_map)] = unit
+    time_unit = specified.get("time_unit", "s" if "rate" in specified else "")
+    _require_unit("time unit", time_unit, tuple(SECONDS))
+    _require_unit("position unit", specified.get("position_unit", ""), LOG_UNITS)
+    for joint, unit in single.items():
+        _require_unit(f"unit of {joint}", unit, LOG_UNITS)
     return {joint: single.get(joint, specified["position_unit"]) for joint in joints}
+
+
+def _require_unit(what: str, unit: str, known: ListOf[str]) -> None:
+    """Refuse a unit that is not known, or not given."""
+    if unit not in known:
+        given = f"'{unit}' is not one of {', '.join(known)}" if unit else "is not given"
+        raise UsageError(f"the table's {what} {given}; say it with {SAY_UNITS}")
 
 
 def _time(

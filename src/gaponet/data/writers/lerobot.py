@@ -316,7 +316,7 @@ def _row(episode: _Placed, number: int, stats: FeatureStatistics) -> dict[str, A
     """The episode's row in the file of meta/episodes that has this number."""
     entry = episode.entry
     meta = asdict(episode.entry.meta)
-    return {
+    columns = {
         "episode_index": episode.index,
         "tasks": [entry.meta.motion],
         "length": entry.rows,
@@ -331,8 +331,11 @@ def _row(episode: _Placed, number: int, stats: FeatureStatistics) -> dict[str, A
         **{name: json.dumps(meta[name], ensure_ascii=False) for name in ("notes", *GAINS)},
         "findings": json.dumps(entry.findings, ensure_ascii=False),
         "content_hash": entry.hash,
-        **{f"stats/{f}/{k}": v.tolist() for f, values in stats.items() for k, v in values.items()},
     }
+    for feature, of_feature in stats.items():
+        for name, values in of_feature.items():
+            columns[f"stats/{feature}/{name}"] = values.tolist()
+    return columns
 
 
 def _task_table(tasks: dict[str, int]) -> pa.Table:
@@ -342,16 +345,16 @@ def _task_table(tasks: dict[str, int]) -> pa.Table:
     import pyarrow as pa
 
     kinds = {"task_index": ("int64", "int64"), "task": ("unicode", "object")}
-    columns = [
-        {
+    columns = []
+    for name, (pandas, numpy) in kinds.items():
+        column = {
             "name": name,
             "field_name": name,
             "pandas_type": pandas,
             "numpy_type": numpy,
             "metadata": None,
         }
-        for name, (pandas, numpy) in kinds.items()
-    ]
+        columns.append(column)
     header = {
         "index_columns": ["task"],
         "column_indexes": [],

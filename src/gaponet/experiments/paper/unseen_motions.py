@@ -71,10 +71,13 @@ def unseen_names(library: Library) -> list[str]:
     sides = list(library.kit.arms)
     if len(sides) == 2:
         sides = ["both", *sides]
-    if sides:
-        return [f"{kind}-{side}-{VARIANT}" for side in sides for kind in BUILDERS]
-    variants = range(VARIANT, VARIANT + MAX_VARIANTS)
-    return [f"{kind}-all-{variant}" for variant in variants for kind in available(library.kit)]
+    names = []
+    for side in sides:
+        names += [f"{kind}-{side}-{VARIANT}" for kind in BUILDERS]
+    if not sides:
+        for variant in range(VARIANT, VARIANT + MAX_VARIANTS):
+            names += [f"{kind}-all-{variant}" for kind in available(library.kit)]
+    return names
 
 
 def require_unseen(

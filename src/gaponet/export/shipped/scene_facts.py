@@ -104,8 +104,13 @@ def joint_fields(model: Any, name: str) -> dict[str, Any]:
         "dof": model.joint(name).dofadr[0],
         "actuator": model.actuator(name).id,
     }
-    values = {field: getattr(model, field)[row[field.split("_")[0]]] for field in FIELDS}
-    return {field: (x[:3] if field.endswith("prm") else x).tolist() for field, x in values.items()}
+    fields = {}
+    for field in FIELDS:
+        values = getattr(model, field)[row[field.split("_")[0]]]
+        if field.endswith("prm"):
+            values = values[:3]
+        fields[field] = values.tolist()
+    return fields
 
 
 def solver_options(model: Any) -> dict[str, Any]:
@@ -115,8 +120,10 @@ def solver_options(model: Any) -> dict[str, Any]:
     """
     import mujoco
 
-    values = {name: getattr(model.opt, name) for name in OPTIONS}
-    options = {name: x.tolist() if hasattr(x, "tolist") else x for name, x in values.items()}
+    options = {}
+    for name in OPTIONS:
+        value = getattr(model.opt, name)
+        options[name] = value.tolist() if hasattr(value, "tolist") else value
     for name, kind in (
         ("integrator", "Integrator"),
         ("cone", "Cone"),
@@ -127,7 +134,10 @@ def solver_options(model: Any) -> dict[str, Any]:
             getattr(mujoco, f"mjt{kind}")(getattr(model.opt, name)).name.split("_", 1)[1].lower()
         )
     for name, kind in (("disableflags", "Disable"), ("enableflags", "Enable")):
-        bits = getattr(mujoco, f"mjt{kind}Bit").__members__.items()
-        flags = {key.split("BL_")[1].lower(): bit.value for key, bit in bits if "BL_" in key}
-        options[name] = sorted(key for key, bit in flags.items() if getattr(model.opt, name) & bit)
+        value = getattr(model.opt, name)
+        flags = []
+        for key, bit in getattr(mujoco, f"mjt{kind}Bit").__members__.items():
+            if "BL_" in key and value & bit.value:
+                flags.append(key.split("BL_")[1].lower())
+        options[name] = sorted(flags)
     return options

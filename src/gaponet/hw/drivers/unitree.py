@@ -51,9 +51,11 @@ ARM = (
     "wrist_yaw",
 )
 MOTOR_NAMES = (
-    *(f"{side}_{joint}_joint" for side in ("left", "right") for joint in LEG),
+    *(f"left_{joint}_joint" for joint in LEG),
+    *(f"right_{joint}_joint" for joint in LEG),
     "torso_joint",
-    *(f"{side}_{joint}_joint" for side in ("left", "right") for joint in ARM),
+    *(f"left_{joint}_joint" for joint in ARM),
+    *(f"right_{joint}_joint" for joint in ARM),
 )
 FIRST_MOTOR = {"arms": 13, "upper_body": 12, "all": 0}  # of the commanded ones
 # Not all 0 in a slot with a motor.

@@ -369,7 +369,10 @@ def draw_uncertainty(uncertainty: ParameterUncertainty, heading: str) -> Figure:
     """Draw a panel for each parameter: the value of every joint with its 90 % interval."""
     joints = list(uncertainty.joints)
     summaries = [summarize(uncertainty, j) for j in joints]
-    fields = [f for f in uncertainty.fields if any(s.values[f] for s in summaries)]
+    fields = []
+    for field in uncertainty.fields:
+        if any(summary.values[field] for summary in summaries):
+            fields.append(field)
     columns = min(MAX_COLUMNS, len(fields))
     rows = math.ceil(len(fields) / columns)
     fig = figure(2.4 * columns + 1.0, (0.24 * len(joints) + 0.8) * rows + 0.4)
