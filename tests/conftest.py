@@ -14,7 +14,7 @@ if sys.platform.startswith("linux") and not os.environ.get("DISPLAY"):
 
 from arm import write_arm
 
-from gaponet.data.importer import import_logs
+from gaponet.data.importer import ImportRequest, import_logs
 from gaponet.data.store import Dataset
 from gaponet.hw.control.clock import SimulatedClock
 from gaponet.robot.spec import RobotSpec, load_robot
@@ -83,5 +83,10 @@ def real_dataset(
     out = tmp_path_factory.mktemp("real") / "so101"
     gravity = lambda qpos, mass, side: static_torque(model, qpos)  # noqa: E731
     return import_logs(
-        sage_so101, so101, "lab", 0.0, out, gravity=gravity, simulator="nominal"
+        sage_so101,
+        so101,
+        out,
+        ImportRequest(unit_id="lab", payload_mass=0.0),
+        gravity=gravity,
+        simulator="nominal",
     ).dataset

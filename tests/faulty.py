@@ -12,7 +12,7 @@ from logs import write_sage
 
 from gaponet.base.errors import GAPONetError
 from gaponet.data.doctor import DoctorResult
-from gaponet.data.importer import import_logs
+from gaponet.data.importer import ImportRequest, import_logs
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.dynamics import dynamics_of, gravity_of
 from gaponet.sim.model import build_model
@@ -114,7 +114,12 @@ def examine(robot: RobotSpec, logs: list[Recording], folder: Path, damage: Calla
                     for n, k in zip(robot.joint_names, robot.servo.kp, strict=True)
                 )
             )
-            report = import_logs(folder / f"{mass:g}", robot, "a", mass, folder / "data", kp=kp)
+            report = import_logs(
+                folder / f"{mass:g}",
+                robot,
+                folder / "data",
+                ImportRequest(unit_id="a", payload_mass=mass, kp=kp),
+            )
         models = {"gravity_model": gravity_of(robot), "dynamics_model": dynamics_of(robot)}
         return DoctorResult.of(report.dataset, robot, **models)
     except GAPONetError as error:

@@ -15,7 +15,7 @@ from gaponet.base.errors import UsageError
 from gaponet.base.files import write_text
 from gaponet.base.structure import Name, read_toml
 from gaponet.data.formats import ReadOptions, read_logs
-from gaponet.data.importer import import_logs
+from gaponet.data.importer import ImportRequest, import_logs
 from gaponet.data.store import Dataset
 from gaponet.robot.spec import RobotSpec, load_robot
 from gaponet.share.public_recordings import DATA_VARIABLE
@@ -134,11 +134,13 @@ def prepare(card: Card, data: Path, work: Path) -> tuple[Dataset, RobotSpec, Lab
     report = import_logs(
         source,
         robot,
-        card.unit,
-        card.payload,
         place / "data",
-        logs=logs if options else None,
-        cut=card.cut,
+        ImportRequest(
+            unit_id=card.unit,
+            payload_mass=card.payload,
+            logs=logs if options else None,
+            cut=card.cut,
+        ),
     )
     report.dataset.set_provenance(licence=card.licence, source=card.source)
     return report.dataset, robot, labels

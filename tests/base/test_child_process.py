@@ -41,7 +41,7 @@ import sys, os
 from gaponet.base import child_process
 child_process.exclude_current_folder()
 from pathlib import Path
-from gaponet.data.importer import import_logs
+from gaponet.data.importer import ImportRequest, import_logs
 from gaponet.hw.control.driver import DriverError
 from gaponet.hw.control.watchdog import Watchdog
 from gaponet.base.executor import open_pool
@@ -49,7 +49,8 @@ from gaponet.robot.spec import load_robot
 
 if __name__ == "__main__":
     robot = load_robot(Path("arm"))
-    print(len(import_logs("logs", robot, "lab", 0.0, "set").entries), "imported")
+    lab = ImportRequest(unit_id="lab", payload_mass=0.0)
+    print(len(import_logs("logs", robot, "set", lab).entries), "imported")
     lock = os.open("lock", os.O_CREAT | os.O_RDWR)
     port = os.ttyname(os.openpty()[1])
     watchdog = Watchdog({"kind": "so101", "robot": "so101", "port": port, "silent": True}, lock, 1, 1)

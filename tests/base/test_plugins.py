@@ -19,7 +19,7 @@ from gaponet.base import plugins
 from gaponet.base.errors import LogError, UsageError
 from gaponet.cli.main import main
 from gaponet.data.formats import FORMATS, detect, formats
-from gaponet.data.importer import import_logs
+from gaponet.data.importer import ImportRequest, import_logs
 from gaponet.data.store import Dataset
 from gaponet.hw.drivers.open import open_driver
 
@@ -124,13 +124,15 @@ def test_the_format_of_the_architecture_page_is_listed_and_read(installed, tmp_p
     rows.tofile(log)
     assert main(["import", "--formats"]) == 0
     assert "Log of my arm" in capsys.readouterr().out
-    made = import_logs(log, robot, "lab", 0.0, tmp_path / "data")
+    made = import_logs(
+        log, robot, tmp_path / "data", ImportRequest(unit_id="lab", payload_mass=0.0)
+    )
     (entry,) = made.entries
     assert entry.meta.motion == "wave"
     assert np.allclose(Dataset(tmp_path / "data").read(entry).ctrl, rows[:, 1:3])
     log.write_bytes(b"1234")
     with pytest.raises(LogError, match="five"):
-        import_logs(log, robot, "lab", 0.0, tmp_path / "data")
+        import_logs(log, robot, tmp_path / "data", ImportRequest(unit_id="lab", payload_mass=0.0))
 
 
 def test_run_lists_and_opens_the_drivers_of_extensions(installed, tmp_path):

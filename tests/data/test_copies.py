@@ -9,7 +9,7 @@ from scipy.signal import lfilter
 from gaponet.cli.main import main
 from gaponet.data.describe.row_copies import copied_rows
 from gaponet.data.doctor import DoctorResult
-from gaponet.data.importer import import_logs
+from gaponet.data.importer import ImportRequest, import_logs
 from gaponet.data.log import Channel
 
 ROWS = 400
@@ -39,7 +39,9 @@ def imported(folder, arm, time, ctrl, qpos, **more):
         columns |= {f"{channel}.{joint}": values[:, j] for channel, values in more.items()}
     (folder / "m.csv").write_text(table_text(columns))
     units = {"position_unit": "rad", "time_unit": "s"}
-    return import_logs(folder, arm, "u", 0.0, folder / "data", **units).dataset
+    return import_logs(
+        folder, arm, folder / "data", ImportRequest(unit_id="u", payload_mass=0.0, **units)
+    ).dataset
 
 
 def errors(dataset, arm):

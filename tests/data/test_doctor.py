@@ -17,7 +17,7 @@ from logs import arm_sequence, late, table_text, wave
 from gaponet.base.errors import DatasetError, WorkerError
 from gaponet.data.checks.timing import MIN_EARLY_RATIO, clock_drift
 from gaponet.data.doctor import DoctorResult
-from gaponet.data.importer import import_logs
+from gaponet.data.importer import ImportRequest, import_logs
 from gaponet.data.sequence import Sequence
 from gaponet.data.signals import Response, lowpass
 from gaponet.data.store import Dataset
@@ -386,7 +386,10 @@ def test_rows_at_12_to_40_hz_are_no_error_of_clocks_and_say_which_times_are_not_
         columns = dict(zip(names, np.concatenate([held, state], axis=1).T, strict=True))
         (folder / f"m{seed}.csv").write_text(table_text({"time": time} | columns))
     data = import_logs(
-        folder, arm, "a", 0.0, tmp_path / "data", position_unit="rad", time_unit="s"
+        folder,
+        arm,
+        tmp_path / "data",
+        ImportRequest(unit_id="a", payload_mass=0.0, position_unit="rad", time_unit="s"),
     ).dataset
     assert "apart, and shorter delays are not known" in data.entries[0].meta.notes["why_resampled"]
     diagnosis = DoctorResult.of(data, arm)

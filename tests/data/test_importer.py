@@ -12,11 +12,13 @@ import pytest
 from logs import arm_columns, late, table_text, wave, write_sage, write_so101
 
 from gaponet.base.errors import DatasetError, FolderError, LogError, UsageError
-from gaponet.data.importer import import_logs
+from gaponet.data.importer import ImportRequest, import_logs
 from gaponet.data.offsets import FILE
 from gaponet.data.store import Dataset
 
 SI = {"position_unit": "rad", "time_unit": "s"}
+
+LAB = ImportRequest(unit_id="lab", payload_mass=0.0)
 
 
 @pytest.fixture
@@ -33,10 +35,8 @@ def test_every_motion_becomes_a_sequence_with_its_origin(logs, so101, tmp_path):
     report = import_logs(
         logs,
         so101,
-        "lab",
-        0.0,
         tmp_path / "data",
-        level="joint",
+        ImportRequest(unit_id="lab", payload_mass=0.0, level="joint"),
         progress=lambda *what: seen.append(what),
     )
     assert seen == [(1, 2, "down"), (2, 2, "up")]
@@ -61,9 +61,9 @@ def test_every_motion_becomes_a_sequence_with_its_origin(logs, so101, tmp_path):
 
 
 def test_what_is_there_is_counted_and_the_rest_is_added(logs, so101, tmp_path):
-    first = import_logs(logs, so101, "lab", 0.0, tmp_path / "data")
+    first = import_logs(logs, so101, tmp_path / "data", LAB)
     write_so101(logs / "real" / "so101" / "custom" / "new")
-    second = import_logs(logs, so101, "lab", 0.0, tmp_path / "data")
+    second = import_logs(logs, so101, tmp_path / "data", LAB)
     assert [e.meta.motion for e in second.entries] == ["new"]
     assert second.present == first.entries
     assert len(Dataset(tmp_path / "data")) == 3
@@ -73,17 +73,20 @@ def test_one_recording_twice_in_the_source_is_refused(logs, so101, tmp_path):
     custom = logs / "real" / "so101" / "custom"
     shutil.copytree(custom / "up", custom / "up_again")
     with pytest.raises(DatasetError, match="up_again"):
-        import_logs(logs, so101, "lab", 0.0, tmp_path / "data")
+        import_logs(logs, so101, tmp_path / "data", LAB)
     assert not (tmp_path / "data").exists()
 
 
 def test_other_payloads_and_units_are_appended(logs, so101, tmp_path):
-    import_logs(logs, so101, "lab", 0.0, tmp_path / "data")
+    import_logs(logs, so101, tmp_path / "data", LAB)
     for lag, unit, mass, side in ((3, "lab", 0.2, "hand"), (4, "roof", 0.0, None)):
         ctrl = wave(200, 6)
         write_sage(tmp_path / unit / "up", ctrl, late(ctrl, lag))
         report = import_logs(
-            tmp_path / unit, so101, unit, mass, tmp_path / "data", payload_side=side
+            tmp_path / unit,
+            so101,
+            tmp_path / "data",
+            ImportRequest(unit_id=unit, payload_mass=mass, payload_side=side),
         )
     assert [(e.meta.unit_id, e.meta.payload_mass) for e in report.dataset.entries[1:]] == [
         ("lab", 0.0), ("lab", 0.2), ("roof", 0.0),
@@ -94,23 +97,30 @@ def test_other_payloads_and_units_are_appended(logs, so101, tmp_path):
 def test_known_samples_under_new_labels_are_refused_and_can_be_had_once_the_old_ones_are_gone(
     logs, so101, tmp_path, unit, mass
 ):
-    dataset = import_logs(logs, so101, "lab", 0.0, tmp_path / "data").dataset
+    dataset = import_logs(logs, so101, tmp_path / "data", LAB).dataset
     write_so101(logs / "real" / "so101" / "custom" / "new")
     with pytest.raises(
         DatasetError,
         match="down-lab",
     ):
-        import_logs(logs, so101, unit, mass, tmp_path / "data")
+        import_logs(logs, so101, tmp_path / "data", ImportRequest(unit_id=unit, payload_mass=mass))
     assert len(Dataset(tmp_path / "data")) == 2
     assert [e.meta.motion for e in dataset.remove(("*-lab-0kg-*",))] == ["down", "up"]
-    assert len(import_logs(logs, so101, unit, mass, tmp_path / "data").dataset) == 3
+    assert (
+        len(
+            import_logs(
+                logs, so101, tmp_path / "data", ImportRequest(unit_id=unit, payload_mass=mass)
+            ).dataset
+        )
+        == 3
+    )
 
 
 def test_a_second_take_of_a_motion_is_its_next_repetition(logs, so101, tmp_path):
-    import_logs(logs, so101, "lab", 0.0, tmp_path / "data")
+    import_logs(logs, so101, tmp_path / "data", LAB)
     again = wave(150, 6)
     write_sage(tmp_path / "later" / "up", again, late(again, 2))
-    report = import_logs(tmp_path / "later", so101, "lab", 0.0, tmp_path / "data")
+    report = import_logs(tmp_path / "later", so101, tmp_path / "data", LAB)
     assert [e.meta.repetition for e in report.entries] == [1]
 
 
@@ -118,7 +128,7 @@ def test_one_bad_file_leaves_nothing_behind(logs, so101, tmp_path):
     state = logs / "real" / "so101" / "custom" / "up" / "state_motor.csv"
     state.write_text(state.read_text()[:-100])
     with pytest.raises(LogError, match=r"up/state_motor\.csv:201"):
-        import_logs(logs, so101, "lab", 0.0, tmp_path / "data")
+        import_logs(logs, so101, tmp_path / "data", LAB)
     assert not (tmp_path / "data").exists()
 
 
@@ -126,7 +136,7 @@ def test_an_import_cut_short_at_any_write_is_finished_by_the_same_call(
     logs, so101, tmp_path, monkeypatch
 ):
     """Every operation on the disk fails once; the journal lists all files, whole ones; the end is always the same."""
-    whole = import_logs(logs, so101, "lab", 0.0, tmp_path / "whole", gravity=lambda q, m, s: 0 * q)
+    whole = import_logs(logs, so101, tmp_path / "whole", LAB, gravity=lambda q, m, s: 0 * q)
     real = {name: getattr(os, name) for name in ("replace", "fsync", "pwrite", "mkdir")}
     left = None
 
@@ -145,7 +155,7 @@ def test_an_import_cut_short_at_any_write_is_finished_by_the_same_call(
     for n in itertools.count(1):
         left, out = n, tmp_path / f"cut{n}"
         try:
-            import_logs(logs, so101, "lab", 0.0, out, gravity=lambda q, m, s: 0 * q)
+            import_logs(logs, so101, out, LAB, gravity=lambda q, m, s: 0 * q)
         except OSError:
             assert left <= 0
         if left > 0:  # there are no more
@@ -157,7 +167,7 @@ def test_an_import_cut_short_at_any_write_is_finished_by_the_same_call(
             Dataset(out).sequences()
         else:
             assert not out.exists()
-        import_logs(logs, so101, "lab", 0.0, out, gravity=lambda q, m, s: 0 * q)
+        import_logs(logs, so101, out, LAB, gravity=lambda q, m, s: 0 * q)
         assert Dataset(out).entries == whole.dataset.entries
         assert sorted(f.name for f in out.rglob("*")) == sorted(
             f.name for f in whole.dataset.path.rglob("*")
@@ -169,17 +179,17 @@ def test_a_folder_with_something_else_in_it_is_left_as_it_is(logs, so101, tmp_pa
     (tmp_path / "proj" / ".git").mkdir(parents=True)
     (tmp_path / "proj" / ".env").write_text("mine")
     with pytest.raises(FolderError, match=r"\.env"):
-        import_logs(logs, so101, "lab", 0.0, tmp_path / "proj")
+        import_logs(logs, so101, tmp_path / "proj", LAB)
     assert sorted(f.name for f in (tmp_path / "proj").iterdir()) == [".env", ".git"]
 
 
 def test_what_a_person_added_to_a_dataset_stays(logs, so101, tmp_path, monkeypatch):
-    import_logs(logs, so101, "lab", 0.0, tmp_path / "data")
+    import_logs(logs, so101, tmp_path / "data", LAB)
     (tmp_path / "data" / "NOTES").write_text("mine")
     write_so101(logs / "real" / "so101" / "custom" / "new")
     monkeypatch.setattr(Dataset, "append", lambda *_: 1 / 0)
     with pytest.raises(ZeroDivisionError):
-        import_logs(logs, so101, "lab", 0.0, tmp_path / "data")
+        import_logs(logs, so101, tmp_path / "data", LAB)
     assert (tmp_path / "data" / "NOTES").read_text() == "mine"
     assert len(Dataset(tmp_path / "data")) == 2
 
@@ -188,12 +198,17 @@ def test_another_robots_dataset_is_refused_before_anything_is_read(logs, so101, 
     Dataset.create(tmp_path / "data", arm)
     shutil.rmtree(logs)
     with pytest.raises(DatasetError, match="'arm'"):
-        import_logs(logs, so101, "lab", 0.0, tmp_path / "data")
+        import_logs(logs, so101, tmp_path / "data", LAB)
 
 
 def test_a_hand_the_robot_does_not_have_is_refused(logs, so101, tmp_path):
     with pytest.raises(UsageError, match="'left'"):
-        import_logs(logs, so101, "lab", 0.2, tmp_path / "data", payload_side="left")
+        import_logs(
+            logs,
+            so101,
+            tmp_path / "data",
+            ImportRequest(unit_id="lab", payload_mass=0.2, payload_side="left"),
+        )
 
 
 def test_offsets_are_fitted_where_a_gravity_is_given(logs, so101, tmp_path):
@@ -204,7 +219,12 @@ def test_offsets_are_fitted_where_a_gravity_is_given(logs, so101, tmp_path):
         return np.zeros_like(qpos)
 
     report = import_logs(
-        logs, so101, "lab", 0.2, tmp_path / "data", gravity=weightless, simulator="abc"
+        logs,
+        so101,
+        tmp_path / "data",
+        ImportRequest(unit_id="lab", payload_mass=0.2),
+        gravity=weightless,
+        simulator="abc",
     )
     assert asked[0] == (0.2, "both")
     assert list(report.offsets) == list(so101.operated)
@@ -220,15 +240,20 @@ def test_the_40_real_motions_come_in_as_recorded(real_dataset):
 
 def test_a_source_named_by_a_dot_is_known_by_its_folder(so101, tmp_path, monkeypatch):
     monkeypatch.chdir(write_so101(tmp_path / "wave"))
-    meta = import_logs(".", so101, "lab", 0.0, tmp_path / "data").entries[0].meta
+    meta = import_logs(".", so101, tmp_path / "data", LAB).entries[0].meta
     assert (meta.motion, meta.source) == ("wave", "wave")
 
 
 def test_gains_are_the_robots_unless_said_by_joint_or_for_all(logs, so101, tmp_path):
-    first = import_logs(logs, so101, "lab", 0.0, tmp_path / "a").entries[0].meta
+    first = import_logs(logs, so101, tmp_path / "a", LAB).entries[0].meta
     assert first.kp == tuple(so101.servo.kp)
     said = import_logs(
-        logs, so101, "lab", 0.0, tmp_path / "b", kp=("elbow_flex=9", "gripper=4"), kd=("0.1",)
+        logs,
+        so101,
+        tmp_path / "b",
+        ImportRequest(
+            unit_id="lab", payload_mass=0.0, kp=("elbow_flex=9", "gripper=4"), kd=("0.1",)
+        ),
     )
     meta = Dataset(tmp_path / "b").entries[0].meta
     assert meta == said.entries[0].meta
@@ -242,13 +267,20 @@ def test_gains_are_the_robots_unless_said_by_joint_or_for_all(logs, so101, tmp_p
 @pytest.mark.parametrize("words", [("stiff",), ("-1",), ("5", "6"), ("elbow_flex=nan",)])
 def test_gains_that_make_no_sense_are_refused(logs, so101, tmp_path, words):
     with pytest.raises(UsageError, match="number"):
-        import_logs(logs, so101, "lab", 0.0, tmp_path / "data", kp=words)
+        import_logs(
+            logs, so101, tmp_path / "data", ImportRequest(unit_id="lab", payload_mass=0.0, kp=words)
+        )
     with pytest.raises(UsageError, match="twice"):
-        import_logs(logs, so101, "lab", 0.0, tmp_path / "data", kp=("elbow_flex=9", "elbow_flex=5"))
+        import_logs(
+            logs,
+            so101,
+            tmp_path / "data",
+            ImportRequest(unit_id="lab", payload_mass=0.0, kp=("elbow_flex=9", "elbow_flex=5")),
+        )
 
 
 def test_a_journal_from_before_gains_were_kept_still_opens(logs, so101, tmp_path):
-    import_logs(logs, so101, "lab", 0.0, tmp_path / "data")
+    import_logs(logs, so101, tmp_path / "data", LAB)
     journal = tmp_path / "data" / "sequences.jsonl"
     old = [json.loads(line) for line in journal.read_text().splitlines()]
     for line in old:
@@ -262,7 +294,10 @@ def test_a_motion_with_a_name_of_many_letters_is_stored(arm, tmp_path):
     file = tmp_path / ("a" * 240 + ".csv")
     file.write_text(table_text(arm_columns()))
     data = import_logs(
-        file, arm, "b" * 300, 0.0, tmp_path / "out", position_unit="rad", time_unit="s"
+        file,
+        arm,
+        tmp_path / "out",
+        ImportRequest(unit_id="b" * 300, payload_mass=0.0, position_unit="rad", time_unit="s"),
     ).dataset
     assert len(data.read(data.entries[0])) == 60
     assert data.entries[0].meta.motion == "a" * 240

@@ -11,7 +11,7 @@ from logs import arm_columns, arm_sequence, late, table_text, wave
 
 from gaponet.base.errors import DatasetError, UsageError
 from gaponet.data.fingerprint import equal_commands, fingerprint
-from gaponet.data.importer import import_logs
+from gaponet.data.importer import ImportRequest, import_logs
 from gaponet.data.split import (
     SPLITS,
     canonical_motions,
@@ -321,19 +321,20 @@ def test_one_command_played_again_is_split_by_repetition_and_long_logs_by_time(a
     report = import_logs(
         tmp_path / "long.csv",
         arm,
-        "a",
-        0.0,
         tmp_path / "cut",
-        cut=4.0,
-        position_unit="rad",
-        time_unit="s",
+        ImportRequest(unit_id="a", payload_mass=0.0, cut=4.0, position_unit="rad", time_unit="s"),
     )
     assert [(e.meta.motion, e.rows) for e in report.entries] == [("long@0s", 225), ("long@4s", 225), ("long@9s", 225),
                                                                  ("long@14s", 225)]  # fmt: skip
     rested = arm_columns(900) | {k: np.zeros(900) for k in arm_columns() if k != "time"}
     (tmp_path / "rest.csv").write_text(table_text(rested))
     how = {"cut": 4.0, "position_unit": "rad", "time_unit": "s"}
-    (piece,) = import_logs(tmp_path / "rest.csv", arm, "a", 0.0, tmp_path / "rests", **how).entries
+    (piece,) = import_logs(
+        tmp_path / "rest.csv",
+        arm,
+        tmp_path / "rests",
+        ImportRequest(unit_id="a", payload_mass=0.0, **how),
+    ).entries
     assert piece.meta.motion == "rest@0s"  # equal pieces of one recording are one
     parts = make_split(report.dataset, "time")
     named = [[e.meta.motion for e in parts[part]] for part in SPLITS]

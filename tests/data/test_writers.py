@@ -8,7 +8,7 @@ from logs import arm_sequence, late, wave, write_so101
 
 from gaponet.cli.main import main
 from gaponet.data.formats import detect
-from gaponet.data.importer import import_logs
+from gaponet.data.importer import ImportRequest, import_logs
 from gaponet.data.store import Dataset
 from gaponet.data.writers import export
 
@@ -55,7 +55,7 @@ def dataset(arm, tmp_path):
 def test_what_is_written_is_read_back_without_a_word(dataset, arm, tmp_path):
     export(dataset, tmp_path / "out")
     assert detect(tmp_path / "out") == "lerobot"
-    import_logs(tmp_path / "out", arm, None, None, tmp_path / "again")
+    import_logs(tmp_path / "out", arm, tmp_path / "again", ImportRequest())
     again = {e.meta.motion: e for e in Dataset(tmp_path / "again").entries}
     for entry in dataset.entries:
         back = again[entry.meta.motion]
@@ -70,9 +70,11 @@ def test_what_is_written_is_read_back_without_a_word(dataset, arm, tmp_path):
 
 def test_a_gripper_goes_out_and_comes_back_as_a_share_of_its_range(so101, tmp_path):
     write_so101(tmp_path / "logs" / "wave")
-    import_logs(tmp_path / "logs", so101, "a", 0.0, tmp_path / "data")
+    import_logs(
+        tmp_path / "logs", so101, tmp_path / "data", ImportRequest(unit_id="a", payload_mass=0.0)
+    )
     export(Dataset(tmp_path / "data"), tmp_path / "out")
-    import_logs(tmp_path / "out", so101, None, None, tmp_path / "again")
+    import_logs(tmp_path / "out", so101, tmp_path / "again", ImportRequest())
     one, other = (Dataset(tmp_path / d) for d in ("data", "again"))
     assert one.entries[0].hash == other.entries[0].hash
 

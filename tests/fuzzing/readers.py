@@ -25,7 +25,7 @@ from strange_logs import (
 
 from fuzzing.harness import AbsurdError, Target
 from fuzzing.mutate import Files
-from gaponet.data.importer import import_logs
+from gaponet.data.importer import ImportRequest, import_logs
 from gaponet.data.store import Dataset
 from gaponet.data.writers import export
 from gaponet.motion.files import read_motion
@@ -105,7 +105,9 @@ def importing(
             {"logs": str(source / str(options["logs"]))} if "logs" in options else {}
         )
         unit, payload = None if stated == "all" else "lab", None if stated else 0.0
-        report = import_logs(source / at, robot(), unit, payload, out, **given)  # type: ignore[arg-type]
+        report = import_logs(
+            source / at, robot(), out, ImportRequest(unit_id=unit, payload_mass=payload, **given)
+        )
         require_sane(Dataset(out), robot(), source)
         if len(report.entries) != len(Dataset(out).entries):
             raise AbsurdError(f"{len(report.entries)} imported, {len(Dataset(out).entries)} stored")

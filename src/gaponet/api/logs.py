@@ -64,6 +64,7 @@ def import_logs(
             to do.
         RemoteError: The address cannot be reached.
     """
+    from gaponet.data.importer import ImportRequest
     from gaponet.data.importer import import_logs as read_logs
     from gaponet.share.hub_logs import logs_folder
     from gaponet.sim.dynamics import gravity_of
@@ -71,16 +72,15 @@ def import_logs(
 
     spec = as_robot(robot)
     require_robot_of_folder(Path(out), spec)
+    request = ImportRequest(unit_id=unit_id, payload_mass=payload_mass, **vars(options))
     return read_logs(
         logs_folder(src),
         spec,
-        unit_id,
-        payload_mass,
         out,
+        request,
         gravity=gravity_of(spec),
         simulator=model_hash(spec),
         progress=progress,
-        **vars(options),
     )
 
 

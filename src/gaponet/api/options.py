@@ -8,10 +8,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 from gaponet.base.errors import UsageError
-from gaponet.data.formats import ReadOptions
+from gaponet.data.importer import ImportOptions as ImportOptions
 from gaponet.robot.servo_fields import Term
 from gaponet.sysid.options import IdentifyOptions as SearchOptions
 
@@ -92,26 +91,6 @@ class IdentifyOptions:
         if any(given):
             what = "--like, --units, --holdout-units, --terms, --stops and --masses"
             raise UsageError(f"{dataset} holds a robot that is driven by torque; leave out {what}")
-
-
-@dataclass(frozen=True)
-class ImportOptions(ReadOptions):
-    """How logs are read, and what they are of."""
-
-    payload_side: str | None = None
-    """Hand that carries the payload: both (default), or the side of one payload mount."""
-    cut: float | None = None
-    """Cut long recordings into equal pieces of about this length, s; each is a motion of its
-    own."""
-    level: Literal["joint", "upper_body", "whole_body"] | None = None
-    """What the motions move; default whole_body."""
-    kp: tuple[str, ...] = ()
-    """Stiffness while recording, N·m/rad: a number, or JOINT=NUMBER for some joints; default what
-    the format states, else the robot's."""
-    kd: tuple[str, ...] = ()
-    """Damping gain while recording, N·m·s/rad, likewise."""
-    skip_bad: bool = False
-    """Cut bad rows and leave out unreadable logs, instead of refusing all."""
 
 
 def parse_joint_map(pairs: tuple[str, ...]) -> dict[str, str] | None:

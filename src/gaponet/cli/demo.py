@@ -8,6 +8,7 @@ import sys
 import time
 from importlib.util import find_spec
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from gaponet import api
 from gaponet.api.opening import test_motions
@@ -21,8 +22,10 @@ from gaponet.cli.experiment import share_bar, show_paper_result
 from gaponet.cli.gap import show_steps
 from gaponet.cli.options import Flag, Json
 from gaponet.cli.out import Out, writes
-from gaponet.data.store import Dataset
 from gaponet.evaluation.tables import mrad
+
+if TYPE_CHECKING:
+    from gaponet import Dataset
 
 FLEET = "firm"
 RECIPE = "demo"

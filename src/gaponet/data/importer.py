@@ -11,7 +11,7 @@ from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -87,23 +87,63 @@ class ImportResult:
         }
 
 
+@dataclass(frozen=True)
+class ImportOptions(ReadOptions):
+    """How logs are read, and what they are of."""
+
+    payload_side: str | None = None
+    """Hand that carries the payload: both (default), or the side of one payload mount."""
+    cut: float | None = None
+    """Cut long recordings into equal pieces of about this length, s; each is a motion of its
+    own."""
+    level: Literal["joint", "upper_body", "whole_body"] | None = None
+    """What the motions move; default whole_body."""
+    kp: tuple[str, ...] = ()
+    """Stiffness while recording, N·m/rad: a number, or JOINT=NUMBER for some joints; default what
+    the format states, else the robot's."""
+    kd: tuple[str, ...] = ()
+    """Damping gain while recording, N·m·s/rad, likewise."""
+    skip_bad: bool = False
+    """Cut bad rows and leave out unreadable logs, instead of refusing all."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImportRequest(ImportOptions):
+    """How logs are read, and whose they are; what is not stated is as the format has it."""
+
+    unit_id: str | None = None
+    """Name of the recorded robot."""
+    payload_mass: float | None = None
+    """kg in each hand."""
+
+    def labels(self, robot: RobotSpec) -> dict[str, Any]:
+        """Return the labels that are given, as fields of SequenceMeta.
+
+        Raises:
+            UsageError: The robot has no such hand or joint, or a gain is no number.
+        """
+        if self.payload_side is not None:
+            _require_side(robot, self.payload_side)
+        labels = {
+            "unit_id": self.unit_id,
+            "payload_mass": self.payload_mass,
+            "payload_side": self.payload_side,
+            "level": self.level,
+            "kp": _parse_gains("kp", self.kp, robot),
+            "kd": _parse_gains("kd", self.kd, robot),
+        }
+        return {name: value for name, value in labels.items() if value is not None}
+
+
 def import_logs(
     src: str | Path,
     robot: RobotSpec,
-    unit_id: str | None,
-    payload_mass: float | None,
     out: str | Path,
+    request: ImportRequest,
     *,
-    payload_side: str | None = None,
-    level: str | None = None,
     gravity: Gravity | None = None,
     simulator: str = "",
     progress: Progress = no_progress,
-    kp: tuple[str, ...] = (),
-    kd: tuple[str, ...] = (),
-    skip_bad: bool = False,
-    cut: float | None = None,
-    **options: Any,
 ) -> ImportResult:
     """Import every recording under a path that the dataset does not hold yet.
 
@@ -115,8 +155,6 @@ def import_logs(
         gravity: Gravity of the nominal model, to measure offsets (data.offsets); default: no
             offsets.
         simulator: Hash of that model, recorded beside the offsets.
-        options: Fields of data.formats.ReadOptions. All other arguments are those of
-            gaponet.api.logs.import_logs.
 
     Raises:
         LogError, JointMismatchError: A recording cannot be read; the message names file and line.
@@ -127,25 +165,15 @@ def import_logs(
     """
     src = Path(src)
     out = Path(out)
-    if payload_side is not None:
-        _require_side(robot, payload_side)
-    labels = {
-        "unit_id": unit_id,
-        "payload_mass": payload_mass,
-        "payload_side": payload_side,
-        "level": level,
-        "kp": _parse_gains("kp", kp, robot),
-        "kd": _parse_gains("kd", kd, robot),
-    }
-    labels = {name: value for name, value in labels.items() if value is not None}
-    if cut is not None:
-        _require_piece(cut)
+    labels = request.labels(robot)
+    if request.cut is not None:
+        _require_piece(request.cut)
     with lock_folder(out, KIND):
         existing = Dataset.open_existing(out, robot)
         if existing is not None:
             read_offsets(existing)  # a damaged file is refused before anything is read
-        source = _Source(src, robot, labels, cut, ReadOptions(**options))
-        with skip_bad_rows(skip_bad) as skipped:
+        source = _Source(src, robot, labels, request.cut, request)
+        with skip_bad_rows(request.skip_bad) as skipped:
             source.check(existing, progress)
             dataset = Dataset.create(out, robot)
             poses: dict[str, StaticPoses] = {}

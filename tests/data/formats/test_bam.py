@@ -9,7 +9,7 @@ from logs import late, wave, write_bam
 
 from gaponet.base.errors import JointMismatchError, LogError, UsageError
 from gaponet.data.formats import ReadOptions, detect, read_logs
-from gaponet.data.importer import import_logs
+from gaponet.data.importer import ImportRequest, import_logs
 from gaponet.robot.spec import load_robot
 from gaponet.sim.batch import Condition
 
@@ -29,7 +29,7 @@ def test_a_recording_says_its_gain_and_its_load(tmp_path, bench):
     write_bam(tmp_path / "b.json", kp=100, vin=5.0, trajectory="up", length=0.15, arm_mass=0.02)
     (tmp_path / "notes.json").write_text('{"entries": "of a diary"}')
     assert detect(tmp_path) == detect(tmp_path / "a.json") == "bam"
-    report = import_logs(tmp_path, bench, "mine", None, tmp_path / "data")
+    report = import_logs(tmp_path, bench, tmp_path / "data", ImportRequest(unit_id="mine"))
     first, second = report.dataset.sequences(report.entries)
     assert first.meta.motion == "sin_sin"
     assert (first.meta.payload_mass, first.meta.payload_side) == (0.49, "100mm")
@@ -57,7 +57,10 @@ def test_a_supply_voltage_that_the_servo_contradicts_is_named(tmp_path, bench, c
 
 def test_a_recording_ends_where_torque_is_switched_off(tmp_path, bench):
     report = import_logs(
-        write_bam(tmp_path / "a.json", off=40), bench, "mine", None, tmp_path / "data"
+        write_bam(tmp_path / "a.json", off=40),
+        bench,
+        tmp_path / "data",
+        ImportRequest(unit_id="mine"),
     )
     assert (report.entries[0].rows, report.entries[0].meta.notes["cut"]) == (
         40,
@@ -100,7 +103,10 @@ def test_any_servo_comes_in_whose_gain_law_robot_toml_states(tmp_path, bench):
 def test_an_arm_of_another_length_is_named(tmp_path, bench):
     with pytest.raises(UsageError, match="123mm"):
         import_logs(
-            write_bam(tmp_path / "a.json", length=0.123), bench, "mine", None, tmp_path / "data"
+            write_bam(tmp_path / "a.json", length=0.123),
+            bench,
+            tmp_path / "data",
+            ImportRequest(unit_id="mine"),
         )
 
 

@@ -13,7 +13,7 @@ from gaponet.cli.main import main
 from gaponet.data.describe.guess import guess_logs
 from gaponet.data.describe.joints import resolve_all
 from gaponet.data.formats import detect, look, read_logs
-from gaponet.data.importer import import_logs
+from gaponet.data.importer import ImportRequest, import_logs
 from gaponet.data.log import skip_bad_rows
 from gaponet.data.store import Dataset
 from gaponet.sim.model import build_model
@@ -319,7 +319,12 @@ FED = theirs() | {"tau_ff_shoulder": TORQUES[:, 0], "tau_ff_elbow": TORQUES[:, 1
 def fed_command(folder, arm, toml, **stated):
     """The command of a recording with TORQUES, (60, 2)."""
     folder = write(folder, NAMES + toml, columns=FED)
-    made = import_logs(folder, arm, "a", 0.0, folder.parent / f"{folder.name}_data", **stated)
+    made = import_logs(
+        folder,
+        arm,
+        folder.parent / f"{folder.name}_data",
+        ImportRequest(unit_id="a", payload_mass=0.0, **stated),
+    )
     return made.dataset.read(made.dataset.entries[0]), np.stack(
         [FED["shoulder_des"], FED["elbow_des"]], axis=1
     )
@@ -380,7 +385,10 @@ def test_a_feedforward_torque_without_gain_or_column_is_refused(tmp_path, arm, t
 def test_a_feedforward_torque_of_zero_needs_no_gain(tmp_path, arm):
     columns = theirs() | {f"feedforward_torque.{j}": np.zeros(60) for j in arm.joint_names}
     made = import_logs(
-        write(tmp_path / "logs", NAMES, columns=columns), arm, "a", 0.0, tmp_path / "data"
+        write(tmp_path / "logs", NAMES, columns=columns),
+        arm,
+        tmp_path / "data",
+        ImportRequest(unit_id="a", payload_mass=0.0),
     )
     assert np.allclose(
         made.dataset.read(made.dataset.entries[0]).ctrl[:, 1], columns["elbow_des"], atol=1e-6

@@ -8,7 +8,7 @@ from logs import arm_columns, table_text
 
 from gaponet.base.errors import LogError
 from gaponet.data.formats import ReadOptions, read_logs
-from gaponet.data.importer import import_logs
+from gaponet.data.importer import ImportRequest, import_logs
 
 SI = {"position_unit": "rad", "time_unit": "s"}
 ROWS = (120, 90, 150)
@@ -56,7 +56,12 @@ def test_numbers_that_no_float_counts_are_no_episodes(tmp_path, arm):
 
 def test_a_reset_between_episodes_is_no_motion(tmp_path, arm):
     write(tmp_path / "log.csv", joined(episode_index=numbers([0, 1, 2])))
-    dataset = import_logs(tmp_path / "log.csv", arm, "u", 0.0, tmp_path / "data", **SI).dataset
+    dataset = import_logs(
+        tmp_path / "log.csv",
+        arm,
+        tmp_path / "data",
+        ImportRequest(unit_id="u", payload_mass=0.0, **SI),
+    ).dataset
     steps = [np.abs(np.diff(dataset.read(e).qpos, axis=0)).max() for e in dataset.entries]
     assert max(steps) < JUMP_RAD / 4
 
@@ -92,4 +97,9 @@ def test_the_line_of_a_bad_row_is_that_of_the_file(tmp_path, arm):
 def test_a_clock_that_starts_again_is_several_recordings(tmp_path, arm, skip_bad):
     write(tmp_path / "log.csv", joined())
     with pytest.raises(LogError, match="episode_index"):
-        import_logs(tmp_path / "log.csv", arm, "u", 0.0, tmp_path / "data", skip_bad=skip_bad, **SI)
+        import_logs(
+            tmp_path / "log.csv",
+            arm,
+            tmp_path / "data",
+            ImportRequest(unit_id="u", payload_mass=0.0, skip_bad=skip_bad, **SI),
+        )

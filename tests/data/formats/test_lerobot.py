@@ -12,7 +12,7 @@ from logs import SO101, arm_sequence, late, stock, wave
 from gaponet.base.errors import LogError, UsageError
 from gaponet.base.progress import no_progress
 from gaponet.data.formats import detect, read_logs
-from gaponet.data.importer import import_logs
+from gaponet.data.importer import ImportRequest, import_logs
 from gaponet.data.store import Dataset
 from gaponet.data.writers import export
 from gaponet.data.writers import lerobot as lerobot_export
@@ -46,7 +46,7 @@ def dataset(arm, tmp_path):
 
 
 def back(lerobot, robot, out, **options):
-    return import_logs(lerobot, robot, None, None, out, format="lerobot", **options).dataset
+    return import_logs(lerobot, robot, out, ImportRequest(format="lerobot", **options)).dataset
 
 
 def same(one, other):
@@ -205,15 +205,16 @@ def test_an_interrupted_export_leaves_nothing(dataset, tmp_path):
 )
 def test_options_that_contradict_the_export_are_refused(dataset, arm, tmp_path, option, said):
     export_lerobot(dataset, tmp_path / "out")
-    fields = {"unit_id": None, "payload_mass": None} | option
     with pytest.raises(UsageError, match=said):
-        import_logs(tmp_path / "out", arm, out=tmp_path / "again", **fields)
+        import_logs(tmp_path / "out", arm, tmp_path / "again", ImportRequest(**option))
     assert not (tmp_path / "again").exists()
 
 
 def read_stock(folder, so101, out, **options):
     options = {"position_unit": "deg"} | options
-    return import_logs(folder, so101, "lab", 0.0, out, **options).dataset
+    return import_logs(
+        folder, so101, out, ImportRequest(unit_id="lab", payload_mass=0.0, **options)
+    ).dataset
 
 
 def test_a_stock_set_in_degrees_becomes_radians(so101, tmp_path):

@@ -10,7 +10,7 @@ from logs import SO101, stock, wave
 
 from gaponet.base.errors import LogError, UsageError
 from gaponet.data.doctor import DoctorResult
-from gaponet.data.importer import import_logs
+from gaponet.data.importer import ImportRequest, import_logs
 
 HAND = ("ee.x", "ee.y", "ee.z", "ee.wx", "ee.wy", "ee.wz")
 CALIBRATION = {
@@ -21,7 +21,9 @@ PER_TICK = 2 * np.pi / 4095
 
 
 def read(folder, robot, out, **options):
-    return import_logs(folder, robot, "u", 0.0, out, **options).dataset
+    return import_logs(
+        folder, robot, out, ImportRequest(unit_id="u", payload_mass=0.0, **options)
+    ).dataset
 
 
 def renamed(folder, feature, names, **more):

@@ -8,7 +8,7 @@ from strange_logs import motion, write_bag
 
 from gaponet.base.errors import LogError
 from gaponet.data.formats import ReadOptions, detect, read_logs
-from gaponet.data.importer import import_logs
+from gaponet.data.importer import ImportRequest, import_logs
 
 JOINTS = 'joints = ["shoulder", "elbow"]\n'
 
@@ -62,14 +62,18 @@ def test_unitrees_low_level_messages_bring_their_gains(tmp_path, arm):
 def test_the_torque_in_unitrees_command_is_fed_forward(tmp_path, arm):
     write_bag(tmp_path / "wave", command="unitree", tau=3.0)
     (tmp_path / "logs.toml").write_text('joints = ["shoulder", "elbow"' + 33 * ', ""' + "]\n")
-    made = import_logs(tmp_path, arm, "lab", 0.0, tmp_path / "data").dataset
+    made = import_logs(
+        tmp_path, arm, tmp_path / "data", ImportRequest(unit_id="lab", payload_mass=0.0)
+    ).dataset
     plain = only(tmp_path, arm).channels["ctrl"].values
     assert np.allclose(made.read(made.entries[0]).ctrl[::2], plain + 3.0 / 20.0, atol=1e-6)
 
 
 def test_commands_are_held_and_states_interpolated_and_it_is_written_down(tmp_path, arm):
     write_bag(tmp_path / "logs" / "wave")
-    (entry,) = import_logs(tmp_path / "logs", arm, "lab", 0.0, tmp_path / "data").entries
+    (entry,) = import_logs(
+        tmp_path / "logs", arm, tmp_path / "data", ImportRequest(unit_id="lab", payload_mass=0.0)
+    ).entries
     assert entry.dt == pytest.approx(0.02)
     assert entry.meta.notes["rows"] == "resampled to 50.00 Hz: commands held, states interpolated"
 

@@ -9,7 +9,7 @@ from logs import arm_columns, table_text
 from gaponet.base.errors import LogError
 from gaponet.data.describe.guess import guess_logs
 from gaponet.data.formats import ReadOptions, detect, look, read_logs
-from gaponet.data.importer import import_logs
+from gaponet.data.importer import ImportRequest, import_logs
 
 SI = ReadOptions(position_unit="rad", time_unit="s")
 POINTER = "version https://git-lfs.github.com/spec/v1\noid sha256:00\nsize 1\n"
@@ -57,7 +57,12 @@ def test_recordings_of_a_dataset_are_no_tables(tmp_path, arm):
     (tmp_path / "logs").mkdir()
     (tmp_path / "logs" / "m.csv").write_text(table_text(arm_columns()))
     units = {"position_unit": "rad", "time_unit": "s"}
-    import_logs(tmp_path / "logs", arm, "u", 0.0, tmp_path / "data", **units)
+    import_logs(
+        tmp_path / "logs",
+        arm,
+        tmp_path / "data",
+        ImportRequest(unit_id="u", payload_mass=0.0, **units),
+    )
     with pytest.raises(LogError, match="dataset"):
         detect(tmp_path / "data")
 

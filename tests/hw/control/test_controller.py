@@ -17,7 +17,7 @@ from arm import commands
 from hw.noted_arm import DT, MOTION, QUICK, NotedArm, acting, control, fake_watchdog, phases, run
 
 from gaponet.base.errors import LogError, UsageError
-from gaponet.data.importer import import_logs
+from gaponet.data.importer import ImportRequest, import_logs
 from gaponet.data.sequence import SequenceMeta, to_sequence
 from gaponet.hw.control.clock import MonotonicClock
 from gaponet.hw.control.driver import DriverError, Fault
@@ -93,11 +93,8 @@ def test_its_recording_can_be_imported_and_trained_on(arm, tmp_path):
     report = import_logs(
         tmp_path / "logs",
         arm,
-        "virtual-1",
-        0.0,
         tmp_path / "set",
-        position_unit="rad",
-        time_unit="s",
+        ImportRequest(unit_id="virtual-1", payload_mass=0.0, position_unit="rad", time_unit="s"),
     )
     stored = report.dataset.read(report.entries[0])
     np.testing.assert_allclose(

@@ -19,7 +19,7 @@ from hw.noted_arm import fake_watchdog, phases
 from servos import Wire
 
 from gaponet.base.errors import LogError
-from gaponet.data.importer import import_logs
+from gaponet.data.importer import ImportRequest, import_logs
 from gaponet.data.sequence import SequenceMeta, to_sequence
 from gaponet.hw.control.clock import SimulatedClock
 from gaponet.hw.control.controller import Controller
@@ -220,7 +220,12 @@ def test_servos_that_do_not_as_told_are_named_and_their_run_is_no_data(
     assert path.exists() == (at > 0.5)
     if path.exists():
         with pytest.raises(LogError, match="servo"):
-            import_logs(path, so101, "a", 0.0, tmp_path / "set", position_unit="rad", time_unit="s")
+            import_logs(
+                path,
+                so101,
+                tmp_path / "set",
+                ImportRequest(unit_id="a", payload_mass=0.0, position_unit="rad", time_unit="s"),
+            )
     assert not json.loads((tmp_path / "logs" / "sway.json").read_text())["obeyed"]
 
 
