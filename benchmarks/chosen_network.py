@@ -32,6 +32,7 @@ def network(question: Question) -> FittedSim:
     (run / "parts.json").write_text(json.dumps({"parts": parts}))
     start = PretrainingConfig(rounds=2, num_envs=128, steps=250, gradient_steps=600, rows=30_000)
     config = TrainConfig(pretraining=start, mixed_gains=True, split=str(run / "parts.json"))
-    gp.train(data, robot=robot, out=run / "run", model="auto", budget="64000", config=config)
+    options = gp.TrainOptions(model="auto")
+    gp.train(data, robot=robot, out=run / "run", budget="64000", config=config, options=options)
     model = GapModel.load(run / "run")
     return FittedSim(robot, model.corrector(robot), note=model.card["model"]["kind"])

@@ -146,10 +146,9 @@ def train(arguments: argparse.Namespace) -> None:
             trained = gp.train(
                 arguments.dataset,
                 out=folder,
-                model=row.kind,
                 budget=str(arguments.steps),
                 config=config,
-                resume=(folder / "checkpoint.pt").is_file(),
+                options=gp.TrainOptions(resume=(folder / "checkpoint.pt").is_file()),
             )
             val = trained.card["val_mpjae"]
             print(

@@ -19,8 +19,11 @@ from gaponet.base.errors import GAPONetError as GAPONetError
 TYPE_CHECKING = False
 if TYPE_CHECKING:
     from gaponet.api import *  # noqa: F403
+    from gaponet.api.options import CollectOptions as CollectOptions
+    from gaponet.api.options import ExciteOptions as ExciteOptions
     from gaponet.api.options import IdentifyOptions as IdentifyOptions
     from gaponet.api.options import ImportOptions as ImportOptions
+    from gaponet.api.options import TrainOptions as TrainOptions
     from gaponet.api.paper import paper_experiment as paper_experiment
     from gaponet.api.results import *  # noqa: F403
     from gaponet.api.run_options import Connection as Connection
@@ -63,8 +66,11 @@ else:
              "TorqueResult", "TrainResult"),
             "gaponet.api.results",
         ),
-        "IdentifyOptions": "gaponet.api.options",
-        "ImportOptions": "gaponet.api.options",
+        **dict.fromkeys(
+            ("CollectOptions", "ExciteOptions", "IdentifyOptions", "ImportOptions",
+             "TrainOptions"),
+            "gaponet.api.options",
+        ),
         "paper_experiment": "gaponet.api.paper",
         "PaperOptions": "gaponet.experiments.paper.options",
         "PaperResult": "gaponet.experiments.paper.experiment",

@@ -9,7 +9,7 @@ from arm import commands, record, recordings, write_arm, write_dataset
 from runs import corrects_by
 
 from gaponet import api
-from gaponet.api.options import IdentifyOptions
+from gaponet.api.options import IdentifyOptions, TrainOptions
 from gaponet.base.errors import DatasetError
 from gaponet.cli.main import main
 from gaponet.nn.artifact import GapModel
@@ -101,9 +101,8 @@ def test_logs_are_named_as_they_were_given(robot, tmp_path):
 
 @pytest.mark.slow
 def test_the_card_of_a_run_says_that_a_person_insisted(mirrored, tmp_path):
-    api.train(
-        mirrored, out=tmp_path / "run", budget="3000", model="shared_mlp", despite_errors=True
-    )
+    options = TrainOptions(model="shared_mlp", despite_errors=True)
+    api.train(mirrored, out=tmp_path / "run", budget="3000", options=options)
     card = GapModel.load(tmp_path / "run").card
     assert card["doctor"]["despite_errors"][0].startswith("sign: shoulder moves against")
     assert (

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 from collections.abc import Sequence as ListOf
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -21,7 +21,7 @@ from gaponet.api.opening import (
     entries_of_unit,
     require_commands,
 )
-from gaponet.api.options import IdentifyOptions
+from gaponet.api.options import IdentifyOptions, TrainOptions
 from gaponet.api.results import AdaptResult, IdentifyResult, TorqueResult, TrainResult
 from gaponet.base.errors import NoGainError, UsageError
 from gaponet.base.files import write_json, write_text
@@ -346,12 +346,8 @@ def train(
     out: Place,
     budget: str = "10m",
     config: TrainConfig | None = None,
-    model: ModelKind | Literal["auto"] | None = None,
     robot: RobotSpec | Place | None = None,
-    holdout_units: tuple[str, ...] = (),
-    resume: bool = False,
-    log: tuple[str, ...] = (),
-    despite_errors: bool = False,
+    options: TrainOptions = TrainOptions(),  # noqa: B008
     progress: Progress = no_progress,
 ) -> TrainResult:
     """Train a delta-action model; the run keeps the model with the least error in rollouts of
@@ -363,18 +359,10 @@ def train(
         dataset: Recordings, a folder.
         out: Run folder.
         budget: Time such as 90s, 10m or 2h, or control steps such as 2000000.
-        config: Everything else; default `TrainConfig()`.
-        model: gaponet, paper (the paper's literal network), or a baseline: shared_mlp, mlp, trees.
-            auto: gaponet, shared_mlp, mlp and, with scikit-learn, trees get a fifth of the budget
-            each. The best network on validation gets the rest, and trees are chosen if they are
-            still better. Default: that of the config.
+        config: Numbers of the training and of the network; default `TrainConfig()`.
         robot: Another robot than the one that the dataset keeps, e.g. the folder that `identify`
             wrote.
-        holdout_units: Units never trained on; their test motions stay in the test split.
-        resume: Continue the run in `out`.
-        log: tensorboard, wandb.
-        despite_errors: Go on although the doctor finds an error in the recordings; the result keeps
-            the errors.
+        options: Kind of network, units that are held out, and what happens to the run.
 
     Returns:
         The exported model; RUN/model holds it.
@@ -400,8 +388,8 @@ def train(
     with lock_folder(folder, "run"):
         data, spec = as_dataset(dataset, robot)
         require_commands(data)
-        entries = used_recordings(data, training_splits(data, config, holdout_units))
-        gate = pass_gate(data, entries, spec, despite_errors=despite_errors)
+        entries = used_recordings(data, training_splits(data, config, options.holdout_units))
+        gate = pass_gate(data, entries, spec, despite_errors=options.despite_errors)
 
         def train_network(
             kind: ModelKind, run: Path, share: float, spent: float, resume: bool
@@ -418,18 +406,19 @@ def train(
                 replace(config, model=replace(config.model, kind=kind)),
                 whole.part(share),
                 resume=resume,
-                holdout_units=holdout_units,
+                holdout_units=options.holdout_units,
                 show=show,
-                log=log,
+                log=options.log,
                 shared=shared,
                 gate=gate,
             )
             return trainer.run()
 
-        if model == "auto":
-            trained = train_best(folder, resume, train_network)
+        if options.model == "auto":
+            trained = train_best(folder, options.resume, train_network)
         else:
-            trained = train_network(model or config.model.kind, folder, 1.0, 0.0, resume)
+            kind = options.model or config.model.kind
+            trained = train_network(kind, folder, 1.0, 0.0, options.resume)
     return TrainResult(
         model=trained, card=trained.card, doctor=gate, candidates=candidate_errors(folder)
     )

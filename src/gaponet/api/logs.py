@@ -8,12 +8,12 @@ from concurrent.futures import Executor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from gaponet.api.opening import Place, as_dataset, as_robot, entries_of_unit
-from gaponet.api.options import ImportOptions
+from gaponet.api.options import CollectOptions, ExciteOptions, ImportOptions
 from gaponet.api.results import ExciteResult, PairResult, Prediction
 from gaponet.base.errors import DatasetError, UsageError
 from gaponet.base.progress import Progress, no_progress, with_note
@@ -228,12 +228,7 @@ def collect(
     *,
     out: Place,
     robot: RobotSpec | Place = "h1_2",
-    fleet: str | Path = "hard",
-    recipe: str = "small",
-    payloads: tuple[float, ...] = (),
-    units: tuple[str, ...] = (),
-    seed: int = 0,
-    nproc: int = 0,
+    options: CollectOptions = CollectOptions(),  # noqa: B008
     executor: str | Executor = "local",
     progress: Progress = no_progress,
 ) -> CollectResult:
@@ -242,15 +237,7 @@ def collect(
     Args:
         out: Dataset folder.
         robot: A robot of the package, or a folder with robot.toml.
-        fleet: Virtual units: hard, easy, shifted, unnamed, firm (hard at nine times the gains), or
-            a .toml file.
-        recipe: demo (under a minute), small (about two), simlifter (30 h: 48 min on one core), arm
-            (any robot), or a .toml file.
-        payloads: kg per hand instead of the recipe's.
-        units: Units of the fleet instead of the recipe's.
-        seed: Seed of motions, noise and start states.
-        nproc: Processes, or jobs at a time; 0 for one per core. More than one starts fresh
-            interpreters: a script that calls this needs `if __name__ == "__main__":`.
+        options: Fleet, recipe, payloads, units, seed, and number of processes.
         executor: Where it is played: local, ray or ray:ADDRESS (docs/install.md).
 
     Raises:
@@ -263,10 +250,21 @@ def collect(
     from gaponet.virtual.fleet import load_fleet
 
     spec = as_robot(robot)
-    plan = recording.load_recipe(recipe)
-    plan = replace(plan, payloads=payloads or plan.payloads, units=units or plan.units)
+    plan = recording.load_recipe(options.recipe)
+    plan = replace(
+        plan,
+        payloads=options.payloads or plan.payloads,
+        units=options.units or plan.units,
+    )
     return recording.collect(
-        spec, load_fleet(fleet, spec), plan, out, seed, nproc, progress, executor=executor
+        spec,
+        load_fleet(options.fleet, spec),
+        plan,
+        out,
+        options.seed,
+        options.nproc,
+        progress,
+        executor=executor,
     )
 
 
@@ -275,11 +273,7 @@ def excite(
     *,
     out: Place,
     further: bool = False,
-    minutes: float | None = None,
-    payloads: tuple[float, ...] = (0.0,),
-    rate: float = 50.0,
-    format: Literal["txt", "csv", "npz"] = "txt",
-    seed: int = 0,
+    options: ExciteOptions = ExciteOptions(),  # noqa: B008
     progress: Progress = no_progress,
 ) -> ExciteResult:
     """Write motions to play on a robot, and instructions to print.
@@ -288,14 +282,9 @@ def excite(
         robot: Robot whose range, torque and payload limits bound the motions; an identified one for
             `further`.
         out: Folder for the motion files and sheet.md.
-        further: Choose the motions that reduce an identified robot's standard errors most.
-        minutes: Duration of all motions; default 10, for `further` 0.5. 10 identify gains, friction
-            and delay; 40 train a good model.
-        payloads: kg in each hand; every motion is played with each. For `further` the choices.
-        rate: Commands per second, Hz.
-        format: txt (SAGE, 50 Hz), csv (with time) or npz; `gaponet run` and `gaponet record` play
-            each.
-        seed: Seed of the motions.
+        further: Choose the motions that reduce an identified robot's standard errors most, as
+            --for of the command.
+        options: Duration, payloads, rate and file format.
 
     Raises:
         UsageError: No motion fits, or the robot folder holds no parameter uncertainty.
@@ -305,23 +294,23 @@ def excite(
     from gaponet.motion.plan import make_plan, sheet
 
     spec = as_robot(robot)
-    masses = tuple(sorted(set(payloads)))
+    masses = tuple(sorted(set(options.payloads)))
+    minutes = options.minutes
+    if minutes is None:
+        minutes = DEFAULT_FURTHER_MINUTES if further else DEFAULT_MINUTES
     folder = Path(out)
     prediction = None
     with lock_folder(folder, "motions"):
         if further:
-            seconds = 60 * (DEFAULT_FURTHER_MINUTES if minutes is None else minutes)
-            plan, prediction = _further_motions(spec, seconds, masses, seed, progress)
+            plan, prediction = _further_motions(spec, 60 * minutes, masses, options.seed, progress)
         else:
-            plan = make_plan(spec, DEFAULT_MINUTES if minutes is None else minutes, masses, seed)
+            plan = make_plan(spec, minutes, masses, options.seed)
         files = {}
         for i, motion in enumerate(plan.motions, 1):
-            files[motion.name] = f"{i:02d}_{motion.name}.{format}"
-        for motion in plan.motions:
-            write_motion(folder / files[motion.name], motion, spec, rate)
-        write_text(
-            folder / "sheet.md", sheet(spec, plan, files, rate, spec.folder if further else None)
-        )
+            files[motion.name] = f"{i:02d}_{motion.name}.{options.format}"
+            write_motion(folder / files[motion.name], motion, spec, options.rate)
+        identified = spec.folder if further else None
+        write_text(folder / "sheet.md", sheet(spec, plan, files, options.rate, identified))
     return ExciteResult(
         folder=folder,
         motions=tuple(files.values()),

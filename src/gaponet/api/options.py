@@ -8,9 +8,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 from gaponet.base.errors import UsageError
 from gaponet.data.importer import ImportOptions as ImportOptions
+from gaponet.nn.config import ModelKind
 from gaponet.robot.servo_fields import Term
 from gaponet.sysid.options import IdentifyOptions as SearchOptions
 
@@ -91,6 +93,65 @@ class IdentifyOptions:
         if any(given):
             what = "--like, --units, --holdout-units, --terms, --stops and --masses"
             raise UsageError(f"{dataset} holds a robot that is driven by torque; leave out {what}")
+
+
+@dataclass(frozen=True)
+class CollectOptions:
+    """Which motions of which virtual robots are recorded."""
+
+    fleet: str | Path = "hard"
+    """Virtual units: hard, easy, shifted, unnamed, firm (hard at nine times the gains), or a .toml
+    file."""
+    recipe: str = "small"
+    """demo (under a minute), small (about two), simlifter (30 h: 48 min on one core), arm (any
+    robot), or a .toml file."""
+    payloads: tuple[float, ...] = ()
+    """kg per hand instead of the recipe's."""
+    units: tuple[str, ...] = ()
+    """Units of the fleet instead of the recipe's."""
+    seed: int = 0
+    """Seed of motions, noise and start states."""
+    nproc: int = 0
+    """Processes, or jobs at a time; 0 for one per core. More than one starts fresh interpreters: a
+    script that calls this needs `if __name__ == "__main__":`."""
+
+
+@dataclass(frozen=True)
+class ExciteOptions:
+    """Motions to play on a robot."""
+
+    minutes: float | None = None
+    """Total duration of the motions. 10 (default) suffice to identify gains, friction and delay, 40
+    to train a good model. For an identified robot (--for) the default is half a minute."""
+    payloads: tuple[float, ...] = (0.0,)
+    """kg in each hand; every motion is played with each payload. With --for: payloads to choose
+    from."""
+    rate: float = 50.0
+    """Commands per second, Hz."""
+    format: Literal["txt", "csv", "npz"] = "txt"
+    """txt (SAGE, 50 Hz), csv (with time) or npz; gaponet run and record play each."""
+    seed: int = 0
+    """Seed of the random choice of motions."""
+
+
+@dataclass(frozen=True)
+class TrainOptions:
+    """Which network is trained, to which units, and how its run is kept."""
+
+    model: ModelKind | Literal["auto"] | None = None
+    """gaponet, paper (the paper's literal network), or a baseline: shared_mlp, mlp, trees. auto:
+    gaponet, shared_mlp, mlp and, with scikit-learn, trees get a fifth of the budget each. The best
+    network on validation gets the rest, and trees are chosen if they are still better. Default: that
+    of the config."""
+    holdout_units: tuple[str, ...] = ()
+    """Units never trained on; their test motions stay in the test split."""
+    resume: bool = False
+    """Continue the run in that folder."""
+    log: tuple[Literal["tensorboard", "wandb"], ...] = ()
+    """Also write the training curve to TensorBoard event files in OUT/tensorboard, or to Weights &
+    Biases."""
+    despite_errors: bool = False
+    """Go on although the doctor finds an error in the recordings; the result keeps the errors."""
 
 
 def parse_joint_map(pairs: tuple[str, ...]) -> dict[str, str] | None:

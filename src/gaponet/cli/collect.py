@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Annotated
+
+import tyro
 
 from gaponet import api
+from gaponet.api.options import CollectOptions
 from gaponet.base.progress import progress_bar
 from gaponet.cli.options import Json, like
 from gaponet.cli.out import Out
@@ -14,12 +18,7 @@ from gaponet.cli.out import Out
 def collect(
     out: Path,
     robot: str = "h1_2",
-    fleet: str = "hard",
-    recipe: str = "small",
-    payloads: tuple[float, ...] = (),
-    units: tuple[str, ...] = (),
-    seed: int = 0,
-    nproc: int = 0,
+    options: Annotated[CollectOptions, tyro.conf.arg(name="")] = CollectOptions(),  # noqa: B008
     executor: str = "local",
     json: Json = False,
 ) -> None:
@@ -33,17 +32,12 @@ def collect(
         made = api.collect(
             out=out,
             robot=robot,
-            fleet=fleet,
-            recipe=recipe,
-            payloads=payloads,
-            units=units,
-            seed=seed,
-            nproc=nproc,
+            options=options,
             executor=executor,
             progress=update,
         )
     screen.table(
-        f"VIRTUAL recordings, fleet {fleet}",
+        f"VIRTUAL recordings, fleet {options.fleet}",
         ["dataset", str(made.dataset)],
         [
             ["sequences written", str(made.written)],

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 from gaponet import api
 from gaponet.api.opening import test_motions
+from gaponet.api.options import CollectOptions
 from gaponet.api.paper import DEMO, paper_experiment
 from gaponet.api.results import GapResult
 from gaponet.api.steps import Step, public_recordings, steps_from_logs
@@ -148,7 +149,8 @@ def run_paper_in_small(screen: Out, out: Path) -> dict[str, object]:
     command = f"gaponet collect --fleet {FLEET} --recipe {RECIPE} --out {dataset}"
     screen.say(f": three robots and an unseen fourth, 0 and 3 kg  ({command})", "1 Record")
     with progress_bar("recordings") as update:
-        api.collect(out=dataset, robot="h1_2", fleet=FLEET, recipe=RECIPE, progress=update)
+        options = CollectOptions(fleet=FLEET, recipe=RECIPE)
+        api.collect(out=dataset, robot="h1_2", options=options, progress=update)
     screen.say(f": how far is the simulator?  (gaponet gap {dataset})", "2 Measure the gap")
     show_gap_by_payload(screen, dataset)
     command = f"gaponet experiment paper {dataset} --out {experiment}"

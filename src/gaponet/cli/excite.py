@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import tyro
 
 from gaponet import api
+from gaponet.api.options import ExciteOptions
 from gaponet.api.results import Prediction
 from gaponet.base.errors import UsageError
 from gaponet.base.progress import progress_bar
@@ -22,11 +23,7 @@ def excite(
     out: Path,
     robot: str = "",
     known: Annotated[Path | None, tyro.conf.arg(name="for")] = None,
-    minutes: float | None = None,
-    payloads: tuple[float, ...] = (0.0,),
-    rate: float = 50.0,
-    format: Literal["txt", "csv", "npz"] = "txt",
-    seed: int = 0,
+    options: Annotated[ExciteOptions, tyro.conf.arg(name="")] = ExciteOptions(),  # noqa: B008
     json: Json = False,
 ) -> None:
     """Write the motions to play on a robot: first, or next.
@@ -38,13 +35,7 @@ def excite(
         robot: Robot name or folder; its range, torque and payload limits bound the motions.
         known: Robot folder of gaponet identify or adapt.
         out: Folder for the motion files and sheet.md.
-        minutes: Total duration of the motions. 10 (default) suffice to identify gains, friction and
-            delay, 40 to train a good model. With --for the default is half a minute.
-        payloads: kg in each hand; every motion is played with each payload. With --for: payloads to
-            choose from.
-        rate: Commands per second, Hz.
-        format: txt (SAGE, 50 Hz), csv (with time) or npz; gaponet run and record play each.
-        seed: Seed of the random choice of motions.
+        options: Duration, payloads, rate and file format.
     """
     screen = Out(json)
     if bool(robot) == (known is not None):
@@ -58,11 +49,7 @@ def excite(
             spec,
             out=out,
             further=known is not None,
-            minutes=minutes,
-            payloads=payloads,
-            rate=rate,
-            format=format,
-            seed=seed,
+            options=options,
             progress=update,
         )
     if made.prediction is not None:

@@ -36,11 +36,16 @@ HELD_AT_HOME = (
 
 @dataclass(frozen=True)
 class ImportArgs(ImportOptions):
-    """How logs are read; joints are mapped by words instead of a dictionary."""
+    """How logs are read, or what is done instead; joints are mapped by words instead of a
+    dictionary."""
 
     joint_map: tyro.conf.Suppress[None] = None
     map: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
     """A joint's name in the log and the robot's, as a=b; may be repeated."""
+    guess: bool = False
+    """Print a logs.toml for these logs, filled in as far as they show it, and import nothing."""
+    formats: Flag = False
+    """List the formats that are read, and what each needs."""
 
     def options(self) -> ImportOptions:
         """Return the options of api.import_logs."""
@@ -56,8 +61,6 @@ def import_logs(
     unit_id: str | None = None,
     payload_mass: float | None = None,
     args: Annotated[ImportArgs, tyro.conf.arg(name="")] = ImportArgs(),
-    guess: bool = False,
-    formats: Flag = False,
     json: Json = False,
 ) -> None:
     """Read a robot's logs into a dataset; the same call adds what is new.
@@ -72,11 +75,8 @@ def import_logs(
             states it.
         payload_mass: kg in each hand, 0.0 when empty. Needed unless the format states it.
         args: How the logs are read.
-        guess: Print a logs.toml for these logs, filled in as far as they show it, and import
-            nothing.
-        formats: List the formats that are read, and what each needs.
     """
-    if formats:
+    if args.formats:
         _show_formats(Out(json))
         return
     if src is None or not robot:
@@ -84,7 +84,7 @@ def import_logs(
             "give a folder of logs and --robot ROBOT (or --formats, to see which formats are read)"
         )
     options = args.options()
-    if guess:
+    if args.guess:
         print(recordings.guess_description(src, robot=robot, options=options), end="")
         return
     if out is None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated
 
@@ -17,6 +17,14 @@ from gaponet.cli.out import Out, writes
 from gaponet.cli.run import ControlArgs, ScreenReporter, show_result
 
 
+@dataclass(frozen=True)
+class RecordArgs(ControlArgs):
+    """Options of a recording: those of ControlArgs, and a seed."""
+
+    seed: int = 0
+    """virtual: seed of the noise in the first recording; it increases by one per recording."""
+
+
 @writes("dataset")
 def record(
     motion: tuple[str, ...],
@@ -24,10 +32,9 @@ def record(
     payload_mass: float,
     unit_id: str = "",
     repetitions: int = 1,
-    seed: int = 0,
     args: Annotated[
-        ControlArgs, tyro.conf.arg(name=""), tyro.conf.FlagCreatePairsOff
-    ] = ControlArgs(),  # noqa: B008
+        RecordArgs, tyro.conf.arg(name=""), tyro.conf.FlagCreatePairsOff
+    ] = RecordArgs(),
     json: Json = False,
 ) -> None:
     """Play a motion without correction and record it into a dataset.
@@ -39,7 +46,6 @@ def record(
         unit_id: Name of the recorded robot; the virtual driver sets it.
         payload_mass: kg in each hand that payload_side names; 0 when empty.
         repetitions: Number of times that each motion is played.
-        seed: virtual: seed of the noise in the first recording; it increases by one per recording.
         args: Robot and control loop.
     """
     screen = Out(json)
@@ -50,7 +56,7 @@ def record(
             screen.say(f"added to {out}: {made.id}, {made.rows} rows at {made.rate:.2f} Hz")
 
     shared = {field.name: getattr(args, field.name) for field in fields(ControlOptions)}
-    options = RunOptions(**shared, payload_mass=payload_mass, unit_id=unit_id, seed=seed)
+    options = RunOptions(**shared, payload_mass=payload_mass, unit_id=unit_id, seed=args.seed)
     made = record_motions(
         motion,
         RunRequest(args.robot, driver=args.driver, options=options),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, fields
 from pathlib import Path
 from shlex import quote
 from typing import Annotated, Literal
@@ -10,10 +11,11 @@ import tyro
 
 from gaponet import TrainConfig, api
 from gaponet.api.fit import ModelKind
+from gaponet.api.options import TrainOptions
 from gaponet.api.results import EvalResult, TrainResult
 from gaponet.base.installation import install_command
 from gaponet.base.progress import progress_bar
-from gaponet.cli.options import Data, Flag, Json, Known, Motions, Robot, like
+from gaponet.cli.options import Data, Json, Known, Motions, Robot, like
 from gaponet.cli.out import Out
 from gaponet.cli.show import show_methods, show_verdict
 from gaponet.evaluation.methods import title
@@ -21,18 +23,27 @@ from gaponet.evaluation.tables import mrad
 from gaponet.robot.folder import STORED_ROBOT
 
 
+@dataclass(frozen=True)
+class TrainArgs(TrainOptions):
+    """Which network is trained, how, to which units, and how its run is kept."""
+
+    model: ModelKind | Literal["auto"] = "auto"
+    recipe: Literal["labels", "paper"] = "labels"
+    """labels: supervised pre-training, then PPO. paper: PPO from an untrained network, with settings
+    for that; PPO options that are given keep their values."""
+
+    def options(self) -> TrainOptions:
+        """Return the options of api.train."""
+        return TrainOptions(**{f.name: getattr(self, f.name) for f in fields(TrainOptions)})
+
+
 @like(api.train)
 def train(
     dataset: Data,
     out: Path,
-    model: ModelKind | Literal["auto"] = "auto",
-    recipe: Literal["labels", "paper"] = "labels",
     budget: str = "10m",
-    resume: Flag = False,
     robot: Robot = None,
-    holdout_units: tuple[str, ...] = (),
-    log: tuple[Literal["tensorboard", "wandb"], ...] = (),
-    despite_errors: Flag = False,
+    args: Annotated[TrainArgs, tyro.conf.arg(name=""), tyro.conf.FlagCreatePairsOff] = TrainArgs(),
     config: Annotated[TrainConfig, tyro.conf.arg(name="")] = TrainConfig(),  # noqa: B008
     json: Json = False,
 ) -> None:
@@ -41,27 +52,20 @@ def train(
     Ctrl-C ends training and leaves a usable run.
 
     Args:
-        recipe: labels: supervised pre-training, then PPO. paper: PPO from an untrained network,
-            with settings for that; PPO options that are given keep their values.
-        log: Also write the training curve to TensorBoard event files in OUT/tensorboard, or to
-            Weights & Biases.
+        args: Kind of network, and what happens to the run.
         config: Settings of the training.
     """
     screen = Out(json)
-    if recipe == "paper":
+    if args.recipe == "paper":
         config = config.paper_recipe()
-    with progress_bar(f"training {model}") as update:
+    with progress_bar(f"training {args.model}") as update:
         trained = api.train(
             dataset,
             out=out,
             budget=budget,
             config=config,
-            model=model,
             robot=robot,
-            holdout_units=holdout_units,
-            resume=resume,
-            log=log,
-            despite_errors=despite_errors,
+            options=args.options(),
             progress=update,
         )
     _show_candidates(screen, trained)
