@@ -141,8 +141,8 @@ class TrainOptions:
     model: ModelKind | Literal["auto"] | None = None
     """gaponet, paper (the paper's literal network), or a baseline: shared_mlp, mlp, trees. auto:
     gaponet, shared_mlp, mlp and, with scikit-learn, trees get a fifth of the budget each. The best
-    network on validation gets the rest, and trees are chosen if they are still better. Default: that
-    of the config."""
+    network on validation gets the rest, and trees are chosen if they are still better. Default:
+    that of the config."""
     holdout_units: tuple[str, ...] = ()
     """Units never trained on; their test motions stay in the test split."""
     resume: bool = False

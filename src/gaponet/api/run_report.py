@@ -45,7 +45,7 @@ class PlanText:
     def __str__(self) -> str:
         """Return title, table and sentences, one a line."""
         cells = [self.columns, *self.rows]
-        widths = [max(len(line[i]) for line in cells) for i in range(len(self.columns))]
+        widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
         lines = [self.title]
         for first, *numbers in cells:
             columns = [text.rjust(width) for text, width in zip(numbers, widths[1:], strict=True)]

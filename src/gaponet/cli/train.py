@@ -29,8 +29,8 @@ class TrainArgs(TrainOptions):
 
     model: ModelKind | Literal["auto"] = "auto"
     recipe: Literal["labels", "paper"] = "labels"
-    """labels: supervised pre-training, then PPO. paper: PPO from an untrained network, with settings
-    for that; PPO options that are given keep their values."""
+    """labels: supervised pre-training, then PPO. paper: PPO from an untrained network, with
+    settings for that; PPO options that are given keep their values."""
 
     def options(self) -> TrainOptions:
         """Return the options of api.train."""

@@ -95,8 +95,8 @@ def common_signals(entries: Iterable[Entry]) -> tuple[str, ...]:
     """Return the channels that every sequence stores, without the command, in the order of
     ARRAYS.
     """
-    stored = [set(entry.channels) for entry in entries]
-    return tuple(name for name in ARRAYS if name != COMMAND and all(name in s for s in stored))
+    common = set(ARRAYS).intersection(*(entry.channels for entry in entries)) - {COMMAND}
+    return tuple(name for name in ARRAYS if name in common)
 
 
 def table_beside_paper(here: DatasetCounts) -> ResultTable:

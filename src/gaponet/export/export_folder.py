@@ -346,8 +346,8 @@ def _urdf_note(facts: dict[str, Any]) -> str:
         if any(servo[field] for servo in servos):
             missing.append(field)
     return (
-        f"the file has no place for {', '.join(missing)}: they are in facts.json (plain), kp and kd for your "
-        "controller; files that it names stay where they were"
+        f"the file has no place for {', '.join(missing)}: they are in facts.json (plain), kp and "
+        "kd for your controller; files that it names stay where they were"
     )
 
 

@@ -88,7 +88,10 @@ def model_fingerprint(model: mujoco.MjModel) -> Iterator[str]:
     data = mujoco.MjData(model)
     data.qpos[:] = model.qpos0
     mujoco.mj_kinematics(model, data)
-    roots = [b for b in range(1, model.nbody) if model.body_weldid[b] == b and model.body_jntnum[b]]
+    roots = []  # bodies with a joint; others are welded to one of them, or to the world
+    for body in range(1, model.nbody):
+        if model.body_weldid[body] == body and model.body_jntnum[body]:
+            roots.append(body)
     link = {}
     for body, root in enumerate(model.body_weldid.tolist()):
         link[body] = roots.index(root) + 1 if root in roots else 0

@@ -445,8 +445,10 @@ def _follower_lines(name: str, follower: Follower, path: Path) -> list[str]:
 def _mounts(model: mujoco.MjModel, joints: list[str]) -> list[tuple[str, str, np.ndarray, str]]:
     """Guess payload mounts: side, body, position in it (m), and source."""
     moved = {int(model.jnt_bodyid[model.joint(name).id]) for name in joints}
-    # nothing moves beyond them
-    tips = [body for body in sorted(moved) if not moved & set(_beyond(model, body)[1:])]
+    tips = []  # nothing moves beyond them
+    for body in sorted(moved):
+        if moved.isdisjoint(_beyond(model, body)[1:]):
+            tips.append(body)
     ends = tips
     if len(tips) > 1:
         ends = _palms(model, [tip for tip in tips if _has_hand(model, tip)])

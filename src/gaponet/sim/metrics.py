@@ -249,8 +249,12 @@ def _row(run: Run, columns: list[int] | None = None) -> list[_Row]:
 def _mean_correlation(real: Array, sim: Array) -> float:
     """Return Pearson's r, averaged over joints that moved; 1 if none did."""
     moved = (np.ptp(real, axis=0) > 0.01) & (np.ptp(sim, axis=0) > 1e-6)
-    values = [np.corrcoef(real[:, j], sim[:, j])[0, 1] for j in np.flatnonzero(moved)]
-    return float(np.mean(values)) if values else 1.0
+    if not moved.any():
+        return 1.0
+    values = []
+    for recorded, simulated in zip(real.T[moved], sim.T[moved], strict=True):
+        values.append(np.corrcoef(recorded, simulated)[0, 1])
+    return float(np.mean(values))
 
 
 def _horizons(run: Run) -> _Row:

@@ -224,7 +224,9 @@ class Bounds:
         self.inertia = (model.dof_M0 - model.dof_armature)[op]
         self.start = self._start(kp, model.opt.timestep)
         slow = 1 / greatest_speeds(sequences, robot)  # s/rad
-        encoder_steps = np.array([encoder_step([s.qpos[:, j] for s in sequences]) for j in op])
+        encoder_steps = np.zeros(self.n)
+        for i, j in enumerate(op):
+            encoder_steps[i] = encoder_step([s.qpos[:, j] for s in sequences])
         varies = temperature_varies(sequences, robot)
         self.limits = self._limits(kp, limit, slow, encoder_steps, varies)
         self.guess = self._guess(kp, varies) | {

@@ -233,7 +233,7 @@ class JointFit(FitProblem):
             self.prior.update_residual(cost.min(axis=0), rollouts.rows)
             if rollouts is self.rollouts:
                 x = better_half(x, cost)
-        return {f: v[0].copy() for f, v in axes.values(x[:1]).items()}
+        return _first_candidate(axes.values(x[:1]))
 
     def robot_fit(self, nthread: int) -> RobotFit:
         """Return the fit of the same robot in its simulator, with fewer windows; its prior begins
@@ -287,7 +287,7 @@ class RobotFit(FitProblem):
             report(names, rows),
             MIN_CHAIN_COST_DECREASE,
         )
-        return {f: v[0].copy() for f, v in axes.values(chains.unpack(x)).items()}
+        return _first_candidate(axes.values(chains.unpack(x)))
 
 
 class RobotSearch:
@@ -327,8 +327,7 @@ class RobotSearch:
     @property
     def values(self) -> Values:
         """Values (n,) of the best start."""
-        x = self._x[self._best()]
-        return {f: v[0].copy() for f, v in self._axes.values(x).items()}
+        return _first_candidate(self._axes.values(self._x[self._best()]))
 
     def _best(self) -> slice:
         """Return where the start with the least cost in the sum over joints is: a slice of one."""
@@ -368,6 +367,11 @@ class KinematicChains:
         place_of_joint = [joint_in_place.index(joint) for joint in range(joints)]
         in_places = x.reshape(*x.shape[:-2], self.joints.size, -1)
         return np.asarray(in_places[..., place_of_joint, :])
+
+
+def _first_candidate(values: Values) -> Values:
+    """Return values (n,) of the first of k candidates (k, n), as arrays of their own."""
+    return {field: value[0].copy() for field, value in values.items()}
 
 
 def fitted_fields(values: dict[str, object] | Values, encoder: bool = False) -> list[str]:

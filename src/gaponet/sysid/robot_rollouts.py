@@ -33,7 +33,8 @@ def cut(sequences: ListOf[Sequence], count: int) -> list[Sequence]:
     parts = []
     for s in sequences:
         rows = min(round(WINDOW_S / s.dt), len(s))
-        parts += [s.rows(slice(a, a + rows)) for a in range(0, len(s) - rows + 1, rows)]
+        for start in range(0, len(s) - rows + 1, rows):
+            parts.append(s.rows(slice(start, start + rows)))
     parts = [p for p in parts if p.duration >= MIN_WINDOW_S]
     if not parts:
         raise UsageError(

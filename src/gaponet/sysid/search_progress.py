@@ -45,9 +45,10 @@ class SearchProgress:
         shares += [step_share] * (fits * steps)
         # Of the time that is left when a search begins: as much as of one more step stays for the
         # table.
-        self._shares = [
-            share / (sum(shares[i:]) + fits * step_share) for i, share in enumerate(shares)
-        ]
+        self._shares = []
+        for i, share in enumerate(shares):
+            left = sum(shares[i:]) + fits * step_share
+            self._shares.append(share / left)
         self._last_of = np.cumsum(iterations).tolist()  # number of each search's last iteration
         self._total = self._last_of[-1] + TABLE_ITERATIONS
         self._began = time.monotonic()

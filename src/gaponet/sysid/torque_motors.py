@@ -160,7 +160,8 @@ def _parts_in_turn(sequences: ListOf[Sequence]) -> tuple[list[Sequence], list[Se
     parts = []
     for s in sequences:
         rows = round(PART_S / s.dt)
-        parts += [s.rows(slice(i, i + rows)) for i in range(0, len(s) - round(2 / s.dt), rows)]
+        for start in range(0, len(s) - round(2 / s.dt), rows):
+            parts.append(s.rows(slice(start, start + rows)))
     if len(parts) < 2:
         raise UsageError(
             f"less than {2 * PART_S:g} s in all: record more, or other motions to judge by"
@@ -243,8 +244,12 @@ def _jackknife(rows: ListOf[_Rows], j: int, constant: bool, lag: int) -> Array:
     """Return standard errors, (5,), by a jackknife over blocks of rows."""
     a, y = _system(rows, j, constant, lag)
     block = np.arange(len(y)) * JACKKNIFE_BLOCKS // max(len(y), 1)
-    each = np.array([_solved(a[block != k], y[block != k])[0] for k in range(JACKKNIFE_BLOCKS)])
-    return np.asarray(np.sqrt((JACKKNIFE_BLOCKS - 1) * each.var(axis=0)))
+    solutions = []
+    for k in range(JACKKNIFE_BLOCKS):
+        kept = block != k
+        x, _ = _solved(a[kept], y[kept])
+        solutions.append(x)
+    return np.asarray(np.sqrt((JACKKNIFE_BLOCKS - 1) * np.var(solutions, axis=0)))
 
 
 def _residual(rows: ListOf[_Rows], terms: dict[str, Array], constant: Array, lags: Array) -> Array:

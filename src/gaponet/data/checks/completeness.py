@@ -290,11 +290,16 @@ def _saturation(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
 def _flat_torque(recorded: list[tuple[Survey, Torque]], robot: RobotSpec) -> Iterator[Finding]:
     """Find torques that are cut off at one value below the limit of robot.toml."""
     for i, name in enumerate(robot.joint_names):
-        top = max((max(-float(t.low[i]), float(t.high[i])) for _, t in recorded), default=0.0)
-        near = [(survey, t) for survey, t in recorded if max(-t.low[i], t.high[i]) > 0.999 * top]
-        rows = sum(int(t.flat[i]) for _, t in near)
+        largest = [max(-float(torque.low[i]), float(torque.high[i])) for _, torque in recorded]
+        top = max(largest, default=0.0)
+        near = []
+        rows = 0
+        for (survey, torque), most in zip(recorded, largest, strict=True):
+            if most > 0.999 * top:
+                near.append(survey)
+                rows += int(torque.flat[i])
         if top > MIN_FLAT_SHARE * robot.servo.effort_limit[i] and rows >= MIN_FLAT_ROWS:
-            motions = _motions([survey for survey, _ in near])
+            motions = _motions(near)
             text = (
                 f"torque of {name} is cut off flat at {top:.3g} N·m in {rows} rows of "
                 f"{motions}: the motor or its driver gives no more. Write "

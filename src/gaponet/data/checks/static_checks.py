@@ -194,7 +194,10 @@ def _fit(poses: _Poses) -> _Fit:
     numbers, index = np.unique(poses.sequence, return_inverse=True)
     fold = index % MAX_FOLDS
     folds = range(min(len(numbers), MAX_FOLDS))
-    without = {f: _solve(poses.columns[fold != f], poses.error[fold != f])[0] for f in folds}
+    without = {}
+    for f in folds:
+        kept = fold != f
+        without[f], _, _ = _solve(poses.columns[kept], poses.error[kept])
     every = np.array(list(without.values()))
     jackknife = np.sqrt(
         (len(every) - 1) / len(every) * ((every - every.mean(axis=0)) ** 2).sum(axis=0)
@@ -558,7 +561,12 @@ def _explained(values: Array, fold: Array, *columns: Array) -> tuple[float, floa
     start = np.zeros(x.shape[1])
     free = np.full(x.shape[1], 1e3)
     folds = np.unique(fold)
-    each = np.array([_solve(x[fold != f], values[fold != f], start, free)[0] for f in folds])
+    without = []
+    for f in folds:
+        kept = fold != f
+        coefficients, _, _ = _solve(x[kept], values[kept], start, free)
+        without.append(coefficients)
+    each = np.array(without)
     left = values - np.einsum("kc,kc->k", x, each[np.searchsorted(folds, fold)])
     std = np.sqrt((len(each) - 1) * each[:, 0].var())
     share = 1 - float(np.mean(left**2)) / max(float(np.var(values)), 1e-12)

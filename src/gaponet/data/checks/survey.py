@@ -519,7 +519,7 @@ def _resolution(qpos: Array) -> Array:
 def _runs(mask: Array) -> list[slice]:
     """Return the runs of True in (T,)."""
     edges = np.flatnonzero(np.diff(np.r_[False, mask, False]))
-    return [slice(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+    return [slice(start, stop) for start, stop in edges.reshape(-1, 2).tolist()]
 
 
 def _torque(sequence: Sequence, robot: RobotSpec) -> Torque | None:

@@ -64,8 +64,11 @@ def _order(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
                 j = int(others[s.follows[i, others].argmax()])
                 candidates[int(i), j].append(float(s.follows[i, j]))
     candidates |= _swapped_pairs(surveys, motions)
-    swapped = {p: found for p, found in candidates.items() if 2 * len(found) >= motions[p[0]]}
-    for (own, other), correlations in swapped.items():
+    swapped = False
+    for (own, other), correlations in candidates.items():
+        if 2 * len(correlations) < motions[own]:
+            continue
+        swapped = True
         a = robot.joint_names[own]
         b = robot.joint_names[other]
         text = (
@@ -156,7 +159,10 @@ def _sign(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     """Does each joint move in the direction of its command?"""
     for i, name in enumerate(robot.joint_names):
         moved = _moved(surveys, i)
-        against = [s for s in moved if _opposes(float(s.opposes[i, i]), float(s.follows[i, i]))]
+        against = []
+        for survey in moved:
+            if _opposes(float(survey.opposes[i, i]), float(survey.follows[i, i])):
+                against.append(survey)
         if against and 2 * len(against) >= len(moved):
             text = (
                 f"{name} moves against its command in {len(against)} of {len(moved)} motions: "

@@ -160,7 +160,9 @@ def _tell_desired_from_velocity(recording: RawRecording, channels: dict[str, str
         return
     apart = np.abs(near - qpos).mean()
     moved = np.abs(qpos - qpos.mean(axis=0)).mean()
-    alike = [np.corrcoef(np.gradient(qpos[:, j]), near[:, j])[0, 1] for j in range(qpos.shape[1])]
+    alike = []
+    for angle, other in zip(qpos.T, near.T, strict=True):
+        alike.append(np.corrcoef(np.gradient(angle), other)[0, 1])
     if apart < NEAR_POSITIONS * moved and np.nanmean(np.abs(alike)) < MAX_SPEED_CORRELATION:
         channels["ctrl"] = channels.pop("qvel")
 

@@ -60,9 +60,9 @@ def _sampled(name: str, channel: Channel, present: Array) -> Channel:
     values = channel.values[some]
     if partial.mean() < MIN_EMPTY_SHARE:
         return Channel(time, values)
-    columns = [
-        _between_samples(name, time, values[:, j], present[some, j]) for j in range(values.shape[1])
-    ]
+    columns = []
+    for column, is_present in zip(values.T, present[some].T, strict=True):
+        columns.append(_between_samples(name, time, column, is_present))
     joined = np.stack(columns, axis=1)
     known = np.isfinite(joined).all(axis=1)
     return Channel(time[known], joined[known])

@@ -144,7 +144,7 @@ def draw_joint_ranges(
 def _draw_raincloud(
     ax: Axes, y: float, values: Array, colour: str, rng: np.random.Generator
 ) -> None:
-    """Draw values (k,) at height y: density above, quartiles with 1 % and 99 %, single values below."""
+    """Draw values (k,) at height y: density, quartiles with 1 % and 99 %, single values."""
     x, density = _density(values)
     ax.fill_between(x, y + 0.06, y + 0.06 + 0.36 * density, color=colour, alpha=0.75, lw=0)
     low, q1, middle, q3, high = np.percentile(values, [1, 25, 50, 75, 99])

@@ -132,7 +132,10 @@ def trajectories(
     Returns:
         Figures by row, the motion with the longest travel first.
     """
-    travel = [np.abs(np.diff(arrays[f"{row}/recorded"], axis=0)).sum() for row in range(len(shown))]
+    travel = []
+    for row in range(len(shown)):
+        steps = np.diff(arrays[f"{row}/recorded"], axis=0)
+        travel.append(np.abs(steps).sum())
     order = sorted(range(len(shown)), key=lambda row: -travel[row])
     return {row: _trajectory(arrays, row, joints, methods, shown[row]["dt"]) for row in order}
 
