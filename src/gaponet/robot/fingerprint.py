@@ -83,15 +83,20 @@ GEOM_FIELDS = (
 )
 
 
+def _bodies_with_joint(model: mujoco.MjModel) -> list[int]:
+    bodies = []
+    for body in range(1, model.nbody):
+        if model.body_weldid[body] == body and model.body_jntnum[body]:
+            bodies.append(body)
+    return bodies
+
+
 def model_fingerprint(model: mujoco.MjModel) -> Iterator[str]:
     """Yield what determines the dynamics of a model, one item per line, without the time step."""
     data = mujoco.MjData(model)
     data.qpos[:] = model.qpos0
     mujoco.mj_kinematics(model, data)
-    roots = []  # bodies with a joint; others are welded to one of them, or to the world
-    for body in range(1, model.nbody):
-        if model.body_weldid[body] == body and model.body_jntnum[body]:
-            roots.append(body)
+    roots = _bodies_with_joint(model)  # others are welded to one of them, or to the world
     link = {}
     for body, root in enumerate(model.body_weldid.tolist()):
         link[body] = roots.index(root) + 1 if root in roots else 0

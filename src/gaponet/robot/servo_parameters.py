@@ -1,5 +1,5 @@
-"""Parameters of a robot's servos: what [[joint]] and [identified.JOINT] of robot.toml state, and what
-identification changes.
+"""Parameters of a robot's servos: what [[joint]] and [identified.JOINT] of robot.toml state, and
+what identification changes.
 """
 
 from __future__ import annotations

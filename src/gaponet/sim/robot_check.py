@@ -128,8 +128,8 @@ def _loads(robot: RobotSpec, models: dict[float, mujoco.MjModel]) -> Iterator[Fi
             carrying = f" with {mass:g} kg" if mass else ""
             text = (
                 f"{robot.joint_names[i]}: needs {load[i]:.3g} N·m to hold its home{carrying}, its "
-                f"limit is {robot.servo.effort_limit[i]:g}: check effort_limit in robot.toml, masses "
-                "and home"
+                f"limit is {robot.servo.effort_limit[i]:g}: check effort_limit in robot.toml, "
+                "masses and home"
             )
             yield Finding(
                 "warning",
@@ -148,8 +148,8 @@ def _limits(robot: RobotSpec, model: mujoco.MjModel) -> Iterator[Finding]:
         if most < 0.999 * robot.servo.effort_limit[i]:
             text = (
                 f"{name}: actuatorfrcrange in robot.xml stops the motor at {most:g} N·m, before "
-                f"effort_limit = {robot.servo.effort_limit[i]:g} in robot.toml does: delete one, or "
-                "write the right figure at both"
+                f"effort_limit = {robot.servo.effort_limit[i]:g} in robot.toml does: delete one, "
+                "or write the right figure at both"
             )
             yield Finding("warning", "limits", text, (name,), {"actuatorfrcrange": most})
 
@@ -288,8 +288,8 @@ def _steps(
     elif not oscillates:
         load = f" with {mass:g} kg" if mass else ""
         text = (
-            f"{name}: kp {robot.servo.kp[joint]:g} is too little to hold it up{load}: it falls away "
-            "from its target; check kp in robot.toml"
+            f"{name}: kp {robot.servo.kp[joint]:g} is too little to hold it up{load}: it falls "
+            "away from its target; check kp in robot.toml"
         )
         yield Finding("warning", "step", text, (name,), {"growth": growth})
     else:
@@ -319,8 +319,9 @@ def _unstable_step(
     cures.append("a smaller kp")
     name = robot.joint_names[joint]
     text = (
-        f"{name}: kp {robot.servo.kp[joint]:g} and kd {robot.servo.kd[joint]:g} on so little inertia are "
-        f"unstable in physics steps of {robot.timestep * 1e3:g} ms: write {' or '.join(cures)}"
+        f"{name}: kp {robot.servo.kp[joint]:g} and kd {robot.servo.kd[joint]:g} on so little "
+        f"inertia are unstable in physics steps of {robot.timestep * 1e3:g} ms: write "
+        f"{' or '.join(cures)}"
     )
     values = {"growth": growth, "timestep": step, "armature": armature}
     return Finding("error", "step", text, (name,), values)

@@ -94,7 +94,8 @@ class Study:
         if fleet.gain_scale not in (None, self.robot.servo.gain_scale):
             raise UsageError(
                 f"fleet '{fleet.name}' is driven with gain_scale {fleet.gain_scale:g}, the robot "
-                f"of the dataset with {self.robot.servo.gain_scale:g}; give the fleet that was recorded"
+                f"of the dataset with {self.robot.servo.gain_scale:g}; give the fleet that was "
+                "recorded"
             )
         name = self.options.unit or list(fleet.units)[-1]
         fleet.unit(name)  # refuses a name that is not in the fleet
