@@ -172,10 +172,16 @@ def _held(sequence: Sequence, robot: RobotSpec, idle: tuple[str, ...]) -> Clampe
 
 def _idle_limbs(sequences: ListOf[Sequence], robot: RobotSpec) -> list[tuple[str, ...]]:
     """Return `idle_limbs` of each sequence."""
-    away = [np.abs(s.ctrl - robot.qpos_home).max(axis=0) > 1e-6 for s in sequences]
-    moved = [frozenset(np.array(robot.joint_names)[a]) | set(robot.operated) for a in away]
-    idle = {joints: idle_joints(robot, tuple(joints)) for joints in set(moved)}
-    return [idle[joints] for joints in moved]
+    names = np.array(robot.joint_names)
+    idle: dict[frozenset[str], tuple[str, ...]] = {}  # joints that move → those of idle limbs
+    by_sequence = []
+    for s in sequences:
+        away = np.abs(s.ctrl - robot.qpos_home).max(axis=0) > 1e-6
+        moved = frozenset(names[away].tolist()).union(robot.operated)
+        if moved not in idle:
+            idle[moved] = idle_joints(robot, tuple(moved))
+        by_sequence.append(idle[moved])
+    return by_sequence
 
 
 def _chunks(sequences: ListOf[Sequence], locked: list[Clamped]) -> Iterator[list[int]]:

@@ -44,10 +44,7 @@ def _rate(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     """At which rate was each sequence recorded?"""
     rates: Counter[float] = Counter()
     for survey in surveys:
-        # of a period; a median of such periods scatters
-        uneven = survey.uneven_ms * survey.rate_hz / 1e3
-        near = 0.01 + 0.1 * uneven
-        rates[next((r for r in rates if abs(r - survey.rate_hz) < near * r), survey.rate_hz)] += 1
+        rates[_same_rate(survey, rates)] += 1
     text = ", ".join(f"{count} at {r:.2f} Hz ({1e3 / r:.2f} ms)" for r, count in rates.items())
     deviation = max(abs(survey.rate_hz * robot.dt - 1) for survey in surveys)
     level = "ok"
@@ -62,6 +59,17 @@ def _rate(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     if resampled:
         text = f"{len(resampled)} sequence(s) were put on a uniform grid: {_motions(resampled)}"
         yield Finding("note", "rate", text)
+
+
+def _same_rate(survey: Survey, rates: Iterable[float]) -> float:
+    """Return the rate, Hz, out of these, at which a sequence was recorded too; else its own."""
+    # of a period; a median of such periods scatters
+    uneven = survey.uneven_ms * survey.rate_hz / 1e3
+    near = 0.01 + 0.1 * uneven
+    for rate in rates:
+        if abs(rate - survey.rate_hz) < near * rate:
+            return rate
+    return survey.rate_hz
 
 
 def _is_resampled(survey: Survey) -> bool:
@@ -159,7 +167,8 @@ def _as_logged(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     for key, of_channel in (("slower", _slower), ("absent", _absent), ("turns", _turns)):
         hit = [survey for survey in surveys if key in survey.entry.meta.notes]
         for name in _joined([survey.entry.meta.notes[key] for survey in hit]):
-            yield of_channel(name, [one for one in hit if name in one.entry.meta.notes[key]])
+            with_name = [survey for survey in hit if name in survey.entry.meta.notes[key]]
+            yield of_channel(name, with_name)
     cut = [survey for survey in surveys if _rows_cut(survey) > MAX_CUT_SHARE * survey.entry.rows]
     if cut:
         rows = sum(_rows_cut(survey) for survey in cut)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections import defaultdict
 
 from gaponet.sysid.acceptance import MIN_JUDGES
 from gaponet.sysid.axes import CLASSIC, Values
@@ -25,9 +26,11 @@ def fit_classic(fits: Fits, *, joints_alone: bool) -> FitState:
     """Fit the classic fields, joints by themselves and then together, and choose among the
     candidates.
     """
-    each = [_joint_candidates(joints, fits.progress) for joints in fits.joints]
+    candidates: dict[str, list[Values]] = defaultdict(list)
+    for joints in fits.joints:
+        for name, values_of_set in _joint_candidates(joints, fits.progress).items():
+            candidates[name].append(values_of_set)
     robots = [joints.robot_fit(fits.nthread) for joints in fits.joints]
-    candidates = {name: [one[name] for one in each] for name in each[0]}
     fits.progress.begin_search()
     together: dict[str, list[Values]] = {}
     if not joints_alone:
