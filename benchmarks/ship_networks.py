@@ -21,6 +21,7 @@ import numpy as np
 import onnx
 import tyro
 from shipping import (
+    markdown_cards,
     measure_error,
     put_into_package,
     require_public,
@@ -38,7 +39,7 @@ from gaponet.nn.network_card import HEADINGS, NetworkCard, network_cards
 from gaponet.nn.onnx_export import MAX_DIFFERENCE_RAD
 from gaponet.nn.onnx_network import OnnxNetwork
 from gaponet.nn.packaged_networks import MAX_TOTAL_BYTES, catalogue
-from gaponet.robot.card import PUBLISHED, Published, SourceOfData, markdown_cards
+from gaponet.robot.card import PUBLISHED, Published, SourceOfData
 from gaponet.robot.folder import PackagedRobot, load_stored_robot
 from gaponet.sim.dataset_robot import open_dataset
 from gaponet.sim.model import model_hash

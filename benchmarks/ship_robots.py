@@ -26,6 +26,7 @@ from typing import Annotated
 import tyro
 from real_robots.cards import Card, prepare, read_cards
 from shipping import (
+    markdown_cards,
     measure_error,
     put_into_package,
     require_public,
@@ -48,7 +49,6 @@ from gaponet.robot.card import (
     RobotCard,
     RobotFacts,
     SourceOfData,
-    markdown_cards,
     robot_cards,
 )
 from gaponet.robot.folder import PROVENANCE_FILE, UNCERTAINTY_FILE, save_robot

@@ -6,10 +6,10 @@ import json
 import re
 import shutil
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 from gaponet.base.errors import UsageError
 from gaponet.base.files import write_text
@@ -20,6 +20,35 @@ from gaponet.robot.card import ErrorOnTest, folder_size
 from gaponet.robot.spec import RobotSpec
 
 HOMES = ("/home/", "/Users/", ":\\\\Users")  # in a path of some machine
+
+
+class Card(Protocol):
+    """A card that has a row in a table, and a line below it."""
+
+    @property
+    def name(self) -> str:
+        """The name in the package."""
+
+    def row(self) -> list[str]:
+        """Return the cells of its row; the first one is the name."""
+
+    def details(self) -> str:
+        """Return the line below the table."""
+
+
+def markdown_cards(cards: Sequence[Card], headings: Sequence[str]) -> str:
+    """Return cards as text of the documentation: a table, and a line with the details of each."""
+    if not cards:
+        return "This version of the package has none.\n"
+    lines = [f"| {' | '.join(headings)} |", "|---" * len(headings) + "|"]
+    for card in cards:
+        cells = card.row()
+        cells[0] = f"`{cells[0]}`"
+        lines.append(f"| {' | '.join(cells)} |")
+    lines.append("")
+    for card in cards:
+        lines.append(f"- `{card.name}`: {card.details()}")
+    return "\n".join(lines) + "\n"
 
 
 def today() -> str:

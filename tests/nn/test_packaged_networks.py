@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from shipping import markdown_cards
 from small_network import (
     NAME,
     SMALL,
@@ -32,7 +33,7 @@ from gaponet.nn.packaged_networks import (
     named_folder,
     packaged_networks,
 )
-from gaponet.robot.card import folder_size, markdown_cards
+from gaponet.robot.card import folder_size
 from gaponet.sim.model import model_hash
 
 ROOT = Path(__file__).parents[2]

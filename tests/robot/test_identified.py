@@ -6,12 +6,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from shipping import markdown_cards
 
 import gaponet as gp
 from gaponet.base.errors import RobotError, UsageError
 from gaponet.cli.main import main
 from gaponet.robot.by_name import IDENTIFIED, identified_catalogue
-from gaponet.robot.card import ROBOT_HEADINGS, RobotCard, folder_size, markdown_cards, robot_cards
+from gaponet.robot.card import ROBOT_HEADINGS, RobotCard, folder_size, robot_cards
 from gaponet.robot.spec import named_robots, robot_argument
 from gaponet.sysid.uncertainty import ParameterUncertainty
 

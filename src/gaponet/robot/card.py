@@ -4,10 +4,9 @@ use.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Protocol
+from typing import Annotated
 
 from annotated_types import Ge, Len
 
@@ -167,20 +166,6 @@ class RobotCard:
         )
 
 
-class Card(Protocol):
-    """A card that has a row in a table, and a line below it."""
-
-    @property
-    def name(self) -> str:
-        """The name in the package."""
-
-    def row(self) -> list[str]:
-        """Return the cells of its row; the first one is the name."""
-
-    def details(self) -> str:
-        """Return the line below the table."""
-
-
 def robot_cards() -> tuple[RobotCard, ...]:
     """Return the cards of the identified robots in the package, by name."""
     return tuple(RobotCard.read(folder) for folder in identified_catalogue().folders())
@@ -189,18 +174,3 @@ def robot_cards() -> tuple[RobotCard, ...]:
 def folder_size(folder: Path) -> int:
     """Return the size of all files in a folder, bytes."""
     return sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
-
-
-def markdown_cards(cards: Sequence[Card], headings: Sequence[str]) -> str:
-    """Return cards as text of the documentation: a table, and a line with the details of each."""
-    if not cards:
-        return "This version of the package has none.\n"
-    lines = [f"| {' | '.join(headings)} |", "|---" * len(headings) + "|"]
-    for card in cards:
-        cells = card.row()
-        cells[0] = f"`{cells[0]}`"
-        lines.append(f"| {' | '.join(cells)} |")
-    lines.append("")
-    for card in cards:
-        lines.append(f"- `{card.name}`: {card.details()}")
-    return "\n".join(lines) + "\n"
