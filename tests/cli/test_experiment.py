@@ -1,12 +1,16 @@
 """gaponet experiment paper, as a user types it."""
 
 import json
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 import pytest
 from arm import recordings, write_arm
 
+from gaponet.base.executor import open_pool
 from gaponet.cli.main import main
 from gaponet.data.store import Dataset
+from gaponet.experiments.paper import goals, jobs, measure, study
 
 
 @pytest.fixture(scope="module")
@@ -29,8 +33,23 @@ def words(place):
 
 @pytest.fixture(scope="module")
 def first_run(words, place):
-    """Exit code of the first run, and when its result was written."""
-    code = main(words)
+    """Exit code of the first run, and when its result was written.
+
+    Motions and holds take fractions of a second, and the jobs run in this process.
+    """
+    make_motions = study.make_unseen_motions
+
+    def short_motions(*args):
+        return [replace(motion, ctrl=motion.ctrl[:60]) for motion in make_motions(*args)]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(study, "make_unseen_motions", short_motions)
+        patch.setattr(measure, "REST_S", 0.2)
+        patch.setattr(measure, "HOLD_S", 0.4)
+        patch.setattr(measure, "AVERAGED_S", 0.2)
+        patch.setattr(goals, "REST_S", 0.2)
+        patch.setattr(jobs, "open_pool", lambda where, workers: open_pool(ThreadPoolExecutor(1), 1))
+        code = main(words)
     return code, (place / "out/trainings/labels-GAPONet-0/result.json").stat().st_mtime_ns
 
 
