@@ -100,7 +100,7 @@ def test_trees_train_without_ppo_and_are_exported_like_networks(
     trained, robot, tmp_path, monkeypatch
 ):
     pytest.importorskip("sklearn")
-    monkeypatch.setattr("gaponet.nn.trees.TREES", 15)
+    monkeypatch.setattr("gaponet.nn.trees.TREES", 4)
     config = replace(SMALL, model=replace(SMALL.model, kind="trees"))
     model = Trainer(trained[0], robot, tmp_path / "run", config, STEPS).run()
     assert GapModel.how_trained(model.card) == "supervised pre-training (3 rounds), no PPO"
