@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from weak_arm import model
 
+from gaponet.experiments.paper import goals, measure
 from gaponet.experiments.paper.commands import REFERENCE_WAY
 from gaponet.experiments.paper.measure import (
     Delivery,
@@ -13,6 +14,16 @@ from gaponet.experiments.paper.measure import (
     measure_delivery,
     record_unit,
 )
+
+
+@pytest.fixture(scope="module", autouse=True)
+def short_rests():
+    """The arm is at rest within half a second, and stands within one."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(measure, "REST_S", 0.5)
+        patch.setattr(measure, "HOLD_S", 1.0)
+        patch.setattr(goals, "REST_S", 0.5)
+        yield
 
 
 @pytest.fixture(scope="module")
