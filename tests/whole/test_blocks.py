@@ -63,6 +63,7 @@ OTHERS = {
     "source": "needs an environment", "make": "takes minutes", "pytest": "takes minutes",
     "cd": "needs a folder of an export", "python": "needs a folder of an export",
 }  # fmt: skip
+ROWS = 100  # of a recording
 SO101_IN_SAGE = ("Rotation", "Pitch", "Elbow", "Wrist_Pitch", "Wrist_Roll", "Jaw")
 OPTION = re.compile(r"(?<![\w-])--[a-z][\w.-]*\w")
 MENTION = re.compile(
@@ -160,7 +161,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     low, high = robot.qpos_range[5]
     for seed, name in enumerate(["LOGS"] * 4 + ["NEW_LOGS"] * 3):
         pace = 0.3 + 0.1 * seed
-        ctrl = robot.qpos_home + wave(200, 6, robot.dt, 0.2, pace) * [1, 1, 1, 1, 1, 0.5]
+        ctrl = robot.qpos_home + wave(ROWS, 6, robot.dt, 0.2, pace) * [1, 1, 1, 1, 1, 0.5]
         s = record(
             robot,
             np.clip(ctrl, *robot.qpos_range.T),
@@ -171,7 +172,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
         logged = [values.copy() for values in (s.ctrl, s.qpos)]
         for values in logged:  # SAGE has the gripper as a fraction of its range
             values[:, 5] = (values[:, 5] - low) / (high - low)
-        time = 1e6 * robot.dt * np.arange(200)
+        time = 1e6 * robot.dt * np.arange(ROWS)
         write_sage(folder / name / f"m{seed}", *logged, names=SO101_IN_SAGE, time=time, qvel=s.qvel)
     return folder
 

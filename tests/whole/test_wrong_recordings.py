@@ -50,7 +50,7 @@ def test_the_command_says_it_in_one_line(mirrored, tmp_path, capsys):
 
 
 def test_a_person_may_insist_and_the_robot_folder_says_so(robot, tmp_path):
-    logs = recordings(robot, 5, rows=150, kp=0.6, delay=2)
+    logs = recordings(robot, 5, rows=80, kp=0.6, delay=2)
     twice = replace(logs[0], meta=replace(logs[0].meta, payload_mass=0.1))
     data = write_dataset(tmp_path / "data", robot, [*logs, twice])
     with pytest.raises(DatasetError, match="labels"):
