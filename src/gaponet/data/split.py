@@ -389,9 +389,11 @@ def _split_by_joints(unrecorded: dict[str, frozenset[str]]) -> dict[str, list[st
         return split_motions(unrecorded)
     splits: dict[str, list[str]] = {s: [] for s in SPLITS}
     for names in map(hash_order, groups.values()):
-        few = {"train": names[-1:], "val": names[:-1], "test": []}
-        for s, part in (split_motions(names) if len(names) >= MIN_MOTIONS else few).items():
-            splits[s] += part
+        parts = {"train": names[-1:], "val": names[:-1], "test": []}
+        if len(names) >= MIN_MOTIONS:
+            parts = split_motions(names)
+        for split, part in parts.items():
+            splits[split] += part
     return {s: hash_order(names) for s, names in splits.items()}
 
 

@@ -132,11 +132,7 @@ def _jumps(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
 
 def _nonsense(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     """Were impossible values of a channel replaced at import?"""
-    by_channel: dict[str, list[Survey]] = defaultdict(list)
-    for survey in surveys:
-        for channel in survey.entry.meta.notes.get("nonsense", {}):
-            by_channel[channel].append(survey)
-    for channel, hit in by_channel.items():
+    for channel, hit in _with_note(surveys, "nonsense").items():
         notes = [survey.entry.meta.notes["nonsense"][channel] for survey in hit]
         rows = sum(n["rows"] for n in notes)
         done = ", ".join(dict.fromkeys(n["done"] for n in notes))
@@ -164,11 +160,9 @@ def _repeated_rows(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]
 
 def _as_logged(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     """What was held, left out, continued or cut at import?"""
-    for key, of_channel in (("slower", _slower), ("absent", _absent), ("turns", _turns)):
-        hit = [survey for survey in surveys if key in survey.entry.meta.notes]
-        for name in _joined([survey.entry.meta.notes[key] for survey in hit]):
-            with_name = [survey for survey in hit if name in survey.entry.meta.notes[key]]
-            yield of_channel(name, with_name)
+    for note, finding_of in (("slower", _slower), ("absent", _absent), ("turns", _turns)):
+        for name, hit in _with_note(surveys, note).items():
+            yield finding_of(name, hit)
     cut = [survey for survey in surveys if _rows_cut(survey) > MAX_CUT_SHARE * survey.entry.rows]
     if cut:
         rows = sum(_rows_cut(survey) for survey in cut)
@@ -178,6 +172,15 @@ def _as_logged(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
             "interpolated. Look at the lines that import listed, and repair their cause"
         )
         yield Finding("warning", "cut", text, values={"rows": rows})
+
+
+def _with_note(surveys: list[Survey], note: str) -> dict[str, list[Survey]]:
+    """Return channel or joint → recordings that had this note on it at import."""
+    by_name: dict[str, list[Survey]] = defaultdict(list)
+    for survey in surveys:
+        for name in survey.entry.meta.notes.get(note, ()):
+            by_name[name].append(survey)
+    return by_name
 
 
 def _rows_cut(survey: Survey) -> int:

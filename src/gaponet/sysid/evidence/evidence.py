@@ -136,10 +136,10 @@ def _slopes_of_joints(
     def scaled_errors(x: Array) -> Array:
         return rollouts.flat_errors(axes.values(x)) / np.float32(ERROR_SCALE_RAD)
 
-    # of one start
-    errors, by_change = slopes(axes.normalize(bounds.first)[None], axes.high, scaled_errors)
+    start = axes.normalize(bounds.first)[None]
+    errors, by_change = slopes(start, axes.high, scaled_errors)  # (1, n, rows) and (1, n, rows, P)
     is_free = axes.low < axes.high
-    by_field = by_change[0] / axes.unit[:, None] * is_free[:, None]  # (n, rows, P)
+    by_field = by_change[0] / axes.unit[:, None] * is_free[:, None]
     by_play = _slopes_over_play(rollouts, bounds).reshape(bounds.n, -1, 1)
     return errors[0], np.concatenate([by_field, by_play], axis=-1)
 
