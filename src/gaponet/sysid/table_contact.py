@@ -283,8 +283,12 @@ def _with_table(robot: RobotSpec, x: Array) -> RobotSpec:
     servos = {}
     for joint, zero in zip(robot.operated, zeros, strict=True):
         servos[joint] = {"zero": round(float(zero), ZERO_DECIMALS)}
-    height, friction, stiffness = (float(f"{v:.4g}") for v in (x[0], x[1], np.exp(x[2])))
-    return robot.with_identified(servos).with_table(Table(height, friction, stiffness))
+    table = Table(_four_digits(x[0]), _four_digits(x[1]), _four_digits(np.exp(x[2])))
+    return robot.with_identified(servos).with_table(table)
+
+
+def _four_digits(value: float) -> float:
+    return float(f"{value:.4g}")
 
 
 class _TableRollouts(RobotRollouts):

@@ -286,22 +286,26 @@ def _slope(ctrl: Array, qpos: Array, dt: float, lag: Array, speed: Array) -> Arr
     with unknown lag.
     """
     slope = np.full(len(lag), np.nan)
-    slow = [lowpass(x, dt, SLOW_HZ) for x in (ctrl, qpos)] if len(ctrl) * dt > 3 / SLOW_HZ else None
-    for j in np.flatnonzero(
-        (np.ptp(ctrl, axis=0) > SLOPE_MIN_RANGE_RAD) & ((lag > 0) | (speed < FAST_COMMAND_RAD_S))
-    ):
+    signals = [(ctrl, qpos)]
+    if len(ctrl) * dt > 3 / SLOW_HZ:
+        signals.append((lowpass(ctrl, dt, SLOW_HZ), lowpass(qpos, dt, SLOW_HZ)))
+    is_moved = np.ptp(ctrl, axis=0) > SLOPE_MIN_RANGE_RAD
+    for j in np.flatnonzero(is_moved & ((lag > 0) | (speed < FAST_COMMAND_RAD_S))):
         steps = round(float(lag[j]))
-        candidates = []
-        for a, b in (
-            (ctrl, qpos),
-            *([slow] if slow and np.ptp(slow[0][:, j]) > SLOPE_MIN_RANGE_RAD else []),
-        ):
-            u = a[: len(a) - steps, j].astype(float)
-            v = b[steps:, j].astype(float)
-            u = u - u.mean()
-            candidates.append(float(u @ v / (u @ u)))
-        slope[j] = min(candidates, key=lambda x: abs(x - 1))  # a resonance changes one of them
+        slopes = []
+        for commands, states in signals:
+            if np.ptp(commands[:, j]) > SLOPE_MIN_RANGE_RAD:
+                slopes.append(_fitted_slope(commands[:, j], states[:, j], steps))
+        slope[j] = min(slopes, key=lambda x: abs(x - 1))  # a resonance changes one of them
     return slope
+
+
+def _fitted_slope(command: Array, state: Array, steps: int) -> float:
+    """Return the least-squares slope of a state (T,) over the command `steps` rows before."""
+    before = command[: len(command) - steps].astype(float)
+    after = state[steps:].astype(float)
+    before = before - before.mean()
+    return float(before @ after / (before @ before))
 
 
 def _kind_of_command(sequence: Sequence) -> dict[str, Array]:

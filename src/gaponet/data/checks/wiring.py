@@ -380,7 +380,9 @@ def _converted(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
         yield Finding(
             "note", "unit", f"logged in degrees, converted: {', '.join(degrees)}", degrees
         )
-    for name in (name for name, unit in _units(surveys).items() if unit == "fraction"):
+    for name, unit in _units(surveys).items():
+        if unit != "fraction":
+            continue
         low, high = robot.qpos_range[robot.joint_names.index(name)]
         text = (
             f"{name} is logged as 0..1, not in rad: mapped to its range [{low:.2f}, {high:.2f}], "
@@ -420,9 +422,10 @@ def _labels(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     ids: dict[str, list[str]] = defaultdict(list)
     for s in surveys:
         ids[s.samples].append(s.entry.id)
-    for same in (same for same in ids.values() if len(same) > 1):
-        text = f"same samples under different labels: {', '.join(same)}; remove the wrong one"
-        yield Finding("error", "labels", text)
+    for same in ids.values():
+        if len(same) > 1:
+            text = f"same samples under different labels: {', '.join(same)}; remove the wrong one"
+            yield Finding("error", "labels", text)
 
 
 CHECKS = (

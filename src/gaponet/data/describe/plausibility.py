@@ -106,8 +106,9 @@ def require_plausible(log: Log, robot: RobotSpec, strict: bool = False) -> Log:
     a channel that is mostly nonsense is left out. `strict` refuses it. A sensor may read more
     torque than the motor has, not 20 times as much.
     """
-    still, moved = (np.ptp(log.channels[name].values, axis=0).max() for name in ("ctrl", "qpos"))
-    if still == 0 and moved > UNASKED:
+    commanded = np.ptp(log.channels["ctrl"].values, axis=0).max()
+    moved = np.ptp(log.channels["qpos"].values, axis=0).max()
+    if commanded == 0 and moved > UNASKED:
         raise LogError(
             f"{log.source}: every commanded position stands still while the joints move by up to "
             f"{moved:.3g} rad: a robot driven by torques, by velocities or by hand; such commands "

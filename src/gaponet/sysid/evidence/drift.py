@@ -275,11 +275,11 @@ def _changes(
     share.
     """
     moved: list[ParameterChange] = []
-    fields = each[0].fields
-    for field in COMMON_FIELDS if len(each) > 1 else ():
-        together = _together(each, fields.index(field), threshold)
-        if together is not None:
-            moved.append(together)
+    if len(each) > 1:
+        for field in COMMON_FIELDS:
+            together = _together(each, each[0].fields.index(field), threshold)
+            if together is not None:
+                moved.append(together)
     largest = {change.joint: change for change in moved}
     for one in each:
         changes, first = one.explained(threshold)
