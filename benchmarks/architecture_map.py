@@ -1,6 +1,9 @@
-"""Draw which sub-package imports which, from the code, into docs/architecture.md: python benchmarks/architecture_map.py
+"""Draw which sub-package imports which, from the code, into docs/architecture.md.
 
-An arrow leads from a sub-package to one that it imports. Arrows that follow from others are left out.
+    python benchmarks/architecture_map.py
+
+An arrow leads from a sub-package to one that it imports. Arrows that follow from others are left
+out.
 """
 
 from __future__ import annotations

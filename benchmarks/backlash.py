@@ -113,7 +113,7 @@ class PlayRobot:
         return (self.backlash > 0) | (self.spring > 0)
 
     def xml(self, true: bool) -> str:
-        """Return the MJCF, of the true robot with motors and play hinges, else of a vendor's file."""
+        """Return the MJCF, of the true robot with play hinges, else of a vendor's file."""
         bodies = ""
         ends = ""
         at = "0 0 0"
@@ -157,7 +157,7 @@ class PlayRobot:
         )
 
     def _motor_and_link(self, i: int, at: str) -> str:
-        """Return a motor and its link, without their end tags, with a gap or a spring between them."""
+        """Return a motor, a gap or a spring, and the link, without their end tags."""
         half = self.backlash[i] / 2
         between = (
             f'range="{-half} {half}" limited="true" frictionloss="{self.grease * self.friction[i]}"'
@@ -192,7 +192,7 @@ class PlayRobot:
         )
 
     def commands(self, number: int, seconds: float = MOTION_S) -> np.ndarray:
-        """Return targets of a motion, (T, n) rad: sines, slow ways with rests, steps, fast sines."""
+        """Return targets of a motion, (T, n) rad: sines, ways with rests, steps, fast sines."""
         rng = np.random.default_rng([self.seed, number, 5])
         time = np.arange(round(seconds / DT))[:, None] * DT
         kind = number % 4
@@ -321,7 +321,7 @@ def print_verdicts(rows: list[Row]) -> None:
 
 
 def hinge_result(seed: int) -> Row:
-    """Return the error of each form of one joint with a gap, rad, from gaponet's simulation of it."""
+    """Return how far each form of one joint with a gap is from gaponet's simulation, rad."""
     robot = PlayRobot.draw(seed, backlash=True, joints=1)
     robot = replace(robot, delay=0.0, stribeck=np.zeros(1))
     servo = {

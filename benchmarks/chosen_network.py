@@ -2,7 +2,8 @@
 
     python benchmarks/compare_methods.py --method benchmarks/chosen_network.py:network
 
-Each candidate of `--model auto` gets two short rounds of supervised pre-training and no PPO. Seed 0.
+Each candidate of `--model auto` gets two short rounds of supervised pre-training and no PPO. Seed
+0.
 """
 
 from __future__ import annotations
@@ -20,7 +21,9 @@ from gaponet.nn.training.config import PretrainingConfig, TrainConfig
 
 
 def network(question: Question) -> FittedSim:
-    """Train the candidates of `gaponet train` on top of identification, briefly; validation chooses. Seed 0."""
+    """Train the candidates of `gaponet train` on top of identification, briefly; validation
+    chooses. Seed 0.
+    """
     assert question.work is not None
     robot, run = identified(question).robot, question.work / "network"
     shutil.rmtree(run, ignore_errors=True)

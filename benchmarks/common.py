@@ -1,4 +1,4 @@
-"""What benchmarks share: a command line, rows by seed in a file by which they resume, and tables."""
+"""What benchmarks share: a command line, rows by seed in a file, and tables."""
 
 from __future__ import annotations
 
@@ -77,7 +77,11 @@ def plus_minus(values: Iterable[float]) -> str:
 
 
 def share_inside(intervals: Iterable[tuple[float, float, float]]) -> str:
-    """Return "k of n" of the 90 % intervals that hold the truth: (estimate, truth, standard error)."""
+    """Return "k of n" of the 90 % intervals that hold the truth.
+
+    Args:
+        intervals: Estimate, truth and standard error of each.
+    """
     found = [abs(estimate - truth) <= NORMAL_90 * std for estimate, truth, std in intervals]
     return f"{sum(found)} of {len(found)}"
 

@@ -1,4 +1,6 @@
-"""Compare methods on public recordings of real robots: python benchmarks/compare_methods.py --data FOLDER
+"""Compare methods on public recordings of real robots.
+
+    python benchmarks/compare_methods.py --data FOLDER
 
 docs/benchmark.md says what is asked and how somebody adds a method or a data set.
 """

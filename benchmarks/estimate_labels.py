@@ -1,12 +1,15 @@
-"""Estimation of missing labels: the payload of each recording, and the unit (one physical robot) that made it.
+"""Estimation of missing labels: the payload of each recording, and the unit that made it.
+
+A unit is one physical robot.
 
     python benchmarks/estimate_labels.py LOGS --robot h1_2 --rate 50 --payloads 0 1 2 3 --units 3 --out labels
 
-Recordings in which one joint moves repeat the same commands with several payloads and units. The held torque at equal
-commands is a + b·m: m is one of the given payloads, b is common, a is the unit's. Each joint and command is fitted by
-itself, by expectation maximisation over all pairs of unit and payload. Consecutive recordings with equal torque are
-repetitions of one unit. Units are distinguished by the order of their torques, which is assumed to be the same at every
-payload; the first unit of one joint need not be that of another.
+Recordings in which one joint moves repeat the same commands with several payloads and units. The
+held torque at equal commands is a + b·m: m is one of the given payloads, b is common, a is the
+unit's. Each joint and command is fitted by itself, by expectation maximisation over all pairs of
+unit and payload. Consecutive recordings with equal torque are repetitions of one unit. Units are
+distinguished by the order of their torques, which is assumed to be the same at every payload; the
+first unit of one joint need not be that of another.
 """
 
 from __future__ import annotations
@@ -53,13 +56,15 @@ class LabelledRecording:
     Attributes:
         name: The name that import gives it.
         joint, command: The joint that moves, and its last command, rad.
-        torque: Torque and command of each row, (k,) N·m and rad; gain times error where no torque was recorded.
+        torque: Torque and command of each row, (k,) N·m and rad; gain times error where no torque
+            was recorded.
         named_payload: Payload in the file's name, kg.
         payload, unit: Estimates, kg and a number from 0 on within the joint.
         determined: Whether the joint's torque determines its payload.
         torque_payload: Payload estimated from torque without the unit, kg.
         copy_of: Name of an earlier recording with the same samples.
-        servo_rows: Command, position, velocity and torque of each row, (4, k), where torque was recorded.
+        servo_rows: Command, position, velocity and torque of each row, (4, k), where torque was
+            recorded.
     """
 
     name: str
@@ -129,7 +134,8 @@ class Labels:
 def estimate(
     logs: Iterable[tuple[str, Log]], payloads: Sequence[float], units: int, gain: dict[str, float]
 ) -> Labels:
-    """Estimate payload and unit of every recording. Payloads in files' names are only compared with the estimates.
+    """Estimate payload and unit of every recording. Payloads in files' names are only compared with
+    the estimates.
 
     Args:
         logs: Name and recording, one moving joint each.
@@ -169,7 +175,8 @@ def estimate(
             "said": len(named),
             "within_half_a_kg": float(np.mean([abs(r.payload - (r.named_payload or 0.0)) < MAX_PAYLOAD_ERROR_KG
                                                for r in named])),
-            # What a file's name does not list is none of these either, where such files list all of a payload.
+            # What a file's name does not list is none of these either, where such files list all of
+            # a payload.
             "not_said": len(others),
             "taken_for_one_of_these": float(np.mean([r.payload in masses for r in others] or [False])),
         }  # fmt: skip
@@ -216,7 +223,9 @@ def _read(name: str, log: Log, gain: dict[str, float]) -> LabelledRecording:
 
 
 def _by_command(recordings: list[LabelledRecording]) -> list[list[LabelledRecording]]:
-    """Return the recordings by joint and last command, in their order; `command` becomes their mean."""
+    """Return the recordings by joint and last command, in their order; `command` becomes their
+    mean.
+    """
     parts = []
     for joint in dict.fromkeys(r.joint for r in recordings):
         mine = [r for r in recordings if r.joint == joint]
@@ -273,7 +282,9 @@ def _fit(part: list[LabelledRecording], payloads: Sequence[float], units: int) -
 
 
 def _at_equal_commands(recordings: list[tuple[Array, Array]]) -> Array:
-    """Return the mean torque of each at equal commands, (k,) N·m: one may have begun a period later than another."""
+    """Return the mean torque of each at equal commands, (k,) N·m: one may have begun a period later
+    than another.
+    """
     sign = 1.0 if np.mean([ctrl[-1] - ctrl[0] for _, ctrl in recordings]) > 0 else -1.0
     risen = [np.maximum.accumulate(sign * ctrl) for _, ctrl in recordings]
     low, high = max(r[0] for r in risen), min(r[-1] for r in risen)
@@ -289,9 +300,11 @@ def _at_equal_commands(recordings: list[tuple[Array, Array]]) -> Array:
 
 
 def _ranked(rest: Array, load: Array, units: int) -> tuple[Array, Array]:
-    """Return the unit of each group, (k,), by its torque without payload, N·m, and the torque of each unit, (units,).
+    """Return the unit of each group, (k,), by its torque without payload, N·m, and the torque of
+    each unit, (units,).
 
-    At each payload the units are in one order; where there are fewer groups than units, the nearest unit is taken.
+    At each payload the units are in one order; where there are fewer groups than units, the nearest
+    unit is taken.
     """
     bands = [np.flatnonzero(load == m) for m in np.unique(load)]
     whole = [np.sort(rest[b]) for b in bands if len(b) == units]
@@ -304,7 +317,9 @@ def _ranked(rest: Array, load: Array, units: int) -> tuple[Array, Array]:
 
 
 def _bands(x: Array, masses: Array) -> tuple[float, float, float]:
-    """Return width, distance per kg and place of the first of evenly spaced bands, all units together."""
+    """Return width, distance per kg and place of the first of evenly spaced bands, all units
+    together.
+    """
     span = float(np.ptp(x)) / float(np.ptp(masses))
     fits = [
         _mixture(x, masses, np.array([a]), b * span, 0.3 * b * span, 0.02 * b * span)
@@ -318,7 +333,8 @@ def _bands(x: Array, masses: Array) -> tuple[float, float, float]:
 def _mixture(
     x: Array, masses: Array, zero: Array, slope: float, width: float, least: float
 ) -> tuple[float, Array, float, float]:
-    """Fit normals of one width at zero + slope·masses, all with equal weight, by expectation maximisation.
+    """Fit normals of one width at zero + slope·masses, all with equal weight, by expectation
+    maximisation.
 
     Args:
         x: Torque of each recording, (k,) N·m.
@@ -347,7 +363,9 @@ def _mixture(
 
 
 def write(labels: Labels, folder: Path, rate: float | None = None) -> None:
-    """Write logs.toml and labels.csv into a folder, for `gaponet import LOGS --logs FOLDER/logs.toml`."""
+    """Write logs.toml and labels.csv into a folder, for `gaponet import LOGS --logs
+    FOLDER/logs.toml`.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     text = io.StringIO()
     sheet = csv.writer(text)
@@ -375,12 +393,14 @@ def main(
     units: int = 1,
     rate: float | None = None,
 ) -> None:
-    """Estimate which payload each recording of one moving joint carried and which unit made it, by held torque.
+    """Estimate which payload each recording of one moving joint carried and which unit made it, by
+    held torque.
 
     Args:
         logs: File or folder of logs.
         robot: Robot name or folder.
-        out: Folder for logs.toml and labels.csv, which gaponet import LOGS --logs OUT/logs.toml takes.
+        out: Folder for logs.toml and labels.csv, which gaponet import LOGS --logs OUT/logs.toml
+            takes.
         payloads: Masses that may have been carried, kg.
         units: Number of robots.
         rate: Hz, of logs without a clock.

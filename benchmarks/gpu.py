@@ -1,18 +1,20 @@
-"""Control steps per second on a GPU: bare mujoco_warp, gaponet's simulations, and those with resets.
+"""Control steps per second on a GPU: bare mujoco_warp, gaponet's simulations, and with resets.
 
     python benchmarks/gpu.py [--device cuda] [--robot so101] [--seconds 5] 1024 4096 16384
     python benchmarks/gpu.py --reached RUN OTHER
 
-Measured for each number of simulations, with the plain servo and with servo terms (Stribeck friction, friction by
-load):
+Measured for each number of simulations, with the plain servo and with servo terms (Stribeck
+friction, friction by load):
 
-    plain    mujoco_warp with the robot's own MJCF, without any code of gaponet: what an expert would write
-    graph    gaponet's own CUDA graph of one control period, with the kernel of the servo terms, and nothing else
+    plain    mujoco_warp with the robot's own MJCF, without any code of gaponet: what an expert
+             would write
+    graph    gaponet's own CUDA graph of one control period, with the kernel of the servo terms,
+             and nothing else
     gaponet  a step of gaponet's simulations
     resets   the same; one simulation in a hundred is reset in every period
 
---reached prints how long each of two trainings took to reach the best validation error of RUN. benchmarks/gpu.sh runs
-both.
+--reached prints how long each of two trainings took to reach the best validation error of RUN.
+benchmarks/gpu.sh runs both.
 """
 
 from __future__ import annotations
@@ -38,7 +40,9 @@ SERVO_TERMS = {
 
 
 def rate(period: Callable[[], object], num_envs: int, seconds: float) -> float:
-    """Return the control steps per second of all simulations, after a first period that compiles."""
+    """Return the control steps per second of all simulations, after a first period that
+    compiles.
+    """
     import warp
 
     period()
@@ -54,7 +58,9 @@ def rate(period: Callable[[], object], num_envs: int, seconds: float) -> float:
 
 
 def plain_rate(robot: RobotSpec, num_envs: int, device: str, seconds: float) -> float:
-    """Return the control steps per second of mujoco_warp with the robot's own MJCF, without gaponet."""
+    """Return the control steps per second of mujoco_warp with the robot's own MJCF, without
+    gaponet.
+    """
     import mujoco
     import mujoco_warp
     import warp
@@ -109,7 +115,9 @@ def measure(robot: RobotSpec, num_envs: int, device: str, seconds: float) -> dic
 
 
 def reached(runs: list[Path]) -> None:
-    """Print when each run reached the best validation error of the first; the time includes labels and sensors."""
+    """Print when each run reached the best validation error of the first; the time includes labels
+    and sensors.
+    """
     lines = [
         [json.loads(x) for x in (run / "progress.jsonl").read_text("utf-8").splitlines()]
         for run in runs

@@ -1,22 +1,24 @@
-"""Writing commands under adversity: killed at random moments, on full or read-only disks, and started twice.
+"""Writing commands under adversity: killed at random moments, on full disks, and started twice.
 
     python benchmarks/kills.py WORK [--kills 20] [--only import,train] [--trials kills] [--seed 0]
 
-Records a small VIRTUAL SO-101 set in WORK/input. Each command of `cases` runs once undisturbed, and then
+Records a small VIRTUAL SO-101 set in WORK/input. Each command of `cases` runs once undisturbed, and
+then
 
-    kills      with kill -9 at random moments, restarted each time until the number of kills is reached
+    kills      with kill -9 at random moments, restarted until the number of kills is reached
     full       on a tmpfs that is too small, then on the same one made larger (root only)
     read_only  on a read-only tmpfs (root only)
     races      twice at once into one folder
     mixed      import and collect at once into one dataset; the second is refused, then and later
     foreign    into a folder with a `.git`
 
-At the end, the content of the folder must equal that of the undisturbed command. Prints one JSON object; exits with 1
-if a content differs, a file remains, an exit code is wrong, or a traceback was printed.
+At the end, the content of the folder must equal that of the undisturbed command. Prints one JSON
+object; exits with 1 if a content differs, a file remains, an exit code is wrong, or a traceback was
+printed.
 
-Not among the cases: run and record, which play a motion again and store it under a new name; demo, which consists of
-commands that are; view --render and replay --out, which write one file as
-`robot show --out` does.
+Not among the cases: run and record, which play a motion again and store it under a new name; demo,
+which consists of commands that are; view --render and replay --out, which write one file as `robot
+show --out` does.
 """
 
 from __future__ import annotations
@@ -111,7 +113,9 @@ def trained(out: Path) -> Any:
 
 
 def without(*patterns: str) -> Callable[[Path], Any]:
-    """Return a content: the hash of each file, and only the name of files that hold a time or a place."""
+    """Return a content: the hash of each file, and only the name of files that hold a time or a
+    place.
+    """
 
     def content(out: Path) -> Any:
         made = digests(out)
@@ -130,7 +134,9 @@ def page(out: Path) -> Any:
 
 
 def file_count(out: Path) -> int:
-    """Return the number of files: the name of a pushed file is its hash, and some files hold the time of the push."""
+    """Return the number of files: the name of a pushed file is its hash, and some files hold the
+    time of the push.
+    """
     return len(names(out))
 
 
@@ -148,7 +154,8 @@ def result(out: Path) -> Any:
 def cases(given: Path) -> dict[str, Case]:
     """Return every command that writes a folder in several steps.
 
-    `given` holds data, bare (data without replays), logs (LeRobot), a run, and what `further_cases` needs.
+    `given` holds data, bare (data without replays), logs (LeRobot), a run, and what `further_cases`
+    needs.
     """
     robot = ["--robot", "so101"]
     data, log, run = (str(given / name) for name in ("data", "logs", "run"))
@@ -192,8 +199,8 @@ def cases(given: Path) -> dict[str, Case]:
 def further_cases(given: Path) -> dict[str, Case]:
     """Return commands that are only killed and repeated.
 
-    `given` holds, of an arm with two joints, a model file, a nominal and an identified robot, data and
-    logs; and an empty folder.
+    `given` holds, of an arm with two joints, a model file, a nominal and an identified robot, data
+    and logs; and an empty folder.
     """
     data, logs, nominal, identified, trained_on = (
         str(given / name) for name in ("arm_data", "arm_logs", "nominal", "identified", "data")
@@ -457,8 +464,9 @@ class Trial:
 
 
 def mixed(given: Path, work: Path, turns: int = 6) -> dict[str, Any]:
-    """Run import and collect at once into one dataset: one succeeds. Then run the other again: an import finds the
-    collected recordings, and collect refuses imported ones."""
+    """Run import and collect at once into one dataset: one succeeds. Then run the other again: an
+    import finds the collected recordings, and collect refuses imported ones.
+    """
     both = [cases(given)[name] for name in ("import", "collect")]
     count: Counter[str] = Counter()
     wrong: list[str] = []

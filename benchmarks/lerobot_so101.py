@@ -1,11 +1,11 @@
 """LeRobot on a VIRTUAL SO-101 behind a servo bus: python benchmarks/lerobot_so101.py WORK.
 
-`make lerobot` creates an environment with LeRobot and the plug-in, and runs this script. LeRobot's own so101_follower,
-with Feetech's SDK, and its record() play excitation. gaponet imports the recordings, identifies and trains; LeRobot
-opens the exported dataset. Then record() plays test motions, uncorrected and corrected by the processor step
-gaponet_correct. The bus advances one frame per goal, so that the load of the machine has no effect. The error is
-|observation − action of the frame before| of the joints that move, after the move to the start. Existing results are
-kept.
+`make lerobot` creates an environment with LeRobot and the plug-in, and runs this script. LeRobot's
+own so101_follower, with Feetech's SDK, and its record() play excitation. gaponet imports the
+recordings, identifies and trains; LeRobot opens the exported dataset. Then record() plays test
+motions, uncorrected and corrected by the processor step gaponet_correct. The bus advances one frame
+per goal, so that the load of the machine has no effect. The error is |observation − action of the
+frame before| of the joints that move, after the move to the start. Existing results are kept.
 """
 
 from __future__ import annotations
@@ -104,7 +104,9 @@ def main(work: tyro.conf.Positional[Path]) -> None:
 
 
 def wait_longer() -> None:
-    """Replies of a servo bus on a busy machine take longer than the SDK waits: its patience, 50 ms, becomes 10 s."""
+    """Replies of a servo bus on a busy machine take longer than the SDK waits: its patience, 50 ms,
+    becomes 10 s.
+    """
     from lerobot.motors.feetech import feetech
 
     given = feetech.patch_setPacketTimeout
@@ -141,7 +143,9 @@ def softer(folder: Path) -> Path:
 
 
 def count_frames() -> None:
-    """LeRobot's loop asks the clock how long an episode has been; now that is its frames, as on the bus."""
+    """LeRobot's loop asks the clock how long an episode has been; now that is its frames, as on the
+    bus.
+    """
     from lerobot.scripts import lerobot_record
 
     passed = 0.0
@@ -197,7 +201,9 @@ def record(
     seconds: float,
     step: dict[str, object] | None = None,
 ) -> None:
-    """LeRobot's record() with its own SO-101 and our motions, through the processor step where it is configured."""
+    """LeRobot's record() with its own SO-101 and our motions, through the processor step where it
+    is configured.
+    """
     if (out / "meta" / "stats.json").is_file():
         return
     from lerobot.configs.dataset import DatasetRecordConfig

@@ -58,7 +58,7 @@ T = TypeVar("T")
 
 
 def draw_arm(rng: np.random.Generator, folder: Path) -> tuple[RobotSpec, np.ndarray]:
-    """Write a robot folder; return the robot and the torque to hold each stretched link, (n,) N·m."""
+    """Write a robot folder; return the robot and the torques that hold it, (n,) N·m."""
     lengths = rng.uniform(0.12, 0.3, JOINTS)
     masses = np.sort(rng.uniform(0.15, 1.2, JOINTS))[::-1]
     upright = rng.random() < 0.3

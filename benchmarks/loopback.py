@@ -2,8 +2,9 @@
 
     python benchmarks/loopback.py --minutes 10 --rate 50
 
-Prints the fraction of control periods that started more than one period late or never, and the age of states. Watchdogs
-are on. With --no-stop, a stalled machine is counted and does not stop the robot.
+Prints the fraction of control periods that started more than one period late or never, and the age
+of states. Watchdogs are on. With --no-stop, a stalled machine is counted and does not stop the
+robot.
 """
 
 from __future__ import annotations

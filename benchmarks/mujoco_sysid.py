@@ -3,13 +3,15 @@
     pip install "mujoco[sysid]"
     python benchmarks/compare_methods.py --method benchmarks/mujoco_sysid.py:mujoco_sysid
 
-Parameters, changes of the model, rollouts and the optimizer are those of mujoco.sysid. Some defaults are replaced:
+Parameters, changes of the model, rollouts and the optimizer are those of mujoco.sysid. Some
+defaults are replaced:
 
 - States are compared. The position sensors of a rollout are one physics step older than their time.
 - Residuals are errors in rad. The default divides each window by the norm of its own signal.
 - A rollout function delays the commands. An actuator with a delay starts from a history of zeros.
 - scipy's least squares with soft_l1 loss, as in plain_fit.py.
-- A pseudo-inertia is written by `write_inertia`. That of MuJoCo 4.0.0 compiles the model between two bodies, and fails.
+- A pseudo-inertia is written by `write_inertia`. That of MuJoCo 4.0.0 compiles the model between
+  two bodies, and fails.
 """
 
 from __future__ import annotations
@@ -35,7 +37,9 @@ FIELDS = "kp", "damping", "friction", "armature", "delay", "offset"  # in the or
 
 
 def mujoco_sysid(question: Question) -> FittedSim:
-    """Fit kp, damping, friction, armature, delay and offset of each operated joint with mujoco.sysid."""
+    """Fit kp, damping, friction, armature, delay and offset of each operated joint with
+    mujoco.sysid.
+    """
     problem = equal_problem(question)
     return FittedSim(problem.robot_with(fit(problem)[0].as_vector()))
 

@@ -1,6 +1,7 @@
 """Draw bars of the numbers in tables of the pages: python benchmarks/page_charts.py
 
-A chart takes its numbers from the table beside it, so it cannot say anything else; tests/test_docs.py compares.
+A chart takes its numbers from the table beside it, so it cannot say anything else;
+tests/test_docs.py compares.
 """
 
 from __future__ import annotations

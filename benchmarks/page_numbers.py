@@ -1,9 +1,9 @@
 """Put the numbers of the results' files into the pages: python benchmarks/page_numbers.py
 
-page_numbers.toml lists sentences and rows of the pages, with a name in braces for each number, and where this number
-is. `make results` runs this at its end. tests/test_docs.py compares, so that no page keeps a number that was measured
-anew. The files are docs/results/real.json, docs/results/paper_*.json, docs/results/unseen_*.json and
-benchmarks/steps.json.
+page_numbers.toml lists sentences and rows of the pages, with a name in braces for each number, and
+where this number is. `make results` runs this at its end. tests/test_docs.py compares, so that no
+page keeps a number that was measured anew. The files are docs/results/real.json,
+docs/results/paper_*.json, docs/results/unseen_*.json and benchmarks/steps.json.
 """
 
 from __future__ import annotations
@@ -28,7 +28,9 @@ PLACE = re.compile(r"\{(\w+)\}")
 
 
 def sentences() -> list[dict[str, Any]]:
-    """Return the entries of page_numbers.toml: pages, text, and the source of each name in braces."""
+    """Return the entries of page_numbers.toml: pages, text, and the source of each name in
+    braces.
+    """
     found: list[dict[str, Any]] = tomllib.loads(LIST.read_text(encoding="utf-8"))["sentence"]
     return found
 
@@ -73,7 +75,9 @@ def _paper(name: str, table: str, begin: str, column: str) -> str:
 
 
 def _unseen(name: str, method: str, column: str) -> str:
-    """Return the mean over simulators, ± its standard error over simulators of the mean over seeds."""
+    """Return the mean over simulators, ± its standard error over simulators of the mean over
+    seeds.
+    """
     found = json.loads((RESULTS / f"unseen_{name}.json").read_text(encoding="utf-8"))
     by_simulator = np.array(found[method][column]).mean(axis=1)
     text = f"{by_simulator.mean():.2f}"
@@ -104,7 +108,8 @@ def _step(name: str, pattern: str) -> str:
 
 
 def filled(page: str, sentence: dict[str, Any]) -> str:
-    """Return the text of a page with the numbers of one sentence, below the heading `section` if it names one.
+    """Return the text of a page with the numbers of one sentence, below the heading `section` if it
+    names one.
 
     Raises:
         LookupError: The page has no such sentence.

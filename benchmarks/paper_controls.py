@@ -2,14 +2,18 @@
 
     python benchmarks/paper_controls.py EXPERIMENT [--steps 200000] [--seed 0]
 
-EXPERIMENT is the folder of `gaponet experiment paper`. Each control is trained and measured as its networks are:
+EXPERIMENT is the folder of `gaponet experiment paper`. Each control is trained and measured as its
+networks are:
 
     untrained          the correction is zero
     literal            as the experiment trains it
-    sensors are noise  the literal network; in training its sensor values are drawn at random, afterwards they are zero
-    payload permuted   GAPONet and literal; the payload that the network is told is that of another simulation
+    sensors are noise  the literal network; in training its sensor values are drawn at random,
+                       afterwards they are zero
+    payload permuted   GAPONet and literal; the payload that the network is told is that of
+                       another simulation
 
-It prints the reduction of Q_dis over the nominal simulator, %, on the motions and the unit of Figure 3.
+It prints the reduction of Q_dis over the nominal simulator, %, on the motions and the unit of
+Figure 3.
 """
 
 from __future__ import annotations

@@ -4,8 +4,8 @@
         --method benchmarks/published_so101.py:community
     python benchmarks/published_so101.py DATASET        # error of each joint on the test motions
 
-Values are kp N·m/rad, kd N·m·s/rad, armature kg·m², dry friction N·m; NaN and joints that are left out are not known
-to us and have the robot file's value. Delay and offset: 0.
+Values are kp N·m/rad, kd N·m·s/rad, armature kg·m², dry friction N·m; NaN and joints that are left
+out are not known to us and have the robot file's value. Delay and offset: 0.
 """
 
 from __future__ import annotations

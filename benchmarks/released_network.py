@@ -2,8 +2,8 @@
 
     python benchmarks/released_network.py FOLDER
 
-FOLDER holds weights.npz (their state dict by its names) and pairs.npz (model_obs, action, and delta, the outputs of
-their code). Exit code 1 above 1e-6.
+FOLDER holds weights.npz (their state dict by its names) and pairs.npz (model_obs, action, and
+delta, the outputs of their code). Exit code 1 above 1e-6.
 """
 
 from __future__ import annotations
@@ -24,10 +24,11 @@ RELEASED_EPSILON = 0.01  # in the published network's normaliser, (x − mean) /
 
 
 def released_network(weights: dict[str, Array]) -> PaperNet:
-    """Return the network that the authors published (isaac-sim2real/sage, feature/add-plug-in), ten joints.
+    """Return the network that the authors published (isaac-sim2real/sage, feature/add-plug-in), ten
+    joints.
 
-    Their observation has no present velocities: these columns get weight zero. Their predictor has no variance. Their
-    normaliser of [S | A] only divides by 1 + ε.
+    Their observation has no present velocities: these columns get weight zero. Their predictor has
+    no variance. Their normaliser of [S | A] only divides by 1 + ε.
 
     Args:
         weights: Arrays of their state dict.
@@ -60,7 +61,9 @@ def released_network(weights: dict[str, Array]) -> PaperNet:
 
 
 def released_inputs(observation: Array, action: Array) -> Tensor:
-    """Convert the published network's observation (B, 130) and action (B, 10) to x = [o_t | a_t]."""
+    """Convert the published network's observation (B, 130) and action (B, 10) to x = [o_t |
+    a_t].
+    """
     o, a = torch.from_numpy(observation), torch.from_numpy(action)
     return torch.cat([o[:, :10], torch.zeros_like(a), o[:, 10:], a], dim=1)
 

@@ -1,9 +1,12 @@
-"""Measure the numbers of README.md and docs/results.md again: python benchmarks/results.py WORK [STEP …]
+"""Measure the numbers of README.md and docs/results.md again.
 
-results.toml lists the steps: commands with their seeds. The output, commit, date and seconds of a step go to
-WORK/answers/STEP.json. A step with an answer is skipped, and an interrupted command resumes where it can. Then
-docs/results/real.md, benchmarks/steps.md, README's table and its picture are written from the answers, and
-page_numbers.py puts the numbers into the other pages. What was not measured again stays as it was.
+    python benchmarks/results.py WORK [STEP …]
+
+results.toml lists the steps: commands with their seeds. The output, commit, date and seconds of a
+step go to WORK/answers/STEP.json. A step with an answer is skipped, and an interrupted command
+resumes where it can. Then docs/results/real.md, benchmarks/steps.md, README's table and its picture
+are written from the answers, and page_numbers.py puts the numbers into the other pages. What was
+not measured again stays as it was.
 
     quick     every step in its short form, in WORK/quick; no page changes
     --list    show steps and answers       --write   only write the pages       --data FOLDER   public recordings
@@ -163,7 +166,9 @@ def _git(*words: str) -> str:
 
 
 def write_pages(steps: list[Step], work: Path) -> None:
-    """Write the pages of real robots and of steps, README's table, and the numbers of other pages."""
+    """Write the pages of real robots and of steps, README's table, and the numbers of other
+    pages.
+    """
     answers = {}
     for step in steps:
         file = work / "answers" / f"{step.name}.json"
@@ -256,7 +261,9 @@ def _write_readme(rows: list[dict[str, Any]]) -> None:
 
 
 def readme_rows(rows: list[dict[str, Any]]) -> list[str]:
-    """Return the lines of README's table: errors of each column's method, of two rivals the better one."""
+    """Return the lines of README's table: errors of each column's method, of two rivals the better
+    one.
+    """
     errors = {}
     for row in rows:
         errors[f"{row['set']}, {row['question']}", row["method"]] = row["mrad"]

@@ -1,12 +1,14 @@
-"""Put the network of a run into the package, as src/gaponet/nn/trained/NAME, and the table into docs/network.md.
+"""Put the network of a run into the package, as src/gaponet/nn/trained/NAME, and the table into
+docs/network.md.
 
     python benchmarks/ship_networks.py RUN NAME DATASET --title TITLE --address ADDRESS --data-licence LICENCE \\
         --limits SENTENCE
 
-Copied from the run: model.onnx, card.json, split.json without names of recordings, delay_offset.json. The errors of the
-card are measured here, with the network as it is shipped, on the test motions of the run in DATASET. Nothing is shipped
-if a check fails: the simulator must be a robot of the package, motions of the test must be unseen, files must name no
-path of this machine, and all networks together must be at most MAX_TOTAL_BYTES.
+Copied from the run: model.onnx, card.json, split.json without names of recordings,
+delay_offset.json. The errors of the card are measured here, with the network as it is shipped, on
+the test motions of the run in DATASET. Nothing is shipped if a check fails: the simulator must be a
+robot of the package, motions of the test must be unseen, files must name no path of this machine,
+and all networks together must be at most MAX_TOTAL_BYTES.
 """
 
 from __future__ import annotations
@@ -155,7 +157,9 @@ def packaged_robot(model: GapModel) -> PackagedRobot:
 
 
 def visited_inputs(model: GapModel, run: Path, dataset: str) -> np.ndarray:
-    """Return inputs x of the network in rollouts with it, (k, dim) float32, of test and training recordings."""
+    """Return inputs x of the network in rollouts with it, (k, dim) float32, of test and training
+    recordings.
+    """
     data, _ = open_dataset(dataset, None, run)
     split = split_of_run(run)
     wanted = set()

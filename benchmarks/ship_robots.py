@@ -1,12 +1,13 @@
-"""Put robots that were identified from the public recordings into the package, as src/gaponet/robot/identified/NAME.
+"""Put robots that were identified from the public recordings into the package, as
+src/gaponet/robot/identified/NAME.
 
     python benchmarks/ship_robots.py one SET FOLDER DATASET [--limits SENTENCE]
 
-SET is a data set of the benchmark (benchmarks/real_robots/cards.toml), which has its source and licence; FOLDER
-is what `gaponet identify DATASET --out FOLDER` wrote. Copied are the robot, its uncertainty, the hashes of its
-recordings, and its nearest PD servos, so that an export needs no recordings. The errors of the card are measured here,
-with the robot as it is shipped, on the test motions of DATASET. Nothing is shipped if a check fails. The table goes
-into docs/robots.md.
+SET is a data set of the benchmark (benchmarks/real_robots/cards.toml), which has its source and
+licence; FOLDER is what `gaponet identify DATASET --out FOLDER` wrote. Copied are the robot, its
+uncertainty, the hashes of its recordings, and its nearest PD servos, so that an export needs no
+recordings. The errors of the card are measured here, with the robot as it is shipped, on the test
+motions of DATASET. Nothing is shipped if a check fails. The table goes into docs/robots.md.
 
     python benchmarks/ship_robots.py all --data FOLDER --work FOLDER
 
@@ -164,7 +165,8 @@ def write_robot(folder: Path, made: Path, dataset: Dataset, card: Card, limits: 
 
 
 def write_plain_servos(robot: RobotSpec, made: Path, dataset: Dataset) -> RobotSpec:
-    """Fit the nearest servos without a servo model to the recordings, and copy them; return the robot with them.
+    """Fit the nearest servos without a servo model to the recordings, and copy them; return the
+    robot with them.
 
     A robot without a servo model is returned as it is.
     """

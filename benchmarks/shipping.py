@@ -1,4 +1,6 @@
-"""What ship_networks.py and ship_robots.py have in common: checks, the copy into the package, the page's table."""
+"""What ship_networks.py and ship_robots.py have in common: checks, the copy into the package, the
+page's table.
+"""
 
 from __future__ import annotations
 
@@ -132,5 +134,7 @@ def write_json_line(file: Path, value: Any) -> None:
 
 
 def without_names(hashes: dict[str, str]) -> dict[str, str]:
-    """Return the hashes of a split's part with numbers in place of the names; hashes tell what was seen."""
+    """Return the hashes of a split's part with numbers in place of the names; hashes tell what was
+    seen.
+    """
     return {str(i): digest for i, digest in enumerate(hashes.values())}

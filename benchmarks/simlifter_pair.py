@@ -1,9 +1,11 @@
-"""Draw one recording and its simulation at the lightest and the heaviest payload (docs/simlifter.md).
+"""Draw one recording and its simulation at the lightest and the heaviest payload
+(docs/simlifter.md).
 
     gaponet collect --recipe demo --fleet firm --units virtual-1 --out DATASET
     python benchmarks/simlifter_pair.py DATASET docs/assets/simlifter_pair
 
-The robot of this dataset is VIRTUAL. The second argument is the name of the pictures without its ending.
+The robot of this dataset is VIRTUAL. The second argument is the name of the pictures without its
+ending.
 """
 
 from __future__ import annotations
@@ -26,7 +28,9 @@ BEGIN_S, END_S = 2.2, 3.0  # one step of a quarter radian, and the rests around 
 
 
 def pairs(dataset: Dataset) -> list[Pair]:
-    """Return the recordings of the motion with the lightest and the heaviest payload, each with its simulation."""
+    """Return the recordings of the motion with the lightest and the heaviest payload, each with its
+    simulation.
+    """
     simulator = model_hash(load_stored_robot(dataset.path, dataset.robot_name))
     entries = sorted(dataset.select(motions=(MOTION,)), key=lambda e: e.meta.payload_mass)
     return [dataset.pair(entry, simulator) for entry in (entries[0], entries[-1])]
@@ -34,7 +38,9 @@ def pairs(dataset: Dataset) -> list[Pair]:
 
 @styled
 def draw(shown: list[Pair]) -> Figure:
-    """Draw command, recorded and simulated position of the joint over time, one panel per payload."""
+    """Draw command, recorded and simulated position of the joint over time, one panel per
+    payload.
+    """
     fig = figure(7.0, 2.9)
     axes = fig.subplots(1, len(shown), sharex=True, sharey=True)
     for ax, pair in zip(axes, shown, strict=True):

@@ -4,8 +4,8 @@
     gaponet identify DATASET --out ROBOT
     MUJOCO_GL=egl python benchmarks/so101_film.py DATASET ROBOT docs/assets/so101.webp
 
-The motion is one of the test motions of `gaponet identify`, which fits nothing to it. A PNG beside the film shows the
-moment of the largest nominal error.
+The motion is one of the test motions of `gaponet identify`, which fits nothing to it. A PNG beside
+the film shows the moment of the largest nominal error.
 """
 
 from __future__ import annotations

@@ -3,8 +3,8 @@
     python benchmarks/speed.py latency --run RUN               one robot: onnxruntime, torch, delta(), Compensator
     python benchmarks/speed.py aligned --run RUN               the aligned simulator beside the nominal one
 
-All parts take turns in one run, so that a slow moment of the machine slows all of them. Of repeated turns the fastest
-counts, because other programs only add time. Results are printed as JSON.
+All parts take turns in one run, so that a slow moment of the machine slows all of them. Of repeated
+turns the fastest counts, because other programs only add time. Results are printed as JSON.
 """
 
 from __future__ import annotations
@@ -39,9 +39,9 @@ CALLS = 3000  # of each runtime, in turns of a tenth
 
 
 def bench_latency(run: Path) -> dict[str, Any]:
-    """Microseconds of one correction (p50, p99, max) on each runtime, and corrections per second in batches.
-    Beside it the Compensator of the run's simulator, with and without the network, and one control
-    period of that simulator alone.
+    """Microseconds of one correction (p50, p99, max) on each runtime, and corrections per second in
+    batches. Beside it the Compensator of the run's simulator, with and without the network, and one
+    control period of that simulator alone.
 
     Args:
         run: Run folder of gaponet train.
@@ -77,7 +77,9 @@ def bench_latency(run: Path) -> dict[str, Any]:
 
 
 def bench_aligned(run: Path, num_envs: int, rounds: int) -> dict[str, dict[str, float]]:
-    """Control steps per second of the nominal and the aligned simulator; idle limbs are locked in both."""
+    """Control steps per second of the nominal and the aligned simulator; idle limbs are locked in
+    both.
+    """
     model = GapModel.load(run, threads=0)
     robot = load_stored_robot(run, model.card["robot"])
     locked = idle_joints(robot, robot.operated)

@@ -239,7 +239,9 @@ def _deviations(
 
 
 def absolute_errors(robot: RobotSpec, logs: list[Sequence]) -> np.ndarray:
-    """Return |error| of the operated joints in all rows of the rollouts but the first, (rows, n)."""
+    """Return |error| of the operated joints in all rows of the rollouts but the first, (rows,
+    n).
+    """
     errors = []
     for log, simulated in zip(logs, replay(logs, robot), strict=True):
         errors.append(np.abs(simulated.qpos - log.qpos)[1:, robot.operated_index])

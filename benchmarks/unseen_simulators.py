@@ -11,15 +11,17 @@ Networks with equal data, steps and nearly equal numbers of weights (the table s
     MLP + context             also told the simulator's answers to fixed probes
     GAPONet + context         these answers are its branch input
 
-With --payload-unknown, the networks for many simulators are also trained without the payload as an input; the
-answers are then those of simulators that carry it. So is the paper's network, which is told nothing of its simulator.
-With --literal, the paper's network is trained in one simulator, and its sensor predictor alone is fitted again, in the
-simulators of training or in the simulator of the test. These are the two means that the authors name.
+With --payload-unknown, the networks for many simulators are also trained without the payload as an
+input; the answers are then those of simulators that carry it. So is the paper's network, which is
+told nothing of its simulator. With --literal, the paper's network is trained in one simulator, and
+its sensor predictor alone is fitted again, in the simulators of training or in the simulator of the
+test. These are the two means that the authors name.
 
-The test has twenty simulators within the ranges of training and ten beyond. Their seed was used for nothing else, and
-the motions are the test motions of training. Settings are chosen by the validation error of training, in other
-simulators and on other motions. A number is the mean error over that of the uncorrected simulator, averaged over
-simulators; ± is the standard error over simulators of the mean over seeds.
+The test has twenty simulators within the ranges of training and ten beyond. Their seed was used for
+nothing else, and the motions are the test motions of training. Settings are chosen by the
+validation error of training, in other simulators and on other motions. A number is the mean error
+over that of the uncorrected simulator, averaged over simulators; ± is the standard error over
+simulators of the mean over seeds.
 """
 
 from __future__ import annotations
@@ -109,7 +111,9 @@ def rows(arguments: argparse.Namespace) -> dict[str, Row]:
 
 
 def test_simulators(joints: int) -> dict[str, list[SimulatorChange]]:
-    """Return the simulators of the test. Those beyond have a stiffness outside the range of training."""
+    """Return the simulators of the test. Those beyond have a stiffness outside the range of
+    training.
+    """
     ranges = SimulatorRanges()
     within = ranges.draw(joints, WITHIN, TEST_SEED)
     softer = replace(ranges, kp=(0.3 * ranges.kp[0], 0.8 * ranges.kp[0]))
@@ -249,7 +253,9 @@ def all_methods(arguments: argparse.Namespace, robot: RobotSpec) -> dict[str, li
 def literal_refits(
     arguments: argparse.Namespace, robot: RobotSpec, models: list[GapModel]
 ) -> list[PredictorRefit]:
-    """Return the literal networks with the pieces of recordings at which their predictor is fitted again."""
+    """Return the literal networks with the pieces of recordings at which their predictor is fitted
+    again.
+    """
     dataset, _ = open_dataset(arguments.trained_on or arguments.dataset)
     motions = models[0].card["motions"]["train"]
     entries = [e for e in dataset.entries if e.meta.motion in motions]
@@ -262,7 +268,8 @@ def literal_refits(
 
 
 class PredictorRefit:
-    """The literal network with its sensor predictor fitted again to stepped probes; all else is frozen.
+    """The literal network with its sensor predictor fitted again to stepped probes; all else is
+    frozen.
 
     Attributes:
         model: The trained network.
@@ -280,7 +287,9 @@ class PredictorRefit:
         self.fitted_in_many: Network | None = None
 
     def in_many(self, placed: list[Sequence]) -> float:
-        """Return the error with a predictor of all simulators of training, which it is not told apart, rad."""
+        """Return the error with a predictor of all simulators of training, which it is not told
+        apart, rad.
+        """
         if self.fitted_in_many is None:
             joints = len(self.robot.joint_names)
             drawn = SimulatorRanges().draw(joints, self.simulators, TEST_SEED + 4)

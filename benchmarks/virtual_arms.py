@@ -1,4 +1,6 @@
-"""Arms of benchmarks that identify VIRTUAL robots: their folders, and what they answer to commands."""
+"""Arms of benchmarks that identify VIRTUAL robots: their folders, and what they answer to
+commands.
+"""
 
 from __future__ import annotations
 

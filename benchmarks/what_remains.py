@@ -2,8 +2,9 @@
 
     python benchmarks/what_remains.py DATASET ROBOT
 
-Rows of the test motions. "At the table": the command would bring a tip below the table of robot.toml. "At rest": the
-joint's recorded speed is below 0.02 rad/s over 0.2 s. docs/results.md has the real SO-101's.
+Rows of the test motions. "At the table": the command would bring a tip below the table of
+robot.toml. "At rest": the joint's recorded speed is below 0.02 rad/s over 0.2 s. docs/results.md
+has the real SO-101's.
 """
 
 from __future__ import annotations
@@ -23,7 +24,9 @@ REST_SPEED, REST_SPAN_S = 0.02, 0.2
 
 
 def main(dataset: str, folder: str) -> None:
-    """Print the mean |error| of each kind of row, mrad, and what one removes from the mean over motions."""
+    """Print the mean |error| of each kind of row, mrad, and what one removes from the mean over
+    motions.
+    """
     data, robot = Dataset(dataset), load_robot(folder)
     heights, op = tips_of(robot), robot.operated_index
     kinds = ["at the table", "at rest, free", "moving, free"]

@@ -1,11 +1,12 @@
-"""Logs that pass in silence where nobody looks: seven faults, put into recordings of drawn VIRTUAL robots.
+"""Logs that pass in silence where nobody looks: seven faults in recordings of VIRTUAL robots.
 
     python benchmarks/wrong_records.py WORK --mutations 200 --seed 0
 
-Robot, rate, clock, digits, names of columns and units are drawn for each mutation. Each log is imported and examined as
-a user would do it. Counted are, by fault: "named", the import or the doctor names it; "stopped", another error or
-refusal; "untold", the doctor says that gravity and inertia do not tell it; "silent", none of these. Good logs of the
-same draws count as "false" where an error is found in them. The exit code is 1 where one is silent or false.
+Robot, rate, clock, digits, names of columns and units are drawn for each mutation. Each log is
+imported and examined as a user would do it. Counted are, by fault: "named", the import or the
+doctor names it; "stopped", another error or refusal; "untold", the doctor says that gravity and
+inertia do not tell it; "silent", none of these. Good logs of the same draws count as "false" where
+an error is found in them. The exit code is 1 where one is silent or false.
 """
 
 from __future__ import annotations
@@ -40,7 +41,9 @@ Columns = dict[str, np.ndarray]
 
 @dataclass
 class Truth:
-    """A drawn robot and what it did: times (k,), commands, positions, velocities and torques (k, n), SI."""
+    """A drawn robot and what it did: times (k,), commands, positions, velocities and torques (k,
+    n), SI.
+    """
 
     robot: RobotSpec
     motions: list[tuple[np.ndarray, ...]]
@@ -48,7 +51,9 @@ class Truth:
 
 @dataclass
 class Record:
-    """One log before it is written: clock (k,) s, and arrays (k, n) in SI; extra columns and words for logs.toml."""
+    """One log before it is written: clock (k,) s, and arrays (k, n) in SI; extra columns and words
+    for logs.toml.
+    """
 
     time: np.ndarray
     ctrl: np.ndarray
@@ -87,7 +92,9 @@ def draw_robot(folder: Path, rng: np.random.Generator) -> RobotSpec:
 
 
 def play(robot: RobotSpec, rng: np.random.Generator) -> tuple[np.ndarray, ...]:
-    """Simulate a motion with a delay of the commands: times, commands, positions, velocities, torques."""
+    """Simulate a motion with a delay of the commands: times, commands, positions, velocities,
+    torques.
+    """
     rows, n = round(SECONDS / STEP_S), len(robot.joint_names)
     time = STEP_S * np.arange(rows)
     ctrl = np.zeros((rows, n))

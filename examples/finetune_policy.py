@@ -1,15 +1,17 @@
-"""Fine-tune a policy in the aligned simulator, then test it on an unseen robot: ASAP's use of a gap model.
+"""Fine-tune a policy in the aligned simulator, then test it on an unseen robot: ASAP's use of a gap
+model.
 
-    pip install "rsl-rl-lib>=5.4.2,<6"
-    python examples/finetune_policy.py RUN        # RUN: gaponet train (or demo) on virtual H1-2 units 1 to 3
+    pip install "rsl-rl-lib>=5.4.2,<6" python examples/finetune_policy.py RUN        # RUN: gaponet
+    train (or demo) on virtual H1-2 units 1 to 3
 
-PPO trains a small network in the nominal simulator to follow arm motions with 0 to 3 kg in each hand. Training then
-continues in the aligned simulator and, for comparison, equally long in the nominal one. All three policies are tested
-on VIRTUAL unit 4 with other motions. Neither the gap model nor a policy was trained on that unit.
+PPO trains a small network in the nominal simulator to follow arm motions with 0 to 3 kg in each
+hand. Training then continues in the aligned simulator and, for comparison, equally long in the
+nominal one. All three policies are tested on VIRTUAL unit 4 with other motions. Neither the gap
+model nor a policy was trained on that unit.
 
-The policy observes the measured state, the reference up to 0.2 s ahead, the payload, its last action, and the torque of
-the reference by nominal inverse dynamics, divided by kp. Its output is added to the reference. On the robot, the policy
-runs without the gap model.
+The policy observes the measured state, the reference up to 0.2 s ahead, the payload, its last
+action, and the torque of the reference by nominal inverse dynamics, divided by kp. Its output is
+added to the reference. On the robot, the policy runs without the gap model.
 """
 
 from __future__ import annotations
@@ -131,7 +133,9 @@ class Task:
         return np.concatenate(parts, axis=1).astype(np.float32)
 
     def target(self, row: Array, last: Array, action: Array) -> Array:
-        """Return the target, (N, free) rad: the next row of the reference plus the action on operated joints."""
+        """Return the target, (N, free) rad: the next row of the reference plus the action on
+        operated joints.
+        """
         out = self.reference[np.minimum(row + 1, last)]
         out[:, self.op] += np.clip(REACH * action, -LIMIT, LIMIT)
         return out
@@ -172,7 +176,9 @@ class TrackingEnv(VecEnv):
     def step(
         self, actions: torch.Tensor
     ) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict[str, Any]]:
-        """Step; the reward is minus the mean error in units of 20 mrad, minus a penalty for changes of the action."""
+        """Step; the reward is minus the mean error in units of 20 mrad, minus a penalty for changes
+        of the action.
+        """
         action = actions.numpy().astype(float)
         self.sim.step(self.task.target(self.row, self.last, action))
         self.row += 1
@@ -190,7 +196,9 @@ class TrackingEnv(VecEnv):
 
 
 class Unit:
-    """Copies of a virtual unit, one per payload and motion, with the methods of AlignedSim and sensor readings only."""
+    """Copies of a virtual unit, one per payload and motion, with the methods of AlignedSim and
+    sensor readings only.
+    """
 
     def __init__(
         self,
@@ -261,7 +269,9 @@ def train(name: str, runner: OnPolicyRunner, env: TrackingEnv, updates: int) -> 
 
 
 def measured(plant: Any) -> tuple[Array, Array]:
-    """Return the measured positions and velocities of a simulation or unit, (N, free) rad and rad/s."""
+    """Return the measured positions and velocities of a simulation or unit, (N, free) rad and
+    rad/s.
+    """
     return plant.qpos, plant.qvel
 
 
@@ -271,10 +281,12 @@ def follow(
     policy: OnPolicyRunner | None,
     observe: Callable[[Any], tuple[Array, Array]] = measured,
 ) -> Array:
-    """Return the mean |q − reference| of every simulation or unit, (N,) rad; each plays one motion to its end.
+    """Return the mean |q − reference| of every simulation or unit, (N,) rad; each plays one motion
+    to its end.
 
     Args:
-        observe: Returns the positions and velocities of `plant` that the policy sees, (N, free) rad and rad/s.
+        observe: Returns the positions and velocities of `plant` that the policy sees, (N, free) rad
+            and rad/s.
     """
     count = len(plant.payload_mass)
     motion = np.arange(count) % len(task.first)
@@ -314,7 +326,8 @@ def main(
     unit: str = "virtual-4",
     quick: bool = False,
 ) -> None:
-    """Train, fine-tune and test on the unseen unit; print the mean |error| to the reference in mrad.
+    """Train, fine-tune and test on the unseen unit; print the mean |error| to the reference in
+    mrad.
 
     Args:
         run: Folder of gaponet train, H1-2.
@@ -383,7 +396,9 @@ def main(
 
 
 def table(results: dict[str, list[Array]], plants: list[str], heaviest: float) -> str:
-    """Return a Markdown table: mean over seeds (± standard deviation), without and with the largest payload."""
+    """Return a Markdown table: mean over seeds (± standard deviation), without and with the largest
+    payload.
+    """
     columns = [f"{plant}, {p:g} kg" for plant in plants for p in (0, heaviest)]
     lines = [f"| mean abs error, mrad; units are VIRTUAL | {' | '.join(columns)} |"]
     lines.append("| --- |" + " ---: |" * len(columns))

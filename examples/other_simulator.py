@@ -1,9 +1,10 @@
-"""Correct a simulator that no training has seen: an SO-101 with stiffer servos and three times the friction.
+"""Correct a simulator that no training has seen: an SO-101 with stiffer servos and three times the
+friction.
 
     python examples/other_simulator.py DATASET        recordings of an SO-101, in gaponet's form
 
-It prints the error of this simulator on motions that no training has seen: uncorrected, with the network that is told
-the simulator's answers to fixed probes, and with the exact transfer.
+It prints the error of this simulator on motions that no training has seen: uncorrected, with the
+network that is told the simulator's answers to fixed probes, and with the exact transfer.
 """
 
 import sys

@@ -1,17 +1,19 @@
-"""Transfer of a policy trained in the nominal simulator, the identified one, and the identified one with drawn units.
+"""Transfer of a policy trained in the nominal simulator, the identified one, and the identified one
+with drawn units.
 
     pip install "rsl-rl-lib>=5.4.2,<6"
     python examples/policy_transfer.py WORK        # a VIRTUAL SO-101; minutes on two cores
 
-A VIRTUAL robot plays excitation, and `gaponet identify` writes a robot folder from the recordings. PPO trains a small
-network to follow motions in three simulators: the nominal one, the identified one, and sixteen of the units that
-`gaponet export --to randomization` draws from its uncertainty and chooses. All policies are tested on the VIRTUAL
-robot with other motions. Finally, `gaponet replay` predicts the robot's motion under the targets of the nominal
-policy's own rollout.
+A VIRTUAL robot plays excitation, and `gaponet identify` writes a robot folder from the recordings.
+PPO trains a small network to follow motions in three simulators: the nominal one, the identified
+one, and sixteen of the units that `gaponet export --to randomization` draws from its uncertainty
+and chooses. All policies are tested on the VIRTUAL robot with other motions. Finally, `gaponet
+replay` predicts the robot's motion under the targets of the nominal policy's own rollout.
 
-The nominal policies are also played with `gp.Compensator(identified, follow="nominal")`, under which the robot moves as
-the nominal simulator does, so that nothing is trained again. This is tried where it should be difficult, too: with the
-identified robot of another unit, with commands that are later by 40 ms, and with motors that are too weak.
+The nominal policies are also played with `gp.Compensator(identified, follow="nominal")`, under
+which the robot moves as the nominal simulator does, so that nothing is trained again. This is tried
+where it should be difficult, too: with the identified robot of another unit, with commands that are
+later by 40 ms, and with motors that are too weak.
 """
 
 from __future__ import annotations
@@ -186,7 +188,9 @@ def drawn(known: Path, work: Path) -> list[RobotSpec]:
 
 
 def rollout(task: Task, robot: RobotSpec, policy: Any, file: Path) -> Array:
-    """Simulate the first motion with the policy and write it as a log; returns its targets, (T, free) rad."""
+    """Simulate the first motion with the policy and write it as a log; returns its targets, (T,
+    free) rad.
+    """
     sim = AlignedSim(robot, num_envs=1, options=AlignedSimOptions(locked=task.locked))
     actor = policy.get_inference_policy()
     row, last, action = task.first[:1].copy(), task.last[:1], np.zeros((1, task.n))
@@ -215,7 +219,9 @@ def rollout(task: Task, robot: RobotSpec, policy: Any, file: Path) -> Array:
 
 
 def forecast(work: Path, known: Path, task: Task, plant: Unit, targets: Array) -> str:
-    """Compare the prediction of gaponet replay for WORK/rollout with the VIRTUAL robot under the same targets."""
+    """Compare the prediction of gaponet replay for WORK/rollout with the VIRTUAL robot under the
+    same targets.
+    """
     answer = work / "answer.npz"
     asked = ["replay", str(work / "rollout"), "--robot", str(known), "--out", str(answer), "--json"]
     with contextlib.redirect_stdout(out := io.StringIO()):
@@ -250,7 +256,8 @@ def main(
     seeds: tuple[int, ...] = (0, 1, 2),
     quick: bool = False,
 ) -> None:
-    """Record, identify, train and test on the VIRTUAL robot; print the mean |error| to the reference in mrad.
+    """Record, identify, train and test on the VIRTUAL robot; print the mean |error| to the
+    reference in mrad.
 
     Args:
         work: Output folder.
@@ -351,7 +358,9 @@ def trial_table(errors: dict[str, dict[str, list[Array]]]) -> str:
 
 
 def table(errors: dict[str, list[Array]]) -> str:
-    """Return a Markdown table: mean over motions, ± over seeds, and the paired difference to the nominal policy."""
+    """Return a Markdown table: mean over motions, ± over seeds, and the paired difference to the
+    nominal policy.
+    """
     head = "| trained in | in its own simulator, mrad | on the VIRTUAL robot, mrad | to nominal, paired over motions |"
     lines = [head, "| --- | ---: | ---: | ---: |"]
     for name, runs in errors.items():

@@ -1,1 +1,1 @@
-"""Benchmark on public recordings of real robots: data cards, fixed splits, and one table over all of them."""
+"""Benchmark on public recordings of real robots: data cards, fixed splits, and one table."""

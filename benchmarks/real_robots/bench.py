@@ -43,7 +43,8 @@ class Bench:
             names: Questions; default all.
 
         Returns:
-            rows (evaluate), cards, labels (set → sentences), left_out (folder → reason), seconds (set →).
+            rows (evaluate), cards, labels (set → sentences), left_out (folder → reason), seconds
+            (set →).
 
         Raises:
             UsageError: No such data set or question.
@@ -90,13 +91,15 @@ class Bench:
                 "seconds": {k: round(v) for k, v in seconds.items()}}  # fmt: skip
 
     def evaluate(self, card: Card, name: str, folds: list[Question]) -> list[Row]:
-        """Evaluate every method on every fold of a question; methods without the data that they need are skipped.
+        """Evaluate every method on every fold of a question; methods without the data that they
+        need are skipped.
 
         Returns:
-            A row per method for JSON: mrad, standard errors over motions, of differences paired; by_motion_mrad,
-            independent motion → error; floor_mrad, the mean difference of repetitions; splits, a hash per fold; and
-            by_joint_mrad, joint → payload, kg → (mean error over motions; number of recordings), of data sets in
-            which joints were recorded one at a time.
+            A row per method for JSON: mrad, standard errors over motions, of differences paired;
+            by_motion_mrad, independent motion → error; floor_mrad, the mean difference of
+            repetitions; splits, a hash per fold; and by_joint_mrad, joint → payload, kg → (mean
+            error over motions; number of recordings), of data sets in which joints were recorded
+            one at a time.
         """
         rows: list[Row] = []
         floors = [f for q in folds if (f := repeatability(q)) == f]
@@ -134,7 +137,9 @@ class Bench:
         return (self.data / card.folder).exists()
 
     def _elsewhere(self, card: Card) -> Callable[[], RobotSpec] | None:
-        """Return a function that identifies the robot on the other data set of a card; None if that is not present."""
+        """Return a function that identifies the robot on the other data set of a card; None if that
+        is not present.
+        """
         other = next(
             (c for c in self.cards.set if c.name == card.elsewhere and self._is_present(c)), None
         )
@@ -153,7 +158,9 @@ class Bench:
     def _evaluate_fold(
         self, card: Card, question: Question, method: str, fit: Method
     ) -> dict[str, Any]:
-        """Fit and evaluate, or read the stored evaluation: errors of the test recordings, rad; seconds; note."""
+        """Fit and evaluate, or read the stored evaluation: errors of the test recordings, rad;
+        seconds; note.
+        """
         words = (card.name, question.name, question.split_hash, method)
         file = self.work / "answers" / (re.sub(r"[^A-Za-z0-9]+", "-", " ".join(words)) + ".json")
         if file.is_file():

@@ -105,7 +105,9 @@ def data_folder(given: Path | None) -> Path:
 
 
 def prepare(card: Card, data: Path, work: Path) -> tuple[Dataset, RobotSpec, Labels | None]:
-    """Import a card's recordings below `work` once. Return dataset, robot, and the estimated labels if any."""
+    """Import a card's recordings below `work` once. Return dataset, robot, and the estimated labels
+    if any.
+    """
     own = ROBOTS / card.robot
     robot, place, labels = load_robot(own if own.is_dir() else card.robot), work / card.name, None
     options: dict[str, Any] = {

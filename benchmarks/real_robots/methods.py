@@ -1,4 +1,7 @@
-"""Methods of the benchmark: functions from a question to a fitted simulator (docs/benchmark.md adds one)."""
+"""Methods of the benchmark: functions from a question to a fitted simulator.
+
+docs/benchmark.md adds one.
+"""
 
 from __future__ import annotations
 
@@ -104,7 +107,9 @@ def identified(question: Question) -> FittedSim:
 
 
 def adapted(question: Question) -> FittedSim:
-    """The robot identified on other data, adapted on a few recordings of the test's unit or session."""
+    """The robot identified on other data, adapted on a few recordings of the test's unit or
+    session.
+    """
     if not question.few:
         raise UsageError(f"{question.name}: has no recordings for adaptation")
     start, few = (
@@ -155,7 +160,9 @@ ONE_ROUND = PretrainingConfig(rounds=1, num_envs=256, gradient_steps=200, sensor
 
 
 def network_methods(steps: int) -> dict[str, tuple[str, Method]]:
-    """Return methods that train a network for this number of control steps: name → title and method."""
+    """Return methods that train a network for this number of control steps: name → title and
+    method.
+    """
     return {
         f"{base}{TITLES[kind]} {steps}": (base + TITLES[kind], partial(_train, base=base, kind=kind, steps=steps))
         for base in BASES for kind in TITLES if kind != "trees" or find_spec("sklearn")
@@ -163,7 +170,9 @@ def network_methods(steps: int) -> dict[str, tuple[str, Method]]:
 
 
 def _recipe(steps: int) -> TrainConfig:
-    """Return the training settings for a number of control steps; a short training labels no more rows than that."""
+    """Return the training settings for a number of control steps; a short training labels no more
+    rows than that.
+    """
     warm = PretrainingConfig()
     if steps < FULL_RECIPE_STEPS:
         warm = replace(ONE_ROUND, steps=max(steps // ONE_ROUND.num_envs, 1), rows=steps)
@@ -171,7 +180,9 @@ def _recipe(steps: int) -> TrainConfig:
 
 
 def _train(question: Question, base: str, kind: str, steps: int) -> FittedSim:
-    """Train a network on top of a simulator; leave it out if validation shows no gain over identification."""
+    """Train a network on top of a simulator; leave it out if validation shows no gain over
+    identification.
+    """
     from gaponet.nn.training.trainer import Trainer  # loads torch
 
     if question.work is None:

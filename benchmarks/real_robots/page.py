@@ -56,7 +56,9 @@ def result_table(rows: list[dict[str, Any]]) -> ResultTable:
 
 
 def _more_than(fitted: dict[str, Any] | None, row: dict[str, Any]) -> str:
-    """Return how much larger a row's error is than that of identification, ± over motions; "" if it is no rival."""
+    """Return how much larger a row's error is than that of identification, ± over motions; "" if it
+    is no rival.
+    """
     if fitted in (None, row) or not (fitted.keys() & row.keys() >= {"by_motion_mrad"}):
         return ""
     more = np.array(
@@ -89,7 +91,9 @@ def write_page(result: dict[str, Any], out: Path) -> list[Path]:
 
 @styled
 def draw(rows: list[dict[str, Any]], titles: dict[str, str]) -> Figure:
-    """Draw each method's share of the nominal error, a line for each question; shaded: repeatability of the robot."""
+    """Draw each method's share of the nominal error, a line for each question; shaded:
+    repeatability of the robot.
+    """
     keys = list(dict.fromkeys((r["set"], r["question"]) for r in rows))
     fig = figure(7.2, 0.5 * len(keys) + 1.5)
     ax = fig.subplots()

@@ -1,4 +1,4 @@
-"""Questions of the benchmark: recordings of a robot to fit, and other recordings of it to be evaluated on."""
+"""Questions of the benchmark: recordings of a robot to fit, and others to be evaluated on."""
 
 from __future__ import annotations
 
@@ -21,7 +21,8 @@ from gaponet.robot.spec import RobotSpec
 
 FOLDS = 3
 FEW_RECORDINGS = 6  # per joint, of a unit that is new, for adaptation
-# rad: mean difference of the commands of two repetitions, one of which may begin a part of a period later.
+# rad: mean difference of the commands of two repetitions, one of which may begin a part of a period
+# later.
 MAX_COMMAND_DIFFERENCE = 0.02
 VALIDATION_STRIDE = 8  # one in so many pairs of motion and payload validates, where motions are few
 T = TypeVar("T")
@@ -146,7 +147,8 @@ def _joint(entry: Entry) -> str:
 def train_val(question: Question) -> tuple[list[Sequence], list[Sequence]]:
     """Return training and validation recordings.
 
-    Where joints were recorded one at a time, one command of each joint with several commands validates.
+    Where joints were recorded one at a time, one command of each joint with several commands
+    validates.
     """
     fitted, val = question.fitted, set()
     if len({s.meta.unrecorded for s in fitted}) == 1:
@@ -160,7 +162,9 @@ def train_val(question: Question) -> tuple[list[Sequence], list[Sequence]]:
 
 
 def repeatability(question: Question) -> float:
-    """Mean |difference| between the errors of two recordings of one command, unit and payload, rad; NaN without any."""
+    """Mean |difference| between the errors of two recordings of one command, unit and payload, rad;
+    NaN without any.
+    """
     groups: dict[tuple[object, ...], list[Sequence]] = {}
     for s, motion in zip(question.test, question.test_motions, strict=True):
         groups.setdefault(
@@ -173,7 +177,9 @@ def repeatability(question: Question) -> float:
 
 
 def _differences(group: list[Sequence], robot: RobotSpec) -> Iterator[tuple[float, float]]:
-    """Yield the mean differences of the commands and of the responses of each pair of recordings, rad."""
+    """Yield the mean differences of the commands and of the responses of each pair of recordings,
+    rad.
+    """
     for first, second in itertools.combinations(group, 2):
         rows = min(len(first), len(second))
         command = first.ctrl[:rows] - second.ctrl[:rows]
