@@ -55,7 +55,11 @@ def fingerprint(ctrl: Array, dt: float) -> CommandFingerprint:
     ) >> np.uint64(32)
     distinct = hashes[hashes != hashes[0]]
     changed = np.flatnonzero((steps[1:] != steps[:-1]).any(axis=1))
-    first, last = (int(changed[0]), int(changed[-1]) + 1) if len(changed) else (0, len(ctrl) - 1)
+    first = 0
+    last = len(ctrl) - 1
+    if len(changed):
+        first = int(changed[0])
+        last = int(changed[-1]) + 1
     projection = np.asarray(ctrl, float) @ rng.normal(size=ctrl.shape[1])
     outline = np.interp(np.linspace(first, last, OUTLINE_POINTS), np.arange(len(ctrl)), projection)
     return {

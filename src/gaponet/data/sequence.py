@@ -175,11 +175,9 @@ class Sequence:
     @property
     def temperatures(self) -> tuple[float, ...] | None:
         """Mean temperature of each joint, (n) °C; None if it was not recorded."""
-        return (
-            None
-            if self.temperature is None
-            else tuple(self.temperature.mean(axis=0, dtype=float).round(1).tolist())
-        )
+        if self.temperature is None:
+            return None
+        return tuple(self.temperature.mean(axis=0, dtype=float).round(1).tolist())
 
     @property
     def copied(self) -> dict[str, int]:

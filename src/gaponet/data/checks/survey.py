@@ -399,12 +399,13 @@ def _zero_rows(sequence: Sequence, notes: dict[str, Any], robot: RobotSpec) -> i
     for values, min_edges in ((sequence.qpos[:, logged], 1), (sequence.ctrl[:, logged], 2)):
         far = np.abs(np.diff(values, axis=0)).max(axis=1) > ZERO_JUMP_RAD  # (T − 1,)
         for run in _runs((values == 0).all(axis=1)):
-            edges = [
-                *far[run.start - 1 : run.start if run.start else 0],
-                *far[run.stop - 1 : run.stop],
-            ]
+            edges = 0  # ends of the run at which a joint jumps
+            if run.start > 0:
+                edges += int(far[run.start - 1])
+            if run.stop < len(values):
+                edges += int(far[run.stop - 1])
             # A command may step away from zero; it does not step there and back within a few rows.
-            if sum(edges) >= min_edges and (min_edges == 1 or run.stop - run.start <= 5):
+            if edges >= min_edges and (min_edges == 1 or run.stop - run.start <= 5):
                 count += run.stop - run.start
     return count
 
