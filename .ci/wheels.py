@@ -29,16 +29,56 @@ env = TrackingEnv(gp.AlignedSim(gp.load_robot("so101"), gp.GapModel.load("run"))
 env.reset(seed=0)
 print("reward", env.step(env.action_space.sample())[1])
 """
-TRIES = {
-    "": ["--version", "import --formats", "robot check so101",
-         "collect --robot so101 --recipe recipe.toml --out data --nproc 1", "doctor data", "gap data"],
-    "train": [f"train data --out run --budget 1920 {SMALL}", "export run --to torch"],
-    "deploy": ["eval run data", "report run"],
+BAG = """
+from pathlib import Path
+import numpy as np
+from rosbags.rosbag2 import Writer
+from rosbags.typesys import Stores, get_typestore
+from gaponet.robot.spec import load_robot
+
+robot = load_robot("so101")
+types = get_typestore(Stores.ROS2_JAZZY)
+JointState, Header, Time = (
+    types.types[name] for name in ("sensor_msgs/msg/JointState", "std_msgs/msg/Header", "builtin_interfaces/msg/Time")
+)
+names, none = list(robot.joint_names), np.zeros(0)
+with Writer(Path("bags/wave"), version=9) as bag:
+    topics = {}
+    for topic in ("/joint_states", "/joint_commands"):
+        topics[topic] = bag.add_connection(topic, JointState.__msgtype__, typestore=types)
+    for row in range(200):
+        stamp = int(2e7 * row)
+        angle = robot.qpos_home + 0.1 * np.sin(0.05 * row)
+        for late, connection in enumerate(topics.values()):
+            time = Time(sec=stamp // 10**9, nanosec=stamp % 10**9)
+            position = angle - 0.01 * (1 - late)
+            message = JointState(Header(time, ""), names, position, none, none)
+            bag.write(connection, stamp, types.serialize_cdr(message, JointState.__msgtype__))
+"""
+TRIES: dict[str, list[str]] = {
+    "": [
+        "gaponet --version",
+        "gaponet import --formats",
+        "gaponet robot check so101",
+        "gaponet collect --robot so101 --recipe recipe.toml --out data --nproc 1",
+        "gaponet doctor data",
+        "gaponet gap data",
+    ],
+    "train": [
+        f"gaponet train data --out run --budget 1920 {SMALL}",
+        "gaponet export run --to torch",
+    ],
+    "deploy": ["gaponet eval run data", "gaponet report run"],
     "deploy,gym": [GYM],
-    "ros": ["data export data --to mcap --out bags", "import bags --robot so101 --out again"],
-    "hdf5": ["import --formats"],
-    "deploy,film": ["view data --model run --duration 1 --render film.gif"],
-}  # fmt: skip
+    "ros": [
+        BAG,
+        "gaponet import bags --robot so101 --unit-id a --payload-mass 0 --out again",
+    ],
+    "hdf5": ["gaponet import --formats"],
+    "so101": ["gaponet virtual serve --robot so101 --seconds 1"],
+    "dds": ["gaponet virtual serve --robot h1_2 --seconds 1"],
+    "deploy,film": ["gaponet view data --model run --duration 1 --render film.gif"],
+}
 
 
 def run(*words: object, folder: Path) -> None:
@@ -46,6 +86,14 @@ def run(*words: object, folder: Path) -> None:
     print("$", *words, flush=True)
     environment = {k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "VIRTUAL_ENV")}
     subprocess.run([str(w) for w in words], cwd=folder, env=environment, check=True)
+
+
+def words_of(command: str, bin: Path) -> list[object]:
+    """Return the words of a command of gaponet, or of a script for Python."""
+    if not command.startswith("gaponet "):
+        return [bin / "python", "-c", command]
+    program, *words = command.split()
+    return [bin / program, *words]
 
 
 def main(wanted: list[str]) -> None:
@@ -65,12 +113,7 @@ def main(wanted: list[str]) -> None:
             what = f"gaponet[{extra}] @ {wheel.as_uri()}"
             run("uv", "pip", "install", "--quiet", "--python", place, what, folder=folder)
             for command in commands:
-                words = (
-                    [bin / "python", "-c", command]
-                    if command is GYM
-                    else [bin / "gaponet", *command.split()]
-                )
-                run(*words, folder=folder)
+                run(*words_of(command, bin), folder=folder)
             shutil.rmtree(place)
     print(f"{wheel.name}: {len(TRIES)} clean environments")
 

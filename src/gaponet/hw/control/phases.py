@@ -123,7 +123,8 @@ class ControlConfig:
     settle: float = 0.5
     """Standing still at the first target before the run, s."""
     blend_out: bool = True
-    """Go back to where the robot was at the start; a fault never waits for this."""
+    """Whether the robot goes back, after the run, to where it was at the start. With
+    --no-blend-out it ends where the run ends. A fault never waits for the way back."""
     damp: float = 2.0
     """Damping after a fault, or handing the arms back after a run, before the robot is let go,
     s."""
