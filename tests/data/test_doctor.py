@@ -222,13 +222,16 @@ def test_a_clock_that_drifts_is_late_by_half_in_the_middle_and_motions_that_diff
     middle, told
 ):
     """A trajectory generator follows quick parts of a motion later than slow ones, from one part to the next."""
-    surveys = [SimpleNamespace(response=SimpleNamespace(duration=12.0))] * 6
+
+    def surveys(duration):
+        tracking = SimpleNamespace(response=SimpleNamespace(duration=duration))
+        return [SimpleNamespace(tracking=tracking)] * 6
+
     end = 0.02 * np.array([0.7, 0.9, 1.0, 1.0, 1.1, 1.3])
     way = middle * np.array([1, -1, 1, -1, 1, -1]) if middle > 1 else middle
     shifts = np.stack([0 * end, way * end, end], axis=1)
-    assert [f.check for f in clock_drift(surveys, shifts)] == ["clock"] * told
-    short = [SimpleNamespace(response=SimpleNamespace(duration=5.0))] * 6
-    assert not list(clock_drift(short, shifts))
+    assert [f.check for f in clock_drift(surveys(12.0), shifts)] == ["clock"] * told
+    assert not list(clock_drift(surveys(5.0), shifts))
 
 
 @pytest.mark.parametrize(("ahead", "said"), [(0, False), (6, True)])

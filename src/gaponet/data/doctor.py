@@ -149,9 +149,9 @@ def _sequence_row(survey: Survey, robot: RobotSpec) -> dict[str, Any]:
         "repetition": meta.repetition,
         "rows": survey.entry.rows,
         "seconds": round(survey.entry.rows * survey.entry.dt, 2),
-        "rate_hz": round(survey.rate_hz, 2),
-        "jitter_ms": survey.jitter_ms,
-        "longest_gap_ms": survey.longest_gap_ms,
+        "rate_hz": round(survey.timing.rate_hz, 2),
+        "jitter_ms": survey.timing.jitter_ms,
+        "longest_gap_ms": survey.timing.longest_gap_ms,
         "rows_are": meta.notes.get("rows", ""),
         "fast_lag_s": lags,
     }

@@ -69,10 +69,11 @@ class _Motion:
         parts: list[Array] = []
         payloads: list[Payload] = []
         for survey in surveys:
-            if survey.movement is not None:
-                parts.append(survey.movement)
+            movement = survey.samples.movement
+            if movement is not None:
+                parts.append(movement)
                 payload = (survey.entry.meta.payload_mass, survey.entry.meta.payload_side)
-                payloads += [payload] * survey.movement.shape[1]
+                payloads += [payload] * movement.shape[1]
         rows = np.concatenate(parts, axis=1).astype(float)
         step = -(-rows.shape[1] // MAX_ROWS)
         self.qpos, self.qvel, self.qacc, torque, error, *target = rows[:, ::step]
@@ -138,10 +139,8 @@ class _Motion:
 def arrangement(surveys: list[Survey], robot: RobotSpec, model: Dynamics) -> Iterator[Finding]:
     """Would the joints fit the model better under other names?"""
     by_range = _by_range(surveys, robot)
-    if (
-        sum(survey.movement.shape[1] for survey in surveys if survey.movement is not None)
-        < MIN_ROWS
-    ):
+    movements = [survey.samples.movement for survey in surveys]
+    if sum(rows.shape[1] for rows in movements if rows is not None) < MIN_ROWS:
         yield from by_range
         return
     motion = _Motion(surveys, robot, model)

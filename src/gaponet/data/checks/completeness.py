@@ -46,7 +46,7 @@ def _rate(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     for survey in surveys:
         rates[_same_rate(survey, rates)] += 1
     text = ", ".join(f"{count} at {r:.2f} Hz ({1e3 / r:.2f} ms)" for r, count in rates.items())
-    deviation = max(abs(survey.rate_hz * robot.dt - 1) for survey in surveys)
+    deviation = max(abs(survey.timing.rate_hz * robot.dt - 1) for survey in surveys)
     level = "ok"
     if len(rates) > 1:
         level = "warning"
@@ -64,12 +64,12 @@ def _rate(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
 def _same_rate(survey: Survey, rates: Iterable[float]) -> float:
     """Return the rate, Hz, out of these, at which a sequence was recorded too; else its own."""
     # of a period; a median of such periods scatters
-    uneven = survey.uneven_ms * survey.rate_hz / 1e3
+    uneven = survey.timing.uneven_ms * survey.timing.rate_hz / 1e3
     near = 0.01 + 0.1 * uneven
     for rate in rates:
-        if abs(rate - survey.rate_hz) < near * rate:
+        if abs(rate - survey.timing.rate_hz) < near * rate:
             return rate
-    return survey.rate_hz
+    return survey.timing.rate_hz
 
 
 def _is_resampled(survey: Survey) -> bool:
@@ -78,51 +78,54 @@ def _is_resampled(survey: Survey) -> bool:
 
 def _regularity(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     """How evenly was it sampled, and what is missing?"""
-    jitter = [survey.jitter_ms * survey.rate_hz / 1e3 for survey in surveys]  # of a period
+    timings = [survey.timing for survey in surveys]
+    jitter = [timing.jitter_ms * timing.rate_hz / 1e3 for timing in timings]  # of a period
     worst = surveys[int(np.argmax(jitter))]
     level = "warning"
     if max(jitter) <= MAX_JITTER[0]:
         level = "ok"
     elif max(jitter) <= MAX_JITTER[1]:
         level = "note"
-    where = f" ({worst.motion})" if worst.jitter_ms else ""
-    text = f"periods deviate from their median by at most {worst.jitter_ms:.2f} ms{where}"
-    unknown = 2 * max(survey.uneven_ms for survey in surveys)
+    where = f" ({worst.motion})" if worst.timing.jitter_ms else ""
+    text = f"periods deviate from their median by at most {worst.timing.jitter_ms:.2f} ms{where}"
+    unknown = 2 * max(timing.uneven_ms for timing in timings)
     if level == "warning" and unknown:
         text += (
             f". Delays shorter than {unknown:.0f} ms cannot be told between such rows; log at an "
             "even rate"
         )
-    yield Finding(level, "jitter", text, values={"jitter_ms": worst.jitter_ms})
-    longest = max(surveys, key=lambda survey: survey.longest_gap_ms)
-    gaps = [survey for survey in surveys if survey.missing_samples]
+    yield Finding(level, "jitter", text, values={"jitter_ms": worst.timing.jitter_ms})
+    longest = max(surveys, key=lambda survey: survey.timing.longest_gap_ms)
+    gaps = [survey for survey in surveys if survey.timing.missing_samples]
     if not gaps:
         yield Finding(
-            "ok", "gaps", f"no samples missing; longest period {longest.longest_gap_ms:.2f} ms"
+            "ok",
+            "gaps",
+            f"no samples missing; longest period {longest.timing.longest_gap_ms:.2f} ms",
         )
         return
     text = (
-        f"{len(gaps)} sequence(s) miss samples, at worst {longest.longest_gap_ms:.0f} ms "
+        f"{len(gaps)} sequence(s) miss samples, at worst {longest.timing.longest_gap_ms:.0f} ms "
         f"({longest.motion}): the state there is interpolated; cut the log at long gaps"
     )
-    yield Finding("warning", "gaps", text, values={"longest_gap_ms": longest.longest_gap_ms})
+    yield Finding("warning", "gaps", text, values={"longest_gap_ms": longest.timing.longest_gap_ms})
 
 
 def _jumps(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     """Is the state somewhere that no joint can reach and leave in one period?"""
     for i, name in enumerate(robot.joint_names):
-        hit = [survey for survey in surveys if survey.jump_rows[i] > survey.zero_rows]
+        hit = [s for s in surveys if s.encoders.jump_rows[i] > s.encoders.zero_rows]
         if hit:
-            rows = sum(int(survey.jump_rows[i]) for survey in hit)
+            rows = sum(int(survey.encoders.jump_rows[i]) for survey in hit)
             text = (
                 f"{name} jumps and comes back faster than any motor in {rows} rows of "
                 f"{_motions(hit)}: a misread sample or a wrap of the encoder; repair or cut these "
                 "rows"
             )
             yield Finding("warning", "jumps", text, (name,), {"rows": rows})
-    dropped = [survey for survey in surveys if survey.zero_rows]
+    dropped = [survey for survey in surveys if survey.encoders.zero_rows]
     if dropped:
-        rows = sum(survey.zero_rows for survey in dropped)
+        rows = sum(survey.encoders.zero_rows for survey in dropped)
         text = (
             f"all joints are exactly 0 for {rows} rows of {_motions(dropped)}, and far from it a "
             "row before or after: nothing was read there; repair or cut these rows"
@@ -225,25 +228,27 @@ def _turns(joint: str, hit: list[Survey]) -> Finding:
 
 def _blocked(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     """Did a joint run into a stop, or were all of them held?"""
-    held = [survey for survey in surveys if survey.standstill_s >= MIN_STANDSTILL_S]
+    held = [survey for survey in surveys if survey.standstill.all_s >= MIN_STANDSTILL_S]
     if held:
-        seconds = max(survey.standstill_s for survey in held)
+        seconds = max(survey.standstill.all_s for survey in held)
         text = (
             f"all joints stand still for up to {seconds:.1f} s while their commands move on in "
             f"{_motions(held)}: an emergency stop, brakes, or drives that were off; cut it out"
         )
         yield Finding("warning", "stop", text, (), {"seconds": seconds})
     for i, name in enumerate(robot.joint_names):
-        blocked = [survey for survey in surveys if survey.blocked_s[i] >= MIN_BLOCKED_S]
+        blocked = [survey for survey in surveys if survey.standstill.blocked_s[i] >= MIN_BLOCKED_S]
         hit = [survey for survey in blocked if survey not in held]
         if hit:
-            worst = max(hit, key=lambda survey: survey.blocked_s[i])
+            worst = max(hit, key=lambda survey: survey.standstill.blocked_s[i]).standstill
+            at_rad = float(worst.blocked_at[i])
+            seconds = float(worst.blocked_s[i])
             text = (
-                f"{name} stood at {worst.blocked_at[i]:.2f} rad for {worst.blocked_s[i]:.1f} s, "
+                f"{name} stood at {at_rad:.2f} rad for {seconds:.1f} s, "
                 f"far from its command, in {_motions(hit)}: a stop, an obstacle, too little "
                 "torque, or not read; leave it out or cut it"
             )
-            values = {"at_rad": float(worst.blocked_at[i]), "seconds": float(worst.blocked_s[i])}
+            values = {"at_rad": at_rad, "seconds": seconds}
             yield Finding(
                 "warning" if name in robot.operated else "note", "blocked", text, (name,), values
             )
@@ -322,7 +327,7 @@ def _flat_torque(recorded: list[tuple[Survey, Torque]], robot: RobotSpec) -> Ite
 
 def _resolution(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     """Are positions recorded finely enough?"""
-    step = np.max([survey.resolution for survey in surveys], axis=0)
+    step = np.max([survey.encoders.resolution for survey in surveys], axis=0)
     ratio = np.radians(step) / np.median(step[step > 0]) if step.any() else np.zeros_like(step)
     degrees = masked_names(robot, np.abs(ratio - 1) < RESOLUTION_TOLERANCE)
     if degrees and len(degrees) < (step > 0).sum() / 2:
@@ -361,8 +366,9 @@ def _stuck(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
             level = "error" if len(still) == len(moved) else "warning"
             yield Finding(level, "stuck", text, (name,))
         repeated = [survey for survey in _repeating(surveys, i) if survey not in still]
-        if repeated and not any(survey.all_repeated_s > MIN_REPEATED_S for survey in repeated):
-            seconds = max(survey.repeated_s[i] for survey in repeated)
+        whole = [s for s in repeated if s.standstill.all_repeated_s > MIN_REPEATED_S]
+        if repeated and not whole:
+            seconds = max(survey.standstill.repeated_s[i] for survey in repeated)
             text = (
                 f"{name} repeats one number for up to {seconds:.2f} s while its command moves on "
                 f"in {_motions(repeated)}: it was not read; cut these logs there"
@@ -382,20 +388,20 @@ def _repeating(surveys: list[Survey], i: int) -> list[Survey]:
 
     At a stop, an encoder with coarse steps repeats one number too: _blocked reports that.
     """
-    repeated = [survey for survey in surveys if survey.repeated_s[i] > MIN_REPEATED_S]
-    if any(survey.resolution[i] for survey in surveys):
-        repeated = [survey for survey in repeated if not survey.blocked_s[i]]
+    repeated = [survey for survey in surveys if survey.standstill.repeated_s[i] > MIN_REPEATED_S]
+    if any(survey.encoders.resolution[i] for survey in surveys):
+        repeated = [survey for survey in repeated if not survey.standstill.blocked_s[i]]
     return repeated
 
 
 def _frozen(surveys: list[Survey]) -> Iterator[Finding]:
     """Find recordings whose whole state repeats itself."""
-    repeated = [survey for survey in surveys if survey.all_repeated_s > MIN_REPEATED_S]
+    repeated = [survey for survey in surveys if survey.standstill.all_repeated_s > MIN_REPEATED_S]
     frozen = [survey for survey in repeated if not _all_blocked(survey)]
     if frozen:
+        seconds = max(survey.standstill.all_repeated_s for survey in frozen)
         text = (
-            "the whole state repeats itself for up to "
-            f"{max(survey.all_repeated_s for survey in frozen):.2f} s while the command moves in "
+            f"the whole state repeats itself for up to {seconds:.2f} s while the command moves in "
             f"{_motions(frozen)}: samples were lost; cut the logs there"
         )
         yield Finding("warning", "stuck", text)
@@ -406,8 +412,8 @@ def _all_blocked(survey: Survey) -> bool:
     repeats one number.
     """
     commanded = survey.ctrl_range > MIN_COMMANDED_RAD
-    coarse = survey.resolution[commanded] > 0
-    return bool((coarse & (survey.blocked_s[commanded] > 0)).all())
+    coarse = survey.encoders.resolution[commanded] > 0
+    return bool((coarse & (survey.standstill.blocked_s[commanded] > 0)).all())
 
 
 CHECKS = (

@@ -199,8 +199,8 @@ def _recorded_torques(surveys: list[Survey]) -> Loads:
         return {}
     samples = []
     for survey in surveys:
-        if survey.gravity_samples is not None:
-            qpos, torque = survey.gravity_samples
+        if survey.samples.gravity is not None:
+            qpos, torque = survey.samples.gravity
             samples.append((survey, qpos, torque))
     return _by_payload(samples)
 
@@ -210,7 +210,7 @@ def _servo_torques(surveys: list[Survey], robot: RobotSpec) -> Loads:
     samples = []
     for survey in surveys:
         kp = robot.with_gains(*survey.entry.meta.recorded_gains).servo.kp
-        poses = survey.static_poses
+        poses = survey.samples.static_poses
         samples.append((survey, poses.qpos, kp * (poses.ctrl - poses.qpos)))
     return _by_payload(samples)
 

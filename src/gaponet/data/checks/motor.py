@@ -38,7 +38,7 @@ def _lag(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
         return
     every = np.concatenate(list(lags.values()))
     median = float(np.median(every))
-    period = float(np.median([1 / survey.rate_hz for survey in surveys]))
+    period = float(np.median([1 / survey.timing.rate_hz for survey in surveys]))
     low = every.min()
     high = every.max()
     text = (
@@ -69,7 +69,7 @@ def _lag(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
 
 def _no_lag(surveys: list[Survey]) -> Finding:
     """Say why no lag is known."""
-    if any(np.isfinite(survey.copied_rows).any() for survey in surveys):
+    if any(np.isfinite(survey.tracking.copied_rows).any() for survey in surveys):
         return Finding("ok", "lag", "a command that repeats the state shows no lag")
     text = (
         f"nothing is commanded faster than {FAST_COMMAND_RAD_S} rad/s: lag and stiction "
@@ -89,7 +89,11 @@ def _dead_times(
     Only joints with smooth commands: of the others the timing check sees more.
     """
     sharp = dict(
-        zip(robot.operated, Response.sharp([survey.response for survey in surveys]), strict=True)
+        zip(
+            robot.operated,
+            Response.sharp([survey.tracking.response for survey in surveys]),
+            strict=True,
+        )
     )
     dead_times = {}
     for name, of_joint in lags.items():
@@ -234,7 +238,7 @@ def fast_lags(surveys: list[Survey], robot: RobotSpec) -> dict[str, Array]:
     """
     lags = {}
     for i, name in enumerate(robot.joint_names):
-        known = [float(survey.delay[i]) for survey in surveys if _shows_fast_lag(survey, i)]
+        known = [float(s.tracking.delay[i]) for s in surveys if _shows_fast_lag(s, i)]
         if known:
             lags[name] = np.array(known)
     return lags
@@ -242,9 +246,10 @@ def fast_lags(surveys: list[Survey], robot: RobotSpec) -> dict[str, Array]:
 
 def _shows_fast_lag(survey: Survey, i: int) -> bool:
     """Return True if the lag of joint i is known, and of a fast motion."""
-    if survey.speed[i] < FAST_COMMAND_RAD_S:
+    if survey.tracking.speed[i] < FAST_COMMAND_RAD_S:
         return False
-    return bool(np.isfinite(survey.delay[i]) and np.isnan(survey.copied_rows[i]))
+    tracking = survey.tracking
+    return bool(np.isfinite(tracking.delay[i]) and np.isnan(tracking.copied_rows[i]))
 
 
 def lag_values(lags: Array) -> dict[str, float]:
@@ -259,7 +264,9 @@ def lag_values(lags: Array) -> dict[str, float]:
 
 def static_errors(surveys: list[Survey], robot: RobotSpec) -> dict[str, StaticError]:
     """Return the static error of each operated joint over all static poses."""
-    poses = StaticPoses.joined([survey.static_poses for survey in surveys], len(robot.joint_names))
+    poses = StaticPoses.joined(
+        [survey.samples.static_poses for survey in surveys], len(robot.joint_names)
+    )
     errors = map(poses.static_error, robot.operated_index)
     return dict(zip(robot.operated, errors, strict=True))
 

@@ -169,7 +169,7 @@ def _collect(surveys: list[Survey], robot: RobotSpec, model: Gravity) -> _Poses:
     parts = [(np.zeros(0, int), np.zeros(0, int), np.zeros(0), np.zeros((0, 4)), np.zeros(0))]
     for number, survey in enumerate(surveys):
         meta = survey.entry.meta
-        poses = survey.static_poses
+        poses = survey.samples.static_poses
         if not len(poses):
             continue
         kp = np.where(robot.servo.kp > 0, robot.with_gains(*meta.recorded_gains).servo.kp, np.inf)
@@ -539,9 +539,9 @@ def _holds_of(surveys: list[Survey], robot: RobotSpec, model: Gravity, joint: in
     """
     parts = [np.zeros((0, 5))]
     for number, survey in enumerate(surveys):
-        if survey.holds is None:
+        if survey.samples.holds is None:
             continue
-        own = survey.holds[survey.holds[:, 0] == joint]
+        own = survey.samples.holds[survey.samples.holds[:, 0] == joint]
         if not len(own):
             continue
         meta = survey.entry.meta

@@ -88,22 +88,39 @@ class Torque(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Survey:
-    """Measurements of one sequence; n joints in robot order.
+class Timing:
+    """Times of the rows of one sequence, from the state's timestamps."""
+
+    rate_hz: float
+    jitter_ms: float  # largest deviation of a period from the median
+    uneven_ms: float  # 95th percentile of these deviations
+    longest_gap_ms: float
+
+    @classmethod
+    def of(cls, notes: dict[str, Any], dt: float) -> Timing:
+        """Take what the import noted; without notes, rows are dt (s) apart."""
+        return Timing(
+            rate_hz=float(notes.get("rate_hz", 1 / dt)),
+            jitter_ms=float(notes.get("jitter_ms", 0.0)),
+            uneven_ms=float(notes.get("uneven_ms", 0.0)),
+            longest_gap_ms=float(notes.get("longest_gap_ms", dt * 1e3)),
+        )
+
+    @property
+    def missing_samples(self) -> bool:
+        """True if a period is 2.5 times as long as usual."""
+        return self.longest_gap_ms * self.rate_hz / 1e3 > 2.5
+
+
+@dataclass(frozen=True)
+class Tracking:
+    """How the state of one sequence follows its command, n joints.
 
     follows and opposes [i, j] are the greatest correlation of commanded velocity i with measured
     velocity j, and with its negative, at lags up to MAX_LAG_S; 0 where one does not move. Periodic
     motion shows both.
     """
 
-    entry: Entry
-    samples: str  # hash of command and state alone, without unit and payload
-    rate_hz: float  # from the state's timestamps, like the three below
-    jitter_ms: float  # largest deviation of a period from the median
-    uneven_ms: float  # 95th percentile of these deviations
-    longest_gap_ms: float
-    ctrl_limits: Array  # least and greatest, (n, 2) rad
-    qpos_limits: Array
     speed: Array  # signals.fast_speed of the command, (n) rad/s
     delay: Array  # of the state behind the command, (n) s; NaN where the motion does not show it
     lead: Array  # of the state before the command, (n) s; NaN where there is none
@@ -113,34 +130,101 @@ class Survey:
     slope: Array
     # rows by which the state repeats the command (describe.row_copies), (n); NaN where it does not
     copied_rows: Array
-    jump_rows: Array  # rows with a position that no joint can reach and leave in a period, (n)
-    zero_rows: int  # rows in which every joint is exactly 0, far from the rows around
-    qvel_ratio: (
-        Array  # recorded qvel over the derivative of qpos, (n); NaN where the joint hardly moves
-    )
-    blocked_s: Array  # longest standstill far from a moving command, (n) s
-    blocked_at: Array  # its position, (n) rad
-    standstill_s: float  # longest standstill of all joints while the commands of half of them move
-    repeated_s: (
-        Array  # longest stretch in which a joint repeats one number while its command moves, (n) s
-    )
-    all_repeated_s: (
-        float  # longest stretch in which the whole state repeats itself while the command moves
-    )
-    resolution: (
-        Array  # step between positions, (n) rad; 0 where positions are continuous, or too few
-    )
-    torque: Torque | None  # None if no torque was recorded
-    static_poses: StaticPoses
     response: Response  # of the operated joints
-    spectra: Array  # log power of command and state at SPECTRUM_HZ, (2, H)
+
+    @classmethod
+    def of(cls, sequence: Sequence, robot: RobotSpec) -> Tracking:
+        """Compare command and state of one sequence."""
+        ctrl = sequence.ctrl
+        qpos = sequence.qpos
+        dt = sequence.dt
+        op = robot.operated_index
+        speed = fast_speed(ctrl, dt)
+        follows, opposes = _correlations(ctrl, qpos, dt)
+        delay = estimate_delay(ctrl, qpos, dt, MAX_LAG_S)
+        lead = estimate_delay(qpos, ctrl, dt, MAX_LAG_S)
+        return Tracking(
+            speed=speed,
+            delay=delay,
+            lead=np.where((lead > 1.5 * dt) & ~(delay > 0.5 * dt), lead, np.nan),
+            follows=follows,
+            opposes=opposes,
+            slope=_slope(ctrl, qpos, dt, np.nan_to_num(delay) / dt, speed),
+            copied_rows=_copied_rows(sequence),
+            response=Response.of(ctrl[:, op], qpos[:, op], dt),
+        )
+
+
+@dataclass(frozen=True)
+class KindOfCommand:
+    """What a command is like: a position, a velocity or a torque; n joints."""
+
     # nearest state to the command of up to MAX_LAG_S before, in standard deviations of the state,
     # (n); NaN where the joint does not move
-    command_distance: Array
+    distance: Array
     velocity_correlation: Array  # of the command with the measured velocity, (n)
     torque_correlation: Array  # of the command with the measured torque, (n)
+
+
+@dataclass(frozen=True)
+class Standstill:
+    """Joints that stand still while their commands move, n joints."""
+
+    blocked_s: Array  # longest standstill far from a moving command, (n) s
+    blocked_at: Array  # its position, (n) rad
+    all_s: float  # longest standstill of all joints while the commands of half of them move
+    # longest stretch in which a joint repeats one number while its command moves, (n) s
+    repeated_s: Array
+    # longest stretch in which the whole state repeats itself while the command moves
+    all_repeated_s: float
+
+    @classmethod
+    def of(cls, sequence: Sequence) -> Standstill:
+        """Measure the standstills of one sequence."""
+        ctrl = sequence.ctrl
+        qpos = sequence.qpos
+        blocked_s, blocked_at = _blocked(ctrl, qpos, sequence.dt)
+        return Standstill(
+            blocked_s=blocked_s,
+            blocked_at=blocked_at,
+            all_s=_standstill(ctrl, qpos, sequence.dt),
+            repeated_s=_repeated(ctrl, qpos, sequence.dt),
+            all_repeated_s=_all_repeated(sequence),
+        )
+
+
+@dataclass(frozen=True)
+class Encoders:
+    """Readings of position and velocity of one sequence, n joints."""
+
+    jump_rows: Array  # rows with a position that no joint can reach and leave in a period, (n)
+    zero_rows: int  # rows in which every joint is exactly 0, far from the rows around
+    # recorded qvel over the derivative of qpos, (n); NaN where the joint hardly moves
+    qvel_ratio: Array
+    # step between positions, (n) rad; 0 where positions are continuous, or too few
+    resolution: Array
+
+    @classmethod
+    def of(cls, sequence: Sequence, notes: dict[str, Any], robot: RobotSpec) -> Encoders:
+        """Measure the readings of one sequence."""
+        qpos = sequence.qpos
+        # from the line between the neighbouring rows
+        apart = np.abs(qpos[1:-1] - (qpos[:-2] + qpos[2:]) / 2)
+        return Encoders(
+            jump_rows=(apart > max(JUMP_RAD, JUMP_RAD_S2 / 2 * sequence.dt**2)).sum(axis=0),
+            zero_rows=_zero_rows(sequence, notes, robot),
+            qvel_ratio=_qvel_ratio(sequence),
+            resolution=_resolution(qpos),
+        )
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Rows of one sequence that are compared with the model of the robot."""
+
+    static_poses: StaticPoses
     # positions and torques in slow rows, (2, k, n); None if no torque was recorded
-    gravity_samples: Array | None
+    gravity: Array | None
     # rows of smoothed motion: position, velocity, acceleration, torque (NaN if none was recorded),
     # command − position (its lag taken off), and the command's velocity and acceleration,
     # (7, k, n) in SI; None if the recording is too short
@@ -148,6 +232,24 @@ class Survey:
     # of single joints that rest under a constant command: joint, command − position (rad), torque,
     # and positions of all joints, (k, 3 + n); None if no torque was recorded
     holds: Array | None
+
+
+@dataclass(frozen=True)
+class Survey:
+    """Measurements of one sequence; n joints in robot order."""
+
+    entry: Entry
+    content: str  # hash of command and state alone, without unit and payload
+    timing: Timing
+    ctrl_limits: Array  # least and greatest, (n, 2) rad
+    qpos_limits: Array
+    tracking: Tracking
+    kind: KindOfCommand
+    standstill: Standstill
+    encoders: Encoders
+    torque: Torque | None  # None if no torque was recorded
+    samples: Samples
+    spectra: Array  # log power of command and state at SPECTRUM_HZ, (2, H)
 
     @property
     def motion(self) -> str:
@@ -164,11 +266,6 @@ class Survey:
         """(n) rad."""
         return np.asarray(np.ptp(self.qpos_limits, axis=1))
 
-    @property
-    def missing_samples(self) -> bool:
-        """True if a period is 2.5 times as long as usual."""
-        return self.longest_gap_ms * self.rate_hz / 1e3 > 2.5
-
     @classmethod
     def of(cls, entry: Entry, sequence: Sequence, robot: RobotSpec) -> Survey:
         """Measure one sequence."""
@@ -176,46 +273,26 @@ class Survey:
         qpos = sequence.qpos
         dt = sequence.dt
         notes = entry.meta.notes
-        op = robot.operated_index
-        blocked_s, blocked_at = _blocked(ctrl, qpos, dt)
-        follows, opposes = _correlations(ctrl, qpos, dt)
-        delay = estimate_delay(ctrl, qpos, dt, MAX_LAG_S)
-        lead = estimate_delay(qpos, ctrl, dt, MAX_LAG_S)
-        # from the line between the neighbouring rows
-        apart = np.abs(qpos[1:-1] - (qpos[:-2] + qpos[2:]) / 2)
+        tracking = Tracking.of(sequence, robot)
+        samples = Samples(
+            static_poses=StaticPoses.of(sequence, robot.operated_index),
+            gravity=_gravity_samples(sequence),
+            movement=_movement(sequence, tracking.delay),
+            holds=_holds(sequence),
+        )
         return Survey(
             entry=entry,
-            samples=hashlib.sha256(ctrl.tobytes() + qpos.tobytes()).hexdigest(),
-            rate_hz=float(notes.get("rate_hz", 1 / dt)),
-            jitter_ms=float(notes.get("jitter_ms", 0.0)),
-            uneven_ms=float(notes.get("uneven_ms", 0.0)),
-            longest_gap_ms=float(notes.get("longest_gap_ms", dt * 1e3)),
+            content=hashlib.sha256(ctrl.tobytes() + qpos.tobytes()).hexdigest(),
+            timing=Timing.of(notes, dt),
             ctrl_limits=np.stack([ctrl.min(axis=0), ctrl.max(axis=0)], axis=1),
             qpos_limits=np.stack([qpos.min(axis=0), qpos.max(axis=0)], axis=1),
-            speed=fast_speed(ctrl, dt),
-            delay=delay,
-            lead=np.where((lead > 1.5 * dt) & ~(delay > 0.5 * dt), lead, np.nan),
-            follows=follows,
-            opposes=opposes,
-            slope=_slope(ctrl, qpos, dt, np.nan_to_num(delay) / dt, fast_speed(ctrl, dt)),
-            copied_rows=_copied_rows(sequence),
-            jump_rows=(apart > max(JUMP_RAD, JUMP_RAD_S2 / 2 * dt**2)).sum(axis=0),
-            zero_rows=_zero_rows(sequence, notes, robot),
-            qvel_ratio=_qvel_ratio(sequence),
-            blocked_s=blocked_s,
-            blocked_at=blocked_at,
-            standstill_s=_standstill(ctrl, qpos, dt),
-            repeated_s=_repeated(ctrl, qpos, dt),
-            all_repeated_s=_all_repeated(sequence),
-            resolution=_resolution(qpos),
+            tracking=tracking,
+            kind=_kind_of_command(sequence),
+            standstill=Standstill.of(sequence),
+            encoders=Encoders.of(sequence, notes, robot),
             torque=_torque(sequence, robot),
-            static_poses=StaticPoses.of(sequence, op),
-            response=Response.of(ctrl[:, op], qpos[:, op], dt),
+            samples=samples,
             spectra=np.stack([_spectrum(ctrl, dt), _spectrum(qpos, dt)]).astype(np.float32),
-            **_kind_of_command(sequence),
-            gravity_samples=_gravity_samples(sequence),
-            movement=_movement(sequence, delay),
-            holds=_holds(sequence),
         )
 
 
@@ -308,7 +385,7 @@ def _fitted_slope(command: Array, state: Array, steps: int) -> float:
     return float(before @ after / (before @ before))
 
 
-def _kind_of_command(sequence: Sequence) -> dict[str, Array]:
+def _kind_of_command(sequence: Sequence) -> KindOfCommand:
     """Compare the command with the position soon after, with the velocity, and with the torque."""
     every = max(1, round(0.02 / sequence.dt))
     ctrl = np.ascontiguousarray(sequence.ctrl[::every].T, float)  # (n, T)
@@ -333,11 +410,11 @@ def _kind_of_command(sequence: Sequence) -> dict[str, Array]:
     torque = np.full(near.shape, np.nan)
     if sequence.tau is not None:
         torque = correlation(ctrl, sequence.tau[::every].T)
-    return {
-        "command_distance": near,
-        "velocity_correlation": np.max(velocity, axis=0),
-        "torque_correlation": torque,
-    }
+    return KindOfCommand(
+        distance=near,
+        velocity_correlation=np.max(velocity, axis=0),
+        torque_correlation=torque,
+    )
 
 
 def _standing(qpos: Array, dt: float) -> Array:

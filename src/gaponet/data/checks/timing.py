@@ -47,15 +47,15 @@ AVERAGING_WIDTHS_S = np.geomspace(0.04, 0.4, 150)
 
 def _timing(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     """Do commands and states have one clock?"""
-    surveys = [survey for survey in surveys if not np.isfinite(survey.copied_rows).any()]
+    surveys = [survey for survey in surveys if not np.isfinite(survey.tracking.copied_rows).any()]
     if not surveys:
         yield Finding("ok", "timing", "a command that repeats the state shows no clocks")
         return
-    step = Counter(survey.response.step for survey in surveys).most_common(1)[0][0]
-    comparable = [survey for survey in surveys if survey.response.step == step]
+    step = Counter(survey.tracking.response.step for survey in surveys).most_common(1)[0][0]
+    comparable = [survey for survey in surveys if survey.tracking.response.step == step]
     # Across a gap states are interpolated: they begin to move before anything was measured.
-    complete = [survey for survey in comparable if not survey.missing_samples] or comparable
-    unknown = max(survey.uneven_ms for survey in complete) * UNEVEN_ROWS_SHARE / 1e3  # s
+    complete = [survey for survey in comparable if not survey.timing.missing_samples] or comparable
+    unknown = max(survey.timing.uneven_ms for survey in complete) * UNEVEN_ROWS_SHARE / 1e3  # s
     findings = [*_late_recordings(comparable, unknown)]
     common = _common_response(complete, findings)
     onset = _usual_onset(common)
@@ -80,7 +80,7 @@ def _common_response(surveys: list[Survey], late: list[Finding]) -> CommonRespon
     for finding in late:
         odd.update(finding.values["recordings"])
     usual = [survey.entry.id not in odd for survey in surveys]
-    return Response.common([survey.response for survey in surveys], usual)
+    return Response.common([survey.tracking.response for survey in surveys], usual)
 
 
 def _usual_onset(common: CommonResponse) -> float:
@@ -175,17 +175,17 @@ def _shifts(responses: list[Response]) -> Array:
 
 
 def _late_recordings(surveys: list[Survey], unknown: float) -> Iterator[Finding]:
-    shifts = _shifts([one.response for one in surveys])
+    shifts = _shifts([one.tracking.response for one in surveys])
     if np.isfinite(shifts).sum() < MIN_RECORDINGS:
         return
     shifts = shifts - np.nanmedian(shifts)
     scatter = max(1.48 * float(np.nanmedian(np.abs(shifts))), 1e-3)
-    period = float(np.median([1 / one.rate_hz for one in surveys]))
+    period = float(np.median([1 / one.timing.rate_hz for one in surveys]))
     limit = max(MIN_SHIFT_S, SHIFT_SCATTERS * scatter, unknown, MIN_SHIFT_PERIODS * period)
     delays = _relative_delays(surveys)
     far: list[tuple[Survey, float]] = []
     for survey, late, delay in zip(surveys, shifts.tolist(), delays.tolist(), strict=True):
-        fast = max(survey.speed) >= FAST_COMMAND_RAD_S  # stiction delays slow motions
+        fast = max(survey.tracking.speed) >= FAST_COMMAND_RAD_S  # stiction delays slow motions
         if abs(late) > limit and fast and _agree(late, delay):
             far.append((survey, late))
     yield from _shifted("later", [(one, late) for one, late in far if late > 0])
@@ -231,7 +231,7 @@ def _relative_delays(surveys: list[Survey]) -> Array:
 
     NaN where no joint's delay is known.
     """
-    delays = np.array([survey.delay for survey in surveys])  # (recordings, n)
+    delays = np.array([survey.tracking.delay for survey in surveys])  # (recordings, n)
     usual = np.full(delays.shape[1], np.nan)
     known = np.isfinite(delays).sum(axis=0) > 1
     usual[known] = np.nanmedian(delays[:, known], axis=0)
@@ -253,7 +253,7 @@ def _agree(late: float, delay: float) -> bool:
 
 def clock_drift(surveys: list[Survey], shifts: Array, unknown: float = 0.0) -> Iterator[Finding]:
     """Find a clock drift from the shifts (recordings, parts) s of the parts of each recording."""
-    duration = np.array([survey.response.duration for survey in surveys])
+    duration = np.array([survey.tracking.response.duration for survey in surveys])
     long = duration >= MIN_DRIFT_DURATION_S  # in shorter recordings friction changes the shift
     between = duration[long] * (1 - 1 / shifts.shape[1])
     first = shifts[long, 0]

@@ -10,7 +10,7 @@ import numpy as np
 
 from gaponet.base.arrays import Array
 from gaponet.data.checks.check import Check
-from gaponet.data.checks.survey import Survey
+from gaponet.data.checks.survey import Survey, Tracking
 from gaponet.robot.finding import Finding, abbreviate
 from gaponet.robot.spec import RobotSpec
 
@@ -43,7 +43,7 @@ def _follow_small_commands(survey: Survey) -> Array:
     """Return which joints move far with a small command, as where state and command have different
     units, (n).
     """
-    follow = np.diag(survey.follows) > MIN_FOLLOWING
+    follow = np.diag(survey.tracking.follows) > MIN_FOLLOWING
     return follow & (
         survey.qpos_range > np.maximum(MIN_COMMAND_RAD, RATIO_BOUNDS[1] * survey.ctrl_range)
     )
@@ -56,13 +56,15 @@ def _order(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     for s in surveys:
         moved = s.ctrl_range > MIN_COMMAND_RAD
         motions += moved | _follow_small_commands(s)
-        for i in np.flatnonzero(moved & (np.diag(s.follows) < 0.3) & (np.diag(s.opposes) < 0.6)):
+        follows = s.tracking.follows
+        itself = np.diag(follows)
+        for i in np.flatnonzero(moved & (itself < 0.3) & (np.diag(s.tracking.opposes) < 0.6)):
             others = np.flatnonzero(
-                (s.follows[i] > 0.6) & ((s.ctrl_range < 0.02) | (s.follows[:, i] > 0.6).any())
+                (follows[i] > 0.6) & ((s.ctrl_range < 0.02) | (follows[:, i] > 0.6).any())
             )
             if others.size:
-                j = int(others[s.follows[i, others].argmax()])
-                candidates[int(i), j].append(float(s.follows[i, j]))
+                j = int(others[follows[i, others].argmax()])
+                candidates[int(i), j].append(float(follows[i, j]))
     candidates |= _swapped_pairs(surveys, motions)
     swapped = False
     for (own, other), correlations in candidates.items():
@@ -93,7 +95,7 @@ def _swapped_pairs(surveys: list[Survey], motions: Array) -> dict[tuple[int, int
     """Return swapped joints over several motions; in one motion, joints that move together look
     alike.
     """
-    follows = np.array([s.follows for s in surveys])  # (sequences, n, n)
+    follows = np.array([s.tracking.follows for s in surveys])  # (sequences, n, n)
     own = np.median(np.diagonal(follows, axis1=1, axis2=2), axis=0)
     cross = np.median(follows, axis=0)
     pairs = {}
@@ -111,7 +113,7 @@ def _swapped_pairs(surveys: list[Survey], motions: Array) -> dict[tuple[int, int
 def _command(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     """Are the commands positions?"""
     operated = robot.operated_index
-    distance = np.stack([s.command_distance for s in surveys])[:, operated]
+    distance = np.stack([s.kind.distance for s in surveys])[:, operated]
     spans = np.stack([s.ctrl_range for s in surveys])[:, operated]
     judged = np.isfinite(distance) & (spans > 0)  # (sequences, operated)
     if not judged.any() or float(np.median(distance[judged])) < MAX_DISTANCE:
@@ -121,15 +123,15 @@ def _command(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
         return float(np.median(np.stack(by_sequence)[:, operated][judged]))
 
     correlation = {
-        "velocities": median([s.velocity_correlation for s in surveys]),
-        "torques": median([s.torque_correlation for s in surveys]),
+        "velocities": median([s.kind.velocity_correlation for s in surveys]),
+        "torques": median([s.kind.torque_correlation for s in surveys]),
     }
     text = (
         f"states are {np.median(distance[judged]):.2f} times as far from their commands as from "
         "their own mean"
     )
     alike = max(np.nan_to_num(list(correlation.values()))) >= MIN_KIND_CORRELATION
-    if not alike and median([np.diag(s.follows) for s in surveys]) > MIN_FOLLOWING:
+    if not alike and median([np.diag(s.tracking.follows) for s in surveys]) > MIN_FOLLOWING:
         text += (
             ", though they move with them: motors too weak for their load, or a wrong kp; check "
             "payload and kp"
@@ -159,10 +161,7 @@ def _sign(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     """Does each joint move in the direction of its command?"""
     for i, name in enumerate(robot.joint_names):
         moved = _moved(surveys, i)
-        against = []
-        for survey in moved:
-            if _opposes(float(survey.opposes[i, i]), float(survey.follows[i, i])):
-                against.append(survey)
+        against = [survey for survey in moved if _opposes(survey.tracking, i)]
         if against and 2 * len(against) >= len(moved):
             text = (
                 f"{name} moves against its command in {len(against)} of {len(moved)} motions: "
@@ -171,11 +170,13 @@ def _sign(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
             yield Finding("error", "sign", text, (name,))
 
 
-def _opposes(against: float, along: float) -> bool:
-    """Return True if a joint moves against its command, by the greatest correlations of both.
+def _opposes(tracking: Tracking, i: int) -> bool:
+    """Return True if joint i moves against its command, by the greatest correlations of both.
 
     Commands that come and go show some motion along them too, a part of their period later.
     """
+    against = float(tracking.opposes[i, i])
+    along = float(tracking.follows[i, i])
     if against > 0.6 and along < 0.3:
         return True
     return against > MIN_OPPOSITION and against - along > MIN_OPPOSITION_MARGIN
@@ -228,7 +229,7 @@ def _swapped_recordings(early: list[Survey]) -> Finding:
 
 def _leads(surveys: list[Survey], i: int) -> list[float]:
     """Return by how much joint i moves before its command, s, where it does."""
-    return [float(s.lead[i]) for s in surveys if np.isfinite(s.lead[i])]
+    return [float(s.tracking.lead[i]) for s in surveys if np.isfinite(s.tracking.lead[i])]
 
 
 def _copies(surveys: list[Survey], robot: RobotSpec) -> dict[int, dict[str, list[str]]]:
@@ -236,8 +237,8 @@ def _copies(surveys: list[Survey], robot: RobotSpec) -> dict[int, dict[str, list
     copies: dict[int, dict[str, list[str]]] = {}
     for i, name in enumerate(robot.joint_names):
         for s in _moved(surveys, i):
-            if np.isfinite(s.copied_rows[i]):
-                motions = copies.setdefault(round(float(s.copied_rows[i])), {})
+            if np.isfinite(s.tracking.copied_rows[i]):
+                motions = copies.setdefault(round(float(s.tracking.copied_rows[i])), {})
                 motions.setdefault(name, []).append(s.motion)
     return copies
 
@@ -248,7 +249,7 @@ def driven_by_torque(surveys: list[Survey]) -> bool:
     """
     for s in surveys:
         moves = s.qpos_range > MIN_COMMAND_RAD
-        if s.torque is None or not moves.any() or (s.copied_rows[moves] != 0).any():
+        if s.torque is None or not moves.any() or (s.tracking.copied_rows[moves] != 0).any():
             return False
     return True
 
@@ -287,7 +288,7 @@ def _moves_first(survey: Survey, joints: list[int]) -> bool:
     that move.
     """
     moved = [i for i in joints if survey.ctrl_range[i] > MIN_COMMAND_RAD]
-    first = int(np.isfinite(survey.lead[moved]).sum())
+    first = int(np.isfinite(survey.tracking.lead[moved]).sum())
     return first >= 2 and 2 * first > len(moved)
 
 
@@ -322,7 +323,8 @@ def _range_unit(surveys: list[Survey], i: int, name: str) -> Iterator[Finding]:
 
 def _scale(surveys: list[Survey], i: int, name: str) -> Iterator[Finding]:
     """Does joint i go 1 rad where its command goes 1 rad?"""
-    slope = _median_or_one([s.slope[i] for s in surveys if np.isfinite(s.slope[i])])
+    slopes = [s.tracking.slope[i] for s in surveys]
+    slope = _median_or_one([one for one in slopes if np.isfinite(one)])
     if slope > SLOPE_BOUNDS[1] or 0.1 < slope < SLOPE_BOUNDS[0]:
         text = (
             f"{name} goes {slope:.2f} rad where its command goes 1 rad: another scale (a "
@@ -336,8 +338,9 @@ def _velocity_unit(surveys: list[Survey], i: int, name: str) -> Iterator[Finding
     """Is the recorded velocity of joint i the derivative of its position?"""
     ratios = []
     for s in surveys:
-        if np.isfinite(s.qvel_ratio[i]) and s.qpos_range[i] > 20 * s.resolution[i]:
-            ratios.append(s.qvel_ratio[i])
+        ratio = s.encoders.qvel_ratio[i]
+        if np.isfinite(ratio) and s.qpos_range[i] > 20 * s.encoders.resolution[i]:
+            ratios.append(ratio)
     ratio = _median_or_one(ratios)
     if not QVEL_RATIO_BOUNDS[0] < ratio < QVEL_RATIO_BOUNDS[1]:
         text = (
@@ -421,7 +424,7 @@ def _labels(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
         yield Finding("note", "labels", text)
     ids: dict[str, list[str]] = defaultdict(list)
     for s in surveys:
-        ids[s.samples].append(s.entry.id)
+        ids[s.content].append(s.entry.id)
     for same in ids.values():
         if len(same) > 1:
             text = f"same samples under different labels: {', '.join(same)}; remove the wrong one"
