@@ -75,7 +75,7 @@ def test_the_virtual_arm_at_the_other_end_of_a_port_is_no_other_program(servos):
 
 def test_the_port_is_closed_for_others_again_after_the_watchdog_has_opened_it(driver, monkeypatch):
     driver.watchdog()
-    monkeypatch.setattr("gaponet.hw.drivers.so101.other_programs", lambda port: ["lerobot"])
+    monkeypatch.setattr("gaponet.hw.drivers.so101_port.other_programs", lambda port: ["lerobot"])
 
     with pytest.raises(DriverError, match="lerobot"):
         driver.read()
