@@ -128,13 +128,13 @@ def page(tmp_path):
 
 def test_nothing_starts_before_what_it_needs_and_the_page_says_what(page):
     for act, hint in (
-        (page.logs.read, "Choose a robot"),
-        (page.gap.show_recording, "Choose a robot"),
-        (page.identify.words, "Choose a robot"),
+        (page.steps.logs.read, "Choose a robot"),
+        (page.steps.gap.show_recording, "Choose a robot"),
+        (page.steps.identify.words, "Choose a robot"),
     ):
         page.controls.attempt(act)
         assert hint in page.controls.status.content
-    assert page.identify.button.disabled
+    assert page.steps.identify.button.disabled
     assert page.jobs.all == []
 
 
@@ -146,7 +146,7 @@ def test_a_hint_names_the_next_thing_to_do(page):
         ("doctor", "Identify the robot"),
     ):
         finish(page.jobs, step, {}, ("robot", "check", "so101"))
-        page.identify.show()
+        page.steps.identify.show()
         assert said in hint.content
 
 
@@ -155,7 +155,7 @@ def test_beside_a_running_command_no_earlier_one_is_said_to_have_ended(page, mon
     page.refresh()
     assert "gaponet gap** has ended" in page.controls.status.content
     seen = []
-    monkeypatch.setattr(page.gap, "show", lambda: seen.append(page.controls.status.content))
+    monkeypatch.setattr(page.steps.gap, "show", lambda: seen.append(page.controls.status.content))
     page.jobs.start("robot", "robot", "list")
     page.refresh()
     page.jobs.cancel()
@@ -165,25 +165,25 @@ def test_beside_a_running_command_no_earlier_one_is_said_to_have_ended(page, mon
 @pytest.mark.parametrize(("model", "offered"), [("model/arm.urdf", True), ("model/arm.xml", False)])
 def test_a_urdf_is_exported_where_the_robot_was_made_from_one(page, model, offered):
     finish(page.jobs, "robot", {}, ("robot", "new", model, "--out", "robot1"))
-    (page.folder / "robot1").mkdir()
-    page.use.show()
-    assert ("urdf" in page.use.target.options) == offered
+    (page.controls.folder / "robot1").mkdir()
+    page.steps.use.show()
+    assert ("urdf" in page.steps.use.target.options) == offered
 
 
 def test_the_next_step_is_offered_once_a_step_is_done(page):
-    assert page.onwards["robot"].disabled
+    assert page.steps.onwards["robot"].disabled
     finish(page.jobs, "robot", {}, ("robot", "check", "so101"))
     page.refresh()
-    assert not page.onwards["robot"].disabled
-    assert page.onwards["import"].disabled
+    assert not page.steps.onwards["robot"].disabled
+    assert page.steps.onwards["import"].disabled
 
 
 def test_an_identification_is_bounded_in_rollouts_and_tries_all_terms(page):
     for step in ("robot", "import"):
         finish(page.jobs, step, {}, ("robot", "check", "so101"))
     finish(page.jobs, "doctor", {"findings": []})
-    page.identify.windows.value = 12
-    assert page.identify.words()[4:] == ["--windows", "12"]
+    page.steps.identify.windows.value = 12
+    assert page.steps.identify.words()[4:] == ["--windows", "12"]
 
 
 def test_identification_is_locked_while_the_check_finds_an_error(page):
@@ -191,11 +191,11 @@ def test_identification_is_locked_while_the_check_finds_an_error(page):
         finish(page.jobs, step, {}, ("robot", "check", "so101"))
     finding = {"level": "error", "check": "sign", "message": "elbow moves against its command"}
     finish(page.jobs, "doctor", {"findings": [finding]})
-    assert "Locked: the check finds an error (sign)" in page.identify.locked()
-    page.controls.attempt(page.identify.words)
+    assert "Locked: the check finds an error (sign)" in page.steps.identify.locked()
+    page.controls.attempt(page.steps.identify.words)
     assert "Locked" in page.controls.status.content
     finish(page.jobs, "doctor", {"findings": [finding | {"level": "warning"}]})
-    assert page.identify.locked() == ""
+    assert page.steps.identify.locked() == ""
 
 
 def test_what_a_command_prints_is_shown_as_a_table_and_names_stay_text(page):
@@ -253,24 +253,24 @@ def test_a_box_that_is_no_table_keeps_its_words():
 
 def test_a_name_in_the_form_is_no_option_of_the_command(page):
     finish(page.jobs, "robot", {}, ("robot", "check", "so101"))
-    (page.folder / "logs" / "logs.toml").write_text("mine")
-    page.logs.unit.value = "--allow-pickle"
-    page.logs.cut.value = 8.0
-    page.controls.attempt(page.logs.read)
+    (page.controls.folder / "logs" / "logs.toml").write_text("mine")
+    page.steps.logs.unit.value = "--allow-pickle"
+    page.steps.logs.cut.value = 8.0
+    page.controls.attempt(page.steps.logs.read)
     assert {"--unit-id=--allow-pickle", "--cut=8"} < set(page.jobs.all[-1].words)
-    page.controls.attempt(page.logs.set_aside)
+    page.controls.attempt(page.steps.logs.set_aside)
     assert "is running" in page.controls.status.content
     page.jobs.cancel()
-    assert (page.folder / "logs" / "logs.toml").read_text() == "mine"
-    (page.folder / "logs_aside2").mkdir()
-    page.logs.set_aside()
-    assert (page.folder / "logs_aside1" / "logs.toml").read_text() == "mine"
-    assert list((page.folder / "logs").iterdir()) == []
-    (page.folder / "model" / "arm.xml").write_text("<mujoco/>")
+    assert (page.controls.folder / "logs" / "logs.toml").read_text() == "mine"
+    (page.controls.folder / "logs_aside2").mkdir()
+    page.steps.logs.set_aside()
+    assert (page.controls.folder / "logs_aside1" / "logs.toml").read_text() == "mine"
+    assert list((page.controls.folder / "logs").iterdir()) == []
+    (page.controls.folder / "model" / "arm.xml").write_text("<mujoco/>")
     page.refresh()
-    page.robot.model.value = "model/arm.xml"
-    page.robot.options["kp"].value = "--contacts"
-    page.controls.attempt(page.robot.use)
+    page.steps.robot.model.value = "model/arm.xml"
+    page.steps.robot.options["kp"].value = "--contacts"
+    page.controls.attempt(page.steps.robot.use)
     assert "without a dash" in page.controls.status.content
 
 
@@ -285,24 +285,24 @@ def test_a_command_that_is_being_started_is_not_called_cancelled(page):
         page.jobs.process = SimpleNamespace(poll=lambda: None)
     watching.join()
     page.jobs.process = None
-    assert "**gaponet robot**, 0 %" in page.running.content
+    assert "**gaponet robot**, 0 %" in page.running.text.content
 
 
 def test_a_guess_does_not_replace_the_logs_toml_of_the_folder(page):
-    (page.folder / "logs" / "logs.toml").write_text('unit = "deg"\n')
-    page.controls.attempt(page.logs.guess)
+    (page.controls.folder / "logs" / "logs.toml").write_text('unit = "deg"\n')
+    page.controls.attempt(page.steps.logs.guess)
     assert "a guess would replace it" in page.controls.status.content
-    assert not page.logs.described.value
+    assert not page.steps.logs.described.value
 
 
 def test_a_proposal_is_added_to_the_logs_toml_of_the_folder(page):
     for step in ("robot", "import"):
         finish(page.jobs, step, {}, ("robot", "check", "so101"))
     finish(page.jobs, "doctor", {"findings": []})
-    (page.folder / "logs" / "logs.toml").write_text('unit = "deg"\n')
-    page.controls.attempt(page.check.propose)
-    assert page.logs.described.value.startswith('unit = "deg"\n')
-    assert "nothing to mend" in page.logs.described.value
+    (page.controls.folder / "logs" / "logs.toml").write_text('unit = "deg"\n')
+    page.controls.attempt(page.steps.check.propose)
+    assert page.steps.logs.described.value.startswith('unit = "deg"\n')
+    assert "nothing to mend" in page.steps.logs.described.value
 
 
 @pytest.fixture
@@ -325,18 +325,18 @@ def test_step_use_exports_the_calibrated_robot_and_a_network_only_if_it_helps(cl
     acts, words = clicked
     for step in ("robot", "import", "identify", "new", "adapt"):
         finish(page.jobs, step, {}, (step, "x", "y", "--out", step))
-        (page.folder / step).mkdir(exist_ok=True)
+        (page.controls.folder / step).mkdir(exist_ok=True)
         if step == "identify":
             acts["Export"]()
             finish(page.jobs, "train", {"val_mpjae": {"added": 1e-4, "error": 2e-4, "start": 0.01}})
             page.seen = ()
             page.controls.attempt(page.refresh)
-            assert page.use.target.options == TARGETS
+            assert page.steps.use.target.options == TARGETS
             finish(page.jobs, "train", {"val_mpjae": {"added": 2e-3, "error": 2e-4, "start": 0.01}})
         if step == "new":
             acts["Check whether the robot changed"]()
             acts["Calibrate with the new logs"]()
-    page.use.target.value = "mjlab"
+    page.steps.use.target.value = "mjlab"
     for label in ("Export", "Parameter sets for training", "Train a network"):
         acts[label]()
     assert helping_network(page.jobs) is not None
@@ -371,9 +371,9 @@ def test_view_shows_a_dataset_in_the_page_at_step_gap_and_leaves_no_folder(
     app.serve_dataset(data, Scene(shown), Clip.from_start(shown, 0.0, 1.0), 0, 2.0, said.append)
     (page,) = pages
     assert said == [f"open {page.address}?step=4 in a browser; Ctrl-C ends"]
-    assert page.logs.recording.options == tuple(e.id for e in data.entries)
+    assert page.steps.logs.recording.options == tuple(e.id for e in data.entries)
     assert "differences drawn 2×" in page.player.title.content
-    assert not page.folder.exists()
+    assert not page.controls.folder.exists()
 
 
 def test_curves_are_saved_as_the_page_shows_them(page):
@@ -396,12 +396,12 @@ def test_curves_are_saved_as_the_page_shows_them(page):
 
 @pytest.mark.browser  # four processes
 def test_the_page_says_what_is_wrong_with_logs_and_what_to_do(page):
-    write_arm(page.folder / "arm")
+    write_arm(page.controls.folder / "arm")
     finish(page.jobs, "robot", {}, ("robot", "new", "x", "--out", "arm"))
-    page.logs.described.value = (
+    page.steps.logs.described.value = (
         'time = "t"\ntime_unit = "s"\nctrl = "{joint}_des"\nqpos = "{joint}_pos"\n'
     )
-    page.logs.position.value = "rad"
+    page.steps.logs.position.value = "rad"
     time_s = np.arange(300) * 0.02
     for joints, scale, why in (
         ((), 1.0, "no log of"),
@@ -414,13 +414,13 @@ def test_the_page_says_what_is_wrong_with_logs_and_what_to_do(page):
         if joints:
             rows = np.column_stack([time_s, *swing, *swing])
             np.savetxt(
-                page.folder / "logs" / "m.csv",
+                page.controls.folder / "logs" / "m.csv",
                 rows,
                 delimiter=",",
                 header=",".join(columns),
                 comments="",
             )
-        page.controls.attempt(page.logs.read)
+        page.controls.attempt(page.steps.logs.read)
         wait_for(page.jobs)
         assert why in ending(page.jobs.all[-1])
     assert "elbow: missing in some recordings" in report(page.jobs.all[-1])
@@ -449,7 +449,7 @@ def test_a_calibration_and_a_training_end_in_step_use_with_their_result(tmp_path
         finish(Jobs(tmp_path), step, {"findings": []}, (step, "x", "--out", out))
     page = App(tmp_path, 0)
     try:
-        page.use.budget.value = "40000"
+        page.steps.use.budget.value = "40000"
         for label, step in (("Calibrate with the new logs", "adapt"), ("Train a network", "train")):
             page.controls.attempt(acts[label])
             wait_for(page.jobs)

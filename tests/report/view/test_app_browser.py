@@ -124,7 +124,7 @@ def page(tmp_path):
 
 def export_agrees(page):
     """Run the exported check: the model file alone moves as in gaponet."""
-    script = page.folder / page.jobs.result("export").out / "check.py"
+    script = page.controls.folder / page.jobs.result("export").out / "check.py"
     check = subprocess.run(
         [sys.executable, script], capture_output=True, text=True, check=True, cwd=script.parent
     )

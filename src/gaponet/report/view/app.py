@@ -32,6 +32,7 @@ from gaponet.report.view.steps import (
     GapStep,
     IdentifyStep,
     LogsStep,
+    Play,
     RobotStep,
     Step,
     UseStep,
@@ -51,6 +52,93 @@ TITLES = {
     "5 Identify": "identify",
     "6 Use": "",
 }
+
+
+class Steps:
+    """The tabs of the six steps.
+
+    Attributes:
+        robot, logs, check, gap, identify, use: The steps.
+        onwards: Result → button that opens the next step.
+    """
+
+    def __init__(self, controls: Controls, uploads: Uploads, play: Play) -> None:
+        """Add the tabs; `play` shows motions."""
+        self._jobs = controls.jobs
+        self._unreadable = controls.gui.add_markdown("")
+        tabs = controls.gui.add_tab_group()
+        places = [tabs.add_tab(title) for title in TITLES]
+        with places[0]:
+            self.robot = RobotStep(controls, uploads, play)
+        with places[1]:
+            self.logs = LogsStep(controls, uploads, self.robot)
+        with places[2]:
+            self.check = CheckStep(controls, self.logs)
+        with places[3]:
+            self.gap = GapStep(controls, self.logs, play)
+        with places[4]:
+            self.identify = IdentifyStep(controls)
+        with places[5]:
+            self.use = UseStep(controls, uploads, self.logs)
+        # The script of the page opens the next step.
+        titles = list(TITLES)
+        self.onwards = {}
+        for place, title, following in zip(places, titles, titles[1:], strict=False):
+            with place:
+                self.onwards[TITLES[title]] = controls.gui.add_button(f"Next: {following}")
+
+    def show(self) -> None:
+        """Show the result of each step, and what may be done next.
+
+        Raises:
+            Exception: The first one of a step, after all others have been shown.
+        """
+        failed: Exception | None = None
+        steps: tuple[Step, ...] = (
+            self.robot,
+            self.logs,
+            self.check,
+            self.gap,
+            self.identify,
+            self.use,
+        )
+        for step in steps:
+            try:
+                step.show()
+            except Exception as error:  # the others have results too
+                failed = failed or error
+        for result, button in self.onwards.items():
+            button.disabled = self._jobs.result(result) is None
+        reasons = [f"Left out: {escape_markdown(text)}" for text in self._jobs.unreadable()]
+        self._unreadable.content = "\n\n".join(reasons)
+        if failed is not None:
+            raise failed
+
+
+class RunningCommand:
+    """The running command and how far it is, above the steps."""
+
+    def __init__(self, controls: Controls) -> None:
+        self.text = controls.gui.add_markdown("")
+        self._bar = controls.gui.add_progress_bar(0.0)
+        self._cancel = controls.add_button("Cancel", controls.jobs.cancel)
+
+    def show(self, running: Job | None, elsewhere: Job | None) -> None:
+        """Show how far a command is that runs here, or that an earlier page started."""
+        self._bar.visible = running is not None
+        self._cancel.visible = running is not None
+        text = ""
+        if running is not None:
+            self._bar.value, note = running.progress()
+            command = escape_markdown(running.words[0])
+            text = f"**gaponet {command}**, {self._bar.value:.0f} %. {escape_markdown(note)}"
+        elif elsewhere is not None:
+            command = escape_markdown(elsewhere.words[0])
+            text = (
+                f"**gaponet {command}** of an earlier page is still running. "
+                "It ends soon, because the server of that page has ended."
+            )
+        self.text.content = text
 
 
 class App:
@@ -73,7 +161,6 @@ class App:
             UsageError: A folder in it is a link.
         """
         make_places(folder)
-        self.folder = folder
         self.jobs = Jobs(folder, outside)
         self.polled = 0.0  # s since the last look at the running command
         self.seen: tuple[int, str] | None = None  # number of jobs and name of the living one
@@ -84,47 +171,13 @@ class App:
         gui.main_panel.set_width(PANEL_WIDTH)
         gui.add_html(TEMPLATES.joinpath("app.html").read_text(encoding="utf-8"))
         self.controls = Controls(gui, folder, self.jobs)
-        self.running = gui.add_markdown("")
-        self.bar = gui.add_progress_bar(0.0)
-        self.cancel = self.controls.add_button("Cancel", self.jobs.cancel)
+        self.running = RunningCommand(self.controls)
         self.notices = gui.add_markdown("")
         self.uploads = Uploads(folder, self.jobs, self._show_notices)
         self.dismiss = self.controls.add_button("Dismiss", self.uploads.notices.dismiss)
         self.dismiss.visible = False
-        self.unreadable = gui.add_markdown("")
-        self._add_steps()
+        self.steps = Steps(self.controls, self.uploads, self.play)
         self.controls.attempt(self.refresh)
-
-    def _add_steps(self) -> None:
-        controls = self.controls
-        tabs = controls.gui.add_tab_group()
-        places = [tabs.add_tab(title) for title in TITLES]
-        with places[0]:
-            self.robot = RobotStep(controls, self.uploads, self.play)
-        with places[1]:
-            self.logs = LogsStep(controls, self.uploads, self.robot)
-        with places[2]:
-            self.check = CheckStep(controls, self.logs)
-        with places[3]:
-            self.gap = GapStep(controls, self.logs, self.play)
-        with places[4]:
-            self.identify = IdentifyStep(controls)
-        with places[5]:
-            self.use = UseStep(controls, self.uploads, self.logs)
-        self.steps: tuple[Step, ...] = (
-            self.robot,
-            self.logs,
-            self.check,
-            self.gap,
-            self.identify,
-            self.use,
-        )
-        # The script of the page opens the next step.
-        titles = list(TITLES)
-        self.onwards = {}  # result → button that opens the next step
-        for place, title, following in zip(places, titles, titles[1:], strict=False):
-            with place:
-                self.onwards[TITLES[title]] = controls.gui.add_button(f"Next: {following}")
 
     def tick(self, elapsed: float) -> None:
         """Play on, and look after the running command; `elapsed` is the time since, s."""
@@ -150,11 +203,11 @@ class App:
         state = (len(every), living.folder.name if living else "")
         if living is not None and self.seen != state:
             self.controls.say("")  # how the command before ended is no news beside a running one
-        self._show_progress(running, elsewhere)
-        self.robot.list_models()
+        self.running.show(running, elsewhere)
+        self.steps.robot.list_models()
         if self.seen == state:
             return
-        self._show_results()
+        self.steps.show()
         if living is None and every:
             self.controls.say(ending(every[-1]))
             self._compare(every[-1])
@@ -162,49 +215,13 @@ class App:
             self.controls.say("Six steps, from left to right.")
         self.seen = state  # last: after an error all is shown again
 
-    def _show_progress(self, running: Job | None, elsewhere: Job | None) -> None:
-        """Show how far the running command is."""
-        self.bar.visible = running is not None
-        self.cancel.visible = running is not None
-        text = ""
-        if running is not None:
-            self.bar.value, note = running.progress()
-            command = escape_markdown(running.words[0])
-            text = f"**gaponet {command}**, {self.bar.value:.0f} %. {escape_markdown(note)}"
-        elif elsewhere is not None:
-            command = escape_markdown(elsewhere.words[0])
-            text = (
-                f"**gaponet {command}** of an earlier page is still running. "
-                "It ends soon, because the server of that page has ended."
-            )
-        self.running.content = text
-
-    def _show_results(self) -> None:
-        """Show the result of each step, and what may be done next.
-
-        Raises:
-            Exception: The first one of a step, after all others have been shown.
-        """
-        failed: Exception | None = None
-        for step in self.steps:
-            try:
-                step.show()
-            except Exception as error:  # the others have results too
-                failed = failed or error
-        for result, button in self.onwards.items():
-            button.disabled = self.jobs.result(result) is None
-        reasons = [f"Left out: {escape_markdown(text)}" for text in self.jobs.unreadable()]
-        self.unreadable.content = "\n\n".join(reasons)
-        if failed is not None:
-            raise failed
-
     def _compare(self, last: Job) -> None:
         """Compare a robot with the nominal one when its identification has just ended here."""
         identified = self.jobs.result("identify")
         if identified is None or identified.number != last.number:
             return
         if self.jobs.started_here(last):
-            self.identify.compare()
+            self.steps.identify.compare()
 
     def play(
         self, shown: Scene | SideBySide, clip: Clip | None = None, magnify: float = 1.0
@@ -217,7 +234,7 @@ class App:
         self.player = None
         if before is not None:
             before.remove()
-        with self.gap.stage:
+        with self.steps.gap.stage:
             self.player = Player(self.server, scene, clip, magnify)
 
     def _show_notices(self, text: str, dismissible: bool) -> None:
