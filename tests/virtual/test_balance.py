@@ -55,8 +55,8 @@ def moving(arm):
 def test_work_becomes_energy_and_heat_and_torques_add_up_to_what_moves_the_links(moving):
     robots, model, (energy, qpos, qvel, force, friction) = moving
     h = 0.001
-    cogging = robots.physics.cogging * np.sin(
-        robots.physics.cogging_count * qpos + robots.physics.cogging_phase
+    cogging = robots.motors.physics.cogging * np.sin(
+        robots.motors.physics.cogging_count * qpos + robots.motors.physics.cogging_phase
     )
     middle = lambda x: (x[1:] + x[:-1]) / 2  # noqa: E731
     work = (middle(force + friction + cogging) * middle(qvel)).sum() * h

@@ -102,7 +102,7 @@ def _serve_arm(
         rows = {joint: asdict(row) for joint, row in arm.calibration.rows.items()}
         write_text(options.calibration, json.dumps(rows, indent=4) + "\n")
     with closing(arm):
-        report(f"{label}: servo bus on {arm.port}; Ctrl-C ends it")
+        report(f"{label}: servo bus on {arm.terminal.port}; Ctrl-C ends it")
         with suppress(KeyboardInterrupt):
             arm.run(_limit(options))
 

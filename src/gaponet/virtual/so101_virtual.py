@@ -39,8 +39,36 @@ GRIPPER_SHIFT_STEPS = 300  # of the middle of the gripper's range against that o
 FREE_DAMPING = 0.3  # N·m·s/rad of the gears while the torque is off (assumed)
 
 
+class Terminal:
+    """A pseudo-terminal, which a driver opens like a serial port.
+
+    Attributes:
+        port: Path that a driver opens.
+        descriptor: Our end.
+    """
+
+    def __init__(self, link: Path | None) -> None:
+        """link: Symbolic link to the port; an existing link is replaced."""
+        self.descriptor, slave = os.openpty()
+        tty.setraw(slave)
+        self.port = os.ttyname(slave)
+        self._slave = slave
+        self._link = link
+        if link is not None:
+            if link.is_symlink():
+                link.unlink()
+            link.symlink_to(self.port)
+
+    def close(self) -> None:
+        """Close both ends and remove the link."""
+        for descriptor in (self.descriptor, self._slave):
+            os.close(descriptor)
+        if self._link is not None and self._link.is_symlink():
+            self._link.unlink()
+
+
 class VirtualSO101:
-    """The servos on the bus; a driver opens `port`."""
+    """The servos on the bus; a driver opens `terminal.port`."""
 
     def __init__(
         self,
@@ -63,15 +91,7 @@ class VirtualSO101:
         self.live = LiveUnit(robot, physics, payload, period=PERIOD)
         self._order = robot.index(JOINTS)  # servo number − 1 → joint
         self.calibration = ArmCalibration(_as_calibrated(robot), robot)
-        self._master, slave = os.openpty()
-        tty.setraw(slave)
-        self.port = os.ttyname(slave)
-        self._slave = slave
-        self._link = link
-        if link is not None:
-            if link.is_symlink():
-                link.unlink()
-            link.symlink_to(self.port)
+        self.terminal = Terminal(link)
         self.memory = [_new_memory(self.calibration.rows[joint]) for joint in JOINTS]
         self.silent: set[int] = set()  # servos that do not answer
         self.damaged = False  # replies have a wrong checksum
@@ -83,6 +103,7 @@ class VirtualSO101:
     @no_garbage_collection()
     def run(self, seconds: float = np.inf) -> None:
         """Simulate and answer in real time."""
+        bus = self.terminal.descriptor
         began = time.monotonic()
         start = began - self.live.steps * PERIOD
         while time.monotonic() - began < seconds:
@@ -90,9 +111,9 @@ class VirtualSO101:
             wait = MAX_LAG_S
             if self._frame is None:
                 wait = min(max(0.0, due - time.monotonic()), PERIOD)
-            readable, _, _ = select.select([self._master], [], [], wait)
+            readable, _, _ = select.select([bus], [], [], wait)
             if readable:
-                os.write(self._master, self.receive(os.read(self._master, 4096)))
+                os.write(bus, self.receive(os.read(bus, 4096)))
             if self._frame is not None:
                 continue
             now = time.monotonic()
@@ -103,10 +124,7 @@ class VirtualSO101:
                     self.live.step()
 
     def close(self) -> None:
-        for descriptor in (self._master, self._slave):
-            os.close(descriptor)
-        if self._link is not None and self._link.is_symlink():
-            self._link.unlink()
+        self.terminal.close()
 
     def receive(self, data: bytes) -> bytes:
         """Handle bytes from the bus and return the replies."""

@@ -104,7 +104,7 @@ class Disobedient(VirtualH12):
             unit = self.live.unit
             elbow = unit.batch.model.joint("left_elbow_joint").dofadr[0]
             unit.batch.expand("dof_damping")[:, elbow] = 1000.0
-            unit.cold_damping[:, elbow] = 1000.0
+            unit.motors.cold_damping[:, elbow] = 1000.0
         if wrong and self.way == "weak":
             kp, kd, effort, torque = self.live._gains
             self.live.set_gains(

@@ -498,7 +498,9 @@ def test_it_speaks_over_a_pseudo_terminal_in_another_thread(so101, arm):
     thread = threading.Thread(target=live, daemon=True)
     thread.start()
     try:
-        driver = SO101Driver(so101, arm.port, timeout=20.0)  # s: machines that run tests are busy
+        driver = SO101Driver(
+            so101, arm.terminal.port, timeout=20.0
+        )  # s: machines that run tests are busy
         driver.connect()
         assert np.isfinite(driver.read().qpos).all()
         driver.close()
