@@ -33,7 +33,8 @@ from gaponet.hw.control.plan import Plan, Planner
 from gaponet.hw.control.recording import Recording
 from gaponet.hw.drivers.dry import DryRun, summarize_commands
 from gaponet.hw.drivers.open import driver_names, open_driver, supported_options
-from gaponet.hw.targets.live import LiveTargets, Transport
+from gaponet.hw.targets.live import LiveTargets
+from gaponet.hw.targets.message import Transport
 from gaponet.motion.files import SUFFIXES, read_motion
 from gaponet.motion.library import Library
 from gaponet.motion.motion import Motion

@@ -78,8 +78,8 @@ CONSTANTS = {
         "MAX_BEYOND_RANGE_RAD": 0.051,
     },
     "control.watchdog": {"MAX_RETRY_S": 600.0},
-    "targets.live": {
-        "MAX_MESSAGE_BYTES": 1 << 14,
+    "targets.message": {"MAX_MESSAGE_BYTES": 1 << 14},
+    "targets.accepted_target": {
         "MAX_BEYOND_RANGE_RAD": 0.2,
         "MAX_CATCH_UP_PERIODS": 5,
     },

@@ -15,14 +15,9 @@ from gaponet.hw.control.clock import SimulatedClock
 from gaponet.hw.control.controller import Controller
 from gaponet.hw.control.phases import ControlConfig
 from gaponet.hw.control.safety import Limits, SafetyConfig
-from gaponet.hw.targets.live import (
-    MAX_MESSAGE_BYTES,
-    LiveConfig,
-    LiveTargets,
-    Message,
-    decode,
-    next_step,
-)
+from gaponet.hw.targets.accepted_target import next_step
+from gaponet.hw.targets.live import LiveConfig, LiveTargets
+from gaponet.hw.targets.message import MAX_MESSAGE_BYTES, Message, decode
 from gaponet.motion.motion import Motion
 
 # S; from FAULT on a sender goes wrong; HOLD is the default.

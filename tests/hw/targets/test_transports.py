@@ -16,7 +16,7 @@ from environments import environment
 
 from gaponet.base.errors import UsageError
 from gaponet.hw.control.driver import DriverError
-from gaponet.hw.targets.live import MAX_MESSAGE_BYTES, Message
+from gaponet.hw.targets.message import MAX_MESSAGE_BYTES, Message
 from gaponet.hw.targets.pipe import PipeTransport
 
 STATE = {

@@ -11,32 +11,25 @@ lists the end of each fault.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Hashable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol
-
-import numpy as np
+from typing import Any
 
 from gaponet.base.arrays import Array
 from gaponet.base.errors import UsageError
-from gaponet.base.structure import parse_json
 from gaponet.hw.control.clock import Clock
 from gaponet.hw.control.driver import Fault, State
+from gaponet.hw.targets.accepted_target import AcceptedTarget, Approach, Rejection, Sender
+from gaponet.hw.targets.message import Message, Transport, decode, sender_name
 from gaponet.hw.targets.policy import NotYet
 from gaponet.robot.spec import RobotSpec
 
-MAX_MESSAGE_BYTES = 1 << 14  # a message of 27 joints with long names has 1,500
-# beyond a joint's range: up to this a target is clipped to the range, else rejected
-MAX_BEYOND_RANGE_RAD = 0.2
-# control periods for which the speed limit bounds the distance to the last target
-MAX_CATCH_UP_PERIODS = 5
 MAX_OPTIONS = {
     "hold": (60.0, "s"),
     "late": (60.0, "s"),
     "wait": (1e6, "s"),
     "acceleration": (1e6, "rad/s²"),
 }
-MAX_CLOCK_DRIFT = 2e-4  # of the sender's clock, relative to ours
 
 
 @dataclass(frozen=True)
@@ -59,106 +52,6 @@ class LiveConfig:
                     f"live: {name} is {getattr(self, name)} {unit}; give a positive number up to "
                     f"{most:g}"
                 )
-
-
-@dataclass(frozen=True)
-class MessageFields:
-    """Fields of a message in JSON; optional fields may be left out.
-
-    Attributes:
-        time: On the sender's own clock, s; increases from message to message.
-        target: Joint → rad; the same joints in every message. Empty: the sender only wants to
-            receive states.
-        end: The motion is over: the robot goes back to where it started.
-    """
-
-    time: float
-    target: dict[str, float] | None = None
-    end: bool = False
-
-
-class Message(NamedTuple):
-    """A received message; time None without a clock; error: why it cannot be read, else empty."""
-
-    sender: Hashable
-    time: float | None = None
-    target: dict[str, float] | None = None
-    end: bool = False
-    error: str = ""
-
-
-def sender_name(sender: Hashable) -> str:
-    """Return a sender in words: a DDS handle or the bytes of a ZeroMQ connection as hexadecimal
-    digits.
-    """
-    if isinstance(sender, bytes):
-        return sender.hex()
-    if isinstance(sender, int):
-        return f"{sender:x}"
-    return str(sender)
-
-
-def decode(sender: Hashable, data: bytes) -> Message:
-    """Return a message from JSON; it carries its error if the bytes are not one."""
-    if len(data) > MAX_MESSAGE_BYTES:
-        return Message(sender, error=f"has more than {MAX_MESSAGE_BYTES} bytes")
-    try:
-        fields = parse_json(MessageFields, data, "it", UsageError)
-    except UsageError as error:
-        return Message(sender, error=str(error))
-    return Message(sender, fields.time, fields.target, fields.end)
-
-
-class Transport(Protocol):
-    """Receives targets and publishes states; no method blocks."""
-
-    address: str
-
-    def receive(self) -> list[Message]:
-        """Return the messages since the last call, oldest first, at most some dozens."""
-
-    def senders(self) -> set[Hashable]:
-        """Return the senders that are connected now.
-
-        Empty where a transport knows them by their messages alone.
-        """
-
-    def publish(self, to: Hashable, state: dict[str, Any]) -> None:
-        """Send joint_names, commanded, and qpos, qvel, tau in SI units to the sender, or to all
-        listeners.
-        """
-
-    def close(self, reason: str) -> None:
-        """Send the reason why the run ended, and close."""
-
-
-def next_step(step: Array, distance: Array, max_step: float, max_change: float) -> Array:
-    """Return the next step (n) rad towards a target: the fastest approach without overshoot.
-
-    Args:
-        step: The last one, rad per control period.
-        distance: To the target, (n) rad.
-        max_step: Largest step, rad.
-        max_change: Largest change of the step from one control period to the next, rad.
-    """
-    # A step of u changes, u from m to m + 1, and the m smaller ones that end it go (m + 1) u - m (m
-    # + 1) / 2 changes.
-    far = np.abs(distance)
-    m = np.floor((np.sqrt(1 + 8 * far / max_change) - 1) / 2)
-    largest = np.where(
-        far <= max_change, far, max_change * (far / max_change + m * (m + 1) / 2) / (m + 1)
-    )
-    result: Array = np.clip(
-        np.copysign(np.minimum(largest, max_step), distance), step - max_change, step + max_change
-    )
-    return result
-
-
-class Rejection(NamedTuple):
-    """Why a message is not obeyed."""
-
-    kind: str  # key of counts["refused"]
-    reason: str
 
 
 class LiveTargets:
@@ -200,26 +93,15 @@ class LiveTargets:
         decode("", b'{"time": 0.0, "target": {"joint": 0.0}, "end": false}')
         decode("", b"no message")
         self.transport = transport
-        self.robot = robot
-        self.commanded = commanded
         self.clock = clock
-        self.dt = dt
-        self.speed = speed
         self.config = config
         self.counts: dict[str, Any] = {"taken": 0, "held": 0, "refused": Counter(), "sender": ""}
         self.remarks: list[str] = []
         self.observe: Callable[[Array], tuple[Array, Array] | None] | None = None
-        self._sender: Hashable | None = None
-        self._joints: tuple[str, ...] = ()
-        self._target: Array | None = None  # the last accepted one, all joints, rad
-        self._position = np.zeros(0)  # on the way to the target, rad
-        self._step = np.zeros(0)  # the last one, rad
-        self._offset = np.inf  # least arrival − time, s
-        self._offset_time = np.inf  # our time of its last update, s
-        self._sender_time = -np.inf  # of the last accepted target, sender's clock
+        self._sender = Sender(config.late)
+        self._target = AcceptedTarget(robot, commanded, dt, speed)
+        self._approach = Approach(speed * dt, config.acceleration * dt**2)
         self._start: float | None = None
-        self._accepted_time = 0.0  # our time of the last accepted target
-        self._ended = False
         self._rejection = ""
 
     def __call__(self, k: int, state: State) -> Array | Fault | None:
@@ -233,11 +115,11 @@ class LiveTargets:
         now = self.clock.now()
         if self._start is None:
             self._start = now
-        self.transport.publish(self._sender, self._published(state))
+        self.transport.publish(self._sender.identity, self._published(state))
         # Row 0 is also the goal of the blend: it is asked for again and again.
         running = k > 0
-        if not (self._ended and running):
-            unproven = self._target is None
+        if not (self._sender.has_ended and running):
+            unproven = self._target.qpos is None
             self._receive(now, state)
             if unproven and self._has_second_sender():
                 return Fault(
@@ -245,26 +127,27 @@ class LiveTargets:
                     f"more than one program sends targets to {self.transport.address}; end all "
                     "but one",
                 )
-        if self._target is None:
-            return None if self._ended else self._still_silent(now - self._start)
-        return self._next_position(self._target, now, self._ended and running)
+        ended = self._sender.has_ended
+        if self._target.qpos is None:
+            return None if ended else self._still_silent(now - self._start)
+        return self._next_position(self._target.qpos, now, ended and running)
 
     def _next_position(self, target: Array, now: float, ending: bool) -> Array | Fault | None:
         """Return the position, (n) rad, one period further towards an accepted target.
 
         None: ending, and it is reached. Fault: no target was accepted for long.
         """
-        silent = now - self._accepted_time
+        silent = now - self._target.time
         if silent > self.config.hold and not ending:
             return Fault(
                 "silence", f"no target was accepted for {silent * 1e3:.0f} ms{self._rejection}"
             )
-        self._advance(target)
-        if ending and not self._step.any():
+        self._approach.advance(target)
+        if ending and not self._approach.step.any():
             return None
         if silent > 0 and not ending:
             self.counts["held"] += 1
-        return self._position
+        return self._approach.position
 
     def _still_silent(self, waited: float) -> Fault:
         """Return why there is no first target after some s: not yet, or a fault."""
@@ -284,23 +167,12 @@ class LiveTargets:
             return True
         return len(self.transport.senders()) > 1
 
-    def _advance(self, target: Array) -> None:
-        """Move on towards a target (n) rad by one control period."""
-        if not self._position.size:
-            self._position = target
-            self._step = np.zeros_like(target)
-        distance = target - self._position
-        self._step = next_step(
-            self._step, distance, self.speed * self.dt, self.config.acceleration * self.dt**2
-        )
-        self._position = np.where(self._step == distance, target, self._position + self._step)
-
     def _published(self, state: State) -> dict[str, Any]:
         """Return what the sender is told of a state."""
         message: dict[str, Any] = {
             "time": state.time,
-            "joint_names": self.robot.joint_names,
-            "commanded": self.commanded,
+            "joint_names": self._target.robot.joint_names,
+            "commanded": self._target.commanded,
         }
         for name in ("qpos", "qvel", "tau"):
             message[name] = getattr(state, name).tolist()
@@ -315,21 +187,19 @@ class LiveTargets:
 
         Each is compared with the one in force before this call.
         """
-        before = self._target
-        since = now - self._accepted_time
         accepted = None
         for message in self.transport.receive():
-            target = self._reject(message, now) or self._full_target(message, before, since, state)
+            rejection = self._sender.reject(message, now)
+            target = rejection or self._target.of_all_joints(message, now, state)
             if isinstance(target, Rejection):
                 self._count_rejection(message, target)
             elif target is not None:
                 accepted = target
-                if message.time is not None:
-                    self._sender_time = message.time
+                self._sender.note_accepted(message)
                 self.counts["taken"] += 1
+        self.counts["sender"] = self._sender.name
         if accepted is not None:
-            self._target = accepted
-            self._accepted_time = now
+            self._target.accept(accepted, now)
             self._rejection = ""
 
     def _count_rejection(self, message: Message, rejection: Rejection) -> None:
@@ -341,73 +211,3 @@ class LiveTargets:
             )
         refused[rejection.kind] += 1
         self._rejection = f"; the last one was rejected: {rejection.reason}"
-
-    def _reject(self, message: Message, now: float) -> Rejection | None:
-        """Return why sender or time of a message are wrong; None if they are right."""
-        if message.error:
-            return Rejection("malformed", message.error)
-        if self._sender is None:
-            self._sender = message.sender
-            self.counts["sender"] = sender_name(message.sender)
-        if message.sender != self._sender:
-            return Rejection(
-                "stranger",
-                "it is from another sender than the first one; start a new run for a new sender",
-            )
-        if message.end:
-            self._ended = True
-        if message.time is None:
-            return None
-        if message.time <= self._sender_time:
-            return Rejection(
-                "order", f"its time {message.time:.6g} s is not after {self._sender_time:.6g} s"
-            )
-        drifted = self._offset + MAX_CLOCK_DRIFT * max(now - self._offset_time, 0.0)
-        self._offset = min(now - message.time, drifted)
-        self._offset_time = now
-        late = now - message.time - self._offset
-        if late > self.config.late:
-            return Rejection("late", f"it took {late * 1e3:.0f} ms longer than the fastest")
-        return None
-
-    def _full_target(
-        self, message: Message, before: Array | None, since: float, state: State
-    ) -> Array | Rejection | None:
-        """Return the target of all joints (n) rad, or why it is rejected; None for a greeting."""
-        if not message.target:
-            return None
-        names = self._joints or tuple(message.target)
-        odd = self._odd_joints(message.target, names)
-        if odd:
-            return Rejection(
-                "joints", f"joint '{odd[0]}' is new, left out, or not one that is commanded"
-            )
-        at = self.robot.index(names)
-        wanted = np.array([message.target[name] for name in names], float)
-        low, high = self.robot.qpos_range[at].T
-        beyond = np.maximum(low - wanted, wanted - high)
-        if not beyond.max() <= MAX_BEYOND_RANGE_RAD:  # NaN too
-            worst = int(np.argmax(beyond))
-            return Rejection(
-                "range", f"{names[worst]} at {wanted[worst]:.3g} rad is out of its range"
-            )
-        target = np.array(state.qpos if before is None else before)
-        step = np.abs(np.clip(wanted, low, high) - target[at])
-        allowed = self.speed * min(since + self.dt, MAX_CATCH_UP_PERIODS * self.dt)
-        if before is not None and step.max() > allowed:
-            worst = int(step.argmax())
-            return Rejection(
-                "speed",
-                f"{names[worst]} goes {step[worst]:.2f} rad at once, {allowed:.2f} would be "
-                "possible",
-            )
-        target[at] = np.clip(wanted, low, high)
-        self._joints = names
-        return target
-
-    def _odd_joints(self, target: Mapping[str, float], names: tuple[str, ...]) -> list[str]:
-        """Return joints that are not in both, or else those that are not commanded."""
-        odd = sorted(target.keys() ^ set(names))
-        if odd:
-            return odd
-        return [name for name in names if name not in self.commanded]

@@ -11,7 +11,7 @@ from collections.abc import Hashable
 from typing import Any
 
 from gaponet.base.errors import UsageError
-from gaponet.hw.targets.live import MAX_MESSAGE_BYTES, Message, decode
+from gaponet.hw.targets.message import MAX_MESSAGE_BYTES, Message, decode
 
 READ_BYTES = 1 << 16  # per call: some 40 messages of a humanoid
 

@@ -17,7 +17,7 @@ from cyclonedds.idl.types import float64, int32, sequence, uint32
 
 from gaponet.hw.drivers import dds
 from gaponet.hw.drivers.hg import HEADER
-from gaponet.hw.targets.live import MAX_MESSAGE_BYTES, Message
+from gaponet.hw.targets.message import MAX_MESSAGE_BYTES, Message
 
 TOPIC = "rt/joint_trajectory_controller/joint_trajectory"
 STATES_TOPIC = "rt/joint_states"

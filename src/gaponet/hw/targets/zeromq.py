@@ -13,7 +13,7 @@ from typing import Any
 import zmq
 
 from gaponet.base.errors import UsageError
-from gaponet.hw.targets.live import MAX_MESSAGE_BYTES, Message, decode
+from gaponet.hw.targets.message import MAX_MESSAGE_BYTES, Message, decode
 
 ADDRESS = "tcp://127.0.0.1:5555"
 QUEUE_LENGTH = 64  # messages read per call, and buffered per connection
