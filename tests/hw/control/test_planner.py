@@ -294,7 +294,7 @@ def test_when_targets_end_it_stands_until_a_clear_way_back_is_found_or_ends_ther
         )
 
     driver.read = read
-    controller.monitor.noisy = False
+    controller.monitor.frozen.noisy = False
     assert judge.along(np.stack([far, found]), 0.02)[0] > 0.1
     legs = itertools.pairwise([found, robot.qpos_home, far])
     rows = np.concatenate(

@@ -359,6 +359,93 @@ def spoils_data(kind: str) -> bool:
     return kind in FAULTS and not FAULTS[kind].is_data
 
 
+class FrozenReadings:
+    """Finds readings that stand still although the robot is told to move.
+
+    Attributes:
+        noisy: Equal readings count as frozen at once; else only after the command has moved by
+            frozen_travel.
+    """
+
+    def __init__(
+        self, joint_names: tuple[str, ...], commanded: Array, noisy: bool, config: SafetyConfig
+    ) -> None:
+        """commanded: Indices of the commanded joints."""
+        self.noisy = noisy
+        self._names = joint_names
+        self._commanded = commanded
+        self._config = config
+        self._equal_states = 0  # states in a row whose readings are all equal
+        self._travel = np.zeros(len(commanded))  # way of the commands meanwhile, rad
+        # Of joints whose position stands still, since it does:
+        self._anchor: Array | None = None  # the command when it began, rad
+        self._integral = np.zeros(len(commanded))  # of the velocity, rad
+        self._still_states = np.zeros(len(commanded), int)
+
+    def check(
+        self, state: State, last: State | None, ctrl: Array | None, last_ctrl: Array | None
+    ) -> Fault | None:
+        """Return the fault of a state.
+
+        Args:
+            state: The newest one.
+            last: The one before it.
+            ctrl, last_ctrl: The command in force when each was read, rad; None: there was none.
+        """
+        if last is not None and state.time <= last.time:
+            return None  # the same state again
+        fault = None
+        if last is not None:
+            fault = self._equal_readings(state, last, ctrl, last_ctrl)
+        return fault or self._joint_stands_still(state, last, ctrl)
+
+    def _equal_readings(
+        self, state: State, last: State, ctrl: Array | None, last_ctrl: Array | None
+    ) -> Fault | None:
+        """Return a fault if all readings of several states in a row are equal."""
+        if not self._config.frozen:
+            return None
+        if not _reads_the_same(state, last):
+            self._equal_states = 0
+            self._travel[:] = 0.0
+            return None
+        self._equal_states += 1
+        if ctrl is not None and last_ctrl is not None:
+            self._travel += np.abs(ctrl - last_ctrl)
+        repeats = self.noisy or self._travel.max() > self._config.frozen_travel
+        if self._equal_states < self._config.frozen or not repeats:
+            return None
+        return Fault("frozen", f"{self._equal_states + 1} states in a row read exactly the same")
+
+    def _joint_stands_still(
+        self, state: State, last: State | None, ctrl: Array | None
+    ) -> Fault | None:
+        """Return a fault if one encoder stands still while its command or the integral of its
+        velocity goes on.
+        """
+        qpos = state.qpos[self._commanded]
+        if last is None or ctrl is None or not self.noisy:
+            self._anchor = ctrl
+            return None
+        moved = qpos != last.qpos[self._commanded]
+        anchor = ctrl if self._anchor is None else np.where(moved, ctrl, self._anchor)
+        integral = self._integral + state.qvel[self._commanded] * (state.time - last.time)
+        self._anchor = anchor
+        self._integral = np.where(moved, 0.0, integral)
+        self._still_states = np.where(moved, 0, self._still_states + 1)
+        distance = np.maximum(np.abs(ctrl - anchor), np.abs(self._integral))
+        beyond = np.where(self._still_states < MIN_STILL_STATES, 0.0, distance)
+        worst = int(beyond.argmax())
+        if beyond[worst] <= self._config.frozen_joint:
+            return None
+        joint = self._names[int(self._commanded[worst])]
+        far = f"{beyond[worst]:.2f} rad"
+        return Fault(
+            "frozen",
+            f"the position of {joint} stands still while its command or velocity goes {far}",
+        )
+
+
 class StateMonitor:
     """Checks successive states; it returns the first fault of each and remembers none."""
 
@@ -381,15 +468,9 @@ class StateMonitor:
         self.commanded = commanded
         self.dt = dt
         self.config = config
-        self.noisy = noisy
+        self.frozen = FrozenReadings(joint_names, commanded, noisy, config)
         self._last: State | None = None
         self._last_ctrl: Array | None = None
-        self._equal_states = 0  # states in a row whose readings are all equal
-        self._travel = np.zeros(len(commanded))  # way of the commands meanwhile, rad
-        # Of joints whose position stands still, since it does:
-        self._anchor: Array | None = None  # the command when it began, rad
-        self._integral = np.zeros(len(commanded))  # of the velocity, rad
-        self._still_states = np.zeros(len(commanded), int)
         self._tracking_s = 0.0  # for which a joint has been far from its command
         self._refused: list[tuple[float, int]] = []  # time, s, and messages refused until then
 
@@ -421,8 +502,7 @@ class StateMonitor:
             or self._tilt(state)
             or self._jump(state)
             or self._hot(state)
-            or self._frozen(state, ctrl)
-            or self._frozen_joint(state, ctrl)
+            or self.frozen.check(state, self._last, ctrl, self._last_ctrl)
             or self._tracking(state, ctrl, requested)
             or self._checksum(now, state)
         )
@@ -482,51 +562,6 @@ class StateMonitor:
                 f"{self.names[worst]} is at {state.temperature[worst]:.0f} °C; let it cool",
             )
         return None
-
-    def _frozen(self, state: State, ctrl: Array | None) -> Fault | None:
-        last = self._last
-        if last is None or state.time <= last.time or not self.config.frozen:
-            return None
-        if not _reads_the_same(state, last):
-            self._equal_states = 0
-            self._travel[:] = 0.0
-            return None
-        self._equal_states += 1
-        if ctrl is not None and self._last_ctrl is not None:
-            self._travel += np.abs(ctrl - self._last_ctrl)
-        repeats = self.noisy or self._travel.max() > self.config.frozen_travel
-        if self._equal_states < self.config.frozen or not repeats:
-            return None
-        return Fault("frozen", f"{self._equal_states + 1} states in a row read exactly the same")
-
-    def _frozen_joint(self, state: State, ctrl: Array | None) -> Fault | None:
-        """Return a fault if one encoder stands still while its command or the integral of its
-        velocity goes on.
-        """
-        qpos = state.qpos[self.commanded]
-        last = self._last
-        if last is not None and state.time <= last.time:
-            return None  # the same state again
-        if last is None or ctrl is None or not self.noisy:
-            self._anchor = ctrl
-            return None
-        moved = qpos != last.qpos[self.commanded]
-        anchor = ctrl if self._anchor is None else np.where(moved, ctrl, self._anchor)
-        integral = self._integral + state.qvel[self.commanded] * (state.time - last.time)
-        self._anchor = anchor
-        self._integral = np.where(moved, 0.0, integral)
-        self._still_states = np.where(moved, 0, self._still_states + 1)
-        distance = np.maximum(np.abs(ctrl - anchor), np.abs(self._integral))
-        beyond = np.where(self._still_states < MIN_STILL_STATES, 0.0, distance)
-        worst = int(beyond.argmax())
-        if beyond[worst] <= self.config.frozen_joint:
-            return None
-        joint = self.names[int(self.commanded[worst])]
-        far = f"{beyond[worst]:.2f} rad"
-        return Fault(
-            "frozen",
-            f"the position of {joint} stands still while its command or velocity goes {far}",
-        )
 
     def _tracking(self, state: State, ctrl: Array | None, requested: Array | None) -> Fault | None:
         """Return a fault if a joint is far from its command, or from where it is asked to be
