@@ -89,7 +89,7 @@ def test_a_users_mujoco_loop_is_aligned_by_one_call_per_period(robot, model):
     mj_model = build_model(robot, 0.2)
     data, align, sim = (
         mujoco.MjData(mj_model),
-        MujocoAligner(model, mj_model, 0.02, 0.2),
+        MujocoAligner(model, mj_model, dt=0.02, payload_mass=0.2),
         AlignedSim(robot, model, 0.2),
     )
     for _ in range(2):
@@ -119,9 +119,9 @@ def test_other_rates_simulators_and_locked_joints_are_refused(robot, model, tmp_
 def test_a_scene_that_does_not_fit_is_refused(robot, model):
     mj_model = build_model(robot)
     with pytest.raises(ModelError, match=r"50\.0"):
-        MujocoAligner(model, mj_model, 0.025, 0.0)
+        MujocoAligner(model, mj_model, dt=0.025, payload_mass=0.0)
     with pytest.raises(ModelError, match="left/shoulder"):
-        MujocoAligner(model, mj_model, 0.02, 0.0, prefix="left/")
+        MujocoAligner(model, mj_model, dt=0.02, payload_mass=0.0, prefix="left/")
 
 
 def test_a_scene_without_actuators_is_refused(robot):
@@ -129,7 +129,7 @@ def test_a_scene_without_actuators_is_refused(robot):
     assert scene.nu == 0
 
     with pytest.raises(ModelError, match="actuator"):
-        MujocoAligner(robot, scene, 0.02, 0.0)
+        MujocoAligner(robot, scene, dt=0.02, payload_mass=0.0)
 
 
 def test_a_scene_moves_like_an_identified_robot_without_a_model(robot):
@@ -138,7 +138,7 @@ def test_a_scene_moves_like_an_identified_robot_without_a_model(robot):
     mj_model = build_model(robot, 0.2)
     data, align, sim = (
         mujoco.MjData(mj_model),
-        MujocoAligner(known, mj_model, 0.02, 0.2),
+        MujocoAligner(known, mj_model, dt=0.02, payload_mass=0.2),
         AlignedSim(known, None, 0.2),
     )
     plain, apart = AlignedSim(robot, None, 0.2), []
@@ -150,4 +150,6 @@ def test_a_scene_moves_like_an_identified_robot_without_a_model(robot):
         apart.append([np.abs(sim.qpos - other).max() for other in (data.qpos, plain.qpos)])
     aligned, nominal = np.mean(apart, axis=0)
     assert aligned < 0.1 * nominal
-    assert MujocoAligner(robot, mj_model, 0.02, 0.2).transfer is None  # it moves so of itself
+    assert (
+        MujocoAligner(robot, mj_model, dt=0.02, payload_mass=0.2).transfer is None
+    )  # it moves so of itself

@@ -88,7 +88,10 @@ def test_with_aim_simulator_the_robot_moves_like_the_nominal_simulator(robot, mo
     config = replace(NOW, aim="simulator", feedback=0.0)
     raw, _ = play(WeakArm(robot, 0.2), targets)
     q, _ = play(
-        WeakArm(robot, 0.2), targets, Compensator(robot, model, config, payload_step=0.1), 0.2
+        WeakArm(robot, 0.2),
+        targets,
+        Compensator(robot, model, config=config, payload_step=0.1),
+        0.2,
     )
     assert error(q, expected) < 0.1 * error(raw, expected)
 
@@ -107,7 +110,7 @@ def test_a_command_is_no_further_from_its_target_than_the_limit(robot, given):
 
 def test_what_is_measured_changes_nothing_without_feedback(robot, model):
     targets = commands(60, 2)
-    one, two = (Compensator(robot, model, replace(NOW, feedback=0.0)) for _ in range(2))
+    one, two = (Compensator(robot, model, config=replace(NOW, feedback=0.0)) for _ in range(2))
     for compensator in (one, two):
         compensator.reset(targets[0], 0.0)
     rng = np.random.default_rng(0)
@@ -117,7 +120,7 @@ def test_what_is_measured_changes_nothing_without_feedback(robot, model):
 
 def test_commands_blend_in(robot, model):
     target = np.array([0.5, 0.3])
-    compensator = Compensator(robot, model, CompensatorConfig(blend=1.0))
+    compensator = Compensator(robot, model, config=CompensatorConfig(blend=1.0))
     compensator.reset(target, 0.4)
     u = np.array([compensator.step(target, None) for _ in range(80)])
     np.testing.assert_array_equal(u[0], target)
@@ -143,7 +146,7 @@ def test_by_default_half_of_the_compensation_is_there_after_half_a_second_and_al
 @pytest.mark.parametrize(("late", "lost"), [(0, 0.0), (4, 0.2)])
 def test_steps_of_command_and_payload_die_out(robot, model, late, lost):
     targets = np.repeat([[0.3, -0.2], [-0.4, 0.5], [0.2, 0.2]], 150, axis=0)
-    arm, compensator = WeakArm(robot, 0.0, late, lost), Compensator(robot, model, NOW)
+    arm, compensator = WeakArm(robot, 0.0, late, lost), Compensator(robot, model, config=NOW)
 
     def load(heavy, mass):
         arm.load(heavy)
@@ -169,7 +172,10 @@ def test_the_default_feedback_is_stable_on_a_weakly_damped_arm(tmp_path):
     calm = {}
     for name, config in (("default", NOW), ("fast", replace(NOW, feedback=5.0, feedback_time=0.0))):
         q, _ = play(
-            WeakArm(swinging, 0.4, late=4), targets, Compensator(swinging, model, config), 0.4
+            WeakArm(swinging, 0.4, late=4),
+            targets,
+            Compensator(swinging, model, config=config),
+            0.4,
         )
         calm[name] = float(np.abs(np.diff(q[-100:], axis=0)).max())
     assert calm["default"] < 1e-3 < calm["fast"]
@@ -177,7 +183,7 @@ def test_the_default_feedback_is_stable_on_a_weakly_damped_arm(tmp_path):
 
 def test_a_payload_that_is_not_stated_is_estimated(robot, model):
     targets = np.repeat([[0.3, -0.2]], 500, axis=0)
-    arm, compensator = WeakArm(robot), Compensator(robot, model, NOW, payload_step=0.1)
+    arm, compensator = WeakArm(robot), Compensator(robot, model, config=NOW, payload_step=0.1)
     q, _ = play(arm, targets, compensator, None, {100: lambda: arm.load(1)})
     assert compensator.payload_mass[0] == pytest.approx(
         0.4, abs=0.12
@@ -224,7 +230,7 @@ def test_torques_contradict_a_payload_that_is_wrong_by_more_than_half_of_the_lar
 def test_a_stated_payload_is_compared_with_the_servo_torques(robot, model, held, told, doubted):
     arm, compensator = (
         WeakArm(robot, WeakArm.masses[held]),
-        Compensator(robot, model, NOW, payload_step=0.1),
+        Compensator(robot, model, config=NOW, payload_step=0.1),
     )
     play(arm, np.repeat([[0.3, -0.2]], 200, axis=0), compensator, told)
     assert (
@@ -235,7 +241,7 @@ def test_a_stated_payload_is_compared_with_the_servo_torques(robot, model, held,
 
 def test_torques_unlike_a_payload_give_mass_zero(robot, model):
     target = np.array([0.3, -0.2])
-    compensator = Compensator(robot, model, NOW, payload_step=0.1)
+    compensator = Compensator(robot, model, config=NOW, payload_step=0.1)
     compensator.reset(target, None)
     per_kg = np.subtract(*compensator.payload_estimate.gravity(target)[::-1])
     across = 6.0 * np.array([-per_kg[1], per_kg[0]]) + 2.0 * per_kg  # mostly what no payload does
@@ -248,7 +254,7 @@ def test_torques_unlike_a_payload_give_mass_zero(robot, model):
 
 def test_the_integral_of_a_blocked_joint_is_limited(robot, model):
     target = np.array([0.3, 0.3])
-    compensator = Compensator(robot, model, replace(NOW, limit=0.05))
+    compensator = Compensator(robot, model, config=replace(NOW, limit=0.05))
     compensator.reset(target, 0.0)
     for _ in range(500):  # 10 s against a stop
         compensator.step(target, np.array([-0.5, -0.5]))
@@ -262,7 +268,7 @@ def test_the_integral_of_a_blocked_joint_is_limited(robot, model):
 
 
 def test_without_fresh_states_feedback_waits(robot, model):
-    compensator = Compensator(robot, model, NOW)
+    compensator = Compensator(robot, model, config=NOW)
     compensator.reset(np.zeros(2), 0.0)
     for _ in range(20):
         compensator.step(np.zeros(2), np.array([0.1, 0.1]))
@@ -274,9 +280,9 @@ def test_without_fresh_states_feedback_waits(robot, model):
 
 def test_several_robots_are_compensated_as_each_alone(robot, model):
     targets = np.stack([commands(40, 0), commands(40, 1)], axis=1)
-    both = Compensator(robot, model, NOW, num_envs=2, payload_step=0.1)
+    both = Compensator(robot, model, config=NOW, num_envs=2, payload_step=0.1)
     both.reset(targets[0], np.array([0.0, 0.3]))
-    alone = [Compensator(robot, model, NOW, payload_step=0.1) for _ in range(2)]
+    alone = [Compensator(robot, model, config=NOW, payload_step=0.1) for _ in range(2)]
     for i, c in enumerate(alone):
         c.reset(targets[0, i], (0.0, 0.3)[i])
     for target in targets:
@@ -316,7 +322,7 @@ def test_dynamic_feed_forward_reduces_the_error_of_a_moving_arm(robot, model):
     targets = commands(150, 1)
     missed = {}
     for dynamics in (False, True):
-        compensator = Compensator(robot, model, replace(NOW, dynamics=dynamics))
+        compensator = Compensator(robot, model, config=replace(NOW, dynamics=dynamics))
         q, _ = play(WeakArm(robot, 0.2), targets, compensator, 0.2)
         missed[dynamics] = error(q, targets)
     assert missed[True] < 0.6 * missed[False]
@@ -391,7 +397,7 @@ def test_payloads_beyond_the_training_data_are_refused_without_extrapolate(robot
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
 def test_values_that_are_not_finite_have_no_lasting_effect(robot, model, payload, bad):
     targets = commands(60, 0)
-    one, two = (Compensator(robot, model, NOW, num_envs=2) for _ in range(2))
+    one, two = (Compensator(robot, model, config=NOW, num_envs=2) for _ in range(2))
     for compensator in (one, two):
         compensator.reset(np.tile(targets[0], (2, 1)), payload)
     q = np.tile(targets[0], (2, 1))
@@ -424,7 +430,7 @@ def test_an_adapted_unit_follows_where_the_model_alone_does_not(robot):
         q, _ = play(
             WeakArm(robot, 0.4),
             targets,
-            Compensator(robot, ignorant, still, adaptation=adaptation),
+            Compensator(robot, ignorant, config=still, adaptation=adaptation),
             0.4,
         )
         error[name] = np.abs(q[1:] - targets[:-1])[100:].mean()

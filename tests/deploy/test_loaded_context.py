@@ -50,7 +50,7 @@ def test_the_payload_in_hand_changes_what_aligned_sim_sends(model, simulated):
 def test_a_mujoco_loop_sends_what_aligned_sim_sends(model, simulated):
     robot = model.simulator()
     scene = build_model(robot, PAYLOAD)
-    align = gp.MujocoAligner(model, scene, robot.dt, PAYLOAD)
+    align = gp.MujocoAligner(model, scene, dt=robot.dt, payload_mass=PAYLOAD)
     data = mujoco.MjData(scene)
     data.qpos[:] = robot.qpos_home
     mujoco.mj_forward(scene, data)

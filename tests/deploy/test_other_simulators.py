@@ -113,7 +113,7 @@ def test_a_scene_moves_like_the_aligned_simulator(trained) -> None:
     aligned = AlignedSim(robot, trained.model)
     scene = build_model(robot)
     data = mujoco.MjData(scene)
-    align = MujocoAligner(trained.model, scene, robot.dt, 0.0)
+    align = MujocoAligner(trained.model, scene, dt=robot.dt, payload_mass=0.0)
 
     def step_aligned(target: np.ndarray) -> np.ndarray:
         aligned.step(target)

@@ -196,7 +196,7 @@ def scene(robot):
 
 def test_a_users_scene_moves_like_the_reference_with_its_model(robot, model):
     there, mj_model = follow(AlignedSim(robot, model, 0.2)), scene(robot)
-    align, apart = MujocoAligner(model, mj_model, 0.02, payload_mass=0.2), []
+    align, apart = MujocoAligner(model, mj_model, dt=0.02, payload_mass=0.2), []
     for correct in (align, lambda data, target: target):
         data = mujoco.MjData(mj_model)
         data.qpos[:2] = TARGETS[0]
@@ -210,12 +210,12 @@ def test_a_users_scene_moves_like_the_reference_with_its_model(robot, model):
 
 
 def test_in_a_scene_equal_to_the_simulator_of_training_nothing_is_transferred(robot, model):
-    assert MujocoAligner(model, build_model(robot), 0.02, 0.0).transfer is None
-    assert MujocoAligner(model, build_model(robot), 0.02, payload_mass=0.2).transfer is not None
+    assert MujocoAligner(model, build_model(robot), dt=0.02, payload_mass=0.0).transfer is None
+    assert MujocoAligner(model, build_model(robot), dt=0.02, payload_mass=0.2).transfer is not None
 
 
 def test_the_compensator_takes_the_simulator_of_the_run(robot, model):
     stiff = other(robot, kp=2.0)
     assert Compensator(stiff, model).robot.servo.kp[0] == robot.servo.kp[0]
     with pytest.raises(ModelError, match="aim"):
-        Compensator(stiff, model, CompensatorConfig(aim="simulator"))
+        Compensator(stiff, model, config=CompensatorConfig(aim="simulator"))

@@ -75,7 +75,9 @@ class Corrector:
         if fps is not None:
             dt = 1 / fps
         config = CompensatorConfig(dynamics=dynamics)
-        compensator = Compensator(spec, network, config, dt, follow="nominal" if follow else None)
+        compensator = Compensator(
+            spec, network, config=config, dt=dt, follow="nominal" if follow else None
+        )
         return cls(spec, compensator, dt, payload_mass)
 
     def restart(self) -> None:

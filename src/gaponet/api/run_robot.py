@@ -580,8 +580,8 @@ def _with_model(
     compensator = Compensator(
         robot,
         model,
-        options.compensation,
-        request.dt,
+        config=options.compensation,
+        dt=request.dt,
         payload_side=options.payload_side,
         extrapolate=options.extrapolate,
         adaptation=known.get(name),

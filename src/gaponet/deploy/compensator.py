@@ -115,6 +115,7 @@ class Compensator:
         self,
         robot: RobotSpec,
         model: GapModel | None = None,
+        *,
         config: CompensatorConfig = CompensatorConfig(),
         dt: float | None = None,
         num_envs: int | None = None,

@@ -155,7 +155,12 @@ class AlignedActions(gymnasium.Wrapper):
         super().__init__(env)
         scene: Any = env.unwrapped
         self.align = MujocoAligner(
-            model, scene.model, float(scene.dt), payload_mass, prefix, extrapolate
+            model,
+            scene.model,
+            dt=float(scene.dt),
+            payload_mass=payload_mass,
+            prefix=prefix,
+            extrapolate=extrapolate,
         )
 
     def reset(self, **how: Any) -> tuple[Any, dict[str, Any]]:

@@ -42,6 +42,7 @@ class MujocoAligner:
         self,
         model: Reference,
         mj_model: mujoco.MjModel,
+        *,
         dt: float,
         payload_mass: float,
         prefix: str = "",

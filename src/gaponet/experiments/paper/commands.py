@@ -127,4 +127,4 @@ def make_compensator(
     With and without a network, its simulators carry the same masses.
     """
     config = replace(config, payload_max=max(*payloads, MIN_PAYLOAD_KG))
-    return Compensator(robot, model, config, num_envs=len(payloads), nthread=1)
+    return Compensator(robot, model, config=config, num_envs=len(payloads), nthread=1)
