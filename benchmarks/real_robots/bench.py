@@ -49,50 +49,72 @@ class Bench:
         Raises:
             UsageError: No such data set or question.
         """
-        unknown = set(sets) - {c.name for c in self.cards.set}
-        if unknown:
-            raise UsageError(
-                f"no set '{min(unknown)}'; there are {', '.join(c.name for c in self.cards.set)}"
-            )
-        present = [
-            c for c in self.cards.set if self._is_present(c) and (not sets or c.name in sets)
-        ]
-        every = {q for c in present for q in c.questions}
-        if set(names) - every:
-            raise UsageError(
-                f"no question '{min(set(names) - every)}'; there are {', '.join(sorted(every))}"
-            )
-        left_out = {f.folder: f.why for f in self.cards.left_out if (self.data / f.folder).exists()}
-        left_out |= {c.folder: "not there" for c in self.cards.set if not self._is_present(c)}
+        present = self._chosen(sets, names)
+        left_out = {}
+        for folder in self.cards.left_out:
+            if (self.data / folder.folder).exists():
+                left_out[folder.folder] = folder.why
+        for card in self.cards.set:
+            if not self._is_present(card):
+                left_out[card.folder] = "not there"
         rows: list[Row] = []
         labels: dict[str, list[str]] = {}
         seconds: dict[str, float] = {}
         for card in present:
-            start = time.monotonic()
+            began = time.monotonic()
             try:
                 dataset, robot, estimated = prepare(card, self.data, self.work)
             except GAPONetError as error:
                 self.say(f"{card.name}: {error}")
                 left_out[card.folder] = str(error)
                 continue
-            seconds[card.name] = time.monotonic() - start
+            seconds[card.name] = time.monotonic() - began
             self.say(
-                f"{card.name}: {len(dataset)} recordings, {dataset.hours() * 60:.1f} min, from file to dataset in "
-                f"{seconds[card.name]:.0f} s"
+                f"{card.name}: {len(dataset)} recordings, {dataset.hours() * 60:.1f} min, from "
+                f"file to dataset in {seconds[card.name]:.0f} s"
             )
             if estimated:
                 labels[card.name] = estimated.remarks
-            for name in (q for q in card.questions if not names or q in names):
-                rows += self.evaluate(
-                    card, name, list(questions(name, dataset, robot, self._elsewhere(card)))
-                )
-            seconds[card.name] += sum(r["seconds"] for r in rows if r["set"] == card.name)
-        return {"rows": rows, "cards": {c.name: c.title for c in present}, "labels": labels, "left_out": left_out,
-                "seconds": {k: round(v) for k, v in seconds.items()}}  # fmt: skip
+            for name in card.questions:
+                if names and name not in names:
+                    continue
+                folds = list(questions(name, dataset, robot, self._elsewhere(card)))
+                found = self.evaluate(card, name, folds)
+                seconds[card.name] += sum(row["seconds"] for row in found)
+                rows += found
+        return {
+            "rows": rows,
+            "cards": {card.name: card.title for card in present},
+            "labels": labels,
+            "left_out": left_out,
+            "seconds": {name: round(value) for name, value in seconds.items()},
+        }
+
+    def _chosen(self, sets: tuple[str, ...], names: tuple[str, ...]) -> list[Card]:
+        """Return the cards that are wanted and whose data are there.
+
+        Raises:
+            UsageError: No such data set or question.
+        """
+        known = [card.name for card in self.cards.set]
+        unknown = set(sets) - set(known)
+        if unknown:
+            raise UsageError(f"no set '{min(unknown)}'; there are {', '.join(known)}")
+        present = []
+        asked: set[str] = set()
+        for card in self.cards.set:
+            if self._is_present(card) and (not sets or card.name in sets):
+                present.append(card)
+                asked |= set(card.questions)
+        unknown = set(names) - asked
+        if unknown:
+            raise UsageError(f"no question '{min(unknown)}'; there are {', '.join(sorted(asked))}")
+        return present
 
     def evaluate(self, card: Card, name: str, folds: list[Question]) -> list[Row]:
-        """Evaluate every method on every fold of a question; methods without the data that they
-        need are skipped.
+        """Evaluate every method on every fold of a question.
+
+        Methods without the data that they need are skipped.
 
         Returns:
             A row per method for JSON: mrad, standard errors over motions, of differences paired;
@@ -102,34 +124,40 @@ class Bench:
             one at a time.
         """
         rows: list[Row] = []
-        floors = [f for q in folds if (f := repeatability(q)) == f]
         nominal = np.empty(0)
-        folds = [self._with_folder(card, q) for q in folds]
+        floor_mrad = 1e3 * _floor(folds)
+        folds = [self._with_folder(card, question) for question in folds]
         for method, (title, fit) in self.methods.items():
             if _lacks_data(method, folds[0]):
                 continue
+            evaluated = []
             try:
-                evaluated = [self._evaluate_fold(card, q, method, fit) for q in folds]
+                for question in folds:
+                    evaluated.append(self._evaluate_fold(card, question, method, fit))
             except Exception as error:  # anybody's method: it loses its own row and no other
                 kind = "" if isinstance(error, GAPONetError) else f"{type(error).__name__}: "
                 self.say(f"{card.name}, {name}, {title}: {kind}{error}")
                 continue
-            by_motion, by_joint = _averages(folds, [e["errors"] for e in evaluated])
+            errors_of_folds = [fold["errors"] for fold in evaluated]
+            by_motion, by_joint = _averages(folds, errors_of_folds)
             errors = np.array([*by_motion.values()])
-            nominal = nominal if rows else errors
-            less = 1e3 * (nominal - errors)
-            rows.append(json_compatible({
-                "set": card.name, "question": name, "method": title, "mrad": 1e3 * errors.mean(),
-                "standard_error": 1e3 * standard_error(errors), "of_nominal": errors.mean() / nominal.mean(),
-                "less_than_nominal": less.mean(), "less_standard_error": standard_error(less), "motions": len(errors),
-                "recordings": sum(len(e["errors"]) for e in evaluated),
-                "floor_mrad": 1e3 * float(np.mean(floors or [np.nan])), "splits": [q.split_hash for q in folds],
+            if not rows:
+                nominal = errors
+            row: Row = {"set": card.name, "question": name, "method": title}
+            row |= _statistics(errors, nominal)
+            row |= {
+                "recordings": sum(map(len, errors_of_folds)),
+                "floor_mrad": floor_mrad,
+                "splits": [question.split_hash for question in folds],
                 "by_motion_mrad": {motion: 1e3 * error for motion, error in by_motion.items()},
-                "by_joint_mrad": by_joint, "seconds": round(sum(e["seconds"] for e in evaluated), 1),
-                "notes": [e["note"] for e in evaluated if e["note"]],
-            }))  # fmt: skip
+                "by_joint_mrad": by_joint,
+                "seconds": round(sum(fold["seconds"] for fold in evaluated), 1),
+                "notes": [fold["note"] for fold in evaluated if fold["note"]],
+            }
+            rows.append(json_compatible(row))
             self.say(
-                f"{card.name}, {name}: {title}: {1e3 * errors.mean():.2f} mrad, nominal {1e3 * nominal.mean():.2f}"
+                f"{card.name}, {name}: {title}: {1e3 * errors.mean():.2f} mrad, "
+                f"nominal {1e3 * nominal.mean():.2f}"
             )
         return rows
 
@@ -137,19 +165,19 @@ class Bench:
         return (self.data / card.folder).exists()
 
     def _elsewhere(self, card: Card) -> Callable[[], RobotSpec] | None:
-        """Return a function that identifies the robot on the other data set of a card; None if that
-        is not present.
+        """Return a function that identifies the robot on the other data set of a card.
+
+        None if that is not present.
         """
-        other = next(
-            (c for c in self.cards.set if c.name == card.elsewhere and self._is_present(c)), None
-        )
-        return functools.partial(self._identified_on, other) if other else None
+        for other in self.cards.set:
+            if other.name == card.elsewhere and self._is_present(other):
+                return functools.partial(self._identified_on, other)
+        return None
 
     def _identified_on(self, card: Card) -> RobotSpec:
         dataset, robot, _ = prepare(card, self.data, self.work)
-        return identified(
-            self._with_folder(card, next(questions(card.questions[0], dataset, robot, None)))
-        ).robot
+        question = next(questions(card.questions[0], dataset, robot, None))
+        return identified(self._with_folder(card, question)).robot
 
     def _with_folder(self, card: Card, question: Question) -> Question:
         """Return the question with a folder of its own for identified robots and trainings."""
@@ -165,13 +193,33 @@ class Bench:
         file = self.work / "answers" / (re.sub(r"[^A-Za-z0-9]+", "-", " ".join(words)) + ".json")
         if file.is_file():
             return {"note": "", **json.loads(file.read_text(encoding="utf-8"))}
-        start = time.monotonic()
+        began = time.monotonic()
         fitted = fit(question)
         errors = fitted.errors(question.test)
-        record = {"errors": errors, "seconds": time.monotonic() - start, "note": fitted.note}
+        record = {"errors": errors, "seconds": time.monotonic() - began, "note": fitted.note}
         file.parent.mkdir(parents=True, exist_ok=True)
         write_text(file, json.dumps(record))
         return record
+
+
+def _statistics(errors: np.ndarray, nominal: np.ndarray) -> Row:
+    """Return the columns of a row that follow from the errors of each motion, (motions,) rad."""
+    less = 1e3 * (nominal - errors)
+    return {
+        "mrad": 1e3 * errors.mean(),
+        "standard_error": 1e3 * standard_error(errors),
+        "of_nominal": errors.mean() / nominal.mean(),
+        "less_than_nominal": less.mean(),
+        "less_standard_error": standard_error(less),
+        "motions": len(errors),
+    }
+
+
+def _floor(folds: list[Question]) -> float:
+    """Return the mean difference of repetitions, rad; NaN without any."""
+    floors = np.array([repeatability(question) for question in folds])
+    floors = floors[np.isfinite(floors)]
+    return float(np.mean(floors)) if len(floors) else float("nan")
 
 
 def _averages(
@@ -179,26 +227,33 @@ def _averages(
 ) -> tuple[dict[str, float], dict[str, dict[str, tuple[float, int]]]]:
     """Return the mean error of each independent motion, rad, and by_joint_mrad (Bench.evaluate)."""
     by_motion: dict[str, list[float]] = {}
-    by_cell: dict[tuple[str, str], dict[str, list[float]]] = {}
-    for q, fold in zip(folds, errors, strict=True):
-        for s, motion, error in zip(q.test, q.test_motions, fold, strict=True):
+    by_cell: dict[tuple[str, str], dict[str, list[float]]] = {}  # joint, kg → motion → mrad
+    for question, errors_of_fold in zip(folds, errors, strict=True):
+        robot = question.robot
+        for s, motion, error in zip(
+            question.test, question.test_motions, errors_of_fold, strict=True
+        ):
             by_motion.setdefault(motion, []).append(error)
-            if len(columns := recorded_joints(s, q.robot)) == 1 < len(q.robot.operated):
-                cell = q.robot.joint_names[columns[0]], f"{s.meta.payload_mass:g}"
+            columns = recorded_joints(s, robot)
+            if len(columns) == 1 and len(robot.operated) > 1:
+                cell = (robot.joint_names[columns[0]], f"{s.meta.payload_mass:g}")
                 by_cell.setdefault(cell, {}).setdefault(motion, []).append(1e3 * error)
     by_joint: dict[str, dict[str, tuple[float, int]]] = {}
     for (joint, kg), motions in sorted(by_cell.items()):
-        mean = float(np.mean([np.mean(v) for v in motions.values()]))
-        by_joint.setdefault(joint, {})[kg] = mean, sum(map(len, motions.values()))
-    return {motion: float(np.mean(v)) for motion, v in by_motion.items()}, by_joint
+        mean = float(np.mean([np.mean(values) for values in motions.values()]))
+        count = sum(map(len, motions.values()))
+        by_joint.setdefault(joint, {})[kg] = (mean, count)
+    return {motion: float(np.mean(values)) for motion, values in by_motion.items()}, by_joint
 
 
 def _lacks_data(method: str, question: Question) -> bool:
     if method == "constant":
         return len({(s.meta.payload_mass, s.meta.unit_id) for s in question.train}) < 2
-    return (method == "elsewhere" and question.elsewhere is None) or (
-        method == "adapted" and not question.few
-    )
+    if method == "elsewhere":
+        return question.elsewhere is None
+    if method == "adapted":
+        return not question.few
+    return False
 
 
 def load_method(where: str) -> tuple[str, Method]:
@@ -208,11 +263,9 @@ def load_method(where: str) -> tuple[str, Method]:
         UsageError: No such file or function.
     """
     file, _, name = where.rpartition(":")
-    spec = (
-        importlib.util.spec_from_file_location(Path(file).stem, file)
-        if Path(file).is_file()
-        else None
-    )
+    spec = None
+    if Path(file).is_file():
+        spec = importlib.util.spec_from_file_location(Path(file).stem, file)
     if spec is None or spec.loader is None:
         raise UsageError(f"--method {where}: no such file; give FILE.py:FUNCTION")
     module = importlib.util.module_from_spec(spec)

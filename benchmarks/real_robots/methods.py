@@ -10,6 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from importlib.util import find_spec
+from pathlib import Path
 
 import numpy as np
 
@@ -49,10 +50,12 @@ class FittedSim:
     def positions(self, sequences: list[Sequence]) -> list[Array]:
         """Return open-loop rollouts, (T, n) rad each."""
         replays = replay(sequences, self.robot, self.corrector, lock_idle=True)
-        return [
-            t.qpos + (self.shift(s) if self.shift else 0.0)
-            for s, t in zip(sequences, replays, strict=True)
-        ]
+        if self.shift is None:
+            return [simulated.qpos for simulated in replays]
+        found = []
+        for s, simulated in zip(sequences, replays, strict=True):
+            found.append(simulated.qpos + self.shift(s))
+        return found
 
     def errors(self, sequences: list[Sequence]) -> list[float]:
         """Return the mean |error| of each rollout over the recorded joints, rad."""
@@ -82,23 +85,33 @@ def constant(question: Question) -> FittedSim:
 
     This control needs no model of the robot. It is fitted to the recordings for adaptation too.
     """
-    robot, n, seen = question.robot, len(question.robot.joint_names), question.fitted + question.few
+    robot = question.robot
+    n = len(robot.joint_names)
+    seen = question.fitted + question.few
     biases: dict[tuple[object, ...], list[Array]] = {}
-    for s, q in zip(seen, FittedSim(robot).positions(seen), strict=True):
-        columns, bias = recorded_joints(s, robot), np.full(n, np.nan)
-        bias[columns] = (s.qpos - q)[1:, columns].mean(axis=0)
-        for key in ((s.meta.payload_mass, s.meta.unit_id), (s.meta.payload_mass,), ()):
+    for s, qpos in zip(seen, FittedSim(robot).positions(seen), strict=True):
+        columns = recorded_joints(s, robot)
+        bias = np.full(n, np.nan)
+        bias[columns] = (s.qpos - qpos)[1:, columns].mean(axis=0)
+        for key in _bias_keys(s):
             biases.setdefault(key, []).append(bias)
 
     def shift(s: Sequence) -> Array:
         offset = np.zeros(n)
-        for key in ((), (s.meta.payload_mass,), (s.meta.payload_mass, s.meta.unit_id)):
-            rows = np.array(biases.get(key, np.full((1, n), np.nan)))
+        for key in _bias_keys(s):
+            if key not in biases:
+                continue
+            rows = np.array(biases[key])
             estimated = np.isfinite(rows).any(axis=0)
             offset[estimated] = np.nanmean(rows[:, estimated], axis=0)
         return offset
 
     return FittedSim(robot, shift=shift)
+
+
+def _bias_keys(s: Sequence) -> tuple[tuple[object, ...], ...]:
+    """Return what a recording's mean error may depend on, the most special one last."""
+    return (), (s.meta.payload_mass,), (s.meta.payload_mass, s.meta.unit_id)
 
 
 def identified(question: Question) -> FittedSim:
@@ -112,13 +125,12 @@ def adapted(question: Question) -> FittedSim:
     """
     if not question.few:
         raise UsageError(f"{question.name}: has no recordings for adaptation")
-    start, few = (
-        (identified if question.elsewhere is None else elsewhere)(question).robot,
-        question.few,
-    )
-    seconds = (
-        len(few) * WINDOW_S if few[0].duration < WINDOW_S else ADAPTATION_S
-    )  # all of the short windows
+    fitted = identified(question) if question.elsewhere is None else elsewhere(question)
+    start = fitted.robot
+    few = question.few
+    seconds = ADAPTATION_S
+    if few[0].duration < WINDOW_S:  # all of the short windows
+        seconds = len(few) * WINDOW_S
     fit = adapt(few, start, seconds, judge=True)
     return FittedSim(fit.robot if fit.accepted else start)
 
@@ -163,10 +175,14 @@ def network_methods(steps: int) -> dict[str, tuple[str, Method]]:
     """Return methods that train a network for this number of control steps: name → title and
     method.
     """
-    return {
-        f"{base}{TITLES[kind]} {steps}": (base + TITLES[kind], partial(_train, base=base, kind=kind, steps=steps))
-        for base in BASES for kind in TITLES if kind != "trees" or find_spec("sklearn")
-    }  # fmt: skip
+    methods: dict[str, tuple[str, Method]] = {}
+    for base in BASES:
+        for kind, title in TITLES.items():
+            if kind == "trees" and not find_spec("sklearn"):
+                continue
+            method = partial(_train, base=base, kind=kind, steps=steps)
+            methods[f"{base}{title} {steps}"] = (f"{base}{title}", method)
+    return methods
 
 
 def _recipe(steps: int) -> TrainConfig:
@@ -189,22 +205,13 @@ def _train(question: Question, base: str, kind: str, steps: int) -> FittedSim:
         raise UsageError(f"{question.name}: networks need a folder to be trained in")
     start = BASES[base](question)
     run = question.work / f"{base.partition(' ')[0]}{kind}-{steps}"
-    training, split = run / "training", run / "parts.json"
+    training = run / "training"
     if not (training / "model" / "card.json").is_file():
-        dataset = Dataset.create(run / "recordings", question.robot)
-        parts: dict[str, dict[str, str]] = {"test": {}}
-        for part, sequences in zip(("train", "val"), train_val(question), strict=True):
-            hashes = {s.content_hash(): s for s in sequences}
-            entries = [
-                dataset.find(h) or dataset.append(s, content_hash=h) for h, s in hashes.items()
-            ]
-            parts[part] = {e.id: e.hash for e in entries}
-        write_text(split, json.dumps({"parts": parts}))
+        dataset, split = store_parts(question, run)
         config = replace(_recipe(steps), model=ModelConfig(kind), split=str(split))  # type: ignore[arg-type]
         resume = (training / "checkpoint.pt").is_file()
-        trainer = Trainer(
-            dataset, start.robot, training, config, Budget(steps=steps), resume=resume
-        )
+        budget = Budget(steps=steps)
+        trainer = Trainer(dataset, start.robot, training, config, budget, resume=resume)
         trainer.baseline = fit_delay_offset(question)
         trainer.run()
     model = GapModel.load(training)
@@ -214,3 +221,19 @@ def _train(question: Question, base: str, kind: str, steps: int) -> FittedSim:
     if base and not gain.helps:
         return replace(start, note=f"{LEFT_OUT}: {note}")
     return replace(start, corrector=model.corrector(start.robot), note=note)
+
+
+def store_parts(question: Question, run: Path) -> tuple[Dataset, Path]:
+    """Write a question's recordings to fit as a dataset, and parts.json, which splits them."""
+    dataset = Dataset.create(run / "recordings", question.robot)
+    train, val = train_val(question)
+    parts: dict[str, dict[str, str]] = {"test": {}}
+    for part, sequences in (("train", train), ("val", val)):
+        parts[part] = {}
+        by_hash = {s.content_hash(): s for s in sequences}
+        for digest, s in by_hash.items():
+            entry = dataset.find(digest) or dataset.append(s, content_hash=digest)
+            parts[part][entry.id] = entry.hash
+    split = run / "parts.json"
+    write_text(split, json.dumps({"parts": parts}))
+    return dataset, split

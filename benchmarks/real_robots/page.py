@@ -16,6 +16,7 @@ from gaponet.sim.metrics import standard_error
 from real_robots.methods import LEFT_OUT, METHODS
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 LOOKS = {  # method's title → colour, marker
@@ -29,8 +30,17 @@ LOOKS = {  # method's title → colour, marker
     "identification + GAPONet": (colour("identified+gaponet"), "v"),
 }
 MAX_OF_NOMINAL = 1.6  # end of the figure's axis; larger values are drawn at it
-COLUMNS = ("set", "question", "method", "mrad", "of nominal", "less than nominal, mrad",
-           "more than identification, mrad", "floor", "motions")  # fmt: skip
+COLUMNS = (
+    "set",
+    "question",
+    "method",
+    "mrad",
+    "of nominal",
+    "less than nominal, mrad",
+    "more than identification, mrad",
+    "floor",
+    "motions",
+)
 STEM = "real"
 HEADING = """# Real robots
 
@@ -43,27 +53,45 @@ between two recordings of one command. "Identified elsewhere" means on another s
 
 
 def result_table(rows: list[dict[str, Any]]) -> ResultTable:
-    """One row per data set, question and method, from Bench.evaluate."""
-    fitted = {(r["set"], r["question"]): r for r in rows if r["method"] == METHODS["identified"][0]}
-    return ResultTable(STEM, COLUMNS, tuple(
-        (r["set"], r["question"], r["method"] + _left_out(r.get("notes", ())),
-         _plus_minus(r["mrad"], r["standard_error"]), f"{r['of_nominal']:.2f}",
-         "" if i == 0 or not r["less_than_nominal"] else _plus_minus(r["less_than_nominal"], r["less_standard_error"]),
-         _more_than(fitted.get((r["set"], r["question"])), r),
-         "–" if r["floor_mrad"] is None else f"{r['floor_mrad']:.1f}", r["motions"])
-        for i, r in enumerate(rows)
-    ))  # fmt: skip
+    """Return a row for each data set, question and method, from Bench.evaluate."""
+    identification = METHODS["identified"][0]
+    identified = {}
+    for row in rows:
+        if row["method"] == identification:
+            identified[row["set"], row["question"]] = row
+    lines = []
+    for i, row in enumerate(rows):
+        less = ""
+        if i > 0 and row["less_than_nominal"]:
+            less = _plus_minus(row["less_than_nominal"], row["less_standard_error"])
+        floor = row["floor_mrad"]
+        line = (
+            row["set"],
+            row["question"],
+            row["method"] + _left_out(row.get("notes", ())),
+            _plus_minus(row["mrad"], row["standard_error"]),
+            f"{row['of_nominal']:.2f}",
+            less,
+            _more_than(identified.get((row["set"], row["question"])), row),
+            "–" if floor is None else f"{floor:.1f}",
+            row["motions"],
+        )
+        lines.append(line)
+    return ResultTable(STEM, COLUMNS, tuple(lines))
 
 
-def _more_than(fitted: dict[str, Any] | None, row: dict[str, Any]) -> str:
-    """Return how much larger a row's error is than that of identification, ± over motions; "" if it
-    is no rival.
+def _more_than(identified: dict[str, Any] | None, row: dict[str, Any]) -> str:
+    """Return how much larger a row's error is than that of identification, ± over motions.
+
+    "" if there is none to compare with.
     """
-    if fitted in (None, row) or not (fitted.keys() & row.keys() >= {"by_motion_mrad"}):
+    if identified is None or identified is row:
         return ""
-    more = np.array(
-        [row["by_motion_mrad"][motion] - mrad for motion, mrad in fitted["by_motion_mrad"].items()]
-    )
+    mrad = row.get("by_motion_mrad")
+    mrad_of_identified = identified.get("by_motion_mrad")
+    if mrad is None or mrad_of_identified is None:
+        return ""
+    more = np.array([mrad[motion] - value for motion, value in mrad_of_identified.items()])
     return _plus_minus(more.mean(), standard_error(more) if len(more) > 1 else None)
 
 
@@ -74,7 +102,9 @@ def _left_out(notes: tuple[str, ...]) -> str:
 
 
 def _plus_minus(value: float, error: float | None) -> str:
-    return f"{value:.2f}" + (f" ± {error:.2f}" if error is not None else "")
+    if error is None:
+        return f"{value:.2f}"
+    return f"{value:.2f} ± {error:.2f}"
 
 
 def write_page(result: dict[str, Any], out: Path) -> list[Path]:
@@ -91,35 +121,63 @@ def write_page(result: dict[str, Any], out: Path) -> list[Path]:
 
 @styled
 def draw(rows: list[dict[str, Any]], titles: dict[str, str]) -> Figure:
-    """Draw each method's share of the nominal error, a line for each question; shaded:
-    repeatability of the robot.
+    """Draw each method's share of the nominal error, a line for each question.
+
+    The nominal simulator is the vertical line. The repeatability of the robot is shaded.
     """
-    keys = list(dict.fromkeys((r["set"], r["question"]) for r in rows))
-    fig = figure(7.2, 0.5 * len(keys) + 1.5)
+    questions: dict[tuple[str, str], list[dict[str, Any]]] = {}
+    for row in rows:
+        questions.setdefault((row["set"], row["question"]), []).append(row)
+    fig = figure(7.2, 0.5 * len(questions) + 1.5)
     ax = fig.subplots()
-    names = [titles.get(name, name).partition(",")[0] + f": {question}" for name, question in keys]
-    lines = {y: [r for r in rows if (r["set"], r["question"]) == key] for y, key in enumerate(keys)}
-    for y, (first, *_) in lines.items():
-        if first["floor_mrad"] is not None:
-            ax.barh(y, first["floor_mrad"] / first["mrad"], 0.86, color="#111111", alpha=0.1, lw=0,
-                    label="repetitions differ by")  # fmt: skip
-    for method, (own, marker) in LOOKS.items():  # the nominal simulator is the vertical line
-        for y, (first, *others) in lines.items():
-            drawn = [r for r in others if r["method"] in LOOKS]
-            for i, r in enumerate(drawn):
-                if r["method"] == method:
-                    x, error = r["of_nominal"], (r["standard_error"] or 0.0) / first["mrad"]
-                    ax.errorbar(min(x, MAX_OF_NOMINAL), y + 0.76 * ((i + 0.5) / len(drawn) - 0.5), xerr=error or None,
-                                fmt=marker if x <= MAX_OF_NOMINAL else ">", ms=4, color=own, elinewidth=0.8,
-                                label=method.partition(" by ")[0])  # fmt: skip
-    for y in range(1, len(keys)):
+    lines = list(questions.values())
+    for y, (nominal, *_) in enumerate(lines):
+        _draw_floor(ax, y, nominal)
+    for method in LOOKS:  # so is the order of the legend
+        for y, line in enumerate(lines):
+            _draw_method(ax, y, line, method)
+    for y in range(1, len(lines)):
         ax.axhline(y - 0.5, color="#111111", alpha=0.08, lw=0.6, zorder=0)
     ax.axvline(1.0, color=colour("nominal"), lw=1.2, zorder=0, label="nominal simulator")
-    ax.set_yticks(np.arange(len(keys)), names)
+    names = []
+    for data_set, question in questions:
+        title, _, _ = titles.get(data_set, data_set).partition(",")
+        names.append(f"{title}: {question}")
+    ax.set_yticks(np.arange(len(lines)), names)
     ax.tick_params(axis="y", length=0)
-    ax.set_ylim(len(keys) - 0.5, -0.5)
-    ax.set_xlim(0.0, max(1.05, min(1.05 * max(r["of_nominal"] for r in rows), MAX_OF_NOMINAL)))
+    ax.set_ylim(len(lines) - 0.5, -0.5)
+    largest = 1.05 * max(row["of_nominal"] for row in rows)
+    ax.set_xlim(0.0, max(1.05, min(largest, MAX_OF_NOMINAL)))
     ax.grid(axis="y", visible=False)
     ax.set_xlabel("mean |error|, of the nominal simulator's")
     legend(fig)
     return fig
+
+
+def _draw_floor(ax: Axes, y: int, nominal: dict[str, Any]) -> None:
+    if nominal["floor_mrad"] is None:
+        return
+    width = nominal["floor_mrad"] / nominal["mrad"]
+    ax.barh(y, width, 0.86, color="#111111", alpha=0.1, lw=0, label="repetitions differ by")
+
+
+def _draw_method(ax: Axes, y: int, line: list[dict[str, Any]], method: str) -> None:
+    """Draw the error of one method into the line of a question, whose methods stand side by side."""
+    nominal, *others = line
+    drawn = [row for row in others if row["method"] in LOOKS]
+    own_colour, marker = LOOKS[method]
+    for i, row in enumerate(drawn):
+        if row["method"] != method:
+            continue
+        x = row["of_nominal"]
+        error = (row["standard_error"] or 0.0) / nominal["mrad"]
+        ax.errorbar(
+            min(x, MAX_OF_NOMINAL),
+            y + 0.76 * ((i + 0.5) / len(drawn) - 0.5),
+            xerr=error or None,
+            fmt=marker if x <= MAX_OF_NOMINAL else ">",
+            ms=4,
+            color=own_colour,
+            elinewidth=0.8,
+            label=method.partition(" by ")[0],
+        )

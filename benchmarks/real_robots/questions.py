@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import itertools
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TypeVar
 
@@ -75,68 +75,103 @@ def questions(
         UsageError: No such question.
     """
     lead = canonical_motions(dataset)
-    entries = dataset.entries
-
-    def split(
-        train: list[Entry],
-        val: list[Entry],
-        test: list[Entry],
-        few: list[Entry] = [],  # noqa: B006
-    ) -> Question:
-        if not val:
-            cell = {e.id: f"{e.meta.motion} {e.meta.payload_mass:g}" for e in train}
-            judges = hash_order(cell.values())[::VALIDATION_STRIDE]
-            val = [e for e in train if cell[e.id] in judges]
-            train = [e for e in train if cell[e.id] not in judges]
-        digest = hashlib.sha256(
-            f"{dataset_hash(train + val)} {dataset_hash(test)}".encode()
-        ).hexdigest()[:8]
-        read = lambda part: dataset.sequences(part)  # noqa: E731
-        motions = [lead[e.meta.motion] for e in test]
-        return Question(
-            name, robot, read(train), read(val), read(test), motions, digest, read(few), elsewhere
+    for parts in _folds(name, dataset):
+        if not parts.val:
+            parts = _with_validation(parts)
+        fitted_hash = dataset_hash(parts.train + parts.val)
+        words = f"{fitted_hash} {dataset_hash(parts.test)}"
+        yield Question(
+            name=name,
+            robot=robot,
+            train=dataset.sequences(parts.train),
+            val=dataset.sequences(parts.val),
+            test=dataset.sequences(parts.test),
+            test_motions=[lead[entry.meta.motion] for entry in parts.test],
+            split_hash=hashlib.sha256(words.encode()).hexdigest()[:8],
+            few=dataset.sequences(parts.few),
+            elsewhere=elsewhere,
         )
 
+
+@dataclass(frozen=True)
+class Parts:
+    """Entries of a split; without `val`, a part of `train` validates."""
+
+    train: list[Entry]
+    val: list[Entry]
+    test: list[Entry]
+    few: list[Entry] = field(default_factory=list)
+
+
+def _folds(name: str, dataset: Dataset) -> list[Parts]:
+    """Return the splits of a question."""
     if name in ("new motions", "another session"):
         parts = split_entries(dataset)
         few = parts["train"] if name == "another session" else []
-        yield split(parts["train"], parts["val"], parts["test"], few)
-    elif name == "later repetitions":
+        return [Parts(parts["train"], parts["val"], parts["test"], few)]
+    if name == "later repetitions":
         parts = split_by_order(dataset, "repetition")
-        yield split(parts["train"], parts["val"], parts["test"])
-    elif name == "new commands":
-        order = {
-            j: hash_order({e.meta.motion for e in entries if _joint(e) == j})
-            for j in {_joint(e) for e in entries}
-        }
-        for fold in range(FOLDS):
-            out = {names[fold] for names in order.values() if fold < len(names) > 1}
-            yield split(
-                [e for e in entries if e.meta.motion not in out],
-                [],
-                [e for e in entries if e.meta.motion in out],
-            )
-    elif name.endswith(" kg left out"):
+        return [Parts(parts["train"], parts["val"], parts["test"])]
+    if name == "new commands":
+        return _without_commands(dataset.entries)
+    if name.endswith(" kg left out"):
         mass = float(name.split()[0])
-        test = [e for e in entries if e.meta.payload_mass == mass]
-        yield split([e for e in entries if e not in test], [], test)
-    elif name == "a unit left out":
-        for unit in sorted({e.meta.unit_id for e in entries}):
-            of_unit = [e for e in entries if e.meta.unit_id == unit]
-            first = {
-                j: hash_order({e.meta.motion for e in of_unit if _joint(e) == j})[0]
-                for j in {_joint(e) for e in of_unit}
-            }
-            seen = [e for e in of_unit if e.meta.motion in first.values()]
-            few = [e for j in first for e in [e for e in seen if _joint(e) == j][:FEW_RECORDINGS]]
-            yield split(
-                [e for e in entries if e not in of_unit],
-                [],
-                [e for e in of_unit if e not in seen],
-                few,
-            )
-    else:
-        raise UsageError(f"question '{name}' is not known; docs/benchmark.md lists them")
+        test = [entry for entry in dataset.entries if entry.meta.payload_mass == mass]
+        return [Parts(_others(dataset.entries, test), [], test)]
+    if name == "a unit left out":
+        units = sorted({entry.meta.unit_id for entry in dataset.entries})
+        return [_without_unit(dataset.entries, unit) for unit in units]
+    raise UsageError(f"question '{name}' is not known; docs/benchmark.md lists them")
+
+
+def _with_validation(parts: Parts) -> Parts:
+    """Move every eighth pair of motion and payload from training to validation."""
+    pairs = [f"{entry.meta.motion} {entry.meta.payload_mass:g}" for entry in parts.train]
+    judges = hash_order(pairs)[::VALIDATION_STRIDE]
+    train = []
+    val = []
+    for entry, pair in zip(parts.train, pairs, strict=True):
+        if pair in judges:
+            val.append(entry)
+        else:
+            train.append(entry)
+    return replace(parts, train=train, val=val)
+
+
+def _without_commands(entries: list[Entry]) -> list[Parts]:
+    """Leave out one command of each joint that has several, a fold for each."""
+    motions = [hash_order({e.meta.motion for e in part}) for part in _by_joint(entries).values()]
+    folds = []
+    for fold in range(FOLDS):
+        left_out = {names[fold] for names in motions if fold < len(names) > 1}
+        test = [entry for entry in entries if entry.meta.motion in left_out]
+        folds.append(Parts(_others(entries, test), [], test))
+    return folds
+
+
+def _without_unit(entries: list[Entry], unit: str) -> Parts:
+    """Leave out a unit; a few recordings of one motion of each joint are for adaptation."""
+    of_unit = [entry for entry in entries if entry.meta.unit_id == unit]
+    seen = []
+    few = []
+    for part in _by_joint(of_unit).values():
+        first = hash_order({entry.meta.motion for entry in part})[0]
+        of_motion = [entry for entry in part if entry.meta.motion == first]
+        seen += of_motion
+        few += of_motion[:FEW_RECORDINGS]
+    return Parts(_others(entries, of_unit), [], _others(of_unit, seen), few)
+
+
+def _by_joint(entries: list[Entry]) -> dict[str, list[Entry]]:
+    """Return joint → its recordings, in their order."""
+    parts: dict[str, list[Entry]] = {}
+    for entry in entries:
+        parts.setdefault(_joint(entry), []).append(entry)
+    return parts
+
+
+def _others(entries: list[Entry], without: list[Entry]) -> list[Entry]:
+    return [entry for entry in entries if entry not in without]
 
 
 def _joint(entry: Entry) -> str:
@@ -150,50 +185,56 @@ def train_val(question: Question) -> tuple[list[Sequence], list[Sequence]]:
     Where joints were recorded one at a time, one command of each joint with several commands
     validates.
     """
-    fitted, val = question.fitted, set()
-    if len({s.meta.unrecorded for s in fitted}) == 1:
+    motions: dict[tuple[str, ...], set[str]] = {}
+    for s in question.fitted:
+        motions.setdefault(s.meta.unrecorded, set()).add(s.meta.motion)
+    if len(motions) == 1:
         return question.train, question.val
-    for unrecorded in {s.meta.unrecorded for s in fitted}:
-        motions = hash_order(s.meta.motion for s in fitted if s.meta.unrecorded == unrecorded)
-        val |= set(motions[:1] if len(motions) > 1 else [])
-    return [s for s in fitted if s.meta.motion not in val], [
-        s for s in fitted if s.meta.motion in val
-    ]
+    judges = {hash_order(names)[0] for names in motions.values() if len(names) > 1}
+    train = []
+    val = []
+    for s in question.fitted:
+        if s.meta.motion in judges:
+            val.append(s)
+        else:
+            train.append(s)
+    return train, val
 
 
 def repeatability(question: Question) -> float:
-    """Mean |difference| between the errors of two recordings of one command, unit and payload, rad;
-    NaN without any.
+    """Return how far the errors of repetitions of one command, unit and payload differ, rad.
+
+    The mean |difference| of two recordings; NaN without any.
     """
     groups: dict[tuple[object, ...], list[Sequence]] = {}
     for s, motion in zip(question.test, question.test_motions, strict=True):
-        groups.setdefault(
-            (motion, *s.meta.repetition_key[1:], s.meta.unrecorded, s.meta.kp), []
-        ).append(s)
-    pairs = [d for group in groups.values() for d in _differences(group, question.robot)]
-    least = min((command for command, _ in pairs), default=0.0)
-    errors = [d for command, d in pairs if command <= max(least, MAX_COMMAND_DIFFERENCE_RAD)]
-    return float(np.mean(errors)) if errors else float("nan")
+        key = (motion, *s.meta.repetition_key[1:], s.meta.unrecorded, s.meta.kp)
+        groups.setdefault(key, []).append(s)
+    pairs: list[tuple[float, float]] = []
+    for group in groups.values():
+        pairs += _differences(group, question.robot)
+    if not pairs:
+        return float("nan")
+    least = min(command for command, _ in pairs)
+    most = max(least, MAX_COMMAND_DIFFERENCE_RAD)
+    return float(np.mean([response for command, response in pairs if command <= most]))
 
 
 def _differences(group: list[Sequence], robot: RobotSpec) -> Iterator[tuple[float, float]]:
-    """Yield the mean differences of the commands and of the responses of each pair of recordings,
-    rad.
-    """
+    """Yield the mean differences of the commands and of the responses of each pair, rad."""
     for first, second in itertools.combinations(group, 2):
         rows = min(len(first), len(second))
         command = first.ctrl[:rows] - second.ctrl[:rows]
-        error: Array = np.abs(first.qpos[:rows] - second.qpos[:rows] - command)[
-            :, recorded_joints(first, robot)
-        ]
+        error: Array = np.abs(first.qpos[:rows] - second.qpos[:rows] - command)
         if np.abs(command).mean() < MAX_COMMAND_DIFFERENCE:
-            yield float(np.abs(command).mean()), float(error.mean())
+            recorded = error[:, recorded_joints(first, robot)]
+            yield float(np.abs(command).mean()), float(recorded.mean())
 
 
 def recorded_joints(sequence: Sequence, robot: RobotSpec) -> list[int]:
     """Return the columns of the operated joints that a recording holds."""
-    return [
-        int(i)
-        for i, j in zip(robot.operated_index, robot.operated, strict=True)
-        if j not in sequence.meta.unrecorded
-    ]
+    columns = []
+    for column, joint in zip(robot.operated_index, robot.operated, strict=True):
+        if joint not in sequence.meta.unrecorded:
+            columns.append(int(column))
+    return columns
