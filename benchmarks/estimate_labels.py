@@ -40,10 +40,9 @@ MAX_END_DIFFERENCE = 0.05  # of two commands that count as one, over the range o
 SETTLE_S = 0.1
 # standard deviations of a repetition within which neighbours are repetitions
 MAX_REPETITION_STD = 3.0
-MIN_NM_PER_KG, MIN_BAND_DISTANCE = (
-    0.3,
-    2.5,
-)  # distance in widths of a band, from which a joint determines its payload
+# From which a joint determines its payload; the distance is in widths of a band.
+MIN_NM_PER_KG = 0.3
+MIN_BAND_DISTANCE = 2.5
 MIN_RECORDINGS = 4  # of a joint, for its gains from torque
 MAX_PAYLOAD_ERROR_KG = 0.5  # from a label
 PAYLOAD_IN_NAME = re.compile(r"_(\d+(?:[.p]\d+)?)kg(?:_|$)")
@@ -94,48 +93,74 @@ class LabelGroup:
 
 
 @dataclass(frozen=True)
+class Agreement:
+    """How estimated payloads agree with those in files' names.
+
+    Attributes:
+        said: Number of recordings with a payload in the file's name.
+        within: Share of them whose estimate is near it.
+        not_said: Number of other recordings.
+        taken: Share of these that are taken for a payload of the first kind. What a file's name
+            does not list is none of these either, where such files list all of a payload.
+    """
+
+    said: int
+    within: float
+    not_said: int
+    taken: float
+
+    def __str__(self) -> str:
+        return (
+            f"of {self.said} recordings with a payload in the file's name, {self.within:.0%} are "
+            f"within {MAX_PAYLOAD_ERROR_KG:g} kg of it; of {self.not_said} others "
+            f"{self.taken:.0%} are taken for one of these"
+        )
+
+
+@dataclass(frozen=True)
 class Labels:
     """Estimated labels.
 
     Attributes:
-        agreement: Shares of the recordings whose payload agrees with that in the file's name.
+        agreement: With payloads in files' names; None if there are none.
         gains: Joint → gains of its servo from torque, of all rows and of the recordings' ends.
     """
 
     recordings: list[LabelledRecording]
     groups: list[LabelGroup]
-    agreement: dict[str, float] = field(default_factory=dict)
+    agreement: Agreement | None
     gains: dict[str, tuple[Gains, Gains]] = field(default_factory=dict)
 
     @property
     def remarks(self) -> list[str]:
         """Return remarks in sentences."""
-        a = self.agreement
-        lines = [
-            f"of {a['said']} recordings with a payload in the file's name, {a['within_half_a_kg']:.0%} are within "
-            f"0.5 kg of it; of {a['not_said']} others {a['taken_for_one_of_these']:.0%} are taken for one of these"
-        ] if a else []  # fmt: skip
+        lines = []
+        if self.agreement is not None:
+            lines.append(str(self.agreement))
         loaded = [r for r in self.recordings if r.determined and not r.copy_of]
-        near = sum(abs(r.torque_payload - r.payload) < MAX_PAYLOAD_ERROR_KG for r in loaded)
         if loaded:
+            near = sum(abs(r.torque_payload - r.payload) < MAX_PAYLOAD_ERROR_KG for r in loaded)
             lines.append(
                 f"torque alone, without the unit, gives {near} of {len(loaded)} payloads within "
                 f"{MAX_PAYLOAD_ERROR_KG:g} kg of their label"
             )
-        return lines + [
-            f"{joint}: torque is kp (command − position) − kd velocity, kp {format_uncertainty(g.kp, g.error)} "
-            f"N·m/rad ({format_uncertainty(end.kp, end.error)} by the end of recordings), kd {g.kd:.2f} N·m·s/rad: "
-            f"{g.explained:.1%} of its variance"
-            for joint, (g, end) in self.gains.items()
-            if g.trusted
-        ]
+        for joint, (gains, at_end) in self.gains.items():
+            if gains.trusted:
+                lines.append(
+                    f"{joint}: torque is kp (command − position) − kd velocity, "
+                    f"kp {format_uncertainty(gains.kp, gains.error)} N·m/rad "
+                    f"({format_uncertainty(at_end.kp, at_end.error)} by the end of recordings), "
+                    f"kd {gains.kd:.2f} N·m·s/rad: {gains.explained:.1%} of its variance"
+                )
+        return lines
 
 
 def estimate(
     logs: Iterable[tuple[str, Log]], payloads: Sequence[float], units: int, gain: dict[str, float]
 ) -> Labels:
-    """Estimate payload and unit of every recording. Payloads in files' names are only compared with
-    the estimates.
+    """Estimate payload and unit of every recording.
+
+    Payloads in files' names are only compared with the estimates.
 
     Args:
         logs: Name and recording, one moving joint each.
@@ -151,75 +176,120 @@ def estimate(
     copies: list[tuple[LabelledRecording, LabelledRecording]] = []
     for name, log in logs:
         one = _read(name, log, gain)
-        digest = hashlib.sha256(
-            b"".join(log.channels[c].values.tobytes() for c in ("ctrl", "qpos"))
-        ).hexdigest()
-        first = seen.setdefault((one.joint, digest), one)
+        first = seen.setdefault((one.joint, _digest(log)), one)
         if first is not one:
             one.copy_of = first.name
-            first.named_payload = (
-                one.named_payload if first.named_payload is None else first.named_payload
-            )
+            if first.named_payload is None:
+                first.named_payload = one.named_payload
             copies.append((one, first))
         recordings.append(one)
     own = list(seen.values())
     groups = [_fit(part, payloads, units) for part in _by_command(own)]
     for one, first in copies:
-        one.payload, one.unit, one.determined = first.payload, first.unit, first.determined
-    named = [r for r in own if r.named_payload is not None and r.determined]
-    agreement = {}
-    if named:
-        masses = {r.named_payload for r in named}
-        others = [r for r in own if r.named_payload is None and r.determined]
-        agreement = {
-            "said": len(named),
-            "within_half_a_kg": float(np.mean([abs(r.payload - (r.named_payload or 0.0)) < MAX_PAYLOAD_ERROR_KG
-                                               for r in named])),
-            # What a file's name does not list is none of these either, where such files list all of
-            # a payload.
-            "not_said": len(others),
-            "taken_for_one_of_these": float(np.mean([r.payload in masses for r in others] or [False])),
-        }  # fmt: skip
-    torque_rows: dict[str, list[Array]] = {}
-    for r in own:
-        torque_rows.setdefault(r.joint, []).extend([] if r.servo_rows is None else [r.servo_rows])
-    enough = {joint: rows for joint, rows in torque_rows.items() if len(rows) >= MIN_RECORDINGS}
-    gains = {joint: (servo_gains(rows), servo_gains(rows, 1)) for joint, rows in enough.items()}
-    return Labels(recordings, groups, agreement, gains)
+        one.payload = first.payload
+        one.unit = first.unit
+        one.determined = first.determined
+    return Labels(recordings, groups, _agreement(own), _gains(own))
+
+
+def _digest(log: Log) -> str:
+    """Return a hash of the samples."""
+    commands = log.channels["ctrl"].values.tobytes()
+    positions = log.channels["qpos"].values.tobytes()
+    return hashlib.sha256(commands + positions).hexdigest()
+
+
+def _agreement(recordings: list[LabelledRecording]) -> Agreement | None:
+    """Compare the estimates with files' names; None if no name has a payload."""
+    errors = []
+    masses = set()
+    others = []
+    for r in recordings:
+        if not r.determined:
+            continue
+        if r.named_payload is None:
+            others.append(r.payload)
+        else:
+            masses.add(r.named_payload)
+            errors.append(abs(r.payload - r.named_payload))
+    if not errors:
+        return None
+    taken = [payload in masses for payload in others]
+    return Agreement(
+        said=len(errors),
+        within=float(np.mean(np.array(errors) < MAX_PAYLOAD_ERROR_KG)),
+        not_said=len(others),
+        taken=float(np.mean(taken)) if taken else 0.0,
+    )
+
+
+def _gains(recordings: list[LabelledRecording]) -> dict[str, tuple[Gains, Gains]]:
+    """Estimate the gains of each joint with enough recorded torque."""
+    rows: dict[str, list[Array]] = {}
+    for r in recordings:
+        if r.servo_rows is not None:
+            rows.setdefault(r.joint, []).append(r.servo_rows)
+    gains = {}
+    for joint, parts in rows.items():
+        if len(parts) >= MIN_RECORDINGS:
+            gains[joint] = (servo_gains(parts), servo_gains(parts, 1))
+    return gains
 
 
 def _read(name: str, log: Log, gain: dict[str, float]) -> LabelledRecording:
-    ctrl, qpos = log.channels["ctrl"], log.channels["qpos"]
+    """Return a recording of one moving joint without its labels."""
+    ctrl = log.channels["ctrl"]
+    qpos = log.channels["qpos"]
     moved = np.flatnonzero(np.ptp(ctrl.values, axis=0) > MIN_MOVE_RAD)
     if len(moved) != 1:
         raise LogError(
-            f"{log.source}: {len(moved)} joints are commanded to move; labels are estimated from recordings of one"
+            f"{log.source}: {len(moved)} joints are commanded to move; labels are estimated from "
+            "recordings of one"
         )
     j = int(moved[0])
     joint = log.joint_names[j]
+    commands = ctrl.values[:, j]
     servo_rows = None
-    if tau := log.channels.get("tau"):
-        time, values = tau.time, tau.values[:, j]
-        at = lambda c: np.interp(ctrl.time, log.channels[c].time, log.channels[c].values[:, j])  # noqa: E731
-        speed = at("qvel") if "qvel" in log.channels else np.gradient(at("qpos"), ctrl.time)
-        servo_rows = np.stack([ctrl.values[:, j], at("qpos"), speed, at("tau")])
+    if "tau" in log.channels:
+        tau = log.channels["tau"]
+        time = tau.time
+        torque = tau.values[:, j]
+        servo_rows = _servo_rows(log, j)
     else:
         time = qpos.time
-        values = gain[joint] * (
-            ctrl.values[: len(qpos.values), j] - qpos.values[: len(ctrl.values), j]
-        )
-    later = time[: len(values)] >= time[0] + SETTLE_S
-    commands = np.interp(time[: len(values)][later], ctrl.time, ctrl.values[:, j])
-    kilograms = PAYLOAD_IN_NAME.search(Path(log.source.partition("#")[0]).stem)
-    payload = float(kilograms[1].replace("p", ".")) if kilograms else None
+        rows = min(len(commands), len(qpos.values))
+        torque = gain[joint] * (commands[:rows] - qpos.values[:rows, j])
+    time = time[: len(torque)]
+    settled = time >= time[0] + SETTLE_S
+    commands_then = np.interp(time[settled], ctrl.time, commands)
     return LabelledRecording(
         name,
         joint,
-        float(ctrl.values[-1, j]),
-        (values[later], commands),
-        payload,
+        float(commands[-1]),
+        (torque[settled], commands_then),
+        _named_payload(log.source),
         servo_rows=servo_rows,
     )
+
+
+def _servo_rows(log: Log, j: int) -> Array:
+    """Return command, position, velocity and torque of joint j at the commands' times, (4, k)."""
+    time = log.channels["ctrl"].time
+
+    def sampled(name: str) -> Array:
+        channel = log.channels[name]
+        return np.interp(time, channel.time, channel.values[:, j])
+
+    qpos = sampled("qpos")
+    speed = sampled("qvel") if "qvel" in log.channels else np.gradient(qpos, time)
+    return np.stack([log.channels["ctrl"].values[:, j], qpos, speed, sampled("tau")])
+
+
+def _named_payload(source: str) -> float | None:
+    """Return the payload in a file's name, kg."""
+    file, _, _ = source.partition("#")
+    kilograms = PAYLOAD_IN_NAME.search(Path(file).stem)
+    return float(kilograms[1].replace("p", ".")) if kilograms else None
 
 
 def _by_command(recordings: list[LabelledRecording]) -> list[list[LabelledRecording]]:
@@ -251,52 +321,56 @@ def _fit(part: list[LabelledRecording], payloads: Sequence[float], units: int) -
             r.payload = float(masses[0])
         return LabelGroup(part[0].joint, part[0].command, len(part), 0.0, 0.0, np.zeros(0), False)
     step = float(np.median(np.abs(np.diff(x)))) / 0.954  # most neighbours are repetitions
-    width, slope, base = _bands(x, masses)
-    start = [
-        base + np.array(d) * width for d in itertools.combinations(np.linspace(-2, 2, 9), units)
-    ]
-    fits = [_mixture(x, masses, a, slope, 0.5 * width, max(step / 2, 0.04 * slope)) for a in start]
-    _, zero, slope, _ = max((f for f in fits if f[2] > 0), key=lambda f: f[0], default=fits[0])
-    load = masses[
-        np.abs(x[:, None] - (zero[:, None] + slope * masses).ravel()).argmin(axis=1) % len(masses)
-    ]
-    new = (np.abs(np.diff(x)) > MAX_REPETITION_STD * max(step, 1e-6)) | (np.diff(load) != 0)
-    group = np.concatenate([[0], np.cumsum(new)])
+    bands = _bands(x, masses)
+    least = max(step / 2, 0.04 * bands.slope)
+    fits = []
+    for places in itertools.combinations(np.linspace(-2, 2, 9), units):
+        zero = bands.zero + np.array(places) * bands.width
+        fits.append(_mixture(x, masses, zero, bands.slope, 0.5 * bands.width, least))
+    best = _likeliest(fits)
+    centres = (best.zero[:, None] + best.slope * masses).ravel()  # unit by unit
+    load = masses[np.abs(x[:, None] - centres).argmin(axis=1) % len(masses)]
+    jumps = np.abs(np.diff(x)) > MAX_REPETITION_STD * max(step, 1e-6)
+    group = np.concatenate([[0], np.cumsum(jumps | (np.diff(load) != 0))])
     mean = np.bincount(group, x) / np.bincount(group)
     first = np.unique(group, return_index=True)[1]
-    unit, own = _ranked(mean - slope * load[first], load[first], units)
-    determined = bool(slope >= MIN_NM_PER_KG and slope / width >= MIN_BAND_DISTANCE)
-    held = (x - own.mean()) / slope
-    for r, g, m, kg in zip(part, group, load, held, strict=True):
-        r.payload, r.torque_payload = float(m), float(kg)
-        r.unit, r.determined = int(unit[g]), determined
+    unit, own = _ranked(mean - best.slope * load[first], load[first], units)
+    distance = float(best.slope / bands.width)
+    determined = bool(best.slope >= MIN_NM_PER_KG and distance >= MIN_BAND_DISTANCE)
+    held = (x - own.mean()) / best.slope
+    for i, r in enumerate(part):
+        r.payload = float(load[i])
+        r.torque_payload = float(held[i])
+        r.unit = int(unit[group[i]])
+        r.determined = determined
     return LabelGroup(
-        part[0].joint,
-        part[0].command,
-        len(part),
-        sign * slope,
-        float(slope / width),
-        sign * own,
-        determined,
+        joint=part[0].joint,
+        command=part[0].command,
+        count=len(part),
+        slope=sign * best.slope,
+        band_distance=distance,
+        units=sign * own,
+        determined=determined,
     )
 
 
 def _at_equal_commands(recordings: list[tuple[Array, Array]]) -> Array:
-    """Return the mean torque of each at equal commands, (k,) N·m: one may have begun a period later
-    than another.
+    """Return the mean torque of each at equal commands, (k,) N·m.
+
+    One recording may have begun a period later than another.
     """
-    sign = 1.0 if np.mean([ctrl[-1] - ctrl[0] for _, ctrl in recordings]) > 0 else -1.0
-    risen = [np.maximum.accumulate(sign * ctrl) for _, ctrl in recordings]
-    low, high = max(r[0] for r in risen), min(r[-1] for r in risen)
+    ways = [commands[-1] - commands[0] for _, commands in recordings]
+    sign = 1.0 if np.mean(ways) > 0 else -1.0
+    risen = [np.maximum.accumulate(sign * commands) for _, commands in recordings]
+    low = max(commands[0] for commands in risen)
+    high = min(commands[-1] for commands in risen)
     if not high > low:
         return np.array([torque.mean() for torque, _ in recordings])
     grid = np.linspace(low, high, 50)
-    return np.array(
-        [
-            np.interp(grid, r, torque).mean()
-            for r, (torque, _) in zip(risen, recordings, strict=True)
-        ]
-    )
+    means = []
+    for commands, (torque, _) in zip(risen, recordings, strict=True):
+        means.append(np.interp(grid, commands, torque).mean())
+    return np.array(means)
 
 
 def _ranked(rest: Array, load: Array, units: int) -> tuple[Array, Array]:
@@ -307,59 +381,88 @@ def _ranked(rest: Array, load: Array, units: int) -> tuple[Array, Array]:
     unit is taken.
     """
     bands = [np.flatnonzero(load == m) for m in np.unique(load)]
-    whole = [np.sort(rest[b]) for b in bands if len(b) == units]
-    own = np.mean(whole, axis=0) if whole else np.quantile(rest, (np.arange(units) + 0.5) / units)
+    whole = [band for band in bands if len(band) == units]
+    if whole:
+        own = np.mean([np.sort(rest[band]) for band in whole], axis=0)
+    else:
+        own = np.quantile(rest, (np.arange(units) + 0.5) / units)
     unit = np.abs(rest[:, None] - own).argmin(axis=1)
-    for b in bands:
-        if len(b) == units:
-            unit[b[np.argsort(rest[b])]] = np.arange(units)
+    for band in whole:
+        unit[band[np.argsort(rest[band])]] = np.arange(units)
     return unit, own
 
 
-def _bands(x: Array, masses: Array) -> tuple[float, float, float]:
-    """Return width, distance per kg and place of the first of evenly spaced bands, all units
-    together.
+@dataclass(frozen=True)
+class Mixture:
+    """Normals of one width at zero + slope · masses: N·m, N·m/kg; zero is (units,)."""
+
+    likelihood: float  # its logarithm
+    zero: Array
+    slope: float
+    width: float
+
+
+def _likeliest(fits: list[Mixture]) -> Mixture:
+    """Return the likeliest fit in which torque grows with the payload; the first if there is
+    none.
     """
+    rising = [fit for fit in fits if fit.slope > 0]
+    return max(rising, key=lambda fit: fit.likelihood, default=fits[0])
+
+
+@dataclass(frozen=True)
+class Bands:
+    """Evenly spaced bands of torque, all units together: N·m, N·m/kg; `zero` is without payload."""
+
+    width: float
+    slope: float
+    zero: float
+
+
+def _bands(x: Array, masses: Array) -> Bands:
+    """Find the bands of torques (k,) N·m for masses (p,) kg."""
     span = float(np.ptp(x)) / float(np.ptp(masses))
-    fits = [
-        _mixture(x, masses, np.array([a]), b * span, 0.3 * b * span, 0.02 * b * span)
-        for b in np.linspace(0.4, 1.1, 15)
-        for a in np.percentile(x, [0, 5, 10, 15, 20, 25])
-    ]
-    _, zero, slope, width = max((f for f in fits if f[2] > 0), key=lambda f: f[0], default=fits[0])
-    return max(width, 1e-9), slope, float(zero[0])
+    fits = []
+    for share in np.linspace(0.4, 1.1, 15):
+        slope = share * span
+        for zero in np.percentile(x, [0, 5, 10, 15, 20, 25]):
+            fits.append(
+                _mixture(
+                    x, masses, np.array([zero]), slope, 0.3 * share * span, 0.02 * share * span
+                )
+            )
+    best = _likeliest(fits)
+    return Bands(max(best.width, 1e-9), best.slope, float(best.zero[0]))
 
 
 def _mixture(
     x: Array, masses: Array, zero: Array, slope: float, width: float, least: float
-) -> tuple[float, Array, float, float]:
-    """Fit normals of one width at zero + slope·masses, all with equal weight, by expectation
-    maximisation.
+) -> Mixture:
+    """Fit normals of one width, all with equal weight, by expectation maximisation.
 
     Args:
         x: Torque of each recording, (k,) N·m.
         masses: kg, (p,).
         zero, slope, width, least: Where to start, (units,) and scalars; no width below `least`.
-
-    Returns:
-        Log likelihood, zero, slope, width.
     """
+    torque = x[:, None, None]  # beside (units, masses)
     for _ in range(60):
-        apart = x[:, None, None] - zero[:, None] - slope * masses  # (k, units, masses)
-        w = np.exp(-0.5 * (apart**2 - (apart**2).min(axis=(1, 2), keepdims=True)) / width**2)
-        w /= w.sum(axis=(1, 2), keepdims=True)
-        n = np.maximum(w.sum(axis=(0, 2)), 1e-9)
-        m, mean = (w * masses).sum(axis=(0, 2)) / n, (w * x[:, None, None]).sum(axis=(0, 2)) / n
-        aside = masses - m[:, None]
-        slope = float(
-            (w * aside * (x[:, None, None] - mean[:, None])).sum()
-            / max((w * aside**2).sum(), 1e-12)
-        )
-        zero = mean - slope * m
-        apart = x[:, None, None] - zero[:, None] - slope * masses
-        width = max(float(np.sqrt((w * apart**2).sum() / len(x))), least, 1e-9)
-    likely = np.log(np.exp(-0.5 * (apart / width) ** 2).sum(axis=(1, 2)) + 1e-300) - np.log(width)
-    return float(likely.sum()), zero, slope, width
+        squares = (torque - zero[:, None] - slope * masses) ** 2  # (k, units, masses)
+        nearest = squares.min(axis=(1, 2), keepdims=True)
+        weight = np.exp(-0.5 * (squares - nearest) / width**2)
+        weight /= weight.sum(axis=(1, 2), keepdims=True)
+        count = np.maximum(weight.sum(axis=(0, 2)), 1e-9)  # (units,)
+        mean_mass = (weight * masses).sum(axis=(0, 2)) / count
+        mean_torque = (weight * torque).sum(axis=(0, 2)) / count
+        aside = masses - mean_mass[:, None]
+        covariance = (weight * aside * (torque - mean_torque[:, None])).sum()
+        slope = float(covariance / max((weight * aside**2).sum(), 1e-12))
+        zero = mean_torque - slope * mean_mass
+        apart = torque - zero[:, None] - slope * masses
+        width = max(float(np.sqrt((weight * apart**2).sum() / len(x))), least, 1e-9)
+    density = np.exp(-0.5 * (apart / width) ** 2).sum(axis=(1, 2))
+    likelihood = (np.log(density + 1e-300) - np.log(width)).sum()
+    return Mixture(float(likelihood), zero, slope, width)
 
 
 def write(labels: Labels, folder: Path, rate: float | None = None) -> None:
@@ -371,17 +474,22 @@ def write(labels: Labels, folder: Path, rate: float | None = None) -> None:
     sheet = csv.writer(text)
     sheet.writerow(["file", "motion", "unit", "payload", "estimated", "leave_out"])
     for r in labels.recordings:
-        payload = r.payload if r.named_payload is None else r.named_payload
-        unsure = "" if r.determined else " (not determined by this joint)"
-        estimated = "unit" if r.named_payload is not None else f"unit, payload{unsure}"
-        sheet.writerow([r.name, f"{r.joint}-to{r.command:+.2f}", f"unit-{r.unit + 1}", f"{payload:g}", estimated,
-                        "yes" if r.copy_of else "no"])  # fmt: skip
+        payload = r.named_payload
+        estimated = "unit"
+        if payload is None:
+            payload = r.payload
+            unsure = "" if r.determined else " (not determined by this joint)"
+            estimated = f"unit, payload{unsure}"
+        motion = f"{r.joint}-to{r.command:+.2f}"
+        leave_out = "yes" if r.copy_of else "no"
+        sheet.writerow([r.name, motion, f"unit-{r.unit + 1}", f"{payload:g}", estimated, leave_out])
     write_text(folder / "labels.csv", text.getvalue())
     lines = [
         "# benchmarks/estimate_labels.py: units and payloads are estimated from held torque",
         'manifest = "labels.csv"',
     ]
-    lines += [f"rate = {rate:g}"] if rate else []
+    if rate:
+        lines.append(f"rate = {rate:g}")
     write_text(folder / "logs.toml", "\n".join(lines) + "\n")
 
 

@@ -52,10 +52,7 @@ def test_payload_and_unit_are_estimated_if_the_payload_loads_the_joint():
             float(mass),
             int(unit),
         )  # the one that holds more is the later one
-    assert (found.agreement["within_half_a_kg"], found.agreement["taken_for_one_of_these"]) == (
-        1.0,
-        0.0,
-    )
+    assert (found.agreement.within, found.agreement.taken) == (1.0, 0.0)
     assert (
         "torque alone, without the unit, gives 36 of 36 payloads within 0.5 kg of their label"
         in found.remarks
