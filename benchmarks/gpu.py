@@ -19,7 +19,6 @@ benchmarks/gpu.sh runs both.
 
 from __future__ import annotations
 
-import argparse
 import json
 import time
 from collections.abc import Callable
@@ -27,6 +26,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from common import command_line, read_rows
 
 from gaponet.robot.spec import RobotSpec, load_robot
 from gaponet.sim.batch import BatchSim, Condition
@@ -40,14 +40,13 @@ SERVO_TERMS = {
 
 
 def rate(period: Callable[[], object], num_envs: int, seconds: float) -> float:
-    """Return the control steps per second of all simulations, after a first period that
-    compiles.
-    """
+    """Return the control steps per second of all simulations; a first period compiles."""
     import warp
 
     period()
     warp.synchronize()
-    periods, began = 0, time.perf_counter()
+    periods = 0
+    began = time.perf_counter()
     while time.perf_counter() - began < seconds:
         period()
         periods += 1
@@ -58,9 +57,7 @@ def rate(period: Callable[[], object], num_envs: int, seconds: float) -> float:
 
 
 def plain_rate(robot: RobotSpec, num_envs: int, device: str, seconds: float) -> float:
-    """Return the control steps per second of mujoco_warp with the robot's own MJCF, without
-    gaponet.
-    """
+    """Return the control steps per second of mujoco_warp alone with the robot's own MJCF."""
     import mujoco
     import mujoco_warp
     import warp
@@ -115,27 +112,29 @@ def measure(robot: RobotSpec, num_envs: int, device: str, seconds: float) -> dic
 
 
 def reached(runs: list[Path]) -> None:
-    """Print when each run reached the best validation error of the first; the time includes labels
-    and sensors.
+    """Print when each run reached the best validation error of the first.
+
+    The time includes labels and sensors.
     """
-    lines = [
-        [json.loads(x) for x in (run / "progress.jsonl").read_text("utf-8").splitlines()]
-        for run in runs
-    ]
+    lines = [read_rows(run / "progress.jsonl") for run in runs]
     best = min(line["val_mpjae"] for line in lines[0])
     for run, rows in zip(runs, lines, strict=True):
-        there = next((r for r in rows if r["val_mpjae"] <= best), None)
-        when = f"{there['seconds']:.0f} s, {there['steps']:,} steps" if there else "never"
-        own = min(r["val_mpjae"] for r in rows)
-        end = f"its best {own * 1e3:.3f} mrad; {rows[-1]['steps']:,} steps in {rows[-1]['seconds']:.0f} s"
-        print(f"{run.name}: {best * 1e3:.3f} mrad after {when}; {end}")
+        when = "never"
+        for row in rows:
+            if row["val_mpjae"] <= best:
+                when = f"{row['seconds']:.0f} s, {row['steps']:,} steps"
+                break
+        own = min(row["val_mpjae"] for row in rows)
+        last = rows[-1]
+        print(
+            f"{run.name}: {best * 1e3:.3f} mrad after {when}; its best {own * 1e3:.3f} mrad; "
+            f"{last['steps']:,} steps in {last['seconds']:.0f} s"
+        )
 
 
 def main() -> None:
     """Measure and print one JSON line per size and servo."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = command_line(__doc__)
     parser.add_argument("sizes", type=int, nargs="*")
     parser.add_argument("--reached", type=Path, nargs=2, metavar=("RUN", "OTHER"))
     parser.add_argument("--device", default="cuda", choices=("cuda", "warp-cpu"))
@@ -145,19 +144,14 @@ def main() -> None:
     if args.reached:
         reached(args.reached)
     stated = load_robot(args.robot)
+    with_terms = stated.with_identified(dict.fromkeys(stated.operated, SERVO_TERMS))
     for size in args.sizes:
-        for servo, robot in (
-            ("stated", stated),
-            ("law", stated.with_identified(dict.fromkeys(stated.operated, SERVO_TERMS))),
-        ):
-            found = {
-                k: round(v) for k, v in measure(robot, size, args.device, args.seconds).items()
-            }
+        for servo, robot in (("stated", stated), ("law", with_terms)):
+            rates = measure(robot, size, args.device, args.seconds)
             memory = torch.cuda.max_memory_reserved() >> 20 if args.device == "cuda" else 0
-            print(
-                json.dumps({"num_envs": size, "servo": servo, "torch_mb": memory} | found),
-                flush=True,
-            )
+            row: dict[str, object] = {"num_envs": size, "servo": servo, "torch_mb": memory}
+            row |= {name: round(value) for name, value in rates.items()}
+            print(json.dumps(row), flush=True)
 
 
 if __name__ == "__main__":

@@ -23,8 +23,8 @@ show --out` does.
 
 from __future__ import annotations
 
-import argparse
 import hashlib
+import itertools
 import json
 import os
 import shutil
@@ -41,6 +41,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from common import command_line, read_rows
 
 import gaponet.nn.onnx_export  # imported before children are forked
 import gaponet.nn.training.trainer  # noqa: F401
@@ -48,9 +49,18 @@ from gaponet.base.files import FOLDER_MARKER
 from gaponet.cli.main import main as gaponet_main
 from gaponet.data.store import Dataset
 
-TRAIN = ["--model.history", "2", "--pretraining.num-envs", "16", "--pretraining.steps", "40",
-         "--pretraining.rounds", "3", "--pretraining.gradient-steps", "40", "--pretraining.batch-size", "128",
-         "--ppo.num-envs", "16", "--ppo.num-steps", "16", "--validate-every", "2"]  # fmt: skip
+TRAIN_OPTIONS = {
+    "--model.history": "2",
+    "--pretraining.num-envs": "16",
+    "--pretraining.steps": "40",
+    "--pretraining.rounds": "3",
+    "--pretraining.gradient-steps": "40",
+    "--pretraining.batch-size": "128",
+    "--ppo.num-envs": "16",
+    "--ppo.num-steps": "16",
+    "--validate-every": "2",
+}
+TRAIN = list(itertools.chain(*TRAIN_OPTIONS.items()))
 QUICK_FIT = ["--windows", "2", "--no-table", "--threads", "1", "--terms"]
 ARM = """<mujoco model="arm">
   <compiler angle="radian" autolimits="true"/>
@@ -107,8 +117,9 @@ def digests(out: Path) -> dict[str, str]:
 
 def trained(out: Path) -> Any:
     """Return the content of a run without times."""
-    lines = [json.loads(line) for line in (out / "progress.jsonl").read_text().splitlines()]
-    curve = [{k: v for k, v in line.items() if k != "seconds"} for line in lines]
+    curve = read_rows(out / "progress.jsonl")
+    for row in curve:
+        row.pop("seconds", None)
     return [curve, digests(out / "model")["model.onnx"], names(out)]
 
 
@@ -119,10 +130,10 @@ def without(*patterns: str) -> Callable[[Path], Any]:
 
     def content(out: Path) -> Any:
         made = digests(out)
-        return {
-            name: "" if any(fnmatch(name, pattern) for pattern in patterns) else digest
-            for name, digest in made.items()
-        }
+        for name in made:
+            if any(fnmatch(name, pattern) for pattern in patterns):
+                made[name] = ""
+        return made
 
     return content
 
@@ -158,7 +169,9 @@ def cases(given: Path) -> dict[str, Case]:
     needs.
     """
     robot = ["--robot", "so101"]
-    data, log, run = (str(given / name) for name in ("data", "logs", "run"))
+    data = str(given / "data")
+    log = str(given / "logs")
+    run = str(given / "run")
     recipe = ["--recipe", str(given / "more.toml")]
 
     def train(out: Path) -> list[str]:
@@ -167,18 +180,8 @@ def cases(given: Path) -> dict[str, Case]:
         return ["train", data, "--out", str(out), "--budget", "4000", *resume, *TRAIN]
 
     def experiment(out: Path) -> list[str]:
-        return [
-            "experiment",
-            "paper",
-            data,
-            "--out",
-            str(out),
-            "--quick",
-            "--methods",
-            "GAPONet",
-            "--blocks",
-            "labels",
-        ]
+        part = ["--quick", "--methods", "GAPONet", "--blocks", "labels"]
+        return ["experiment", "paper", data, "--out", str(out), *part]
 
     return {
         "import": Case(lambda out: ["import", log, *robot, "--out", str(out)], entries),
@@ -202,9 +205,11 @@ def further_cases(given: Path) -> dict[str, Case]:
     `given` holds, of an arm with two joints, a model file, a nominal and an identified robot, data
     and logs; and an empty folder.
     """
-    data, logs, nominal, identified, trained_on = (
-        str(given / name) for name in ("arm_data", "arm_logs", "nominal", "identified", "data")
-    )
+    data = str(given / "arm_data")
+    logs = str(given / "arm_logs")
+    nominal = str(given / "nominal")
+    identified = str(given / "identified")
+    trained_on = str(given / "data")
 
     def killed(
         words: Callable[[Path], list[str]],
@@ -270,24 +275,18 @@ def further_cases(given: Path) -> dict[str, Case]:
 
 def prepare(given: Path) -> None:
     """Create the inputs."""
-    recipe = 'motions = ["steps-*", "tour-all-*"]\npayloads = [{}]\nunits = ["virtual-1"]\nvariants = {}\n'
     given.mkdir(parents=True)
-    for name, payloads, variants in (("few", "0.0", 3), ("more", "0.0, 0.2", 6)):
-        (given / f"{name}.toml").write_text(recipe.format(payloads, variants))
+    for name, payloads, variants in (("few", [0.0], 3), ("more", [0.0, 0.2], 6)):
+        (given / f"{name}.toml").write_text(
+            'motions = ["steps-*", "tour-all-*"]\nunits = ["virtual-1"]\n'
+            f"payloads = {payloads}\nvariants = {variants}\n"
+        )
     (given / "arm.xml").write_text(ARM)
     nominal = str(given / "nominal")
     arm_data = str(given / "arm_data")
     few = ["--recipe", str(given / "few.toml")]
     for argv in (
-        [
-            "collect",
-            "--robot",
-            "so101",
-            "--recipe",
-            str(given / "few.toml"),
-            "--out",
-            str(given / "data"),
-        ],
+        ["collect", "--robot", "so101", *few, "--out", str(given / "data")],
         ["data", "export", str(given / "data"), "--out", str(given / "logs")],
         ["train", str(given / "data"), "--out", str(given / "run"), "--budget", "2000", *TRAIN],
         ["robot", "new", str(given / "arm.xml"), "--out", nominal, *GAINS],
@@ -339,7 +338,10 @@ class Trial:
     """Tests of one command under adversity; collects failures."""
 
     def __init__(self, name: str, case: Case, work: Path, rng: np.random.Generator) -> None:
-        self.name, self.case, self.work, self.rng = name, case, work / name, rng
+        self.name = name
+        self.case = case
+        self.work = work / name
+        self.rng = rng
         self.log = self.work / "log.txt"
         self.wrong: list[str] = []
         self.count: Counter[str] = Counter()
@@ -391,20 +393,28 @@ class Trial:
         while self.count["killed"] < wanted:
             out = self.fresh(self.work / f"killed-{turn}")
             turn += 1
-            while True:
-                process = start(self.case.argv(out), self.log)
-                last = self.count["killed"] >= wanted
-                code = wait(process, LIMIT_S if last else self.rng.uniform(0, 1.1 * self.duration))
-                if code is not None:
-                    break
-                os.kill(process, signal.SIGKILL)
-                os.waitpid(process, 0)
-                self.count["killed"] += 1
-                self.log.unlink(missing_ok=True)
-                if self.case.content is entries and (out / "dataset.json").is_file():
-                    Dataset(out).sequences()  # whatever is listed is there
+            code = None
+            while code is None:
+                code = self._run_or_kill(out, wanted)
             self.expect("resumed", code, *self.case.done)
             self.same("killed", out)
+
+    def _run_or_kill(self, out: Path, wanted: int) -> int | None:
+        """Start the command; return its exit code, or None if it was killed at a random moment."""
+        process = start(self.case.argv(out), self.log)
+        patience = LIMIT_S
+        if self.count["killed"] < wanted:
+            patience = self.rng.uniform(0, 1.1 * self.duration)
+        code = wait(process, patience)
+        if code is not None:
+            return code
+        os.kill(process, signal.SIGKILL)
+        os.waitpid(process, 0)
+        self.count["killed"] += 1
+        self.log.unlink(missing_ok=True)
+        if self.case.content is entries and (out / "dataset.json").is_file():
+            Dataset(out).sequences()  # whatever is listed is there
+        return None
 
     def full(self) -> None:
         """Run on a disk with a fraction of the needed space, then with enough."""
@@ -464,27 +474,33 @@ class Trial:
 
 
 def mixed(given: Path, work: Path, turns: int = 6) -> dict[str, Any]:
-    """Run import and collect at once into one dataset: one succeeds. Then run the other again: an
-    import finds the collected recordings, and collect refuses imported ones.
+    """Run import and collect at once into one dataset: one succeeds.
+
+    Then run the other again: an import finds the collected recordings, and collect refuses
+    imported ones.
     """
-    both = [cases(given)[name] for name in ("import", "collect")]
+    both = {name: cases(given)[name] for name in ("import", "collect")}
     count: Counter[str] = Counter()
     wrong: list[str] = []
     work.mkdir()
-    for case, name in zip(both, ("import", "collect"), strict=True):
+    for name, case in both.items():
         wait(start(case.argv(work / name), work / f"{name}.txt"))
     for turn in range(turns):
-        out, log, step = work / f"mixed-{turn}", work / f"mixed-{turn}.txt", 1 - 2 * (turn % 2)
-        running = [start(case.argv(out), log) for case in both[::step]]
-        codes = [wait(process) for process in running][::step]
-        first = "import" if codes[0] == 0 else "collect"
+        out = work / f"mixed-{turn}"
+        log = work / f"mixed-{turn}.txt"
+        order = ("import", "collect") if turn % 2 == 0 else ("collect", "import")
+        running = {name: start(both[name].argv(out), log) for name in order}
+        codes = {name: wait(running[name]) for name in order}
+        first, second = "collect", "import"
+        if codes["import"] == 0:
+            first, second = "import", "collect"
         count[f"{first} first"] += 1
-        later = wait(start(both[first == "import"].argv(out), log))
-        if sorted(map(str, codes)) != ["0", "2"] or later != (2 if first == "import" else 0):
-            wrong.append(f"mixed: exit codes {codes}, then {later}; see {log}")
-        if entries(out)[0] != entries(work / first)[0] or "Traceback" in log.read_text(
-            errors="replace"
-        ):
+        again = wait(start(both[second].argv(out), log))
+        meant = 2 if second == "collect" else 0
+        if (codes[first], codes[second], again) != (0, 2, meant):
+            wrong.append(f"mixed: exit codes {codes}, then {again}; see {log}")
+        has_traceback = "Traceback" in log.read_text(errors="replace")
+        if has_traceback or entries(out)[0] != entries(work / first)[0]:
             wrong.append(f"mixed: {out} is not what {first} leaves; see {log}")
     return {**count, "wrong": wrong}
 
@@ -505,9 +521,7 @@ def mounted(place: Path, size: float) -> Path:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = command_line(__doc__)
     parser.add_argument("work", type=Path)
     parser.add_argument("--kills", type=int, default=20)
     parser.add_argument("--only", default="", help="some of the commands, separated by commas")
@@ -519,20 +533,23 @@ def main() -> int:
     work = args.work.resolve()
     found: dict[str, Any] = {}
     wrong = 0
-    wanted = args.trials.split(",")
+    wanted = set(args.trials.split(","))
+    if os.geteuid() != 0:
+        wanted -= set(AS_ROOT)
+    only = args.only.split(",") if args.only else []
     if not (work / "input").is_dir():
         prepare(work / "input")
     for name, case in cases(work / "input").items():
-        if args.only and name not in args.only.split(","):
+        if only and name not in only:
             continue
         trial = Trial(name, case, work, np.random.default_rng(args.seed))
         for kind in case.trials:
-            if kind in wanted and (kind not in AS_ROOT or os.geteuid() == 0):
+            if kind in wanted:
                 trial.run(kind, args.kills)
         found[name] = {"whole_s": round(trial.duration, 1), **trial.count, "wrong": trial.wrong}
         wrong += len(trial.wrong)
         print(f"{name}: {found[name]}", file=sys.stderr, flush=True)
-    if "mixed" in args.only.split(",") or (not args.only and "races" in wanted):
+    if "mixed" in only or (not only and "races" in wanted):
         found["mixed"] = mixed(work / "input", work / "mixed")
         wrong += len(found["mixed"]["wrong"])
     print(json.dumps(found))

@@ -45,25 +45,20 @@ def main(
         no_stop: Count late periods and old states instead of stopping.
     """
     robot = load_robot("h1_2")
-    command = [
-        sys.executable,
-        "-m",
-        "gaponet",
-        "virtual",
-        "serve",
-        "--payload-mass",
-        str(payload_mass),
-    ]
+    command = [sys.executable, "-m", "gaponet", "virtual", "serve"]
+    command += ["--payload-mass", str(payload_mass)]
     command += ["--domain", str(domain), "--rate", str(state_rate)]
     served = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     try:
         assert served.stdout is not None
         print(served.stdout.readline().strip(), flush=True)
         time.sleep(0.5)
-        recording = Controller(
-            UnitreeDriver(robot, domain=domain), robot, config=ControlConfig(rate=rate),
-            safety=replace(SafetyConfig(), stale=1e6, overrun=1e6) if no_stop else SafetyConfig(),
-        ).run(swing(robot.qpos_home, minutes * 60, rate))  # fmt: skip
+        safety = SafetyConfig()
+        if no_stop:
+            safety = replace(safety, stale=1e6, overrun=1e6)
+        driver = UnitreeDriver(robot, domain=domain)
+        controller = Controller(driver, robot, config=ControlConfig(rate=rate), safety=safety)
+        recording = controller.run(swing(robot.qpos_home, minutes * 60, rate))
     finally:
         served.terminate()
         served.wait()

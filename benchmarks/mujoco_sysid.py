@@ -37,11 +37,10 @@ FIELDS = "kp", "damping", "friction", "armature", "delay", "offset"  # in the or
 
 
 def mujoco_sysid(question: Question) -> FittedSim:
-    """Fit kp, damping, friction, armature, delay and offset of each operated joint with
-    mujoco.sysid.
-    """
+    """Fit the parameters of each operated joint with mujoco.sysid."""
     problem = equal_problem(question)
-    return FittedSim(problem.robot_with(fit(problem)[0].as_vector()))
+    params, _ = fit(problem)
+    return FittedSim(problem.robot_with(params.as_vector()))
 
 
 def fit(problem: Problem, links: tuple[str, ...] = ()) -> tuple[sysid.ParameterDict, Any]:
@@ -52,12 +51,9 @@ def fit(problem: Problem, links: tuple[str, ...] = ()) -> tuple[sysid.ParameterD
     for w, (spec, state) in enumerate(zip(problem.specs, problem.states, strict=True)):
         commands = problem.controls(np.zeros(len(problem.op)), w)
         times = np.arange(len(commands) + 1) * spec.option.timestep
-        control = sysid.TimeSeries(
-            times, np.append(commands, commands[-1:], axis=0)
-        )  # the last one is not applied
-        recorded = sysid.TimeSeries(
-            times, np.zeros((len(times), 0))
-        )  # positions are in the problem
+        # The last command is not applied; recorded positions are in the problem.
+        control = sysid.TimeSeries(times, np.append(commands, commands[-1:], axis=0))
+        recorded = sysid.TimeSeries(times, np.zeros((len(times), 0)))
         window_of |= {id(spec): w, id(control): w, id(recorded): w}
         windows.append(sysid.ModelSequences(str(w), spec, str(w), state, control, recorded, True))
 
@@ -67,11 +63,13 @@ def fit(problem: Problem, links: tuple[str, ...] = ()) -> tuple[sysid.ParameterD
     def build(params: sysid.ParameterDict, spec: mujoco.MjSpec) -> mujoco.MjModel:
         servos = problem.servos(vector(params), window_of[id(spec)])
         for i, name in enumerate(robot.operated):
-            v = {field: float(x[i]) for field, x in servos.items()}
-            actuator, joint = spec.actuator(name), spec.joint(name)
-            sysid.apply_pdgain(spec, name, np.array([v["kp"], v["kd"]]))
-            actuator.biasprm[0], joint.damping[0] = v["kp"] * v["offset"], v["damping"]
-            joint.frictionloss, joint.armature = v["frictionloss"], v["armature"]
+            values = {field: float(x[i]) for field, x in servos.items()}
+            joint = spec.joint(name)
+            sysid.apply_pdgain(spec, name, np.array([values["kp"], values["kd"]]))
+            spec.actuator(name).biasprm[0] = values["kp"] * values["offset"]
+            joint.damping[0] = values["damping"]
+            joint.frictionloss = values["frictionloss"]
+            joint.armature = values["armature"]
         for name in links:
             params[name].apply_modifier(spec)
         model = spec.compile()
@@ -80,16 +78,12 @@ def fit(problem: Problem, links: tuple[str, ...] = ()) -> tuple[sysid.ParameterD
 
     def rollout(control_signal: list[Any], param_dicts: list[Any], **rest: Any) -> Any:
         late = []
-        for control, params in zip(
-            control_signal, param_dicts, strict=True
-        ):  # one window, many candidates
+        # One window, many candidates.
+        for control, params in zip(control_signal, param_dicts, strict=True):
             w = window_of[id(control)]
             delay = problem.servos(vector(params), w)["delay"]
-            late.append(
-                replace(
-                    control, data=np.append(problem.controls(delay, w), control.data[-1:], axis=0)
-                )
-            )
+            commands = np.append(problem.controls(delay, w), control.data[-1:], axis=0)
+            late.append(replace(control, data=commands))
         return sysid.sysid_rollout(control_signal=late, **rest)
 
     def residual(
@@ -98,21 +92,31 @@ def fit(problem: Problem, links: tuple[str, ...] = ()) -> tuple[sysid.ParameterD
         return problem.errors(state, window_of[id(recorded)]), recorded, recorded
 
     residuals = sysid.build_residual_fn(
-        models_sequences=windows, build_model=build, custom_rollout=rollout, modify_residual=residual,
+        models_sequences=windows,
+        build_model=build,
+        custom_rollout=rollout,
+        modify_residual=residual,
         resample_true=False,
-    )  # fmt: skip
+    )
     params = sysid.ParameterDict()
-    limits = (problem.start, problem.low, problem.high)
-    for field, start, low, high in zip(
-        FIELDS, *(np.split(x, len(FIELDS)) for x in limits), strict=True
-    ):
-        params.add(sysid.Parameter(field, start, low, high))
+    starts = np.split(problem.start, len(FIELDS))
+    lows = np.split(problem.low, len(FIELDS))
+    highs = np.split(problem.high, len(FIELDS))
+    for i, field in enumerate(FIELDS):
+        params.add(sysid.Parameter(field, starts[i], lows[i], highs[i]))
     for name in links:
         spec = problem.specs[0].copy()  # the parameter changes it
-        bounds = {"mass_bound_mult": np.array([0.3, 3.0]), "ipos_bound_off": np.array([-0.1, 0.1])}
-        params.add(sysid.body_inertia_param(
-            spec, spec.compile(), name, sysid.InertiaType.Pseudo, param_name=name, modifier=write_inertia, **bounds
-        ))  # fmt: skip
+        inertia = sysid.body_inertia_param(
+            spec,
+            spec.compile(),
+            name,
+            sysid.InertiaType.Pseudo,
+            param_name=name,
+            modifier=write_inertia,
+            mass_bound_mult=np.array([0.3, 3.0]),
+            ipos_bound_off=np.array([-0.1, 0.1]),
+        )
+        params.add(inertia)
     with redirect_stdout(sys.stderr):  # it prints each iteration
         return sysid.optimize(
             params, residuals, "scipy_parallel_fd", max_iters=EVALUATIONS, diff_step=STEP, **LOSS
@@ -121,12 +125,14 @@ def fit(problem: Problem, links: tuple[str, ...] = ()) -> tuple[sysid.ParameterD
 
 def write_inertia(spec: mujoco.MjSpec, param: sysid.Parameter) -> None:
     """Write mass, centre and inertia of the body that a pseudo-inertia is named after."""
-    pi, body = sysid.model_modifier.pi_from_theta(param.value), spec.body(param.name)
-    body.explicitinertial, body.mass, body.ipos = True, pi[0], pi[1:4] / pi[0]
+    pi = sysid.model_modifier.pi_from_theta(param.value)  # mass, mass · centre, inertia
+    mass = pi[0]
+    body = spec.body(param.name)
+    body.explicitinertial = True
+    body.mass = mass
+    body.ipos = pi[1:4] / mass
     cross = sysid.model_modifier.skew(body.ipos)
-    inertia = pi[4:].reshape(3, 3) + pi[0] * cross @ cross
-    body.iquat, body.inertia, body.fullinertia = (
-        [1, 0, 0, 0],
-        [0, 0, 0],
-        inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]],
-    )
+    inertia = pi[4:].reshape(3, 3) + mass * cross @ cross
+    body.iquat = [1, 0, 0, 0]
+    body.inertia = [0, 0, 0]
+    body.fullinertia = inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]

@@ -1,6 +1,7 @@
-"""Published servo parameters of the SO-101 as rivals of an identification.
+r"""Published servo parameters of the SO-101 as rivals of an identification.
 
-    python benchmarks/compare_methods.py --sets so101 so101_another_day --method benchmarks/published_so101.py:nvidia \
+    python benchmarks/compare_methods.py --sets so101 so101_another_day \
+        --method benchmarks/published_so101.py:nvidia \
         --method benchmarks/published_so101.py:community
     python benchmarks/published_so101.py DATASET        # error of each joint on the test motions
 
@@ -17,13 +18,17 @@ import numpy as np
 from real_robots.methods import FittedSim
 from real_robots.questions import Question
 
+from gaponet.data.sequence import Sequence
 from gaponet.data.split import split_entries
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.dataset_robot import open_dataset
 from gaponet.sim.replay import replay
 
 FIELDS = "kp", "damping", "armature", "frictionloss"
-PAN, LIFT, ELBOW, EVERY = "shoulder_pan", "shoulder_lift", "elbow_flex", ""
+PAN = "shoulder_pan"
+LIFT = "shoulder_lift"
+ELBOW = "elbow_flex"
+EVERY = ""  # joint
 SETS = {
     "NVIDIA so101-typing-task": {
         PAN: (48.9, 2.31, 0.058, 0.215),
@@ -67,23 +72,33 @@ def hand_tuned(question: Question) -> FittedSim:
 
 def published(robot: RobotSpec, name: str) -> RobotSpec:
     """Return the robot with a published set."""
-    joints = {j: SETS[name].get(j, SETS[name].get(EVERY, ())) for j in robot.operated}
-    return robot.with_identified({
-        j: {f: v for f, v in zip(FIELDS, values, strict=False) if not isnan(v)} for j, values in joints.items()
-    })  # fmt: skip
+    values = SETS[name]
+    joints: dict[str, dict[str, float]] = {}
+    for joint in robot.operated:
+        known = values.get(joint, values.get(EVERY, ()))
+        joints[joint] = {}
+        for field, value in zip(FIELDS, known, strict=False):
+            if not isnan(value):
+                joints[joint][field] = value
+    return robot.with_identified(joints)
 
 
 def main() -> None:
     """Print the error of each joint, mean over the test motions, mrad."""
     data, robot = open_dataset(sys.argv[1], None, None)
-    test, op = data.sequences(split_entries(data)["test"]), robot.operated_index
-    for name, spec in {"nominal": robot, **{name: published(robot, name) for name in SETS}}.items():
-        errors = [
-            np.abs(t.qpos - s.qpos)[1:, op].mean(axis=0)
-            for s, t in zip(test, replay(test, spec), strict=True)
-        ]
-        cells = [f"{1e3 * e:.2f}" for e in np.mean(errors, axis=0)]
-        print(f"| {name} | {' | '.join(cells)} |")
+    test = data.sequences(split_entries(data)["test"])
+    _print_errors("nominal", test, robot)
+    for name in SETS:
+        _print_errors(name, test, published(robot, name))
+
+
+def _print_errors(name: str, test: list[Sequence], robot: RobotSpec) -> None:
+    errors = []
+    for log, simulated in zip(test, replay(test, robot), strict=True):
+        error = np.abs(simulated.qpos - log.qpos)[1:, robot.operated_index]
+        errors.append(error.mean(axis=0))
+    cells = [f"{1e3 * error:.2f}" for error in np.mean(errors, axis=0)]
+    print(f"| {name} | {' | '.join(cells)} |")
 
 
 if __name__ == "__main__":

@@ -24,11 +24,11 @@ RELEASED_EPSILON = 0.01  # in the published network's normaliser, (x − mean) /
 
 
 def released_network(weights: dict[str, Array]) -> PaperNet:
-    """Return the network that the authors published (isaac-sim2real/sage, feature/add-plug-in), ten
-    joints.
+    """Return the network of ten joints that the authors published.
 
-    Their observation has no present velocities: these columns get weight zero. Their predictor has
-    no variance. Their normaliser of [S | A] only divides by 1 + ε.
+    It is in isaac-sim2real/sage, feature/add-plug-in. Their observation has no present velocities:
+    these columns get weight zero. Their predictor has no variance. Their normaliser of [S | A] only
+    divides by 1 + ε.
 
     Args:
         weights: Arrays of their state dict.
@@ -42,12 +42,14 @@ def released_network(weights: dict[str, Array]) -> PaperNet:
     }
     for own, name in published.items():
         for layer in (0, 2, 4, 6):
-            fusion = own == "branch" and layer == 6
-            source = "branch_net.fusion.0" if fusion else f"{name}.{layer}"
+            source = f"{name}.{layer}"
+            if own == "branch" and layer == 6:
+                source = "branch_net.fusion.0"
             for part in ("weight", "bias"):
                 if f"{source}.{part}" in weights:
                     state[f"{own}.{layer}.{part}"] = torch.from_numpy(weights[f"{source}.{part}"])
-    first, n = state["predictor.net.0.weight"], net.n
+    n = net.n
+    first = state["predictor.net.0.weight"]
     state["predictor.net.0.weight"] = torch.cat(
         [first[:, :n], torch.zeros(len(first), n), first[:, n:]], dim=1
     )
@@ -61,19 +63,17 @@ def released_network(weights: dict[str, Array]) -> PaperNet:
 
 
 def released_inputs(observation: Array, action: Array) -> Tensor:
-    """Convert the published network's observation (B, 130) and action (B, 10) to x = [o_t |
-    a_t].
-    """
-    o, a = torch.from_numpy(observation), torch.from_numpy(action)
-    return torch.cat([o[:, :10], torch.zeros_like(a), o[:, 10:], a], dim=1)
+    """Convert the published observation (B, 130) and action (B, 10) to x = [o_t | a_t]."""
+    observed = torch.from_numpy(observation)
+    sent = torch.from_numpy(action)
+    no_velocities = torch.zeros_like(sent)
+    return torch.cat([observed[:, :10], no_velocities, observed[:, 10:], sent], dim=1)
 
 
 def difference(folder: Path) -> float:
     """Largest |module − published output| over the pairs, rad."""
-    net, pairs = (
-        released_network(dict(np.load(folder / "weights.npz"))),
-        np.load(folder / "pairs.npz"),
-    )
+    net = released_network(dict(np.load(folder / "weights.npz")))
+    pairs = np.load(folder / "pairs.npz")
     with torch.inference_mode():
         delta = net(released_inputs(pairs["model_obs"], pairs["action"])).numpy()
     return float(np.abs(delta - pairs["delta"]).max())

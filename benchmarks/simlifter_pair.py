@@ -1,11 +1,10 @@
-"""Draw one recording and its simulation at the lightest and the heaviest payload
-(docs/simlifter.md).
+"""Draw one recording and its simulation at the lightest and the heaviest payload.
 
     gaponet collect --recipe demo --fleet firm --units virtual-1 --out DATASET
     python benchmarks/simlifter_pair.py DATASET docs/assets/simlifter_pair
 
-The robot of this dataset is VIRTUAL. The second argument is the name of the pictures without its
-ending.
+The picture is in docs/simlifter.md. The robot of this dataset is VIRTUAL. The second argument is
+the name of the pictures without its ending.
 """
 
 from __future__ import annotations
@@ -23,14 +22,15 @@ from gaponet.report.figures.style import DASHED, figure, legend, save, styled
 from gaponet.robot.folder import load_stored_robot
 from gaponet.sim.model import model_hash
 
-MOTION, JOINT = "steps-right_elbow", "right_elbow_joint"
-BEGIN_S, END_S = 2.2, 3.0  # one step of a quarter radian, and the rests around it
+MOTION = "steps-right_elbow"
+JOINT = "right_elbow_joint"
+# One step of a quarter radian, and the rests around it.
+BEGIN_S = 2.2
+END_S = 3.0
 
 
 def pairs(dataset: Dataset) -> list[Pair]:
-    """Return the recordings of the motion with the lightest and the heaviest payload, each with its
-    simulation.
-    """
+    """Return the recordings with the lightest and the heaviest payload and their simulations."""
     simulator = model_hash(load_stored_robot(dataset.path, dataset.robot_name))
     entries = sorted(dataset.select(motions=(MOTION,)), key=lambda e: e.meta.payload_mass)
     return [dataset.pair(entry, simulator) for entry in (entries[0], entries[-1])]
@@ -64,8 +64,8 @@ def _panel(ax: Axes, pair: Pair) -> None:
 
 def main() -> None:
     """Write the pictures as SVG and PNG."""
-    dataset, picture = Dataset(sys.argv[1]), Path(sys.argv[2])
-    for file in save(draw(pairs(dataset)), picture):
+    dataset = Dataset(sys.argv[1])
+    for file in save(draw(pairs(dataset)), Path(sys.argv[2])):
         print(file)
 
 

@@ -1,7 +1,7 @@
 """Speed of one correction or compensated command, and of the aligned simulator.
 
-    python benchmarks/speed.py latency --run RUN               one robot: onnxruntime, torch, delta(), Compensator
-    python benchmarks/speed.py aligned --run RUN               the aligned simulator beside the nominal one
+    python benchmarks/speed.py latency --run RUN   one robot: network, delta(), Compensator
+    python benchmarks/speed.py aligned --run RUN   the aligned simulator beside the nominal one
 
 All parts take turns in one run, so that a slow moment of the machine slows all of them. Of repeated
 turns the fastest counts, because other programs only add time. Results are printed as JSON.
@@ -9,7 +9,6 @@ turns the fastest counts, because other programs only add time. Results are prin
 
 from __future__ import annotations
 
-import argparse
 import itertools
 import json
 import time
@@ -20,6 +19,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from common import command_line
 
 from gaponet.base.arrays import Array
 from gaponet.deploy.aligned_sim import AlignedSim, AlignedSimOptions
@@ -35,18 +35,21 @@ Turn = Callable[[], object]
 
 TURN_STEPS = 40  # control periods of a turn
 INFERENCE_BATCH = 4096
-CALLS = 3000  # of each runtime, in turns of a tenth
+CALLS = 300  # of each runtime in a turn
+TURNS = 10
 
 
 def bench_latency(run: Path) -> dict[str, Any]:
-    """Microseconds of one correction (p50, p99, max) on each runtime, and corrections per second in
-    batches. Beside it the Compensator of the run's simulator, with and without the network, and one
-    control period of that simulator alone.
+    """Measure one correction on each runtime, µs, and corrections per second in batches.
+
+    Beside it the Compensator of the run's simulator, with and without the network, and one control
+    period of that simulator alone.
 
     Args:
         run: Run folder of gaponet train.
     """
-    model, rng = GapModel.load(run), np.random.default_rng(0)
+    model = GapModel.load(run)
+    rng = np.random.default_rng(0)
     n = len(model.card["joint_names"])
     x = rng.normal(0, 0.3, (INFERENCE_BATCH, model.config.input_dim(n))).astype(np.float32)
     turns: dict[str, Turn] = {"network, onnxruntime": partial(model.infer, x[:1])}
@@ -60,20 +63,26 @@ def bench_latency(run: Path) -> dict[str, Any]:
     turns["Compensator.step"] = _compensation(robot, model)
     turns["simulator, one control period"] = _period(robot)
     micro: dict[str, list[Array]] = {name: [] for name in turns}
-    for _ in range(10):
+    for _ in range(TURNS):
         for name, turn in turns.items():
-            micro[name].append(_durations(turn, CALLS // 10))
-    quantiles = {
-        name: {
-            "p50": float(np.median(t)),
-            "p99": float(np.quantile(t, 0.99)),
-            "max": float(t.max()),
-        }
-        for name, t in ((name, np.concatenate(times)) for name, times in micro.items())
+            micro[name].append(_durations(turn, CALLS))
+    batch_s = _durations(partial(GapModel.load(run, 1).infer, x), 3).min() * 1e-6
+    return {
+        "run": str(run),
+        "joints": n,
+        "model": model.card["model"],
+        "microseconds": {name: _quantiles(np.concatenate(t)) for name, t in micro.items()},
+        "batch": INFERENCE_BATCH,
+        "deltas_per_s": INFERENCE_BATCH / batch_s,
     }
-    batch = _durations(partial(GapModel.load(run, 1).infer, x), 3).min() * 1e-6
-    return {"run": str(run), "joints": n, "model": model.card["model"], "microseconds": quantiles,
-            "batch": INFERENCE_BATCH, "deltas_per_s": INFERENCE_BATCH / batch}  # fmt: skip
+
+
+def _quantiles(times: Array) -> dict[str, float]:
+    return {
+        "p50": float(np.median(times)),
+        "p99": float(np.quantile(times, 0.99)),
+        "max": float(times.max()),
+    }
 
 
 def bench_aligned(run: Path, num_envs: int, rounds: int) -> dict[str, dict[str, float]]:
@@ -87,9 +96,8 @@ def bench_aligned(run: Path, num_envs: int, rounds: int) -> dict[str, dict[str, 
     options = AlignedSimOptions(locked=locked)
     aligned = AlignedSim(robot, model, num_envs=num_envs, options=options)
     phase = np.random.default_rng(0).uniform(0, 2 * np.pi, (num_envs, nominal.n))
-    targets = [
-        aligned.qpos_home + 0.3 * np.sin(phase + np.pi * robot.dt * t) for t in range(TURN_STEPS)
-    ]
+    angles = np.pi * robot.dt * np.arange(TURN_STEPS)
+    targets = [aligned.qpos_home + 0.3 * np.sin(phase + angle) for angle in angles]
 
     def run_nominal() -> None:
         nominal.reset(slice(None), targets[0], 0.0, past=targets[0][:, None])  # type: ignore[arg-type]
@@ -107,17 +115,19 @@ def bench_aligned(run: Path, num_envs: int, rounds: int) -> dict[str, dict[str, 
             start = time.perf_counter()
             turn()
             seconds[name].append(time.perf_counter() - start)
-    speed = {
-        name: num_envs * TURN_STEPS / min(s[1:]) for name, s in seconds.items()
-    }  # the first warms up
-    return {
-        name: {"control_steps_per_s": v, "ratio": v / speed["nominal"]} for name, v in speed.items()
-    }
+    speed = {}
+    for name, times in seconds.items():
+        speed[name] = num_envs * TURN_STEPS / min(times[1:])  # the first one warms up
+    found = {}
+    for name, rate in speed.items():
+        found[name] = {"control_steps_per_s": rate, "ratio": rate / speed["nominal"]}
+    return found
 
 
 def _correction(model: GapModel, states: Array) -> Turn:
     """delta() at changing states, (k, 3, n)."""
-    loop, k = model.loop(), 0
+    loop = model.loop()
+    k = 0
 
     def step() -> Array:
         nonlocal k
@@ -172,19 +182,16 @@ def _durations(turn: Turn, calls: int) -> Array:
 
 def main() -> None:
     """Measure and print JSON."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = command_line(__doc__)
     parser.add_argument("what", choices=("latency", "aligned"))
     parser.add_argument("--run", type=Path, default=Path("."), help="run folder of gaponet train")
     parser.add_argument("--num-envs", type=int, default=512)
     parser.add_argument("--rounds", type=int, default=15)
     args = parser.parse_args()
-    result = (
-        bench_latency(args.run)
-        if args.what == "latency"
-        else bench_aligned(args.run, args.num_envs, args.rounds)
-    )
+    if args.what == "latency":
+        result = bench_latency(args.run)
+    else:
+        result = bench_aligned(args.run, args.num_envs, args.rounds)
     print(json.dumps(result, indent=1))
 
 

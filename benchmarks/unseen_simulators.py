@@ -27,6 +27,7 @@ simulators of the mean over seeds.
 from __future__ import annotations
 
 import argparse
+import functools
 import json
 from collections.abc import Callable
 from collections.abc import Sequence as ListOf
@@ -40,7 +41,7 @@ import gaponet as gp
 from gaponet.base.files import write_json
 from gaponet.base.result_table import ResultTable
 from gaponet.data.sequence import Sequence
-from gaponet.data.store import Dataset
+from gaponet.data.store import Dataset, Entry
 from gaponet.deploy.transfer import TransferCorrector
 from gaponet.nn.artifact import GapModel
 from gaponet.nn.config import ModelKind
@@ -60,6 +61,7 @@ from gaponet.robot.spec import RobotSpec
 from gaponet.sim.batch import Condition
 from gaponet.sim.context import contexts
 from gaponet.sim.dataset_robot import open_dataset
+from gaponet.sim.metrics import standard_error
 from gaponet.sim.replay import Corrector, rollout_errors
 
 TEST_SEED = 20_261_128
@@ -179,47 +181,59 @@ def test(arguments: argparse.Namespace) -> None:
                 for name, correctors in methods.items():
                     ratios = [errors(placed) / uncorrected for errors in correctors]
                     found[name].setdefault(column, []).append(ratios)
-                print(
-                    f"{column}, {number + 1} of {len(simulators)}: {1e3 * uncorrected:.1f} mrad",
-                    flush=True,
-                )
+                place = f"{column}, {number + 1} of {len(simulators)}"
+                print(f"{place}: {1e3 * uncorrected:.1f} mrad", flush=True)
             write_json(arguments.out / f"{arguments.result}.json", found)
     print(table(found).markdown())
 
 
 def test_recordings(dataset: Dataset, arguments: argparse.Namespace) -> dict[float, list[Sequence]]:
     """Return payload, kg → pieces of the test recordings, at most `recordings` of each."""
-    split = json.loads(next(arguments.out.glob("*/model/card.json")).read_text())["motions"]
-    chosen = [e for e in dataset.entries if e.meta.motion in split["test"] or arguments.all]
-    if arguments.rates:
-        chosen = [e for e in chosen if round(1 / e.dt) in arguments.rates]
+    card = next(arguments.out.glob("*/model/card.json"))
+    test_motions = json.loads(card.read_text())["motions"]["test"]
+    entries: dict[float, list[Entry]] = {}
+    for entry in _at_rates(dataset.entries, arguments.rates):
+        if arguments.all or entry.meta.motion in test_motions:
+            entries.setdefault(entry.meta.payload_mass, []).append(entry)
     by_payload: dict[float, list[Sequence]] = {}
-    for kg in sorted({e.meta.payload_mass for e in chosen}):
-        same = [e for e in chosen if e.meta.payload_mass == kg]
-        steps = np.linspace(0, len(same) - 1, min(arguments.recordings, len(same)))
-        cut = []
-        for whole in dataset.sequences([same[round(i)] for i in steps]):
-            start, end = (round(seconds / whole.dt) for seconds in PIECE_S)
-            is_long = len(whole) > end
-            cut.append(whole.rows(slice(start, end)) if is_long else whole)
-        by_payload[kg] = cut
-        motions = {s.meta.motion for s in cut}
-        print(f"{kg:g} kg: {len(cut)} recordings of {len(motions)} motions")
+    for kg, same in sorted(entries.items()):
+        recordings = dataset.sequences(_evenly_spaced(same, arguments.recordings))
+        by_payload[kg] = [_piece(whole) for whole in recordings]
+        motions = {recording.meta.motion for recording in recordings}
+        print(f"{kg:g} kg: {len(recordings)} recordings of {len(motions)} motions")
     return by_payload
+
+
+def _at_rates(entries: ListOf[Entry], rates: list[float]) -> list[Entry]:
+    """Return the recordings at one of the rates, Hz; all without any."""
+    if not rates:
+        return list(entries)
+    return [entry for entry in entries if round(1 / entry.dt) in rates]
+
+
+def _evenly_spaced(entries: list[Entry], most: int) -> list[Entry]:
+    steps = np.linspace(0, len(entries) - 1, min(most, len(entries)))
+    return [entries[round(step)] for step in steps]
+
+
+def _piece(whole: Sequence) -> Sequence:
+    """Return the piece of a long recording that is tested, or a short one as it is."""
+    first, last = (round(seconds / whole.dt) for seconds in PIECE_S)
+    if len(whole) <= last:
+        return whole
+    return whole.rows(slice(first, last))
 
 
 def all_methods(arguments: argparse.Namespace, robot: RobotSpec) -> dict[str, list[Errors]]:
     """Return method → for each training seed, its errors."""
-    methods: dict[str, list[Errors]] = {}
-    models: dict[str, list[GapModel]] = {}
-    for name in rows(arguments):
-        folders = [run_folder(arguments.out, name, seed) for seed in range(arguments.seeds)]
-        models[name] = [GapModel.load(f) for f in folders if (f / "model" / "card.json").is_file()]
+    models = trained_models(arguments)
 
-    def corrected(make: Callable[[GapModel], Corrector], model: GapModel) -> Errors:
-        return lambda placed: float(rollout_errors(placed, robot, 1, make(model)).mean())
+    def corrected(
+        models: list[GapModel], corrector: Callable[[GapModel], Corrector]
+    ) -> list[Errors]:
+        return [functools.partial(_error, robot, corrector, model) for model in models]
 
-    def plain(model: GapModel) -> Corrector:
+    def as_trained(model: GapModel) -> Corrector:
         return DeltaCorrector(model.infer, model.config, robot)
 
     def told_another(model: GapModel) -> Corrector:
@@ -228,26 +242,49 @@ def all_methods(arguments: argparse.Namespace, robot: RobotSpec) -> dict[str, li
     def transferred(model: GapModel) -> Corrector:
         return TransferCorrector(model, robot, extrapolate=True)
 
-    for name, loaded in models.items():
-        methods[name] = [corrected(plain, model) for model in loaded]
-    methods["GAPONet + context of another simulator"] = [
-        corrected(told_another, model) for model in models["GAPONet + context"]
-    ]
-    methods["GAPONet, one simulator, transferred"] = [
-        corrected(transferred, model) for model in models["GAPONet, one simulator"]
-    ]
+    methods = {name: corrected(loaded, as_trained) for name, loaded in models.items()}
+    methods["GAPONet + context of another simulator"] = corrected(
+        models["GAPONet + context"], told_another
+    )
+    methods["GAPONet, one simulator, transferred"] = corrected(
+        models["GAPONet, one simulator"], transferred
+    )
     if arguments.literal:
         refits = literal_refits(arguments, robot, models[LITERAL])
         methods["literal, predictor fitted in many simulators"] = [r.in_many for r in refits]
         methods["literal, predictor fitted in the test's simulator"] = [r.in_own for r in refits]
     if arguments.identified:
         identified = gp.load_robot(arguments.identified)
-        methods["identified robot (bound)"] = [
-            lambda placed: float(
-                rollout_errors([replace(s, simulator=None) for s in placed], identified, 1).mean()
-            )
-        ]
+        methods["identified robot (bound)"] = [functools.partial(_error_without_change, identified)]
     return {name: correctors for name, correctors in methods.items() if correctors}
+
+
+def trained_models(arguments: argparse.Namespace) -> dict[str, list[GapModel]]:
+    """Return the trained networks of each name, by seed."""
+    models: dict[str, list[GapModel]] = {}
+    for name in rows(arguments):
+        models[name] = []
+        for seed in range(arguments.seeds):
+            folder = run_folder(arguments.out, name, seed)
+            if (folder / "model" / "card.json").is_file():
+                models[name].append(GapModel.load(folder))
+    return models
+
+
+def _error(
+    robot: RobotSpec,
+    corrector: Callable[[GapModel], Corrector],
+    model: GapModel,
+    placed: list[Sequence],
+) -> float:
+    """Return the mean error with a network, rad."""
+    return float(rollout_errors(placed, robot, 1, corrector(model)).mean())
+
+
+def _error_without_change(robot: RobotSpec, placed: list[Sequence]) -> float:
+    """Return the mean error of a robot in its own simulator, rad."""
+    own = [replace(recording, simulator=None) for recording in placed]
+    return float(rollout_errors(own, robot, 1).mean())
 
 
 def literal_refits(
@@ -258,12 +295,11 @@ def literal_refits(
     """
     dataset, _ = open_dataset(arguments.trained_on or arguments.dataset)
     motions = models[0].card["motions"]["train"]
-    entries = [e for e in dataset.entries if e.meta.motion in motions]
-    if arguments.rates:
-        entries = [e for e in entries if round(1 / e.dt) in arguments.rates]
-    steps = np.linspace(0, len(entries) - 1, min(MAX_RECORDINGS, len(entries)))
-    recordings = dataset.sequences([entries[round(i)] for i in steps])
-    cut = [piece for whole in recordings for piece in pieces(whole)]
+    at_rates = _at_rates(dataset.entries, arguments.rates)
+    entries = [entry for entry in at_rates if entry.meta.motion in motions]
+    cut: list[Sequence] = []
+    for whole in dataset.sequences(_evenly_spaced(entries, MAX_RECORDINGS)):
+        cut += pieces(whole)
     return [PredictorRefit(model, robot, cut, arguments.simulators) for model in models]
 
 
@@ -293,19 +329,17 @@ class PredictorRefit:
         if self.fitted_in_many is None:
             joints = len(self.robot.joint_names)
             drawn = SimulatorRanges().draw(joints, self.simulators, TEST_SEED + 4)
-            spread = [
-                replace(piece, simulator=drawn[i % len(drawn)])
-                for i, piece in enumerate(self.recordings)
-            ]
+            spread = []
+            for i, piece in enumerate(self.recordings):
+                spread.append(replace(piece, simulator=drawn[i % len(drawn)]))
             self.fitted_in_many = self._fit(spread)
         return self._error(self.fitted_in_many, placed)
 
     def in_own(self, placed: list[Sequence]) -> float:
         """Return the error with a predictor of the simulator of the test, rad."""
         simulator = placed[0].simulator
-        return self._error(
-            self._fit([replace(piece, simulator=simulator) for piece in self.recordings]), placed
-        )
+        there = [replace(piece, simulator=simulator) for piece in self.recordings]
+        return self._error(self._fit(there), placed)
 
     def _fit(self, sequences: list[Sequence]) -> Network:
         config = self.model.config
@@ -344,57 +378,62 @@ class OtherContext(DeltaCorrector):
 
 def table(found: dict[str, dict[str, list[list[float]]]]) -> ResultTable:
     """Return the table: mean over simulators and seeds, ± over simulators, and each seed's mean."""
+    heads = ["error over uncorrected", *next(iter(found.values()))]
     lines = []
     for name, groups in found.items():
-        cells = [name]
-        for ratios in groups.values():
-            by_simulator = np.array(ratios)  # (simulators, seeds)
-            mean = by_simulator.mean(axis=1)
-            text = f"{mean.mean():.3f}"
-            if len(mean) > 1:
-                text += f" ± {mean.std(ddof=1) / np.sqrt(len(mean)):.3f}"
-            seeds = ", ".join(f"{value:.2f}" for value in by_simulator.mean(axis=0))
-            cells.append(f"{text} ({seeds})")
-        lines.append(cells)
-    heads = ["error over uncorrected", *next(iter(found.values()))]
-    rows = tuple(tuple(cells) for cells in lines)
-    return ResultTable("unseen_simulators", tuple(heads), rows)
+        lines.append((name, *map(_cell, groups.values())))
+    return ResultTable("unseen_simulators", tuple(heads), tuple(lines))
+
+
+def _cell(ratios: list[list[float]]) -> str:
+    """Return the cell of ratios, (simulators, seeds)."""
+    values = np.array(ratios)
+    by_simulator = values.mean(axis=1)
+    text = f"{by_simulator.mean():.3f}"
+    if len(by_simulator) > 1:
+        text += f" ± {standard_error(by_simulator):.3f}"
+    seeds = ", ".join(f"{value:.2f}" for value in values.mean(axis=0))
+    return f"{text} ({seeds})"
 
 
 def main() -> None:
     """Train or test."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     commands = parser.add_subparsers(required=True)
-    for name, function in (("train", train), ("test", test)):
-        command = commands.add_parser(name)
-        command.set_defaults(run=function)
-        if name == "test":
-            command.add_argument("out", type=Path)
-        command.add_argument("dataset")
-        if name == "train":
-            command.add_argument("--out", type=Path, required=True)
-        command.add_argument("--seeds", type=int, default=3)
-        command.add_argument("--steps", type=int, default=240_000)
-        command.add_argument("--simulators", type=int, default=200)
-        command.add_argument(
-            "--share", type=float, default=1.0, help="of the training motions that are used"
-        )
-        command.add_argument(
-            "--recordings", type=int, default=MAX_RECORDINGS, help="of the test, by payload"
-        )
-        command.add_argument("--rates", type=float, nargs="*", default=[])
-        command.add_argument("--identified")
-        command.add_argument("--payload-unknown", action="store_true")
-        command.add_argument("--literal", action="store_true")
-        command.add_argument("--trained-on", help="the dataset of training, if DATASET is another")
-        command.add_argument(
-            "--result", default="unseen_simulators", help="name of the result file"
-        )
-        command.add_argument(
-            "--all", action="store_true", help="all recordings of DATASET, none of training"
-        )
+    train_command = commands.add_parser("train")
+    train_command.set_defaults(run=train)
+    train_command.add_argument("dataset")
+    train_command.add_argument("--out", type=Path, required=True)
+    test_command = commands.add_parser("test")
+    test_command.set_defaults(run=test)
+    test_command.add_argument("out", type=Path)
+    test_command.add_argument("dataset")
+    for command in (train_command, test_command):
+        add_options(command)
     arguments = parser.parse_args()
     arguments.run(arguments)
+
+
+def add_options(command: argparse.ArgumentParser) -> None:
+    """Add the options that training and test have in common."""
+    command.add_argument("--seeds", type=int, default=3)
+    command.add_argument("--steps", type=int, default=240_000)
+    command.add_argument("--simulators", type=int, default=200)
+    command.add_argument(
+        "--share", type=float, default=1.0, help="of the training motions that are used"
+    )
+    command.add_argument(
+        "--recordings", type=int, default=MAX_RECORDINGS, help="of the test, by payload"
+    )
+    command.add_argument("--rates", type=float, nargs="*", default=[])
+    command.add_argument("--identified")
+    command.add_argument("--payload-unknown", action="store_true")
+    command.add_argument("--literal", action="store_true")
+    command.add_argument("--trained-on", help="the dataset of training, if DATASET is another")
+    command.add_argument("--result", default="unseen_simulators", help="name of the result file")
+    command.add_argument(
+        "--all", action="store_true", help="all recordings of DATASET, none of training"
+    )
 
 
 if __name__ == "__main__":

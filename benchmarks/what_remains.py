@@ -20,42 +20,52 @@ from gaponet.robot.spec import load_robot
 from gaponet.sim.dynamics import tips_of
 from gaponet.sim.replay import replay
 
-REST_SPEED, REST_SPAN_S = 0.02, 0.2
+REST_SPEED = 0.02  # rad/s
+REST_SPAN_S = 0.2
+KINDS = ("at the table", "at rest, free", "moving, free")
 
 
 def main(dataset: str, folder: str) -> None:
     """Print the mean |error| of each kind of row, mrad, and what one removes from the mean over
     motions.
     """
-    data, robot = Dataset(dataset), load_robot(folder)
-    heights, op = tips_of(robot), robot.operated_index
-    kinds = ["at the table", "at rest, free", "moving, free"]
-    sums, counts = np.zeros((2, len(kinds), len(op)))
+    data = Dataset(dataset)
+    robot = load_robot(folder)
+    heights = tips_of(robot)
+    table = robot.scene.table
+    shape = (len(KINDS), len(robot.operated))
+    sums = np.zeros(shape)
+    counts = np.zeros(shape)
     means = []
     test = data.sequences(split_entries(data, ())["test"])
-    for s, simulated in zip(test, replay(test, robot), strict=True):
-        error = 1e3 * np.abs(simulated.qpos - s.qpos)[:, op]
-        low = np.zeros(len(s), bool)
-        if heights is not None and robot.scene.table is not None:
-            low = heights(s.ctrl) < robot.scene.table.height
-        speed = np.abs(np.gradient(s.qpos[:, op].astype(float), s.dt, axis=0))
-        rest = uniform_filter1d(speed, max(1, round(REST_SPAN_S / s.dt)), axis=0) < REST_SPEED
-        at_table = np.broadcast_to(low[:, None], rest.shape)
-        for k, rows in enumerate((at_table, ~at_table & rest, ~at_table & ~rest)):
+    for log, simulated in zip(test, replay(test, robot), strict=True):
+        error = 1e3 * np.abs(simulated.qpos - log.qpos)[:, robot.operated_index]
+        low = np.zeros(len(log), bool)
+        if heights is not None and table is not None:
+            low = heights(log.ctrl) < table.height
+        rests = _rests(log.qpos[:, robot.operated_index], log.dt)
+        at_table = np.broadcast_to(low[:, None], rests.shape)
+        for k, rows in enumerate((at_table, ~at_table & rests, ~at_table & ~rests)):
             sums[k] += (error * rows).sum(axis=0)
             counts[k] += rows.sum(axis=0)
         means.append((error.mean(), error[~low].mean()))
     print(f"{'rows':<16}{'share':>7}{'all':>7}  " + "  ".join(robot.operated))
-    for kind, total, count in zip(kinds, sums, counts, strict=True):
-        joints = "  ".join(
-            f"{x:{len(j)}.2f}"
-            for x, j in zip(total / np.maximum(count, 1), robot.operated, strict=True)
-        )
-        print(
-            f"{kind:<16}{count.sum() / counts.sum():7.2f}{total.sum() / max(count.sum(), 1):7.2f}  {joints}"
-        )
+    for k, kind in enumerate(KINDS):
+        joints = []
+        for j, joint in enumerate(robot.operated):
+            joints.append(f"{sums[k, j] / max(counts[k, j], 1):{len(joint)}.2f}")
+        share = counts[k].sum() / counts.sum()
+        mean = sums[k].sum() / max(counts[k].sum(), 1)
+        print(f"{kind:<16}{share:7.2f}{mean:7.2f}  {'  '.join(joints)}")
     whole, free = np.mean(means, axis=0)
     print(f"mean over {len(test)} motions: {whole:.2f} mrad, without rows at the table {free:.2f}")
+
+
+def _rests(qpos: np.ndarray, dt: float) -> np.ndarray:
+    """Return in which rows the joints rest, (T, n), by recorded positions, rad."""
+    speed = np.abs(np.gradient(qpos.astype(float), dt, axis=0))
+    smooth: np.ndarray = uniform_filter1d(speed, max(1, round(REST_SPAN_S / dt)), axis=0)
+    return smooth < REST_SPEED
 
 
 if __name__ == "__main__":
