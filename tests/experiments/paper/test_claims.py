@@ -70,7 +70,7 @@ def make_results(*trainings):
     return Results(study, baselines, list(trainings))  # type: ignore[arg-type]
 
 
-def test_an_untrained_network_has_zero_percent_in_every_claim():
+def test_networks_have_zero_percent_in_every_claim_if_all_are_untrained():
     found = claims(make_results(training("MLP", 1.0), training("GAPONet", 1.0)))
     assert len(found) > 10
     for claim in found:
