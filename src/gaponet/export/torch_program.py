@@ -110,7 +110,7 @@ class DeltaStep(nn.Module):
         Count these.
         """
         finite = torch.isfinite(delta).all(dim=1)
-        self.refused += (~finite).sum()
+        self.refused.add_((~finite).sum())  # in place: torch 2.7 exports no assignment
         limited = delta.clamp(-self.delta_max, self.delta_max)
         return torch.where(finite[:, None], limited, torch.zeros_like(limited))
 

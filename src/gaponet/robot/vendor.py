@@ -281,9 +281,29 @@ def _urdf(
     ET.SubElement(own, "compiler", URDF_COMPILER)
     with mujoco_errors(path, "not valid URDF"):
         spec = mujoco.MjSpec.from_string(ET.tostring(root, encoding="unicode"))
+    _add_mimic_joints(spec, root)
     hint = "were not found; --packages NAME=FOLDER says where package://NAME is"
     notes = _left_out(missing, hint) + _left_out(unread, f"are none of {', '.join(MESHES)}")
     return spec, notes + _drop_unreadable_meshes(spec) + corrected
+
+
+def _add_mimic_joints(spec: mujoco.MjSpec, root: ET.Element) -> None:
+    """Let joints follow others as URDF's <mimic> says; MuJoCo before 4 does not read it."""
+    known = {equality.name1 for equality in spec.equalities}
+    for joint in root.iter("joint"):
+        mimic = joint.find("mimic")
+        name = joint.get("name", "")
+        if mimic is None or name in known:
+            continue
+        multiplier = 1.0
+        if "multiplier" in mimic.attrib:
+            multiplier = _number(mimic, "multiplier")
+        equality = spec.add_equality(
+            type=mujoco.mjtEq.mjEQ_JOINT,
+            name1=name,
+            name2=mimic.get("joint", ""),
+        )
+        equality.data[:5] = [_number(mimic, "offset"), multiplier, 0.0, 0.0, 0.0]  # polynomial
 
 
 def _left_out(names: list[str], why: str) -> list[str]:
