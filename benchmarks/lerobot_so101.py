@@ -33,14 +33,15 @@ WAYS: dict[str, dict[str, bool] | None] = {
     "corrected": {},
     "dynamics": {"dynamics": True},
 }
-MOTIONS = (
-    "tour-all-20",
-    "tour-all-21",
-    "limber-all-20",
-    "limber-all-21",
-)  # of the test; excitation has other ones
-MINUTES, FPS, UNIT = 8, 25, "1"  # excitation, LeRobot's rate, unit of the fleet `hard`
-LEAD = 5.0  # s of a test motion that are not judged: the way to its start, and the correction's blending in
+# Of the test; excitation has other ones.
+MOTIONS = ("tour-all-20", "tour-all-21", "limber-all-20", "limber-all-21")
+EXCITATION_MINUTES = 8
+EPISODE_S = 30.0  # of excitation
+FPS = 25  # LeRobot's rate
+UNIT = "1"  # of the fleet `hard`
+# Of a test motion, not judged: the way to its start, and the correction's blending in.
+LEAD_S = 5.0
+JUDGED_S = 8.0
 
 
 def main(work: tyro.conf.Positional[Path]) -> None:
@@ -54,59 +55,67 @@ def main(work: tyro.conf.Positional[Path]) -> None:
     wait_longer()
     count_frames()
     tell_where_it_is()
-    excitation, data, arm, run, out = (
-        work / x for x in ("excitation", "data", "identified", "run", "exported")
-    )
-    if not excitation.is_dir():
-        call("excite", "--robot", "so101", "--minutes", MINUTES, "--out", excitation)
+    sets = work / "lerobot" / "me"
     with served(work):
-        sets = work / "lerobot" / "me"
-        record(sets / "excitation", work, str(excitation), 2 * MINUTES, 30.0)
-        if not (data / "dataset.json").is_file():
-            words = [
-                "--position-unit",
-                "deg",
-                "--unit-id",
-                f"virtual-{UNIT}",
-                "--payload-mass",
-                "0",
-            ]
-            call(
-                "import",
-                sets / "excitation",
-                "--robot",
-                softer(work / "so101_p16"),
-                *words,
-                "--out",
-                data,
-            )
-        if not (arm / "robot.toml").is_file():
-            call("identify", data, "--out", arm, "--windows", 12, "--no-table", "--terms")
-        if not (run / "model" / "card.json").is_file():
-            call("train", data, "--robot", arm, "--out", run, "--budget", "10m")
-        if not out.is_dir():
-            call("data", "export", data, "--out", out)
-        errors = {}
-        for motion in MOTIONS:
-            for how, given in WAYS.items():
-                step = {"model": str(run), **given} if given is not None else None
-                record(sets / f"{motion}-{how}", work, motion, 1, LEAD + 8.0, step)
-                errors[f"{motion} {how}"] = error(sets / f"{motion}-{how}")
-    ratios = {
-        how: [errors[f"{motion} {how}"] / errors[f"{motion} uncorrected"] for motion in MOTIONS]
-        for how in WAYS
+        learn(work, sets)
+        errors = play_test_motions(work, sets)
+    ratios = {}
+    for how in WAYS:
+        ratios[how] = [errors[f"{m} {how}"] / errors[f"{m} uncorrected"] for m in MOTIONS]
+    gap = json.loads(call("gap", work / "data", "--json"))
+    result = {
+        "virtual": True,
+        "unit": UNIT,
+        "fps": FPS,
+        "gap_rad": gap["methods"]["nominal"]["mpjae"],
+        "opened_by_lerobot": opened(work / "exported"),
+        "error_rad": errors,
+        "ratio": ratios,
+        "mean": {how: float(np.mean(values)) for how, values in ratios.items()},
     }
-    nominal = json.loads(call("gap", data, "--json"))["methods"]["nominal"]["mpjae"]
-    print(json.dumps({
-        "virtual": True, "unit": UNIT, "fps": FPS, "gap_rad": nominal, "opened_by_lerobot": opened(out),
-        "error_rad": errors, "ratio": ratios, "mean": {how: float(np.mean(each)) for how, each in ratios.items()},
-    }, indent=1))  # fmt: skip
+    print(json.dumps(result, indent=1))
+
+
+def learn(work: Path, sets: Path) -> None:
+    """Record excitation, import, identify, train and export; what is there is kept."""
+    excitation = work / "excitation"
+    data = work / "data"
+    arm = work / "identified"
+    run = work / "run"
+    if not excitation.is_dir():
+        minutes = ["--minutes", EXCITATION_MINUTES]
+        call("excite", "--robot", "so101", *minutes, "--out", excitation)
+    episodes = round(60 * EXCITATION_MINUTES / EPISODE_S)
+    record(sets / "excitation", work, str(excitation), episodes, EPISODE_S)
+    if not (data / "dataset.json").is_file():
+        robot = ["--robot", softer(work / "so101_p16")]
+        labels = ["--unit-id", f"virtual-{UNIT}", "--payload-mass", "0"]
+        logs = [sets / "excitation", "--position-unit", "deg"]
+        call("import", *logs, *robot, *labels, "--out", data)
+    if not (arm / "robot.toml").is_file():
+        call("identify", data, "--out", arm, "--windows", 12, "--no-table", "--terms")
+    if not (run / "model" / "card.json").is_file():
+        call("train", data, "--robot", arm, "--out", run, "--budget", "10m")
+    if not (work / "exported").is_dir():
+        call("data", "export", data, "--out", work / "exported")
+
+
+def play_test_motions(work: Path, sets: Path) -> dict[str, float]:
+    """Record each test motion in all WAYS; return the errors by "motion way", rad."""
+    errors = {}
+    for motion in MOTIONS:
+        for how, given in WAYS.items():
+            step = None
+            if given is not None:
+                step = {"model": str(work / "run"), **given}
+            out = sets / f"{motion}-{how}"
+            record(out, work, motion, 1, LEAD_S + JUDGED_S, step)
+            errors[f"{motion} {how}"] = error(out)
+    return errors
 
 
 def wait_longer() -> None:
-    """Replies of a servo bus on a busy machine take longer than the SDK waits: its patience, 50 ms,
-    becomes 10 s.
-    """
+    """Let the SDK wait 10 s for replies, not 50 ms: a busy machine's servo bus needs longer."""
     from lerobot.motors.feetech import feetech
 
     given = feetech.patch_setPacketTimeout
@@ -143,9 +152,7 @@ def softer(folder: Path) -> Path:
 
 
 def count_frames() -> None:
-    """LeRobot's loop asks the clock how long an episode has been; now that is its frames, as on the
-    bus.
-    """
+    """Let LeRobot's loop measure an episode in its frames, as the bus does, not by the clock."""
     from lerobot.scripts import lerobot_record
 
     passed = 0.0
@@ -160,30 +167,20 @@ def count_frames() -> None:
 
 def call(*words: object) -> str:
     """Run a command of gaponet; what it printed."""
-    return subprocess.run(
-        [*GAPONET, *map(str, words)], check=True, stdout=subprocess.PIPE, text=True
-    ).stdout
+    command = [*GAPONET, *map(str, words)]
+    return subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout
 
 
 @contextmanager
 def served(work: Path) -> Iterator[None]:
     """A VIRTUAL arm on the pseudo-terminal WORK/so101, its calibration in WORK/virtual.json."""
-    words = [
-        "--robot",
-        "so101",
-        "--unit",
-        UNIT,
-        "--link",
-        work / "so101",
-        "--calibration",
-        work / "virtual.json",
-    ]
-    (work / "virtual.json").unlink(missing_ok=True)
-    process = subprocess.Popen(
-        [*GAPONET, "virtual", "serve", *map(str, words), "--frame", str(1 / FPS)]
-    )
+    calibration = work / "virtual.json"
+    calibration.unlink(missing_ok=True)
+    robot = ["--robot", "so101", "--unit", UNIT, "--frame", str(1 / FPS)]
+    places = ["--link", str(work / "so101"), "--calibration", str(calibration)]
+    process = subprocess.Popen([*GAPONET, "virtual", "serve", *robot, *places])
     try:
-        while not (work / "virtual.json").exists():
+        while not calibration.exists():
             if process.poll() is not None:
                 raise SystemExit("gaponet virtual serve has ended")
             time.sleep(0.1)
@@ -201,8 +198,10 @@ def record(
     seconds: float,
     step: dict[str, object] | None = None,
 ) -> None:
-    """LeRobot's record() with its own SO-101 and our motions, through the processor step where it
-    is configured.
+    """Run LeRobot's record() with its own SO-101 and our motions.
+
+    Args:
+        step: Options of the processor step, through which actions go.
     """
     if (out / "meta" / "stats.json").is_file():
         return
@@ -226,9 +225,17 @@ def record(
     teleop = TeleoperatorConfig.get_choice_class("gaponet_motion")(motions=motions, fps=FPS)
     robot = SO101FollowerConfig(port=str(work / "so101"), id="virtual", calibration_dir=work)
     dataset = DatasetRecordConfig(
-        repo_id=f"me/{out.name}", root=out, fps=FPS, single_task=out.name, num_episodes=episodes, reset_time_s=0,
-        episode_time_s=seconds, video=False, push_to_hub=False, no_stamp=True,
-    )  # fmt: skip
+        repo_id=f"me/{out.name}",
+        root=out,
+        fps=FPS,
+        single_task=out.name,
+        num_episodes=episodes,
+        reset_time_s=0,
+        episode_time_s=seconds,
+        video=False,
+        push_to_hub=False,
+        no_stamp=True,
+    )
     play(RecordConfig(robot, dataset, teleop, play_sounds=False), robot_action_processor=processor)
 
 
@@ -243,9 +250,9 @@ def opened(folder: Path) -> list[int]:
 def error(recorded: Path) -> float:
     """Mean |observation − action of the frame before| over the joints that move, rad."""
     table = pq.read_table(recorded / "data", columns=["action", "observation.state"])
-    asked, seen = (
-        np.array(table[name].to_pylist())[round(LEAD * FPS) :, :5] for name in table.column_names
-    )
+    first = round(LEAD_S * FPS)
+    asked = np.array(table["action"].to_pylist())[first:, :5]
+    seen = np.array(table["observation.state"].to_pylist())[first:, :5]
     moves = np.ptp(asked, axis=0) > 1.0  # degrees
     return float(np.deg2rad(np.abs(seen[1:] - asked[:-1])[:, moves]).mean())
 

@@ -1,8 +1,9 @@
-"""Fine-tune a policy in the aligned simulator, then test it on an unseen robot: ASAP's use of a gap
-model.
+"""Fine-tune a policy in the aligned simulator, then test it on an unseen robot, as ASAP does.
 
-    pip install "rsl-rl-lib>=5.4.2,<6" python examples/finetune_policy.py RUN        # RUN: gaponet
-    train (or demo) on virtual H1-2 units 1 to 3
+    pip install "rsl-rl-lib>=5.4.2,<6"
+    python examples/finetune_policy.py RUN
+
+RUN is a run of gaponet train (or demo) on virtual H1-2 units 1 to 3.
 
 PPO trains a small network in the nominal simulator to follow arm motions with 0 to 3 kg in each
 hand. Training then continues in the aligned simulator and, for comparison, equally long in the
@@ -48,27 +49,47 @@ LEARN = [
     f"{kind}-{variant}" for kind in KINDS for variant in ("both-0", "both-1", "left-0", "right-0")
 ]
 TRY = [f"{kind}-both-0" for kind in KINDS]
-LEARN_SEED, TRY_SEED = 101, 202  # different motions; the package's recipes use seed 0
+# Different motions; the package's recipes use seed 0.
+LEARN_SEED = 101
+TRY_SEED = 202
 AHEAD = (2, 3, 5, 8, 11)  # observed rows of the reference, beside the next one
-REACH, LIMIT = 0.1, 0.4  # rad: effect of an action of 1, and largest effect
-NOISE = (0.0005, 0.02)  # rad, rad/s, of observations in training
+REACH_RAD = 0.1  # effect of an action of 1
+LIMIT_RAD = 0.4  # largest effect of an action
+POSITION_NOISE = 0.0005  # rad, of observations in training
+VELOCITY_NOISE = 0.02  # rad/s
 EPISODE = 200  # control periods
 WARMTH = 12.0  # K above ambient, of the motors
 SKIP = 50  # control periods at the start of a motion without effect on the score
 
 PPO: dict[str, Any] = {
-    "num_steps_per_env": 16, "save_interval": 10**9, "obs_groups": {"actor": ["policy"], "critic": ["policy"]},
+    "num_steps_per_env": 16,
+    "save_interval": 10**9,
+    "obs_groups": {"actor": ["policy"], "critic": ["policy"]},
     "actor": {
-        "class_name": "MLPModel", "hidden_dims": [128, 128], "activation": "elu",
-        "distribution_cfg": {"class_name": "GaussianDistribution", "init_std": 0.2, "std_type": "log"},
+        "class_name": "MLPModel",
+        "hidden_dims": [128, 128],
+        "activation": "elu",
+        "distribution_cfg": {
+            "class_name": "GaussianDistribution",
+            "init_std": 0.2,
+            "std_type": "log",
+        },
     },
     "critic": {"class_name": "MLPModel", "hidden_dims": [128, 128], "activation": "elu"},
     "algorithm": {
-        "class_name": "PPO", "num_learning_epochs": 4, "num_mini_batches": 4, "learning_rate": 1e-3,
-        "desired_kl": 0.02, "gamma": 0.9, "lam": 0.9, "clip_param": 0.2, "entropy_coef": 0.0, "max_grad_norm": 1.0,
+        "class_name": "PPO",
+        "num_learning_epochs": 4,
+        "num_mini_batches": 4,
+        "learning_rate": 1e-3,
+        "desired_kl": 0.02,
+        "gamma": 0.9,
+        "lam": 0.9,
+        "clip_param": 0.2,
+        "entropy_coef": 0.0,
+        "max_grad_norm": 1.0,
         "schedule": "adaptive",
     },
-}  # fmt: skip
+}
 
 
 class Task:
@@ -85,24 +106,25 @@ class Task:
     def __init__(self, robot: RobotSpec, ctrls: list[Array], heaviest: float) -> None:
         self.locked = idle_joints(robot, robot.operated)
         self.joints = tuple(name for name in robot.joint_names if name not in self.locked)
-        free, operated = robot.index(self.joints), robot.operated_index
+        free = robot.index(self.joints)
+        operated = robot.operated_index
         self.op = np.searchsorted(free, operated)
         self.reference = np.concatenate(ctrls)[:, free]
         self.last = np.cumsum([len(c) for c in ctrls]) - 1
         self.first = np.append(0, self.last[:-1] + 1)
-        self.heaviest, self.n = heaviest, len(operated)
+        self.heaviest = heaviest
+        self.n = len(operated)
         loads = []
         for mass in (0.0, heaviest):
             model = build_model(robot, mass)
-            moves = [
-                [c, v := np.gradient(c, robot.dt, axis=0), np.gradient(v, robot.dt, axis=0)]
-                for c in ctrls
-            ]
-            torque = np.concatenate([inverse_dynamics(model, *move) for move in moves])
-            damped = robot.servo.kd * np.concatenate(
-                [move[1] for move in moves]
-            )  # the servo damps its own motion
-            loads.append(((torque + damped) / robot.servo.kp)[:, operated])
+            torques = []
+            for ctrl in ctrls:
+                velocity = np.gradient(ctrl, robot.dt, axis=0)
+                acceleration = np.gradient(velocity, robot.dt, axis=0)
+                torque = inverse_dynamics(model, ctrl, velocity, acceleration)
+                # The servo damps its own motion.
+                torques.append(torque + robot.servo.kd * velocity)
+            loads.append((np.concatenate(torques) / robot.servo.kp)[:, operated])
         self.load = np.array(loads)
 
     def observe(
@@ -123,21 +145,21 @@ class Task:
         load = (1 - share) * self.load[0, at] + share * self.load[1, at]
         parts = [
             then,
-            (q - then) / REACH,
+            (q - then) / REACH_RAD,
             0.3 * v,
-            load / REACH,
+            load / REACH_RAD,
             action,
             share,
-            *[a / REACH for a in ahead],
+            *[way / REACH_RAD for way in ahead],
         ]
         return np.concatenate(parts, axis=1).astype(np.float32)
 
     def target(self, row: Array, last: Array, action: Array) -> Array:
-        """Return the target, (N, free) rad: the next row of the reference plus the action on
-        operated joints.
+        """Return the next row of the reference plus the action on operated joints, (N, free)
+        rad.
         """
         out = self.reference[np.minimum(row + 1, last)]
-        out[:, self.op] += np.clip(REACH * action, -LIMIT, LIMIT)
+        out[:, self.op] += np.clip(REACH_RAD * action, -LIMIT_RAD, LIMIT_RAD)
         return out
 
 
@@ -145,12 +167,17 @@ class TrackingEnv(VecEnv):
     """Environment of rsl_rl: simulations that follow motions from a random row on."""
 
     def __init__(self, task: Task, sim: AlignedSim, seed: int) -> None:
-        self.task, self.sim, self.rng = task, sim, np.random.default_rng(seed)
+        self.task = task
+        self.sim = sim
+        self.rng = np.random.default_rng(seed)
         self.cfg: dict[str, Any] = {}
-        self.device, self.num_envs, self.num_actions = "cpu", sim.num_envs, task.n
+        self.device = "cpu"
+        self.num_envs = sim.num_envs
+        self.num_actions = task.n
         self.max_episode_length = EPISODE
         self.episode_length_buf = torch.zeros(sim.num_envs, dtype=torch.long)
-        self.row, self.last = np.zeros((2, sim.num_envs), int)
+        self.row = np.zeros(sim.num_envs, int)
+        self.last = np.zeros(sim.num_envs, int)
         self.action = np.zeros((sim.num_envs, task.n))
         self.error: list[float] = []
         self._begin(np.arange(sim.num_envs))
@@ -168,16 +195,18 @@ class TrackingEnv(VecEnv):
     def get_observations(self) -> TensorDict:
         """Observe the state with noise."""
         shape = (self.num_envs, self.task.n)
-        q, v = (x[:, self.task.op] + s * self.rng.standard_normal(shape) for x, s in zip(
-            (self.sim.qpos, self.sim.qvel), NOISE, strict=True))  # fmt: skip
+        q = self.sim.qpos[:, self.task.op] + POSITION_NOISE * self.rng.standard_normal(shape)
+        v = self.sim.qvel[:, self.task.op] + VELOCITY_NOISE * self.rng.standard_normal(shape)
         seen = self.task.observe(q, v, self.row, self.last, self.sim.payload_mass, self.action)
         return TensorDict({"policy": torch.from_numpy(seen)}, batch_size=[self.num_envs])
 
     def step(
         self, actions: torch.Tensor
     ) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict[str, Any]]:
-        """Step; the reward is minus the mean error in units of 20 mrad, minus a penalty for changes
-        of the action.
+        """Step all simulations.
+
+        The reward is minus the mean error in units of 20 mrad, minus a penalty for changes of the
+        action.
         """
         action = actions.numpy().astype(float)
         self.sim.step(self.task.target(self.row, self.last, action))
@@ -196,8 +225,9 @@ class TrackingEnv(VecEnv):
 
 
 class Unit:
-    """Copies of a virtual unit, one per payload and motion, with the methods of AlignedSim and
-    sensor readings only.
+    """Copies of a virtual unit, one per payload and motion, with the methods of AlignedSim.
+
+    Its positions and velocities are sensor readings.
     """
 
     def __init__(
@@ -216,11 +246,9 @@ class Unit:
         self.robots = VirtualRobot(
             robot, [physics] * len(payloads), payloads, robot.dt, locked=task.locked, nthread=0
         )
-        self.payload_mass, self.free, self.home = (
-            payload_mass,
-            robot.index(task.joints),
-            robot.qpos_home,
-        )
+        self.payload_mass = payload_mass
+        self.free = robot.index(task.joints)
+        self.home = robot.qpos_home
 
     def reset(self, qpos: Array) -> None:
         self.robots.reset(self.all_joints(qpos), list(range(len(qpos))), WARMTH)
@@ -260,18 +288,16 @@ def train(name: str, runner: OnPolicyRunner, env: TrackingEnv, updates: int) -> 
     for k in range(1, updates + 1):
         runner.learn(1)
         if k % max(updates // 4, 1) == 0:
-            error, env.error = 1e3 * float(np.mean(env.error)), []
-            print(
-                f"{name}: {k} of {updates} updates, {time.perf_counter() - start:.0f} s, {error:.1f} mrad",
-                flush=True,
-            )
+            error = 1e3 * float(np.mean(env.error))
+            env.error = []
+            seconds = time.perf_counter() - start
+            line = f"{name}: {k} of {updates} updates, {seconds:.0f} s, {error:.1f} mrad"
+            print(line, flush=True)
     return runner
 
 
 def measured(plant: Any) -> tuple[Array, Array]:
-    """Return the measured positions and velocities of a simulation or unit, (N, free) rad and
-    rad/s.
-    """
+    """Return measured positions and velocities of simulations, (N, free) rad and rad/s."""
     return plant.qpos, plant.qvel
 
 
@@ -281,8 +307,9 @@ def follow(
     policy: OnPolicyRunner | None,
     observe: Callable[[Any], tuple[Array, Array]] = measured,
 ) -> Array:
-    """Return the mean |q − reference| of every simulation or unit, (N,) rad; each plays one motion
-    to its end.
+    """Return the mean |q − reference| of every simulation or unit, (N,) rad.
+
+    Each plays one motion to its end.
 
     Args:
         observe: Returns the positions and velocities of `plant` that the policy sees, (N, free) rad
@@ -290,25 +317,34 @@ def follow(
     """
     count = len(plant.payload_mass)
     motion = np.arange(count) % len(task.first)
-    row, last, action = task.first[motion].copy(), task.last[motion], np.zeros((count, task.n))
+    row = task.first[motion].copy()
+    last = task.last[motion]
+    action = np.zeros((count, task.n))
     plant.reset(task.reference[row])
     actor = None if policy is None else policy.get_inference_policy()
-    total, rows = np.zeros(count), np.zeros(count)
+    total = np.zeros(count)
+    rows = np.zeros(count)
     for t in range(int((last - row).max())):
         if actor is not None:
-            q, v = (values[:, task.op] for values in observe(plant))
-            seen = torch.from_numpy(task.observe(q, v, row, last, plant.payload_mass, action))
-            with torch.inference_mode():
-                action = (
-                    actor(TensorDict({"policy": seen}, batch_size=[count])).numpy().astype(float)
-                )
+            q, v = observe(plant)
+            seen = task.observe(q[:, task.op], v[:, task.op], row, last, plant.payload_mass, action)
+            action = act(actor, seen)
         plant.step(task.target(row, last, action))
         going = row < last
         row = np.minimum(row + 1, last)
         error = np.abs(plant.qpos - task.reference[row])[:, task.op].mean(axis=1)
         if t >= SKIP:
-            total, rows = total + going * error, rows + going
+            total += going * error
+            rows += going
     return total / rows
+
+
+def act(actor: Any, seen: Array) -> Array:
+    """Return a policy's actions, (N, n), for observations (N, dim)."""
+    observation = TensorDict({"policy": torch.from_numpy(seen)}, batch_size=[len(seen)])
+    with torch.inference_mode():
+        actions: Array = actor(observation).numpy().astype(float)
+    return actions
 
 
 def motions(robot: RobotSpec, heaviest: float, seed: int, names: list[str]) -> list[Array]:
@@ -326,8 +362,7 @@ def main(
     unit: str = "virtual-4",
     quick: bool = False,
 ) -> None:
-    """Train, fine-tune and test on the unseen unit; print the mean |error| to the reference in
-    mrad.
+    """Train, fine-tune and test on the unseen unit; print the mean |error| in mrad.
 
     Args:
         run: Folder of gaponet train, H1-2.
@@ -340,21 +375,21 @@ def main(
     """
     begin = time.perf_counter()
     torch.set_num_threads(1)  # the simulators take the other cores
-    first, more, num_envs, names = (
-        (2, 1, 16, LEARN[:2]) if quick else (first, more, num_envs, LEARN)
-    )
+    names = LEARN
+    if quick:
+        first = 2
+        more = 1
+        num_envs = 16
+        names = LEARN[:2]
     model = GapModel.load(run, threads=0)
-    corrected = load_robot(
-        run / "robot"
-    )  # the simulator that the model corrects: nominal, or identified
+    # The simulator that the model corrects: nominal, or identified.
+    corrected = load_robot(run / "robot")
     robot = corrected.nominal or corrected
     heaviest = float(max(model.card["payload_seen"])) or model.config.payload_max
     task = Task(robot, motions(robot, heaviest, LEARN_SEED, names), heaviest)
     unseen = Task(robot, motions(robot, heaviest, TRY_SEED, TRY[: len(names)]), heaviest)
-    mass, tried = (
-        np.resize(np.linspace(0, heaviest, 4), num_envs),
-        np.repeat([0.0, heaviest], len(unseen.first)),
-    )
+    mass = np.resize(np.linspace(0, heaviest, 4), num_envs)
+    tried = np.repeat([0.0, heaviest], len(unseen.first))
     options = AlignedSimOptions(locked=task.locked)
     plants: dict[str, AlignedSim | Unit] = {
         "nominal simulator": AlignedSim(robot, None, tried, num_envs=len(tried), options=options),
@@ -366,48 +401,47 @@ def main(
     results: dict[str, list[Array]] = {}
 
     def evaluate(name: str, policy: OnPolicyRunner | None) -> None:
-        errors = [
-            follow(unseen, plant, policy).reshape(2, -1).mean(axis=1) for plant in plants.values()
-        ]
+        errors = []
+        for plant in plants.values():
+            of_payloads = follow(unseen, plant, policy).reshape(2, -1)
+            errors.append(of_payloads.mean(axis=1))
         results.setdefault(name, []).append(1e3 * np.array(errors))
 
     print(
-        f"{len(task.first)} motions to learn from, {len(unseen.first)} to try; {time.perf_counter() - begin:.0f} s"
+        f"{len(task.first)} motions to learn from, {len(unseen.first)} to try; "
+        f"{time.perf_counter() - begin:.0f} s"
     )
     evaluate("reference as target", None)
     for seed in seeds:
         torch.manual_seed(seed)
-        env = TrackingEnv(
-            task, AlignedSim(robot, None, mass, num_envs=num_envs, options=options), seed
-        )
+        nominal_sim = AlignedSim(robot, None, mass, num_envs=num_envs, options=options)
+        env = TrackingEnv(task, nominal_sim, seed)
         policy = train("nominal", make_runner(env), env, first)
         evaluate("policy, nominal", policy)
         env.error = []
         longer = make_runner(env, policy)
-        aligned = TrackingEnv(
-            task, AlignedSim(corrected, model, mass, num_envs=num_envs, options=options), seed
-        )
-        evaluate(
-            "policy, fine-tuned", train("fine-tuning", make_runner(aligned, policy), aligned, more)
-        )
+        aligned_sim = AlignedSim(corrected, model, mass, num_envs=num_envs, options=options)
+        aligned = TrackingEnv(task, aligned_sim, seed)
+        tuned = train("fine-tuning", make_runner(aligned, policy), aligned, more)
+        evaluate("policy, fine-tuned", tuned)
         evaluate("policy, nominal as long", train("nominal, on", longer, env, more))
     print(table(results, list(plants), heaviest))
     print(f"{time.perf_counter() - begin:.0f} s in all")
 
 
 def table(results: dict[str, list[Array]], plants: list[str], heaviest: float) -> str:
-    """Return a Markdown table: mean over seeds (± standard deviation), without and with the largest
-    payload.
-    """
-    columns = [f"{plant}, {p:g} kg" for plant in plants for p in (0, heaviest)]
+    """Return a Markdown table: mean over seeds (± standard deviation), without and with payload."""
+    columns = []
+    for plant in plants:
+        columns += [f"{plant}, 0 kg", f"{plant}, {heaviest:g} kg"]
     lines = [f"| mean abs error, mrad; units are VIRTUAL | {' | '.join(columns)} |"]
     lines.append("| --- |" + " ---: |" * len(columns))
     for name, errors in results.items():
-        mean, std = np.mean(errors, axis=0).ravel(), np.std(errors, axis=0).ravel()
-        cells = [
-            f"{m:.1f} ± {s:.1f}" if len(errors) > 1 else f"{m:.1f}"
-            for m, s in zip(mean, std, strict=True)
-        ]
+        mean = np.mean(errors, axis=0).ravel()
+        cells = [f"{value:.1f}" for value in mean]
+        if len(errors) > 1:
+            std = np.std(errors, axis=0).ravel()
+            cells = [f"{m:.1f} ± {s:.1f}" for m, s in zip(mean, std, strict=True)]
         lines.append(f"| {name} | {' | '.join(cells)} |")
     return "\n".join(lines)
 

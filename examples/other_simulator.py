@@ -1,5 +1,4 @@
-"""Correct a simulator that no training has seen: an SO-101 with stiffer servos and three times the
-friction.
+"""Correct a simulator that no training has seen: an SO-101 with stiffer servos and more friction.
 
     python examples/other_simulator.py DATASET        recordings of an SO-101, in gaponet's form
 
