@@ -1,8 +1,9 @@
-"""Estimation of missing labels: the payload of each recording, and the unit that made it.
+r"""Estimation of missing labels: the payload of each recording, and the unit that made it.
 
 A unit is one physical robot.
 
-    python benchmarks/estimate_labels.py LOGS --robot h1_2 --rate 50 --payloads 0 1 2 3 --units 3 --out labels
+    python benchmarks/estimate_labels.py LOGS --robot h1_2 --rate 50 --payloads 0 1 2 3 --units 3 \
+        --out labels
 
 Recordings in which one joint moves repeat the same commands with several payloads and units. The
 held torque at equal commands is a + b·m: m is one of the given payloads, b is common, a is the
@@ -523,8 +524,8 @@ def main(
         determined = "" if group.determined else "not "
         print(
             f"  {group.joint} to {group.command:+.2f} rad: {group.count} recordings, "
-            f"{group.slope:+.2f} N·m a kg, bands {group.band_distance:.1f} apart, units {zeros} N·m, "
-            f"payload {determined}determined"
+            f"{group.slope:+.2f} N·m a kg, bands {group.band_distance:.1f} apart, "
+            f"units {zeros} N·m, payload {determined}determined"
         )
     for line in labels.remarks:
         print(line)

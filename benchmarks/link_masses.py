@@ -382,19 +382,12 @@ def table(rows: list[Row]) -> None:
             cells = [plus_minus(r[key][name] for r in some) for some in groups]
             errors.append((name, *cells))
         print_table((f"mrad, {key}", *titles), errors)
-    accepted = [[r for r in some if r["accepted"]] for some in groups]
     lines = [
         ("arms", *map(len, groups)),
-        ("--masses accepted", *map(len, accepted)),
-        ("masses inside 90 %", *(_masses_inside(some, "masses inside") for some in accepted)),
-        (
-            "mujoco.sysid masses inside 90 %",
-            *(_masses_inside(some, "mujoco.sysid masses inside") for some in groups),
-        ),
-        (
-            "all values inside 90 %",
-            *(f"{_sum(some, 'inside')} of {_sum(some, 'known')}" for some in groups),
-        ),
+        ("--masses accepted", *map(len, map(_accepted, groups))),
+        ("masses inside 90 %", *map(_masses_inside, groups)),
+        ("mujoco.sysid masses inside 90 %", *map(_masses_inside_of_rival, groups)),
+        ("all values inside 90 %", *map(_values_inside, groups)),
     ]
     print_table(("number", *titles), lines)
     seconds = []
@@ -403,8 +396,21 @@ def table(rows: list[Row]) -> None:
     print("processor, s:", ", ".join(seconds))
 
 
-def _masses_inside(rows: list[Row], key: str) -> str:
-    return f"{_sum(rows, key)} of {JOINTS * len(rows)}"
+def _accepted(rows: list[Row]) -> list[Row]:
+    return [row for row in rows if row["accepted"]]
+
+
+def _masses_inside(rows: list[Row]) -> str:
+    accepted = _accepted(rows)
+    return f"{_sum(accepted, 'masses inside')} of {JOINTS * len(accepted)}"
+
+
+def _masses_inside_of_rival(rows: list[Row]) -> str:
+    return f"{_sum(rows, 'mujoco.sysid masses inside')} of {JOINTS * len(rows)}"
+
+
+def _values_inside(rows: list[Row]) -> str:
+    return f"{_sum(rows, 'inside')} of {_sum(rows, 'known')}"
 
 
 def _sum(rows: list[Row], key: str) -> int:

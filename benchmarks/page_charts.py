@@ -58,11 +58,13 @@ class Chart:
         values = self.values()
         longest = max([*values, self.line or 0.0])
         lines = [
-            f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {WIDTH} {height}" width="{WIDTH}" height="{height}" '
-            'role="img" aria-labelledby="t" font-family="Helvetica, Arial, \'Liberation Sans\', sans-serif" '
+            f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {WIDTH} {height}" '
+            f'width="{WIDTH}" height="{height}" role="img" aria-labelledby="t" '
+            "font-family=\"Helvetica, Arial, 'Liberation Sans', sans-serif\" "
             'font-size="14" fill="#111111">',
             f'<title id="t">{self.title}</title>',
-            f'<rect x="0.5" y="0.5" width="{WIDTH - 1}" height="{height - 1}" rx="8" fill="#ffffff" stroke="#cccccc"/>',
+            f'<rect x="0.5" y="0.5" width="{WIDTH - 1}" height="{height - 1}" rx="8" '
+            'fill="#ffffff" stroke="#cccccc"/>',
             f'<text x="20" y="30" font-weight="bold">{self.title}</text>',
         ]
         for i, ((_, label, method), value) in enumerate(zip(self.bars, values, strict=True)):
@@ -70,7 +72,8 @@ class Chart:
         if self.line is not None:
             x = LEFT + BAR_WIDTH * self.line / longest
             lines.append(
-                f'<path d="M{x:.1f} 44 V{height - 12}" stroke="#333333" stroke-dasharray="4 3" fill="none"/>'
+                f'<path d="M{x:.1f} 44 V{height - 12}" stroke="#333333" '
+                'stroke-dasharray="4 3" fill="none"/>'
             )
         return "\n".join([*lines, "</svg>"]) + "\n"
 

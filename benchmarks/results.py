@@ -9,7 +9,9 @@ are written from the answers, and page_numbers.py puts the numbers into the othe
 not measured again stays as it was.
 
     quick     every step in its short form, in WORK/quick; no page changes
-    --list    show steps and answers       --write   only write the pages       --data FOLDER   public recordings
+    --list    show steps and answers
+    --write   only write the pages
+    --data FOLDER   public recordings
 """
 
 from __future__ import annotations
@@ -49,11 +51,12 @@ QUICK = "quick"
 TAIL = 60  # lines of an output on the page
 STEPS_HEAD = """# Steps of `make results`
 
-Commands of `benchmarks/results.toml`, and when `make results` last ran each. DATA is the folder of the public
-recordings (`GAPONET_DATA`), WORK is `results_work`. `make results STEPS="backlash hinge"` runs two steps. A step with
-an answer in WORK/answers is skipped; delete the answer to repeat it. A killed step starts again. Commands that store
-each robot or set, such as `python benchmarks/compare_methods.py`, then continue. `make results STEPS=quick` runs each
-step in its short form and writes no page. Below the table is what steps printed.
+Commands of `benchmarks/results.toml`, and when `make results` last ran each. DATA is the folder of
+the public recordings (`GAPONET_DATA`), WORK is `results_work`. `make results STEPS="backlash
+hinge"` runs two steps. A step with an answer in WORK/answers is skipped; delete the answer to
+repeat it. A killed step starts again. Commands that store each robot or set, such as `python
+benchmarks/compare_methods.py`, then continue. `make results STEPS=quick` runs each step in its
+short form and writes no page. Below the table is what steps printed.
 """
 
 Answer = dict[str, Any]  # commit, date, seconds and output of a step

@@ -1,8 +1,8 @@
 """Put the network of a run into the package, as src/gaponet/nn/trained/NAME, and the table into
 docs/network.md.
 
-    python benchmarks/ship_networks.py RUN NAME DATASET --title TITLE --address ADDRESS --data-licence LICENCE \\
-        --limits SENTENCE
+    python benchmarks/ship_networks.py RUN NAME DATASET --title TITLE --address ADDRESS \\
+        --data-licence LICENCE --limits SENTENCE
 
 Copied from the run: model.onnx, card.json, split.json without names of recordings,
 delay_offset.json. The errors of the card are measured here, with the network as it is shipped, on
@@ -98,7 +98,8 @@ def ship(
     print(f"{name}: {card.size_bytes:,} bytes, {total:,} of {MAX_TOTAL_BYTES:,} in all networks")
     print(f"differs by at most {card.published.largest_difference_rad:.1e} rad from {run}")
     print(
-        f"test: nominal {test.nominal_mrad:.2f} → {test.model_mrad:.2f} mrad, {test.recordings} recordings"
+        f"test: nominal {test.nominal_mrad:.2f} → {test.model_mrad:.2f} mrad, "
+        f"{test.recordings} recordings"
     )
 
 
@@ -150,8 +151,9 @@ def packaged_robot(model: GapModel) -> PackagedRobot:
     found = model_hash(named.load())
     if found != model.card["simulator"]:
         raise UsageError(
-            f"{model.path}: trained in simulator {model.card['simulator']}, the package's {named.name} with gain_scale "
-            f"{named.gain_scale:g} is {found}; train in the nominal robot of the package"
+            f"{model.path}: trained in simulator {model.card['simulator']}, the package's "
+            f"{named.name} with gain_scale {named.gain_scale:g} is {found}; train in the nominal "
+            "robot of the package"
         )
     return named
 
@@ -259,15 +261,16 @@ def stored_form(trained: bytes, inputs: np.ndarray) -> tuple[bytes, float]:
     if len(exact) <= FLOAT32_BYTES:
         if not np.array_equal(OnnxNetwork(exact)(inputs), before):
             raise UsageError(
-                "outputs changed although no weight did; report this with the version of onnxruntime"
+                "outputs changed although no weight did; report this with the version of "
+                "onnxruntime"
             )
         return exact, 0.0
     short = with_small_matrices(trained, int16=True)
     difference = float(np.abs(OnnxNetwork(short)(inputs) - before).max())
     if not difference <= MAX_DIFFERENCE_RAD:
         raise UsageError(
-            f"with int16 weights outputs change by {difference:.1e} rad (limit {MAX_DIFFERENCE_RAD:.0e}); train a "
-            f"network of at most {FLOAT32_BYTES:,} bytes"
+            f"with int16 weights outputs change by {difference:.1e} rad (limit "
+            f"{MAX_DIFFERENCE_RAD:.0e}); train a network of at most {FLOAT32_BYTES:,} bytes"
         )
     return short, difference
 

@@ -60,13 +60,19 @@ PAGE = Path(__file__).parents[1] / "docs" / "robots.md"
 MAX_TOTAL_BYTES = 1_000_000  # of all robots together, so that the wheel stays small
 LICENCE = "Apache-2.0"  # of the identified values, as of the package
 NAMES = {  # data set of the benchmark → name in the package
-    "so101": "so101@sage", "so101_another_day": "so101@sage-earlier", "h1_2": "h1_2@sage-left",
-    "h1_2_right": "h1_2@sage-right", "g1_arms": "g1_29@policy-train", "go2": "go2@rx-00", "go2_other_lab": "go2@iit",
-    "aliengo": "aliengo@iit", "z1": "z1@iit",
-}  # fmt: skip
+    "so101": "so101@sage",
+    "so101_another_day": "so101@sage-earlier",
+    "h1_2": "h1_2@sage-left",
+    "h1_2_right": "h1_2@sage-right",
+    "g1_arms": "g1_29@policy-train",
+    "go2": "go2@rx-00",
+    "go2_other_lab": "go2@iit",
+    "aliengo": "aliengo@iit",
+    "z1": "z1@iit",
+}
 LIMITS = (
-    "These are the values of that unit on that day: identify or adapt yours before you rely on them; another unit of "
-    "the type differs, and so does this one when it is warm or worn"
+    "These are the values of that unit on that day: identify or adapt yours before you rely on "
+    "them; another unit of the type differs, and so does this one when it is warm or worn"
 )
 
 

@@ -68,8 +68,8 @@ def put_into_package(folder: Path, place: Catalogue, limit_bytes: int) -> int:
     total = sum(folder_size(other) for other in others) + folder_size(folder)
     if total > limit_bytes:
         raise UsageError(
-            f"{folder.name} has {folder_size(folder):,} bytes; all of its kind together would have {total:,} of at "
-            f"most {limit_bytes:,}"
+            f"{folder.name} has {folder_size(folder):,} bytes; all of its kind together would have "
+            f"{total:,} of at most {limit_bytes:,}"
         )
     shutil.rmtree(place.place / folder.name, ignore_errors=True)
     shutil.copytree(folder, place.place / folder.name)
@@ -111,7 +111,8 @@ def require_public(folder: Path, source: Path, read: Callable[[Path], str]) -> N
         for path in private:
             if path in text:
                 raise UsageError(
-                    f"{file.name} names '{path}', a path of a machine; remove it from the source's files"
+                    f"{file.name} names '{path}', a path of a machine; remove it from the "
+                    "source's files"
                 )
 
 

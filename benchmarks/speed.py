@@ -100,7 +100,8 @@ def bench_aligned(run: Path, num_envs: int, rounds: int) -> dict[str, dict[str, 
     targets = [aligned.qpos_home + 0.3 * np.sin(phase + angle) for angle in angles]
 
     def run_nominal() -> None:
-        nominal.reset(slice(None), targets[0], 0.0, past=targets[0][:, None])  # type: ignore[arg-type]
+        start = targets[0]
+        nominal.reset(slice(None), start, 0.0, past=start[:, None])  # type: ignore[arg-type]
         for target in targets:
             nominal.step(target)
 

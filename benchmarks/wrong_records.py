@@ -16,6 +16,7 @@ import shutil
 import sys
 from collections import Counter
 from collections.abc import Callable
+from collections.abc import Sequence as ListOf
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -25,6 +26,7 @@ from common import command_line
 
 from gaponet import api
 from gaponet.base.errors import GAPONetError
+from gaponet.robot.finding import Finding
 from gaponet.robot.spec import RobotSpec, load_robot
 from gaponet.sim.model import build_model
 
@@ -324,16 +326,20 @@ def outcome(place: Path, truth: Truth, fault: Fault, rng: np.random.Generator) -
         said = str(error)
         return ("named" if _is_named(said, fault) else "stopped"), said
     bad = [finding for finding in findings if finding.level in ("error", "warning")]
-    texts = [f"{finding.check}: {finding.message}" for finding in bad]
-    said = "; ".join(f"{f.level} {text}" for f, text in zip(bad, texts, strict=True))
+    said = "; ".join(f"{f.level} {f.check}: {f.message}" for f in bad)
+    return _count(fault, findings, bad), said
+
+
+def _count(fault: Fault, findings: ListOf[Finding], bad: list[Finding]) -> str:
+    """Return as what a mutation counts that was imported; `bad` are warnings and errors."""
     has_error = any(finding.level == "error" for finding in bad)
     if not fault.words:
-        return ("false" if has_error else "good"), said
-    if any(_is_named(text, fault) for text in texts):
-        return "named", said
+        return "false" if has_error else "good"
+    if any(_is_named(f"{finding.check}: {finding.message}", fault) for finding in bad):
+        return "named"
     if any(UNTOLD in finding.message for finding in findings):
-        return "untold", said
-    return ("stopped" if has_error else "silent"), said
+        return "untold"
+    return "stopped" if has_error else "silent"
 
 
 def _is_named(text: str, fault: Fault) -> bool:

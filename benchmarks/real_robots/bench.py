@@ -50,13 +50,7 @@ class Bench:
             UsageError: No such data set or question.
         """
         present = self._chosen(sets, names)
-        left_out = {}
-        for folder in self.cards.left_out:
-            if (self.data / folder.folder).exists():
-                left_out[folder.folder] = folder.why
-        for card in self.cards.set:
-            if not self._is_present(card):
-                left_out[card.folder] = "not there"
+        left_out = self._left_out()
         rows: list[Row] = []
         labels: dict[str, list[str]] = {}
         seconds: dict[str, float] = {}
@@ -75,9 +69,7 @@ class Bench:
             )
             if estimated:
                 labels[card.name] = estimated.remarks
-            for name in card.questions:
-                if names and name not in names:
-                    continue
+            for name in [q for q in card.questions if q in (names or card.questions)]:
                 folds = list(questions(name, dataset, robot, self._elsewhere(card)))
                 found = self.evaluate(card, name, folds)
                 seconds[card.name] += sum(row["seconds"] for row in found)
@@ -89,6 +81,17 @@ class Bench:
             "left_out": left_out,
             "seconds": {name: round(value) for name, value in seconds.items()},
         }
+
+    def _left_out(self) -> dict[str, str]:
+        """Return folder → reason why it is not used."""
+        left_out = {}
+        for folder in self.cards.left_out:
+            if (self.data / folder.folder).exists():
+                left_out[folder.folder] = folder.why
+        for card in self.cards.set:
+            if not self._is_present(card):
+                left_out[card.folder] = "not there"
+        return left_out
 
     def _chosen(self, sets: tuple[str, ...], names: tuple[str, ...]) -> list[Card]:
         """Return the cards that are wanted and whose data are there.
@@ -130,29 +133,24 @@ class Bench:
         for method, (title, fit) in self.methods.items():
             if _lacks_data(method, folds[0]):
                 continue
-            evaluated = []
             try:
-                for question in folds:
-                    evaluated.append(self._evaluate_fold(card, question, method, fit))
+                evaluated = [self._evaluate_fold(card, fold, method, fit) for fold in folds]
             except Exception as error:  # anybody's method: it loses its own row and no other
                 kind = "" if isinstance(error, GAPONetError) else f"{type(error).__name__}: "
                 self.say(f"{card.name}, {name}, {title}: {kind}{error}")
                 continue
-            errors_of_folds = [fold["errors"] for fold in evaluated]
-            by_motion, by_joint = _averages(folds, errors_of_folds)
+            by_motion, by_joint = _averages(folds, [fold["errors"] for fold in evaluated])
             errors = np.array([*by_motion.values()])
             if not rows:
                 nominal = errors
             row: Row = {"set": card.name, "question": name, "method": title}
             row |= _statistics(errors, nominal)
+            row |= _costs_and_notes(evaluated)
             row |= {
-                "recordings": sum(map(len, errors_of_folds)),
                 "floor_mrad": floor_mrad,
                 "splits": [question.split_hash for question in folds],
                 "by_motion_mrad": {motion: 1e3 * error for motion, error in by_motion.items()},
                 "by_joint_mrad": by_joint,
-                "seconds": round(sum(fold["seconds"] for fold in evaluated), 1),
-                "notes": [fold["note"] for fold in evaluated if fold["note"]],
             }
             rows.append(json_compatible(row))
             self.say(
@@ -212,6 +210,15 @@ def _statistics(errors: np.ndarray, nominal: np.ndarray) -> Row:
         "less_than_nominal": less.mean(),
         "less_standard_error": standard_error(less),
         "motions": len(errors),
+    }
+
+
+def _costs_and_notes(evaluated: list[dict[str, Any]]) -> Row:
+    """Return the columns that follow from what was stored about each fold."""
+    return {
+        "recordings": sum(len(fold["errors"]) for fold in evaluated),
+        "seconds": round(sum(fold["seconds"] for fold in evaluated), 1),
+        "notes": [fold["note"] for fold in evaluated if fold["note"]],
     }
 
 

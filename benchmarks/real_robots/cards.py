@@ -99,7 +99,8 @@ def data_folder(given: Path | None) -> Path:
     folder = given or Path(os.environ.get(DATA_VARIABLE, "../shared/data"))
     if not folder.is_dir():
         raise UsageError(
-            f"{folder}: no such folder; name the folder of the public recordings with --data or {DATA_VARIABLE}"
+            f"{folder}: no such folder; name the folder of the public recordings with --data or "
+            f"{DATA_VARIABLE}"
         )
     return folder
 

@@ -208,7 +208,8 @@ def _train(question: Question, base: str, kind: str, steps: int) -> FittedSim:
     training = run / "training"
     if not (training / "model" / "card.json").is_file():
         dataset, split = store_parts(question, run)
-        config = replace(_recipe(steps), model=ModelConfig(kind), split=str(split))  # type: ignore[arg-type]
+        network = ModelConfig(kind)  # type: ignore[arg-type]
+        config = replace(_recipe(steps), model=network, split=str(split))
         resume = (training / "checkpoint.pt").is_file()
         budget = Budget(steps=steps)
         trainer = Trainer(dataset, start.robot, training, config, budget, resume=resume)

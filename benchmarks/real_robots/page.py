@@ -44,12 +44,13 @@ COLUMNS = (
 STEM = "real"
 HEADING = """# Real robots
 
-This table is what `benchmarks/compare_methods.py` writes ([compare your method](../benchmark.md)): errors in mrad on
-public recordings of real robots, of motions that no method was fitted to. Each simulation starts at the recorded state
-and then receives only commands.
+This table is what `benchmarks/compare_methods.py` writes ([compare your method](../benchmark.md)):
+errors in mrad on public recordings of real robots, of motions that no method was fitted to. Each
+simulation starts at the recorded state and then receives only commands.
 
-± is the standard error over independent motions; differences are paired, motion by motion. "Floor" is the difference
-between two recordings of one command. "Identified elsewhere" means on another session or unit."""
+± is the standard error over independent motions; differences are paired, motion by motion. "Floor"
+is the difference between two recordings of one command. "Identified elsewhere" means on another
+session or unit."""
 
 
 def result_table(rows: list[dict[str, Any]]) -> ResultTable:
@@ -162,7 +163,7 @@ def _draw_floor(ax: Axes, y: int, nominal: dict[str, Any]) -> None:
 
 
 def _draw_method(ax: Axes, y: int, line: list[dict[str, Any]], method: str) -> None:
-    """Draw the error of one method into the line of a question, whose methods stand side by side."""
+    """Draw the error of one method into the line of a question, beside the other methods."""
     nominal, *others = line
     drawn = [row for row in others if row["method"] in LOOKS]
     own_colour, marker = LOOKS[method]

@@ -1,7 +1,8 @@
 """LeRobot plug-in: robots with compensation, a teleoperator of motions, and a processor step.
 
-LeRobot discovers this module by the name of its distribution (register_third_party_plugins) and the classes by the
-names of their configurations. Angles use LeRobot's units outside (degrees, gripper 0..100) and rad inside.
+LeRobot discovers this module by the name of its distribution (register_third_party_plugins) and the
+classes by the names of their configurations. Angles use LeRobot's units outside (degrees, gripper
+0..100) and rad inside.
 """
 
 from .any_robot import GaponetRobot, GaponetRobotConfig

@@ -23,20 +23,22 @@ class GaponetRobotConfig(RobotConfig):
     --robot.type=gaponet_robot --robot.robot="{type: koch_follower, port: /dev/ttyACM0, id: mine}"
     """
 
-    # Configuration of LeRobot's own robot: its type, and its port, cameras, id and other fields. It is no RobotConfig,
-    # because a choice of robots that contains itself has no end for LeRobot's command line.
+    # Configuration of LeRobot's own robot: its type, and its port, cameras, id and other fields. It
+    # is no RobotConfig, because a choice of robots that contains itself has no end for LeRobot's
+    # command line.
     robot: dict[str, Any]
     # Robot folder of gaponet identify, or a name of the package; its joints are matched by name.
     known: str = ""
     # Instead of it, a run of gaponet train.
     model: str = ""
-    # Move as the nominal simulator of `known` does, for a policy that was trained there. The policy then observes the
-    # nominal simulator's positions.
+    # Move as the nominal simulator of `known` does, for a policy that was trained there. The policy
+    # then observes the nominal simulator's positions.
     follow: bool = False
     payload_mass: float = 0.0  # kg in each hand
     dynamics: bool = False  # feed forward accelerations: only for planned, smooth targets
     fps: float | None = None  # control rate, Hz, equal to LeRobot's; default that of known or model
-    # deg, rad, or signed_percent: -100..100 over the joint's range, as robots without use_degrees have it.
+    # deg, rad, or signed_percent: -100..100 over the joint's range, as robots without use_degrees
+    # have it.
     unit: JointUnit = "deg"
     # LeRobot's name of a joint → its name in robot.toml, where they differ.
     joints: dict[str, str] = field(default_factory=dict)
@@ -45,8 +47,9 @@ class GaponetRobotConfig(RobotConfig):
 class GaponetRobot(Robot):
     """LeRobot's own robot, with corrected position targets.
 
-    Calibration, motors and cameras stay with LeRobot's robot. Targets that are no positions, and joints that robot.toml
-    does not have, pass unchanged. The correction is limited in size and rate, but no watchdog protects the robot.
+    Calibration, motors and cameras stay with LeRobot's robot. Targets that are no positions, and
+    joints that robot.toml does not have, pass unchanged. The correction is limited in size and
+    rate, but no watchdog protects the robot.
     """
 
     config_class = GaponetRobotConfig
@@ -130,7 +133,7 @@ class GaponetRobot(Robot):
 
 
 def inner_config(given: Any) -> RobotConfig:
-    """Return the configuration of LeRobot's robot from its fields; one that is made already stays as it is."""
+    """Return the configuration of LeRobot's robot from its fields, or one that is made already."""
     if isinstance(given, RobotConfig):
         return given
     import draccus

@@ -1,4 +1,4 @@
-"""The correction of joint targets within bounds, and the processor step that puts it behind a policy."""
+"""The correction of joint targets within bounds, and the processor step behind a policy."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -113,20 +113,22 @@ class Corrector:
 @ProcessorStepRegistry.register("gaponet_correct")
 @dataclass
 class GaponetCorrect(ProcessorStep):
-    """Processor step that corrects joint targets once per control period, by a model or an identified robot.
+    """Processor step that corrects joint targets once per control period.
 
-    It is for robots other than gaponet_so101: the correction is limited in size and rate, but no watchdog protects the
-    arm. As last step of a policy's postprocessor (gaponet attach), actions are tensors (..., n) of all joints, or a
-    chunk (1, T, n) that is sent one row per period, and the state is unknown. As a robot action processor, actions are
-    named, and the observation is used.
+    It corrects by a model or an identified robot. It is for robots other than gaponet_so101: the
+    correction is limited in size and rate, but no watchdog protects the arm. As last step of a
+    policy's postprocessor (gaponet attach), actions are tensors (..., n) of all joints, or a chunk
+    (1, T, n) that is sent one row per period, and the state is unknown. As a robot action
+    processor, actions are named, and the observation is used.
     """
 
     model: str = ""
     known: str = ""  # instead of a model, a robot folder of gaponet identify
     payload_mass: float = 0.0
     dynamics: bool = False  # feed forward accelerations: only for planned, smooth targets
-    # Move as the nominal simulator of `known` does. The policy sees the measured state, whose delay a policy with a
-    # high gain may not bear (docs/deploy.md): gaponet_so101 gives it the nominal simulator's instead.
+    # Move as the nominal simulator of `known` does. The policy sees the measured state, whose delay
+    # a policy with a high gain may not bear (docs/deploy.md): gaponet_so101 gives it the nominal
+    # simulator's instead.
     follow: bool = False
 
     def __post_init__(self) -> None:
@@ -166,8 +168,11 @@ class GaponetCorrect(ProcessorStep):
         return transition
 
     def _corrected_chunk(self, action: torch.Tensor) -> torch.Tensor:
-        """Correct all rows of a chunk. LeRobot does not tell how many rows of the last chunk were sent: the correction
-        continues after the rows before the nearest one of that chunk."""
+        """Correct all rows of a chunk.
+
+        LeRobot does not tell how many rows of the last chunk were sent: the correction continues
+        after the rows before the nearest one of that chunk.
+        """
         if action.ndim > 2 and action.shape[:-2].numel() != 1:
             raise ValueError(
                 f"gaponet_correct corrects one robot's chunk, not {tuple(action.shape)}"

@@ -18,9 +18,11 @@ DEFAULT_RATE = 30.0  # Hz: LeRobot's own
 @TeleoperatorConfig.register_subclass("gaponet_motion")
 @dataclass
 class GaponetMotionConfig(TeleoperatorConfig):
-    """Motions instead of a leader arm: a folder of gaponet excite, motion files, or names of the library."""
+    """Motions instead of a leader arm: a folder of gaponet excite, files, or names."""
 
-    motions: str = ""  # a folder, or files and names separated by commas; each starts where the previous one ended
+    # A folder, or files and names of the library, separated by commas; each motion starts where
+    # the previous one ended.
+    motions: str = ""
     robot: str = "so101"  # robot folder, or a name of the package
     unit: JointUnit = "deg"  # of the robot's joints in LeRobot
     fps: float = DEFAULT_RATE  # as --dataset.fps
@@ -31,8 +33,9 @@ class GaponetMotionConfig(TeleoperatorConfig):
 class GaponetMotion(Teleoperator):
     """Teleoperator that returns one row of its motions per call, at the end always the last one.
 
-    One plan leads from the arm's first position through all motions. It is checked before the first row, as in gaponet
-    run: joints that a motion does not name keep their position, and moves between motions avoid collisions.
+    One plan leads from the arm's first position through all motions. It is checked before the first
+    row, as in gaponet run: joints that a motion does not name keep their position, and moves
+    between motions avoid collisions.
     """
 
     config_class = GaponetMotionConfig
@@ -70,30 +73,33 @@ class GaponetMotion(Teleoperator):
         """Nothing to do."""
 
     def connect(self, calibrate: bool = True) -> None:
-        self._connected, self._rows, self._next_row = True, None, 0
+        self._connected = True
+        self._rows = None
+        self._next_row = 0
 
     def plan(self, found: np.ndarray) -> np.ndarray:
         """Plan all rows (T, n) rad from the arm's position, (n,) rad.
 
         Raises:
-            UsageError: A part would collide with arm or table, or exceeds a limit; the message names it.
+            UsageError: A part would collide with arm or table, or exceeds a limit; the message
+                names it.
         """
         from gaponet.hw.control.phases import ControlConfig
         from gaponet.hw.control.plan import Planner
         from gaponet.motion.files import SUFFIXES, read_motion
         from gaponet.motion.library import Library
 
-        given, dt = self.config.motions, 1 / self.config.fps
-        files = (
-            sorted(str(f) for f in Path(given).iterdir() if f.suffix in SUFFIXES)
-            if Path(given).is_dir()
-            else []
-        )
+        dt = 1 / self.config.fps
+        words = self.config.motions.split(",")
+        folder = Path(self.config.motions)
+        if folder.is_dir():
+            files = sorted(str(f) for f in folder.iterdir() if f.suffix in SUFFIXES)
+            words = files or words
         library = Library(self.spec, max_payload=self.config.payload_mass)
         one = ControlConfig(blend=1.0, blend_out=False)
         planner = Planner(self.spec, self.spec.joint_names, one, limits=library.limits)
         parts = [np.repeat(found[None], max(1, round(self.config.lead / dt)), axis=0)]
-        for word in files or given.split(","):
+        for word in words:
             motion = read_motion(word, self.spec) if word.endswith(SUFFIXES) else library.make(word)
             plan = planner.plan(motion, parts[-1][-1])
             assert plan.motion
@@ -107,9 +113,10 @@ class GaponetMotion(Teleoperator):
             found = self.units.rad(last_observation())
             if not np.isfinite(found).all():
                 raise DeviceNotConnectedError(
-                    "gaponet_motion plans from the arm's position, which is unknown: use it with gaponet_so101 or "
-                    "gaponet_robot, "
-                    "or call lerobot_robot_gaponet.set_observation(observation) with your robot's first observation"
+                    "gaponet_motion plans from the arm's position, which is unknown: use it with "
+                    "gaponet_so101 or gaponet_robot, or call "
+                    "lerobot_robot_gaponet.set_observation(observation) with your robot's first "
+                    "observation"
                 )
             self._rows = self.plan(found)
         row = self._rows[min(self._next_row, len(self._rows) - 1)]

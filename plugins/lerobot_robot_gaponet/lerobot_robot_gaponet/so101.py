@@ -1,6 +1,7 @@
 """An SO-101 behind `gaponet run`, which commands it with compensator, limits, checks and watchdog.
 
-A separate process, `gaponet run --targets zmq`, talks to the servos. If a policy stalls, the arm is held, then damped.
+A separate process, `gaponet run --targets zmq`, talks to the servos. If a policy stalls, the arm is
+held, then damped.
 """
 
 import shlex
@@ -43,13 +44,15 @@ class _Controller:
         """Start the command for an address and wait for the first state.
 
         Raises:
-            DeviceNotConnectedError: The process ended, or sent no state within MAX_START_S; with its messages.
+            DeviceNotConnectedError: The process ended, or sent no state within MAX_START_S; with
+                its messages.
         """
         from gaponet.hw.control.driver import DriverError
         from gaponet.hw.targets.client import RemoteRobot
 
         folder = tempfile.TemporaryDirectory(prefix="gaponet-lerobot-")
-        address, start = f"ipc://{folder.name}/targets", time.monotonic()
+        address = f"ipc://{folder.name}/targets"
+        start = time.monotonic()
         with Path(folder.name, "messages").open("wb") as log:
             process = subprocess.Popen(
                 command(address), stdin=subprocess.DEVNULL, stdout=log, stderr=log
@@ -98,11 +101,12 @@ class GaponetSO101Config(RobotConfig):
     """SO-101 follower with the calibration that lerobot-calibrate wrote for so101_follower."""
 
     port: str = "/dev/ttyACM0"
-    # Calibration file, compared with the servos; default that of --robot.id, without an id the servos' counts.
+    # Calibration file, compared with the servos; default that of --robot.id, without an id the
+    # servos' counts.
     calibration: Path | None = None
     known: Path | None = None  # robot folder of gaponet identify, for compensation
-    # Move as the nominal simulator does, for a policy that was trained there; needs known, and takes no model. The
-    # policy then observes the nominal simulator's positions.
+    # Move as the nominal simulator does, for a policy that was trained there; needs known, and
+    # takes no model. The policy then observes the nominal simulator's positions.
     follow: bool = False
     # run of gaponet train, in addition; without both, targets are not corrected
     model: Path | None = None
@@ -132,7 +136,10 @@ class GaponetSO101(Robot):
         return self.action_features | {name: shape for name, shape, _ in self._pictures()}
 
     def _pictures(self) -> Iterator[tuple[str, tuple[int, int, int], Callable[[], Any]]]:
-        """Yield key, shape and reader of each camera's colour and depth images; keys are those of LeRobot's robots."""
+        """Yield key, shape and reader of each camera's colour and depth images.
+
+        Keys are those of LeRobot's robots.
+        """
         for name, camera in self.cameras.items():
             size = camera.height, camera.width
             if getattr(camera, "use_rgb", True):
@@ -162,7 +169,7 @@ class GaponetSO101(Robot):
         )
 
     def _calibration(self) -> Path | None:
-        """Return the given calibration file, or the one that LeRobot's own follower wrote for this id."""
+        """Return the given calibration file, or that of LeRobot's own follower for this id."""
         if self.config.calibration is not None or not self.config.id:
             return self.config.calibration
         own = Path(self.calibration_fpath)
@@ -170,7 +177,7 @@ class GaponetSO101(Robot):
         return next((place for place in places if place.is_file()), None)
 
     def configure(self) -> None:
-        """Keep the settings of the servos; gaponet run compares them with the robot and the model."""
+        """Keep the settings of the servos; gaponet run compares them with the robot."""
 
     def connect(self, calibrate: bool = True) -> None:
         from gaponet.hw.control.consent import require_consent
@@ -187,7 +194,8 @@ class GaponetSO101(Robot):
             camera.connect()
 
     def _command(self, address: str) -> list[str]:
-        config, rate = self.config, self.config.fps
+        config = self.config
+        rate = config.fps
         if rate is None and config.model is not None:
             from gaponet.nn.artifact import GapModel
 

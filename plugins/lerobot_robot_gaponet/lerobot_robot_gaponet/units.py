@@ -7,7 +7,8 @@ import numpy as np
 
 from gaponet.robot.spec import RobotSpec
 
-# Degrees, rad, or -100..100 over the joint's range, as LeRobot's robots have it without use_degrees.
+# Degrees, rad, or -100..100 over the joint's range, as LeRobot's robots have it without
+# use_degrees.
 JointUnit = Literal["deg", "rad", "signed_percent"]
 
 
@@ -19,10 +20,13 @@ class Units:
     ) -> None:
         """
         Args:
-            unit: Of all joints but those whose unit in robot.toml is fraction, which LeRobot gives as 0..100.
+            unit: Of all joints but those whose unit in robot.toml is fraction, which LeRobot gives
+                as 0..100.
             keys: LeRobot's name of each joint's value; default the joint's name and ".pos".
         """
-        self.keys = [f"{joint}.pos" for joint in robot.joint_names] if keys is None else [*keys]
+        if keys is None:
+            keys = [f"{joint}.pos" for joint in robot.joint_names]
+        self.keys = [*keys]
         low, high = robot.qpos_range.T
         scales = {"deg": np.pi / 180, "rad": 1.0, "signed_percent": (high - low) / 200}
         zero = (low + high) / 2 if unit == "signed_percent" else 0.0
@@ -32,23 +36,26 @@ class Units:
 
     def rad(self, action: dict[str, Any]) -> np.ndarray:
         """Convert to (n,) rad; NaN for a joint that is not named."""
-        return self.zero + self.scale * np.array(
-            [float(action.get(key, np.nan)) for key in self.keys]
-        )
+        values = [float(action.get(key, np.nan)) for key in self.keys]
+        return self.zero + self.scale * np.array(values)
 
     def named(self, qpos: np.ndarray) -> dict[str, float]:
         """Convert (n,) rad to LeRobot's values."""
-        return dict(zip(self.keys, ((qpos - self.zero) / self.scale).tolist(), strict=True))
+        values = (qpos - self.zero) / self.scale
+        return dict(zip(self.keys, values.tolist(), strict=True))
 
 
 _last_observation: dict[str, float] = {}
 
 
 def set_observation(observation: dict[str, Any]) -> None:
-    """Tell gaponet_motion where the arm is. The robots of this plug-in call this; for others the program must."""
-    _last_observation.update(
-        {key: float(value) for key, value in observation.items() if key.endswith(".pos")}
-    )
+    """Tell gaponet_motion where the arm is.
+
+    The robots of this plug-in call this; for others the program must.
+    """
+    for key, value in observation.items():
+        if key.endswith(".pos"):
+            _last_observation[key] = float(value)
 
 
 def last_observation() -> dict[str, float]:
