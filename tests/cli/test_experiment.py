@@ -2,15 +2,15 @@
 
 import json
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
 
 import pytest
 from arm import recordings, write_arm
+from short_experiment import shorten
 
 from gaponet.base.executor import open_pool
 from gaponet.cli.main import main
 from gaponet.data.store import Dataset
-from gaponet.experiments.paper import goals, jobs, measure, study
+from gaponet.experiments.paper import jobs
 
 
 @pytest.fixture(scope="module")
@@ -37,17 +37,8 @@ def first_run(words, place):
 
     Motions and holds take fractions of a second, and the jobs run in this process.
     """
-    make_motions = study.make_unseen_motions
-
-    def short_motions(*args):
-        return [replace(motion, ctrl=motion.ctrl[:60]) for motion in make_motions(*args)]
-
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(study, "make_unseen_motions", short_motions)
-        patch.setattr(measure, "REST_S", 0.2)
-        patch.setattr(measure, "HOLD_S", 0.4)
-        patch.setattr(measure, "AVERAGED_S", 0.2)
-        patch.setattr(goals, "REST_S", 0.2)
+        shorten(patch.setattr)
         patch.setattr(jobs, "open_pool", lambda where, workers: open_pool(ThreadPoolExecutor(1), 1))
         code = main(words)
     return code, (place / "out/trainings/labels-GAPONet-0/result.json").stat().st_mtime_ns

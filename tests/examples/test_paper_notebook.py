@@ -16,9 +16,18 @@ FILE = Path(__file__).parents[2] / "examples" / "paper.ipynb"
 RECIPE = """
 motions = ["tour-all-*", "multisine-shoulder_pan", "multisine-elbow_flex"]
 payloads = [0.0, 0.2]
-units = ["virtual-1", "virtual-2"]
+units = ["virtual-1"]
 rates = [50]
 variants = 2
+"""
+BEFORE = f"""
+import sys
+from concurrent.futures import ThreadPoolExecutor
+
+sys.path.insert(0, {str(Path(__file__).parents[1])!r})
+from short_experiment import shorten
+
+shorten()
 """
 
 
@@ -33,12 +42,13 @@ def test_the_notebook_goes_from_recordings_to_figure_3(tmp_path, tmp_path_factor
     smaller = {
         'robot="h1_2"': 'robot="so101"',
         'recipe="demo"': f'recipe="{recipe}"',
-        "seeds=1": 'quick=True, methods=("GAPONet",)',
+        "seeds=1": 'quick=True, methods=("GAPONet",), executor=ThreadPoolExecutor(1)',
     }
     notebook = nbformat.read(FILE, 4)
     for cell in notebook.cells:
         for text, replacement in smaller.items():
             cell.source = cell.source.replace(text, replacement)
+    notebook.cells.insert(0, nbformat.v4.new_code_cell(BEFORE))
     NotebookClient(notebook, timeout=600, km=kernel).execute()
     with warnings.catch_warnings(action="ignore", category=ResourceWarning):
         gc.collect()  # jupyter_client leaves sockets open
