@@ -260,7 +260,7 @@ def test_a_consent_of_true_writes_to_the_servos(bus, nobody, tmp_path):
     (tmp_path / "first.csv").write_text("time,wrist_roll\n0.0,0.0\n0.5,0.1\n1.0,0.0\n")
     options = gp.RunOptions(
         connection=gp.Connection(port=port),
-        control=ControlConfig(rate=4.0, damp=0.3),
+        control=ControlConfig(rate=4.0, blend=0.5, settle=0.3, damp=0.3),
         safety=SafetyConfig(acceleration=2.0),
     )
     result = gp.run_robot(
