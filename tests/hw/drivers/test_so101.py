@@ -173,17 +173,18 @@ def test_whatever_single_byte_is_changed_a_state_is_true_or_old(driver, servos):
             else reply[:at] + bytes([reply[at] ^ rng.randrange(1, 256)]) + reply[at + 1 :]
         )
 
+    before = driver.read()
     servos.adversary = change
     true = {}
     for _ in range(150):
         for servo in range(1, 7):
             servos.set(servo, "position", rng.randrange(1000, 3000))
         where = np.array([servos.get(servo, "position") for servo in range(1, 7)])
-        before = driver._state
         state = driver.read()
         if state.time != before.time:
             true[state.time] = np.array_equal(driver.arm.steps(state.qpos), where)
         assert np.array_equal(state.qpos, before.qpos) or true.get(state.time)
+        before = state
     assert all(true.values())
     assert len(true) > 10
 
@@ -198,6 +199,7 @@ def test_answers_that_come_late_are_never_taken_for_those_to_a_later_question(dr
         out = arriving if len(kept) == 1 else b""  # with the first reply to a request
         return out + reply if own else out
 
+    before = driver.read()
     servos.adversary = late
     for period in range(40):
         own = period % 3 == 0  # its own replies come in time as well
@@ -205,13 +207,13 @@ def test_answers_that_come_late_are_never_taken_for_those_to_a_later_question(dr
         kept[:] = []
         for servo in range(1, 7):
             servos.set(servo, "position", 1100 + 10 * period + servo)
-        before = driver._state
         state = driver.read()
         assert (state.time != before.time) == own
         if own:
             np.testing.assert_array_equal(
                 driver.arm.steps(state.qpos), 1100 + 10 * period + np.arange(1, 7)
             )
+        before = state
 
 
 def test_a_late_reply_is_not_taken_for_the_next_registers(wire, servos):
