@@ -24,14 +24,20 @@ def imports_of(file: Path) -> set[str]:
     """Return the sub-packages of gaponet that a file imports, in functions too."""
     found = set()
     for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
-        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("gaponet."):
-            found.add(str(node.module).split(".")[1])
-        elif isinstance(node, ast.ImportFrom) and node.module == "gaponet":
-            found |= {alias.name for alias in node.names}
-        elif isinstance(node, ast.Import):
-            names = [alias.name.split(".") for alias in node.names]
-            found |= {parts[1] for parts in names if parts[0] == "gaponet" and len(parts) > 1}
+        for name in _imported(node):
+            package, _, rest = name.partition(".")
+            if package == "gaponet" and rest:
+                found.add(rest.split(".")[0])
     return found
+
+
+def _imported(node: ast.AST) -> list[str]:
+    """Return the modules, or names of modules, that a statement imports."""
+    if isinstance(node, ast.ImportFrom):
+        return [f"{node.module}.{alias.name}" for alias in node.names]
+    if isinstance(node, ast.Import):
+        return [alias.name for alias in node.names]
+    return []
 
 
 def read_imports(package: Path = PACKAGE) -> Imports:

@@ -279,7 +279,8 @@ def _servo_rows(log: Log, j: int) -> Array:
 
     def sampled(name: str) -> Array:
         channel = log.channels[name]
-        return np.interp(time, channel.time, channel.values[:, j])
+        values: Array = np.interp(time, channel.time, channel.values[:, j])
+        return values
 
     qpos = sampled("qpos")
     speed = sampled("qvel") if "qvel" in log.channels else np.gradient(qpos, time)

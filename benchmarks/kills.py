@@ -491,9 +491,8 @@ def mixed(given: Path, work: Path, turns: int = 6) -> dict[str, Any]:
         order = ("import", "collect") if turn % 2 == 0 else ("collect", "import")
         running = {name: start(both[name].argv(out), log) for name in order}
         codes = {name: wait(running[name]) for name in order}
-        first, second = "collect", "import"
-        if codes["import"] == 0:
-            first, second = "import", "collect"
+        first = "import" if codes["import"] == 0 else "collect"
+        second = "collect" if first == "import" else "import"
         count[f"{first} first"] += 1
         again = wait(start(both[second].argv(out), log))
         meant = 2 if second == "collect" else 0

@@ -118,9 +118,10 @@ def fit(problem: Problem, links: tuple[str, ...] = ()) -> tuple[sysid.ParameterD
         )
         params.add(inertia)
     with redirect_stdout(sys.stderr):  # it prints each iteration
-        return sysid.optimize(
+        fitted, result = sysid.optimize(
             params, residuals, "scipy_parallel_fd", max_iters=EVALUATIONS, diff_step=STEP, **LOSS
         )
+    return fitted, result
 
 
 def write_inertia(spec: mujoco.MjSpec, param: sysid.Parameter) -> None:

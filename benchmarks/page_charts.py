@@ -28,9 +28,7 @@ class Chart:
     page: str  # below docs/
     title: str
     column: int  # of the table, counted from 0
-    bars: tuple[
-        tuple[str, str, str], ...
-    ]  # first cell of the row, label, method whose colour it has
+    bars: tuple[tuple[str, str, str], ...]  # first cell of the row, label, method of its colour
     line: float | None = None  # value at which a dashed line stands
 
     def values(self) -> list[float]:

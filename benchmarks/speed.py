@@ -134,7 +134,8 @@ def _correction(model: GapModel, states: Array) -> Turn:
         nonlocal k
         k = (k + 1) % len(states)
         qpos, qvel, ctrl = states[k]
-        return loop.delta(qpos, qvel, ctrl, 1.0)
+        delta: Array = loop.delta(qpos, qvel, ctrl, 1.0)
+        return delta
 
     return step
 

@@ -181,8 +181,8 @@ def test(arguments: argparse.Namespace) -> None:
                 column = group if len(by_payload) == 1 else f"{group}, {kg:g} kg"
                 placed = [replace(s, simulator=simulator) for s in recordings]
                 uncorrected = float(rollout_errors(placed, robot, 1).mean())
-                for name, correctors in methods.items():
-                    ratios = [errors(placed) / uncorrected for errors in correctors]
+                for name, of_seeds in methods.items():
+                    ratios = [errors(placed) / uncorrected for errors in of_seeds]
                     found[name].setdefault(column, []).append(ratios)
                 place = f"{column}, {number + 1} of {len(simulators)}"
                 print(f"{place}: {1e3 * uncorrected:.1f} mrad", flush=True)

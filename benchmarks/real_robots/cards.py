@@ -106,15 +106,20 @@ def data_folder(given: Path | None) -> Path:
 
 
 def prepare(card: Card, data: Path, work: Path) -> tuple[Dataset, RobotSpec, Labels | None]:
-    """Import a card's recordings below `work` once. Return dataset, robot, and the estimated labels
-    if any.
+    """Import a card's recordings below `work` once.
+
+    Returns:
+        Dataset, robot, and the estimated labels if any.
     """
     own = ROBOTS / card.robot
-    robot, place, labels = load_robot(own if own.is_dir() else card.robot), work / card.name, None
-    options: dict[str, Any] = {
-        k: v for k in ("rate", "joints", "ignore", "posture") if (v := getattr(card, k))
-    }
-    options |= {"position_unit": card.position_unit} if card.position_unit else {}
+    robot = load_robot(own if own.is_dir() else card.robot)
+    place = work / card.name
+    labels = None
+    options: dict[str, Any] = {}
+    for name in ("rate", "joints", "ignore", "posture", "position_unit"):
+        value = getattr(card, name)
+        if value:
+            options[name] = value
     place.mkdir(parents=True, exist_ok=True)
     source = data / card.folder
     if card.files:
@@ -124,27 +129,19 @@ def prepare(card: Card, data: Path, work: Path) -> tuple[Dataset, RobotSpec, Lab
             shutil.copy2(file, source)
     if card.labels:
         gain = dict(zip(robot.joint_names, robot.servo.kp.tolist(), strict=True))
-        labels = estimate(
-            read_logs(source, robot, ReadOptions(rate=card.rate)),
-            card.labels.payloads,
-            card.labels.units,
-            gain,
-        )
+        recordings = read_logs(source, robot, ReadOptions(rate=card.rate))
+        labels = estimate(recordings, card.labels.payloads, card.labels.units, gain)
         write(labels, place)
         options["manifest"] = "labels.csv"
     logs = place / "logs.toml"
     write_text(logs, "".join(f"{k} = {_toml(v)}\n" for k, v in options.items()))
-    report = import_logs(
-        source,
-        robot,
-        place / "data",
-        ImportRequest(
-            unit_id=card.unit,
-            payload_mass=card.payload,
-            logs=logs if options else None,
-            cut=card.cut,
-        ),
+    request = ImportRequest(
+        unit_id=card.unit,
+        payload_mass=card.payload,
+        logs=logs if options else None,
+        cut=card.cut,
     )
+    report = import_logs(source, robot, place / "data", request)
     report.dataset.set_provenance(licence=card.licence, source=card.source)
     return report.dataset, robot, labels
 

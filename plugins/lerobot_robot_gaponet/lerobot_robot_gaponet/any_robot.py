@@ -158,7 +158,7 @@ def joint_keys(features: dict[str, Any], joints: ListOf[str], joint_name: Any) -
     missing = [joint for joint in joints if joint not in keys]
     if missing:
         raise ValueError(
-            f"gaponet_robot: LeRobot's robot has no position target for joint '{missing[0]}'; it has "
-            f"{', '.join(names)}: name it with --robot.joints='{{LEROBOT_NAME: {missing[0]}}}'"
+            f"gaponet_robot: LeRobot's robot has no position target for joint '{missing[0]}'; it "
+            f"has {', '.join(names)}: name it with --robot.joints='{{LEROBOT_NAME: {missing[0]}}}'"
         )
     return [keys[joint] for joint in joints]
