@@ -81,6 +81,8 @@ GAINS = ["--kp", "20", "--effort-limit", "5"]
 LIMIT_S = 600.0
 TRIALS = ("kills", "races", "foreign", "full", "read_only")
 AS_ROOT = ("full", "read_only")  # trials that mount a disk
+# First of two commands at once on one dataset → the other one, and its exit code afterwards.
+AFTER = {"import": ("collect", 2), "collect": ("import", 0)}
 REFUSALS = ("Folder", "File", "Usage", "Dataset", "Model")  # first words of one-line errors
 
 
@@ -492,10 +494,9 @@ def mixed(given: Path, work: Path, turns: int = 6) -> dict[str, Any]:
         running = {name: start(both[name].argv(out), log) for name in order}
         codes = {name: wait(running[name]) for name in order}
         first = "import" if codes["import"] == 0 else "collect"
-        second = "collect" if first == "import" else "import"
+        second, meant = AFTER[first]
         count[f"{first} first"] += 1
         again = wait(start(both[second].argv(out), log))
-        meant = 2 if second == "collect" else 0
         if (codes[first], codes[second], again) != (0, 2, meant):
             wrong.append(f"mixed: exit codes {codes}, then {again}; see {log}")
         has_traceback = "Traceback" in log.read_text(errors="replace")
