@@ -46,7 +46,7 @@ faults: setup
 peers: setup
 	$(BIN)/python -m pytest -m peers -s tests/hw
 
-# MuJoCo, mjlab, Isaac Lab and Newton (environments of their own in ~/.cache/gaponet, 14 GB) play exports beside ours:
+# MuJoCo, mjlab, Isaac Lab and Newton (environments of their own in ~/.cache/gaponet, 16 GB) play exports beside ours:
 # half an hour.
 engines: setup
 	$(BIN)/python -m pytest -m peers -s tests/export

@@ -147,7 +147,8 @@ def run_robot(
 
     Args:
         robot: Robot, its name or folder; it may be identified. Default: the robot of the model's
-            run; without a model h1_2, or so101 for the so101 driver.
+            run; without a model that of options.limits_from for the driver of an extension, so101
+            for so101, otherwise h1_2.
         motion: Motion, its name in the library, or its file (.txt, .csv, .npz). Leave it out with
             options.targets.
         driver: virtual (a simulated robot in this process), unitree (DDS), so101 (serial), or the

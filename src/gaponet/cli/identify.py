@@ -35,8 +35,9 @@ def identify(
     and delay are fitted.
 
     Use the robot folder with --robot and a slash: gaponet gap DATASET --robot ./OUT. The fit starts
-    from the gains in the robot's file. Gains that recordings state are not changed. If no fit is
-    better than the robot as it is, nothing is written and the exit status is 2.
+    from the gains in the robot's file. kp is fitted too; where recordings state it, it stays near
+    what they state. If no fit is better than the robot as it is, nothing is written and the exit
+    status is 2.
 
     Args:
         out: Robot folder to write; `train(…, robot=out)` starts from it.

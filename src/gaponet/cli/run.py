@@ -44,7 +44,7 @@ class ControlArgs(ControlOptions):
     serve), so101 (serial), or the driver of an installed extension."""
     robot: str | None = None
     """Robot name or folder; it may be identified. Default: the robot of the model's run; without a
-    model h1_2, or so101 for the so101 driver."""
+    model that of --limits-from for the driver of an extension, so101 for so101, otherwise h1_2."""
     connection: tyro.conf.OmitArgPrefixes[Connection] = Connection()  # noqa: RUF009
     """Connection to the robot."""
     control: tyro.conf.OmitArgPrefixes[ControlConfig] = ControlConfig()  # noqa: RUF009
@@ -69,7 +69,7 @@ def run(
     """Play a motion or live targets on a robot; any key stops it.
 
     Ctrl-C, Ctrl-Z and SIGTERM also stop it, within one control period. A real robot moves only
-    after you typed yes.
+    after you typed yes, unless --yes skips this question.
 
     Args:
         motion: Motion name (gaponet collect lists the forms) or motion file (.txt, .csv, .npz). Or
