@@ -223,9 +223,9 @@ def test_of_a_hundred_pairs_of_uploads_from_two_pages_none_is_lost(empty):
         for browser in (one, two):
             wait(lambda browser=browser: browser.value("window.ended") == PAIRS)
         expected = {f"{name}-{k}-0.csv" for k in range(PAIRS) for name in ("one", "two")}
-        wait(lambda: stored_whole(empty.folder) == expected)
+        wait(lambda: stored_whole(empty.controls.folder) == expected)
         wait(lambda: f"{2 * PAIRS} uploads are stored" in one.value("document.body.innerText"))
-        print(f"two pages: {len(stored_whole(empty.folder))} of {2 * PAIRS} files")
+        print(f"two pages: {len(stored_whole(empty.controls.folder))} of {2 * PAIRS} files")
 
 
 def test_of_a_hundred_pairs_of_uploads_from_one_page_none_is_lost(empty):
@@ -235,8 +235,8 @@ def test_of_a_hundred_pairs_of_uploads_from_one_page_none_is_lost(empty):
         open_logs(browser, empty)
         browser.value(upload_script("one", 2))
         expected = {f"one-{k}-{i}.csv" for k in range(PAIRS) for i in (0, 1)}
-        wait(lambda: stored_whole(empty.folder) == expected)
-        print(f"one page: {len(stored_whole(empty.folder))} of {2 * PAIRS} files")
+        wait(lambda: stored_whole(empty.controls.folder) == expected)
+        print(f"one page: {len(stored_whole(empty.controls.folder))} of {2 * PAIRS} files")
 
 
 def test_a_broken_zip_behind_a_large_file_is_named_until_it_is_dismissed(empty):
