@@ -179,8 +179,8 @@ class AlignedSim:
         Args:
             qpos: Positions, rad; default home.
             qvel: Velocities, rad/s.
-            ctrl: Target in force before, rad, which delayed servos (robot.servo.delay) still follow;
-                default qpos.
+            ctrl: Target in force before, rad, which delayed servos (robot.servo.delay) still
+                follow; default qpos.
             ids: Which simulations, (k,); arrays are then (k, n).
         """
         count = len(np.arange(self.num_envs)[ids])

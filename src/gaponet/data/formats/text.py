@@ -119,15 +119,22 @@ def heading(text: str) -> Heading:
     delimiter = delimiter_of(lines[start + 1] if named else header)
     if is_numeric(names):
         return Heading([], start, names, delimiter, [])
-    units: list[str] = []
-    row, below = (_row(lines, start + i) for i in (1, 2))
-    if len(row) == len(names) and _holds_no_number(row) and is_numeric(below):
-        units = row
-        row = below
+    units = _units_below(lines, start, len(names))
+    first = start + (2 if units else 1)
+    row = _row(lines, first)
     if len(row) == len(names) + 1 and not row[-1]:
         names = [*names, ""]  # each row ends with a separator
     names = [name.strip() for name in names]
-    return Heading(names, start + 1 + len(units[:1]), row, delimiter, units)
+    return Heading(names, first, row, delimiter, units)
+
+
+def _units_below(lines: list[str], header: int, columns: int) -> list[str]:
+    """Return the cells of the row of units between header and numbers; none if there is none."""
+    row = _row(lines, header + 1)
+    below = _row(lines, header + 2)
+    if len(row) == columns and _holds_no_number(row) and is_numeric(below):
+        return row
+    return []
 
 
 def _after_comments(lines: list[str]) -> int:
