@@ -55,8 +55,8 @@ def test_the_default_number_of_simulations_depends_on_the_device():
 def test_the_options_of_a_configuration_give_it_back(monkeypatch, config):
     heard = []
 
-    def train(dataset, *, config, model, **_):
-        heard.append(replace(config, model=replace(config.model, kind=model)))
+    def train(dataset, *, config, options, **_):
+        heard.append(replace(config, model=replace(config.model, kind=options.model)))
         raise UsageError("heard")
 
     monkeypatch.setattr(api, "train", train)
