@@ -348,6 +348,17 @@ def test_a_mimic_joint_follows_without_a_motor(tmp_path, ratio, at_zero):
     assert np.allclose(sequence.qpos[:, led], ratio * angle[:, 0] + at_zero, atol=1e-6)
 
 
+def test_a_mimic_joint_of_a_joint_that_does_not_exist_has_a_motor(tmp_path):
+    joints = FINGER.format(name="drive", mimic="") + FINGER.format(
+        name="led", mimic='<mimic joint="elsewhere"/>'
+    )
+    (tmp_path / "hand.urdf").write_text(MIMIC.format(joints=joints))
+
+    robot = make(tmp_path, tmp_path / "hand.urdf").robot
+
+    assert robot.operated == ("drive", "led")
+
+
 def test_a_mimic_joint_of_a_mimic_joint_follows_the_motor(tmp_path):
     first = '<mimic joint="drive" multiplier="-0.5" offset="0.2"/>'
     second = '<mimic joint="led" multiplier="2" offset="0.1"/>'

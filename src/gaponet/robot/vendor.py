@@ -288,12 +288,18 @@ def _urdf(
 
 
 def _add_mimic_joints(spec: mujoco.MjSpec, root: ET.Element) -> None:
-    """Let joints follow others as URDF's <mimic> says; MuJoCo before 4 does not read it."""
+    """Let joints follow others as URDF's <mimic> says; MuJoCo before 4 does not read it.
+
+    As in MuJoCo 4, joints that do not move and leaders that do not exist are passed over.
+    """
     known = {equality.name1 for equality in spec.equalities}
     for joint in root.iter("joint"):
         mimic = joint.find("mimic")
         name = joint.get("name", "")
         if mimic is None or name in known:
+            continue
+        leader = mimic.get("joint", "")
+        if spec.joint(name) is None or spec.joint(leader) is None:
             continue
         multiplier = 1.0
         if "multiplier" in mimic.attrib:
@@ -301,7 +307,7 @@ def _add_mimic_joints(spec: mujoco.MjSpec, root: ET.Element) -> None:
         equality = spec.add_equality(
             type=mujoco.mjtEq.mjEQ_JOINT,
             name1=name,
-            name2=mimic.get("joint", ""),
+            name2=leader,
         )
         equality.data[:5] = [_number(mimic, "offset"), multiplier, 0.0, 0.0, 0.0]  # polynomial
 
