@@ -2,6 +2,7 @@
 
 import json
 import re
+from typing import get_args
 
 import mujoco
 import numpy as np
@@ -12,10 +13,11 @@ from gaponet.base.errors import JointMismatchError, LogError, UsageError
 from gaponet.cli.main import main
 from gaponet.data.describe.guess import guess_logs
 from gaponet.data.describe.joints import resolve_all
-from gaponet.data.formats import detect, look, read_logs
+from gaponet.data.formats import PositionUnit, detect, look, read_logs
 from gaponet.data.importer import ImportRequest, import_logs
 from gaponet.data.log import skip_bad_rows
 from gaponet.data.store import Dataset
+from gaponet.robot.log_joints import LOG_UNITS
 from gaponet.sim.model import build_model
 
 UNITS = 'time_unit = "s"\nposition_unit = "rad"\n'
@@ -103,6 +105,10 @@ def test_a_sheet_says_what_names_do_not_and_every_recording_stands_in_it_once(tm
     sheet.write_text("file,payload\nrun_7,heavy\n")
     with pytest.raises(LogError, match="heavy"):
         list(read_logs(folder, arm))
+
+
+def test_each_position_unit_of_a_logs_toml_can_be_given_as_an_option():
+    assert set(get_args(PositionUnit)) == set(LOG_UNITS)
 
 
 def test_signs_and_offsets_come_after_units_and_are_noted(tmp_path, arm):

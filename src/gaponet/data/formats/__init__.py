@@ -182,7 +182,7 @@ def find_logs(path: Path, fmt: str | None = None) -> list[Path]:
     return _find(_reader(path, fmt or read_logs_file(path)[0].get("format")), path)
 
 
-PositionUnit = Literal["rad", "deg", "turns", "fraction", "ticks", "signed_percent"]
+PositionUnit = Literal["rad", "deg", "turns", "fraction", "percent", "ticks", "signed_percent"]
 TimeUnit = Literal["s", "ms", "us", "ns"]
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Protocol
+from typing import Protocol, get_args
 
 import numpy as np
 
@@ -11,7 +11,7 @@ from gaponet.base.errors import UsageError
 from gaponet.base.files import write_text
 from gaponet.base.text import escape_markdown
 from gaponet.data.describe.guess import guess_logs
-from gaponet.data.formats import look
+from gaponet.data.formats import PositionUnit, look
 from gaponet.data.store import Dataset
 from gaponet.evaluation.methods import colour
 from gaponet.evaluation.verdict import NetworkGain
@@ -27,7 +27,7 @@ from gaponet.sim.dataset_robot import dataset_robot
 from gaponet.sysid.options import IdentifyOptions
 
 MODEL_SUFFIXES = (".xml", ".mjcf", ".urdf")
-POSITION_UNITS = ("as the logs state", "rad", "deg", "fraction", "ticks", "signed_percent")
+POSITION_UNITS = ("as the logs state", *get_args(PositionUnit))
 TARGETS = ("mjcf", "mjlab", "isaaclab", "newton", "json")
 URDF_TARGET = "urdf"  # for a robot that was made from one: the export is an edited copy
 NETWORK_TARGETS = ("onnx", "torch")  # of a trained network
