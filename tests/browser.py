@@ -50,11 +50,20 @@ class Browser:
         self.folder = tempfile.TemporaryDirectory(prefix="browser", ignore_cleanup_errors=True)
         place = Path(self.folder.name)
         self.process = subprocess.Popen(
-            [found, "--headless", "--no-sandbox", "--remote-debugging-port=0", f"--user-data-dir={place}",
-             f"--window-size={width},{height}", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
-             "about:blank"],
-            stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
-        )  # fmt: skip
+            [
+                found,
+                "--headless",
+                "--no-sandbox",
+                "--remote-debugging-port=0",
+                f"--user-data-dir={place}",
+                f"--window-size={width},{height}",
+                "--use-angle=swiftshader",
+                "--enable-unsafe-swiftshader",
+                "about:blank",
+            ],
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
         port, path = wait(lambda: (place / "DevToolsActivePort").read_text().split()[:2])
         self.socket = connect(f"ws://127.0.0.1:{port}{path}", max_size=None, open_timeout=PATIENCE)
         self.events: list[dict[str, Any]] = []
@@ -96,8 +105,10 @@ class Browser:
         """What is seen of the page, or of one element: (height, width, 3) int."""
         options: dict[str, Any] = {}
         if selector:
-            box = self.value(f"(({{x, y, width, height}}) => ({{x, y, width, height}}))"
-                             f"(document.querySelector({selector!r}).getBoundingClientRect())")  # fmt: skip
+            box = self.value(
+                f"(({{x, y, width, height}}) => ({{x, y, width, height}}))"
+                f"(document.querySelector({selector!r}).getBoundingClientRect())"
+            )
             options["clip"] = box | {"scale": 1}
         data = self.ask("Page.captureScreenshot", format="png", **options)["data"]
         return np.asarray(Image.open(io.BytesIO(base64.b64decode(data))).convert("RGB")).astype(int)

@@ -95,8 +95,14 @@ def recordings(robot: RobotSpec, kp: float = 0.9) -> list[Recording]:
     return found
 
 
-def examine(robot: RobotSpec, logs: list[Recording], folder: Path, damage: Callable[[Path], None] | None = None,
-            gain: float | None = None, logs_toml: str = "") -> DoctorResult | GAPONetError:  # fmt: skip
+def examine(
+    robot: RobotSpec,
+    logs: list[Recording],
+    folder: Path,
+    damage: Callable[[Path], None] | None = None,
+    gain: float | None = None,
+    logs_toml: str = "",
+) -> DoctorResult | GAPONetError:
     """Write the logs, import them and call the doctor; an import that refuses is an answer as well."""
     for log in logs:
         place = folder / f"{log.payload:g}" / "real" / robot.name / "tests" / log.motion
@@ -180,28 +186,73 @@ ARM, J = [0, 1, 2, 3, 4], 2  # of an SO-101; a joint that carries weight
 EVERY = slice(None)
 FAULTS: dict[str, tuple[Callable[[list[Recording]], list[Recording]], dict[str, object]]] = {
     "sign of command and state": (
-        lambda logs: all_of(logs, lambda g: g.change(J, **dict.fromkeys(("ctrl", "qpos", "qvel", "tau"), np.negative))),
-        {}),
-    "offset of 20 mrad": (lambda logs: all_of(logs, lambda g: g.change(J, qpos=lambda x: x + 0.02)), {}),
-    "offset of 150 mrad": (lambda logs: all_of(logs, lambda g: g.change(J, qpos=lambda x: x + 0.15)), {}),
-    "lag of 100 ms more": (lambda logs: all_of(logs, lambda g: g.change(EVERY, qpos=delayed, qvel=delayed)), {}),
-    "lag of one joint": (lambda logs: all_of(logs, lambda g: g.change(J, qpos=delayed, qvel=delayed)), {}),
+        lambda logs: all_of(
+            logs,
+            lambda g: g.change(J, **dict.fromkeys(("ctrl", "qpos", "qvel", "tau"), np.negative)),
+        ),
+        {},
+    ),
+    "offset of 20 mrad": (
+        lambda logs: all_of(logs, lambda g: g.change(J, qpos=lambda x: x + 0.02)),
+        {},
+    ),
+    "offset of 150 mrad": (
+        lambda logs: all_of(logs, lambda g: g.change(J, qpos=lambda x: x + 0.15)),
+        {},
+    ),
+    "lag of 100 ms more": (
+        lambda logs: all_of(logs, lambda g: g.change(EVERY, qpos=delayed, qvel=delayed)),
+        {},
+    ),
+    "lag of one joint": (
+        lambda logs: all_of(logs, lambda g: g.change(J, qpos=delayed, qvel=delayed)),
+        {},
+    ),
     "scale of 1.2": (lambda logs: all_of(logs, lambda g: g.change(J, qpos=lambda x: 1.2 * x)), {}),
     "spike of a state": (
-        lambda logs: one_of(logs, lambda g: g.change(J, qpos=at(slice(400, 401), lambda x: x + 0.5))), {}),
-    "frozen channel": (lambda logs: one_of(logs, lambda g: g.change(J, qpos=at(slice(0, 400), lambda x: x[:1]))), {}),
+        lambda logs: one_of(
+            logs, lambda g: g.change(J, qpos=at(slice(400, 401), lambda x: x + 0.5))
+        ),
+        {},
+    ),
+    "frozen channel": (
+        lambda logs: one_of(logs, lambda g: g.change(J, qpos=at(slice(0, 400), lambda x: x[:1]))),
+        {},
+    ),
     "command and state swapped in one": (
-        lambda logs: one_of(logs, lambda g: replace(g, ctrl=g.qpos, qpos=g.ctrl)), {}),
-    "two robots in one": (lambda logs: one_of(logs, lambda g: g.change(J, qpos=lambda x: x + 0.1)), {}),
+        lambda logs: one_of(logs, lambda g: replace(g, ctrl=g.qpos, qpos=g.ctrl)),
+        {},
+    ),
+    "two robots in one": (
+        lambda logs: one_of(logs, lambda g: g.change(J, qpos=lambda x: x + 0.1)),
+        {},
+    ),
     "wrong gains": (list, {"gain": 2.0}),
     "wrong payload label": (lambda logs: one_of(logs, lambda g: replace(g, payload=0.2)), {}),
     "joint order": (lambda logs: all_of(logs, rotated), {}),
     "zero of command and state": (
-        lambda logs: all_of(logs, lambda g: g.change(J, ctrl=lambda x: x - 0.6, qpos=lambda x: x - 0.6)), {}),
-    "torque of the other sign": (lambda logs: all_of(logs, lambda g: g.change(J, tau=lambda x: -x)), {}),
-    "quantised": (lambda logs: all_of(logs, lambda g: g.change(EVERY, qpos=lambda x: np.round(x, 2))), {}),
+        lambda logs: all_of(
+            logs, lambda g: g.change(J, ctrl=lambda x: x - 0.6, qpos=lambda x: x - 0.6)
+        ),
+        {},
+    ),
+    "torque of the other sign": (
+        lambda logs: all_of(logs, lambda g: g.change(J, tau=lambda x: -x)),
+        {},
+    ),
+    "quantised": (
+        lambda logs: all_of(logs, lambda g: g.change(EVERY, qpos=lambda x: np.round(x, 2))),
+        {},
+    ),
     "saturated torque": (
-        lambda logs: all_of(logs, lambda g: g.change(J, tau=lambda x: np.clip(x, -peak(x) / 2, peak(x) / 2))), {}),
-    "saturated command": (lambda logs: all_of(logs, lambda g: g.change(J, ctrl=lambda x: np.clip(x, -0.4, 0.4))), {}),
+        lambda logs: all_of(
+            logs, lambda g: g.change(J, tau=lambda x: np.clip(x, -peak(x) / 2, peak(x) / 2))
+        ),
+        {},
+    ),
+    "saturated command": (
+        lambda logs: all_of(logs, lambda g: g.change(J, ctrl=lambda x: np.clip(x, -0.4, 0.4))),
+        {},
+    ),
     "truncated at a row's end": (list, {"damage": cut_at_a_row}),
-}  # fmt: skip
+}

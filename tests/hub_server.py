@@ -149,10 +149,14 @@ class Handler(BaseHTTPRequestHandler):
             self.answer({"errors": [], "warnings": []})
         elif re.fullmatch(rf"{REPO}/preupload/[^/]+", path):
             mode = lambda name: "lfs" if name.endswith(LARGE) else "regular"  # noqa: E731
-            self.answer({"files": [
-                {"path": f["path"], "uploadMode": mode(f["path"]), "shouldIgnore": False}
-                for f in json.loads(data)["files"]
-            ]})  # fmt: skip
+            self.answer(
+                {
+                    "files": [
+                        {"path": f["path"], "uploadMode": mode(f["path"]), "shouldIgnore": False}
+                        for f in json.loads(data)["files"]
+                    ]
+                }
+            )
         elif re.fullmatch(r"/(datasets/)?([^/]+/[^/]+)\.git/info/lfs/objects/batch", path):
             self.answer(
                 {

@@ -94,9 +94,17 @@ def stock(
     )
     feature = {"dtype": "float32", "shape": [6], "names": [f"{n}.pos" for n in names]}
     video = {"dtype": "video", "shape": [48, 64, 3], "names": None}
-    info = {"codebase_version": "v3.0", "fps": 30, "robot_type": "so101_follower",
-            "data_path": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
-            "features": {"action": feature, "observation.state": feature, "observation.images.top": video}}  # fmt: skip
+    info = {
+        "codebase_version": "v3.0",
+        "fps": 30,
+        "robot_type": "so101_follower",
+        "data_path": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
+        "features": {
+            "action": feature,
+            "observation.state": feature,
+            "observation.images.top": video,
+        },
+    }
     for place in ("meta/episodes/chunk-000", "data/chunk-000"):
         (folder / place).mkdir(parents=True, exist_ok=True)
     (folder / "meta" / "info.json").write_text(json.dumps(info | changes))
@@ -105,19 +113,38 @@ def stock(
         folder / "meta" / "tasks.parquet",
     )
     starts = np.cumsum([0, *map(len, values)])
-    pq.write_table(pa.Table.from_pylist([
-        {"episode_index": i, "tasks": ["Pick up!"], "length": len(v), "data/chunk_index": 0, "data/file_index": 0,
-         "dataset_from_index": int(starts[i]), "dataset_to_index": int(starts[i + 1]), "stats/action/min": [0.0]}
-        for i, v in enumerate(values)
-    ]), folder / "meta" / "episodes" / "chunk-000" / "file-000.parquet")  # fmt: skip
+    pq.write_table(
+        pa.Table.from_pylist(
+            [
+                {
+                    "episode_index": i,
+                    "tasks": ["Pick up!"],
+                    "length": len(v),
+                    "data/chunk_index": 0,
+                    "data/file_index": 0,
+                    "dataset_from_index": int(starts[i]),
+                    "dataset_to_index": int(starts[i + 1]),
+                    "stats/action/min": [0.0],
+                }
+                for i, v in enumerate(values)
+            ]
+        ),
+        folder / "meta" / "episodes" / "chunk-000" / "file-000.parquet",
+    )
     frame = np.concatenate([np.arange(len(v)) for v in values])
     flat = np.concatenate(values).astype(np.float32)
-    pq.write_table(pa.table({
-        "action": pa.FixedSizeListArray.from_arrays(pa.array(flat.ravel()), 6),
-        "observation.state": pa.array((flat - 1).tolist(), pa.list_(pa.float32())),
-        "timestamp": (frame / 30).astype(np.float32), "frame_index": frame,
-        "episode_index": np.repeat(np.arange(len(values)), [len(v) for v in values]),
-    }), folder / "data" / "chunk-000" / "file-000.parquet")  # fmt: skip
+    pq.write_table(
+        pa.table(
+            {
+                "action": pa.FixedSizeListArray.from_arrays(pa.array(flat.ravel()), 6),
+                "observation.state": pa.array((flat - 1).tolist(), pa.list_(pa.float32())),
+                "timestamp": (frame / 30).astype(np.float32),
+                "frame_index": frame,
+                "episode_index": np.repeat(np.arange(len(values)), [len(v) for v in values]),
+            }
+        ),
+        folder / "data" / "chunk-000" / "file-000.parquet",
+    )
     return folder
 
 
@@ -173,10 +200,18 @@ def write_bam(file: Path, rows: int = 60, off: int | None = None, **changes: obj
     """One recording of BAM's test bench at firmware gain 400; torque off from row `off` on."""
     ctrl, qpos = wave(rows, 1, 0.0053)[:, 0], late(wave(rows, 1, 0.0053), 3)[:, 0]
     entries = [
-        {"timestamp": 0.0035 + 0.0053 * i, "position": q, "speed": 0.0, "load": 65530, "input_volts": 7.3, "temp": 39,
-         "goal_position": u, "torque_enable": off is None or i < off}
+        {
+            "timestamp": 0.0035 + 0.0053 * i,
+            "position": q,
+            "speed": 0.0,
+            "load": 65530,
+            "input_volts": 7.3,
+            "temp": 39,
+            "goal_position": u,
+            "torque_enable": off is None or i < off,
+        }
         for i, (u, q) in enumerate(zip(ctrl.tolist(), qpos.tolist(), strict=True))
-    ]  # fmt: skip
+    ]
     head = {
         "mass": 0.49,
         "length": 0.1,

@@ -16,12 +16,25 @@ from gaponet.evaluation.evaluate import evaluate
 from gaponet.robot.spec import RobotSpec
 
 FACTS = {
-    "hours": 0.1, "steps": 10, "seconds": 60.0, "excess_delay": 0.0, "parity_rad": 1e-7, "dataset_hash": "0123",
-    "versions": {"gaponet": "0"}, "virtual": True,
-}  # fmt: skip
+    "hours": 0.1,
+    "steps": 10,
+    "seconds": 60.0,
+    "excess_delay": 0.0,
+    "parity_rad": 1e-7,
+    "dataset_hash": "0123",
+    "versions": {"gaponet": "0"},
+    "virtual": True,
+}
 LINE = {"stage": "ppo", "steps": 1, "seconds": 0.5, "val_mpjae": 0.1, "nominal_mpjae": 0.2}
-CONFIG = {"model": {"kind": "gaponet"}, "ppo": {"num_envs": 1, "epochs": 1, "std": 0.1}, "seed": 0, "robot": "arm",
-          "dataset": "../data", "dataset_hash": "0123", "command": "gaponet train data --out run"}  # fmt: skip
+CONFIG = {
+    "model": {"kind": "gaponet"},
+    "ppo": {"num_envs": 1, "epochs": 1, "std": 0.1},
+    "seed": 0,
+    "robot": "arm",
+    "dataset": "../data",
+    "dataset_hash": "0123",
+    "command": "gaponet train data --out run",
+}
 
 
 def evaluated_run(

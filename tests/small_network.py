@@ -56,10 +56,21 @@ def make_run(
     net.bounded.scale.fill_(0.01)
     for weights in net.parameters():
         torch.nn.init.normal_(weights, std=0.1)
-    card = make_card(
-        config, robot, dt=[robot.dt], payload_seen=[0.0], units=["a"], seed=0, steps=1000, virtual=True,
-        motions=PARTS, versions={"gaponet": "0.1.0"},
-    ) | facts  # fmt: skip
+    card = (
+        make_card(
+            config,
+            robot,
+            dt=[robot.dt],
+            payload_seen=[0.0],
+            units=["a"],
+            seed=0,
+            steps=1000,
+            virtual=True,
+            motions=PARTS,
+            versions={"gaponet": "0.1.0"},
+        )
+        | facts
+    )
     export(net, folder / "model", card, sample_inputs(net))
     split = {
         part: {entry.id: entry.hash for entry in data.entries if entry.meta.motion in motions}

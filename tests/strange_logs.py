@@ -153,13 +153,30 @@ def write_bag(
 
     def point(x: np.ndarray) -> object:
         zero = make("builtin_interfaces/msg/Duration", sec=0, nanosec=0)
-        return make("trajectory_msgs/msg/JointTrajectoryPoint", positions=x, velocities=none, accelerations=none,
-                    effort=none, time_from_start=zero)  # fmt: skip
+        return make(
+            "trajectory_msgs/msg/JointTrajectoryPoint",
+            positions=x,
+            velocities=none,
+            accelerations=none,
+            effort=none,
+            time_from_start=zero,
+        )
 
     def motors(kind: str, x: np.ndarray) -> list[object]:
-        rest = {"mode": 1, "reserve": 0, "tau": tau, "kp": 20.0, "kd": 1.0} if kind.endswith("Cmd") else {
-            "mode": 1, "ddq": 0.0, "tau_est": 0.0, "temperature": np.zeros(2, np.int16), "vol": 0.0, "motorstate": 0,
-            "sensor": np.zeros(2, np.uint32), "reserve": np.zeros(4, np.uint32)}  # fmt: skip
+        rest = (
+            {"mode": 1, "reserve": 0, "tau": tau, "kp": 20.0, "kd": 1.0}
+            if kind.endswith("Cmd")
+            else {
+                "mode": 1,
+                "ddq": 0.0,
+                "tau_est": 0.0,
+                "temperature": np.zeros(2, np.int16),
+                "vol": 0.0,
+                "motorstate": 0,
+                "sensor": np.zeros(2, np.uint32),
+                "reserve": np.zeros(4, np.uint32),
+            }
+        )
         return [make(kind, q=float(x[i]) if i < 2 else 0.0, dq=0.0, **rest) for i in range(35)]
 
     def message(kind: str, t: float, x: np.ndarray) -> tuple[str, object]:
@@ -183,22 +200,50 @@ def write_bag(
             )
         if kind == "controller":
             told = "control_msgs/msg/JointTrajectoryControllerState"
-            return told, make(told, header=header(t), joint_names=list(JOINTS), reference=point(x), feedback=point(x),
-                              error=point(0 * x), output=point(none))  # fmt: skip
+            return told, make(
+                told,
+                header=header(t),
+                joint_names=list(JOINTS),
+                reference=point(x),
+                feedback=point(x),
+                error=point(0 * x),
+                output=point(none),
+            )
         if kind == "unitree":
             told, four = "unitree_hg/msg/LowCmd", np.zeros(4, np.uint32)
-            return told, make(told, mode_pr=0, mode_machine=0, motor_cmd=motors("unitree_hg/msg/MotorCmd", x),
-                              reserve=four, crc=0)  # fmt: skip
+            return told, make(
+                told,
+                mode_pr=0,
+                mode_machine=0,
+                motor_cmd=motors("unitree_hg/msg/MotorCmd", x),
+                reserve=four,
+                crc=0,
+            )
         return state(t, x)
 
     def low_state(x: np.ndarray) -> tuple[str, object]:
         three = np.zeros(3, np.float32)
-        imu = make("unitree_hg/msg/IMUState", quaternion=np.zeros(4, np.float32), gyroscope=three, accelerometer=three,
-                   rpy=three, temperature=0)  # fmt: skip
+        imu = make(
+            "unitree_hg/msg/IMUState",
+            quaternion=np.zeros(4, np.float32),
+            gyroscope=three,
+            accelerometer=three,
+            rpy=three,
+            temperature=0,
+        )
         told = "unitree_hg/msg/LowState"
-        return told, make(told, version=np.zeros(2, np.uint32), mode_pr=0, mode_machine=0, tick=0, imu_state=imu,
-                          motor_state=motors("unitree_hg/msg/MotorState", x), wireless_remote=np.zeros(40, np.uint8),
-                          reserve=np.zeros(4, np.uint32), crc=0)  # fmt: skip
+        return told, make(
+            told,
+            version=np.zeros(2, np.uint32),
+            mode_pr=0,
+            mode_machine=0,
+            tick=0,
+            imu_state=imu,
+            motor_state=motors("unitree_hg/msg/MotorState", x),
+            wireless_remote=np.zeros(40, np.uint8),
+            reserve=np.zeros(4, np.uint32),
+            crc=0,
+        )
 
     plugin = StoragePlugin.MCAP if storage == "mcap" else StoragePlugin.SQLITE3
     with Writer(bag, version=9, storage_plugin=plugin) as writer:

@@ -39,12 +39,18 @@ def widths(layers: tuple[int, ...]) -> str:
 @pytest.mark.parametrize(
     ("page", "said"),
     [
-        ("network.md", f"Branch ({widths(MODEL.branch_hidden)}, ELU) and trunk ({widths(MODEL.trunk_hidden)})"),
+        (
+            "network.md",
+            f"Branch ({widths(MODEL.branch_hidden)}, ELU) and trunk ({widths(MODEL.trunk_hidden)})",
+        ),
         ("reference/paper-network.md", f"(hidden layers of {widths(MODEL.sensor_hidden)})"),
         ("network.md", f"{widths(MODEL.mlp_hidden)} on the features"),
         ("network.md", f"p = {MODEL.num_basis} features"),
         ("reference/paper-network.md", f"m = {MODEL.num_probes} targets"),
-        ("reference/paper-network.md", f"Those at ±{MODEL.probe_small} rad read gains and friction"),
+        (
+            "reference/paper-network.md",
+            f"Those at ±{MODEL.probe_small} rad read gains and friction",
+        ),
         ("reference/paper-network.md", f"those at ±{MODEL.probe_large} rad read inertia"),
         ("network.md", f"Δ_max = {MODEL.delta_max} rad"),
         ("network.md", f"{MODEL.observation_dim(10) - 1} for n = 10, H = {MODEL.history}, and"),
@@ -52,7 +58,7 @@ def widths(layers: tuple[int, ...]) -> str:
         ("identification.md", f"an error of {PRIOR_RAD} rad"),
         ("paper.md", f"{PaperOptions().steps:,} control steps"),
     ],
-)  # fmt: skip
+)
 def test_a_default_that_a_page_states_is_that_of_the_code(page, said):
     assert said in text(f"docs/{page}")
 

@@ -65,9 +65,25 @@ MJCF = """<mujoco model="vendor">
   </keyframe>
 </mujoco>
 """
-BOX = "".join(f"v {x} {y} {z}\n" for x in (0.0, 0.25) for y in (-0.03, 0.03) for z in (-0.03, 0.03)) + "".join(
-    f"f {f}\n" for f in ("1 2 4", "1 4 3", "5 8 6", "5 7 8", "1 6 2", "1 5 6", "3 4 8", "3 8 7", "1 3 7", "1 7 5",
-                         "2 6 8", "2 8 4"))  # fmt: skip
+BOX = "".join(
+    f"v {x} {y} {z}\n" for x in (0.0, 0.25) for y in (-0.03, 0.03) for z in (-0.03, 0.03)
+) + "".join(
+    f"f {f}\n"
+    for f in (
+        "1 2 4",
+        "1 4 3",
+        "5 8 6",
+        "5 7 8",
+        "1 6 2",
+        "1 5 6",
+        "3 4 8",
+        "3 8 7",
+        "1 3 7",
+        "1 7 5",
+        "2 6 8",
+        "2 8 4",
+    )
+)
 URDF = """<robot name="bar">
   <link name="base"/>
   <link name="upper">

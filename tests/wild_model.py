@@ -42,10 +42,14 @@ def wild_model(folder: Path, robot: RobotSpec, answer: float) -> GapModel:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         torch.onnx.export(
-            WildNetwork(joints, answer), (torch.zeros(2, config.input_dim(joints)),), content,
-            input_names=["x"], output_names=["delta"], dynamo=False,
+            WildNetwork(joints, answer),
+            (torch.zeros(2, config.input_dim(joints)),),
+            content,
+            input_names=["x"],
+            output_names=["delta"],
+            dynamo=False,
             dynamic_axes={"x": {0: "batch"}, "delta": {0: "batch"}},
-        )  # fmt: skip
+        )
     (folder / "model").mkdir(parents=True)
     (folder / "model" / "model.onnx").write_bytes(content.getvalue())
     card = make_card(config, robot, dt=[robot.dt], payload_seen=[0.0, 0.2])

@@ -249,8 +249,12 @@ def test_a_consent_other_than_true_writes_to_no_servo(answer, bus, nobody, tmp_p
     options = gp.RunOptions(connection=gp.Connection(port=port), control=ControlConfig(rate=4.0))
     with pytest.raises(UsageError, match="commanded"):
         gp.run_robot(
-            motion=tmp_path / "first.csv", driver="so101", options=options, consent=consent, report=SilentReporter()
-        )  # fmt: skip
+            motion=tmp_path / "first.csv",
+            driver="so101",
+            options=options,
+            consent=consent,
+            report=SilentReporter(),
+        )
     assert "will move as planned" in statements[0]
     assert not any(request[4] in WRITES for request in servos.heard)
 

@@ -6,10 +6,17 @@ from gaponet.base.text import escape_markdown, format_uncertainty
 
 @pytest.mark.parametrize(
     ("value", "error", "text"),
-    [(7.43e-5, 1.3, "0.0 ± 1.3"), (320.4, 168.0, "320 ± 170"), (19.63, 0.912, "19.63 ± 0.91"),
-     (-0.01234, 0.00071, "-0.01234 ± 0.00071"), (1234.0, 5678.0, "1200 ± 5700"), (2.0, float("nan"), "2.000 ± nan"),
-     (5.0, 3e4, "5 ± ?"), (-0.2, 26.0, "0 ± 26")],
-)  # fmt: skip
+    [
+        (7.43e-5, 1.3, "0.0 ± 1.3"),
+        (320.4, 168.0, "320 ± 170"),
+        (19.63, 0.912, "19.63 ± 0.91"),
+        (-0.01234, 0.00071, "-0.01234 ± 0.00071"),
+        (1234.0, 5678.0, "1200 ± 5700"),
+        (2.0, float("nan"), "2.000 ± nan"),
+        (5.0, 3e4, "5 ± ?"),
+        (-0.2, 26.0, "0 ± 26"),
+    ],
+)
 def test_the_standard_error_determines_the_digits(value, error, text):
     assert format_uncertainty(value, error) == text
 

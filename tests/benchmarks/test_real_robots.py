@@ -79,8 +79,15 @@ def test_repetitions_count_as_one_motion_set_the_floor_and_are_evaluated_once(
 
 
 def test_the_table_has_paired_differences_to_identification_over_motions():
-    common = {"set": "a", "question": "b", "standard_error": 0.5, "of_nominal": 0.5, "less_than_nominal": 0.0,
-              "floor_mrad": None, "motions": 3}  # fmt: skip
+    common = {
+        "set": "a",
+        "question": "b",
+        "standard_error": 0.5,
+        "of_nominal": 0.5,
+        "less_than_nominal": 0.0,
+        "floor_mrad": None,
+        "motions": 3,
+    }
     by_motion = {
         "identification": [1.0, 2.0, 9.0],
         "rival": [2.0, 3.0, 10.0],

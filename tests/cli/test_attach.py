@@ -60,9 +60,10 @@ def test_a_policy_is_corrected_by_what_was_attached_last_and_by_nothing_after_of
     assert main(["export", str(known), "--to", "lerobot", "--into", str(policy), "--remove"]) == 0
     assert json.loads(file.read_text()) == POLICY
     for into, holder, said in (
-        ([], known, "with --into POLICY"), (["--into", str(tmp_path)], known, "has no policy_postprocessor.json"),
+        ([], known, "with --into POLICY"),
+        (["--into", str(tmp_path)], known, "has no policy_postprocessor.json"),
         (["--into", str(policy)], policy, "is neither a robot folder"),
-    ):  # fmt: skip
+    ):
         assert main(["export", str(holder), "--to", "lerobot", *into]) == 2
         assert said in capsys.readouterr().err
 

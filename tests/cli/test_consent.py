@@ -15,9 +15,15 @@ from gaponet.cli.main import main
 from gaponet.hw.control.consent import require_consent
 
 NO = {
-    "n": "n\n", "quit": "quit\n", "enter": "\n", "escape": "\x1b\n", "y": "y\n", "yes and more": "yes no\n",
-    "end of file": "\x04", "end of file behind the word": "yes\x04",
-}  # fmt: skip
+    "n": "n\n",
+    "quit": "quit\n",
+    "enter": "\n",
+    "escape": "\x1b\n",
+    "y": "y\n",
+    "yes and more": "yes no\n",
+    "end of file": "\x04",
+    "end of file behind the word": "yes\x04",
+}
 
 
 class Person(io.StringIO):

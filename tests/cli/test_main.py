@@ -54,10 +54,13 @@ def test_a_fault_that_a_virtual_robot_does_not_have_is_refused(capsys):
     assert "--fault stop: only h1_2 has faults" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(("words", "message"), [
-    (["identify", "data", "--threads", "-2"], "--threads -2: give at least 0"),
-    (["excite", "--robot", "so101", "--minutes", "nan"], "--minutes nan: give a number"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["identify", "data", "--threads", "-2"], "--threads -2: give at least 0"),
+        (["excite", "--robot", "so101", "--minutes", "nan"], "--minutes nan: give a number"),
+    ],
+)
 def test_a_number_without_a_meaning_is_refused(words, message, tmp_path, capsys):
     assert main([*words, "--out", str(tmp_path / "out")]) == 2
     assert message in capsys.readouterr().err

@@ -73,47 +73,136 @@ SPIKY = at(at(0.3 * wave(ROWS, 2), 100, 4.5, 1), slice(300, 302), -3.0, 0)
 SLOW = wave(ROWS, 2, 0.02, amplitude=0.4, hertz=0.05)
 # What a recording holds instead of command u and state q; check, level and words of the finding.
 FAULTS = {
-    "mirrored": (lambda u, q: {"qpos": q * ELBOW}, "sign", "error", "elbow moves against its command"),
-    "degrees": (lambda u, q: {"qpos": q * DEGREES}, "unit", "error", "elbow moves 57.3 times as far as commanded"),
-    "a command in rad, read as degrees": (lambda u, q: {"ctrl": u / DEGREES}, "unit", "error",
-                                          "elbow moves 57.3 times as far as commanded"),
-    "velocity in degrees": (lambda u, q: {"qvel": np.gradient(q, 0.02, axis=0) * DEGREES}, "unit", "warning",
-                            "recorded velocity of elbow is 57.3 times the derivative of its position"),
-    "another scale": (lambda u, q: {"qpos": q * [1, 1.3]}, "unit", "warning",
-                      "elbow goes 1.30 rad where its command goes 1 rad: another scale"),
-    "the state as command": (lambda u, q: {"ctrl": q}, "copied", "error",
-                             "command and state of shoulder, elbow are the same numbers in m: one was logged as both"),
-    "the next position as command": (lambda u, q: {"ctrl": np.roll(q, -1, axis=0)}, "copied", "error",
-                                     "the command of shoulder, elbow is the recorded position 1 row later"),
-    "the last command as position": (lambda u, q: {"qpos": np.roll(u, 1, axis=0)}, "copied", "error",
-                                     "the command of shoulder, elbow is the recorded position 1 row later"),
-    "the coming command as position": (lambda u, q: {"qpos": np.roll(u, -2, axis=0)}, "copied", "error",
-                                       "the position of shoulder, elbow is the command 2 rows later"),
-    "velocities as commands": (lambda u, q: {"ctrl": np.gradient(u, 0.02, axis=0)}, "command", "error",
-                               "no position targets; they are most like velocities"),
-    "one sample off": (lambda u, q: {"qpos": at(q, 200, q[200, 1] + 1.0, 1)}, "jumps", "warning",
-                       "elbow jumps and comes back faster than any motor in 3 rows of m"),
-    "beyond the range": (lambda u, q: {"ctrl": u + BEYOND, "qpos": q + BEYOND}, "range", "warning",
-                         "the simulator clips there"),
-    "does not move": (lambda u, q: {"qpos": q * [1, 0]}, "stuck", "error",
-                      "elbow does not move when commanded in m: unplugged, torque off or not read"),
-    "repeats itself": (lambda u, q: {"qpos": at(q, slice(100, 121), q[100]), "qvel": at(q, slice(100, 121), q[100])},
-                       "stuck", "warning", "the whole state repeats itself for up to 0.40 s"),
-    "never commanded": (lambda u, q: {"ctrl": u * [1, 0], "qpos": q * [1, 0]}, "order", "warning",
-                        "no motion commands elbow"),
-    "runs into a stop": (lambda u, q: {"qpos": np.minimum(q, [0.1, 9])}, "blocked", "warning",
-                         "shoulder stood at 0.10 rad for"),
-    "slow": (lambda u, q: {"ctrl": SLOW, "qpos": late(SLOW, 3)}, "lag", "note",
-             "nothing is commanded faster than 0.3 rad/s"),
-    "unsigned torque": (lambda u, q: {"tau": np.abs(wave(ROWS, 2))}, "torque", "warning",
-                        "torque is unsigned (never negative"),
-    "torque spikes": (lambda u, q: {"tau": SPIKY}, "torque", "warning",
-                      "torque spikes: 3 samples in m; worst 4.50 N·m on elbow in m"),
-    "torque beyond the limit": (lambda u, q: {"tau": np.clip(40 * wave(ROWS, 2), -9, 9)}, "saturation", "warning",
-                                "worst 9.00 N·m on shoulder (limit 5.00)"),
-    "constant torque": (lambda u, q: {"tau": np.zeros((ROWS, 2))}, "torque", "warning",
-                        "torque of shoulder, elbow never changes; ignore it"),
-}  # fmt: skip
+    "mirrored": (
+        lambda u, q: {"qpos": q * ELBOW},
+        "sign",
+        "error",
+        "elbow moves against its command",
+    ),
+    "degrees": (
+        lambda u, q: {"qpos": q * DEGREES},
+        "unit",
+        "error",
+        "elbow moves 57.3 times as far as commanded",
+    ),
+    "a command in rad, read as degrees": (
+        lambda u, q: {"ctrl": u / DEGREES},
+        "unit",
+        "error",
+        "elbow moves 57.3 times as far as commanded",
+    ),
+    "velocity in degrees": (
+        lambda u, q: {"qvel": np.gradient(q, 0.02, axis=0) * DEGREES},
+        "unit",
+        "warning",
+        "recorded velocity of elbow is 57.3 times the derivative of its position",
+    ),
+    "another scale": (
+        lambda u, q: {"qpos": q * [1, 1.3]},
+        "unit",
+        "warning",
+        "elbow goes 1.30 rad where its command goes 1 rad: another scale",
+    ),
+    "the state as command": (
+        lambda u, q: {"ctrl": q},
+        "copied",
+        "error",
+        "command and state of shoulder, elbow are the same numbers in m: one was logged as both",
+    ),
+    "the next position as command": (
+        lambda u, q: {"ctrl": np.roll(q, -1, axis=0)},
+        "copied",
+        "error",
+        "the command of shoulder, elbow is the recorded position 1 row later",
+    ),
+    "the last command as position": (
+        lambda u, q: {"qpos": np.roll(u, 1, axis=0)},
+        "copied",
+        "error",
+        "the command of shoulder, elbow is the recorded position 1 row later",
+    ),
+    "the coming command as position": (
+        lambda u, q: {"qpos": np.roll(u, -2, axis=0)},
+        "copied",
+        "error",
+        "the position of shoulder, elbow is the command 2 rows later",
+    ),
+    "velocities as commands": (
+        lambda u, q: {"ctrl": np.gradient(u, 0.02, axis=0)},
+        "command",
+        "error",
+        "no position targets; they are most like velocities",
+    ),
+    "one sample off": (
+        lambda u, q: {"qpos": at(q, 200, q[200, 1] + 1.0, 1)},
+        "jumps",
+        "warning",
+        "elbow jumps and comes back faster than any motor in 3 rows of m",
+    ),
+    "beyond the range": (
+        lambda u, q: {"ctrl": u + BEYOND, "qpos": q + BEYOND},
+        "range",
+        "warning",
+        "the simulator clips there",
+    ),
+    "does not move": (
+        lambda u, q: {"qpos": q * [1, 0]},
+        "stuck",
+        "error",
+        "elbow does not move when commanded in m: unplugged, torque off or not read",
+    ),
+    "repeats itself": (
+        lambda u, q: {
+            "qpos": at(q, slice(100, 121), q[100]),
+            "qvel": at(q, slice(100, 121), q[100]),
+        },
+        "stuck",
+        "warning",
+        "the whole state repeats itself for up to 0.40 s",
+    ),
+    "never commanded": (
+        lambda u, q: {"ctrl": u * [1, 0], "qpos": q * [1, 0]},
+        "order",
+        "warning",
+        "no motion commands elbow",
+    ),
+    "runs into a stop": (
+        lambda u, q: {"qpos": np.minimum(q, [0.1, 9])},
+        "blocked",
+        "warning",
+        "shoulder stood at 0.10 rad for",
+    ),
+    "slow": (
+        lambda u, q: {"ctrl": SLOW, "qpos": late(SLOW, 3)},
+        "lag",
+        "note",
+        "nothing is commanded faster than 0.3 rad/s",
+    ),
+    "unsigned torque": (
+        lambda u, q: {"tau": np.abs(wave(ROWS, 2))},
+        "torque",
+        "warning",
+        "torque is unsigned (never negative",
+    ),
+    "torque spikes": (
+        lambda u, q: {"tau": SPIKY},
+        "torque",
+        "warning",
+        "torque spikes: 3 samples in m; worst 4.50 N·m on elbow in m",
+    ),
+    "torque beyond the limit": (
+        lambda u, q: {"tau": np.clip(40 * wave(ROWS, 2), -9, 9)},
+        "saturation",
+        "warning",
+        "worst 9.00 N·m on shoulder (limit 5.00)",
+    ),
+    "constant torque": (
+        lambda u, q: {"tau": np.zeros((ROWS, 2))},
+        "torque",
+        "warning",
+        "torque of shoulder, elbow never changes; ignore it",
+    ),
+}
 
 
 @pytest.mark.parametrize("fault", FAULTS)
@@ -189,11 +278,20 @@ def lively(seed: int) -> tuple[np.ndarray, np.ndarray]:
     return ctrl, late(lowpass(ctrl, 0.02, 4.0), 4)
 
 
-@pytest.mark.parametrize(("odd", "check", "words"), [
-    (lambda i, q: np.stack([np.interp(np.arange(len(q)) * 1.003, np.arange(len(q)), c) for c in q.T], axis=1),
-     "clock", "each recording follows its commands sooner"),
-    (lambda i, q: late(q, 3) if i == 2 else q, "lag", "m2 (a, 0 kg) follows its commands"),
-], ids=["clocks that drift", "one late recording"])  # fmt: skip
+@pytest.mark.parametrize(
+    ("odd", "check", "words"),
+    [
+        (
+            lambda i, q: np.stack(
+                [np.interp(np.arange(len(q)) * 1.003, np.arange(len(q)), c) for c in q.T], axis=1
+            ),
+            "clock",
+            "each recording follows its commands sooner",
+        ),
+        (lambda i, q: late(q, 3) if i == 2 else q, "lag", "m2 (a, 0 kg) follows its commands"),
+    ],
+    ids=["clocks that drift", "one late recording"],
+)
 def test_times_that_do_not_belong_together_are_found_and_others_are_left_alone(
     arm, tmp_path, odd, check, words
 ):

@@ -89,8 +89,10 @@ def test_other_payloads_and_units_are_appended(logs, so101, tmp_path):
             ImportRequest(unit_id=unit, payload_mass=mass, payload_side=side),
         )
     assert [(e.meta.unit_id, e.meta.payload_mass) for e in report.dataset.entries[1:]] == [
-        ("lab", 0.0), ("lab", 0.2), ("roof", 0.0),
-    ]  # fmt: skip
+        ("lab", 0.0),
+        ("lab", 0.2),
+        ("roof", 0.0),
+    ]
 
 
 @pytest.mark.parametrize(("unit", "mass"), [("lab", 0.2), ("roof", 0.0)])

@@ -269,8 +269,12 @@ def test_motions_with_equal_commands_are_one_motion_for_every_split(arm, tmp_pat
     journal.write_text("".join(json.dumps(line) + "\n" for line in old))
     data = Dataset(data.path)
     assert len(set(canonical_motions(data).values())) == 12
-    for parts in (split_entries(data), make_split(data, "motion"), make_split(data, "motion", ("lift3_1kg",)),
-                  make_split(data, "payload", ("1",))):  # fmt: skip
+    for parts in (
+        split_entries(data),
+        make_split(data, "motion"),
+        make_split(data, "motion", ("lift3_1kg",)),
+        make_split(data, "payload", ("1",)),
+    ):
         sides = {
             part: {re.sub("_.*", "", e.meta.motion) for e in entries}
             for part, entries in parts.items()
@@ -324,8 +328,12 @@ def test_one_command_played_again_is_split_by_repetition_and_long_logs_by_time(a
         tmp_path / "cut",
         ImportRequest(unit_id="a", payload_mass=0.0, cut=4.0, position_unit="rad", time_unit="s"),
     )
-    assert [(e.meta.motion, e.rows) for e in report.entries] == [("long@0s", 225), ("long@4s", 225), ("long@9s", 225),
-                                                                 ("long@14s", 225)]  # fmt: skip
+    assert [(e.meta.motion, e.rows) for e in report.entries] == [
+        ("long@0s", 225),
+        ("long@4s", 225),
+        ("long@9s", 225),
+        ("long@14s", 225),
+    ]
     rested = arm_columns(900) | {k: np.zeros(900) for k in arm_columns() if k != "time"}
     (tmp_path / "rest.csv").write_text(table_text(rested))
     how = {"cut": 4.0, "position_unit": "rad", "time_unit": "s"}

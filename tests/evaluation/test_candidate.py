@@ -91,10 +91,14 @@ def test_a_robot_that_is_not_identified_is_refused(arm, data, tmp_path):
 def scores(**errors):
     """Metrics of methods from their errors in two motions, mrad."""
     joint = lambda e: {"elbow": {"mpjae": e / 1e3}}  # noqa: E731
-    return {name.replace("_", "+"): {
-        "mpjae": sum(e) / 2e3, "by_joint": joint(sum(e) / 2),
-        "by_independent_motion": {f"m{i}": {"mpjae": x / 1e3} for i, x in enumerate(e)},
-    } for name, e in errors.items()}  # fmt: skip
+    return {
+        name.replace("_", "+"): {
+            "mpjae": sum(e) / 2e3,
+            "by_joint": joint(sum(e) / 2),
+            "by_independent_motion": {f"m{i}": {"mpjae": x / 1e3} for i, x in enumerate(e)},
+        }
+        for name, e in errors.items()
+    }
 
 
 def test_the_verdict_states_the_gain_of_a_network_even_if_it_is_zero(tmp_path):

@@ -48,8 +48,15 @@ def test_the_floor_is_what_two_repetitions_differ_by(tmp_path):
 def test_every_kind_of_model_has_its_bar(kind):
     steps = {"nominal": 0.01, "delay": 0.008, "offset": 0.007, "identified": 0.004, kind: 0.002}
     floor = {"encoder": 0.0005, "repeatability": None, "both": 0.0005}
-    found = {"left": steps, "floor": floor, "by_joint": {"elbow_joint": {"left": steps, "floor": floor}},
-             "virtual": True, "robot": "arm", "sequences": 3, "unseen": True}  # fmt: skip
+    found = {
+        "left": steps,
+        "floor": floor,
+        "by_joint": {"elbow_joint": {"left": steps, "floor": floor}},
+        "virtual": True,
+        "robot": "arm",
+        "sequences": 3,
+        "unseen": True,
+    }
     ax = waterfall(found).axes[0]
     ticks = [t.get_text() for t in ax.get_yticklabels()]
     assert ticks == [*map(title, steps), "remaining"]
@@ -131,8 +138,12 @@ def test_a_motion_that_repeats_itself_tells_repeatability(tmp_path):
     once = recordings(robot, 1, rows=60)[0]
     start, noise = once.ctrl[:1] + 0.3, np.random.default_rng(1).normal(0, 0.002, (270, 2))
     qpos = np.concatenate([np.tile(once.qpos, (5, 1))[:270] + noise, once.qpos[:1]])
-    thrice = replace(once, ctrl=np.tile(once.ctrl, (5, 1))[:270], qpos=qpos[:270].astype(np.float32),
-                     qvel=np.zeros((270, 2), np.float32))  # fmt: skip
+    thrice = replace(
+        once,
+        ctrl=np.tile(once.ctrl, (5, 1))[:270],
+        qpos=qpos[:270].astype(np.float32),
+        qvel=np.zeros((270, 2), np.float32),
+    )
     assert [len(p) for p in Repetitions.periods(thrice)] == [
         60,
         60,

@@ -16,17 +16,30 @@ from gaponet.evaluation.run_files import (
 
 PART = {"mpjae": 0.01}
 JOINT = PART | {"static": 0.01, "dynamic": 0.01}
-SCORES = dict.fromkeys(("mpjae", "rmse", "q_dis", "static", "dynamic", "large_0.05", "large_0.1"), 0.01) | {
-    "correlation": None, "by_joint": {"elbow": JOINT}, "by_payload": {"0.5": PART}, "by_motion": {"wave": PART},
-    "by_independent_motion": {"wave": PART}, "by_horizon": {"1": PART, "whole": PART},
-}  # fmt: skip
+SCORES = dict.fromkeys(
+    ("mpjae", "rmse", "q_dis", "static", "dynamic", "large_0.05", "large_0.1"), 0.01
+) | {
+    "correlation": None,
+    "by_joint": {"elbow": JOINT},
+    "by_payload": {"0.5": PART},
+    "by_motion": {"wave": PART},
+    "by_independent_motion": {"wave": PART},
+    "by_horizon": {"1": PART, "whole": PART},
+}
 METRICS = {
-    "methods": {"nominal": SCORES, "gaponet": SCORES}, "ratio_to_nominal": {"nominal": 1.0, "gaponet": 0.5},
-    "dataset": "d", "sequences": 1, "motions": ["wave"], "unseen": True, "virtual": False, "robot": "arm",
-    "simulator_hash": "0123", "delta": {"gaponet": {"max": 0.1, "mean": 0.1}},
+    "methods": {"nominal": SCORES, "gaponet": SCORES},
+    "ratio_to_nominal": {"nominal": 1.0, "gaponet": 0.5},
+    "dataset": "d",
+    "sequences": 1,
+    "motions": ["wave"],
+    "unseen": True,
+    "virtual": False,
+    "robot": "arm",
+    "simulator_hash": "0123",
+    "delta": {"gaponet": {"max": 0.1, "mean": 0.1}},
     "artifacts": {"gaponet": {"weights": "0123", "seed": 0}},
     "shown": [{"motion": "wave", "unit_id": "a", "payload_mass": 0.5, "dt": 0.02}],
-}  # fmt: skip
+}
 
 
 def changed(*path, value):
@@ -77,9 +90,11 @@ def test_damaged_metrics_are_refused(tmp_path, metrics, said):
 )
 def test_trajectories_of_other_sizes_are_refused(tmp_path, bad):
     good = np.zeros((5, 2), np.float32)
-    np.savez(tmp_path / "trajectories.npz", **{f"0/{m}": good for m in ("recorded", "command", "nominal")}, **{
-        "0/gaponet": bad.astype(np.float32)
-    })  # fmt: skip
+    np.savez(
+        tmp_path / "trajectories.npz",
+        **{f"0/{m}": good for m in ("recorded", "command", "nominal")},
+        **{"0/gaponet": bad.astype(np.float32)},
+    )
     with pytest.raises(ModelError, match=r"trajectories\.npz: "):
         read_trajectories(tmp_path, METRICS, 2)
 

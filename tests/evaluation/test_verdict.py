@@ -10,9 +10,13 @@ def scores(*errors, motions):
     by_motion = {f"chirp@{i}": {"mpjae": e} for i, e in enumerate(errors)}
     grouped = np.array_split(errors, motions)
     return {
-        "mpjae": float(np.mean(errors)), "by_joint": {"elbow": {"mpjae": 1.0}}, "by_motion": by_motion,
-        "by_independent_motion": {f"chirp{i}": {"mpjae": float(np.mean(e))} for i, e in enumerate(grouped)},
-    }  # fmt: skip
+        "mpjae": float(np.mean(errors)),
+        "by_joint": {"elbow": {"mpjae": 1.0}},
+        "by_motion": by_motion,
+        "by_independent_motion": {
+            f"chirp{i}": {"mpjae": float(np.mean(e))} for i, e in enumerate(grouped)
+        },
+    }
 
 
 @pytest.mark.parametrize(

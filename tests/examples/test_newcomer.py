@@ -48,8 +48,11 @@ def test_the_robot_of_the_page_is_recorded(tmp_path, monkeypatch):
     monkeypatch.chdir(ROOT)
     collect, *others = COMMANDS
     assert [c[1] for c in others] == ["identify", "identify", "gap"]
-    (tmp_path / "short.toml").write_text((ROOT / "examples" / "friction_motions.toml").read_text().replace(
-        '"tour-all-*", "creep-*", "multisine-*"', '"multisine-shoulder_pan"'))  # fmt: skip
+    (tmp_path / "short.toml").write_text(
+        (ROOT / "examples" / "friction_motions.toml")
+        .read_text()
+        .replace('"tour-all-*", "creep-*", "multisine-*"', '"multisine-shoulder_pan"')
+    )
     words = [
         {"examples/friction_motions.toml": str(tmp_path / "short.toml")}.get(w, w)
         for w in collect[1:]

@@ -19,9 +19,11 @@ from mjlab.scene import SceneCfg
 from mjlab.sim import SimulationCfg
 
 KINDS = {
-    "jnt": mujoco.mjtObj.mjOBJ_JOINT, "dof": mujoco.mjtObj.mjOBJ_JOINT, "body": mujoco.mjtObj.mjOBJ_BODY,
+    "jnt": mujoco.mjtObj.mjOBJ_JOINT,
+    "dof": mujoco.mjtObj.mjOBJ_JOINT,
+    "body": mujoco.mjtObj.mjOBJ_BODY,
     "actuator": mujoco.mjtObj.mjOBJ_ACTUATOR,
-}  # fmt: skip
+}
 NOT_COMPARED = (
     "id",
     "adr",

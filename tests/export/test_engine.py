@@ -362,12 +362,14 @@ def isaac_lab(monkeypatch):
         use_default_offset: bool = True
 
     modules = {
-        "isaaclab": {}, "isaaclab.envs": {}, "isaaclab.envs.mdp.actions": {},
+        "isaaclab": {},
+        "isaaclab.envs": {},
+        "isaaclab.envs.mdp.actions": {},
         "isaaclab.utils": {"configclass": dataclass},
         "isaaclab.actuators": {"IdealPDActuatorCfg": Servos, "DCMotorCfg": Motors},
         "isaaclab.envs.mdp": {"JointPositionActionCfg": Config},
         "isaaclab.envs.mdp.actions.joint_actions": {"JointPositionAction": JointPositionAction},
-    }  # fmt: skip
+    }
     for name, content in modules.items():
         monkeypatch.setitem(sys.modules, name, SimpleNamespace(**content))
 

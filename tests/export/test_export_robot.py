@@ -101,8 +101,12 @@ def lawful(robot):
 def mine(tmp_path):
     """A user's scene: includes, degrees, defaults, a mesh, a tendon, sensors, a keyframe, a servo and a body before."""
     folder = tmp_path / "mine"
-    for name, text in {"scene.xml": MAIN.format(step=0.005), "parts/defaults.xml": DEFAULTS, "parts/arm.xml": ARM,
-                       "meshes/wedge.obj": WEDGE}.items():  # fmt: skip
+    for name, text in {
+        "scene.xml": MAIN.format(step=0.005),
+        "parts/defaults.xml": DEFAULTS,
+        "parts/arm.xml": ARM,
+        "meshes/wedge.obj": WEDGE,
+    }.items():
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_text(text)
     return folder / "scene.xml"

@@ -24,9 +24,11 @@ MJLAB = "mjlab==1.6.*"
 PERIODS, WORLDS, TOLERANCE = 50, 8, 1e-4  # rad
 SINGLE = 1e-6  # relative: the device has single precision
 KINDS = {
-    "jnt": mujoco.mjtObj.mjOBJ_JOINT, "dof": mujoco.mjtObj.mjOBJ_JOINT, "body": mujoco.mjtObj.mjOBJ_BODY,
+    "jnt": mujoco.mjtObj.mjOBJ_JOINT,
+    "dof": mujoco.mjtObj.mjOBJ_JOINT,
+    "body": mujoco.mjtObj.mjOBJ_BODY,
     "actuator": mujoco.mjtObj.mjOBJ_ACTUATOR,
-}  # fmt: skip
+}
 
 
 @pytest.fixture(scope="module")

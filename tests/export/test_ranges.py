@@ -43,8 +43,15 @@ ERRORS = np.array([0.05, 0.001, 1e-4, 1e-4, 2e-3, 1e-3])
 
 def source(values, unit="a", days=()):
     covariance = {j: [[0.0] * len(FIELDS)] * len(FIELDS) for j in values}
-    return {"made_by": "identify", "days": days, "unit": unit, "logs": {}, "seconds": 60.0,
-            "values": {j: tuple(v) for j, v in values.items()}, "covariance": covariance}  # fmt: skip
+    return {
+        "made_by": "identify",
+        "days": days,
+        "unit": unit,
+        "logs": {},
+        "seconds": 60.0,
+        "values": {j: tuple(v) for j, v in values.items()},
+        "covariance": covariance,
+    }
 
 
 def written(arm, folder, servo=SERVO_FIELDS, errors=ERRORS, sources=1, links=None):

@@ -80,9 +80,13 @@ class Robot2(Robot):
         self.note("armature", armature, joint_ids, env_ids)
 
     def write_joint_friction_coefficient_to_sim(
-        self, joint_friction_coeff, joint_dynamic_friction_coeff=None, joint_viscous_friction_coeff=None,
-        joint_ids=None, env_ids=None,
-    ):  # fmt: skip
+        self,
+        joint_friction_coeff,
+        joint_dynamic_friction_coeff=None,
+        joint_viscous_friction_coeff=None,
+        joint_ids=None,
+        env_ids=None,
+    ):
         self.note("frictionloss", joint_friction_coeff, joint_ids, env_ids)
         self.note("dynamic", joint_dynamic_friction_coeff, joint_ids, env_ids)
         self.note("damping", joint_viscous_friction_coeff, joint_ids, env_ids)
@@ -106,9 +110,14 @@ class Robot3(Robot):
         self.note("armature", armature, joint_ids, env_ids)
 
     def write_joint_friction_coefficient_to_sim_index(
-        self, *, joint_friction_coeff, joint_dynamic_friction_coeff=None, joint_viscous_friction_coeff=None,
-        joint_ids=None, env_ids=None,
-    ):  # fmt: skip
+        self,
+        *,
+        joint_friction_coeff,
+        joint_dynamic_friction_coeff=None,
+        joint_viscous_friction_coeff=None,
+        joint_ids=None,
+        env_ids=None,
+    ):
         assert joint_dynamic_friction_coeff is None  # it would warn
         self.note("frictionloss", joint_friction_coeff, joint_ids, env_ids)
         self.note("damping", joint_viscous_friction_coeff, joint_ids, env_ids)

@@ -77,8 +77,11 @@ def require_sane(dataset: Dataset, robot: RobotSpec, inside: Path) -> None:
         sequence = dataset.read(entry)
         if not 1e-4 <= sequence.dt <= 1 or not 2 <= len(sequence) <= MOST_ROWS:
             raise AbsurdError(f"{entry.id}: {len(sequence)} rows of {sequence.dt} s")
-        source = (inside.parent / entry.meta.source.rpartition("#")[0] if "#" in entry.meta.source
-                  else inside.parent / entry.meta.source).resolve()  # fmt: skip
+        source = (
+            inside.parent / entry.meta.source.rpartition("#")[0]
+            if "#" in entry.meta.source
+            else inside.parent / entry.meta.source
+        ).resolve()
         if not source.is_relative_to(inside.parent.resolve()) and not entry.meta.virtual:
             raise AbsurdError(f"{entry.id}: read from {source}, outside {inside}")
         for name in entry.channels:
@@ -220,22 +223,55 @@ def _read_recipe(source: Path, out: Path) -> None:
 
 
 TARGETS = (
-    Target("sage", written(lambda f: write_so101(f / "real" / "so101" / "wave", ROWS)), importing(so101), 2.0),
+    Target(
+        "sage",
+        written(lambda f: write_so101(f / "real" / "so101" / "wave", ROWS)),
+        importing(so101),
+        2.0,
+    ),
     Target("table", written(_tables), importing(arm, position_unit="rad", time_unit="s"), 2.0),
     Target("parquet", written(_parquet), importing(arm, position_unit="rad", time_unit="s"), 1.5),
-    Target("logs.toml", written(_mapped), importing(arm, "logs", logs="map.toml"), 1.0, (".toml", "a.csv")),
+    Target(
+        "logs.toml",
+        written(_mapped),
+        importing(arm, "logs", logs="map.toml"),
+        1.0,
+        (".toml", "a.csv"),
+    ),
     Target("described", written(_described), importing(arm, stated="payload"), 1.0),
     Target("rosbag", written(lambda f: write_bag(f / "bag", "mcap", rows=20)), importing(arm), 1.5),
-    Target("db3", written(lambda f: write_bag(f / "bag", "db3", rows=20)), importing(arm), 1.0, (".db3", ".yaml")),
+    Target(
+        "db3",
+        written(lambda f: write_bag(f / "bag", "db3", rows=20)),
+        importing(arm),
+        1.0,
+        (".db3", ".yaml"),
+    ),
     Target("hdf5", written(write_aloha), importing(arm), 1.0, (".hdf5",)),
     Target("npz", written(write_npz), importing(arm), 1.0, (".npz",)),
     Target("gaponet npz", written(write_gaponet), importing(arm, stated="payload"), 1.0, (".npz",)),
     Target("mat", written(write_mat), importing(arm), 0.05, (".mat",)),
     Target("pt", written(write_pace), importing(arm), 0.7, (".pt",)),
     Target("asap", written(write_asap), importing(arm, allow_pickle=True), 1.0, (".pkl",)),
-    Target("lerobot", written(lambda f: stock(f / "set", rows=(25, 15))), importing(so101, position_unit="deg"), 2.5),
-    Target("bam", written(lambda f: write_bam(f / "a.json", ROWS, 30)), importing(bench, stated="payload"), 1.0),
+    Target(
+        "lerobot",
+        written(lambda f: stock(f / "set", rows=(25, 15))),
+        importing(so101, position_unit="deg"),
+        2.5,
+    ),
+    Target(
+        "bam",
+        written(lambda f: write_bam(f / "a.json", ROWS, 30)),
+        importing(bench, stated="payload"),
+        1.0,
+    ),
     Target("export", written(_export), importing(arm, "set", stated="all", format="lerobot"), 2.0),
     Target("motion", written(_motions), _read_motions, 1.5),
-    Target("recipe", written(lambda f: (f / "mine.toml").write_text(RECIPE)), _read_recipe, 0.7, (".toml",)),
-)  # fmt: skip
+    Target(
+        "recipe",
+        written(lambda f: (f / "mine.toml").write_text(RECIPE)),
+        _read_recipe,
+        0.7,
+        (".toml",),
+    ),
+)

@@ -113,11 +113,24 @@ def _fitted() -> Files:
         net = build_network(config, 2).eval()
         torch.nn.init.normal_(net.trunk[-1].weight, std=0.1)
         card = make_card(
-            config, arm(), dt=[0.02], payload_seen=[0.0, 0.5], units=["a"], virtual=False, dataset_hash="0123",
-            hours=0.1, motions={"train": ["m0"], "val": ["m1"], "test": ["m2"]}, seed=0, excess_delay=0.02, steps=1,
-            val_mpjae={"model": 0.01, "nominal": 0.02}, sensor_r2=None, seconds=1.0, interrupted=False,
+            config,
+            arm(),
+            dt=[0.02],
+            payload_seen=[0.0, 0.5],
+            units=["a"],
+            virtual=False,
+            dataset_hash="0123",
+            hours=0.1,
+            motions={"train": ["m0"], "val": ["m1"], "test": ["m2"]},
+            seed=0,
+            excess_delay=0.02,
+            steps=1,
+            val_mpjae={"model": 0.01, "nominal": 0.02},
+            sensor_r2=None,
+            seconds=1.0,
+            interrupted=False,
             versions={"gaponet": "0"},
-        )  # fmt: skip
+        )
         export(net, folder / "model", card, np.zeros((4, net.features.dim), np.float32))
         weights = GapModel.load(folder).weights_hash()
         found = Adaptation("a", weights, {"elbow": {"kp": 1.0}}, ("0123456789",), 8.0, 0.1, 0.05)
@@ -139,8 +152,14 @@ def _evaluation(folder: Path) -> None:
         "sequences": 1,
         "robot": "arm",
     }
-    config = {"model": {"kind": "gaponet"}, "ppo": {"num_envs": 1, "epochs": 1, "std": 0.1}, "seed": 0,
-              "robot": "arm", "dataset": "../set", "dataset_hash": "0123"}  # fmt: skip
+    config = {
+        "model": {"kind": "gaponet"},
+        "ppo": {"num_envs": 1, "epochs": 1, "std": 0.1},
+        "seed": 0,
+        "robot": "arm",
+        "dataset": "../set",
+        "dataset_hash": "0123",
+    }
     line = {
         "stage": "ppo",
         "steps": 1,
@@ -150,8 +169,13 @@ def _evaluation(folder: Path) -> None:
         "nominal_mpjae": 0.2,
     }
     delays = {"delay": {"shoulder": 0.02, "elbow": 0.02}, "offset": {"shoulder": 0.0, "elbow": 0.0}}
-    for name, content in (("metrics", METRICS), ("gap", gap), ("config", config), ("delay_offset", delays),
-                          ("split", {"train": {"a": "0"}, "val": {"b": "1"}, "test": {"c": "2"}})):  # fmt: skip
+    for name, content in (
+        ("metrics", METRICS),
+        ("gap", gap),
+        ("config", config),
+        ("delay_offset", delays),
+        ("split", {"train": {"a": "0"}, "val": {"b": "1"}, "test": {"c": "2"}}),
+    ):
         (folder / f"{name}.json").write_text(json.dumps(content, indent=1))
     (folder / "progress.jsonl").write_text(2 * (json.dumps(line) + "\n"))
     arrays = {
@@ -221,4 +245,4 @@ TARGETS = (
     Target("model", _fitted, _use_model, 2.0, MODEL),
     Target("run", _fitted, _use_run, 2.0, RUN),
     Target("fleet", written(_fleet), _use_fleet, 0.7),
-)  # fmt: skip
+)

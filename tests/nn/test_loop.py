@@ -54,11 +54,13 @@ class FirstRow:
 @pytest.mark.parametrize(
     "how",
     [
-        {"stride": 2}, {"kind": "paper", "sensor_hold": 3}, {"kind": "paper", "sensor_source": "fixed"},
+        {"stride": 2},
+        {"kind": "paper", "sensor_hold": 3},
+        {"kind": "paper", "sensor_source": "fixed"},
         {"kind": "paper", "sensor_source": "fixed", "sensor_hold": 2},
     ],
     ids=["stride", "held sensors", "fixed probes", "held probes"],
-)  # fmt: skip
+)
 def test_training_and_rollout_give_the_network_the_same_inputs(tmp_path, how):
     robot = write_arm(tmp_path)
     config = ModelConfig(history=2, num_probes=3, **how)

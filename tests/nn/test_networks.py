@@ -18,10 +18,14 @@ def x(config, n, batch=7, scale=1.0):
 
 @pytest.mark.parametrize(
     "config",
-    [ModelConfig(), ModelConfig(kind="mlp"), ModelConfig(sensors="predicted"),
-     ModelConfig(payload_input=False, stride=2)],
+    [
+        ModelConfig(),
+        ModelConfig(kind="mlp"),
+        ModelConfig(sensors="predicted"),
+        ModelConfig(payload_input=False, stride=2),
+    ],
     ids=["gaponet", "mlp", "sensors", "no-payload"],
-)  # fmt: skip
+)
 def test_corrections_are_bounded_whatever_comes_in(config):
     net = build_network(config, 3)
     for p in net.parameters():

@@ -53,14 +53,28 @@ def artifact(robot, tmp_path_factory):
 @pytest.mark.parametrize(
     "how",
     [
-        {}, {"sensors": "predicted"}, {"payload_input": False}, {"branch_hidden": ()},
-        {"kind": "mlp", "mlp_hidden": (16, 8)}, {"kind": "mlp", "mlp_match": True}, {"kind": "shared_mlp"},
-        {"kind": "shared_mlp", "sensors": "predicted", "payload_input": False}, {"kind": "paper"},
-        {"kind": "paper", "branch_observation": True, "relative_action": True, "payload_trunk": False},
-        {"kind": "paper", "delta_hold": 3}, {"kind": "paper", "sensor_hold": 5}, {"kind": "paper", "stride": 2},
-        {"kind": "paper", "sensor_source": "learned"}, {"kind": "paper", "real_state": True},
+        {},
+        {"sensors": "predicted"},
+        {"payload_input": False},
+        {"branch_hidden": ()},
+        {"kind": "mlp", "mlp_hidden": (16, 8)},
+        {"kind": "mlp", "mlp_match": True},
+        {"kind": "shared_mlp"},
+        {"kind": "shared_mlp", "sensors": "predicted", "payload_input": False},
+        {"kind": "paper"},
+        {
+            "kind": "paper",
+            "branch_observation": True,
+            "relative_action": True,
+            "payload_trunk": False,
+        },
+        {"kind": "paper", "delta_hold": 3},
+        {"kind": "paper", "sensor_hold": 5},
+        {"kind": "paper", "stride": 2},
+        {"kind": "paper", "sensor_source": "learned"},
+        {"kind": "paper", "real_state": True},
     ],
-)  # fmt: skip
+)
 def test_the_onnx_file_equals_the_network(how):
     net = trained(n=3, **how)
     x = sample_inputs(net, 20)

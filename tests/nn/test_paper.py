@@ -48,9 +48,15 @@ def network(config=PAPER, n=2):
 
 @pytest.mark.parametrize(
     ("history", "payload", "trunk", "seen", "asked"),
-    [(2, False, True, 80, 10), (4, False, True, 140, 10), (6, False, True, 200, 10), (8, False, True, 260, 10),
-     (4, True, True, 141, 11), (4, True, False, 141, 10)],
-)  # fmt: skip
+    [
+        (2, False, True, 80, 10),
+        (4, False, True, 140, 10),
+        (6, False, True, 200, 10),
+        (8, False, True, 260, 10),
+        (4, True, True, 141, 11),
+        (4, True, False, 141, 10),
+    ],
+)
 def test_inputs_have_the_dimensions_of_table_2(history, payload, trunk, seen, asked):
     net = build_network(
         ModelConfig(kind="paper", history=history, payload_input=payload, payload_trunk=trunk), 10
@@ -334,14 +340,16 @@ def test_the_predictor_of_equation_1_is_fitted_and_ppo_does_not_train_it(tmp_pat
 
 @pytest.mark.parametrize(
     ("how", "word"),
-    [({"sensor_source": "none", "sensor_hold": 3}, "hold"),
-     ({"sensor_source": "none", "sensor_target": "absolute"}, "sensor"),
-     ({"predictor_inputs": "equation_1", "sensor_hold": 3}, "held"),
-     ({"predictor_inputs": "equation_1", "payload_input": False}, "payload_input"),
-     ({"predictor_inputs": "equation_1", "sensor_source": "none"}, "predicted"),
-     ({"predictor_inputs": "equation_1", "sensor_source": "fixed"}, "predicted"),
-     ({"predictor_inputs": "equation_1", "sensor_source": "learned"}, "predicted")],
-)  # fmt: skip
+    [
+        ({"sensor_source": "none", "sensor_hold": 3}, "hold"),
+        ({"sensor_source": "none", "sensor_target": "absolute"}, "sensor"),
+        ({"predictor_inputs": "equation_1", "sensor_hold": 3}, "held"),
+        ({"predictor_inputs": "equation_1", "payload_input": False}, "payload_input"),
+        ({"predictor_inputs": "equation_1", "sensor_source": "none"}, "predicted"),
+        ({"predictor_inputs": "equation_1", "sensor_source": "fixed"}, "predicted"),
+        ({"predictor_inputs": "equation_1", "sensor_source": "learned"}, "predicted"),
+    ],
+)
 def test_switches_that_contradict_each_other_are_refused(how, word):
     with pytest.raises(UsageError, match=word):
         replace(PAPER, **how)
@@ -476,10 +484,21 @@ def world(tmp_path_factory):
 
 @pytest.mark.parametrize(
     "how",
-    [{"delta_hold": 3, "branch_observation": True, "real_state": True}, {"sensor_source": "fixed", "sensor_hold": 3},
-     {"sensor_source": "learned"}, {"sensor_source": "none"}, {"predictor_inputs": "equation_1"}],
-    ids=["held correction and more inputs", "held fixed probes", "learned probes", "no sensors", "equation 1"],
-)  # fmt: skip
+    [
+        {"delta_hold": 3, "branch_observation": True, "real_state": True},
+        {"sensor_source": "fixed", "sensor_hold": 3},
+        {"sensor_source": "learned"},
+        {"sensor_source": "none"},
+        {"predictor_inputs": "equation_1"},
+    ],
+    ids=[
+        "held correction and more inputs",
+        "held fixed probes",
+        "learned probes",
+        "no sensors",
+        "equation 1",
+    ],
+)
 def test_it_trains_by_ppo_alone_and_a_resumed_run_equals_one_that_was_not_stopped(
     world, tmp_path, how
 ):

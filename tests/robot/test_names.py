@@ -11,8 +11,14 @@ from gaponet.robot.vendor import find_model
 @pytest.fixture
 def menagerie(tmp_path, monkeypatch):
     """A small collection with the layout of MuJoCo Menagerie."""
-    for file in ("franka_fr3/fr3.xml", "franka_fr3/scene.xml", "unitree_g1/g1.xml", "unitree_g1/g1_with_hands.xml",
-                 "two/a.xml", "two/b.xml"):  # fmt: skip
+    for file in (
+        "franka_fr3/fr3.xml",
+        "franka_fr3/scene.xml",
+        "unitree_g1/g1.xml",
+        "unitree_g1/g1_with_hands.xml",
+        "two/a.xml",
+        "two/b.xml",
+    ):
         place = tmp_path / "collection" / file
         place.parent.mkdir(parents=True, exist_ok=True)
         place.write_text(MJCF)

@@ -113,8 +113,14 @@ def test_gains_and_limits_come_from_actuators_with_their_gears_and_sources(tmp_p
     assert joints["roll"]["effort_limit"] == 1.5  # ctrlrange of a motor, times gear
     assert joints["shoulder"]["aliases"] == ["shoulder_servo"]
     text = (made.robot.folder / "robot.toml").read_text(encoding="utf-8")
-    for source in ("its actuator in vendor.xml", "actuatorfrcrange (in a URDF, effort) in vendor.xml",
-                   "# N·m/rad: --kp", 'keyframe "home"', "a guess: tcp", "vendor.xml has 0.004"):  # fmt: skip
+    for source in (
+        "its actuator in vendor.xml",
+        "actuatorfrcrange (in a URDF, effort) in vendor.xml",
+        "# N·m/rad: --kp",
+        'keyframe "home"',
+        "a guess: tcp",
+        "vendor.xml has 0.004",
+    ):
         assert source in text
 
 
@@ -195,8 +201,12 @@ def hand(*links: str) -> str:
 
 
 def test_impossible_inertias_are_replaced_with_a_note(tmp_path):
-    links = [LINK.format("left_arm", 1.0, 0.01, ""), LINK.format("left_palm", 0.5, 0, ""),
-             LINK.format("left_hand_a", 0, 0, ""), LINK.format("left_hand_b", 0.1, 1e-4, "")]  # fmt: skip
+    links = [
+        LINK.format("left_arm", 1.0, 0.01, ""),
+        LINK.format("left_palm", 0.5, 0, ""),
+        LINK.format("left_hand_a", 0, 0, ""),
+        LINK.format("left_hand_b", 0.1, 1e-4, ""),
+    ]
     (tmp_path / "r.urdf").write_text(hand(*links))
     made = make(tmp_path, tmp_path / "r.urdf")
     told = " ".join(made.notes)

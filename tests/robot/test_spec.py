@@ -56,8 +56,11 @@ def test_the_users_map_has_priority_over_aliases(so101):
 
 
 def test_an_unknown_joint_error_names_the_file_and_similar_joints(so101):
-    with pytest.raises(JointMismatchError, match=r"a\.csv names joint 'elbow', which robot 'so101' does not have; "
-                       r"nearest: elbow_flex, \w+, \w+\. Map it with --map elbow=elbow_flex, "):  # fmt: skip
+    with pytest.raises(
+        JointMismatchError,
+        match=r"a\.csv names joint 'elbow', which robot 'so101' does not have; "
+        r"nearest: elbow_flex, \w+, \w+\. Map it with --map elbow=elbow_flex, ",
+    ):
         so101.resolve("elbow", "a.csv")
     with pytest.raises(JointMismatchError, match="elbow_flex"):  # nothing to map there
         so101.index(["elbow"])
@@ -156,7 +159,7 @@ def test_robot_argument_leads_to_the_folder(tmp_path, monkeypatch):
 def test_names_are_packaged_robots_and_paths_are_folders(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     write_arm(tmp_path / "arm")
-    with pytest.raises(RobotError, match=r"\./arm"):  # fmt: skip
+    with pytest.raises(RobotError, match=r"\./arm"):
         load_robot("arm")
     for way in ("./arm", str(tmp_path / "arm"), Path("arm")):
         assert load_robot(way).name == "arm"
@@ -167,8 +170,7 @@ def test_names_are_packaged_robots_and_paths_are_folders(tmp_path, monkeypatch):
 def test_an_ambiguous_name_is_refused(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     write_arm(tmp_path / "so101")
-    with pytest.raises(RobotError, match=r"write (.*) or \./so101"
-                       ) as refused:  # fmt: skip
+    with pytest.raises(RobotError, match=r"write (.*) or \./so101") as refused:
         load_robot("so101")
     packaged = str(refused.value).split("write ")[1].split(" or ")[0]
     assert load_robot(packaged).name == "so101"

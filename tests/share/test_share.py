@@ -26,8 +26,14 @@ def run(arm, dataset, tmp_path):
     folder = untrained(
         tmp_path / "run", arm, dataset, train=("wave 0",), val=("wave 1",), test=("wave 2",)
     )
-    config = {"model": {"kind": "gaponet"}, "ppo": {"num_envs": 1, "epochs": 1, "std": 0.1}, "seed": 0, "robot": "arm",
-              "dataset": "arm_logs", "dataset_hash": dataset_hash(dataset.entries)}  # fmt: skip
+    config = {
+        "model": {"kind": "gaponet"},
+        "ppo": {"num_envs": 1, "epochs": 1, "std": 0.1},
+        "seed": 0,
+        "robot": "arm",
+        "dataset": "arm_logs",
+        "dataset_hash": dataset_hash(dataset.entries),
+    }
     (folder / "config.json").write_text(json.dumps(config))
     (folder / "report.html").write_text("<script>alert(1)</script>")
     return folder

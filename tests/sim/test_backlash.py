@@ -15,9 +15,14 @@ from gaponet.sysid.joint_rollouts import JointRollouts
 
 WIDTH, KP, DAMPING, ARMATURE = 0.03, 3.0, 0.06, 2e-3
 SERVO = {
-    "kp": KP, "damping": DAMPING, "frictionloss": 0.01, "armature": ARMATURE, "offset": 0.0, "delay": 0.0,
+    "kp": KP,
+    "damping": DAMPING,
+    "frictionloss": 0.01,
+    "armature": ARMATURE,
+    "offset": 0.0,
+    "delay": 0.0,
     "backlash": WIDTH,
-}  # fmt: skip
+}
 TOML = 'name = "pendulum"\ndt = 0.01\ntimestep = 0.001\n[[joint]]\nname = "swing"\nkp = 3.0\neffort_limit = 50.0\n'
 LINK = '<geom type="capsule" fromto="0 0 0 0 0 -0.2" size="0.01" mass="0.15" contype="0" conaffinity="0"/>'
 MODEL = (

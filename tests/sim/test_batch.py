@@ -163,10 +163,25 @@ def test_ramps_of_simulations_left_out_of_a_step_stand_still(tmp_path):
 
 
 OTHER = {
-    "kp": 11.0, "kd": 0.7, "effort_limit": 0.4, "damping": 0.9, "armature": 0.05, "frictionloss": 0.3, "delay": 0.013,
-    "offset": 0.1, "zero": 0.2, "target_speed": 0.4, "stribeck": 0.2, "stribeck_speed": 0.3, "friction_motor": 0.4,
-    "friction_external": 0.4, "min_torque": 0.5, "encoder_step": 0.05, "no_load_speed": 1.0, "backlash": 0.3,
-}  # fmt: skip
+    "kp": 11.0,
+    "kd": 0.7,
+    "effort_limit": 0.4,
+    "damping": 0.9,
+    "armature": 0.05,
+    "frictionloss": 0.3,
+    "delay": 0.013,
+    "offset": 0.1,
+    "zero": 0.2,
+    "target_speed": 0.4,
+    "stribeck": 0.2,
+    "stribeck_speed": 0.3,
+    "friction_motor": 0.4,
+    "friction_external": 0.4,
+    "min_torque": 0.5,
+    "encoder_step": 0.05,
+    "no_load_speed": 1.0,
+    "backlash": 0.3,
+}
 
 
 @pytest.mark.parametrize("field", sorted(set(SERVO_FIELDS) - {*STOP_FIELDS, *TERMS["temperature"]}))

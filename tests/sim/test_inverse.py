@@ -22,10 +22,13 @@ def periods(sequence, friction):
     return [
         Period(q[None], v[None], nq[None], nv[None], friction * np.sign(nq - q)[None])
         for q, v, nq, nv in zip(
-            sequence.qpos[:-1].astype(float), sequence.qvel[:-1].astype(float), sequence.qpos[1:].astype(float),
-            sequence.qvel[1:].astype(float), strict=True,
+            sequence.qpos[:-1].astype(float),
+            sequence.qvel[:-1].astype(float),
+            sequence.qpos[1:].astype(float),
+            sequence.qvel[1:].astype(float),
+            strict=True,
         )
-    ]  # fmt: skip
+    ]
 
 
 def test_the_inverse_of_a_recording_is_its_command(tmp_path):

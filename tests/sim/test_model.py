@@ -123,11 +123,14 @@ def test_invalid_payload_side_and_period_are_refused(arm, options, message):
         (TOML.replace('"elbow"', '"knee"'), XML, "'knee'"),
         (TOML.replace('"fore"', '"hand"'), XML, "body 'hand'"),
         ("[[joint]]".join(TOML.split("[[joint]]")[:2]), XML, "freedom"),
-        (TOML.replace("shoulder", "x").replace("elbow", "shoulder").replace('"x"', '"elbow"'), XML,
-         "order"),
+        (
+            TOML.replace("shoulder", "x").replace("elbow", "shoulder").replace('"x"', '"elbow"'),
+            XML,
+            "order",
+        ),
         (TOML, XML.replace('mass="0.3"', 'mass="-1"'), "compile|MJCF"),
     ],
-)  # fmt: skip
+)
 def test_a_broken_robot_folder_says_what_is_wrong(tmp_path, toml, xml, message):
     robot = write_arm(tmp_path / "arm", toml=toml, xml=xml)
     with pytest.raises(RobotError, match=message):
@@ -170,10 +173,14 @@ def vendor_hash(folder, **change):
         {"xml": FILES_XML.replace("implicitfast", "Euler")},
         {"xml": FILES_XML.replace('springref="4"', 'springref="5"')},
         {"xml": FILES_XML.replace('range="-80 80"', 'range="-80 70"')},
-        {"xml": FILES_XML.replace('<body name="fore" pos="0.2 0 0">', '<body name="fore" pos="0.20001 0 0">')},
+        {
+            "xml": FILES_XML.replace(
+                '<body name="fore" pos="0.2 0 0">', '<body name="fore" pos="0.20001 0 0">'
+            )
+        },
         {"contacts": True},
     ],
-)  # fmt: skip
+)
 def test_the_hash_changes_with_anything_that_changes_the_motion(tmp_path, change):
     assert vendor_hash(tmp_path / "changed", **change) != vendor_hash(tmp_path / "arm")
 
@@ -206,8 +213,10 @@ def test_the_hash_ignores_looks_and_names(tmp_path, xml):
 def test_geoms_that_touch_count_where_contacts_are_on_and_only_there(tmp_path):
     wider = FILES_XML.replace('size="0.02" mass', 'size="0.021" mass')
     for contacts in (False, True):
-        same = [build_model(write_files_arm(tmp_path / f"{contacts}{i}", contacts=contacts, xml=x)) for i, x in
-                enumerate((FILES_XML, wider))]  # fmt: skip
+        same = [
+            build_model(write_files_arm(tmp_path / f"{contacts}{i}", contacts=contacts, xml=x))
+            for i, x in enumerate((FILES_XML, wider))
+        ]
         for model in same:  # the capsule's mass is given; its inertia follows from its size
             model.body_inertia[:] = same[0].body_inertia
             model.body_ipos[:] = same[0].body_ipos

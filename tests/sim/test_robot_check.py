@@ -17,8 +17,10 @@ STIFF = TOML.replace("kp = 20.0", "kp = 4000.0\nkd = 1.0").replace(
 )
 # The upper arm starts inside a pedestal that is fixed to the world, as links beside a base without its joint do.
 WELDED = XML.replace(' contype="0" conaffinity="0"', "").replace(
-    '<body name="upper">', '<body name="base"><geom type="box" size="0.03 0.03 0.03" pos="0.02 0 0"/></body>'
-    '<body name="upper">')  # fmt: skip
+    '<body name="upper">',
+    '<body name="base"><geom type="box" size="0.03 0.03 0.03" pos="0.02 0 0"/></body>'
+    '<body name="upper">',
+)
 
 
 def said(findings: list[Finding], check: str, level: str) -> list[str]:
@@ -89,18 +91,48 @@ def test_postures_of_the_logs_in_which_links_meet_are_counted(tmp_path):
 @pytest.mark.parametrize(
     ("xml", "check", "words"),
     [
-        (XML.replace('axis="0 1 0"', 'axis="0 1 0" actuatorfrcrange="-2 2"', 1), "limits", "stops the motor at 2 N·m"),
-        (XML.replace('range="-1.5 1.5"', 'range="-86 86"', 1), "range", "shoulder: its range is -86 to 86 rad: are"),
-        (XML.replace('angle="radian"', 'angle="degree"'), "range", "elbow: its range is -0.0262 to 0.0262 rad"),
+        (
+            XML.replace('axis="0 1 0"', 'axis="0 1 0" actuatorfrcrange="-2 2"', 1),
+            "limits",
+            "stops the motor at 2 N·m",
+        ),
+        (
+            XML.replace('range="-1.5 1.5"', 'range="-86 86"', 1),
+            "range",
+            "shoulder: its range is -86 to 86 rad: are",
+        ),
+        (
+            XML.replace('angle="radian"', 'angle="degree"'),
+            "range",
+            "elbow: its range is -0.0262 to 0.0262 rad",
+        ),
         (LIGHT, "damping", "no damping, kd or friction at shoulder, elbow"),
         (LIGHT, "inertia", "no armature at shoulder, elbow"),
-        (XML.replace('axis="0 1 0"', 'axis="0 1 0" stiffness="3"', 1), "couplings", "springs at shoulder"),
-        (XML.replace('body name="fore"', 'body name="fore" gravcomp="1"'), "couplings", "gravcomp in robot.xml"),
-        (XML.replace('integrator="implicitfast"', 'gravity="0 0 0"'), "couplings", "gravity in robot.xml is [0.0,"),
-        (XML.replace("</mujoco>", '<equality><joint joint1="shoulder" joint2="elbow"/></equality></mujoco>'),
-         "couplings", "robot.xml has 1 <equality>"),
+        (
+            XML.replace('axis="0 1 0"', 'axis="0 1 0" stiffness="3"', 1),
+            "couplings",
+            "springs at shoulder",
+        ),
+        (
+            XML.replace('body name="fore"', 'body name="fore" gravcomp="1"'),
+            "couplings",
+            "gravcomp in robot.xml",
+        ),
+        (
+            XML.replace('integrator="implicitfast"', 'gravity="0 0 0"'),
+            "couplings",
+            "gravity in robot.xml is [0.0,",
+        ),
+        (
+            XML.replace(
+                "</mujoco>",
+                '<equality><joint joint1="shoulder" joint2="elbow"/></equality></mujoco>',
+            ),
+            "couplings",
+            "robot.xml has 1 <equality>",
+        ),
     ],
-)  # fmt: skip
+)
 def test_springs_constraints_and_missing_inertia_are_reported(tmp_path, xml, check, words):
     findings = check_robot(write_arm(tmp_path / "arm", TOML, xml))
     assert any(words in f.message for f in findings if f.check == check and f.level != "ok")

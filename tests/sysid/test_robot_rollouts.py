@@ -72,8 +72,9 @@ def test_damping_below_zero_is_taken_from_the_servo(robot, parts):
     values = own(less, parts)
     np.testing.assert_allclose(
         RobotRollouts(parts, less).flat_errors(values | {"damping": np.full((1, 2), -0.3)}),
-        RobotRollouts(parts, softer).flat_errors(values | {"damping": np.zeros((1, 2))}), atol=1e-6,
-    )  # fmt: skip
+        RobotRollouts(parts, softer).flat_errors(values | {"damping": np.zeros((1, 2))}),
+        atol=1e-6,
+    )
     written = less.with_identified({"elbow": {"damping": -0.3}})
     assert written.servo.kd.tolist() == pytest.approx([0.4, 0.1])
     assert (written.servo.damping[1], written.nominal.servo.kd[1]) == (0.0, 0.4)

@@ -112,9 +112,13 @@ def test_an_undefined_servo_type_is_refused(tmp_path):
 
 @pytest.mark.parametrize(
     ("joint", "other"),
-    [("left_elbow_joint", "right_elbow_joint"), ("FL_hip_joint", "FR_hip_joint"), ("RH_KFE", "LH_KFE"),
-     ("shoulder_pan", "shoulder_pan")],
-)  # fmt: skip
+    [
+        ("left_elbow_joint", "right_elbow_joint"),
+        ("FL_hip_joint", "FR_hip_joint"),
+        ("RH_KFE", "LH_KFE"),
+        ("shoulder_pan", "shoulder_pan"),
+    ],
+)
 def test_a_mirrored_joint_has_the_other_side_in_its_name(joint, other):
     assert (mirrored(joint), mirrored(other)) == (other, joint)
 

@@ -298,8 +298,9 @@ def test_a_change_smaller_than_the_difference_between_repetitions_is_no_drift(
     for repeats in (1, 3):
         logs = [
             replace(s, qpos=s.qpos + np.float32(0.004 * (repeats > 1) * rng.standard_normal(2)))
-            for s in played(arm) for _ in range(repeats)
-        ]  # fmt: skip
+            for s in played(arm)
+            for _ in range(repeats)
+        ]
         mine = estimate_uncertainty(robot, logs, played(arm, 20, 3), nthread=1)
         seen[repeats] = drift(robot, mine, today, 1), mine.joints["shoulder"].repeatability
     (precise, none), (loose, difference) = seen.values()

@@ -59,10 +59,16 @@ NOT_RUN = {
 }
 # First words of console lines that are not gaponet's → why they are not run here.
 OTHERS = {
-    "pip": "installs", "git": "needs a network", "cmake": "installs", "CYCLONEDDS_HOME=$HOME/cyclonedds": "installs",
-    "source": "needs an environment", "make": "takes minutes", "pytest": "takes minutes",
-    "cd": "needs a folder of an export", "python": "needs a folder of an export",
-}  # fmt: skip
+    "pip": "installs",
+    "git": "needs a network",
+    "cmake": "installs",
+    "CYCLONEDDS_HOME=$HOME/cyclonedds": "installs",
+    "source": "needs an environment",
+    "make": "takes minutes",
+    "pytest": "takes minutes",
+    "cd": "needs a folder of an export",
+    "python": "needs a folder of an export",
+}
 ROWS = 100  # of a recording
 SO101_IN_SAGE = ("Rotation", "Pitch", "Elbow", "Wrist_Pitch", "Wrist_Roll", "Jaw")
 OPTION = re.compile(r"(?<![\w-])--[a-z][\w.-]*\w")
@@ -215,9 +221,13 @@ def names_of_a_reader(page: str, folder: Path) -> dict[str, Any]:
     data = mujoco.MjData(mj_model)
     at_home = {"qpos": robot.qpos_home, "qvel": 0 * robot.qpos_home, "target": robot.qpos_home}
     return at_home | {
-        "mj_model": mj_model, "data": data, "mujoco": mujoco, "targets": [robot.qpos_home] * 3, "model": model,
+        "mj_model": mj_model,
+        "data": data,
+        "mujoco": mujoco,
+        "targets": [robot.qpos_home] * 3,
+        "model": model,
         "mine": robot.with_servo(kp=1.1 * robot.servo.kp),
-    }  # fmt: skip
+    }
 
 
 @pytest.mark.parametrize("page", WITH_PYTHON)
@@ -319,8 +329,13 @@ def literals(file: Path) -> Iterator[str]:
             yield node.value
 
 
-FOREIGN = {"--repo-type": "hf", "--index-url": "pip", "--python": "uv", "--version": "gaponet itself",
-           "--tyro": "gaponet itself"}  # fmt: skip
+FOREIGN = {
+    "--repo-type": "hf",
+    "--index-url": "pip",
+    "--python": "uv",
+    "--version": "gaponet itself",
+    "--tyro": "gaponet itself",
+}
 
 
 def absent(text: str, options: dict[tuple[str, ...], set[str]]) -> Iterator[str]:

@@ -109,14 +109,31 @@ def test_export_and_import_give_the_same_recordings(place, capsys):
     [
         (["data", "card", "{}/nowhere"], "Dataset: {}/nowhere: not a dataset"),
         (["data", "split", "{}/set", "--by", "unit"], "Usage: {}/set: one unit only (a)"),
-        (["data", "split", "{}/set", "--by", "payload", "--holdout", "5"], "no payload '5' to hold out; it holds 0,"),
+        (
+            ["data", "split", "{}/set", "--by", "payload", "--holdout", "5"],
+            "no payload '5' to hold out; it holds 0,",
+        ),
         (["data", "figures", "{}/set", "--out", "{}/p", "--robot", "so101"], "holds robot 'arm'"),
-        (["data", "export", "{}/set", "--out", "{}/set"], "set: exists and is not an empty folder; choose a new one"),
-        (["import", "{}/set/sequences", "--robot", "{}/arm", "--out", "{}/new", "--format", "lerobot"],
-         "no meta/info.json in it; point at a LeRobotDataset v3.0 folder"),
+        (
+            ["data", "export", "{}/set", "--out", "{}/set"],
+            "set: exists and is not an empty folder; choose a new one",
+        ),
+        (
+            [
+                "import",
+                "{}/set/sequences",
+                "--robot",
+                "{}/arm",
+                "--out",
+                "{}/new",
+                "--format",
+                "lerobot",
+            ],
+            "no meta/info.json in it; point at a LeRobotDataset v3.0 folder",
+        ),
     ],
     ids=lambda value: value if isinstance(value, str) else " ".join(value[:2]),
-)  # fmt: skip
+)
 def test_mistakes_get_one_line_and_exit_code_2(place, capsys, words, complaint):
     capsys.readouterr()
     assert main([w.format(place) for w in words]) == 2

@@ -27,8 +27,11 @@ def place(tmp_path_factory):
         XML.replace("</mujoco>", f"<actuator>{SERVOS}</actuator></mujoco>")
     )
     robot = write_arm(folder / "nominal")
-    for name, seeds, how in (("logs", range(5), {"kp": 0.7, "delay": 2}), ("new_logs", [11], {"kp": 0.65, "delay": 2}),
-                             ("rollouts", [12], {})):  # fmt: skip
+    for name, seeds, how in (
+        ("logs", range(5), {"kp": 0.7, "delay": 2}),
+        ("new_logs", [11], {"kp": 0.65, "delay": 2}),
+        ("rollouts", [12], {}),
+    ):
         (folder / name).mkdir()
         rows = 160 if name == "logs" else 300  # an adaptation needs windows that it does not see
         for seed in seeds:

@@ -107,7 +107,7 @@ def test_an_adapted_unit_is_evaluated_with_and_without_and_run_by_its_name(place
         (["gap", "{}/data", "--robot", "h1_2"], "holds robot 'arm'"),
     ],
     ids=lambda value: value if isinstance(value, str) else value[0],
-)  # fmt: skip
+)
 def test_mistakes_get_one_line_and_exit_code_2(place, capsys, words, complaint):
     words = [w.format(place) for w in words]
     if "--robot" not in words:

@@ -26,8 +26,22 @@ def place(tmp_path_factory):
     for i, name in enumerate((os.fsencode(HOSTILE.replace("/", "|")), b"\xff\xfe")):
         with open(os.path.join(os.fsencode(folder), b"logs", name + b".csv"), "w") as file:
             file.write(table_text(arm_columns(60 + i)))
-    words = ["import", f"{folder}/logs", "--robot", f"{folder}/arm", "--unit-id", HOSTILE, "--payload-mass", "0",
-             "--out", f"{folder}/set", "--time-unit", "s", "--position-unit", "rad"]  # fmt: skip
+    words = [
+        "import",
+        f"{folder}/logs",
+        "--robot",
+        f"{folder}/arm",
+        "--unit-id",
+        HOSTILE,
+        "--payload-mass",
+        "0",
+        "--out",
+        f"{folder}/set",
+        "--time-unit",
+        "s",
+        "--position-unit",
+        "rad",
+    ]
     assert main(words) == 0
     return folder
 

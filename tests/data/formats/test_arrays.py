@@ -18,9 +18,12 @@ from gaponet.data.formats import ReadOptions, detect, pickles, read_logs
 from gaponet.data.sequence import SequenceMeta, to_sequence
 
 WRITERS = {
-    "npz": strange_logs.write_npz, "hdf5": strange_logs.write_aloha, "mat": strange_logs.write_mat,
-    "pace": strange_logs.write_pace, "asap": strange_logs.write_asap,
-}  # fmt: skip
+    "npz": strange_logs.write_npz,
+    "hdf5": strange_logs.write_aloha,
+    "mat": strange_logs.write_mat,
+    "pace": strange_logs.write_pace,
+    "asap": strange_logs.write_asap,
+}
 
 
 PAGE = (Path(__file__).parents[3] / "docs" / "logs.md").read_text(encoding="utf-8")
@@ -129,8 +132,11 @@ def test_windows_in_which_one_joint_moves_are_recordings_of_that_joint(tmp_path,
         "velocities": 0 * qpos,
         "torques": 0 * qpos,
     }
-    np.savez(tmp_path / "motor.npz", joint_sequence=np.array(["elbow", "shoulder"]),
-             **{f"real_dof_{name}": x.T[::-1] for name, x in columns.items()})  # fmt: skip
+    np.savez(
+        tmp_path / "motor.npz",
+        joint_sequence=np.array(["elbow", "shoulder"]),
+        **{f"real_dof_{name}": x.T[::-1] for name, x in columns.items()},
+    )
     with pytest.raises(LogError, match="rate"):
         list(read_logs(tmp_path, arm))
     (tmp_path / "logs.toml").write_text("[posture]\nshoulder = 0.3\n")
@@ -159,9 +165,14 @@ def test_every_demonstration_of_robomimic_is_a_recording(tmp_path, arm):
     with pytest.raises(LogError, match=r"actions\[7\]"):
         list(read_logs(tmp_path, arm))
     (tmp_path / "logs.toml").write_text(
-        strange_logs.sheet(ctrl="targets", qpos="obs/robot0_joint_pos", joints=arm.joint_names, rate=20.0,
-                           position_unit="rad")
-    )  # fmt: skip
+        strange_logs.sheet(
+            ctrl="targets",
+            qpos="obs/robot0_joint_pos",
+            joints=arm.joint_names,
+            rate=20.0,
+            position_unit="rad",
+        )
+    )
     found = list(read_logs(tmp_path, arm))
     assert [name for name, _ in found] == ["low_dim-demo_2", "low_dim-demo_10"]
     assert np.allclose(found[1][1].channels["ctrl"].values, ctrl + 0.1)

@@ -26,8 +26,13 @@ UNITS = 'time_unit = "s"\nposition_unit = "rad"\n'
 def theirs(rows=60, **names):
     """The arm's table under a lab's own names."""
     columns = arm_columns(rows)
-    told = {"time": "t", "ctrl.shoulder": "shoulder_des", "ctrl.elbow": "elbow_des", "qpos.shoulder": "shoulder_pos",
-            "qpos.elbow": "elbow_pos"} | names  # fmt: skip
+    told = {
+        "time": "t",
+        "ctrl.shoulder": "shoulder_des",
+        "ctrl.elbow": "elbow_des",
+        "qpos.shoulder": "shoulder_pos",
+        "qpos.elbow": "elbow_pos",
+    } | names
     return {told[name]: values for name, values in columns.items()}
 
 

@@ -43,8 +43,10 @@ def test_each_episode_is_a_recording(tmp_path, arm, name, column):
     write(tmp_path / name, joined(**{column: numbers([4, 5, 7])}))
     logs = dict(read_logs(tmp_path / name, arm, ReadOptions(**SI)))
     assert {motion: len(log.channels["qpos"].time) for motion, log in logs.items()} == {
-        "log-0004": 120, "log-0005": 90, "log-0007": 150,
-    }  # fmt: skip
+        "log-0004": 120,
+        "log-0005": 90,
+        "log-0007": 150,
+    }
 
 
 def test_numbers_that_no_float_counts_are_no_episodes(tmp_path, arm):

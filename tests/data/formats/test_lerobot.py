@@ -35,8 +35,14 @@ def dataset(arm, tmp_path):
         sequence = arm_sequence(
             arm, ctrl, late(ctrl, 2), f"m{i}", payload, unit=unit, notes=notes, **extra
         )
-        fields = {"repetition": 2 * i, "virtual": True, "level": "joint", "source": "somewhere/else.csv",
-                  "source_sha256": "ab" * 32, "recorded_at": "2026-01-02T03:04:05Z"}  # fmt: skip
+        fields = {
+            "repetition": 2 * i,
+            "virtual": True,
+            "level": "joint",
+            "source": "somewhere/else.csv",
+            "source_sha256": "ab" * 32,
+            "recorded_at": "2026-01-02T03:04:05Z",
+        }
         fields |= (
             {"kp": (5.0 + i, 6.0), "kd": (0.1, 0.2)} if i else {}
         )  # the first from before gains were kept
@@ -88,8 +94,11 @@ def test_several_rates_become_several_sets_and_come_back(dataset, arm, tmp_path)
         dataset.append(sequence)
     sets = export_lerobot(dataset, tmp_path / "out")
     assert [s.path.name for s in sets] == [
-        "50hz-ctrl-qpos-qvel-qacc-tau-tau_eq-temperature", "60hz", "49.8504hz", "50hz-ctrl-qpos-qvel",
-    ]  # fmt: skip
+        "50hz-ctrl-qpos-qvel-qacc-tau-tau_eq-temperature",
+        "60hz",
+        "49.8504hz",
+        "50hz-ctrl-qpos-qvel",
+    ]
     same(dataset, back(tmp_path / "out", arm, tmp_path / "again"))
 
 
@@ -155,8 +164,11 @@ def test_many_episodes_are_spread_over_files(dataset, arm, tmp_path, monkeypatch
         f.relative_to(tmp_path / "out").as_posix()
         for f in (tmp_path / "out" / "data").rglob("*.parquet")
     )
-    assert files == ["data/chunk-000/file-000.parquet", "data/chunk-000/file-001.parquet",
-                     "data/chunk-001/file-000.parquet"]  # fmt: skip
+    assert files == [
+        "data/chunk-000/file-000.parquet",
+        "data/chunk-000/file-001.parquet",
+        "data/chunk-001/file-000.parquet",
+    ]
     same(dataset, back(tmp_path / "out", arm, tmp_path / "again"))
 
 
@@ -406,9 +418,13 @@ def test_a_set_of_version_2_1_is_read_as_far_as_its_episodes_are_there(so101, tm
         ]
     ]
     feature = {"dtype": "float32", "shape": [7], "names": names}
-    info = {"codebase_version": "v2.1", "fps": 30, "chunks_size": 2, "features": dict.fromkeys(
-        ("action", "observation.state"), feature),
-        "data_path": "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet"}  # fmt: skip
+    info = {
+        "codebase_version": "v2.1",
+        "fps": 30,
+        "chunks_size": 2,
+        "features": dict.fromkeys(("action", "observation.state"), feature),
+        "data_path": "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet",
+    }
     listed = [{"episode_index": i, "tasks": ["Pick up!"], "length": 40} for i in range(4)]
     (tmp_path / "meta").mkdir()
     (tmp_path / "meta" / "info.json").write_text(json.dumps(info))
@@ -417,11 +433,21 @@ def test_a_set_of_version_2_1_is_read_as_far_as_its_episodes_are_there(so101, tm
         file = tmp_path / "data" / f"chunk-{i // 2:03d}" / f"episode_{i:06d}.parquet"
         file.parent.mkdir(parents=True, exist_ok=True)
         flat = pa.array(np.tile(0.1 * i + 0.01 * np.arange(7, dtype=np.float32), 40))
-        pq.write_table(pa.table({
-            **dict.fromkeys(("action", "observation.state"), pa.FixedSizeListArray.from_arrays(flat, 7)),
-            "timestamp": pa.array(np.arange(40) / 30, pa.float32()), "frame_index": np.arange(40),
-            "episode_index": np.full(40, i), "index": np.arange(40), "task_index": np.zeros(40, int),
-        }), file)  # fmt: skip
+        pq.write_table(
+            pa.table(
+                {
+                    **dict.fromkeys(
+                        ("action", "observation.state"), pa.FixedSizeListArray.from_arrays(flat, 7)
+                    ),
+                    "timestamp": pa.array(np.arange(40) / 30, pa.float32()),
+                    "frame_index": np.arange(40),
+                    "episode_index": np.full(40, i),
+                    "index": np.arange(40),
+                    "task_index": np.zeros(40, int),
+                }
+            ),
+            file,
+        )
     (tmp_path / "logs.toml").write_text('position_unit = "rad"\nignore = ["kCamera*"]\n')
     found = dict(read_logs(tmp_path, so101))
     assert list(found) == ["pick_up-0000", "pick_up-0003"]

@@ -14,9 +14,15 @@ from gaponet.data.importer import ImportRequest, import_logs
 
 HAND = ("ee.x", "ee.y", "ee.z", "ee.wx", "ee.wy", "ee.wz")
 CALIBRATION = {
-    name: {"id": i + 1, "drive_mode": 0, "homing_offset": 37, "range_min": 800 + i, "range_max": 3200 + i}
+    name: {
+        "id": i + 1,
+        "drive_mode": 0,
+        "homing_offset": 37,
+        "range_min": 800 + i,
+        "range_max": 3200 + i,
+    }
     for i, name in enumerate(SO101)
-}  # fmt: skip
+}
 PER_TICK = 2 * np.pi / 4095
 
 

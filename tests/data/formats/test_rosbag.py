@@ -132,9 +132,13 @@ def write_joint_states(bag, messages):
             stamp = make("builtin_interfaces/msg/Time", sec=int(t), nanosec=round(t % 1 * 1e9))
             header = make("std_msgs/msg/Header", stamp=stamp, frame_id="")
             message = make(
-                kind, header=header, name=names, position=np.array(position), velocity=np.array([]),
+                kind,
+                header=header,
+                name=names,
+                position=np.array(position),
+                velocity=np.array([]),
                 effort=np.array(effort),
-            )  # fmt: skip
+            )
             writer.write(topics[topic], round(t * 1e9), store.serialize_cdr(message, kind))
     return bag
 

@@ -105,13 +105,15 @@ def test_lists_in_parquet_cells_are_arrays(tmp_path, arm):
         for name in ("ctrl", "qpos")
     )
     pq.write_table(
-        pa.table({
-            "timestamp": pa.array(columns["time"]),
-            "action": pa.array(action.tolist()),
-            "observation.state": pa.FixedSizeListArray.from_arrays(pa.array(state.ravel()), 2),
-        }),
+        pa.table(
+            {
+                "timestamp": pa.array(columns["time"]),
+                "action": pa.array(action.tolist()),
+                "observation.state": pa.FixedSizeListArray.from_arrays(pa.array(state.ravel()), 2),
+            }
+        ),
         tmp_path / "m.parquet",
-    )  # fmt: skip
+    )
     (tmp_path / "logs.toml").write_text(
         'time = "timestamp"\ntime_unit = "s"\nposition_unit = "rad"\nctrl = "action"\n'
         'qpos = "observation.state"\njoints = ["shoulder", "elbow"]\n'

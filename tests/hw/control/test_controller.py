@@ -105,10 +105,14 @@ def test_its_recording_can_be_imported_and_trained_on(arm, tmp_path):
 @pytest.mark.parametrize(
     ("kind", "reason", "periods"),
     [
-        ("stops", "stale", 3), ("nan", "nan", 1), ("hot", "temperature", 1), ("bus", "driver", 1),
-        ("error", "robot", 1), ("remote", "stop", 1),
+        ("stops", "stale", 3),
+        ("nan", "nan", 1),
+        ("hot", "temperature", 1),
+        ("bus", "driver", 1),
+        ("error", "robot", 1),
+        ("remote", "stop", 1),
     ],
-)  # fmt: skip
+)
 def test_a_fault_of_state_driver_or_operator_ends_in_damp_with_its_reason(
     arm, kind, reason, periods
 ):
@@ -239,10 +243,13 @@ def test_a_policy_that_gives_nan_leaves_the_robot_damped(arm):
 @pytest.mark.parametrize(
     ("where", "error"),
     [
-        ("policy", ZeroDivisionError), ("policy", SystemExit), ("policy", KeyboardInterrupt),
-        ("listener", BrokenPipeError), ("damp", ZeroDivisionError),
+        ("policy", ZeroDivisionError),
+        ("policy", SystemExit),
+        ("policy", KeyboardInterrupt),
+        ("listener", BrokenPipeError),
+        ("damp", ZeroDivisionError),
     ],
-)  # fmt: skip
+)
 def test_an_error_of_other_code_is_raised_after_the_robot_has_damped_for_the_whole_time(
     arm, where, error
 ):

@@ -100,14 +100,21 @@ def test_an_identified_stop_does_not_widen_a_range(h1_2):
 
 @pytest.mark.parametrize(
     ("values", "said"),
-    [({"offset": 0.11}, "offset of"), ({"offset": np.nan}, "offset"), ({"kp": 0.0}, "kp of"),
-     ({"kp": 24.0}, "400"), ({"kp": 401.0}, "kp"), ({"zero": -0.2}, "zero of "
-                                                                                         ".* is "
-                                                                                         "-0.2 rad"),
-     ({"frictionloss": 21.0}, "21 N·m"), ({"damping": 101.0}, "damping"),
-     ({"armature": 9.1}, "armature"), ({"stribeck": 11.0}, "stribeck"), ({"delay": 0.2}, "delay"),
-     ({"backlash": 0.2}, "backlash")],
-)  # fmt: skip
+    [
+        ({"offset": 0.11}, "offset of"),
+        ({"offset": np.nan}, "offset"),
+        ({"kp": 0.0}, "kp of"),
+        ({"kp": 24.0}, "400"),
+        ({"kp": 401.0}, "kp"),
+        ({"zero": -0.2}, "zero of .* is -0.2 rad"),
+        ({"frictionloss": 21.0}, "21 N·m"),
+        ({"damping": 101.0}, "damping"),
+        ({"armature": 9.1}, "armature"),
+        ({"stribeck": 11.0}, "stribeck"),
+        ({"delay": 0.2}, "delay"),
+        ({"backlash": 0.2}, "backlash"),
+    ],
+)
 def test_identified_values_beyond_what_servos_have_are_refused_on_hardware(h1_2, values, said):
     with pytest.raises(RobotError, match=said):
         hardware_robot(h1_2.with_identified({JOINT: values}), h1_2)

@@ -130,14 +130,18 @@ WAYS: dict[str, tuple[Callable[[Bus], object], str]] = {
     "crossed": (lambda bus: None, "elbow_flex.*: it holds the goal"),
     "resets": (lambda bus: bus.reset(ROLL), r"servo 5 \(wrist_roll\): its torque is off"),
     "brown-out": (lambda bus: bus.reset(*range(1, 7)), "shoulder_pan.*its torque is off.*gripper"),
-    "gain": (lambda bus: bus.put(reg.P, 128, (ELBOW,)), r"servo 3 \(elbow_flex\): its p went from "
-                                                        r"32 to 128"),
+    "gain": (
+        lambda bus: bus.put(reg.P, 128, (ELBOW,)),
+        r"servo 3 \(elbow_flex\): its p went from "
+        r"32 to 128",
+    ),
     "zero": (Bus.shift, "elbow_flex.*: its homing offset went from"),
     "mode": (lambda bus: bus.put(reg.MODE, 1, (ELBOW,)), "elbow_flex.*: its mode went from 0 to 1"),
     "limit": (
-        lambda bus: bus.put(reg.TORQUE_LIMIT, 200, (ELBOW,)), "elbow_flex.*: its torque limit "
-                                                              "went from 1000 to 200"),
-}  # fmt: skip
+        lambda bus: bus.put(reg.TORQUE_LIMIT, 200, (ELBOW,)),
+        "elbow_flex.*: its torque limit went from 1000 to 200",
+    ),
+}
 ERRORS: dict[str, Callable[[Bus], object]] = {
     "lost": Bus.lose,
     "silent": lambda bus: setattr(bus.arm, "silent", {4}),
@@ -370,12 +374,21 @@ def swing(
 @pytest.mark.parametrize(
     ("fault", "kind", "periods"),
     [
-        ("stop", "stale", 3), ("repeat", "stale", 3), ("late", "stale", 3), ("checksum", "stale", 3),
-        ("freeze", "frozen", 2), ("nan", "nan", 1), ("jump", "jump", 1), ("hot", "temperature", 1),
-        ("encoder", "frozen", 25), ("motor", "robot", 1), ("remote", "stop", 1), ("fall", "tilt", 1),
+        ("stop", "stale", 3),
+        ("repeat", "stale", 3),
+        ("late", "stale", 3),
+        ("checksum", "stale", 3),
+        ("freeze", "frozen", 2),
+        ("nan", "nan", 1),
+        ("jump", "jump", 1),
+        ("hot", "temperature", 1),
+        ("encoder", "frozen", 25),
+        ("motor", "robot", 1),
+        ("remote", "stop", 1),
+        ("fall", "tilt", 1),
         ("machine", "robot", 1),
     ],
-)  # fmt: skip
+)
 def test_a_fault_of_an_h1_2_ends_in_damp(monkeypatch, fault, kind, periods):
     recording, robot = swing(monkeypatch, fault=fault, at=FAULT_S, size=0.25)
     assert recording.fault.kind == kind, recording.fault
@@ -411,11 +424,20 @@ def test_a_step_of_the_robots_clock_is_no_fault_and_hides_none(monkeypatch):
 @pytest.mark.parametrize(
     ("way", "at"),
     [
-        ("ignores", 0.0), ("ignores", 2.0), ("listens midway", 2.5), ("limp", 2.0), ("all limp", 2.0), ("weak", 2.0),
-        ("crossed", 0.0), ("mirrored", 0.0), ("blocked", 0.5), ("blocked", 2.6), ("blocked", 3.4),
+        ("ignores", 0.0),
+        ("ignores", 2.0),
+        ("listens midway", 2.5),
+        ("limp", 2.0),
+        ("all limp", 2.0),
+        ("weak", 2.0),
+        ("crossed", 0.0),
+        ("mirrored", 0.0),
+        ("blocked", 0.5),
+        ("blocked", 2.6),
+        ("blocked", 3.4),
         ("zero", 2.5),
     ],
-)  # fmt: skip
+)
 def test_a_robot_whose_joints_do_not_follow_is_damped_and_its_run_is_no_data(monkeypatch, way, at):
     recording, _ = swing(monkeypatch, way, at)
     assert recording.fault is not None

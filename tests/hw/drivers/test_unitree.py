@@ -75,11 +75,13 @@ def decoded(robot, data):
 @pytest.mark.parametrize(
     ("quaternion", "tilt"),
     [
-        ((1.0, 0.0, 0.0, 0.0), 0.0), ((np.cos(0.4), 0.0, np.sin(0.4), 0.0), 0.8),
-        ((np.cos(0.4), 0.0, 0.0, np.sin(0.4)), 0.0), ((0.0, 0.0, 0.0, 0.0), np.nan),
+        ((1.0, 0.0, 0.0, 0.0), 0.0),
+        ((np.cos(0.4), 0.0, np.sin(0.4), 0.0), 0.8),
+        ((np.cos(0.4), 0.0, 0.0, np.sin(0.4)), 0.0),
+        ((0.0, 0.0, 0.0, 0.0), np.nan),
     ],
     ids=["upright", "leaning", "turned", "none"],
-)  # fmt: skip
+)
 def test_the_trunk_leans_by_what_the_quaternion_says_and_none_is_not_upright(
     robot, quaternion, tilt
 ):

@@ -394,12 +394,23 @@ def test_a_message_without_a_clock_is_taken_as_it_comes(arm):
 
 @pytest.mark.parametrize(
     "data",
-    [b"", b"null", b"[]", b"{}", b'{"time": NaN, "target": {}}', b'{"time": 1, "target": {"a": '
-                                                                 b'Infinity}}', b"\xff\xfe",
-     b'{"time": 1, "target": [1, 2]}', b'{"time": 1, "targets": {}}', b'{"time": true}', b"[" * 10000,
-     b'{"time": 1' + b"0" * 10000 + b"}", b" " * (MAX_MESSAGE_BYTES + 1),
-     b'{"time": 1, "target": {"a": ' + b"[" * 9000],
-)  # fmt: skip
+    [
+        b"",
+        b"null",
+        b"[]",
+        b"{}",
+        b'{"time": NaN, "target": {}}',
+        b'{"time": 1, "target": {"a": Infinity}}',
+        b"\xff\xfe",
+        b'{"time": 1, "target": [1, 2]}',
+        b'{"time": 1, "targets": {}}',
+        b'{"time": true}',
+        b"[" * 10000,
+        b'{"time": 1' + b"0" * 10000 + b"}",
+        b" " * (MAX_MESSAGE_BYTES + 1),
+        b'{"time": 1, "target": {"a": ' + b"[" * 9000,
+    ],
+)
 def test_what_is_no_message_says_so(data):
     heard = decode("a", data)
     assert heard.error
