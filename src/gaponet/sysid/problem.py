@@ -70,8 +70,8 @@ MAX_RELATIVE_STD = 0.15  # of a value and of its scale; beyond it the parameter 
 class _GainPrior:
     """Prior of kp, armature and damping around the robot file's values.
 
-    Its weight decreases with the residual of the best fit and increases with the residual's
-    correlation time.
+    It counts more against the recordings, the larger the residual of the best fit and the longer
+    the residual's correlation time: both make the recordings less informative.
 
     Attributes:
         log_std: Field → standard deviation of its logarithm, also by joint (n,).
