@@ -43,6 +43,10 @@ def list_robots(json: Json = False) -> None:
         screen.table("Identified robots", list(made.headings), rows)
         for card in made.identified:
             screen.say(f": {card.details()}", card.name)
+        screen.say(
+            "An identified robot has the values of one unit on one day. Identify or adapt yours "
+            "before you rely on them."
+        )
     screen.say(
         "A name stands wherever a robot does. Your own: a folder with robot.toml and robot.xml; "
         "gaponet robot check FOLDER"

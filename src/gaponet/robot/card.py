@@ -156,13 +156,13 @@ class RobotCard:
         )
 
     def details(self) -> str:
-        """Return a line below the table: licences, version, data, units and limits of use."""
+        """Return a line below the table: licences, version, data, units, and the plain error."""
         facts = self.facts
         published = facts.published
         return (
             f"licence {published.licence}, model {facts.model}, gaponet {facts.gaponet}; data: "
             f"{published.data.address}, units {', '.join(facts.units)}; without the servo model "
-            f"{facts.plain_mrad:.2f} mrad. {published.limits_of_use}"
+            f"{facts.plain_mrad:.2f} mrad"
         )
 
 
