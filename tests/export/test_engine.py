@@ -24,7 +24,7 @@ from gaponet.export.shipped.gaponet_action import (
     isaaclab_actuators,
     read_facts,
 )
-from gaponet.export.shipped.mjlab_servos import Addresses, WorldServos
+from gaponet.export.shipped.mjlab_servos import WorldServos, servo_addresses
 from gaponet.export.shipped.scene_facts import require_scene
 from gaponet.export.simulator_facts import mjcf_text, simulator_facts
 from gaponet.export.torch_program import delta_step, program
@@ -215,7 +215,7 @@ def mjlab_servos_of(robot, worlds):
     """Return the servos of a robot in mjlab's scene of that many worlds, with mjlab's model and data."""
     named = re.sub('="(shoulder|elbow)"', r'="robot/\1"', mjcf_text(robot, robot.dt))
     scene = mujoco.MjModel.from_xml_string(named)
-    addresses = Addresses.of_servos(scene, torch.arange(2))
+    addresses = servo_addresses(scene, torch.arange(2))
     facts = simulator_facts(robot, robot.dt)
     servos = WorldServos(facts, ["shoulder", "elbow"], addresses, worlds, scene.opt.timestep)
     model = SimpleNamespace(

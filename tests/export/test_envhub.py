@@ -65,13 +65,13 @@ def test_robots_are_stepped_by_targets_in_degrees_and_come_near(hub):
 def test_an_episode_ends_in_success_at_the_goal_and_without_it_after_its_time(hub):
     env = hub.RobotEnv()
     env.reset(seed=3)
-    env._goal = env._home.copy()
-    outcomes = [env.step(env._shown(env._home)) for _ in range(hub.HELD_PERIODS)]
+    env._goal = env.robot.home
+    outcomes = [env.step(env.values.of(env.robot.home)) for _ in range(hub.HELD_PERIODS)]
     assert [terminated for _, _, terminated, _, _ in outcomes].count(True) == 1
     assert outcomes[-1][-1]["is_success"]
 
     env.reset(seed=3)
-    away = env._shown(env._low)
+    away = env.values.of(env.values.low)
     ends = [env.step(away)[3] for _ in range(env._max_episode_steps)]
     assert ends.index(True) == len(ends) - 1
 
@@ -83,7 +83,7 @@ def test_drawn_servos_differ_between_episodes_and_identified_ones_do_not(hub):
         found = []
         for seed in range(2):
             env.reset(seed=seed)
-            found.append(env.servos.kp.tolist())
+            found.append(env.robot.servos.numbers.kp.tolist())
         gains[servos] = found
     assert gains["identified"][0] == gains["identified"][1]
     assert gains["drawn"][0] != gains["drawn"][1]
@@ -91,16 +91,17 @@ def test_drawn_servos_differ_between_episodes_and_identified_ones_do_not(hub):
 
 def test_the_task_of_lerobots_configuration_chooses_drawn_servos(hub):
     (envs,) = hub.make_env(cfg=SimpleNamespace(task="drawn"))["so101"].values()
-    assert envs.envs[0]._units is not None
+    assert envs.envs[0].robot.units is not None
     envs.close()
 
 
 def test_the_gripper_has_0_to_100_and_other_joints_have_degrees(hub, folder):
     env = hub.RobotEnv()
-    gripper = env.names.index("gripper")
+    joints = json.loads((folder / "facts.json").read_text())["joints"]
+    gripper = list(joints).index("gripper")
     assert env.action_space.low[gripper] == pytest.approx(0.0, abs=1e-4)
     assert env.action_space.high[gripper] == pytest.approx(100.0, abs=1e-3)
-    pan = json.loads((folder / "facts.json").read_text())["joints"]["shoulder_pan"]["range"]
+    pan = joints["shoulder_pan"]["range"]
     assert np.radians(env.action_space.high[0]) == pytest.approx(pan[1], rel=1e-5)
 
 

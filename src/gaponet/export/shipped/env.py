@@ -2,9 +2,9 @@
 
 It needs no gaponet.
 
-envs = lerobot.envs.factory.make_env("USER/NAME", n_envs=4, trust_remote_code=True)   # this folder,
-on the Hub envs = make_env(n_envs=4)                                                             #
-this file, without LeRobot
+    # this folder, on the Hub
+    envs = lerobot.envs.factory.make_env("USER/NAME", n_envs=4, trust_remote_code=True)
+    envs = make_env(n_envs=4)  # this file, without LeRobot
 
 The task is to bring the joints to angles that are drawn for each episode, and to keep them there.
 Values are LeRobot's: degrees, and 0..100 for a joint whose unit in facts.json is percent.
@@ -50,6 +50,103 @@ sys.path.insert(0, str(FOLDER))
 from gaponet.export.shipped.mujoco_servos import Servos, addresses, fill_delays, read  # noqa: E402
 
 
+class JointValues:
+    """LeRobot's values of joints: degrees, and 0..100 for a joint whose unit is percent.
+
+    Attributes:
+        low, high: Range of the joints, (n) rad.
+        zero, scale: Angle of the value 0, and of each unit of it, (n) rad.
+    """
+
+    def __init__(self, facts: dict[str, Any]) -> None:
+        ranges = []
+        for joint in facts["joints"].values():
+            ranges.append(joint["range"] or (-np.pi, np.pi))
+        percent = np.array([facts["lerobot_units"][name] == "percent" for name in facts["joints"]])
+        self.low, self.high = np.array(ranges).T
+        self.zero = np.where(percent, self.low, 0.0)
+        self.scale = np.where(percent, (self.high - self.low) / 100, np.pi / 180)
+
+    def of(self, qpos: np.ndarray) -> np.ndarray:
+        """Return the values of (n) rad."""
+        return ((qpos - self.zero) / self.scale).astype(np.float32)
+
+    def in_rad(self, values: np.ndarray) -> np.ndarray:
+        """Return the angles of values, (n) rad, within the joints' range."""
+        target = self.zero + self.scale * np.asarray(values, float)
+        return np.asarray(np.clip(target, self.low, self.high))
+
+
+class Simulation:
+    """The robot in MuJoCo, with the identified servos or with those of a unit.
+
+    Attributes:
+        facts: facts.json.
+        home: Position in which it starts, (n) rad.
+        units: randomization.json, whose units it may become; None: it stays as identified.
+    """
+
+    def __init__(self, facts: dict[str, Any], units: dict[str, Any] | None) -> None:
+        self.facts = facts
+        self.units = units
+        self.home = np.array([joint["home"] for joint in facts["joints"].values()])
+        self._compiled = mujoco.MjModel.from_xml_path(str(FOLDER / facts["file"]))
+        self._compiled.opt.timestep = facts["dt"] / facts["decimation"]
+        self._renderer: Any = None
+        self._take(copy.copy(self._compiled), facts)
+
+    def _take(self, model: mujoco.MjModel, facts: dict[str, Any]) -> None:
+        """Simulate a model whose servos have the numbers of facts."""
+        prefix = self.facts["prefix"]
+        self.model = model
+        self.servos = Servos(model, facts, prefix)
+        self.data = mujoco.MjData(model)
+        self.at = addresses(model, list(self.facts["joints"]), prefix)
+        self.close()
+
+    def draw_unit(self, rng: np.random.Generator) -> None:
+        """Become a unit, where there are units."""
+        if self.units is None:
+            return
+        drawing = importlib.import_module("mujoco_randomization")
+        row = int(rng.integers(len(self.units["units"]["kp"])))
+        model = copy.copy(self._compiled)
+        drawing.set_links(model, self.units, row)
+        self._take(model, drawing.unit_facts(self.facts, self.units, row))
+
+    def start(self) -> None:
+        """Stand still at home, as if sent there long ago."""
+        mujoco.mj_resetData(self.model, self.data)
+        self.data.qpos[self.at.qpos] = self.home
+        self.data.ctrl[self.at.servo] = self.home
+        fill_delays(self.model, self.data)
+        mujoco.mj_forward(self.model, self.data)
+
+    def step(self, target: np.ndarray) -> None:
+        """Simulate a control period under targets, (n) rad."""
+        self.data.ctrl[self.at.servo] = target
+        for _ in range(self.facts["decimation"]):
+            self.servos.before(self.data)
+            mujoco.mj_step(self.model, self.data)
+
+    @property
+    def qpos(self) -> np.ndarray:
+        """Position of the joints, (n) rad."""
+        return np.asarray(self.data.qpos[self.at.qpos])
+
+    def render(self) -> np.ndarray:
+        """Return an image, (height, width, 3)."""
+        if self._renderer is None:
+            self._renderer = mujoco.Renderer(self.model, *IMAGE_SIZE)
+        self._renderer.update_scene(self.data)
+        return np.asarray(self._renderer.render())
+
+    def close(self) -> None:
+        if self._renderer is not None:
+            self._renderer.close()
+            self._renderer = None
+
+
 class RobotEnv(gymnasium.Env[Any, Any]):
     """One robot that is to reach a goal, and stay there.
 
@@ -70,29 +167,22 @@ class RobotEnv(gymnasium.Env[Any, Any]):
         """
         if servos not in SERVOS:
             raise ValueError(f"servos '{servos}': one of {', '.join(SERVOS)}")
-        self.facts = read(FOLDER / "facts.json")
-        self.names = list(self.facts["joints"])
+        facts = read(FOLDER / "facts.json")
+        self.robot = Simulation(facts, _read_units() if servos == "drawn" else None)
+        self.values = JointValues(facts)
         self.pixels = pixels
-        self._units = _read_units() if servos == "drawn" else None
-        self._compiled = mujoco.MjModel.from_xml_path(str(FOLDER / self.facts["file"]))
-        self._compiled.opt.timestep = self.facts["dt"] / self.facts["decimation"]
-        self.metadata = self.metadata | {"render_fps": round(1 / self.facts["dt"])}
-        self._max_episode_steps = round(EPISODE_S / self.facts["dt"])
-        joints = self.facts["joints"].values()
-        ranges = [joint["range"] or (-np.pi, np.pi) for joint in joints]
-        self._low, self._high = np.array(ranges).T  # rad
-        self._home = np.array([joint["home"] for joint in joints])
-        self._operated = [self.names.index(name) for name in self.facts["corrected"]]
-        percent = np.array([self.facts["lerobot_units"][name] == "percent" for name in self.names])
-        self._scale = np.where(percent, (self._high - self._low) / 100, np.pi / 180)
-        self._zero = np.where(percent, self._low, 0.0)
-        self._renderer: Any = None
-        self._use(self.facts, None)
+        self.metadata = self.metadata | {"render_fps": round(1 / facts["dt"])}
+        self._max_episode_steps = round(EPISODE_S / facts["dt"])
+        names = list(facts["joints"])
+        self._operated = [names.index(name) for name in facts["corrected"]]
+        self._goal = self.robot.home
+        self._periods = 0
+        self._held = 0
         box = partial(gymnasium.spaces.Box, dtype=np.float32)
-        low = self._shown(self._low)
-        high = self._shown(self._high)
+        low = self.values.of(self.values.low)
+        high = self.values.of(self.values.high)
         self.action_space = box(low, high)
-        everything = np.full(len(self.names), np.inf, np.float32)
+        everything = np.full(len(names), np.inf, np.float32)
         spaces: dict[str, Any] = {
             "agent_pos": box(-everything, everything),
             "environment_state": box(low, high),
@@ -102,47 +192,23 @@ class RobotEnv(gymnasium.Env[Any, Any]):
             spaces["pixels"] = gymnasium.spaces.Box(0, 255, shape, dtype=np.uint8)
         self.observation_space = gymnasium.spaces.Dict(spaces)
 
-    def _use(self, facts: dict[str, Any], row: int | None) -> None:
-        """Give the robot the servos of facts, and the links of a unit, if there is one."""
-        self.model = copy.copy(self._compiled)
-        if row is not None:
-            importlib.import_module("mujoco_randomization").set_links(self.model, self._units, row)
-        self.servos = Servos(self.model, facts, self.facts["prefix"])
-        self.data = mujoco.MjData(self.model)
-        where = addresses(self.model, self.names, self.facts["prefix"])
-        self._dof, self._qpos, self._servo = where
-        if self._renderer is not None:
-            self._renderer.close()
-            self._renderer = None
-
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
         super().reset(seed=seed)
-        if self._units is not None:
-            row = int(self.np_random.integers(len(self._units["units"]["kp"])))
-            drawing = importlib.import_module("mujoco_randomization")
-            self._use(drawing.unit_facts(self.facts, self._units, row), row)
-        mujoco.mj_resetData(self.model, self.data)
-        self.data.qpos[self._qpos] = self._home
-        self.data.ctrl[self._servo] = self._home
-        fill_delays(self.model, self.data)
-        mujoco.mj_forward(self.model, self.data)
-        self._goal = self._home.copy()
+        self.robot.draw_unit(self.np_random)
+        self.robot.start()
+        goal = self.robot.home.copy()
         away = self.np_random.uniform(-MAX_GOAL_RAD, MAX_GOAL_RAD, len(self._operated))
-        self._goal[self._operated] += away
-        self._goal = np.clip(self._goal, self._low, self._high)
+        goal[self._operated] += away
+        self._goal = np.clip(goal, self.values.low, self.values.high)
         self._periods = 0
         self._held = 0
         return self._observation(), {"is_success": False}
 
     def step(self, action: np.ndarray) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
-        target = self._zero + self._scale * np.asarray(action, float)
-        self.data.ctrl[self._servo] = np.clip(target, self._low, self._high)
-        for _ in range(self.facts["decimation"]):
-            self.servos.before(self.data)
-            mujoco.mj_step(self.model, self.data)
-        away = np.abs(self.data.qpos[self._qpos] - self._goal)[self._operated]
+        self.robot.step(self.values.in_rad(action))
+        away = np.abs(self.robot.qpos - self._goal)[self._operated]
         self._held = self._held + 1 if away.max() < NEAR_RAD else 0
         self._periods += 1
         reached = self._held >= HELD_PERIODS
@@ -152,24 +218,15 @@ class RobotEnv(gymnasium.Env[Any, Any]):
 
     def render(self) -> np.ndarray:
         """Return an image, (height, width, 3)."""
-        if self._renderer is None:
-            self._renderer = mujoco.Renderer(self.model, *IMAGE_SIZE)
-        self._renderer.update_scene(self.data)
-        return np.asarray(self._renderer.render())
+        return self.robot.render()
 
     def close(self) -> None:
-        if self._renderer is not None:
-            self._renderer.close()
-            self._renderer = None
-
-    def _shown(self, qpos: np.ndarray) -> np.ndarray:
-        """Return LeRobot's values of (n,) rad."""
-        return ((qpos - self._zero) / self._scale).astype(np.float32)
+        self.robot.close()
 
     def _observation(self) -> dict[str, Any]:
         seen = {
-            "agent_pos": self._shown(self.data.qpos[self._qpos]),
-            "environment_state": self._shown(self._goal),
+            "agent_pos": self.values.of(self.robot.qpos),
+            "environment_state": self.values.of(self._goal),
         }
         if self.pixels:
             seen["pixels"] = self.render()

@@ -16,31 +16,27 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gaponet.export.shipped.mujoco_servos import delay_weights, read
+from gaponet.export.shipped.mujoco_servos import (
+    Addresses,
+    ServoNumbers,
+    delay_weights,
+    read,
+)
 from gaponet.export.shipped.unit_events import columns_of, write_model
 from gaponet.robot.servo_fields import SERVO_TERMS
-from gaponet.sim.servo import friction_limit, present, servo_bias, torque_range
+from gaponet.sim.servo import present
 
 # Fields of the model that each world needs for itself.
 SERVO_FIELDS = ("dof_frictionloss", "actuator_biasprm", "actuator_forcerange")
 FRICTION_FIELDS = ("dof_invweight0",)
 
 
-@dataclass(frozen=True)
-class Addresses:
-    """Places of joints in mjlab's model and data, (n) each."""
-
-    dof: Tensor
-    qpos: Tensor
-    servo: Tensor
-
-    @classmethod
-    def of_servos(cls, mj_model: Any, servos: Tensor) -> Addresses:
-        """Return the places of the joints that actuators move."""
-        joints = mj_model.actuator_trnid[servos.cpu().numpy(), 0]
-        dof = torch.as_tensor(mj_model.jnt_dofadr[joints], device=servos.device).long()
-        qpos = torch.as_tensor(mj_model.jnt_qposadr[joints], device=servos.device).long()
-        return cls(dof, qpos, servos)
+def servo_addresses(mj_model: Any, servos: Tensor) -> Addresses:
+    """Return the places of actuators and of the joints that they move, tensors (n)."""
+    joints = mj_model.actuator_trnid[servos.cpu().numpy(), 0]
+    dof = torch.as_tensor(mj_model.jnt_dofadr[joints], device=servos.device).long()
+    qpos = torch.as_tensor(mj_model.jnt_qposadr[joints], device=servos.device).long()
+    return Addresses(dof, qpos, servos)
 
 
 class WorldServos:
@@ -75,12 +71,13 @@ class WorldServos:
 
         self.joints = joints
         self.addresses = addresses
-        self.num_envs = num_envs
-        self.kp = column("kp")
-        self.bias = self.kp * column("offset")
-        self.frictionloss = column("frictionloss")
-        self.effort = column("effort_limit")
-        self.terms = present({name: column(name) for name in SERVO_TERMS})
+        self.numbers = ServoNumbers(
+            kp=column("kp"),
+            bias=column("kp") * column("offset"),
+            frictionloss=column("frictionloss"),
+            effort=column("effort_limit"),
+            terms=present({name: column(name) for name in SERVO_TERMS}),
+        )
         weights = delay_weights(column("delay").cpu().numpy(), step)
         self.weights = torch.tensor(weights, dtype=torch.float, device=device)[:, None]
         self.targets = torch.zeros(len(weights), num_envs, len(joints), device=device)
@@ -90,10 +87,7 @@ class WorldServos:
         self.starts_under_command = False
 
     def restart(self, env_ids: Any = None) -> None:
-        """Let worlds (indices, a mask, a slice.
-
-        None for all) begin anew at the next physics step.
-        """
+        """Let worlds (indices, a mask, a slice; None for all) begin anew at the next step."""
         self.fresh = self.fresh.clone()
         self.fresh[slice(None) if env_ids is None else env_ids] = True
 
@@ -109,7 +103,7 @@ class WorldServos:
             self._start(data, qpos, target)
         # Not in place: tensors of inference mode cannot be written to outside of it.
         self.targets = torch.cat([target[None], self.targets[1:]])
-        if self.terms:
+        if self.numbers.terms:
             self._write_servo_model(model, qpos, qvel, target)
         return (self.weights * self.targets).sum(0)
 
@@ -125,26 +119,24 @@ class WorldServos:
         fresh = self.fresh[:, None]
         held = target if self.starts_under_command else qpos
         self.targets = torch.where(fresh, held, self.targets)
-        self.torque = torch.where(fresh, self.bias + self.kp * (held - qpos), self.torque)
+        requested = self.numbers.bias + self.numbers.kp * (held - qpos)
+        self.torque = torch.where(fresh, requested, self.torque)
         self.load = torch.where(fresh, data.qfrc_bias[:, self.addresses.dof], self.load)
 
     def _write_servo_model(self, model: Any, qpos: Tensor, qvel: Tensor, target: Tensor) -> None:
         """Write friction, torque limits and bias."""
-        if self.num_envs > 1 and model.dof_frictionloss.stride(0) == 0:
+        if len(self.fresh) > 1 and model.dof_frictionloss.stride(0) == 0:
             raise ValueError(
                 "all worlds share one friction: cfg.events.update(mjlab_events(FOLDER)) gives "
                 "each its own"
             )
-        dof = self.addresses.dof
-        servo = self.addresses.servo
-        friction = friction_limit(self.terms, self.frictionloss, qvel, self.torque, self.load)
-        model.dof_frictionloss[:, dof] = friction
-        if "no_load_speed" in self.terms:
-            speed = self.terms["no_load_speed"]
-            limits = torque_range(self.effort, torch.where(speed > 0, qvel / speed, 0.0))
+        numbers = self.numbers
+        dof, _, servo = self.addresses
+        model.dof_frictionloss[:, dof] = numbers.friction(qvel, self.torque, self.load)
+        if "no_load_speed" in numbers.terms:
+            limits = numbers.torque_limits(qvel)
             model.actuator_forcerange[:, servo] = torch.stack(limits, dim=-1)
-        bias = servo_bias(self.terms, self.kp, self.bias, target, qpos)
-        model.actuator_biasprm[:, servo, 0] = bias
+        model.actuator_biasprm[:, servo, 0] = numbers.step_bias(target, qpos)
 
     def set_units(
         self, model: Any, env_ids: Tensor, joints: list[str], units: dict[str, Tensor]
@@ -162,15 +154,22 @@ class WorldServos:
         rows = env_ids[:, None]
 
         def of_worlds(column: Tensor, values: Tensor) -> Tensor:
-            column = column.expand(self.num_envs, -1).clone()
+            column = column.expand(len(self.fresh), -1).clone()
             column[rows, columns] = values.to(column.dtype)
             return column
 
-        self.kp = of_worlds(self.kp, units["kp"])
-        self.bias = of_worlds(self.bias, units["kp"] * units["offset"])
-        self.frictionloss = of_worlds(self.frictionloss, units["frictionloss"])
-        self.effort = of_worlds(self.effort, units["effort_limit"])
-        self.terms = {name: of_worlds(column, units[name]) for name, column in self.terms.items()}
+        old = self.numbers
+        terms = {name: of_worlds(column, units[name]) for name, column in old.terms.items()}
+        if "no_load_speed" in terms:
+            speed = terms["no_load_speed"]
+            terms["no_load_speed"] = torch.where(speed > 0, speed, torch.inf)  # 0 is no limit
+        self.numbers = ServoNumbers(
+            kp=of_worlds(old.kp, units["kp"]),
+            bias=of_worlds(old.bias, units["kp"] * units["offset"]),
+            frictionloss=of_worlds(old.frictionloss, units["frictionloss"]),
+            effort=of_worlds(old.effort, units["effort_limit"]),
+            terms=terms,
+        )
 
 
 def mjlab_servos(folder: str | Path, **options: Any) -> Any:
@@ -222,7 +221,7 @@ def _servo_class() -> Any:
             self.model = model
             self.data = data
             facts = read(Path(self.cfg.folder) / "facts.json")
-            addresses = Addresses.of_servos(mj_model, self.global_ctrl_ids)
+            addresses = servo_addresses(mj_model, self.global_ctrl_ids)
             step = float(mj_model.opt.timestep)
             self.servos = WorldServos(facts, list(self.target_names), addresses, data.nworld, step)
 

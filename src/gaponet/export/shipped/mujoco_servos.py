@@ -2,9 +2,12 @@
 
 This file is copied into exports; it needs MuJoCo and numpy, not gaponet.
 
-servos = Servos(model, read("facts.json"))     # once; prefix="left/" where the robot was attached
-to a scene data.ctrl[...] = …; fill_delays(model, data)   # after each reset data.ctrl[...] = …;
-servos.before(data); mujoco.mj_step(model, data)     # mj_forward after a change of state
+    servos = Servos(model, read("facts.json"))  # once; prefix="left/" if attached to a scene
+    data.ctrl[...] = …
+    fill_delays(model, data)  # after each reset
+    data.ctrl[...] = …
+    servos.before(data)  # mj_forward before it, where you changed the state
+    mujoco.mj_step(model, data)
 """
 
 from __future__ import annotations
@@ -12,7 +15,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -34,6 +37,40 @@ def read(path: str | Path) -> dict[str, Any]:
     return facts
 
 
+class Addresses(NamedTuple):
+    """Places of joints in MuJoCo's model and data, (n) each: indices, or tensors of them."""
+
+    dof: Any  # in qvel
+    qpos: Any
+    servo: Any  # of the actuators that drive the joints
+
+
+class ServoNumbers(NamedTuple):
+    """Numbers of servos, and what follows from them in a physics step: numpy arrays or tensors.
+
+    Each has the joints as its last axis.
+    """
+
+    kp: Any  # N·m/rad
+    bias: Any  # torque of the zero offset, N·m
+    frictionloss: Any  # N·m
+    effort: Any  # torque limit, N·m
+    terms: dict[str, Any]  # of the servo model, as of `present`
+
+    def friction(self, qvel: Any, torque: Any, load: Any) -> Any:
+        """Return the limit of friction, N·m, under the motor's torque and gravity's."""
+        return friction_limit(self.terms, self.frictionloss, qvel, torque, load)
+
+    def torque_limits(self, qvel: Any) -> tuple[Any, Any]:
+        """Return the least and the largest torque of motors with a no-load speed, N·m."""
+        limits: tuple[Any, Any] = torque_range(self.effort, qvel / self.terms["no_load_speed"])
+        return limits
+
+    def step_bias(self, target: Any, qpos: Any) -> Any:
+        """Return the actuators' bias for a step under targets, N·m."""
+        return servo_bias(self.terms, self.kp, self.bias, target, qpos)
+
+
 class Servos:
     """Servos of a compiled model.
 
@@ -53,81 +90,116 @@ class Servos:
             if isinstance(value, int | float):
                 column[field] = np.array([joint.get(field, 0.0) for joint in joints.values()])
         self.model = model
-        self.dof, self.qpos, self.servo = addresses(model, list(joints), prefix)
-        self.kp = column["kp"]
-        self.frictionloss = column["frictionloss"]
-        self._motor = (column["armature"], column["damping"], column["kd"])
-        self._play_time = np.nan
-        self.bias = self.kp * column["offset"]
-        self.effort = column["effort_limit"]
-        model.dof_armature[self.dof] = column["armature"]
-        model.dof_damping[self.dof, ...] = column["damping"]
+        self.at = addresses(model, list(joints), prefix)
+        dof, qpos, servo = self.at
+        self.numbers = ServoNumbers(
+            kp=column["kp"],
+            bias=column["kp"] * column["offset"],
+            frictionloss=column["frictionloss"],
+            effort=column["effort_limit"],
+            terms=present({name: column[name] for name in SERVO_TERMS if name in column}),
+        )
+        model.dof_armature[dof] = column["armature"]
+        model.dof_damping[dof, ...] = column["damping"]
         # A servo that limits the speed of its targets (<pid slewmax>) has its stiffness in biasprm
         # alone.
-        self._ramped = np.array([ramp_speed(model, i) > 0 for i in self.servo])
-        model.actuator_gainprm[self.servo, 0] = np.where(self._ramped, 0.0, self.kp)
-        model.actuator_biasprm[self.servo, 0] = self.bias
-        model.actuator_biasprm[self.servo, 1] = -self.kp
-        model.actuator_biasprm[self.servo, 2] = -column["kd"]
-        model.dof_frictionloss[self.dof] = self.frictionloss
-        model.qpos0[self.qpos] += (
+        self._ramped = np.array([ramp_speed(model, i) > 0 for i in servo])
+        model.actuator_gainprm[servo, 0] = np.where(self._ramped, 0.0, column["kp"])
+        model.actuator_biasprm[servo, 0] = self.numbers.bias
+        model.actuator_biasprm[servo, 1] = -column["kp"]
+        model.actuator_biasprm[servo, 2] = -column["kd"]
+        model.dof_frictionloss[dof] = column["frictionloss"]
+        model.qpos0[qpos] += (
             np.array([facts["plain"][name]["zero"] for name in joints]) - column["zero"]
         )
         if model.nhistory:
-            model.actuator_delay[self.servo] = column["delay"]
+            model.actuator_delay[servo] = column["delay"]
         mujoco.mj_setConst(model, mujoco.MjData(model))
         # stiff friction, which no MJCF can express
-        model.dof_invweight0[self.dof] *= facts["dof_invweight0_factor"]
-        self.terms = present({name: column[name] for name in SERVO_TERMS if name in column})
+        model.dof_invweight0[dof] *= facts["dof_invweight0_factor"]
+        self._backlash: Backlash | None = None
+        if "backlash" in self.numbers.terms:
+            self._backlash = Backlash(model, self.at, column)
 
     def before(self, data: Any) -> None:
         """Set bias, torque limits and friction for the next physics step, under data.ctrl.
 
-        With backlash qfrc_applied
-        too."""
-        if not self.terms:
+        With backlash, also qfrc_applied, and armature, damping and gear of the model.
+        """
+        numbers = self.numbers
+        if not numbers.terms:
             return
         model = self.model
-        torque = data.actuator_force[self.servo]
-        load = data.qfrc_bias[self.dof]
-        q = data.qpos[self.qpos]
-        qvel = data.qvel[self.dof]
-        limit = friction_limit(self.terms, self.frictionloss, qvel, torque, load)
-        if "no_load_speed" in self.terms:
-            limits = torque_range(self.effort, qvel / self.terms["no_load_speed"])
-            model.actuator_forcerange[self.servo] = np.stack(limits, axis=-1)
-        targets = self._targets_in_force(data)
-        bias = servo_bias(self.terms, self.kp, self.bias, targets, q)
-        if "backlash" in self.terms:
-            h = model.opt.timestep
-            if data.time != self._play_time:  # a new state
-                self.play = Play(self.terms["backlash"], *self._motor, load, qvel)
-            else:
-                self.play.after(qvel, torque, data.qfrc_constraint[self.dof], h)
-            limit, armature, damping, applied, gear, more = self.play.before(
-                limit, self.kp, q, qvel, h
-            )
-            model.dof_armature[self.dof] = armature
-            model.dof_damping[self.dof, ...] = damping
-            data.qfrc_applied[self.dof] = applied
-            model.actuator_gear[self.servo, 0] = gear
+        dof, qpos, servo = self.at
+        q = data.qpos[qpos]
+        qvel = data.qvel[dof]
+        friction = numbers.friction(qvel, data.actuator_force[servo], data.qfrc_bias[dof])
+        if "no_load_speed" in numbers.terms:
+            limits = numbers.torque_limits(qvel)
+            model.actuator_forcerange[servo] = np.stack(limits, axis=-1)
+        bias = numbers.step_bias(self._targets_in_force(data), q)
+        if self._backlash is not None:
+            friction, more = self._backlash.before(data, q, qvel, friction)
             bias = bias + more
-            self._play_time = data.time + h
-        model.dof_frictionloss[self.dof] = limit
-        model.actuator_biasprm[self.servo, 0] = bias
+        model.dof_frictionloss[dof] = friction
+        model.actuator_biasprm[servo, 0] = bias
 
     def _targets_in_force(self, data: Any) -> Any:
         """Return the targets of the next physics step, rad.
 
         Where a servo limits their speed, these are the targets so far.
         """
-        targets = np.array(data.ctrl[self.servo])
+        servo = self.at.servo
+        targets = np.array(data.ctrl[servo])
         for k in np.flatnonzero(self._ramped):
-            i = self.servo[k]
+            i = servo[k]
             step = self.model.opt.timestep * ramp_speed(self.model, i)
             now = data.act[self.model.actuator_actadr[i]]
             targets[k] = np.clip(targets[k], now - step, now + step)
         return targets
+
+
+class Backlash:
+    """Backlash of the servos of a compiled model; it begins anew where a state was written."""
+
+    def __init__(self, model: Any, at: Addresses, column: dict[str, Any]) -> None:
+        """
+        Args:
+            column: Field → (n) numbers of the servos, as in facts.json.
+        """
+        self.model = model
+        self.at = at
+        self._column = column
+        self._play: Play | None = None
+        self._next_time = np.nan  # s, at which this state goes on
+
+    def before(self, data: Any, qpos: Any, qvel: Any, friction: Any) -> tuple[Any, Any]:
+        """Write armature, damping, gear and applied torque of the links for the next physics step.
+
+        Args:
+            qpos, qvel: State of the joints, (n) rad and rad/s.
+            friction: Limit of friction of the motors, N·m.
+
+        Returns:
+            Limit of friction of the links, and the bias that their actuators need besides, N·m.
+        """
+        model = self.model
+        dof, _, servo = self.at
+        column = self._column
+        h = model.opt.timestep
+        if self._play is None or data.time != self._next_time:
+            motor = column["armature"], column["damping"], column["kd"]
+            self._play = Play(column["backlash"], *motor, data.qfrc_bias[dof], qvel)
+        else:
+            self._play.after(qvel, data.actuator_force[servo], data.qfrc_constraint[dof], h)
+        values = self._play.before(friction, column["kp"], qpos, qvel, h)
+        friction, armature, damping, applied, gear, bias = values
+        model.dof_armature[dof] = armature
+        model.dof_damping[dof, ...] = damping
+        data.qfrc_applied[dof] = applied
+        model.actuator_gear[servo, 0] = gear
+        self._next_time = data.time + h
+        return friction, bias
 
 
 def ramp_speed(model: Any, actuator: int) -> float:
@@ -140,11 +212,11 @@ def ramp_speed(model: Any, actuator: int) -> float:
     return max(float(model.actuator_dynprm[actuator, SLEW_MAX]), 0.0)
 
 
-def addresses(model: Any, joints: list[str], prefix: str = "") -> tuple[Any, Any, Any]:
-    """Return the indices of joints in qvel and in qpos, and of the actuators that drive them."""
+def addresses(model: Any, joints: list[str], prefix: str = "") -> Addresses:
+    """Return the places of joints and of the actuators that drive them."""
     ids = [model.joint(prefix + name).id for name in joints]
     servos = np.array([np.flatnonzero(model.actuator_trnid[:, 0] == joint)[0] for joint in ids])
-    return model.jnt_dofadr[ids], model.jnt_qposadr[ids], servos
+    return Addresses(model.jnt_dofadr[ids], model.jnt_qposadr[ids], servos)
 
 
 def fill_delays(model: Any, data: Any) -> None:
@@ -193,28 +265,29 @@ def play(
     model.opt.timestep = float(motion["dt"]) / steps
     servos = Servos(model, facts, prefix) if form == "joints" else None
     data = mujoco.MjData(model)
-    dof, at, servo = addresses(model, names, prefix)
-    data.qpos[at] = qpos[0]
-    data.qvel[dof] = motion["qvel"][0]
-    data.ctrl[servo] = ctrl[0]
+    at = addresses(model, names, prefix)
+    data.qpos[at.qpos] = qpos[0]
+    data.qvel[at.dof] = motion["qvel"][0]
+    data.ctrl[at.servo] = ctrl[0]
     fill_delays(model, data)
     mujoco.mj_forward(model, data)
     for t in range(len(ctrl) - 1):
-        data.ctrl[servo] = ctrl[t]
+        data.ctrl[at.servo] = ctrl[t]
         for _ in range(steps):
             if servos is not None:
                 servos.before(data)
             mujoco.mj_step(model, data)
-        qpos[t + 1] = data.qpos[at]
+        qpos[t + 1] = data.qpos[at.qpos]
     return qpos
 
 
 def delay_weights(delay: Any, step: float) -> Any:
     """Return weights of past commands, for engines whose actuators have no delay.
 
-    past = np.concatenate([ctrl[None], past[:-1]])   # (depth, n), newest first; at the start the
-    first command repeated target = (weights * past).sum(0)                 # same as MuJoCo's delay
-    with interp="linear"
+        past = np.concatenate([ctrl[None], past[:-1]])  # (depth, n), newest first
+        target = (weights * past).sum(0)
+
+    This is MuJoCo's delay with interp="linear". At the start, past is the first command repeated.
 
     Args:
         delay: (n,) s.
