@@ -46,6 +46,14 @@ GRAVITY_ROWS = 5  # rows that share one derivative
 class JointRollouts:
     """Rollouts of windows of recordings, n operated joints; rows in which a tip may touch
     something do not count.
+
+    Attributes:
+        windows: The recordings side by side, and the loads along them.
+        recorded: Whether a window holds a joint, (n, windows); without, there is no error.
+        counted: Rows that count, (windows, rows).
+        kp_ratio: kp of each recording over the robot's own, (windows, n).
+        kd: kd of each recording, (windows, n) N·m·s/rad.
+        temperature: Mean temperature of each recording, (n, windows) °C.
     """
 
     def __init__(
@@ -65,107 +73,18 @@ class JointRollouts:
         self.robot = robot
         self.op = robot.operated_index
         self.nthread = nthread or os.cpu_count() or 1
-        self.periods = np.array([p.dt for p in parts])  # (windows,) s
-        self.dt = float(self.periods.max())
-        # Physics steps of every period, so that windows step side by side.
-        self.count = robot.steps_per(self.dt)
-        self.thin = max(1, round(ROW_PERIOD_S / self.dt))
-        # Rows of each window from one that is compared to the next, (windows,): multiples of
-        # `thin`.
-        thins = np.round(ROW_PERIOD_S / self.periods / self.thin)
-        self._thins = self.thin * np.maximum(1, thins).astype(int)
-        self.lengths = np.array([len(p) for p in parts])
-        self.qpos = self._stacked([p.qpos[:, self.op] for p in parts])
-        self.qvel = self._stacked([p.qvel[:, self.op] for p in parts])
-        self.ctrl = self._commands()
-        self.tables = self._loads()
-        self.stops = self._stops()
-        self.touch = self._touch(contact_height)  # (windows, rows)
-        # Joints that a window does not hold have no error, (n, windows).
+        self.windows = _windows(parts, robot, contact_height)
         self.recorded = np.stack([p.meta.records(robot.operated) for p in parts], axis=1)
-        self.counted = self._counted()
-        # Gains of each recording: kp over the robot's own, kd in N·m·s/rad, (windows, n).
+        self.counted = _counted_rows(self.windows)
         acting = [robot.with_gains(*p.meta.recorded_gains) for p in parts]
         self.kp_ratio = np.array([(r.servo.kp / robot.servo.kp)[self.op] for r in acting])
         self.kd = np.array([r.servo.kd[self.op] for r in acting])
-        self.temperature = recorded_temperatures(parts, self.op).T  # (n, windows) °C
+        self.temperature = recorded_temperatures(parts, self.op).T
 
-    def _stacked(self, windows: list[Array]) -> Array:
-        """Return arrays (rows, n) of each window as (n, windows, rows); the last row of a shorter
-        one is repeated.
-        """
-        rows = int(self.lengths.max())
-        extended = np.stack([_extended(x, rows) for x in windows])
-        return extended.transpose(2, 0, 1).astype(np.float32)
-
-    def _commands(self) -> Array:
-        """Return the commands inside the joints' ranges, as servos with a speed limit ramp them,
-        (n, windows, rows).
-        """
-        low, high = self.robot.qpos_range[self.op].T
-        ctrl = self._stacked([np.clip(p.ctrl[:, self.op], low, high) for p in self.parts])
-        speed = self.robot.servo.target_speed[self.op]
-        if not speed.any():
-            return ctrl
-        limit = np.where(speed > 0, speed, np.inf)[:, None]
-        limited = speed_limited(np.moveaxis(ctrl, -1, 0), self.qpos[..., 0], limit, self.periods)
-        return np.ascontiguousarray(np.moveaxis(limited, 0, -1))
-
-    def _loads(self) -> Array:
-        """Return the loads along the recordings in the middle of each period, as
-        `Windows.loads`.
-        """
-        payloads = [(p.meta.payload_mass, p.meta.payload_side) for p in self.parts]
-        models = {}
-        for payload in dict.fromkeys(payloads):
-            models[payload] = build_model(self.robot, *payload, self.dt, physics_only=True)
-        along = []
-        for part, payload, thin in zip(self.parts, payloads, self._thins, strict=True):
-            along.append(_loads_along(part, models[payload], self.op, thin))
-        stacked = []
-        for of_windows in zip(*along, strict=True):
-            stacked.append(_at_middle(self._stacked(list(of_windows))))
-        inertia, weight, pull, slope = stacked
-        weight_at_zero = weight - slope * _at_middle(self.qpos)
-        return np.stack([inertia, weight_at_zero, pull, slope])
-
-    def _stops(self) -> Array:
-        """Return the ends of each joint's range, or of the recordings, so that no rollout
-        diverges, (n, 2) rad.
-        """
-        low, high = self.robot.qpos_range[self.op].T
-        lowest = np.where(np.isfinite(low), low, -UNLIMITED_STOP_RAD)
-        highest = np.where(np.isfinite(high), high, UNLIMITED_STOP_RAD)
-        ends = (
-            np.minimum(lowest, self.qpos.min(axis=(1, 2))),
-            np.maximum(highest, self.qpos.max(axis=(1, 2))),
-        )
-        return np.stack(ends, axis=1).astype(np.float32)
-
-    def _touch(self, contact_height: float) -> Array:
-        """Return the rows in which a tip is below a height, m, (windows, rows)."""
-        rows = int(self.lengths.max())
-        heights = tips_of(self.robot)
-        if heights is None:
-            return np.zeros((len(self.parts), rows), bool)
-        each = np.stack([_extended(heights(p.qpos), rows) for p in self.parts])
-        return np.asarray(each < contact_height)
-
-    def _counted(self) -> Array:
-        """Return the rows that count, (windows, rows): after the start has settled, away from
-        contacts.
-        """
-        rows = self.touch.shape[1]
-        settling = np.round(SETTLE_S / self.periods).astype(int)  # rows, (windows,)
-        near = []
-        for touch, after in zip(self.touch, settling, strict=True):
-            near.append(np.convolve(touch, np.ones(after + 1))[:rows] > 0.5)
-        row = np.arange(rows)
-        has_settled = row > np.maximum(settling, 1)[:, None]
-        is_recorded = row < self.lengths[:, None]
-        is_compared = row % self._thins[:, None] == 0
-        counted = has_settled & is_recorded & ~np.array(near) & is_compared
-        return np.asarray(counted[:, :: self.thin])
+    @property
+    def dt(self) -> float:
+        """Longest control period, s."""
+        return float(self.windows.periods.max())
 
     @property
     def window(self) -> Array:
@@ -181,80 +100,13 @@ class JointRollouts:
         """Return the same windows, put back on the recording every `seconds`: a smoother surface
         to descend on.
         """
+        touch = self.windows.touch.copy()
+        for of_window, period in zip(touch, self.windows.periods, strict=True):
+            of_window[:: max(round(seconds / period), 1)] = True
         short = copy.copy(self)
-        short.touch = self.touch.copy()
-        for touch, period in zip(short.touch, self.periods, strict=True):
-            touch[:: max(round(seconds / period), 1)] = True
-        short.counted = short._counted()
+        short.windows = self.windows._replace(touch=touch)
+        short.counted = _counted_rows(short.windows)
         return short
-
-    def regressed(self) -> dict[str, Array]:
-        """Return kp, total damping, dry friction, armature, offset and delay that balance the
-        recorded accelerations.
-
-        The regression is linear but for the delay, biased by noise, and independent of any file's
-        gains. (n,) each; kp is 0 where it fails.
-        """
-        joints = [self._regressed_joint(j) for j in range(len(self.op))]
-        by_field = np.array([list(joint.values()) for joint in joints]).T
-        return dict(zip(REGRESSED_FIELDS, by_field, strict=True))
-
-    def _regressed_joint(self, j: int) -> dict[str, float]:
-        """Return `regressed` of joint j: the fit with the delay that leaves the least residual.
-
-        A least-squares fit of non-negative factors x to
-
-            torque of the links = x0 (command − q) − x1 q̇ − x2 sign(q̇) − x3 q̈ + x4 − x5
-
-        in which x4 − x5 is kp times the offset, of either sign.
-        """
-        row = np.concatenate([np.arange(length) for length in self.lengths])
-        window = np.repeat(np.arange(len(self.lengths)), self.lengths)
-        q, v, a = self._smooth_motion(j)
-        inertia, weight, pull, slope = self.tables[:, j, window, row]
-        torque = inertia * a + weight + slope * q + pull
-        one = np.ones_like(q)
-        best = dict.fromkeys(REGRESSED_FIELDS, 0.0)
-        least = np.inf
-        for delay in np.arange(0.0, MAX_REGRESSION_DELAY_S, max(self.dt / 2, 5e-3)):
-            error = self._late_commands(j, delay, window, row) - q
-            columns = np.stack([error, -v, -np.tanh(v / SLIP_SPEED), -a, one, -one], axis=1)
-            x, residual = _nonnegative_factors(columns, torque)
-            if residual < least and x[0] > 0:
-                least = residual
-                offset = (x[4] - x[5]) / x[0]
-                best = dict(zip(REGRESSED_FIELDS, (*x[:4], offset, delay), strict=True))
-        return best
-
-    def _smooth_motion(self, j: int) -> tuple[Array, Array, Array]:
-        """Return position, velocity and acceleration of joint j in all rows of all windows, (rows,)
-        each, SI.
-        """
-        positions = []
-        velocities = []
-        accelerations = []
-        for window, (length, dt) in enumerate(zip(self.lengths, self.periods, strict=True)):
-            recorded = self.qpos[j, window, :length, None].astype(float)
-            smooth = lowpass(recorded, dt, CUTOFF_HZ)[:, 0]
-            speed = np.gradient(smooth, dt)
-            positions.append(smooth)
-            velocities.append(speed)
-            accelerations.append(np.gradient(speed, dt))
-        position = np.concatenate(positions)
-        velocity = np.concatenate(velocities)
-        acceleration = np.concatenate(accelerations)
-        return position, velocity, acceleration
-
-    def _late_commands(self, j: int, delay: float, window: Array, row: Array) -> Array:
-        """Return the command of joint j that reaches its servo in rows of windows, (rows,) rad,
-        interpolated between the commands before and after `delay`, s.
-        """
-        late = row - delay / self.periods[window]
-        whole = np.floor(late).astype(int)
-        last = self.lengths[window] - 1
-        before = self.ctrl[j, window, np.clip(whole, 0, last)]
-        after = self.ctrl[j, window, np.clip(whole + 1, 0, last)]
-        return np.asarray(before + (late - whole) * (after - before))
 
     def errors(self, values: dict[str, Array]) -> Array:
         """Return q_sim − q_real of k candidates, (k, n, windows, rows) rad; zero where rows do not
@@ -269,12 +121,11 @@ class JointRollouts:
         n = len(self.op)
         out = np.zeros((k, n * len(self.parts), self.counted.shape[1]), np.float32)
         joints = self._joints(values)
-        windows = self._windows()
         simulate = compiled(simulate_joints)
         ends = np.linspace(0, len(joints), self.nthread + 1).astype(int).tolist()
         with ThreadPoolExecutor(self.nthread) as pool:
             done = [
-                pool.submit(simulate, first, last, joints, windows, out)
+                pool.submit(simulate, first, last, joints, self.windows, out)
                 for first, last in pairwise(ends)
             ]
             for one in done:
@@ -304,20 +155,89 @@ class JointRollouts:
             joints[field] = np.moveaxis(np.broadcast_to(each[field], (k, n, windows)), 0, -1)
         return joints.reshape(n * windows, k)
 
-    def _windows(self) -> Windows:
-        """Return the windows, of one type for numba whatever their number."""
-        return Windows(
-            loads=np.ascontiguousarray(self.tables, np.float32),
-            ctrl=np.ascontiguousarray(self.ctrl, np.float32),
-            qpos=np.ascontiguousarray(self.qpos, np.float32),
-            qvel=np.ascontiguousarray(self.qvel, np.float32),
-            touch=np.ascontiguousarray(self.touch),
-            lengths=self.lengths,
-            stops=self.stops,
-            periods=self.periods,
-            steps=self.count,
-            thin=self.thin,
-        )
+
+def _windows(parts: list[Sequence], robot: RobotSpec, contact_height: float) -> Windows:
+    """Return the recordings side by side, whose rows in which a tip is below a height, m, touch
+    something.
+    """
+    op = robot.operated_index
+    periods = np.array([p.dt for p in parts])
+    dt = float(periods.max())
+    thin = max(1, round(ROW_PERIOD_S / dt))
+    qpos = _side_by_side([p.qpos[:, op] for p in parts])
+    return Windows(
+        loads=_loads(parts, robot, qpos, _compared_rows(periods, thin)),
+        ctrl=_commands(parts, robot, qpos[..., 0]),
+        qpos=qpos,
+        qvel=_side_by_side([p.qvel[:, op] for p in parts]),
+        touch=_touch(parts, robot, contact_height),
+        lengths=np.array([len(p) for p in parts]),
+        stops=_stops(robot, qpos),
+        periods=periods,
+        steps=robot.steps_per(dt),  # of every period, so that windows step side by side
+        thin=thin,
+    )
+
+
+def _side_by_side(windows: list[Array]) -> Array:
+    """Return arrays (rows, n) of each window as (n, windows, rows) float32; the last row of a
+    shorter one is repeated.
+    """
+    rows = max(map(len, windows))
+    extended = np.stack([_extended(x, rows) for x in windows])
+    return np.ascontiguousarray(extended.transpose(2, 0, 1), np.float32)
+
+
+def _extended(x: Array, rows: int) -> Array:
+    """Return x, (k, …), with its last row repeated up to `rows`."""
+    return np.concatenate([x, np.repeat(x[-1:], rows - len(x), axis=0)])
+
+
+def _compared_rows(periods: Array, thin: int) -> Array:
+    """Return the rows of each window from one that is compared to the next, (windows,): multiples
+    of `thin`.
+    """
+    thins = np.round(ROW_PERIOD_S / periods / thin)
+    return np.asarray(thin * np.maximum(1, thins).astype(int))
+
+
+def _commands(parts: list[Sequence], robot: RobotSpec, start: Array) -> Array:
+    """Return the commands inside the joints' ranges, as servos with a speed limit ramp them from
+    `start` (n, windows) rad on, (n, windows, rows).
+    """
+    op = robot.operated_index
+    low, high = robot.qpos_range[op].T
+    ctrl = _side_by_side([np.clip(p.ctrl[:, op], low, high) for p in parts])
+    speed = robot.servo.target_speed[op]
+    if not speed.any():
+        return ctrl
+    limit = np.where(speed > 0, speed, np.inf)[:, None]
+    periods = np.array([p.dt for p in parts])
+    limited = speed_limited(np.moveaxis(ctrl, -1, 0), start, limit, periods)
+    return np.ascontiguousarray(np.moveaxis(limited, 0, -1))
+
+
+def _loads(parts: list[Sequence], robot: RobotSpec, qpos: Array, thins: Array) -> Array:
+    """Return the loads along the recordings in the middle of each period, as `Windows.loads`.
+
+    Args:
+        qpos: (n, windows, rows) rad.
+        thins: Rows from one for which loads are computed to the next, (windows,).
+    """
+    dt = max(p.dt for p in parts)
+    payloads = [(p.meta.payload_mass, p.meta.payload_side) for p in parts]
+    models = {}
+    for payload in dict.fromkeys(payloads):
+        models[payload] = build_model(robot, *payload, dt, physics_only=True)
+    along = []
+    for part, payload, thin in zip(parts, payloads, thins, strict=True):
+        along.append(_loads_along(part, models[payload], robot.operated_index, thin))
+    stacked = []
+    for of_windows in zip(*along, strict=True):
+        stacked.append(_at_middle(_side_by_side(list(of_windows))))
+    inertia, weight, pull, slope = stacked
+    weight_at_zero = weight - slope * _at_middle(qpos)
+    return np.stack([inertia, weight_at_zero, pull, slope])
 
 
 def _loads_along(part: Sequence, model: mujoco.MjModel, op: Array, thin: int) -> Array:
@@ -363,6 +283,125 @@ def _loads_along(part: Sequence, model: mujoco.MjModel, op: Array, thin: int) ->
     return np.apply_along_axis(lambda load: np.interp(rows, at, load), 1, loads)
 
 
+def _at_middle(x: Array) -> Array:
+    """Return values (…, rows) in the middle between each row and the next."""
+    return np.asarray(0.5 * (x + np.concatenate([x[..., 1:], x[..., -1:]], axis=-1)))
+
+
+def _stops(robot: RobotSpec, qpos: Array) -> Array:
+    """Return the ends of each joint's range, or of the recordings (n, windows, rows), so that no
+    rollout diverges, (n, 2) rad.
+    """
+    low, high = robot.qpos_range[robot.operated_index].T
+    lowest = np.where(np.isfinite(low), low, -UNLIMITED_STOP_RAD)
+    highest = np.where(np.isfinite(high), high, UNLIMITED_STOP_RAD)
+    ends = (
+        np.minimum(lowest, qpos.min(axis=(1, 2))),
+        np.maximum(highest, qpos.max(axis=(1, 2))),
+    )
+    return np.stack(ends, axis=1).astype(np.float32)
+
+
+def _touch(parts: list[Sequence], robot: RobotSpec, contact_height: float) -> Array:
+    """Return the rows in which a tip is below a height, m, (windows, rows)."""
+    rows = max(map(len, parts))
+    heights = tips_of(robot)
+    if heights is None:
+        return np.zeros((len(parts), rows), bool)
+    each = np.stack([_extended(heights(p.qpos), rows) for p in parts])
+    return np.asarray(each < contact_height)
+
+
+def _counted_rows(windows: Windows) -> Array:
+    """Return the rows that count, (windows, rows): after the start has settled, away from
+    contacts.
+    """
+    rows = windows.touch.shape[1]
+    settling = np.round(SETTLE_S / windows.periods).astype(int)  # rows, (windows,)
+    near = []
+    for touch, after in zip(windows.touch, settling, strict=True):
+        near.append(np.convolve(touch, np.ones(after + 1))[:rows] > 0.5)
+    row = np.arange(rows)
+    has_settled = row > np.maximum(settling, 1)[:, None]
+    is_recorded = row < windows.lengths[:, None]
+    is_compared = row % _compared_rows(windows.periods, windows.thin)[:, None] == 0
+    counted = has_settled & is_recorded & ~np.array(near) & is_compared
+    return np.asarray(counted[:, :: windows.thin])
+
+
+def balanced_values(windows: Windows) -> dict[str, Array]:
+    """Return kp, total damping, dry friction, armature, offset and delay that balance the recorded
+    accelerations, (n,) each; kp is 0 where it fails.
+
+    The regression is linear but for the delay, biased by noise, and independent of any file's
+    gains.
+    """
+    joints = [_balanced_joint(windows, j) for j in range(len(windows.qpos))]
+    by_field = np.array([list(joint.values()) for joint in joints]).T
+    return dict(zip(REGRESSED_FIELDS, by_field, strict=True))
+
+
+def _balanced_joint(windows: Windows, j: int) -> dict[str, float]:
+    """Return `balanced_values` of joint j: the fit with the delay that leaves the least residual.
+
+    A least-squares fit of non-negative factors x to
+
+        torque of the links = x0 (command − q) − x1 q̇ − x2 sign(q̇) − x3 q̈ + x4 − x5
+
+    in which x4 − x5 is kp times the offset, of either sign.
+    """
+    row = np.concatenate([np.arange(length) for length in windows.lengths])
+    window = np.repeat(np.arange(len(windows.lengths)), windows.lengths)
+    q, v, a = _smooth_motion(windows, j)
+    inertia, weight, pull, slope = windows.loads[:, j, window, row]
+    torque = inertia * a + weight + slope * q + pull
+    one = np.ones_like(q)
+    best = dict.fromkeys(REGRESSED_FIELDS, 0.0)
+    least = np.inf
+    delay_step = max(windows.periods.max() / 2, 5e-3)
+    for delay in np.arange(0.0, MAX_REGRESSION_DELAY_S, delay_step):
+        error = _late_commands(windows, j, delay, window, row) - q
+        columns = np.stack([error, -v, -np.tanh(v / SLIP_SPEED), -a, one, -one], axis=1)
+        x, residual = _nonnegative_factors(columns, torque)
+        if residual < least and x[0] > 0:
+            least = residual
+            offset = (x[4] - x[5]) / x[0]
+            best = dict(zip(REGRESSED_FIELDS, (*x[:4], offset, delay), strict=True))
+    return best
+
+
+def _smooth_motion(windows: Windows, j: int) -> tuple[Array, Array, Array]:
+    """Return position, velocity and acceleration of joint j in all rows of all windows, (rows,)
+    each, SI.
+    """
+    positions = []
+    velocities = []
+    accelerations = []
+    for window, (length, dt) in enumerate(zip(windows.lengths, windows.periods, strict=True)):
+        recorded = windows.qpos[j, window, :length, None].astype(float)
+        smooth = lowpass(recorded, dt, CUTOFF_HZ)[:, 0]
+        speed = np.gradient(smooth, dt)
+        positions.append(smooth)
+        velocities.append(speed)
+        accelerations.append(np.gradient(speed, dt))
+    position = np.concatenate(positions)
+    velocity = np.concatenate(velocities)
+    acceleration = np.concatenate(accelerations)
+    return position, velocity, acceleration
+
+
+def _late_commands(windows: Windows, j: int, delay: float, window: Array, row: Array) -> Array:
+    """Return the command of joint j that reaches its servo in rows of windows, (rows,) rad,
+    interpolated between the commands before and after `delay`, s.
+    """
+    late = row - delay / windows.periods[window]
+    whole = np.floor(late).astype(int)
+    last = windows.lengths[window] - 1
+    before = windows.ctrl[j, window, np.clip(whole, 0, last)]
+    after = windows.ctrl[j, window, np.clip(whole + 1, 0, last)]
+    return np.asarray(before + (late - whole) * (after - before))
+
+
 def _nonnegative_factors(columns: Array, torque: Array) -> tuple[Array, float]:
     """Return the non-negative factors of columns (rows, 6) that balance a torque (rows,) N·m, and
     the residual; at most MAX_REGRESSION_ROWS rows count.
@@ -371,13 +410,3 @@ def _nonnegative_factors(columns: Array, torque: Array) -> tuple[Array, float]:
     size = np.sqrt(np.square(columns[some]).mean(axis=0)) + 1e-12
     x, residual = nnls(columns[some] / size, torque[some])
     return x / size, float(residual)
-
-
-def _at_middle(x: Array) -> Array:
-    """Return values (…, rows) in the middle between each row and the next."""
-    return np.asarray(0.5 * (x + np.concatenate([x[..., 1:], x[..., -1:]], axis=-1)))
-
-
-def _extended(x: Array, rows: int) -> Array:
-    """Return x, (k, …), with its last row repeated up to `rows`."""
-    return np.concatenate([x, np.repeat(x[-1:], rows - len(x), axis=0)])

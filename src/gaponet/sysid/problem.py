@@ -19,7 +19,7 @@ from gaponet.robot.spec import RobotSpec
 from gaponet.sim.model import build_model
 from gaponet.sysid.acceptance import Covariance, Std
 from gaponet.sysid.axes import CLASSIC, MIN_EXCITATION_RAD, WARM, Axes, Bounds, Values
-from gaponet.sysid.joint_rollouts import ERROR_SCALE_RAD, JointRollouts
+from gaponet.sysid.joint_rollouts import ERROR_SCALE_RAD, JointRollouts, balanced_values
 from gaponet.sysid.least_squares import (
     DAMPING_FACTORS,
     Errors,
@@ -136,7 +136,7 @@ class _GainPrior:
         correlation = np.fft.irfft(power)[:, :rows]  # (n, rows), by lag
         correlation /= np.maximum(correlation[:, :1], 1e-30)
         correlation *= np.cumprod(correlation > MIN_CORRELATION, axis=1)
-        seconds = rollouts.dt * rollouts.thin * (2 * correlation.sum(axis=1) - 1)
+        seconds = rollouts.dt * rollouts.windows.thin * (2 * correlation.sum(axis=1) - 1)
         self.correlation_time = np.maximum(seconds, MIN_CORRELATION_TIME_S)
 
 
@@ -172,7 +172,7 @@ class JointFit(FitProblem):
     rollouts: JointRollouts
 
     def __init__(self, rollouts: JointRollouts, robot: RobotSpec, bounds: Bounds) -> None:
-        step = rollouts.dt / rollouts.count
+        step = rollouts.dt / rollouts.windows.steps
         super().__init__(rollouts, robot, bounds, _GainPrior(bounds, rollouts.dt), step)
 
     def regressed(self) -> list[Values]:
@@ -180,7 +180,7 @@ class JointFit(FitProblem):
         and with all torques scaled to the file's kp.
         """
         kp_of_file = self.bounds.first["kp"]
-        balanced = self.rollouts.regressed()
+        balanced = balanced_values(self.rollouts.windows)
         valid = balanced["kp"] > 0
         ratio = np.divide(kp_of_file, balanced["kp"], out=np.ones(self.bounds.n), where=valid)
         scaled = {f: x if f in ("offset", "delay") else x * ratio for f, x in balanced.items()}
@@ -242,7 +242,7 @@ class JointFit(FitProblem):
         parts = self.rollouts.parts
         some = np.unique(np.arange(ROBOT_WINDOWS) * len(parts) // ROBOT_WINDOWS)
         rollouts = RobotRollouts(
-            [parts[i] for i in some], self.robot, nthread, touch=self.rollouts.touch[some]
+            [parts[i] for i in some], self.robot, nthread, touch=self.rollouts.windows.touch[some]
         )
         return RobotFit(rollouts, self.robot, self.bounds, copy.copy(self.prior), self.physics_step)
 

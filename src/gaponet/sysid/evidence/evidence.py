@@ -174,14 +174,15 @@ def _slopes_over_play(rollouts: JointRollouts, bounds: Bounds) -> Array:
 
     The link is half the width behind the motor, on the side on which the servo's error presses it.
     """
-    late = np.round(bounds.first["delay"][:, None] / rollouts.periods).astype(int)  # (n, windows)
-    command = np.empty_like(rollouts.ctrl)
-    for j, of_joint in enumerate(rollouts.ctrl):
+    windows = rollouts.windows
+    late = np.round(bounds.first["delay"][:, None] / windows.periods).astype(int)  # (n, windows)
+    command = np.empty_like(windows.ctrl)
+    for j, of_joint in enumerate(windows.ctrl):
         for window, ctrl in enumerate(of_joint):
             command[j, window] = np.roll(ctrl, late[j, window])
     offset = bounds.first["offset"][:, None, None].astype(np.float32)
-    servo_error = command + offset - rollouts.qpos
-    side = np.tanh(servo_error / PLAY_TURN_RAD)[..., :: rollouts.thin]
+    servo_error = command + offset - windows.qpos
+    side = np.tanh(servo_error / PLAY_TURN_RAD)[..., :: windows.thin]
     is_counted = rollouts.counted & rollouts.recorded[..., None]
     return np.asarray(0.5 / ERROR_SCALE_RAD * side * is_counted)
 

@@ -46,7 +46,7 @@ def probability(fit: JointFit, without: Values, values: Values) -> Array:
     """
     square_without = _squared_error(fit, without)
     square = _squared_error(fit, values)
-    seconds = fit.rollouts.rows * fit.rollouts.dt * fit.rollouts.thin
+    seconds = fit.rollouts.rows * fit.rollouts.dt * fit.rollouts.windows.thin
     clusters = np.maximum(seconds / fit.prior.correlation_time, 1.0)
     gain = np.log(np.maximum(square_without, 1e-12) / np.maximum(square, 1e-12))
     return np.asarray(expit(0.5 * (clusters * gain - np.log(clusters))))
