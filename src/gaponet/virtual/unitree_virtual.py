@@ -17,7 +17,8 @@ import numpy as np
 from gaponet.base.arrays import Array
 from gaponet.hw.control.clock import MonotonicClock, no_garbage_collection
 from gaponet.hw.drivers import hg
-from gaponet.hw.drivers.unitree import MOTOR_NAMES, VIRTUAL_MARK, WEIGHT_MOTOR
+from gaponet.hw.drivers.unitree_commands import WEIGHT_MOTOR
+from gaponet.hw.drivers.unitree_states import MOTOR_NAMES, VIRTUAL_MARK
 from gaponet.robot.spec import RobotSpec
 from gaponet.virtual.physics import Physics
 from gaponet.virtual.virtual_driver import LiveUnit

@@ -170,13 +170,14 @@ def living(
 ) -> RobotClock:
     """A clock by which such a robot lives, and to which the driver's time belongs."""
     import gaponet.hw.drivers as drivers
-    from gaponet.hw.drivers import unitree
+    from gaponet.hw.drivers import unitree, unitree_states
 
     bus = Loopback()
     monkeypatch.setattr(drivers, "dds", bus, raising=False)
     clock = RobotClock(robot, bus, unit, payload, fleet)
     sleep = lambda seconds: clock.wait_until(clock.now() + max(seconds, 0.005))  # noqa: E731
-    monkeypatch.setattr(unitree, "time", SimpleNamespace(monotonic=clock.now, sleep=sleep))
+    for module in (unitree, unitree_states):
+        monkeypatch.setattr(module, "time", SimpleNamespace(monotonic=clock.now, sleep=sleep))
     return clock
 
 

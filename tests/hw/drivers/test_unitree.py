@@ -7,7 +7,6 @@ import subprocess
 import sys
 import time
 from collections import defaultdict
-from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -20,7 +19,15 @@ from hw.control.loopback import Loopback
 from gaponet.base.errors import UsageError
 from gaponet.hw.control.driver import DriverError, State
 from gaponet.hw.drivers import hg
-from gaponet.hw.drivers.unitree import MOTOR_NAMES, WEIGHT_MOTOR, TickClock, UnitreeDriver
+from gaponet.hw.drivers.unitree import UnitreeDriver
+from gaponet.hw.drivers.unitree_commands import WEIGHT_MOTOR, CommandMessages
+from gaponet.hw.drivers.unitree_states import (
+    MOTOR_NAMES,
+    FirstMessages,
+    StateReceiver,
+    motor_numbers,
+    require_h1_2,
+)
 from gaponet.robot.spec import RobotSpec, load_robot
 from gaponet.virtual.fleet import load_fleet
 from gaponet.virtual.unitree_virtual import VirtualH12
@@ -59,17 +66,16 @@ def message(motors: int = 27, machine: int = 6) -> np.ndarray:
         (message(27, 5), "mode_machine"),
     ],
 )
-def test_another_robot_is_refused(robot, data, why):
+def test_another_robot_is_refused(data, why):
     with pytest.raises(DriverError, match=why):
-        UnitreeDriver(robot)._require_h1_2([data])
+        require_h1_2([data], "lo")
 
 
-def decoded(robot, data):
-    driver = UnitreeDriver(robot)
-    driver._require_h1_2([data])
-    driver._clock = TickClock([0.0], [0])
-    driver._state = driver._decode(data, driver._clock, 0.0)
-    return driver._state, driver
+def receiver(robot: RobotSpec, found: np.ndarray, *later: list[np.ndarray]) -> StateReceiver:
+    """A receiver that found a robot by one message, and what comes before each reading."""
+    queue = list(later)
+    source = SimpleNamespace(receive=lambda: queue.pop(0), second="")
+    return StateReceiver(source, motor_numbers(robot), FirstMessages([0.0], [found], 0))
 
 
 @pytest.mark.parametrize(
@@ -87,11 +93,11 @@ def test_the_trunk_leans_by_what_the_quaternion_says_and_none_is_not_upright(
 ):
     data = message()
     hg.LowState.view(data, "imu_state.quaternion")[:] = quaternion
-    assert decoded(robot, data)[0].tilt == pytest.approx(tilt, abs=1e-3, nan_ok=True)
+    assert receiver(robot, data).newest.tilt == pytest.approx(tilt, abs=1e-3, nan_ok=True)
 
 
 def test_only_the_stop_keys_of_the_remote_stop(robot):
-    reported = decoded(robot, message())[1]._reported_fault
+    reported = receiver(robot, message()).reported_fault
     pressed = message()
     for keys, stops in (
         (0x0008, True),
@@ -112,18 +118,16 @@ def test_what_one_of_several_messages_says_stops_for_good(robot):
     hg.LowState.view(pressed, "wireless_remote")[2] = 0x08  # select
     for data in (pressed, well):
         hg.LowState.seal(data)
-    _, driver = decoded(robot, message())
-    queue = [[pressed, well], [well]]
-    driver._states = SimpleNamespace(receive=lambda: queue.pop(0), second="")
-    assert [driver.read().fault.kind, driver.read().fault.kind] == ["stop", "stop"]
+    states = receiver(robot, message(), [pressed, well], [well])
+    assert [states.read().fault.kind, states.read().fault.kind] == ["stop", "stop"]
 
 
 def unplugged(robot: RobotSpec, **how: str) -> tuple[UnitreeDriver, list[np.ndarray]]:
     """A driver without a bus, and the list of what it sends."""
     driver = UnitreeDriver(robot, **how)
     sent = []
-    driver._bus = object()
-    driver._writer = SimpleNamespace(send=lambda data: sent.append(data.copy()))
+    driver._link._bus = object()
+    driver._link._writer = SimpleNamespace(send=lambda data: sent.append(data.copy()))
     return driver, sent
 
 
@@ -157,18 +161,21 @@ def test_an_identified_robot_is_commanded_with_the_gains_of_its_real_servos(robo
     )
 
 
-def test_damping_gains_are_four_times_the_robots_but_no_more_than_the_effort_limits_allow(robot):
-    driver, sent = unplugged(robot, topic="lowcmd", joints="all")
-    for speed in (0.0, 1.0, 100.0):
-        driver._state = State(0.0, *np.zeros((2, 27)), *np.zeros((2, 27)))
-        driver._state = replace(driver._state, qvel=np.full(27, speed))
-        driver.damp()
-        kp, kd = (hg.LowCmd.motors(sent[-1], name)[:27] for name in ("kp", "kd"))
-        order = robot.index(MOTOR_NAMES)
-        np.testing.assert_array_equal(kp, 0.0)
-        believed = min(max(speed, 1e-6), 12.0)  # a wrong speed must not take the brake away
-        most = np.minimum(4 * robot.servo.kd, robot.servo.effort_limit / believed)[order]
-        np.testing.assert_allclose(kd, most, rtol=1e-6)
+@pytest.mark.parametrize("speed", [0.0, 1.0, 100.0])
+def test_damping_gains_are_four_times_the_robots_but_no_more_than_the_effort_limits_allow(
+    robot, speed
+):
+    messages = CommandMessages(robot, robot.joint_names, shares_control=False)
+    still = np.zeros(27)
+
+    sent = messages.damping(1.0, State(0.0, still, np.full(27, speed), still, still))
+
+    kp, kd = (hg.LowCmd.motors(sent, name)[:27] for name in ("kp", "kd"))
+    order = robot.index(MOTOR_NAMES)
+    np.testing.assert_array_equal(kp, 0.0)
+    believed = min(max(speed, 1e-6), 12.0)  # a wrong speed must not take the brake away
+    most = np.minimum(4 * robot.servo.kd, robot.servo.effort_limit / believed)[order]
+    np.testing.assert_allclose(kd, most, rtol=1e-6)
 
 
 def test_after_damping_the_last_message_gives_the_arms_back_and_a_hold_sends_nothing(robot):

@@ -61,22 +61,17 @@ class State:
 class Driver(Protocol):
     """Connection to one robot: connect, read states, write targets, damp.
 
+    What the properties below say is final once the driver is connected.
+
     Attributes:
         address: Name of the connection ("unitree dds domain 0", "/dev/ttyUSB0"); one controller at
             a time per address.
-        virtual: True without a real robot; final once connected.
         joint_names: All joints of the robot, (n), in the order of every array.
         commanded: Joints that `write` commands; other controllers command the rest.
         noisy: Readings of a working robot are never twice the same, so equal ones mean that it is
             frozen.
         reads_back: `read` and `verify` check that the robot holds its commands and settings
             (state.fault). For other robots the controller checks that the joints follow.
-        kp, kd: Gains of the real servos under `write`, (n), N·m/rad and N·m·s/rad; final once
-            connected.
-        qpos_range: Joint ranges that the robot itself reports, (n, 2) rad, or None; final once
-            connected.
-        facts: Stored with a recording (registers, kind of machine); `remarks`: sentences for the
-            user; `source`: the one robot that the states are from, in words. Final once connected.
         at_end: After a run without fault: hand_over (hold while the weight goes from 1 to 0; the
             robot's own controller takes over), hold (servos keep the last target after `close`),
             damp (nothing holds it afterwards).
@@ -84,17 +79,36 @@ class Driver(Protocol):
     """
 
     address: str
-    virtual: bool
     joint_names: tuple[str, ...]
     commanded: tuple[str, ...]
     noisy: bool
     reads_back: bool
-    kp: Array
-    kd: Array
-    qpos_range: Array | None
-    facts: dict[str, Any]
     at_end: EndAction
     at_stop: str
+
+    @property
+    def virtual(self) -> bool:
+        """True without a real robot."""
+
+    @property
+    def kp(self) -> Array:
+        """Stiffness of the real servos under `write`, (n) N·m/rad."""
+
+    @property
+    def kd(self) -> Array:
+        """Damping of the real servos under `write`, (n) N·m·s/rad."""
+
+    @property
+    def qpos_range(self) -> Array | None:
+        """Joint ranges that the robot itself reports, (n, 2) rad, or None."""
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """What is stored with a recording (registers, kind of machine).
+
+        `remarks`: sentences for the user; `source`: the one robot that the states are from, in
+        words.
+        """
 
     def connect(self) -> None:
         """Open the bus and wait for a first state; commands nothing, publishes nothing.
