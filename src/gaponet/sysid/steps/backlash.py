@@ -22,6 +22,7 @@ SCREENED_WIDTHS_RAD = (1e-3, 2.5e-3, 5e-3, 1e-2, 2e-2)
 MIN_SCREENED_GAIN = 0.02  # of a joint's squared error, at otherwise equal values
 MIN_PROBABILITY = 0.9  # of a gap that stays in the robot
 MIN_WIDTH_RAD = 5e-4  # of a gap that is reported though it is not probable
+MIN_SQUARED_ERROR = 1e-12  # rad², so that a ratio of two stays finite
 
 
 def worth_a_search(fit: JointFit, values: Values) -> bool:
@@ -29,27 +30,35 @@ def worth_a_search(fit: JointFit, values: Values) -> bool:
     (n,) otherwise.
     """
     widths = np.array([0.0, *SCREENED_WIDTHS_RAD])
-    candidates = {f: np.repeat(v[None], len(widths), axis=0) for f, v in values.items()}
+    candidates = {}  # field → (widths, n)
+    for field, value in values.items():
+        candidates[field] = np.repeat(value[None], len(widths), axis=0)
     candidates["backlash"] = np.repeat(widths[:, None], fit.bounds.n, axis=1)
-    square = np.square(fit.rollouts.errors(candidates)).sum(axis=(2, 3))  # (widths, n)
-    return bool((square.min(axis=0) < (1 - MIN_SCREENED_GAIN) * square[0]).any())
+    errors = fit.rollouts.errors(candidates)  # (widths, n, windows, rows) rad
+    squared_error = np.square(errors).sum(axis=(2, 3))  # (widths, n)
+    without_gap = squared_error[0]
+    is_better = squared_error.min(axis=0) < (1 - MIN_SCREENED_GAIN) * without_gap
+    return bool(is_better.any())
 
 
 def probability(fit: JointFit, without: Values, values: Values) -> Array:
     """Return the probability of backlash by the Bayesian information criterion, (n,); both odds
     are equal before.
 
-    Parts of the recordings as long as the errors' correlation time count as independent.
+    N measurements with squared errors S₀ without a gap and S with it, which is one more parameter,
+    have the log odds (N log(S₀ / S) − log N) / 2. Parts of the recordings as long as the errors'
+    correlation time count as one measurement.
 
     Args:
         without, values: Best values (n,) without and with backlash, of the same search.
     """
-    square_without = _squared_error(fit, without)
-    square = _squared_error(fit, values)
+    squared_without = np.maximum(_squared_error(fit, without), MIN_SQUARED_ERROR)
+    squared_with = np.maximum(_squared_error(fit, values), MIN_SQUARED_ERROR)
     seconds = fit.rollouts.rows * fit.rollouts.dt * fit.rollouts.windows.thin
-    clusters = np.maximum(seconds / fit.prior.correlation_time, 1.0)
-    gain = np.log(np.maximum(square_without, 1e-12) / np.maximum(square, 1e-12))
-    return np.asarray(expit(0.5 * (clusters * gain - np.log(clusters))))
+    measurements = np.maximum(seconds / fit.prior.correlation_time, 1.0)  # (n,)
+    gain = np.log(squared_without / squared_with)
+    log_odds = 0.5 * (measurements * gain - np.log(measurements))
+    return np.asarray(expit(log_odds))
 
 
 def _squared_error(fit: JointFit, values: Values) -> Array:
@@ -84,18 +93,29 @@ def findings(
     """
     sentences = []
     for joint, gap, p in zip(joints, width.tolist(), chance.tolist(), strict=True):
-        if p >= MIN_PROBABILITY and "backlash" in std[joint]:
-            size = format_uncertainty(1e3 * gap, 1e3 * std[joint]["backlash"])
-            chance_of_it = "above 0.99" if p > 0.99 else f"{p:.2f}"
-            sentences.append(f"{joint}: backlash {size} mrad (probability {chance_of_it})")
-        elif p >= MIN_PROBABILITY:
-            sentences.append(
-                f"{joint}: validation motions do not show a gap of {1e3 * gap:.1f} mrad that fits "
-                "suggest"
-            )
-        elif gap > MIN_WIDTH_RAD:
-            sentences.append(
-                f"{joint}: backlash of {1e3 * gap:.1f} mrad is not distinguishable from static "
-                f"friction (probability {p:.2f}); play the creep motions of gaponet excite to tell"
-            )
+        finding = _finding(gap, p, std[joint].get("backlash"))
+        if finding:
+            sentences.append(f"{joint}: {finding}")
     return tuple(sentences)
+
+
+def _finding(gap: float, p: float, std: float | None) -> str:
+    """Return what is known of a gap, rad, of probability p; nothing of one that is neither probable
+    nor wide.
+
+    Args:
+        std: Standard error, rad; None if the robot was left without backlash.
+    """
+    mrad = 1e3 * gap
+    if p >= MIN_PROBABILITY and std is not None:
+        size = format_uncertainty(mrad, 1e3 * std)
+        chance = "above 0.99" if p > 0.99 else f"{p:.2f}"
+        return f"backlash {size} mrad (probability {chance})"
+    if p >= MIN_PROBABILITY:
+        return f"validation motions do not show a gap of {mrad:.1f} mrad that fits suggest"
+    if gap > MIN_WIDTH_RAD:
+        return (
+            f"backlash of {mrad:.1f} mrad is not distinguishable from static friction "
+            f"(probability {p:.2f}); play the creep motions of gaponet excite to tell"
+        )
+    return ""

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import time
-from collections import defaultdict
 
-from gaponet.sysid.acceptance import MIN_JUDGES
+from gaponet.base.arrays import Array
+from gaponet.sysid.acceptance import MIN_JUDGES, Judge
 from gaponet.sysid.axes import CLASSIC, Values
-from gaponet.sysid.least_squares import DAMPING_FACTORS
+from gaponet.sysid.least_squares import DAMPING_FACTORS, Progress
 from gaponet.sysid.problem import JointFit, RobotFit, RobotSearch
 from gaponet.sysid.search_progress import (
     FIRST_ROBOT_ITERATIONS,
@@ -16,7 +16,7 @@ from gaponet.sysid.search_progress import (
 )
 from gaponet.sysid.steps.step import Fits, FitState
 
-MAX_LOSS_OF_FIRST_ITERATIONS = 0.05  # share of the error; see `robot_candidates`
+MAX_LOSS_OF_FIRST_ITERATIONS = 0.05  # share of the error; see `_loses_much`
 # In the judge's order: the given robot, then the default, which others replace only where they are
 # clearly better.
 CANDIDATES = ("given", "limbs", "joints", "whole", "delay and offset")
@@ -26,25 +26,32 @@ def fit_classic(fits: Fits, *, joints_alone: bool) -> FitState:
     """Fit the classic fields, joints by themselves and then together, and choose among the
     candidates.
     """
-    candidates: dict[str, list[Values]] = defaultdict(list)
-    for joints in fits.joints:
-        for name, values_of_set in _joint_candidates(joints, fits.progress).items():
-            candidates[name].append(values_of_set)
+    of_joints = _fits_of_joints(fits)
     robots = [joints.robot_fit(fits.nthread) for joints in fits.joints]
     fits.progress.begin_search()
-    together: dict[str, list[Values]] = {}
+    of_robots: dict[str, list[Values]] = {}
     if not joints_alone:
-        together = robot_candidates(fits, robots, candidates["joints"])
-    candidates |= together
-    candidates = {name: candidates[name] for name in CANDIDATES if name in candidates}
-    if fits.given.nominal is not None:
+        of_robots = robot_candidates(fits, robots, of_joints["joints"])
+    every = of_joints | of_robots
+    candidates = {name: every[name] for name in CANDIDATES if name in every}
+    is_together = bool(of_robots)
+    if fits.given.is_identified:
         chosen, values = fits.judge.best_by_joint(candidates)
-        return FitState(chosen, values, values, robots, bool(together))
+        return FitState(chosen, values, values, robots, is_together)
     chosen, values = fits.judge.best(candidates)
     base = values
     if chosen == "given":
-        base = candidates["limbs"] if together else candidates["joints"]
-    return FitState(chosen, values, base, robots, bool(together))
+        base = candidates["limbs" if is_together else "joints"]
+    return FitState(chosen, values, base, robots, is_together)
+
+
+def _fits_of_joints(fits: Fits) -> dict[str, list[Values]]:
+    """Return the candidates by name, with the values (n,) of each set of recordings."""
+    candidates: dict[str, list[Values]] = {}
+    for joints in fits.joints:
+        for name, values in _joint_candidates(joints, fits.progress).items():
+            candidates.setdefault(name, []).append(values)
+    return candidates
 
 
 def _joint_candidates(joints: JointFit, progress: SearchProgress) -> dict[str, Values]:
@@ -52,13 +59,13 @@ def _joint_candidates(joints: JointFit, progress: SearchProgress) -> dict[str, V
     fields.
     """
     bounds = joints.bounds
-    residual = joints.prior.residual
     given = {f: bounds.first[f] for f in bounds.start}  # without terms that the robot does not have
+    residual_before = joints.prior.residual
     progress.begin_search()
     late = joints.search_fields(
         ("offset", "delay"), given, report=lambda cost: progress.search_is_over()
     )
-    joints.prior.residual = residual  # of other fields' searches
+    joints.prior.residual = residual_before  # that of two fields is not that of all
     report = progress.reporter("each joint alone", joints.robot.operated, joints.rollouts.rows)
     alone = joints.search(bounds.start, joints.regressed(), report=report)
     joints.prior.update_correlation_time(joints.rollouts, alone)
@@ -70,37 +77,49 @@ def robot_candidates(
 ) -> dict[str, list[Values]]:
     """Fit all joints together, from their own fits and from the robot's file; return nothing if
     that does not help.
-
-    The first iterations decide by the motions that were not fitted, if there are enough of them. On
-    real robots they lose either up to 1 % of the error, which later iterations and the chains win
-    back (G1, SO-101 on another day), or a third of it, which nothing wins back (SO-101).
     """
-    judge = fits.judge
     if not _has_time_for_iterations(fits, robots, alone):
         return {}
-    starts = zip(robots, alone, strict=True)
-    searches = [r.search(CLASSIC, r.bounds.start, (own, r.bounds.start)) for r, own in starts]
+    searches = []
+    for robot, own in zip(robots, alone, strict=True):
+        of_file = robot.bounds.start
+        searches.append(robot.search(CLASSIC, of_file, (own, of_file)))
     _iterate(fits, robots, searches, FIRST_ROBOT_ITERATIONS)
-    if len(set(judge.names.tolist())) >= MIN_JUDGES:
-        first = [search.values for search in searches]
-        largest = (1 + MAX_LOSS_OF_FIRST_ITERATIONS) * judge.errors(alone).mean()
-        if judge.errors(first).mean() > largest:
-            return {}
+    if _loses_much(fits.judge, alone, [search.values for search in searches]):
+        return {}
     for search in searches:
         search.keep_better_starts()
     _iterate(fits, robots, searches, ROBOT_ITERATIONS)
-    whole_robot = [search.values for search in searches]
+    together = [search.values for search in searches]
     if fits.progress.search_is_over():
-        return {"whole": whole_robot, "limbs": whole_robot}
+        return {"whole": together, "limbs": together}
+    return {"whole": together, "limbs": _chain_fits(fits, robots, together)}
+
+
+def _loses_much(judge: Judge, alone: list[Values], together: list[Values]) -> bool:
+    """Return whether the first iterations of all joints together lose too much to go on, on the
+    motions that were not fitted; never where these are too few to tell.
+
+    On real robots they lose either up to 1 % of the error, which later iterations and the chains
+    win back (G1, SO-101 on another day), or a third of it, which nothing wins back (SO-101).
+    """
+    motions = set(judge.names.tolist())
+    if len(motions) < MIN_JUDGES:
+        return False
+    largest = (1 + MAX_LOSS_OF_FIRST_ITERATIONS) * judge.errors(alone).mean()
+    return bool(judge.errors(together).mean() > largest)
+
+
+def _chain_fits(fits: Fits, robots: list[RobotFit], together: list[Values]) -> list[Values]:
+    """Return fits of the kinematic chains that begin with values of all joints together."""
+
+    def reporter(joints: tuple[str, ...], rows: Array) -> Progress:
+        return fits.progress.reporter("kinematic chains", joints, rows)
+
     chains = []
-    for robot, values in zip(robots, whole_robot, strict=True):
-        chains.append(
-            robot.descend_chains(
-                values,
-                lambda joints, rows: fits.progress.reporter("kinematic chains", joints, rows),
-            )
-        )
-    return {"whole": whole_robot, "limbs": chains}
+    for robot, values in zip(robots, together, strict=True):
+        chains.append(robot.descend_chains(values, reporter))
+    return chains
 
 
 def _has_time_for_iterations(fits: Fits, robots: list[RobotFit], alone: list[Values]) -> bool:
@@ -116,8 +135,11 @@ def _has_time_for_iterations(fits: Fits, robots: list[RobotFit], alone: list[Val
     seconds_per_row = (time.monotonic() - began) / fits.judge.rows
     starts = 2
     candidates = starts * (len(CLASSIC) + 1 + len(DAMPING_FACTORS))
-    rows = sum(sum(map(len, robot.rollouts.parts)) for robot in robots)
-    return fits.progress.has_time_for(seconds_per_row * rows * candidates * FIRST_ROBOT_ITERATIONS)
+    rows = 0
+    for robot in robots:
+        rows += sum(len(part) for part in robot.rollouts.parts)
+    seconds_per_candidate = seconds_per_row * rows
+    return fits.progress.has_time_for(seconds_per_candidate * candidates * FIRST_ROBOT_ITERATIONS)
 
 
 def _iterate(

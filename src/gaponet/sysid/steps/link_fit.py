@@ -31,17 +31,20 @@ from gaponet.sysid.least_squares import (
 )
 from gaponet.sysid.problem import MIN_COST_DECREASE, PRIOR_LOG_STD, PRIORS, RobotFit, cluster_sums
 
-ROWS = 400  # of recordings, whose torques choose directions
+DYNAMICS_ROWS = 400  # of recordings, about, whose torques choose directions
 MIN_INFORMATION = 1.0  # of a direction that is fitted, over the prior's
 MAX_DIRECTIONS = 12
 MIN_KP_LOG_STD = 0.05  # of a kp from recorded torque, whose scale is a motor constant
 ITERATIONS = (1, 2)  # with the first residual, and with what that leaves
 FIRST_RESIDUAL_SHARE = 0.25  # of the servos' residual, which wrong links may have caused
+JOINT_WEIGHT_BOUNDS = (0.3, 3.0)  # of a joint's errors, over those of a joint of mean residual
 MAX_SERVO_NUMBERS = 36  # that are fitted with the links; of robots with more, FEW_FIELDS
 FEW_FIELDS = ("kp", "armature")
-MIN_CHANGE = 0.1  # of a link's coordinates, in standard deviations of the prior; less is none
+# Of a link's coordinates, in standard deviations of the prior: a smaller change is none.
+MIN_CHANGE = 0.1
 MAX_CHANGE = 6.0
 ENCODER_ZERO_STD_RAD = 0.006  # a third of a degree, as a joint's zero at its stop is set by hand
+PINV_RCOND = 1e-10  # eigenvalues that are smaller by this count as none
 MIN_SIGNIFICANCE = 2.0  # standard errors, of the change along some direction; else all links stay
 
 
@@ -55,94 +58,137 @@ class _DynamicsRows(NamedTuple):
 
 
 class LinkFit:
-    """Fit of links and servos; `directions` are orthonormal columns (L · COORDINATES, K) that
-    recordings determine.
+    """Fit of the coordinates of L links (sim/links.py, 10 of each link) and of n servos.
+
+    A candidate x, (P,), holds the servos' numbers in large changes, joint by joint, and then a
+    change along each direction, in standard deviations of the prior.
+
+    Attributes:
+        whole: Fit of the servos in the simulator of the whole robot.
+        axes: The links' coordinates.
+        directions: Directions of coordinates that recordings determine, orthonormal columns,
+            (10 L, K).
     """
 
     def __init__(
         self, whole: RobotFit, values: Values, torque_kp: dict[str, tuple[float, float]]
     ) -> None:
-        """Take a fit of servos, its values (n,), and joint → kp from torque and its standard
-        error.
         """
-        fields = CLASSIC if whole.bounds.n * len(CLASSIC) <= MAX_SERVO_NUMBERS else FEW_FIELDS
+        Args:
+            whole: Fit of the servos.
+            values: Its values, (n,).
+            torque_kp: Joint → kp from recorded torque, N·m/rad, and its standard error.
+        """
         self.whole = whole
-        self._servos = Axes(whole.bounds, fields, values)
-        self._first = values
         self.axes = LinkAxes(whole.robot)
         self._n = whole.bounds.n
+        self._first = values
+        fields: tuple[str, ...] = CLASSIC
+        if self._n * len(CLASSIC) > MAX_SERVO_NUMBERS:
+            fields = FEW_FIELDS
+        self._servos = Axes(whole.bounds, fields, values)
+        self._servo_numbers = self._n * len(self._servos.names)
         self._prior = copy.copy(whole.prior)
         self._prior.log_std = dict(PRIOR_LOG_STD)  # a stated kp would shift all masses
-        kp, error = np.array([torque_kp.get(j, (np.nan, np.nan)) for j in whole.robot.operated]).T
-        self._kp_std = np.maximum(error / kp, MIN_KP_LOG_STD)  # nan where torque does not state it
-        self._prior.state_kp(kp, self._kp_std)
         self._prior.residual = FIRST_RESIDUAL_SHARE * whole.prior.residual
-        self._weigh()
-        none: Array = np.zeros((0, 0))
-        self.directions, self._rest = self._determined() if self.axes.names else (none, none)
+        self._kp_std = self._state_kp(torque_kp)
+        self.directions: Array = np.zeros((0, 0))
+        self._rest: Array = np.zeros((0, 0))  # covariance along all other directions, (10 L, 10 L)
+        if self.axes.names:
+            self.directions, self._rest = self._determined()
 
-    def _weigh(self) -> None:
-        """Weigh each joint's errors by its residual; the prior weighs as much as errors of the
-        mean residual.
+    def _state_kp(self, torque_kp: dict[str, tuple[float, float]]) -> Array:
+        """Let the prior hold a kp from torque; return the standard deviation of its logarithm,
+        (n,), nan where torque does not state it.
         """
-        std = self._prior.error_std()
-        self._level = float(np.sqrt(np.mean(std**2)))
-        self._weight = np.clip(self._level / std, 0.3, 3.0)
+        kp = np.full(self._n, np.nan)
+        error = np.full(self._n, np.nan)
+        for i, joint in enumerate(self.whole.robot.operated):
+            if joint in torque_kp:
+                kp[i], error[i] = torque_kp[joint]
+        std = np.asarray(np.maximum(error / kp, MIN_KP_LOG_STD))
+        self._prior.state_kp(kp, std)
+        return std
+
+    @property
+    def _prior_scale(self) -> float:
+        """Root mean square over joints of the standard deviation of one row's error beside the
+        prior, in ERROR_SCALE_RAD: the prior weighs as much as errors of the mean residual.
+        """
+        return float(np.sqrt(np.mean(self._prior.error_std() ** 2)))
+
+    @property
+    def _joint_weights(self) -> Array:
+        """Weight of each joint's errors by its residual, (n,)."""
+        return np.clip(self._prior_scale / self._prior.error_std(), *JOINT_WEIGHT_BOUNDS)
 
     def _determined(self) -> tuple[Array, Array]:
-        """Return directions with more information than the prior's, and the covariance along
-        others, (10 L, 10 L).
+        """Return directions with more information than the prior's, (10 L, K), and the covariance
+        along others, (10 L, 10 L).
 
         They come from inverse dynamics. A change of torque moves a joint by itself over kp. What
         gains, offsets, damping, friction and armature of the joint explain as well does not count,
         so without payloads or recorded torque all masses do not change together.
         """
-        size = self.axes.scale.size
         rows = self._dynamics_rows()
-        information = np.zeros((size, size))
-        for i in range(self._n):
-            information += self._information_beyond_servo(i, rows)
-        strength, vectors = np.linalg.eigh(information)
-        chosen = np.flatnonzero(strength > MIN_INFORMATION)[::-1][:MAX_DIRECTIONS]
-        rest = np.delete(vectors / np.sqrt(np.maximum(strength, MIN_INFORMATION)), chosen, axis=1)
+        coordinates = self.axes.scale.size  # 10 L
+        information = np.zeros((coordinates, coordinates))
+        for joint in range(self._n):
+            information += self._information_beyond_servo(joint, rows)
+        strength, vectors = np.linalg.eigh(information)  # the weakest first
+        strongest_first = np.flatnonzero(strength > MIN_INFORMATION)[::-1]
+        chosen = strongest_first[:MAX_DIRECTIONS]
+        by_std = vectors / np.sqrt(np.maximum(strength, MIN_INFORMATION))
+        rest = np.delete(by_std, chosen, axis=1)
         return vectors[:, chosen], rest @ rest.T
 
     def _dynamics_rows(self) -> _DynamicsRows:
-        """Return some rows of the recordings, about ROWS, those of one payload after another."""
+        """Return some rows of the recordings, about DYNAMICS_ROWS, those of one payload after
+        another.
+        """
         parts = self.whole.rollouts.parts
-        stride = max(1, sum(map(len, parts)) // ROWS)
-        motions = list[Array]()
-        torques = list[Array]()
-        changes = list[Array]()
-        for payload in dict.fromkeys(map(_payload, parts)):
-            with_payload = [part for part in parts if _payload(part) == payload]
-            smooth = [_smooth_motion(part)[:, ::stride] for part in with_payload]
-            motion = np.concatenate(smooth, axis=1)
+        stride = max(1, sum(map(len, parts)) // DYNAMICS_ROWS)
+        motions_by_payload: dict[tuple[float, str], list[Array]] = {}
+        for part in parts:
+            payload = (part.meta.payload_mass, part.meta.payload_side)
+            motions_by_payload.setdefault(payload, []).append(_smooth_motion(part)[:, ::stride])
+        motions = []
+        torques = []
+        changes = []
+        for payload, motions_with_it in motions_by_payload.items():
+            motion = np.concatenate(motions_with_it, axis=1)
             torque, torque_changes = self._torques_by_link(motion, payload)
             motions.append(motion)
             torques.append(torque)
             changes.append(torque_changes)
         _, qvel, qacc = np.concatenate(motions, axis=1)
         op = self.whole.rollouts.op
-        moved = np.concatenate(changes, axis=1) / DIFFERENCE_STEP / self._first["kp"]
-        return _DynamicsRows(qvel[:, op], qacc[:, op], np.concatenate(torques), moved)
+        slopes = np.concatenate(changes, axis=1) / DIFFERENCE_STEP  # (10 L, rows, n) N·m
+        return _DynamicsRows(
+            qvel=qvel[:, op],
+            qacc=qacc[:, op],
+            torque=np.concatenate(torques),
+            moved=slopes / self._first["kp"],
+        )
 
-    def _information_beyond_servo(self, i: int, rows: _DynamicsRows) -> Array:
-        """Return the information that errors of joint i hold about link coordinates and that its
+    def _information_beyond_servo(self, joint: int, rows: _DynamicsRows) -> Array:
+        """Return the information that errors of a joint hold about link coordinates and that its
         servo does not explain as well, (10 L, 10 L): the Schur complement.
         """
-        qvel = rows.qvel[:, i]
+        qvel = rows.qvel[:, joint]
         seconds = sum(part.duration for part in self.whole.rollouts.parts)
-        measurements = seconds / self._prior.correlation_time[i]
-        weight = np.sqrt(measurements / len(qvel)) / self._prior.residual[i]
-        by_gain = rows.torque[:, i] / self._first["kp"][i]
-        friction = np.tanh(qvel / SLIP_SPEED)
-        columns = [by_gain, np.ones(len(qvel)), qvel, rows.qacc[:, i], friction]
+        measurements = seconds / self._prior.correlation_time[joint]
+        weight = np.sqrt(measurements / len(qvel)) / self._prior.residual[joint]
+        by_gain = rows.torque[:, joint] / self._first["kp"][joint]
+        by_offset = np.ones(len(qvel))
+        by_friction = np.tanh(qvel / SLIP_SPEED)
+        columns = [by_gain, by_offset, qvel, rows.qacc[:, joint], by_friction]
         by_servo = weight * np.stack(columns, axis=1)  # (rows, 5)
-        by_link = weight * rows.moved[:, :, i].T  # (rows, 10 L)
-        stated = np.diag([np.nan_to_num(self._kp_std[i] ** -2), 0, 0, 0, 0])
-        of_servo = np.linalg.pinv(by_servo.T @ by_servo + stated)
-        explained = by_link.T @ by_servo @ of_servo @ by_servo.T @ by_link
+        by_link = weight * rows.moved[:, :, joint].T  # (rows, 10 L)
+        known_gain = np.nan_to_num(self._kp_std[joint] ** -2)
+        servo_information = by_servo.T @ by_servo + np.diag([known_gain, 0, 0, 0, 0])
+        servo_covariance = np.linalg.pinv(servo_information)
+        explained = by_link.T @ by_servo @ servo_covariance @ by_servo.T @ by_link
         return np.asarray(by_link.T @ by_link - explained)
 
     def _torques_by_link(self, motion: Array, payload: tuple[float, str]) -> tuple[Array, Array]:
@@ -162,69 +208,80 @@ class LinkFit:
             changed.append(inverse_dynamics(other, *motion)[:, op])
         return torque, np.array(changed) - torque
 
-    def _unpacked(self, x: Array) -> tuple[Values, list[Array]]:
-        """Return servo values (k, n) and link coordinates of candidates x (k, 1, P)."""
-        servos, z = np.split(x[:, 0], [self._n * len(self._servos.names)], axis=1)
-        return self._servos.values(servos.reshape(len(x), self._n, -1)), list(z @ self.directions.T)
+    def _servo_values(self, x: Array) -> Values:
+        """Return servo values (k, n) of candidates x (k, 1, P)."""
+        numbers = x[:, 0, : self._servo_numbers]
+        return self._servos.values(numbers.reshape(len(x), self._n, -1))
+
+    def _coordinates(self, x: Array) -> Array:
+        """Return link coordinates (k, 10 L) of candidates x (k, 1, P)."""
+        along_directions = x[:, 0, self._servo_numbers :]
+        return np.asarray(along_directions @ self.directions.T)
+
+    def _rollout_errors(self, x: Array, values: Values) -> Array:
+        """Return errors of rollouts with the links of candidates x (k, 1, P) and servo values (k,
+        n), (k, n, rows) rad.
+        """
+        links = [self.axes.links(coordinates) for coordinates in self._coordinates(x)]
+        return self.whole.rollouts.flat_errors(values, links)
 
     def errors(self, x: Array, **other: Array) -> Array:
         """Return errors of candidates (k, 1, P), (k, 1, n · (rows + PRIORS) + K) in
-        ERROR_SCALE_RAD.
+        ERROR_SCALE_RAD; `other` values (k, n) hold instead of those of x.
         """
-        values, links = self._unpacked(x)
-        errors = (
-            self.whole.rollouts.flat_errors(values | other, [self.axes.links(c) for c in links])
-            / ERROR_SCALE_RAD
-        )
-        own = np.concatenate([errors, self._prior.errors(values)], axis=2) * self._weight[:, None]
-        z = x[:, 0, self._n * len(self._servos.names) :]
-        return np.concatenate([own.reshape(len(x), -1), self._level * z], axis=1)[:, None]
+        values = self._servo_values(x)
+        of_rollouts = self._rollout_errors(x, values | other) / ERROR_SCALE_RAD
+        of_prior = self._prior.errors(values)
+        of_joints = np.concatenate([of_rollouts, of_prior], axis=2) * self._joint_weights[:, None]
+        of_directions = self._prior_scale * x[:, 0, self._servo_numbers :]
+        every = np.concatenate([of_joints.reshape(len(x), -1), of_directions], axis=1)
+        return every[:, None]
 
     def descend(self, report: Progress) -> LinkResult:
         """Fit links and servos together; return them with the links' covariance."""
         if not self.directions.size:
             unchanged = np.zeros(self.axes.scale.size)
             return LinkResult(self.axes, unchanged, np.eye(len(unchanged)), self._first)
-        x = self._searched(report)
-        values, links = self._unpacked(x)
+        x = self._searched(report)  # (1, 1, P)
         by_noise, by_zeros = self._covariances(x[0, 0])
-        changed = self._significant(links[0], by_noise)
+        changed = self._significant(self._coordinates(x)[0], by_noise)
         covariance = self.directions @ (by_noise + by_zeros) @ self.directions.T + self._rest
-        fitted = {field: value[0].copy() for field, value in values.items()}
+        fitted = {field: value[0].copy() for field, value in self._servo_values(x).items()}
         return LinkResult(self.axes, changed, covariance, fitted)
 
     def _searched(self, report: Progress) -> Array:
         """Return servos and links that follow the recordings best, (1, 1, P)."""
         servos = self._servos.normalize(self._first).ravel()
-        ends = np.full(self.directions.shape[1], MAX_CHANGE)
-        x = np.r_[servos, np.zeros(len(ends))][None, None]
-        low = np.r_[self._servos.low.ravel(), -ends][None]
-        high = np.r_[self._servos.high.ravel(), ends][None]
-        problems = Problems(self.errors, low, high)
-        for i, count in enumerate(ITERATIONS):
-            if i:
-                self._update_residual(x)
-            x, _ = descend(problems, x, count, report, MIN_COST_DECREASE)
+        no_change = np.zeros(self.directions.shape[1])
+        most = np.full(len(no_change), MAX_CHANGE)
+        low = np.concatenate([self._servos.low.ravel(), -most])
+        high = np.concatenate([self._servos.high.ravel(), most])
+        problems = Problems(self.errors, low[None], high[None])
+        first, second = ITERATIONS
+        start = np.concatenate([servos, no_change])[None, None]
+        x, _ = descend(problems, start, first, report, MIN_COST_DECREASE)
+        self._update_residual(x)
+        x, _ = descend(problems, x, second, report, MIN_COST_DECREASE)
         return np.asarray(x)
 
     def _update_residual(self, x: Array) -> None:
-        """Take the residual that x (1, 1, P) leaves, and weigh joints by it."""
-        values, coordinates = self._unpacked(x)
-        links = [self.axes.links(c) for c in coordinates]
-        errors = self.whole.rollouts.flat_errors(values, links)
-        cost = soft_l1(errors[0] / ERROR_SCALE_RAD)
+        """Take the residual that x (1, 1, P) leaves, by which joints are weighed."""
+        errors = self._rollout_errors(x, self._servo_values(x))[0]  # (n, rows) rad
+        cost = soft_l1(errors / ERROR_SCALE_RAD)
         self._prior.update_residual(cost, self.whole.rollouts.rows)
-        self._weigh()
 
     def _significant(self, coordinates: Array, covariance: Array) -> Array:
-        """Return link coordinates (L · COORDINATES,) with 0 for links that hardly change, and for
-        all links where no direction changes by more than noise of this covariance, (K, K).
+        """Return link coordinates (10 L,) with 0 for links that hardly change, and for all links
+        where no direction changes by more than noise of this covariance, (K, K).
         """
-        by_link = coordinates.reshape(-1, COORDINATES)
-        is_small = np.abs(by_link).max(axis=1, keepdims=True) < MIN_CHANGE
         along = np.abs(coordinates @ self.directions)  # (K,)
-        is_noise = (along <= MIN_SIGNIFICANCE * np.sqrt(np.diag(covariance))).all()
-        return np.where(is_small | is_noise, 0.0, by_link).ravel()
+        noise = np.sqrt(np.diag(covariance))
+        if (along <= MIN_SIGNIFICANCE * noise).all():
+            return np.zeros_like(coordinates)
+        by_link = coordinates.reshape(-1, COORDINATES).copy()
+        hardly_changes = np.abs(by_link).max(axis=1) < MIN_CHANGE
+        by_link[hardly_changes] = 0.0
+        return by_link.ravel()
 
     def _slopes(self, x: Array) -> tuple[Array, Array]:
         """Return errors at x (P,) and their differences over x, (m,) and (m, P)."""
@@ -239,13 +296,14 @@ class LinkFit:
         which it is.
         """
         errors, jac = self._slopes(x)  # (m,) and (m, P)
-        count = self.directions.shape[1]
-        weighted = jac / np.sqrt(1 + errors**2)[:, None]
+        weighted = _weighted(jac, errors)
         scatter = self._scatter(jac, weighted * errors[:, None])
-        inverse = np.linalg.pinv(jac.T @ weighted, rcond=1e-10, hermitian=True)
+        inverse = np.linalg.pinv(jac.T @ weighted, rcond=PINV_RCOND, hermitian=True)
+        by_noise = inverse @ scatter @ inverse  # (P, P)
         by_zero = self._errors_by_zeros(x) - errors  # (n, m)
-        shifted = (inverse @ weighted.T @ by_zero.T)[-count:]
-        return (inverse @ scatter @ inverse)[-count:, -count:], shifted @ shifted.T
+        shifted = inverse @ weighted.T @ by_zero.T  # (P, n)
+        of_links = slice(-self.directions.shape[1], None)
+        return by_noise[of_links, of_links], shifted[of_links] @ shifted[of_links].T
 
     def _scatter(self, jac: Array, gradient: Array) -> Array:
         """Return the scatter of the cost's gradient over windows, and that of the prior, (P, P);
@@ -256,16 +314,17 @@ class LinkFit:
         """
         count = self.directions.shape[1]
         own = len(jac) - count  # errors of joints; those of the directions' prior follow
-        jac_by_joint = jac[:own].reshape(self._n, own // self._n, -1)
+        jac_by_joint = jac[:own].reshape(self._n, own // self._n, -1)  # (n, rows + PRIORS, P)
         gradient_by_joint = gradient[:own].reshape(jac_by_joint.shape)
-        window = self.whole.rollouts.window
-        by_joint, _ = cluster_sums(gradient_by_joint[:, :-PRIORS], window)
-        by_window = by_joint.sum(axis=0)  # (windows, P)
-        by_window -= by_window.mean(axis=0)
-        correction = len(by_window) / max(len(by_window) - count, 1)
-        of_prior = np.concatenate([*jac_by_joint[:, -PRIORS:], jac[own:]])
-        of_windows = by_window.T @ by_window * correction**2
-        return np.asarray(of_windows + self._level**2 * of_prior.T @ of_prior)
+        of_rollouts = gradient_by_joint[:, :-PRIORS]
+        by_joint, _ = cluster_sums(of_rollouts, self.whole.rollouts.window)  # (n, clusters, P)
+        by_cluster = by_joint.sum(axis=0)
+        by_cluster -= by_cluster.mean(axis=0)
+        clusters = len(by_cluster)
+        correction = clusters / max(clusters - count, 1)
+        of_windows = by_cluster.T @ by_cluster * correction**2
+        prior_slopes = np.concatenate([*jac_by_joint[:, -PRIORS:], jac[own:]])
+        return np.asarray(of_windows + self._prior_scale**2 * prior_slopes.T @ prior_slopes)
 
     def _errors_by_zeros(self, x: Array) -> Array:
         """Return the errors at x (P,) with each joint's encoder zero off by its standard deviation,
@@ -276,19 +335,20 @@ class LinkFit:
         return self.errors(np.repeat(x[None, None], self._n, axis=0), zero=zeros)[:, 0]
 
     def servo_slopes(self, result: LinkResult) -> dict[str, Array]:
-        """Return how the servos follow the links: field → its change on its axis for one of x, (n,
-        L · COORDINATES).
+        """Return how the servos follow the links: field → its change on its axis for one of each
+        link coordinate, (n, 10 L).
         """
-        along_all = copy.copy(self)
-        along_all.directions = np.eye(len(result.x))
-        count = self._servos.unit.size  # numbers of the servos in x
-        x = np.r_[self._servos.normalize(result.values).ravel(), result.x]
-        errors, jac = along_all._slopes(x)
-        normal = jac.T @ (jac / np.sqrt(1 + errors**2)[:, None])
-        of_servos = np.linalg.pinv(normal[:count, :count], rcond=1e-10, hermitian=True)
-        slopes = -of_servos @ normal[:count, count:]
-        slopes = slopes.reshape(*self._servos.unit.shape, -1) * self._servos.unit[..., None]
-        by_field = dict(zip(self._servos.names, np.moveaxis(slopes, 1, 0), strict=True))
+        of_all_coordinates = copy.copy(self)
+        of_all_coordinates.directions = np.eye(len(result.x))
+        servos = self._servos.normalize(result.values).ravel()
+        errors, jac = of_all_coordinates._slopes(np.concatenate([servos, result.x]))
+        normal = jac.T @ _weighted(jac, errors)
+        count = self._servo_numbers
+        of_servos = np.linalg.pinv(normal[:count, :count], rcond=PINV_RCOND, hermitian=True)
+        in_large_changes = -of_servos @ normal[:count, count:]  # (n · P, 10 L)
+        unit = self._servos.unit  # (n, P)
+        on_axes = in_large_changes.reshape(*unit.shape, -1) * unit[..., None]
+        by_field = dict(zip(self._servos.names, np.moveaxis(on_axes, 1, 0), strict=True))
         if "damping" in by_field:
             # The fitted sum with kd over kp keeps its value, and kd does not change with kp.
             kd_over_kp = self.whole.bounds.kd / result.values["kp"]
@@ -296,13 +356,14 @@ class LinkFit:
         return by_field
 
 
-def _payload(s: Sequence) -> tuple[float, str]:
-    """Return mass, kg, and side of a recording's payload."""
-    return s.meta.payload_mass, s.meta.payload_side
+def _weighted(jac: Array, errors: Array) -> Array:
+    """Return slopes (m, P) of errors (m,) with the weights of soft L1."""
+    return np.asarray(jac / np.sqrt(1 + errors**2)[:, None])
 
 
 def _smooth_motion(s: Sequence) -> Array:
     """Return smooth positions, velocities and accelerations of a recording, (3, T, joints)."""
     qpos = lowpass(s.qpos.astype(float), s.dt, CUTOFF_HZ)
     qvel = differentiate(qpos, s.dt)
-    return np.stack([qpos, qvel, differentiate(qvel, s.dt)])
+    qacc = differentiate(qvel, s.dt)
+    return np.stack([qpos, qvel, qacc])

@@ -20,6 +20,7 @@ class LinkMasses:
 
     def __init__(self, fits: Fits) -> None:
         self._fits = fits
+        # Of each set of recordings: joint → kp from torque, N·m/rad, and its standard error.
         self._torque_gains: list[dict[str, tuple[float, float]]] = []
         for recordings in fits.recordings:
             known = TorqueFit(recordings, fits.joints[0].robot).known
@@ -31,25 +32,33 @@ class LinkMasses:
 
     def propose(self, state: FitState) -> FitState:
         """Return the state with links; the same state if no link changes."""
-        links = []
-        values = []
+        progress = self._fits.progress
+        fits = []
+        results = []
         for robot, base, gains in zip(state.robots, state.base, self._torque_gains, strict=True):
-            self._fits.progress.begin_search()
+            progress.begin_search()
             fit = LinkFit(robot, base, gains)
             rows = robot.rollouts.rows.sum(keepdims=True)
-            result = fit.descend(self._fits.progress.reporter(self.name, ("all joints",), rows))
-            links.append(result.axes.links(result.x))
-            values.append(result.values)
-        if not result.x.any():  # of the last set, whose fit is kept
+            report = progress.reporter(self.name, ("all joints",), rows)
+            fits.append(fit)
+            results.append(fit.descend(report))
+        if not results[-1].x.any():
             return state
-        return replace(state, values=values, base=values, links=links, link_fit=(fit, result))
+        values = [result.values for result in results]
+        return replace(
+            state,
+            values=values,
+            base=values,
+            links=[result.axes.links(result.x) for result in results],
+            link_fit=(fits[-1], results[-1]),
+        )
 
     def warnings(self, state: FitState) -> list[str]:
         """Return a warning if links were accepted and nothing tells masses from gains."""
-        recordings = self._fits.recordings[-1]
-        payloads = {s.meta.payload_mass for s in recordings}
         if not state.links or not self._fits.given.payload_mounts:
             return []
-        if self._torque_gains[-1] or len(payloads) > 1:
+        payloads = {s.meta.payload_mass for s in self._fits.recordings[-1]}
+        gains_are_known = bool(self._torque_gains[-1])
+        if gains_are_known or len(payloads) > 1:
             return []
         return [ONE_PAYLOAD]

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from gaponet.data.sequence import Sequence
 from gaponet.robot.spec import RobotSpec
-from gaponet.sim.metrics import Comparison, metrics, runs
+from gaponet.sim.metrics import Comparison, Run, metrics, runs
 from gaponet.sim.replay import motion_errors, replay
 from gaponet.sysid.acceptance import HeldOut, Identified, Split, held_out_errors
 from gaponet.sysid.axes import CLASSIC, Bounds
@@ -26,25 +26,25 @@ def with_torque(
     validation motions are followed no worse. `given` is the robot that both fits start from.
     """
     torques = [TorqueFit(train, given) for train, _ in splits]
-    if not all(t.known for t in torques):
+    if not all(torque.known for torque in torques):
         return fitted
     options, folds = _best_options(torques, splits)
     comparison = Comparison(
         "torque",
         held_out_errors(fitted.held_out),
         held_out_errors(folds),
-        equally_complex=given.nominal is None,
+        equally_complex=not given.is_identified,
     )
     comparisons = (*fitted.comparisons, comparison)
     if not comparison.accepted:
         return replace(fitted, comparisons=comparisons)
+    train, validation = splits[0]
+    every = [*train, *validation]
     after = float(comparison.after.mean())
-    every = [*splits[0][0], *splits[0][1]]
     robot = TorqueFit(every, given).fit(options)
-    if len(splits) == 1 and motion_errors(splits[0][1], robot).mean() > after:
+    if len(splits) == 1 and motion_errors(validation, robot).mean() > after:
         robot = folds[0].robot
     errors = _standard_errors(robot, every, nthread)
-    now = _errors_by_joint(folds, given, nthread)
     return replace(
         fitted,
         robot=robot,
@@ -55,7 +55,7 @@ def with_torque(
         warnings=errors.sentences,
         comparisons=comparisons,
         table_fit=None,
-        by_joint={j: (before, now[j]) for j, (before, _) in fitted.by_joint.items()},
+        by_joint=_before_and_after(fitted, folds, nthread),
         undetermined=errors.undetermined,
         held_out=folds,
         without_terms=None,
@@ -68,15 +68,20 @@ def _best_options(
     """Return the options with the least error on motions that were not fitted, and the robot of
     each fold.
     """
-    tried = {}
+    has_payloads = all(torque.several_payloads for torque in torques)
+    tried: dict[TorqueOptions, tuple[HeldOut, ...]] = {}
     for options in OPTIONS:
-        if options.place and not all(t.several_payloads for t in torques):
+        if options.place and not has_payloads:
             continue
         folds = []
         for torque, (_, held_out) in zip(torques, splits, strict=True):
             folds.append(HeldOut(held_out, torque.fit(options)))
         tried[options] = tuple(folds)
-    best = min(tried, key=lambda one: float(held_out_errors(tried[one]).mean()))
+
+    def error(options: TorqueOptions) -> float:
+        return float(held_out_errors(tried[options]).mean())
+
+    best = min(tried, key=error)
     return best, tried[best]
 
 
@@ -88,10 +93,18 @@ def _standard_errors(robot: RobotSpec, recordings: list[Sequence], nthread: int)
     return standard_errors(whole, {f: bounds.first[f] for f in CLASSIC})
 
 
-def _errors_by_joint(folds: ListOf[HeldOut], robot: RobotSpec, nthread: int) -> dict[str, float]:
-    """Return the mean |error| of each operated joint over recordings that were not fitted, rad."""
-    part = []
-    for sequences, judged in folds:
-        replays = replay(sequences, judged, nthread=nthread, lock_idle=True)
-        part += runs(sequences, [t.qpos for t in replays], judged)
-    return {j: metrics(part, [i]).get("mpjae", 0.0) for i, j in enumerate(robot.operated)}
+def _before_and_after(
+    fitted: Identified, folds: ListOf[HeldOut], nthread: int
+) -> dict[str, tuple[float, float]]:
+    """Return joint → mean |error| of the given robot, as `fitted` has it, and of the fit from
+    torque, over recordings that were not fitted, rad.
+    """
+    played: list[Run] = []
+    for sequences, robot in folds:
+        replays = replay(sequences, robot, nthread=nthread, lock_idle=True)
+        played += runs(sequences, [simulated.qpos for simulated in replays], robot)
+    errors = {}
+    for i, joint in enumerate(folds[0].robot.operated):
+        before, _ = fitted.by_joint[joint]
+        errors[joint] = (before, metrics(played, [i]).get("mpjae", 0.0))
+    return errors

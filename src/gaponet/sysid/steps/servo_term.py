@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence as ListOf
 from dataclasses import replace
 
+from gaponet.base.arrays import Array
 from gaponet.robot.servo_fields import SERVO_FIELDS, TERMS, Term
 from gaponet.sysid.axes import Values
 from gaponet.sysid.problem import JointFit, RobotFit, robot_fields
@@ -20,7 +20,8 @@ class ServoTerm:
 
     def __init__(self, term: Term, fits: Fits) -> None:
         self.name = str(term)
-        self._term: Term = term
+        self._fields = TERMS[term]
+        self._strength = self._fields[0]  # without it the term's other fields have no effect
         self._fits = fits
 
     def applies(self, state: FitState) -> bool:
@@ -29,60 +30,77 @@ class ServoTerm:
 
     def propose(self, state: FitState) -> FitState:
         """Return the state with the term."""
-        return self._with_values(state, self._fitted(state, self._alone(state)))
+        alone = self._fit_alone(state)
+        return self._with_values(state, self._improved(state, alone))
 
     def warnings(self, state: FitState) -> list[str]:
         """Return no warning: `Bounds.warnings` has those of all values."""
         return []
 
-    def _alone(self, state: FitState) -> list[Values]:
-        """Return the fits of single joints."""
-        return [self._fit_joints(*one) for one in zip(self._fits.joints, state.base, strict=True)]
+    def _fit_alone(self, state: FitState) -> list[Values]:
+        """Return the fit of each set of recordings, every joint by itself."""
+        fitted = []
+        for joints, base in zip(self._fits.joints, state.base, strict=True):
+            fitted.append(self._fit_joints(joints, base))
+        return fitted
 
-    def _fitted(self, state: FitState, alone: list[Values]) -> list[Values]:
-        """Return values from fits of single joints, polished in the whole robot's simulator where
-        that helps.
+    def _fit_joints(self, joints: JointFit, values: Values) -> Values:
+        """Fit the term from values (n,), each joint by itself."""
+        start = values.copy()
+        for field in self._fields:
+            start[field] = joints.bounds.guess[field]
+        progress = self._fits.progress
+        progress.begin_search()
+        report = progress.reporter(self.name, joints.robot.operated, joints.rollouts.rows)
+        return joints.search(start, report=report)
+
+    def _improved(self, state: FitState, alone: list[Values]) -> list[Values]:
+        """Return fits of single joints, polished where that helps, with 0 where the term cannot be
+        seen.
         """
-        values = alone
-        fields = TERMS[self._term]
-        is_of_single_joints = any(SERVO_FIELDS[field].single_joint for field in fields)
-        has_time = not self._fits.progress.search_is_over()
-        if state.together and not is_of_single_joints and has_time:
-            polished = [self._polish(*one) for one in zip(state.robots, alone, strict=True)]
-            judge = self._fits.judge
-            if judge.errors(polished).mean() < judge.errors(alone).mean():
-                values = polished
-        strength = fields[0]  # without it the others of the term have no effect
-        visible = []
-        for fit, of_set in zip(self._fits.joints, values, strict=True):
-            visible.append(of_set | {strength: fit.bounds.visible(strength, of_set)})
-        return visible
+        improved = []
+        for joints, values in zip(self._fits.joints, self._polished(state, alone), strict=True):
+            visible: Array = joints.bounds.visible(self._strength, values)
+            improved.append(values | {self._strength: visible})
+        return improved
+
+    def _polished(self, state: FitState, alone: list[Values]) -> list[Values]:
+        """Return the values after a fit of all joints together, if the motions that judge are then
+        followed better; else those of single joints.
+        """
+        if not state.together or self._fits.progress.search_is_over():
+            return alone
+        if any(SERVO_FIELDS[field].single_joint for field in self._fields):
+            return alone
+        polished = []
+        for robot, values in zip(state.robots, alone, strict=True):
+            polished.append(self._polish(robot, values))
+        judge = self._fits.judge
+        if judge.errors(polished).mean() < judge.errors(alone).mean():
+            return polished
+        return alone
+
+    def _polish(self, robot: RobotFit, values: Values) -> Values:
+        """Fit values (n,) with the term once more, all joints together."""
+        what = f"{self.name}, whole robot"
+        rows = robot.rollouts.rows
+        report = self._fits.progress.reporter(what, robot.robot.operated, rows)
+        search = robot.search(robot_fields(values), values, (values,))
+        search.iterate(POLISH_ITERATIONS, report)
+        return search.values
 
     def _with_values(self, state: FitState, values: list[Values]) -> FitState:
         """Return the state with values, without the term if it is zero in every joint: then it only
         gave the others more iterations.
         """
-        fields = TERMS[self._term]
-        if not any(of_set[fields[0]].any() for of_set in values):
-            values = [_without(fields, of_set) for of_set in values]
+        is_used = any(of_set[self._strength].any() for of_set in values)
+        if not is_used:
+            values = [self._without_term(of_set) for of_set in values]
         return replace(state, values=values, base=values)
 
-    def _fit_joints(self, joints: JointFit, values: Values) -> Values:
-        """Fit the term from values (n,), each joint by itself."""
-        progress = self._fits.progress
-        progress.begin_search()
-        report = progress.reporter(self.name, joints.robot.operated, joints.rollouts.rows)
-        start = values | {f: joints.bounds.guess[f] for f in TERMS[self._term]}
-        return joints.search(start, report=report)
-
-    def _polish(self, robot: RobotFit, values: Values) -> Values:
-        """Fit values (n,) with the term once more, all joints together."""
-        report = self._fits.progress.reporter(
-            f"{self.name}, whole robot", robot.robot.operated, robot.rollouts.rows
-        )
-        search = robot.search(robot_fields(values), values, (values,))
-        search.iterate(POLISH_ITERATIONS, report)
-        return search.values
+    def _without_term(self, values: Values) -> Values:
+        """Return values without the fields of the term."""
+        return {field: value for field, value in values.items() if field not in self._fields}
 
 
 class Backlash(ServoTerm):
@@ -96,21 +114,25 @@ class Backlash(ServoTerm):
     def applies(self, state: FitState) -> bool:
         """Return whether a joint's rollouts are better with some gap."""
         base = state.base[-1]
-        return "backlash" not in base and backlash.worth_a_search(self._fits.joints[-1], base)
+        if "backlash" in base:
+            return False
+        return backlash.worth_a_search(self._fits.joints[-1], base)
 
     def propose(self, state: FitState) -> FitState:
         """Return the state with backlash at the joints where it is probable."""
-        fit = self._fits.joints[-1]
-        over = self._fits.progress.search_is_over
-        alone = self._alone(state)
-        values = self._fitted(state, alone)
-        without = fit.search(state.base[-1], report=lambda cost: over())
-        chance = backlash.probability(fit, without, alone[-1])
+        alone = self._fit_alone(state)
+        values = self._improved(state, alone)
+        chance = self._probability(state.base[-1], alone[-1])
         width = values[-1]["backlash"]
         probable = backlash.only_probable(state.values, values, chance)
         return replace(self._with_values(state, probable), gaps=(width, chance))
 
+    def _probability(self, base: Values, with_gap: Values) -> Array:
+        """Return the probability of backlash in the last set of recordings, (n,).
 
-def _without(fields: ListOf[str], values: Values) -> Values:
-    """Return values without these fields."""
-    return {field: value for field, value in values.items() if field not in fields}
+        The base is searched once more, so that both fits have had equally many iterations.
+        """
+        joints = self._fits.joints[-1]
+        progress = self._fits.progress
+        without_gap = joints.search(base, report=lambda cost: progress.search_is_over())
+        return backlash.probability(joints, without_gap, with_gap)

@@ -20,29 +20,36 @@ def seen_speed_limits(sequences: ListOf[Sequence], robot: RobotSpec) -> SpeedLim
     """
     if robot.servo.target_speed.any():
         return {}
-    speeds = dict(zip(robot.operated, target_speeds(sequences, robot), strict=True))
-    return {joint: {"target_speed": float(f"{v:.3g}")} for joint, v in speeds.items() if v}
+    limits: SpeedLimits = {}
+    for joint, speed in zip(robot.operated, target_speeds(sequences, robot), strict=True):
+        if speed > 0:
+            limits[joint] = {"target_speed": float(f"{speed:.3g}")}
+    return limits
 
 
 def better_of(plain: Identified, limited: Identified, limits: SpeedLimits) -> Identified:
     """Return the fit with speed limits if motions that were not fitted accept it, else the one
     without.
     """
-    comparison = Comparison(
-        "ramp", held_out_errors(plain.held_out), held_out_errors(limited.held_out)
-    )
+    errors_without = held_out_errors(plain.held_out)
+    errors_with = held_out_errors(limited.held_out)
+    comparison = Comparison("ramp", errors_without, errors_with)
     if not comparison.accepted:
         return replace(plain, comparisons=(*plain.comparisons, comparison))
-    listed = ", ".join(f"{joint} {v['target_speed']:.3g}" for joint, v in limits.items())
-    warning = (
-        f"servos limit the speed of their targets, rad/s: {listed}. That is a setting of theirs "
-        "(profile velocity, goal speed). The simulator has it, so record and run with the same "
-        "one; engines that load an export do not"
-    )
     return replace(
         limited,
         before=plain.before,
         chosen=limited.chosen if limited.improved else "ramp",
         comparisons=(*limited.comparisons, comparison),
-        warnings=(warning, *limited.warnings),
+        warnings=(_warning(limits), *limited.warnings),
+    )
+
+
+def _warning(limits: SpeedLimits) -> str:
+    """Return what to do about servos with speed limits."""
+    speeds = [f"{joint} {servo['target_speed']:.3g}" for joint, servo in limits.items()]
+    return (
+        f"servos limit the speed of their targets, rad/s: {', '.join(speeds)}. That is a setting "
+        "of theirs (profile velocity, goal speed). The simulator has it, so record and run with "
+        "the same one; engines that load an export do not"
     )
