@@ -51,7 +51,6 @@ class RobotRollouts:
     Attributes:
         window: Window of each row that counts, (rows,).
         recorded: Whether a row holds a joint, (n, rows).
-        rows: Number of rows that hold a joint, (n,).
     """
 
     def __init__(
@@ -85,8 +84,11 @@ class RobotRollouts:
         self.window = np.broadcast_to(np.arange(len(parts)), self.counted.shape)[self.counted]
         recorded = np.stack([p.meta.records(robot.operated) for p in parts], axis=1)
         self.recorded = recorded[:, self.window]
-        self.rows = self.recorded.sum(axis=1)
-        self._standing = self._standing_joints()
+
+    @property
+    def rows(self) -> Array:
+        """Number of rows that hold a joint, (n,)."""
+        return np.asarray(self.recorded.sum(axis=1))
 
     def _counted(self) -> Array:
         """Return the rows that count: after the start has settled, every ROW_PERIOD_S, away from
@@ -102,16 +104,6 @@ class RobotRollouts:
             settled = time >= SETTLE_S / part.dt
             counted.append(settled & (time < len(part)) & (time % thin == 0))
         return np.asarray(np.array(counted).T[1:] & ~near[1:])
-
-    def _standing_joints(self) -> list[tuple[int, int]]:
-        """Return window and number of each joint that a window does not hold: it stands where the
-        window says.
-        """
-        free = [joint for joint in self.robot.joint_names if joint not in self.locked]
-        standing = []
-        for window, part in enumerate(self.parts):
-            standing += [(window, i) for i, j in enumerate(free) if j in part.meta.unrecorded]
-        return standing
 
     def flat_errors(self, values: dict[str, Array], links: ListOf[dict[str, Link]] = ()) -> Array:
         """Return q_sim − q_real in the rows that count, (k, n, rows) rad; values (k, n), `links`
@@ -147,14 +139,16 @@ class RobotRollouts:
         return each
 
     def _hold_standing_joints(self, sim: BatchSim) -> None:
-        """Let joints that a window does not hold stand."""
+        """Let joints that a window does not hold stand where the window says."""
         windows = len(self.parts)
-        # A robot with all joints free has as many degrees of freedom as joints.
-        for window, joint in self._standing:
-            sim.batch.expand("dof_armature")[window::windows, joint] = IMMOVABLE_ARMATURE
-            if sim.servo_model is not None:
-                sim.servo_model.armature[window::windows, joint] = IMMOVABLE_ARMATURE
-                sim.servo_model.values["backlash"][window::windows, joint] = 0.0
+        for window, part in enumerate(self.parts):
+            own = slice(window, None, windows)  # simulations of all candidates
+            # The joints of a simulation are its degrees of freedom.
+            for joint in np.flatnonzero(~part.meta.records(sim.joint_names)):
+                sim.batch.expand("dof_armature")[own, joint] = IMMOVABLE_ARMATURE
+                if sim.servo_model is not None:
+                    sim.servo_model.armature[own, joint] = IMMOVABLE_ARMATURE
+                    sim.servo_model.values["backlash"][own, joint] = 0.0
 
     def _set_links(
         self, sim: BatchSim, conditions: list[Condition], links: ListOf[dict[str, Link]]
