@@ -57,7 +57,7 @@ def test_a_loaded_motor_has_more_friction(tmp_path):
         sim.step(home)
     rest = sim.qpos[0].copy()
     held = -0.2 * 9.81 * 0.1  # N·m: the fore arm's weight
-    assert abs(sim.servo_model.torque[0, 1]) == pytest.approx(
+    assert abs(sim.servo_model.state.torque[0, 1]) == pytest.approx(
         abs(held) / 1.2, rel=0.05
     )  # friction carries the rest
     # What friction may take there, it takes: a small push moves nothing.

@@ -120,7 +120,7 @@ def test_the_servo_model_agrees_with_mujoco(tmp_path, rates, delay):
     )
     robot = robot.with_identified({"elbow": {"offset": 0.1}})
     ours = BatchSim(robot, [Condition(0.0, "both", dt) for dt in rates], 1)
-    for x in ours.servo_model.values.values():
+    for x in ours.servo_model.servos.terms.values():
         x *= np.array([[1.0], [0.5], [2.0]])
     theirs, apart, still = WarpSim(ours, DEVICE), 0.0, 0.0
     plain = BatchSim(
@@ -159,10 +159,10 @@ def test_the_servo_model_of_a_physics_step_agrees_with_mujoco_up_to_rounding(tmp
     robot = robot.with_servo(**{name: law[name] for name in parts})
     robot = robot.with_identified({"elbow": {"offset": 0.1}})
     ours = BatchSim(robot, [Condition(0.0, "both", robot.dt)] * 3, 1)
-    for x in ours.servo_model.values.values():
+    for x in ours.servo_model.servos.terms.values():
         x[:, 0] *= [0.0, 1.0, 2.0]
     ours.batch.expand("actuator_forcerange")[:] *= np.array([1.0, 0.5, 0.1])[:, None, None]
-    ours.servo_model.effort *= np.array([[1.0], [0.5], [0.1]])
+    ours.servo_model.servos.records["effort_limit"] *= np.array([[1.0], [0.5], [0.1]])
     theirs, rng = WarpSim(ours, DEVICE), np.random.default_rng(0)
     model = theirs._worlds[0].model
     for ids in (np.arange(3), np.array([0, 2])):

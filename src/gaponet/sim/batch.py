@@ -20,7 +20,7 @@ from gaponet.robot.simulator_change import SimulatorChange
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.changed_model import changed_model
 from gaponet.sim.model import build_model, qpos_range
-from gaponet.sim.servo import ServoModel
+from gaponet.sim.servo_model import ServoModel
 
 
 class OneByOne:
@@ -334,8 +334,8 @@ class BatchSim:
             each[:, at] = values["target_speed"]
             self.max_change = self._max_change(each)
         if self.servo_model is not None:
-            self.servo_model.bias[:, at] = bias[:, at, 0]
-            self.servo_model.set_servos(at, values)
+            self.servo_model.state.bias[:, at] = bias[:, at, 0]
+            self.servo_model.servos.set(at, values)
 
     def _require_settable(self, values: dict[str, Array]) -> None:
         """Raise UsageError if values hold what these simulations cannot take."""
@@ -373,10 +373,7 @@ class BatchSim:
         if self._history is not None:
             state |= {"history": self._history.buffer, "time": self._history.time}
         if self.servo_model is not None:
-            state |= {"servo_torque": self.servo_model.torque, "servo_load": self.servo_model.load}
-            play = self.servo_model.play
-            if play is not None:
-                state |= {"servo_gap": play.gap, "servo_rotor": play.rotor, "servo_seen": play.seen}
+            state |= self.servo_model.memory()
         if self.max_change is not None:
             state["ctrl"] = self.ctrl
         return state

@@ -11,8 +11,9 @@ limit of friction, so friction sticks as MuJoCo's does. A gear with backlash par
 The model stands here twice. `servo_torque`, `torque_limits`, `friction_limit` and
 `overcome_friction` take arrays, for exports and inverses. `requested_torque`, `motor_limits` and
 `joint_friction` take one servo with fields by name, for numba and Warp, which are faster.
-Simulations (`set_servos`) and the fit of single joints (`simulate_joints`) share the latter. A
-MuJoCo model's actuator_user holds the parameters; without, nothing here runs.
+Simulations (`set_servos`, called by sim/servo_model.py) and the fit of single joints
+(`simulate_joints`) share the latter. A MuJoCo model's actuator_user holds the parameters; without,
+nothing here runs.
 """
 
 from __future__ import annotations
@@ -21,7 +22,6 @@ import functools
 from importlib import import_module
 from typing import Any, NamedTuple
 
-import mujoco
 import numpy as np
 
 from gaponet.base.arrays import Array, array_module
@@ -540,166 +540,3 @@ def _extend() -> None:
     )
     for function in functions:
         extending.register_jitable(function)
-
-
-class ServoModel:
-    """Servo models of all simulations in a batch, whose actuators are in the order of its joints.
-
-    Attributes:
-        values: Name of SERVO_TERMS → (nsim, nu); may be written.
-        active: The terms that are present since the last reset.
-        frictionloss, bias, effort, armature, damping: The MuJoCo model's own, without the servo
-            model, (nsim, nu); may be written.
-        play: Backlash; None where no servo has any.
-        torque, load: Torque of the actuators in the last physics step, and of gravity and Coriolis
-            forces, (nsim, nu) N·m. The next step follows from these and the batch's own state.
-    """
-
-    def __init__(self, batch: Any, model: mujoco.MjModel) -> None:
-        """Take the MuJoCo model's parameters for all simulations of a Batch, or of an object with
-        its methods.
-        """
-        self.batch = batch
-        self.model = model
-        user = np.zeros((model.nu, len(SERVO_TERMS)))
-        if model.nuser_actuator:
-            user = model.actuator_user
-        self._qpos = batch.bind("qpos")
-        self._qvel = batch.bind("qvel")
-        self._force = batch.bind("actuator_force")
-        self._passing = batch.bind("qfrc_bias")
-        self._gain = batch.expand("actuator_gainprm")
-        self._bias = batch.expand("actuator_biasprm")
-        self._limit = batch.expand("dof_frictionloss")
-        self.values: ServoTerms = {}
-        for i, name in enumerate(SERVO_TERMS):
-            self.values[name] = np.tile(user[:, i], (len(self._qpos), 1))
-        self._servos = np.zeros(self._limit.shape, SERVO_RECORD)
-        self.frictionloss = self._servos["frictionloss"]
-        self.frictionloss[:] = self._limit
-        self.bias = self._bias[:, :, 0].copy()
-        own = batch.expanded("actuator_forcerange")
-        limits = model.actuator_forcerange if own is None else own
-        self.effort = self._servos["effort_limit"]
-        self.effort[:] = limits[..., 1]
-        self._range = np.zeros((0, 0, 2))  # of torques, expanded where a term changes it
-        self.armature = np.zeros(self._force.shape) + model.dof_armature
-        self.damping = np.zeros(self._force.shape) + model.dof_damping
-        self.play: Play | None = None
-        self.torque = np.zeros(self._force.shape)
-        self.load = np.zeros(self._force.shape)
-        self._state = ActuatorState(
-            self._gain,
-            self.bias,
-            batch.bind("ctrl"),
-            self._qpos,
-            self._qvel,
-            self.torque,
-            self.load,
-        )
-        self._set_servos = compiled(set_servos)
-        self._take_terms()
-        bias = self._bias.copy()
-        limit = self._limit.copy()
-        self.before()  # compiles now, since the first step may belong to a control loop
-        self._bias[:] = bias
-        self._limit[:] = limit
-        if "backlash" in self.active:
-            self._reset_play(np.arange(len(self._force)))
-
-    def _take_terms(self) -> None:
-        """Take the present values of the terms for the steps to come."""
-        self.active = present(self.values)
-        if "no_load_speed" in self.active or self._range.size:
-            self._range = self.batch.expand("actuator_forcerange")
-            self._range[..., 0] = -self.effort
-            self._range[..., 1] = self.effort
-        for name, values in self.values.items():
-            self._servos[name] = values
-
-    def set_servos(self, at: Array, values: dict[str, Array]) -> None:
-        """Set the joints `at` (k,) of all simulations to values (nsim, k), as of
-        BatchSim.set_servos.
-        """
-        self.frictionloss[:, at] = values["frictionloss"]
-        self.armature[:, at] = values["armature"]
-        self.damping[:, at] = np.maximum(values["damping"], 0.0)
-        if "effort_limit" in values:
-            self.effort[:, at] = values["effort_limit"]
-        for name in SERVO_TERMS:
-            self.values[name][:, at] = values.get(name, 0.0)
-
-    @property
-    def records(self) -> Array:
-        """Present values of all servos, SERVO_RECORD (nsim, nu)."""
-        records = self._servos.copy()
-        for name, values in self.values.items():
-            records[name] = values
-        return records
-
-    def reset(self, ids: Array, target: Array) -> None:
-        """Begin again for simulations `ids`, which were put into a state, under position targets
-        (k, nu) rad.
-        """
-        self._take_terms()
-        requested = self._gain[ids][..., 0] * (target - self._qpos[ids]) + self.bias[ids]
-        self.torque[ids] = requested.clip(-self.effort[ids], self.effort[ids])
-        self.batch.forward(ids, stage=mujoco.mjtStage.mjSTAGE_VEL.value)
-        self.load[ids] = self._passing[ids]
-        if self.play is not None or "backlash" in self.active:
-            self._reset_play(ids)
-
-    def _reset_play(self, ids: Array) -> None:
-        expand = self.batch.expand
-        bind = self.batch.bind
-        step = self.batch.expanded("opt.timestep")
-        self._links = (
-            expand("dof_armature"),
-            expand("dof_damping"),
-            bind("qfrc_applied"),
-            expand("actuator_gear")[..., 0],
-        )
-        self._constraint = bind("qfrc_constraint")
-        self._h = self.model.opt.timestep if step is None else np.array(step).reshape(-1, 1)
-        play = Play(
-            self.values["backlash"],
-            self.armature,
-            self.damping,
-            -self._bias[..., 2],
-            self.load,
-            self._qvel,
-        )
-        if self.play is not None:
-            others = np.delete(np.arange(len(play.gap)), ids)
-            for mine, before in (
-                (play.gap, self.play.gap),
-                (play.rotor, self.play.rotor),
-                (play.seen, self.play.seen),
-            ):
-                mine[others] = before[others]
-        self.play = play
-
-    def before(self) -> None:
-        """Set bias, torque limits and friction for the next physics step.
-
-        MuJoCo delays ctrl after this: the least torque of a late servo follows the target that is
-        under way.
-        """
-        bias = self._bias[:, :, 0]
-        if self.play is not None:
-            bias[:] = self.bias
-        self._set_servos(self._servos, self._state, self._bias, self._limit, self._range)
-        if self.play is not None:
-            gain = self._gain[:, :, 0]
-            *values, more = self.play.before(self._limit, gain, self._qpos, self._qvel, self._h)
-            bias += more
-            for field, value in zip((self._limit, *self._links), values, strict=True):
-                field[:] = value
-
-    def after(self, ids: Any = None) -> None:
-        """Store torque and load after a physics step of these simulations."""
-        moved = slice(None) if ids is None else ids
-        self.torque[moved] = self._force[moved]
-        self.load[moved] = self._passing[moved]
-        if self.play is not None:
-            self.play.after(self._qvel, self.torque, self._constraint, self._h, moved)

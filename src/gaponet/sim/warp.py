@@ -21,6 +21,7 @@ from torch import Tensor
 from gaponet.base.errors import UsageError
 from gaponet.sim import servo
 from gaponet.sim.batch import BatchSim, CommandHistory, ramp_start
+from gaponet.sim.servo_model import ServoModel
 
 # of a simulation whose links collide
 MAX_CONTACTS = 48
@@ -147,13 +148,13 @@ class _Worlds:
             view = warp.to_torch(getattr(self.model, name))
             view.copy_(torch.tensor(values).reshape(view.shape))
 
-    def _inputs(self, servos: servo.ServoModel, rows: np.ndarray) -> list[Any]:
+    def _inputs(self, servo_model: ServoModel, rows: np.ndarray) -> list[Any]:
         """Return the arguments of _set_servos."""
         data = self.data
-        single = servos.records[rows].astype(_Servo.numpy_dtype())
+        single = servo_model.servos.latest_records()[rows].astype(_Servo.numpy_dtype())
         return [
             warp.array(single, dtype=_Servo),
-            warp.array(servos.bias[rows], dtype=float),
+            warp.array(servo_model.state.bias[rows], dtype=float),
             self.model.actuator_gainprm,
             data.ctrl,
             data.qpos,
@@ -256,7 +257,7 @@ class WarpSim:
         Raises:
             UsageError: No such device, or servos with backlash.
         """
-        if sim.servo_model is not None and sim.servo_model.values["backlash"].any():
+        if sim.servo_model is not None and sim.servo_model.servos.terms["backlash"].any():
             raise UsageError(
                 f"{sim.robot.name}: no GPU simulates its backlash; use --device cpu, or backlash "
                 "= 0"
@@ -288,8 +289,8 @@ class WarpSim:
             self._max_change = self.array(sim.max_change)
         if sim.servo_model:
             self._gain = self.array(sim.batch.expand("actuator_gainprm")[..., 0])
-            self._bias = self.array(sim.servo_model.bias)
-            self._effort = self.array(sim.servo_model.effort)
+            self._bias = self.array(sim.servo_model.state.bias)
+            self._effort = self.array(sim.servo_model.servos.records["effort_limit"])
         self.nstep = self.array(sim.nstep)
         self.timestep = self.array(sim.timestep)
         if self._delayed:

@@ -147,8 +147,8 @@ class RobotRollouts:
             for joint in np.flatnonzero(~part.meta.records(sim.joint_names)):
                 sim.batch.expand("dof_armature")[own, joint] = IMMOVABLE_ARMATURE
                 if sim.servo_model is not None:
-                    sim.servo_model.armature[own, joint] = IMMOVABLE_ARMATURE
-                    sim.servo_model.values["backlash"][own, joint] = 0.0
+                    sim.servo_model.servos.armature[own, joint] = IMMOVABLE_ARMATURE
+                    sim.servo_model.servos.terms["backlash"][own, joint] = 0.0
 
     def _set_links(
         self, sim: BatchSim, conditions: list[Condition], links: ListOf[dict[str, Link]]

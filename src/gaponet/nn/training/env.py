@@ -343,8 +343,8 @@ def _simulations(
         held = IMMOVABLE_ARMATURE * rows.unobserved[rows.group]
         sim.batch.expand("dof_armature")[:] += held
         if sim.servo_model is not None:
-            sim.servo_model.armature += held
-            sim.servo_model.values["backlash"][held > 0] = 0.0
+            sim.servo_model.servos.armature += held
+            sim.servo_model.servos.terms["backlash"][held > 0] = 0.0
     return sim
 
 
