@@ -6,7 +6,7 @@ In simulated time, and on a real DDS bus.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import numpy as np
 import pytest
@@ -79,12 +79,21 @@ def test_a_second_robot_that_appears_while_a_person_reads_the_plan_is_refused(ro
     assert clock.robot.heard == []
 
 
-def test_a_second_robot_that_appears_during_a_run_is_damped_within_three_periods(robot, clock):
-    def during(k: int) -> None:
-        if k == 30:
-            clock.add_robot()
+@pytest.fixture(scope="module")
+def joined(robot: RobotSpec) -> Iterator[tuple[Recording, RobotClock]]:
+    """A run in which a second robot, in another pose, appears after some periods; and its clock."""
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        clock = living(monkeypatch, robot)
 
-    recording = sway(robot, clock, during)
+        def during(k: int) -> None:
+            if k == 30:
+                clock.add_robot().live.unit.reset(robot.qpos_home[None] + 0.3, [1])
+
+        yield sway(robot, clock, during), clock
+
+
+def test_a_second_robot_that_appears_during_a_run_is_damped_within_three_periods(joined):
+    recording, clock = joined
 
     (second,) = clock.seconds
     assert recording.fault.kind == "source"
@@ -96,19 +105,15 @@ def test_a_second_robot_that_appears_during_a_run_is_damped_within_three_periods
         assert damped - second.heard[0]["time"] <= 3 * PERIOD_S
 
 
-def test_states_of_a_second_robot_are_never_taken_for_those_of_the_first(robot, clock):
-    def during(k: int) -> None:
-        if k == 30:
-            clock.add_robot().live.unit.reset(robot.qpos_home[None] + 0.3, [1])
-
-    recording = sway(robot, clock, during)
+def test_states_of_a_second_robot_are_never_taken_for_those_of_the_first(joined):
+    recording, _ = joined
 
     read = np.array([row.state.qpos for row in recording.rows])
     assert np.abs(np.diff(read, axis=0)).max() < 0.1
 
 
-def test_a_run_with_a_second_robot_is_no_data(robot, clock):
-    recording = sway(robot, clock, lambda k: clock.add_robot() if k == 80 else None)
+def test_a_run_with_a_second_robot_is_no_data(joined):
+    recording, _ = joined
 
     assert "second robot" in recording.disobedience
 

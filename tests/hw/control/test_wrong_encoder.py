@@ -5,6 +5,7 @@ in simulated time.
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from gaponet.robot.spec import RobotSpec, load_robot
 WRONG_FROM_S = 2.5  # after the first command
 FIRST_S = 0.5  # in which our share of rt/arm_sdk is at least three quarters (--damp 2)
 MAX_MOTION_RAD = 0.15  # of a true joint in that time: it comes to rest, and sinks
+ELBOW_MOTOR = 16
 KINDS = {  # way in which the robot is wrong → faults that may end the run
     "drifts": ("obedience", "tracking"),
     "encoder": ("frozen",),
@@ -26,32 +28,46 @@ KINDS = {  # way in which the robot is wrong → faults that may end the run
 }
 
 
+class Swaying:
+    """Plays each fault once: both elbows go up and sway, and the left one's reading becomes wrong."""
+
+    def __init__(self, robot: RobotSpec, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.robot = robot
+        self.monkeypatch = monkeypatch
+        self.played: dict[tuple[str, str, float], tuple[Recording, RobotClock]] = {}
+
+    def play(self, wrong: str, topic: str, swing: float = 0.5) -> tuple[Recording, RobotClock]:
+        """Recording of a run with this fault, and the clock by which the robot lived."""
+        key = (wrong, topic, swing)
+        if key not in self.played:
+            self.played[key] = self._run(*key)
+        return self.played[key]
+
+    def _run(self, wrong: str, topic: str, swing: float) -> tuple[Recording, RobotClock]:
+        robot = self.robot
+        clock = living(self.monkeypatch, robot)
+        clock.robot.at = clock.robot.fault_at = WRONG_FROM_S
+        if wrong == "drifts":
+            clock.robot.way = wrong
+        else:
+            clock.robot.fault = wrong  # type: ignore[assignment]
+        elbows = robot.index(["left_elbow_joint", "right_elbow_joint"])
+
+        def policy(k: int, state: object) -> np.ndarray | None:
+            target = robot.qpos_home.copy()
+            target[elbows] += 0.5 + swing * np.array([1, -1]) * np.sin(0.06 * k)
+            return target if k < 250 else None
+
+        config = ControlConfig(blend=1.5, settle=0.1, damp=2.0)
+        driver = UnitreeDriver(robot, topic, domain=200 + os.getpid() % 30)
+        controller = Controller(driver, robot, config=config, clock=clock, watchdog=False)
+        return controller.run(policy), clock
+
+
 @pytest.fixture(scope="module")
-def robot() -> RobotSpec:
-    return load_robot("h1_2")
-
-
-def sway(
-    robot: RobotSpec, monkeypatch: pytest.MonkeyPatch, wrong: str, topic: str, swing: float = 0.5
-) -> tuple[Recording, RobotClock]:
-    """Both elbows go up and sway; from some time on the reading of the left one is wrong."""
-    clock = living(monkeypatch, robot)
-    clock.robot.at = clock.robot.fault_at = WRONG_FROM_S
-    if wrong == "drifts":
-        clock.robot.way = wrong
-    else:
-        clock.robot.fault = wrong  # type: ignore[assignment]
-    elbows = robot.index(["left_elbow_joint", "right_elbow_joint"])
-
-    def policy(k: int, state: object) -> np.ndarray | None:
-        target = robot.qpos_home.copy()
-        target[elbows] += 0.5 + swing * np.array([1, -1]) * np.sin(0.06 * k)
-        return target if k < 250 else None
-
-    config = ControlConfig(blend=1.5, settle=0.1, damp=2.0)
-    driver = UnitreeDriver(robot, topic, domain=200 + os.getpid() % 30)
-    controller = Controller(driver, robot, config=config, clock=clock, watchdog=False)
-    return controller.run(policy), clock
+def swaying() -> Iterator[Swaying]:
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        yield Swaying(load_robot("h1_2"), monkeypatch)
 
 
 def true_motion(clock: RobotClock, start: float, seconds: float) -> float:
@@ -64,8 +80,8 @@ def true_motion(clock: RobotClock, start: float, seconds: float) -> float:
 
 @pytest.mark.parametrize("topic", ["arm_sdk", "lowcmd"])
 @pytest.mark.parametrize("wrong", KINDS)
-def test_after_a_fault_of_an_encoder_no_true_joint_moves_far(robot, monkeypatch, wrong, topic):
-    recording, clock = sway(robot, monkeypatch, wrong, topic)
+def test_after_a_fault_of_an_encoder_no_true_joint_moves_far(swaying, wrong, topic):
+    recording, clock = swaying.play(wrong, topic)
 
     assert recording.fault.kind in KINDS[wrong]
     moved = true_motion(clock, recording.fault.time, FIRST_S)
@@ -74,22 +90,21 @@ def test_after_a_fault_of_an_encoder_no_true_joint_moves_far(robot, monkeypatch,
 
 
 @pytest.mark.parametrize("wrong", KINDS)
-def test_after_a_fault_of_an_encoder_no_stiff_position_is_sent(robot, monkeypatch, wrong):
-    recording, clock = sway(robot, monkeypatch, wrong, "arm_sdk")
+def test_after_a_fault_of_an_encoder_no_stiff_position_is_sent(swaying, wrong):
+    recording, clock = swaying.play(wrong, "arm_sdk")
 
-    elbow = 16  # motor
     after = [row for row in clock.robot.heard if row["time"] > recording.fault.time + 0.02]
     assert after
-    assert {row["kp"][elbow] for row in after} == {0.0}
+    assert {row["kp"][ELBOW_MOTOR] for row in after} == {0.0}
 
 
-def test_a_drifting_encoder_does_not_carry_a_joint_away_before_it_is_noticed(robot, monkeypatch):
+def test_a_drifting_encoder_does_not_carry_a_joint_away_before_it_is_noticed(swaying):
     """The torque limit keeps the command near the reading, so that the joint runs after it: once
     by 2.4 rad.
     """
-    recording, clock = sway(robot, monkeypatch, "drifts", "arm_sdk", swing=0.0)
+    recording, clock = swaying.play("drifts", "arm_sdk", swing=0.0)
 
-    elbow = robot.index(["left_elbow_joint"])[0]
+    elbow = swaying.robot.index(["left_elbow_joint"])[0]
     wrong_from = clock.robot.first_command + WRONG_FROM_S
     until = recording.fault.time
     qpos = np.array([qpos[elbow] for time, qpos in clock.truth if wrong_from <= time <= until])
