@@ -6,7 +6,7 @@ from typing import Any
 
 from gaponet.experiments.paper import goals, measure, study
 
-ROWS = 60  # of a motion
+ROWS = 30  # of a motion
 
 
 def shorten(set_attribute: Callable[[Any, str, Any], None] = setattr) -> None:
@@ -17,7 +17,7 @@ def shorten(set_attribute: Callable[[Any, str, Any], None] = setattr) -> None:
         return [replace(motion, ctrl=motion.ctrl[:ROWS]) for motion in make_motions(*args)]
 
     set_attribute(study, "make_unseen_motions", short_motions)
-    set_attribute(measure, "REST_S", 0.2)
-    set_attribute(measure, "HOLD_S", 0.4)
-    set_attribute(measure, "AVERAGED_S", 0.2)
-    set_attribute(goals, "REST_S", 0.2)
+    set_attribute(measure, "REST_S", 0.1)
+    set_attribute(measure, "HOLD_S", 0.2)
+    set_attribute(measure, "AVERAGED_S", 0.1)
+    set_attribute(goals, "REST_S", 0.1)

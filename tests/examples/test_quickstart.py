@@ -1,57 +1,45 @@
 """The notebook runs from its first cell to its last, and its model is better than the simulator it corrects."""
 
-import gc
 import re
-import warnings
 from pathlib import Path
 
-import nbformat
 import pytest
 
-pytest.importorskip("ipykernel")
-from jupyter_client import AsyncKernelManager
-from nbclient import NotebookClient
+pytest.importorskip("IPython")
+from notebooks import code_cells, run_notebook
 
 FILE = Path(__file__).parents[2] / "examples" / "quickstart.ipynb"
-
-
-def texts(notebook):
-    for cell in notebook.cells:
-        for out in cell.get("outputs", ()):
-            yield out.get("text") or out.get("data", {}).get("text/plain", "")
-
-
-def test_the_notebook_goes_from_logs_to_a_model_that_is_better_than_the_simulator(
-    tmp_path, tmp_path_factory, monkeypatch
-):
-    monkeypatch.setenv("TMPDIR", str(tmp_path))
-    monkeypatch.setenv("IPYTHONDIR", str(tmp_path / "ipython"))
-    kernel = AsyncKernelManager(
-        kernel_name="python3", transport="ipc", ip=str(tmp_path_factory.mktemp("k") / "s")
+PROCESS = """done = subprocess.run(
+        [sys.executable, "-m", "gaponet", *map(str, words)], capture_output=True, text=True
     )
-    notebook = nbformat.read(FILE, 4)
-    smaller = {  # a third of its recordings and of its training
+    assert done.returncode == 0, done.stderr"""
+CALL = """from gaponet.cli.main import main
+
+    assert main([*map(str, words)]) == 0"""
+
+
+def test_the_notebook_goes_from_logs_to_a_model_that_is_better_than_the_simulator(tmp_path):
+    smaller = {  # a third of its recordings and of its training, in one process
+        "work = Path(tempfile.mkdtemp())": f'work = Path("{tmp_path}")',
+        PROCESS: CALL,
         '"multisine-*"': '"multisine-shoulder_*"',
         "rounds=3": "rounds=1",
         '"14400"': '"4800"',
+        "plt.show()": 'plt.savefig(work / "figure.png")',
     }
-    for cell in notebook.cells:
-        for text, replacement in smaller.items():
-            cell.source = cell.source.replace(text, replacement)
-    NotebookClient(notebook, timeout=300, km=kernel).execute()
-    with warnings.catch_warnings(action="ignore", category=ResourceWarning):
-        gc.collect()  # jupyter_client leaves sockets open, which would fail whatever test runs when they are collected
-    said = "\n".join(texts(notebook))
-    error = {name: float(x) for name, x in re.findall(r"'(\w+)': '([\d.]+) mrad'", said)}
+
+    shown = run_notebook(FILE, smaller)
+
+    rows = re.findall(r"'(\w+)': '([\d.]+) mrad'", shown.text)
+    error = {name: float(milliradians) for name, milliradians in rows}
     assert error["gaponet"] < error["nominal"]
-    assert any(
-        "image/png" in out.get("data", {})
-        for cell in notebook.cells
-        for out in cell.get("outputs", ())
-    )
+    assert (tmp_path / "figure.png").is_file()
 
 
 def test_the_notebook_as_it_is_kept_shows_results_and_no_place_of_the_machine_that_made_them():
-    kept = "\n".join(texts(nbformat.read(FILE, 4)))
-    assert re.search(r"'gaponet': '[\d.]+ mrad'", kept)
+    text = ""
+    for cell in code_cells(FILE):
+        for output in cell["outputs"]:
+            text += "".join(output.get("text") or output.get("data", {}).get("text/plain", ""))
+    assert re.search(r"'gaponet': '[\d.]+ mrad'", text)
     assert not re.search(r"/(tmp|home|work|root)/", FILE.read_text(encoding="utf-8"))
