@@ -10,7 +10,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from gaponet.base.arrays import Array
-from gaponet.data.sequence import Sequence
+from gaponet.data.sequence import Sequence, SequenceMeta
 from gaponet.data.split import hash_order
 from gaponet.robot.spec import Link, RobotSpec
 from gaponet.sim.links import LinkResult
@@ -68,48 +68,54 @@ def cross_validation(
     """
     every = [*sequences, *validation]
     motions = _motions(every)
-    count = min(folds, max(map(len, motions.values())))
-    if not validation or count < 2:
+    most_motions = max(len(names) for names in motions.values())
+    folds = min(folds, most_motions)
+    if not validation or folds < 2 or not _needs_cross_validation(motions, _motions(validation)):
         return [(list(sequences), list(validation))]
-    if len({s.meta.independent_motion for s in every}) < MIN_CROSS_VALIDATED:
-        return [(list(sequences), list(validation))]
-    several = [unrecorded for unrecorded, names in motions.items() if len(names) > 1]
-    judges = _motions(validation)
-    fewest_judges = min((len(judges.get(unrecorded, ())) for unrecorded in several), default=0)
-    if fewest_judges >= MIN_JUDGES:
-        return [(list(sequences), list(validation))]
-    fold = {}
-    for unrecorded in several:
-        for i, name in enumerate(motions[unrecorded]):
-            fold[unrecorded, name] = i % count
-    return [_split(every, fold, i) for i in range(count)]
+    return [_split(every, motions, number, folds) for number in range(folds)]
 
 
-def _split(
-    sequences: ListOf[Sequence], fold: dict[tuple[tuple[str, ...], str], int], number: int
-) -> Split:
-    """Return the recordings outside and inside a fold; `fold` has its number by unrecorded joints
-    and motion.
+# Joints that a recording does not hold → names of independent motions, in the order of their
+# hashes.
+_Motions = dict[tuple[str, ...], list[str]]
+
+
+def _motions(sequences: ListOf[Sequence]) -> _Motions:
+    """Return the motions of each set of joints."""
+    names: _Motions = {}
+    for s in sequences:
+        names.setdefault(s.meta.unrecorded, []).append(s.meta.independent_motion)
+    return {unrecorded: hash_order(motions) for unrecorded, motions in names.items()}
+
+
+def _needs_cross_validation(motions: _Motions, judges: _Motions) -> bool:
+    """Return whether there are enough motions for it, and too few in validation for some set of
+    joints.
+    """
+    every = set[str]().union(*motions.values())
+    if len(every) < MIN_CROSS_VALIDATED:
+        return False
+    judges_of_sets = []
+    for unrecorded, names in motions.items():
+        if len(names) > 1:
+            judges_of_sets.append(len(judges.get(unrecorded, [])))
+    return min(judges_of_sets, default=0) < MIN_JUDGES
+
+
+def _split(sequences: ListOf[Sequence], motions: _Motions, number: int, folds: int) -> Split:
+    """Return the recordings outside and inside one of some folds: each takes every so many motions
+    of a set of joints, and none of a set with a single motion.
     """
     fitted: list[Sequence] = []
     held_out: list[Sequence] = []
     for s in sequences:
-        own = fold.get((s.meta.unrecorded, s.meta.independent_motion))
-        if own == number:
+        names = motions[s.meta.unrecorded]
+        place = names.index(s.meta.independent_motion)
+        if len(names) > 1 and place % folds == number:
             held_out.append(s)
         else:
             fitted.append(s)
     return fitted, held_out
-
-
-def _motions(sequences: ListOf[Sequence]) -> dict[tuple[str, ...], list[str]]:
-    """Return joints that recordings do not hold → names of their independent motions, in the order
-    of their hashes.
-    """
-    names: dict[tuple[str, ...], list[str]] = {}
-    for s in sequences:
-        names.setdefault(s.meta.unrecorded, []).append(s.meta.independent_motion)
-    return {joints: hash_order(motions) for joints, motions in names.items()}
 
 
 @dataclass(frozen=True)
@@ -166,8 +172,9 @@ class Identified:
         """Explain why nothing is written, and what to record; errors of the given and the fitted
         robot, rad.
         """
-        worst = sorted(self.by_joint, key=lambda joint: -self.by_joint[joint][0])[:3]
-        joints = ", ".join(f"{joint} {1e3 * self.by_joint[joint][0]:.2f}" for joint in worst)
+        before = {joint: error for joint, (error, _) in self.by_joint.items()}
+        worst = sorted(before, key=lambda joint: -before[joint])[:3]
+        joints = ", ".join(f"{joint} {1e3 * before[joint]:.2f}" for joint in worst)
         why = f"; {self.warnings[0]}" if self.warnings else ""
         return (
             f"nothing is written: no fit follows the {len(given)} validation motion(s) better "
@@ -249,19 +256,20 @@ class Judge:
         evidence to change.
         """
         names = list(candidates)
-        given, *others = names
-        # Name → (motions, n) rad; NaN where a motion does not hold a joint.
-        errors = {name: self._joint_errors(values) for name, values in candidates.items()}
-        winner = np.zeros(errors[given].shape[1], int)  # number of the candidate of each joint
+        of_candidates = [self._joint_errors(values) for values in candidates.values()]
+        errors = np.stack(of_candidates)  # (candidates, motions, n) rad; the given robot first
+        winner = np.zeros(errors.shape[-1], int)  # number of the candidate of each joint
         for i in range(len(winner)):
-            held = ~np.isnan(errors[given][:, i])
-            if not held.any():
+            is_held = ~np.isnan(errors[0, :, i])  # (motions,)
+            if not is_held.any():
                 continue
-            best = min(others, key=lambda other: float(np.nansum(errors[other][:, i])))
-            if Comparison(best, errors[given][held, i], errors[best][held, i]).accepted:
-                winner[i] = names.index(best)
+            of_others = np.nansum(errors[1:, :, i], axis=1)
+            best = 1 + int(of_others.argmin())
+            given = errors[0, is_held, i]
+            if Comparison(names[best], given, errors[best, is_held, i]).accepted:
+                winner[i] = best
         if not winner.any():
-            return given, candidates[given]
+            return names[0], candidates[names[0]]
         return "mixed", _mixed(candidates, winner)
 
     def _joint_errors(self, candidate: ListOf[Values]) -> Array:
@@ -269,9 +277,12 @@ class Judge:
         does not hold it.
         """
         total, count = self._sums(candidate)
-        with np.errstate(invalid="ignore"):
-            same = [self.names == name for name in dict.fromkeys(self.names)]
-            return np.stack([total[rows].sum(axis=0) / count[rows].sum(axis=0) for rows in same])
+        errors = []
+        for name in dict.fromkeys(self.names):
+            judges = self.names == name
+            with np.errstate(invalid="ignore"):  # 0 / 0 where no judge holds a joint
+                errors.append(total[judges].sum(axis=0) / count[judges].sum(axis=0))
+        return np.stack(errors)
 
     def best(self, candidates: dict[str, list[Values]]) -> tuple[str, list[Values]]:
         """Return name and values of the best candidate.
@@ -281,30 +292,43 @@ class Judge:
         ("mixed") replace it only if they are accepted. The first candidate, the given robot, is
         returned if no fit is better by 1 %.
         """
-        given, default, *others = candidates
-        by_joint = np.array([self.errors_by_joint(values) for values in candidates.values()])
-        winner = by_joint.argmin(axis=0)  # number of the candidate of each joint
+        of_candidates = [self.errors_by_joint(values) for values in candidates.values()]
+        winner = np.array(of_candidates).argmin(axis=0)  # number of the candidate of each joint
         if len(set(winner.tolist())) > 1:
             candidates = candidates | {"mixed": _mixed(candidates, winner)}
-            others.append("mixed")
         errors = {name: self.errors(values) for name, values in candidates.items()}
+        given, default, *others = candidates
         best = default
         for other in others:
             limit = (1 - MIN_RELATIVE_GAIN_ONE_MOTION) * errors[best].mean()
             is_much_better = other != "mixed" and errors[other].mean() < limit
             if is_much_better or Comparison(other, errors[best], errors[other]).accepted:
                 best = other
-        if not errors[best].mean() < (1 - MIN_RELATIVE_GAIN) * errors[given].mean():
+        is_better = errors[best].mean() < (1 - MIN_RELATIVE_GAIN) * errors[given].mean()
+        if not is_better:
             best = given
         return best, candidates[best]
+
+
+class _JudgeKey(NamedTuple):
+    """What recordings have in common that judge as one: repetitions of a motion, pieces of it, and
+    the same with other gains.
+    """
+
+    motion: str
+    unit_id: str
+    payload_mass: float
+    payload_side: str
+
+
+def _judge(meta: SequenceMeta) -> _JudgeKey:
+    """Return the judge that a recording belongs to."""
+    return _JudgeKey(meta.independent_motion, meta.unit_id, meta.payload_mass, meta.payload_side)
 
 
 @dataclass(frozen=True)
 class _Fold:
     """Recordings that judge the candidate of one fold.
-
-    What one unit plays of a motion with one payload is one judge: its repetitions, its pieces, and
-    its recordings with other gains.
 
     Attributes:
         rollouts: Rollouts beside the recordings.
@@ -319,21 +343,21 @@ class _Fold:
     @classmethod
     def of(cls, sequences: ListOf[Sequence], rollouts: RobotRollouts) -> _Fold:
         """Return the judges that have rows."""
-        metas = [s.meta for s in sequences]
-        judges = [(m.independent_motion, m.unit_id, m.payload_mass, m.payload_side) for m in metas]
+        judge_of_window = [_judge(s.meta) for s in sequences]
         motions = []
         rows = []
-        for judge in dict.fromkeys(judges):
-            is_own = np.array([other == judge for other in judges])[rollouts.window]
-            if is_own.any():
-                motions.append(judge[0])
-                rows.append(is_own)
+        for judge in dict.fromkeys(judge_of_window):
+            has_window = np.array([other == judge for other in judge_of_window])
+            has_row = has_window[rollouts.window]
+            if has_row.any():
+                motions.append(judge.motion)
+                rows.append(has_row)
         return cls(rollouts, motions, rows)
 
     def sums(self, values: Values, links: ListOf[Links]) -> Array:
         """Return the sums of |error| over the rows of each judge, (judges, n) rad; values (n,)."""
-        errors = self.rollouts.flat_errors({f: v[None] for f, v in values.items()}, links)
-        size = np.abs(errors)[0]  # (n, rows)
+        one_candidate = {field: value[None] for field, value in values.items()}
+        size = np.abs(self.rollouts.flat_errors(one_candidate, links))[0]  # (n, rows) rad
         return np.stack([size[:, rows].sum(axis=1) for rows in self.rows])
 
     def counts(self) -> Array:
@@ -370,7 +394,8 @@ def _contact_rows(
     if not robot.scene.tips:
         return None
     heights = tip_heights(sequences, robot)
-    touch = np.zeros((len(heights), max(map(len, heights))), bool)
-    for row, height in zip(touch, heights, strict=True):
-        row[: len(height)] = height < contact_height
+    most_rows = max(len(height) for height in heights)
+    touch = np.zeros((len(heights), most_rows), bool)
+    for i, height in enumerate(heights):
+        touch[i, : len(height)] = height < contact_height
     return touch

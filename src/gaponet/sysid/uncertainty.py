@@ -8,7 +8,6 @@ and the error of motions that were not fitted.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from collections.abc import Sequence as ListOf
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -35,9 +34,13 @@ PLAY = "play"
 UNSEEN_ERROR_OF_ZERO = 1.0
 UNSEEN_ERROR = 3.0  # of another value
 AT_BOUND = 0.05  # standard errors: a value nearer to zero has ended at this bound
+DERIVATIVE_STEP = 1e-6  # on an axis, of the delta method
 # Parameters that correlate so much, and have at least this relative error, are known only as a set.
 MIN_SET_CORRELATION = 0.9
 MIN_SET_RELATIVE_ERROR = 0.03
+REPAIR_HINT = (
+    "identify or adapt again, or remove the file: the robot then has values without uncertainty"
+)
 # Keys of known.json → of uncertainty.json.
 OLD_KEYS = {
     "step": "gauss_newton_step",
@@ -116,21 +119,22 @@ class LinkUncertainty:
         began_with_others = bool(result.axes.links(0 * result.x))
         if began_with_others or robot.links != result.axes.links(result.x):
             return None
-        none = np.zeros((len(robot.operated), len(result.x)))
-        slopes = np.stack([result.servo_slopes.get(f, none) for f in fields], axis=1)  # (n, P, Q)
+        no_slope = np.zeros((len(robot.operated), len(result.x)))
+        by_field = [result.servo_slopes.get(field, no_slope) for field in fields]
+        slopes = np.stack(by_field, axis=1)  # (n, P, Q)
         return cls(
-            tuple(result.x.tolist()),
-            result.covariance.tolist(),
-            dict(zip(robot.operated, slopes.tolist(), strict=True)),
+            values=tuple(result.x.tolist()),
+            covariance=result.covariance.tolist(),
+            servo_slopes=dict(zip(robot.operated, slopes.tolist(), strict=True)),
         )
 
     def are_of(self, robot: RobotSpec) -> bool:
         """Return True if the robot's links have the masses of these values."""
-        for body, link in (
-            LinkAxes(robot.before_identification).links(np.array(self.values)).items()
-        ):
-            own_mass = robot.links[body].mass if body in robot.links else 0.0
-            if not np.isclose(link.mass, own_mass, rtol=1e-4):
+        axes = LinkAxes(robot.before_identification)
+        for body, link in axes.links(np.array(self.values)).items():
+            if body not in robot.links:
+                return False
+            if not np.isclose(link.mass, robot.links[body].mass, rtol=1e-4):
                 return False
         return True
 
@@ -159,26 +163,26 @@ class ParameterUncertainty:
         Raises:
             RobotError: The file is damaged, or its values are not those of robot.toml.
         """
-        hint = (
-            "identify or adapt again, or remove the file: the robot then has values without "
-            "uncertainty"
-        )
         file = robot.folder / UNCERTAINTY_FILE
         if not file.is_file():
             file = robot.folder / OLD_UNCERTAINTY_FILE
         if not file.is_file():
             return None
-        table = _with_new_keys(read_json(dict[str, Any], file, RobotError, hint))
-        uncertainty = validated(cls, table, file, RobotError, hint)
-        for joint, values in to_axes(robot, uncertainty.fields).items():
-            stored = uncertainty.joints.get(joint)
+        table = _with_new_keys(read_json(dict[str, Any], file, RobotError, REPAIR_HINT))
+        uncertainty = validated(cls, table, file, RobotError, REPAIR_HINT)
+        uncertainty._require_values_of(robot, file)
+        return uncertainty
+
+    def _require_values_of(self, robot: RobotSpec, file: Path) -> None:
+        """Raise RobotError if the values are not those of robot.toml."""
+        for joint, values in to_axes(robot, self.fields).items():
+            stored = self.joints.get(joint)
             if stored is None or not np.allclose(values, stored.values, rtol=1e-4, atol=1e-5):
                 raise RobotError(
-                    f"{file}: its values are other values than robot.toml's, at {joint}; {hint}"
+                    f"{file}: its values are other values than robot.toml's, at {joint}; {REPAIR_HINT}"
                 )
-        if uncertainty.links and not uncertainty.links.are_of(robot):
-            raise RobotError(f"{file}: its links are other links than robot.toml's; {hint}")
-        return uncertainty
+        if self.links and not self.links.are_of(robot):
+            raise RobotError(f"{file}: its links are other links than robot.toml's; {REPAIR_HINT}")
 
     @classmethod
     def require(cls, robot: RobotSpec) -> ParameterUncertainty:
@@ -193,10 +197,8 @@ class ParameterUncertainty:
 
     def save(self, folder: Path) -> None:
         """Write uncertainty.json into a robot folder."""
-        write_json(
-            folder / UNCERTAINTY_FILE,
-            {name: x for name, x in asdict(self).items() if x is not None},
-        )
+        table = {name: value for name, value in asdict(self).items() if value is not None}
+        write_json(folder / UNCERTAINTY_FILE, table)
 
     def array(self, joint: str, name: ArrayName) -> Array:
         """Return an attribute of a joint as an array."""
@@ -207,44 +209,48 @@ class ParameterUncertainty:
 
         `covariance` (P, P) on the axes replaces the joint's own.
         """
+        if covariance is None:
+            covariance = self.array(joint, "covariance")
         x = self.array(joint, "values")
-        step = 1e-6
-        here = from_axes(self.fields, x)
-        ahead = from_axes(self.fields, x + step * np.eye(len(x)))
-        jac = np.stack([(ahead[f] - here[f]) / step for f in self.fields])  # (P, axes)
-        own = self.array(joint, "covariance") if covariance is None else covariance
-        return {f: float(v) for f, v in here.items()}, jac @ own @ jac.T
+        values = from_axes(self.fields, x)
+        moved = from_axes(self.fields, x + DERIVATIVE_STEP * np.eye(len(x)))
+        slopes = [(moved[field] - values[field]) / DERIVATIVE_STEP for field in self.fields]
+        jac = np.stack(slopes)  # of fields over axes, (P, P)
+        return {field: float(value) for field, value in values.items()}, jac @ covariance @ jac.T
 
 
 def _with_new_keys(table: dict[str, Any]) -> dict[str, Any]:
     """Rename the keys of a known.json; those of an uncertainty.json stay."""
     renamed = {OLD_KEYS.get(key, key): value for key, value in table.items()}
     joints = renamed.get("joints")
-    if isinstance(joints, dict):
-        renamed["joints"] = joints.copy()
-        for joint, values in joints.items():
-            if isinstance(values, dict):
-                renamed["joints"][joint] = _with_new_keys(values)
+    if not isinstance(joints, dict):
+        return renamed
+    renamed["joints"] = joints.copy()
+    for joint, values in joints.items():
+        if isinstance(values, dict):
+            renamed["joints"][joint] = _with_new_keys(values)
     return renamed
 
 
 def to_axes(robot: RobotSpec, fields: ListOf[str]) -> dict[str, Array]:
     """Return a robot's own values on the axes, (P,) of each operated joint."""
     first = first_values(robot)
-    rows = [to_axis(f, first[f], first["kp"]) for f in fields]
-    return dict(zip(robot.operated, np.stack(rows, axis=-1), strict=True))
+    by_field = [to_axis(field, first[field], first["kp"]) for field in fields]
+    by_joint = np.stack(by_field, axis=-1)  # (n, P)
+    return dict(zip(robot.operated, by_joint, strict=True))
 
 
 def from_axes(fields: ListOf[str], x: Array) -> Values:
     """Return values on the axes, (…, P), as field → (…) in SI units."""
-    return from_axis({f: x[..., i] for i, f in enumerate(fields)})
+    return from_axis({field: x[..., i] for i, field in enumerate(fields)})
 
 
 def prior_std(fields: ListOf[str], x: Array) -> Array:
     """Return the prior standard deviations of values (…, P) on the axes, before any log."""
-    records = [SERVO_FIELDS[f] for f in fields]
-    least = np.array([r.prior_std for r in records], float)
-    return np.where([r.axis == "log" for r in records], least, np.maximum(least, np.abs(x)))
+    records = [SERVO_FIELDS[field] for field in fields]
+    own = np.array([record.prior_std for record in records], float)
+    is_log = np.array([record.axis == "log" for record in records])
+    return np.where(is_log, own, np.maximum(own, np.abs(x)))
 
 
 @dataclass(frozen=True)
@@ -266,15 +272,17 @@ class JointSummary:
         """Return the value with its uncertainty as text; no uncertainty where the logs say
         nothing.
         """
-        value = self.values[field] * SERVO_FIELDS[field].factor
+        record = SERVO_FIELDS[field]
+        value = self.values[field] * record.factor
+        error = self.errors[field] * record.factor
         relative = self.relative_error(field)
         if value == 0 and relative > UNSEEN_ERROR_OF_ZERO:
             return "none seen"
         if value != 0 and relative > UNSEEN_ERROR:
             return f"{value:.3g} (no log shows it)"
-        error = self.errors[field] * SERVO_FIELDS[field].factor
-        if not SERVO_FIELDS[field].signed and value < AT_BOUND * error:
-            return f"at most {value + 2 * error:.2g}"  # a delay below zero does not exist
+        ended_at_zero = not record.signed and value < AT_BOUND * error
+        if ended_at_zero:  # a delay below zero does not exist
+            return f"at most {value + 2 * error:.2g}"
         return format_uncertainty(value, error)
 
 
@@ -285,15 +293,16 @@ def summarize(uncertainty: ParameterUncertainty, joint: str) -> JointSummary:
     errors = np.sqrt(np.diag(covariance))
     summary = JointSummary(values, dict(zip(fields, errors.tolist(), strict=True)))
     size = np.where(errors > 0, errors, 1.0)
-    correlation = np.abs(covariance / np.outer(size, size))
+    correlation = np.abs(covariance / np.outer(size, size))  # (P, P)
     is_correlated = (correlation > MIN_SET_CORRELATION) & (errors > 0)
     is_loose = np.array([summary.relative_error(f) > MIN_SET_RELATIVE_ERROR for f in fields])
-    _, set_of_field = connected_components(is_correlated & is_loose[:, None] & is_loose[None, :])
+    both_are_loose = is_loose[:, None] & is_loose[None, :]
+    _, set_of_field = connected_components(is_correlated & both_are_loose)  # numbers, (P,)
     sets: dict[int, list[str]] = {}
     for field, number in zip(fields, set_of_field.tolist(), strict=True):
         sets.setdefault(number, []).append(field)
-    together = [tuple(fields_of_set) for fields_of_set in sets.values() if len(fields_of_set) > 1]
-    return replace(summary, sets=tuple(together))
+    of_several = [tuple(members) for members in sets.values() if len(members) > 1]
+    return replace(summary, sets=tuple(of_several))
 
 
 def format_change(field: str, change: float, uncertainty: ParameterUncertainty, joint: str) -> str:
@@ -305,10 +314,13 @@ def format_change(field: str, change: float, uncertainty: ParameterUncertainty, 
         return f"{record.factor * change:+.1f} {record.shown_unit}"
     if record.axis == "log":
         return f"× {np.exp(change):.2f}"
-    value = uncertainty.joints[joint].values[uncertainty.fields.index(field)]
-    if record.axis == "inverse" and min(value, value + change) > 0:
-        return f"× {value / (value + change):.2f}"
-    return f"{max(100 * change / value, -100):+.0f} %" if value > 1e-9 else "from none"
+    before = uncertainty.joints[joint].values[uncertainty.fields.index(field)]
+    after = before + change
+    if record.axis == "inverse" and min(before, after) > 0:
+        return f"× {before / after:.2f}"
+    if before <= 1e-9:
+        return "from none"
+    return f"{max(100 * change / before, -100):+.0f} %"
 
 
 def table_rows(uncertainty: ParameterUncertainty, fields: tuple[str, ...]) -> list[list[str]]:
@@ -324,33 +336,53 @@ def sentences(uncertainty: ParameterUncertainty) -> list[str]:
     """Return the recordings, the parameters that are only known together, and the residual error,
     in sentences.
     """
+    return [
+        *_recordings(uncertainty.sources),
+        *_values_in_sets(uncertainty),
+        _residual_error(uncertainty),
+    ]
+
+
+def _recordings(sources: ListOf[Provenance]) -> list[str]:
+    """Return which recordings were used, a sentence for each command that used some."""
     lines = []
-    for s in uncertainty.sources:
-        days = ", ".join(s["days"]) or "date unknown"
-        count = len(s["logs"])
+    for source in sources:
+        count = len(source["logs"])
         logs = "1 log" if count == 1 else f"{count} logs"
-        lines.append(f"{s['made_by']}: {logs} of {s['unit']}, {s['seconds']:.0f} s, {days}")
+        days = ", ".join(source["days"]) or "date unknown"
+        what = f"{logs} of {source['unit']}, {source['seconds']:.0f} s, {days}"
+        lines.append(f"{source['made_by']}: {what}")
+    return lines
+
+
+def _values_in_sets(uncertainty: ParameterUncertainty) -> list[str]:
+    """Return a sentence for each set of values that are only known together."""
+    lines = []
     for joint in uncertainty.joints:
         for *some, last in summarize(uncertainty, joint).sets:
             lines.append(
                 f"{joint}: the logs determine only {', '.join(some)} and {last} together; change "
                 "none alone"
             )
-    joints = uncertainty.joints
-    worst = max(joints, key=lambda j: joints[j].residual_rms)
-    judges = (
-        "were not fitted" if uncertainty.validated else "were fitted, since no others were there"
-    )
-    lines.append(
-        f"the RMS error of motions that {judges} is "
-        f"{_root_mean_square(j.residual_rms for j in joints.values()):.2f} mrad ({worst} "
-        f"{1e3 * joints[worst].residual_rms:.2f}). The standard errors predict "
-        f"{_root_mean_square(j.parameter_rms for j in joints.values()):.2f}; more than that is "
-        "due to the servo model"
-    )
     return lines
 
 
-def _root_mean_square(errors: Iterable[float]) -> float:
+def _residual_error(uncertainty: ParameterUncertainty) -> str:
+    """Return the error of motions that judge, and what of it the standard errors explain."""
+    joints = uncertainty.joints
+    judges = "were fitted, since no others were there"
+    if uncertainty.validated:
+        judges = "were not fitted"
+    error = _root_mean_square([joint.residual_rms for joint in joints.values()])
+    predicted = _root_mean_square([joint.parameter_rms for joint in joints.values()])
+    worst = max(joints, key=lambda name: joints[name].residual_rms)
+    return (
+        f"the RMS error of motions that {judges} is {error:.2f} mrad "
+        f"({worst} {1e3 * joints[worst].residual_rms:.2f}). The standard errors predict "
+        f"{predicted:.2f}; more than that is due to the servo model"
+    )
+
+
+def _root_mean_square(errors: ListOf[float]) -> float:
     """Return the root mean square of errors in rad, in mrad."""
     return 1e3 * float(np.sqrt(np.mean([x**2 for x in errors])))

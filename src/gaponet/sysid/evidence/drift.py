@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from collections.abc import Sequence as ListOf
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from scipy.stats import t as student
@@ -40,6 +40,7 @@ MIN_EFFECT_RATIO = 0.15  # of a change's effect on the joint's path, over the re
 MAX_CHANGES_PER_JOINT = 3
 MAX_PRIOR_CLUSTERS = 40  # that the identification's overdispersion counts as
 MAX_SET_ASIDE = 0.4  # of the recordings; more of them contradict the others
+MIN_INFORMATION_OF_OTHERS = 0.5  # over that of the recording which is compared with them
 COMMON_FIELDS = ("delay",)  # of one bus: those of all joints change together
 EVERY_JOINT = "every joint"
 FRICTION_FIELDS = ("damping", "frictionloss", "stribeck")
@@ -140,18 +141,19 @@ def drift(
     _require_identified(robot, own)
     repeatability = _repeatability(uncertainty, sequences, joints)
     far = _far_joints(uncertainty, own, joints, repeatability)
-    overdispersion = np.stack(
-        [np.maximum(uncertainty.array(j, "overdispersion"), 1.0) for j in joints]
-    )
+    stored = [uncertainty.array(joint, "overdispersion") for joint in joints]
+    overdispersion = np.maximum(np.stack(stored), 1.0)  # (n, Q)
     against = _contradictions(own, overdispersion, uncertainty, joints)
-    aside = {a.recording for a in against}
-    contradictory = len(aside) > MAX_SET_ASIDE * len(own.names)
-    if not contradictory:
-        own = own.without(aside)
-    each, threshold = _gradients_to_explain(own, overdispersion, uncertainty, joints, repeatability)
-    moved, largest = _changes(each, threshold)
+    set_aside = {contradiction.recording for contradiction in against}
+    is_contradictory = len(set_aside) > MAX_SET_ASIDE * len(own.names)
+    if not is_contradictory:
+        own = own.without(set_aside)
+    gradients, threshold = _gradients_to_explain(
+        own, overdispersion, uncertainty, joints, repeatability
+    )
+    moved, largest = _changes(gradients, threshold)
     verdict: Verdict = "same"
-    if contradictory:
+    if is_contradictory:
         verdict = "contradictory"
     elif moved or far:
         verdict = "drifted"
@@ -159,7 +161,7 @@ def drift(
         verdict=verdict,
         moved=tuple(moved),
         largest=largest,
-        min_effect={one.name: one.min_effect for one in each},
+        min_effect={joint.name: joint.min_effect for joint in gradients},
         against=tuple(against),
         advice=_advice(verdict, moved, against, joints, far),
         threshold=threshold,
@@ -242,29 +244,29 @@ def _gradients_to_explain(
     beside those of these recordings; Student's t has their degrees of freedom, and all parameters
     together raise FALSE_ALARM_RATE.
     """
-    grouped = own.by_recording() if len(own.names) > 1 else own
-    clusters = grouped.gradients.shape[1]
+    if len(own.names) > 1:
+        own = own.by_recording()
+    clusters = own.gradients.shape[1]
     trusted = min(uncertainty.clusters, MAX_PRIOR_CLUSTERS)
     freedom = trusted + clusters - 1
     tests = len(joints) * (len(uncertainty.fields) + 1) + len(COMMON_FIELDS)
     threshold = float(student.isf(FALSE_ALARM_RATE / tests / 2, freedom))
-    information = grouped.information.sum(axis=1)
+    information = own.information.sum(axis=1)  # (n, Q, Q)
     expected = trusted * widened(information, overdispersion)
-    scatter = expected + (clusters - 1) * gradient_covariance(grouped.gradients)
-    gradients = grouped.gradients.sum(axis=1)
+    scatter = expected + (clusters - 1) * gradient_covariance(own.gradients)
+    gradients = own.gradients.sum(axis=1)  # (n, Q)
     each = []
     for i, joint in enumerate(joints):
-        each.append(
-            _Joint(
-                joint,
-                uncertainty,
-                information[i],
-                gradients[i],
-                scatter[i] / freedom,
-                int(own.rows[i]),
-                repeatability[joint],
-            )
+        one = _Joint(
+            joint,
+            uncertainty,
+            information=information[i],
+            gradient=gradients[i],
+            scatter=scatter[i] / freedom,
+            rows=int(own.rows[i]),
+            repeatability=repeatability[joint],
         )
+        each.append(one)
     return each, threshold
 
 
@@ -311,6 +313,13 @@ class _Joint:
         rows: int,
         repeatability: float,
     ) -> None:
+        """
+        Args:
+            information, scatter: Of the recordings, and the covariance of their gradients, (Q, Q).
+            gradient: Sum over the recordings, (Q,).
+            rows: Number of rows that hold the joint.
+            repeatability: RMS difference between two recordings of one command, rad.
+        """
         self.name = name
         self.fields = (*uncertainty.fields, PLAY)
         # Change of the axes and play by a change of one parameter in SI units, column by column: a
@@ -381,14 +390,8 @@ def _together(joints: ListOf[_Joint], number: int, threshold: float) -> Paramete
     """Return a parameter that changed in every joint by the same, if that is more significant than
     the joints' own changes; it is then taken out of their gradients.
     """
-    information = np.array([j.columns[:, number] @ j.weight @ j.columns[:, number] for j in joints])
-    pulls = np.array([j.columns[:, number] @ j.weight @ j.gradient for j in joints])
-    total = max(information.sum(), 1e-300)
-    by = float(pulls.sum() / total)
-    error = float(total**-0.5)
-    moves = float(np.sqrt(np.mean([(by * j.effect[number]) ** 2 for j in joints])))
-    change = ParameterChange(EVERY_JOINT, joints[0].fields[number], by, error, moves)
-    if moves < np.mean([joint.min_effect for joint in joints]):
+    change = _common_change(joints, number)
+    if change.moves < np.mean([joint.min_effect for joint in joints]):
         return None
     needed = threshold
     for joint in joints:
@@ -398,8 +401,24 @@ def _together(joints: ListOf[_Joint], number: int, threshold: float) -> Paramete
     if abs(change.sigmas) < needed:
         return None
     for joint in joints:
-        joint.gradient = joint.gradient - by * joint.columns[:, number]
+        joint.gradient = joint.gradient - change.by * joint.columns[:, number]
     return change
+
+
+def _common_change(joints: ListOf[_Joint], number: int) -> ParameterChange:
+    """Return the one change of a parameter in every joint that explains all gradients best."""
+    information = []
+    pulls = []
+    for joint in joints:
+        weighted = joint.columns[:, number] @ joint.weight
+        information.append(weighted @ joint.columns[:, number])
+        pulls.append(weighted @ joint.gradient)
+    total = max(np.array(information).sum(), 1e-300)
+    by = float(np.array(pulls).sum() / total)
+    error = float(total**-0.5)
+    squares = [(by * joint.effect[number]) ** 2 for joint in joints]
+    moves = float(np.sqrt(np.mean(squares)))
+    return ParameterChange(EVERY_JOINT, joints[0].fields[number], by, error, moves)
 
 
 def _solved(columns: Array, weight: Array, pull: Array) -> tuple[Array, Array]:
@@ -426,23 +445,29 @@ def _farthest(
     for i, joint in enumerate(joints):
         residual = uncertainty.joints[joint].residual_rms
         for recording in range(count):
-            differences = _differences(own, i, recording, overdispersion[i])
-            for number, by, sigmas, effect in differences:
-                if abs(sigmas) > limit and effect > residual:
-                    limit = abs(sigmas)
+            for found in _differences(own, i, recording, overdispersion[i]):
+                if abs(found.sigmas) > limit and found.effect > residual:
+                    limit = abs(found.sigmas)
                     name = own.names[recording]
-                    worst = Contradiction(name, joint, fields[number], by, sigmas)
+                    field = fields[found.number]
+                    worst = Contradiction(name, joint, field, found.by, found.sigmas)
     return worst
+
+
+class _Difference(NamedTuple):
+    """Difference of one recording from all others together, in one parameter of a joint."""
+
+    number: int  # of the parameter
+    by: float  # on its axis
+    sigmas: float  # the same in standard errors
+    effect: float  # RMS on the joint's path, rad
 
 
 def _differences(
     own: Evidence, joint: int, recording: int, overdispersion: Array
-) -> list[tuple[int, float, float, float]]:
-    """Return by how much a recording differs from all others together, for one joint: number of
-    the parameter, difference on its axis, the same in standard errors, and its RMS effect on the
-    joint's path, rad.
-
-    Parameters of which the others say too little are left out.
+) -> list[_Difference]:
+    """Return by how much a recording differs from all others together, for one joint; without
+    parameters of which the others say too little.
     """
     mine = own.information[joint, recording]  # (Q, Q)
     rest = own.information[joint].sum(axis=0) - mine
@@ -459,12 +484,15 @@ def _differences(
     differences = []
     for number in range(len(mine)):
         own_information = mine[number, number]
-        if own_information <= 0 or rest[number, number] < 0.5 * own_information:
+        if own_information <= 0:
             continue
-        by, error = _solved(mine[:, [number]], weight, difference)
-        sigmas = float(by[0] / error[0])
+        if rest[number, number] < MIN_INFORMATION_OF_OTHERS * own_information:
+            continue
+        by, error = _solved(mine[:, [number]], weight, difference)  # (1,) each
+        sigmas = by[0] / error[0]
         effect = ERROR_SCALE_RAD * abs(by[0]) * np.sqrt(own_information * recordings / rows)
-        differences.append((number, float(by[0]), sigmas, float(effect)))
+        found = _Difference(number, float(by[0]), float(sigmas), float(effect))
+        differences.append(found)
     return differences
 
 
@@ -501,7 +529,11 @@ def _advice(
 
 def _another_robot_advice(moved: ListOf[ParameterChange], joints: ListOf[str]) -> str:
     """Return what to do if many joints changed as another robot's would; else nothing."""
-    odd = [j for j in joints if _is_odd([m for m in moved if m.joint == j])]
+    odd = []
+    for joint in joints:
+        changes = [change for change in moved if change.joint == joint]
+        if _is_odd(changes):
+            odd.append(joint)
     if len(odd) <= MAX_CHANGED_JOINTS * len(joints) or len(odd) == 1:
         return ""
     return (
@@ -513,11 +545,12 @@ def _another_robot_advice(moved: ListOf[ParameterChange], joints: ListOf[str]) -
 
 def _gearbox_advice(moved: ListOf[ParameterChange]) -> str:
     """Return what to do if joints have play that was not there; else nothing."""
-    play = sorted({m.joint for m in moved if m.field == PLAY and m.by > 0})
-    if not play:
+    with_play = {change.joint for change in moved if change.field == PLAY and change.by > 0}
+    if not with_play:
         return ""
+    joints = ", ".join(sorted(with_play))
     return (
-        f"look at the gearbox and the screws of {', '.join(play)}: play that was not there; then "
+        f"look at the gearbox and the screws of {joints}: play that was not there; then "
         "identify again"
     )
 
@@ -526,16 +559,21 @@ def _is_odd(changes: ListOf[ParameterChange]) -> bool:
     """Return whether a joint's changes are rather another robot's: several, or one of its
     stiffness.
     """
-    return len(changes) > 1 or any(m.field == "kp" for m in changes)
+    return len(changes) > 1 or any(change.field == "kp" for change in changes)
 
 
 def _friction_advice(moved: ListOf[ParameterChange], joints: ListOf[str]) -> str:
     """Return what to do if most joints turn more easily, or harder; else nothing."""
-    eased = [m for m in moved if m.field in FRICTION_FIELDS]
-    ways = {np.sign(m.by) for m in eased}
-    if len({m.joint for m in eased}) <= len(joints) / 2 or len(ways) != 1:
+    of_friction = [change for change in moved if change.field in FRICTION_FIELDS]
+    changed_joints = {change.joint for change in of_friction}
+    if len(changed_joints) <= len(joints) / 2:
         return ""
-    how = "more easily: warmer" if ways == {-1.0} else "harder: colder, or dry"
+    if all(change.by < 0 for change in of_friction):
+        how = "more easily: warmer"
+    elif all(change.by > 0 for change in of_friction):
+        how = "harder: colder, or dry"
+    else:
+        return ""
     return (
         f"most joints turn {how}? Check again as warm as when it was identified, or adapt for now"
     )

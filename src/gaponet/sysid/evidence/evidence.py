@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 from collections.abc import Sequence as ListOf
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -20,7 +20,7 @@ from gaponet.sysid.acceptance import HeldOut
 from gaponet.sysid.axes import CLASSIC, Axes, Bounds, first_values
 from gaponet.sysid.joint_rollouts import ERROR_SCALE_RAD, JointRollouts
 from gaponet.sysid.least_squares import slopes
-from gaponet.sysid.problem import MIN_CLUSTERS, cluster_sums
+from gaponet.sysid.problem import cluster_sums
 from gaponet.sysid.robot_rollouts import cut
 from gaponet.sysid.table_contact import contact_height, tip_heights
 from gaponet.sysid.uncertainty import (
@@ -35,6 +35,7 @@ WINDOWS = 40  # of 8 s
 PLAY_TURN_RAD = 0.002  # servo error at which play has changed sides
 MIN_RELATIVE_INFORMATION = 1e-6  # of a parameter; less counts as none
 BOUND_QUANTILE = 0.9  # of all samples
+MIN_RECORDINGS_AS_CLUSTERS = 6  # fewer recordings are divided into more clusters
 
 
 @dataclass(frozen=True)
@@ -50,22 +51,26 @@ class Evidence:
 
     def by_recording(self) -> Evidence:
         """Return the evidence with one cluster of each recording."""
-        order = np.arange(len(self.names))
-        pick = (self.recording == order[:, None]).astype(float)
-        gradients = np.einsum("rc,ncq->nrq", pick, self.gradients)
-        information = np.einsum("rc,ncqp->nrqp", pick, self.information)
-        return Evidence(gradients, information, self.rows, order, self.names, self.window_rms)
+        numbers = np.arange(len(self.names))
+        is_of_recording = (self.recording == numbers[:, None]).astype(float)  # (recordings, C)
+        gradients = np.einsum("rc,ncq->nrq", is_of_recording, self.gradients)
+        information = np.einsum("rc,ncqp->nrqp", is_of_recording, self.information)
+        return replace(self, gradients=gradients, information=information, recording=numbers)
 
     def without(self, names: Collection[str]) -> Evidence:
         """Return the evidence without these recordings."""
         if not names:
             return self
-        keep = np.array([self.names[r] not in names for r in self.recording])
+        keep = np.array([self.names[number] not in names for number in self.recording])  # (C,)
         rest = tuple(name for name in self.names if name not in names)
-        order = np.array([rest.index(self.names[r]) for r in self.recording[keep]])
-        rows = self.rows * keep.mean()  # windows are as long as each other
-        return Evidence(
-            self.gradients[:, keep], self.information[:, keep], rows, order, rest, self.window_rms
+        recording = [rest.index(self.names[number]) for number in self.recording[keep]]
+        return replace(
+            self,
+            gradients=self.gradients[:, keep],
+            information=self.information[:, keep],
+            rows=self.rows * keep.mean(),  # windows are as long as each other
+            recording=np.array(recording),
+            names=rest,
         )
 
 
@@ -80,8 +85,9 @@ def gradient_covariance(gradients: Array) -> Array:
     (n, Q, Q).
     """
     clusters = gradients.shape[1]
-    each = gradients - gradients.mean(axis=1, keepdims=True)
-    return np.asarray(np.swapaxes(each, -1, -2) @ each * (clusters / max(clusters - 1, 1)))
+    deviation = gradients - gradients.mean(axis=1, keepdims=True)  # (n, C, Q)
+    scatter = np.swapaxes(deviation, -1, -2) @ deviation
+    return np.asarray(scatter * (clusters / max(clusters - 1, 1)))
 
 
 def inverted(information: Array) -> Array:
@@ -111,16 +117,17 @@ def evidence(
     rollouts = JointRollouts(parts, robot, contact, nthread)
     errors, jac = _slopes_of_joints(rollouts, Bounds(robot, sequences), fields)
     weight = 1 / np.sqrt(1 + errors**2)  # of soft L1
-    gradients, window = cluster_sums(jac * (weight * errors)[..., None], rollouts.window)
-    names = [_window_name(part) for part in parts]
-    recordings = list(dict.fromkeys(names))
-    recording_of_window = np.array([recordings.index(name) for name in names])
+    gradient_of_rows = jac * (weight * errors)[..., None]  # (n, rows, Q)
+    gradients, window_of_cluster = cluster_sums(gradient_of_rows, rollouts.window)
+    name_of_window = [_window_name(part) for part in parts]
+    names = list(dict.fromkeys(name_of_window))
+    recording_of_window = np.array([names.index(name) for name in name_of_window])
     return Evidence(
         gradients=gradients,
         information=_information(jac, weight, rollouts.window),
         rows=rollouts.rows,
-        recording=recording_of_window[window],
-        names=tuple(recordings),
+        recording=recording_of_window[window_of_cluster],
+        names=tuple(names),
         window_rms=_window_rms(rollouts, errors),
     )
 
@@ -136,10 +143,10 @@ def _slopes_of_joints(
     def scaled_errors(x: Array) -> Array:
         return rollouts.flat_errors(axes.values(x)) / np.float32(ERROR_SCALE_RAD)
 
-    start = axes.normalize(bounds.first)[None]
-    errors, by_change = slopes(start, axes.high, scaled_errors)  # (1, n, rows) and (1, n, rows, P)
-    is_free = axes.low < axes.high
-    by_field = by_change[0] / axes.unit[:, None] * is_free[:, None]
+    own = axes.normalize(bounds.first)  # (n, P)
+    errors, by_large_change = slopes(own[None], axes.high, scaled_errors)
+    is_free = axes.low < axes.high  # (n, P)
+    by_field = by_large_change[0] / axes.unit[:, None] * is_free[:, None]  # (n, rows, P)
     by_play = _slopes_over_play(rollouts, bounds).reshape(bounds.n, -1, 1)
     return errors[0], np.concatenate([by_field, by_play], axis=-1)
 
@@ -155,8 +162,8 @@ def _information(jac: Array, weight: Array, window: Array) -> Array:
     information = []
     for of_joint, weights in zip(jac, weight, strict=True):  # a joint at a time, for memory
         weighted = weights[:, None] * of_joint
-        products = of_joint[None, :, :, None] * weighted[None, :, None, :]  # (1, rows, Q, Q)
-        of_clusters, _ = cluster_sums(products, window)
+        of_rows = of_joint[:, :, None] * weighted[:, None, :]  # (rows, Q, Q)
+        of_clusters, _ = cluster_sums(of_rows[None], window)
         information.append(of_clusters)
     return np.concatenate(information)
 
@@ -219,27 +226,24 @@ def estimate_uncertainty(
     """
     fields = before.fields if before else _fitted_fields(robot)
     own = evidence(robot, sequences, fields, nthread=nthread)
-    values = to_axes(robot, fields)
     clusters, overdispersion = _overdispersion(own, before, robot.operated)
-    information = own.information.sum(axis=1)
-    inverse = inverted(information)
-    step = -(inverse @ own.gradients.sum(axis=1)[..., None])[..., 0]
-    step_covariance = inverse @ widened(information, np.maximum(overdispersion, 1.0)) @ inverse
+    step = _gauss_newton_step(own, overdispersion)
+    values = to_axes(robot, fields)
     repeatability = repetition_difference(sequences, robot.operated)
-    errors = _errors_by_joint(held_out or [HeldOut(list(judges or sequences), robot)], nthread)
+    folds = held_out or [HeldOut(list(judges or sequences), robot)]
+    errors = _errors_by_joint(folds, nthread)
+    is_validated = bool(judges or held_out)
     joints = {}
     for i, joint in enumerate(robot.operated):
-        covariance = _covariance(
-            joint, fields, values[joint], step_covariance[i, :-1, :-1], covariances, before
-        )
-        variance = max(np.trace(covariance @ information[i, :-1, :-1]), 0.0) / max(own.rows[i], 1)
+        from_rows = step.covariance[i, :-1, :-1]
+        covariance = _covariance(joint, fields, values[joint], from_rows, covariances, before)
         today = JointUncertainty(
             values=_nested(values[joint]),
             covariance=_nested(covariance),
-            gauss_newton_step=_nested(step[i]),
-            gauss_newton_covariance=_nested(step_covariance[i]),
+            gauss_newton_step=_nested(step.change[i]),
+            gauss_newton_covariance=_nested(step.covariance[i]),
             overdispersion=_nested(overdispersion[i]),
-            parameter_rms=ERROR_SCALE_RAD * float(np.sqrt(variance)),
+            parameter_rms=_predicted_rms(covariance, step.information[i, :-1, :-1], own.rows[i]),
             residual_rms=float(np.sqrt(np.mean(np.concatenate(errors[joint]) ** 2))),
             residual_p90=_error_bound(errors[joint]),
             repeatability=float(repeatability[i]),
@@ -247,17 +251,44 @@ def estimate_uncertainty(
         joints[joint] = today
         if before:
             old = before.joints[joint]
-            joints[joint] = _no_better(today, old, errors_are_of_fit=not (judges or held_out))
-    source = _provenance(sequences, joints, "identify" if judges or covariances else "adapt")
-    sources = (*before.sources, source) if before else (source,)
-    return ParameterUncertainty(fields, joints, sources, clusters, bool(judges or held_out))
+            joints[joint] = _no_better(today, old, errors_are_of_fit=not is_validated)
+    sources = before.sources if before else ()
+    made_by = "identify" if judges or covariances else "adapt"
+    source = _provenance(sequences, joints, made_by)
+    return ParameterUncertainty(fields, joints, (*sources, source), clusters, is_validated)
+
+
+class _GaussNewtonStep(NamedTuple):
+    """Gauss-Newton step that recordings ask for, of n joints and Q numbers."""
+
+    change: Array  # (n, Q)
+    covariance: Array  # of the change, (n, Q, Q)
+    information: Array  # of all clusters, (n, Q, Q)
+
+
+def _gauss_newton_step(own: Evidence, overdispersion: Array) -> _GaussNewtonStep:
+    """Return the step that evidence asks for; overdispersion (n, Q) makes it less sure."""
+    information = own.information.sum(axis=1)
+    gradient = own.gradients.sum(axis=1)
+    inverse = inverted(information)
+    change = -(inverse @ gradient[..., None])[..., 0]
+    scatter = widened(information, np.maximum(overdispersion, 1.0))
+    return _GaussNewtonStep(change, inverse @ scatter @ inverse, information)
+
+
+def _predicted_rms(covariance: Array, information: Array, rows: float) -> float:
+    """Return the RMS position error that a covariance alone predicts, rad, from the information of
+    so many rows; (P, P) both.
+    """
+    squared_errors = max(np.trace(covariance @ information), 0.0)
+    return ERROR_SCALE_RAD * float(np.sqrt(squared_errors / max(rows, 1)))
 
 
 def _fitted_fields(robot: RobotSpec) -> tuple[str, ...]:
     """Return the fields that a robot's fit has: the classic ones, and those of its terms."""
     first = first_values(robot)
-    present = [f for f in SERVO_TERMS if SERVO_FIELDS[f].prior_std and first[f].any()]
-    return (*CLASSIC, *present)
+    of_terms = [f for f in SERVO_TERMS if SERVO_FIELDS[f].prior_std and first[f].any()]
+    return (*CLASSIC, *of_terms)
 
 
 def _no_better(
@@ -302,15 +333,18 @@ def _overdispersion(
 
     It is averaged with that of `before`, in proportion to the clusters of both.
     """
-    grouped = own.by_recording() if len(own.names) >= MIN_CLUSTERS // 4 else own
-    clusters = grouped.gradients.shape[1]
-    independent = np.einsum("nckk->nk", grouped.information)
-    scatter = np.einsum("nkk->nk", gradient_covariance(grouped.gradients))
-    seen = np.divide(scatter, independent, out=np.zeros_like(independent), where=independent > 0)
+    if len(own.names) >= MIN_RECORDINGS_AS_CLUSTERS:
+        own = own.by_recording()
+    clusters = own.gradients.shape[1]
+    independent = np.einsum("nckk->nk", own.information)
+    scatter = np.einsum("nkk->nk", gradient_covariance(own.gradients))
+    none = np.zeros_like(independent)
+    seen = np.divide(scatter, independent, out=none, where=independent > 0)
     if before is None:
         return clusters, seen
-    old = np.stack([before.array(j, "overdispersion") for j in joints])
-    return clusters, (before.clusters * old + clusters * seen) / (before.clusters + clusters)
+    old = np.stack([before.array(joint, "overdispersion") for joint in joints])
+    total = before.clusters * old + clusters * seen
+    return clusters, total / (before.clusters + clusters)
 
 
 def _covariance(
@@ -328,20 +362,29 @@ def _covariance(
         fitted, before: As `covariances` and `before` of `estimate_uncertainty`.
     """
     covariance = from_rows
-    if before:
-        was = before.array(joint, "covariance")
-        at = before.array(joint, "values")
-        moved = np.square(values - at) - np.diag(covariance) - np.diag(was)
-        wider = was + np.diag(np.maximum(moved, 0.0))
-        covariance = inverted(inverted(wider) + inverted(covariance))
     if joint in fitted:
-        names, whole = fitted[joint]
-        order = np.array([names.index(f) for f in fields])
-        covariance = whole[np.ix_(order, order)]
-    if not before:
-        prior = np.diag(prior_std(fields, values) ** -2)
-        covariance = inverted(inverted(covariance) + prior)
-    return covariance
+        names, of_names = fitted[joint]
+        order = np.array([names.index(field) for field in fields])
+        covariance = of_names[np.ix_(order, order)]
+    elif before:
+        covariance = _beside_earlier(joint, values, from_rows, before)
+    if before:
+        return covariance
+    prior_information = np.diag(prior_std(fields, values) ** -2)
+    return inverted(inverted(covariance) + prior_information)
+
+
+def _beside_earlier(
+    joint: str, values: Array, from_rows: Array, before: ParameterUncertainty
+) -> Array:
+    """Return the covariance of a joint's values (P,) by new recordings and by those before, whose
+    variance grows by how far the values moved beyond both; (P, P).
+    """
+    earlier = before.array(joint, "covariance")
+    squared_move = np.square(values - before.array(joint, "values"))
+    unexplained = squared_move - np.diag(from_rows) - np.diag(earlier)
+    wider = earlier + np.diag(np.maximum(unexplained, 0.0))
+    return inverted(inverted(wider) + inverted(from_rows))
 
 
 def _log_name(sequence: Sequence) -> str:
@@ -358,7 +401,7 @@ def _errors_by_joint(folds: ListOf[HeldOut], nthread: int) -> dict[str, list[Arr
     for sequences, judged in folds:
         replays = replay(sequences, judged, nthread=nthread, lock_idle=True)
         for s, simulated in zip(sequences, replays, strict=True):
-            error = np.abs(simulated.qpos - s.qpos)[1:]
+            error = np.abs(simulated.qpos - s.qpos)[1:]  # (T − 1, joints); both start as recorded
             for joint, i in zip(robot.operated, robot.operated_index, strict=True):
                 if joint not in s.meta.unrecorded:
                     errors.setdefault(joint, []).append(error[:, i])
@@ -367,6 +410,7 @@ def _errors_by_joint(folds: ListOf[HeldOut], nthread: int) -> dict[str, list[Arr
 
 
 def _mean_square(errors: ListOf[Array]) -> float:
+    """Return the mean square of all samples, rad²."""
     return float(np.square(np.concatenate(errors)).mean())
 
 
@@ -376,14 +420,18 @@ def _error_bound(motions: ListOf[Array]) -> float:
     It is wider than the bound of these by one standard error (Student's t) of the mean of their RMS
     errors.
     """
-    rms = np.array([np.sqrt(np.square(error).mean()) for error in motions])
+    bound = float(np.quantile(np.concatenate(motions), BOUND_QUANTILE))
     freedom = len(motions) - 1
-    wider = 0.0
-    if freedom:
-        wider = confidence_factor(freedom) * standard_error(rms) / max(float(rms.mean()), 1e-12)
-    return float(np.quantile(np.concatenate(motions), BOUND_QUANTILE)) * (1 + wider)
+    if not freedom:
+        return bound
+    rms = np.array([np.sqrt(np.square(error).mean()) for error in motions])
+    margin = confidence_factor(freedom) * standard_error(rms)
+    relative_margin = margin / max(float(rms.mean()), 1e-12)
+    return bound * (1 + relative_margin)
 
 
 def _nested(x: Array) -> Any:
-    """Return an array as nested tuples."""
-    return tuple(_nested(y) for y in x) if x.ndim else float(x)
+    """Return an array as nested tuples, or a number if it has no dimension."""
+    if x.ndim == 0:
+        return float(x)
+    return tuple(_nested(row) for row in x)

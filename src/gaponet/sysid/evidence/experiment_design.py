@@ -75,11 +75,12 @@ class ExperimentDesign:
         """Return the covariance after recordings with this information, (…, n, P, P)."""
         size = np.sqrt(np.maximum(np.einsum("...ii->...i", normal), EPSILON))
         scale = size[..., :, None] * size[..., None, :]
-        share = normal / scale + EPSILON * np.eye(normal.shape[-1])
-        scaled = share / np.sqrt(self.overdispersion)[:, None, :]
-        added = scaled @ np.linalg.solve(share, np.swapaxes(scaled, -1, -2))
+        scaled = normal / scale + EPSILON * np.eye(normal.shape[-1])  # with a diagonal of one
+        less_sure = scaled / np.sqrt(self.overdispersion)[:, None, :]
+        added = less_sure @ np.linalg.solve(scaled, np.swapaxes(less_sure, -1, -2))
         added = size[..., :, None] * added * size[..., None, :]
-        return np.asarray(np.linalg.inv(np.linalg.inv(self.covariance) + added))
+        present = np.linalg.inv(self.covariance)
+        return np.asarray(np.linalg.inv(present + added))
 
     def _mean_log_error(self, normal: Array) -> Array:
         """Return the mean over joints and parameters of the logarithm of the standard error then,
@@ -92,7 +93,7 @@ class ExperimentDesign:
         """Return the best recordings in so much time, s: greedily by gain per second, then by
         exchanges.
         """
-        picks = [i for i, _ in self.greedy(seconds)]
+        picks = [recording for recording, _ in self.greedy(seconds)]
         if not picks:
             return picks
         error = float(self._mean_log_error(self.information[:, picks].sum(axis=1)))
@@ -113,11 +114,12 @@ class ExperimentDesign:
         """
         exchanges = []
         for place in range(len(picks)):
-            rest = [*picks[:place], *picks[place + 1 :]]
-            others = self._that_fit(rest, seconds, without=picks)
-            errors = self._errors_with(rest, others)
-            for recording, error in zip(others, errors, strict=True):
-                exchanges.append((float(error), place, int(recording)))
+            kept = picks.copy()
+            del kept[place]
+            others = self._that_fit(kept, seconds, without=picks)
+            errors = self._errors_with(kept, others)
+            for recording, error in zip(others.tolist(), errors.tolist(), strict=True):
+                exchanges.append((error, place, recording))
         return exchanges
 
     def _that_fit(self, picks: list[int], seconds: float, without: list[int]) -> Array:
@@ -136,10 +138,12 @@ class ExperimentDesign:
             if not len(others):
                 return
             then = self._errors_with(picks, others)
-            best = int(((now - then) / self.seconds[others]).argmax())
-            picks.append(int(others[best]))
+            gain_per_second = (now - then) / self.seconds[others]
+            best = int(gain_per_second.argmax())
+            recording = int(others[best])
+            picks.append(recording)
             now = float(then[best])
-            yield picks[-1], now
+            yield recording, now
 
     def _errors_with(self, picks: ListOf[int], more: Array) -> Array:
         """Return the mean log error after the picks and each of some more recordings, (more,)."""
@@ -152,10 +156,11 @@ class ExperimentDesign:
         """
         played = 0.0
         before = float(self._mean_log_error(np.zeros_like(self.information[:, 0])))
-        for i, now in self.greedy():
-            if (before - now) * WORTH_INTERVAL_S / self.seconds[i] < MIN_WORTH:
+        for recording, now in self.greedy():
+            seconds = float(self.seconds[recording])
+            if (before - now) * WORTH_INTERVAL_S / seconds < MIN_WORTH:
                 return played
-            played = played + float(self.seconds[i])
+            played += seconds
             before = now
         return played
 
@@ -165,27 +170,38 @@ def candidate_motions(library: Library, progress: Progress = no_progress) -> lis
     signal each.
     """
     robot = library.robot
-    single = robot.operated if len(robot.operated) <= MAX_SINGLE_JOINTS else ()
-    names = []
-    for joint in single:
-        names += [f"{signal}-{short(joint)}" for signal in SIGNALS]
-    for kind in ANY:
-        names += [f"{kind.__name__}-all-{variant}" for variant in range(VARIANTS)]
+    names = _candidate_names(robot)
+    count = len(names) + MOTIONS_OF_ALL_JOINTS
     motions = []
-    for k in range(len(names) + MOTIONS_OF_ALL_JOINTS):
-        progress(k, len(names) + MOTIONS_OF_ALL_JOINTS, "which motions fit the robot's limits")
+    for number in range(count):
+        progress(number, count, "which motions fit the robot's limits")
         try:
-            motions.append(
-                library.make(names[k]) if k < len(names) else _at_once(library, k - len(names))
-            )
+            if number < len(names):
+                motion = library.make(names[number])
+            else:
+                motion = _at_once(library, number - len(names))
         except UsageError:  # does not fit this robot's limits: no candidate
             continue
+        motions.append(motion)
     if not motions:
         raise UsageError(
             f"{robot.name}: no motion fits its limits; lighten --payloads, or look at "
             "collision.toml"
         )
     return motions
+
+
+def _candidate_names(robot: RobotSpec) -> list[str]:
+    """Return names in a motion library: signals in single joints, of a robot with few; tours and
+    the like.
+    """
+    names = []
+    if len(robot.operated) <= MAX_SINGLE_JOINTS:
+        for joint in robot.operated:
+            names += [f"{signal}-{short(joint)}" for signal in SIGNALS]
+    for kind in ANY:
+        names += [f"{kind.__name__}-all-{variant}" for variant in range(VARIANTS)]
+    return names
 
 
 def _at_once(library: Library, variant: int) -> Motion:
@@ -195,16 +211,19 @@ def _at_once(library: Library, variant: int) -> Motion:
     robot = library.robot
     rng = np.random.default_rng([library.seed, 5, variant])
     kinds = list(SIGNALS.values())
-    columns = {}
+    signals = {}  # joint's number → its commands, (rows,) rad
     for joint in robot.operated:
         i = robot.index([joint])[0]
-        there = library.excitation_range(joint)
+        interval = library.excitation_range(joint)
         ready = library.kit.ready[i]
-        low, high = sorted(ready + RANGE_SHARE * (end - ready) for end in (there.low, there.high))
-        columns[i] = kinds[rng.integers(len(kinds))](low, high, rng, GRID)
-    ctrl = np.repeat(library.kit.ready[None], max(map(len, columns.values())), axis=0)
-    for i, column in columns.items():
-        ctrl[:, i] = np.concatenate([column, np.full(len(ctrl) - len(column), column[-1])])
+        ends = [ready + RANGE_SHARE * (end - ready) for end in (interval.low, interval.high)]
+        kind = kinds[rng.integers(len(kinds))]
+        signals[i] = kind(min(ends), max(ends), rng, GRID)
+    rows = max(map(len, signals.values()))
+    ctrl = np.repeat(library.kit.ready[None], rows, axis=0)
+    for i, signal in signals.items():
+        ctrl[: len(signal), i] = signal
+        ctrl[len(signal) :, i] = signal[-1]
     made = Motion(f"together-{variant}", "whole_body", GRID, ctrl, robot.operated)
     return library.limits.fit(made)
 
@@ -216,14 +235,15 @@ def simulated_recordings(
     commanded = []
     for motion in motions:
         ctrl = motion.sample(robot.dt).astype(np.float32)
-        meta = SequenceMeta(
-            robot.name, "expected", f"{motion.name} {payload:g} kg", payload, virtual=True
-        )
-        commanded.append(
-            Sequence(meta, robot.joint_names, robot.dt, ctrl, ctrl, np.zeros_like(ctrl))
-        )
+        name = f"{motion.name} {payload:g} kg"
+        meta = SequenceMeta(robot.name, "expected", name, payload, virtual=True)
+        resting = np.zeros_like(ctrl)
+        commanded.append(Sequence(meta, robot.joint_names, robot.dt, ctrl, ctrl, resting))
     replays = replay(commanded, robot, lock_idle=True)
-    return [replace(s, qpos=t.qpos, qvel=t.qvel) for s, t in zip(commanded, replays, strict=True)]
+    recordings = []
+    for s, simulated in zip(commanded, replays, strict=True):
+        recordings.append(replace(s, qpos=simulated.qpos, qvel=simulated.qvel))
+    return recordings
 
 
 def undetermined_gains(
@@ -233,8 +253,8 @@ def undetermined_gains(
     determine.
     """
     kp = uncertainty.fields.index("kp")
-    after = design.after(range(len(design.seconds)))
-    errors = np.sqrt(after[:, kp, kp]).tolist()
+    after_all = design.after(range(len(design.seconds)))
+    errors = np.sqrt(after_all[:, kp, kp]).tolist()  # of log kp, (n,)
     advice = {}
     for joint, error in zip(uncertainty.joints, errors, strict=True):
         if error > MAX_KP_ERROR:
