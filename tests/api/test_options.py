@@ -3,7 +3,7 @@
 import pytest
 
 from gaponet.api.options import IdentifyOptions, parse_joint_map
-from gaponet.api.steps import StartOptions
+from gaponet.api.start import StartOptions
 from gaponet.base.errors import UsageError
 
 
@@ -34,10 +34,7 @@ def test_a_robot_that_is_driven_by_torque_refuses_options_of_servos():
         IdentifyOptions(terms=("stribeck",)).require_none_for_torque("data")
 
 
-def test_what_start_is_told_reaches_the_commands():
-    options = StartOptions(map=("a=b",), time_unit="ms", cut=3.0, skip_bad=True, budget="4m")
-    words = options.import_words()
-    assert words[:4] == ["--unit-id", "lab", "--payload-mass", "0"]
-    assert set(words[4:]) == {"--map=a=b", "--time-unit=ms", "--cut=3.0", "--skip-bad"}
-    assert options.identify_words() == ["--budget", "4m"]
-    assert options.read_options().joint_map == {"a": "b"}
+def test_what_start_is_told_of_joints_and_units_holds_for_the_first_recording_too():
+    read = StartOptions(map=("a=b",), time_unit="ms").read_options()
+    assert read.joint_map == {"a": "b"}
+    assert read.time_unit == "ms"

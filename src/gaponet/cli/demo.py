@@ -15,7 +15,8 @@ from gaponet.api.opening import test_motions
 from gaponet.api.options import CollectOptions
 from gaponet.api.paper import DEMO, paper_experiment
 from gaponet.api.results import GapResult
-from gaponet.api.steps import Step, public_recordings, steps_from_logs
+from gaponet.api.share import public_recordings
+from gaponet.api.start import Step, measure_error, steps_from_logs
 from gaponet.base.errors import UsageError
 from gaponet.base.installation import install_command
 from gaponet.base.progress import progress_bar, progress_bars
@@ -67,8 +68,8 @@ def identify_real_arm(screen: Out, out: Path) -> dict[str, object]:
     screen.say(f"{origin}.", "Recordings: ")
     folder = out / REAL_ROBOT
     robot = folder / "identified"
-    import_words = ["--unit-id", REAL_ROBOT, "--payload-mass", "0"]
-    steps = steps_from_logs(logs, REAL_ROBOT, import_words, folder, [], "mjcf")
+    unit = {"unit_id": REAL_ROBOT, "payload_mass": "0"}
+    steps = steps_from_logs(logs, REAL_ROBOT, unit, folder, {}, "mjcf")
     read, _, measure, fit, causes, export, _ = steps
 
     _announce(screen, 1, read)
@@ -151,7 +152,7 @@ def run_paper_in_small(screen: Out, out: Path) -> dict[str, object]:
     with progress_bar("recordings") as update:
         options = CollectOptions(fleet=FLEET, recipe=RECIPE)
         api.collect(out=dataset, robot="h1_2", options=options, progress=update)
-    screen.say(f": how far is the simulator?  (gaponet gap {dataset})", "2 Measure the gap")
+    _announce(screen, 2, measure_error(str(dataset)))
     show_gap_by_payload(screen, dataset)
     command = f"gaponet experiment paper {dataset} --out {experiment}"
     screen.say(

@@ -13,7 +13,7 @@ from typing import Annotated
 import tyro
 
 from gaponet import api
-from gaponet.api.steps import (
+from gaponet.api.start import (
     COMMANDS_FILE,
     Inspection,
     Start,
@@ -150,7 +150,7 @@ def _walk(screen: Out, task: Start, steps: list[Step], record: StartRecord) -> N
                 screen.say(step.line, "done before: ", "green")
                 continue
             screen.say(step.line, "$ ", "bold cyan")
-            if step.command == "doctor":
+            if step.name == "doctor":
                 _examine(screen, task, step.words[1])
             else:
                 _run(step)

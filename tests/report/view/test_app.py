@@ -3,6 +3,7 @@
 import json
 import threading
 import time
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -11,6 +12,7 @@ from arm import recordings, write_arm
 
 from gaponet.base.errors import UsageError
 from gaponet.data.store import Dataset
+from gaponet.report.steps import Step, make_robot, steps_from_logs
 from gaponet.report.view import app
 from gaponet.report.view.app import App
 from gaponet.report.view.controls import Controls
@@ -19,7 +21,9 @@ from gaponet.report.view.jobs import OUT, Jobs
 from gaponet.report.view.player import draw_curves
 from gaponet.report.view.scene import Scene
 from gaponet.report.view.side_by_side import Clip, side_by_side
-from gaponet.report.view.steps import TARGETS, helping_network
+from gaponet.report.view.tabs import TARGETS, helping_network
+
+LIST = Step("robot", ("robot", "list"))
 
 
 def finish(jobs, step, result, words=("x",)):
@@ -54,13 +58,13 @@ def test_a_result_is_out_of_date_when_what_it_was_made_from_is_newer(tmp_path):
 
 def test_one_command_at_a_time_and_cancelling_leaves_what_was_there(tmp_path):
     jobs = Jobs(tmp_path)
-    jobs.start("robot", "robot", "list")
+    jobs.start(LIST)
     with pytest.raises(UsageError, match="running"):
-        jobs.start("robot", "robot", "list")
+        jobs.start(LIST)
     wait_for(jobs)
     assert "so101" in [robot["name"] for robot in jobs.result("robot").result["robots"]]
     assert jobs.result("robot").command == "gaponet robot list"
-    jobs.start("robot", "robot", "new", "missing.xml", "--out", OUT)
+    jobs.start(make_robot("missing.xml", OUT))
     assert jobs.running.words[-2:] == ["--out", "robot2"]
     jobs.cancel()
     assert jobs.running is None
@@ -74,7 +78,7 @@ def test_of_two_clicks_at_once_one_starts_a_command(tmp_path):
 
     def click():
         try:
-            jobs.start("robot", "robot", "list")
+            jobs.start(LIST)
         except UsageError as error:
             refused.append(error)
 
@@ -128,13 +132,13 @@ def page(tmp_path):
 
 def test_nothing_starts_before_what_it_needs_and_the_page_says_what(page):
     for act, hint in (
-        (page.steps.logs.read, "Choose a robot"),
-        (page.steps.gap.show_recording, "Choose a robot"),
-        (page.steps.identify.words, "Choose a robot"),
+        (page.tabs.logs.read, "Choose a robot"),
+        (page.tabs.gap.show_recording, "Choose a robot"),
+        (page.tabs.identify.identify, "Choose a robot"),
     ):
         page.controls.attempt(act)
         assert hint in page.controls.status.content
-    assert page.steps.identify.button.disabled
+    assert page.tabs.identify.button.disabled
     assert page.jobs.all == []
 
 
@@ -146,7 +150,7 @@ def test_a_hint_names_the_next_thing_to_do(page):
         ("doctor", "Identify the robot"),
     ):
         finish(page.jobs, step, {}, ("robot", "check", "so101"))
-        page.steps.identify.show()
+        page.tabs.identify.show()
         assert said in hint.content
 
 
@@ -155,8 +159,8 @@ def test_beside_a_running_command_no_earlier_one_is_said_to_have_ended(page, mon
     page.refresh()
     assert "gaponet gap** has ended" in page.controls.status.content
     seen = []
-    monkeypatch.setattr(page.steps.gap, "show", lambda: seen.append(page.controls.status.content))
-    page.jobs.start("robot", "robot", "list")
+    monkeypatch.setattr(page.tabs.gap, "show", lambda: seen.append(page.controls.status.content))
+    page.jobs.start(LIST)
     page.refresh()
     page.jobs.cancel()
     assert seen == [""]
@@ -166,24 +170,24 @@ def test_beside_a_running_command_no_earlier_one_is_said_to_have_ended(page, mon
 def test_a_urdf_is_exported_where_the_robot_was_made_from_one(page, model, offered):
     finish(page.jobs, "robot", {}, ("robot", "new", model, "--out", "robot1"))
     (page.controls.folder / "robot1").mkdir()
-    page.steps.use.show()
-    assert ("urdf" in page.steps.use.target.options) == offered
+    page.tabs.use.show()
+    assert ("urdf" in page.tabs.use.target.options) == offered
 
 
 def test_the_next_step_is_offered_once_a_step_is_done(page):
-    assert page.steps.onwards["robot"].disabled
+    assert page.tabs.onwards["robot"].disabled
     finish(page.jobs, "robot", {}, ("robot", "check", "so101"))
     page.refresh()
-    assert not page.steps.onwards["robot"].disabled
-    assert page.steps.onwards["import"].disabled
+    assert not page.tabs.onwards["robot"].disabled
+    assert page.tabs.onwards["import"].disabled
 
 
 def test_an_identification_is_bounded_in_rollouts_and_tries_all_terms(page):
     for step in ("robot", "import"):
         finish(page.jobs, step, {}, ("robot", "check", "so101"))
     finish(page.jobs, "doctor", {"findings": []})
-    page.steps.identify.windows.value = 12
-    assert page.steps.identify.words()[4:] == ["--windows", "12"]
+    page.tabs.identify.windows.value = 12
+    assert page.tabs.identify.identify().words[4:] == ("--windows", "12")
 
 
 def test_identification_is_locked_while_the_check_finds_an_error(page):
@@ -191,11 +195,11 @@ def test_identification_is_locked_while_the_check_finds_an_error(page):
         finish(page.jobs, step, {}, ("robot", "check", "so101"))
     finding = {"level": "error", "check": "sign", "message": "elbow moves against its command"}
     finish(page.jobs, "doctor", {"findings": [finding]})
-    assert "Locked: the check finds an error (sign)" in page.steps.identify.locked()
-    page.controls.attempt(page.steps.identify.words)
+    assert "Locked: the check finds an error (sign)" in page.tabs.identify.locked()
+    page.controls.attempt(page.tabs.identify.identify)
     assert "Locked" in page.controls.status.content
     finish(page.jobs, "doctor", {"findings": [finding | {"level": "warning"}]})
-    assert page.steps.identify.locked() == ""
+    assert page.tabs.identify.locked() == ""
 
 
 def test_what_a_command_prints_is_shown_as_a_table_and_names_stay_text(page):
@@ -254,29 +258,29 @@ def test_a_box_that_is_no_table_keeps_its_words():
 def test_a_name_in_the_form_is_no_option_of_the_command(page):
     finish(page.jobs, "robot", {}, ("robot", "check", "so101"))
     (page.controls.folder / "logs" / "logs.toml").write_text("mine")
-    page.steps.logs.unit.value = "--allow-pickle"
-    page.steps.logs.cut.value = 8.0
-    page.controls.attempt(page.steps.logs.read)
-    assert {"--unit-id=--allow-pickle", "--cut=8"} < set(page.jobs.all[-1].words)
-    page.controls.attempt(page.steps.logs.set_aside)
+    page.tabs.logs.unit.value = "--allow-pickle"
+    page.tabs.logs.cut.value = 8.0
+    page.jobs.start(page.tabs.logs.read())
+    assert {"--unit-id=--allow-pickle", "--cut"} < set(page.jobs.all[-1].words)
+    page.controls.attempt(page.tabs.logs.set_aside)
     assert "is running" in page.controls.status.content
     page.jobs.cancel()
     assert (page.controls.folder / "logs" / "logs.toml").read_text() == "mine"
     (page.controls.folder / "logs_aside2").mkdir()
-    page.steps.logs.set_aside()
+    page.tabs.logs.set_aside()
     assert (page.controls.folder / "logs_aside1" / "logs.toml").read_text() == "mine"
     assert list((page.controls.folder / "logs").iterdir()) == []
     (page.controls.folder / "model" / "arm.xml").write_text("<mujoco/>")
     page.refresh()
-    page.steps.robot.model.value = "model/arm.xml"
-    page.steps.robot.options["kp"].value = "--contacts"
-    page.controls.attempt(page.steps.robot.use)
+    page.tabs.robot.model.value = "model/arm.xml"
+    page.tabs.robot.options["kp"].value = "--contacts"
+    page.controls.attempt(page.tabs.robot.use)
     assert "without a dash" in page.controls.status.content
 
 
 def test_a_command_that_is_being_started_is_not_called_cancelled(page):
     with page.jobs.lock:
-        page.jobs.add("robot", "robot", "list")
+        page.jobs.add(LIST)
         watching = threading.Thread(target=page.refresh)
         watching.start()
         watching.join(0.3)
@@ -290,9 +294,9 @@ def test_a_command_that_is_being_started_is_not_called_cancelled(page):
 
 def test_a_guess_does_not_replace_the_logs_toml_of_the_folder(page):
     (page.controls.folder / "logs" / "logs.toml").write_text('unit = "deg"\n')
-    page.controls.attempt(page.steps.logs.guess)
+    page.controls.attempt(page.tabs.logs.guess)
     assert "a guess would replace it" in page.controls.status.content
-    assert not page.steps.logs.described.value
+    assert not page.tabs.logs.described.value
 
 
 def test_a_proposal_is_added_to_the_logs_toml_of_the_folder(page):
@@ -300,9 +304,9 @@ def test_a_proposal_is_added_to_the_logs_toml_of_the_folder(page):
         finish(page.jobs, step, {}, ("robot", "check", "so101"))
     finish(page.jobs, "doctor", {"findings": []})
     (page.controls.folder / "logs" / "logs.toml").write_text('unit = "deg"\n')
-    page.controls.attempt(page.steps.check.propose)
-    assert page.steps.logs.described.value.startswith('unit = "deg"\n')
-    assert "nothing to mend" in page.steps.logs.described.value
+    page.controls.attempt(page.tabs.check.propose)
+    assert page.tabs.logs.described.value.startswith('unit = "deg"\n')
+    assert "nothing to mend" in page.tabs.logs.described.value
 
 
 @pytest.fixture
@@ -317,8 +321,15 @@ def clicked(monkeypatch):
         return add(self, label, act)
 
     monkeypatch.setattr(Controls, "add_button", noted)
-    monkeypatch.setattr(Jobs, "start", lambda self, step, *command: words.append(command))
+    monkeypatch.setattr(Jobs, "start", lambda self, step: words.append(step.words))
     return acts, words
+
+
+def test_the_page_has_a_button_for_each_step_of_start_from_logs_to_export(clicked, page):
+    acts, _ = clicked
+    steps = steps_from_logs(Path("logs"), "so101", {}, Path("out"), {}, "mjcf")
+    elsewhere = ("causes", "report")  # the page measures causes after each identification
+    assert {s.title for s in steps if s.name not in elsewhere} <= acts.keys()
 
 
 def test_step_use_exports_the_calibrated_robot_and_a_network_only_if_it_helps(clicked, page):
@@ -331,12 +342,12 @@ def test_step_use_exports_the_calibrated_robot_and_a_network_only_if_it_helps(cl
             finish(page.jobs, "train", {"val_mpjae": {"added": 1e-4, "error": 2e-4, "start": 0.01}})
             page.seen = ()
             page.controls.attempt(page.refresh)
-            assert page.steps.use.target.options == TARGETS
+            assert page.tabs.use.target.options == TARGETS
             finish(page.jobs, "train", {"val_mpjae": {"added": 2e-3, "error": 2e-4, "start": 0.01}})
         if step == "new":
             acts["Check whether the robot changed"]()
             acts["Calibrate with the new logs"]()
-    page.steps.use.target.value = "mjlab"
+    page.tabs.use.target.value = "mjlab"
     for label in ("Export", "Parameter sets for training", "Train a network"):
         acts[label]()
     assert helping_network(page.jobs) is not None
@@ -346,7 +357,7 @@ def test_step_use_exports_the_calibrated_robot_and_a_network_only_if_it_helps(cl
         "adapt ./identify ./new --out OUT",
         "export ./adapt --to mjlab --out OUT",
         "export ./adapt --to randomization --engine mjlab --out OUT",
-        "train ./import --robot=./identify --budget=10m --out OUT",
+        "train ./import --robot ./identify --budget 10m --out OUT",
     ]
 
 
@@ -371,7 +382,7 @@ def test_view_shows_a_dataset_in_the_page_at_step_gap_and_leaves_no_folder(
     app.serve_dataset(data, Scene(shown), Clip.from_start(shown, 0.0, 1.0), 0, 2.0, said.append)
     (page,) = pages
     assert said == [f"open {page.address}?step=4 in a browser; Ctrl-C ends"]
-    assert page.steps.logs.recording.options == tuple(e.id for e in data.entries)
+    assert page.tabs.logs.recording.options == tuple(e.id for e in data.entries)
     assert "differences drawn 2×" in page.player.title.content
     assert not page.controls.folder.exists()
 
@@ -398,10 +409,10 @@ def test_curves_are_saved_as_the_page_shows_them(page):
 def test_the_page_says_what_is_wrong_with_logs_and_what_to_do(page):
     write_arm(page.controls.folder / "arm")
     finish(page.jobs, "robot", {}, ("robot", "new", "x", "--out", "arm"))
-    page.steps.logs.described.value = (
+    page.tabs.logs.described.value = (
         'time = "t"\ntime_unit = "s"\nctrl = "{joint}_des"\nqpos = "{joint}_pos"\n'
     )
-    page.steps.logs.position.value = "rad"
+    page.tabs.logs.position.value = "rad"
     time_s = np.arange(300) * 0.02
     for joints, scale, why in (
         ((), 1.0, "no log of"),
@@ -420,7 +431,7 @@ def test_the_page_says_what_is_wrong_with_logs_and_what_to_do(page):
                 header=",".join(columns),
                 comments="",
             )
-        page.controls.attempt(page.steps.logs.read)
+        page.jobs.start(page.tabs.logs.read())
         wait_for(page.jobs)
         assert why in ending(page.jobs.all[-1])
     assert "elbow: missing in some recordings" in report(page.jobs.all[-1])
@@ -449,7 +460,7 @@ def test_a_calibration_and_a_training_end_in_step_use_with_their_result(tmp_path
         finish(Jobs(tmp_path), step, {"findings": []}, (step, "x", "--out", out))
     page = App(tmp_path, 0)
     try:
-        page.steps.use.budget.value = "40000"
+        page.tabs.use.budget.value = "40000"
         for label, step in (("Calibrate with the new logs", "adapt"), ("Train a network", "train")):
             page.controls.attempt(acts[label])
             wait_for(page.jobs)

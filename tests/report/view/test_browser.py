@@ -35,7 +35,7 @@ def web(arm):
 
     with ticking(served.advance):
         yield served
-    served.server.stop()
+    server.stop()
 
 
 def reddish(picture):
@@ -66,7 +66,7 @@ def test_the_canvas_shows_the_robot_and_it_moves_when_played_and_stands_when_not
         assert wait(lambda: (n := moved(still, page.look("canvas"))) > 300 and n)
         web.playing.value = False
         # And the eye is no blind one: without robots it sees none.
-        for frame in web.frames.values():
+        for frame in web.bodies.frames.values():
             frame.visible = False
         # What is left is an axis of the compass.
         wait(lambda: reddish(page.look("canvas")) < 0.1 * reddish(still))

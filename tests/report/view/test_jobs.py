@@ -13,6 +13,7 @@ from arm import recordings, write_arm
 from gaponet.base.errors import UsageError
 from gaponet.base.files import lock_file
 from gaponet.data.store import Dataset
+from gaponet.report.steps import make_robot, use_robot
 from gaponet.report.view.app import App, make_places
 from gaponet.report.view.job_text import ending, picture, report
 from gaponet.report.view.jobs import Jobs
@@ -106,7 +107,7 @@ def test_a_new_job_writes_into_no_folder_that_is_there(tmp_path):
     outside.mkdir()
     (folder / "jobs" / "001-robot").symlink_to(outside)
     (folder / "robot2").mkdir()
-    job = Jobs(folder).add("robot", "robot", "new", "x", "--out", "\0")
+    job = Jobs(folder).add(make_robot("x", "\0"))
     assert job.words[-1] == "robot3"
     assert list(outside.iterdir()) == []
 
@@ -184,6 +185,7 @@ SERVER = """
 import sys, threading
 from pathlib import Path
 from types import SimpleNamespace
+from gaponet.report.steps import measure_error
 from gaponet.report.view import app, jobs
 
 COMMAND = '''
@@ -200,7 +202,7 @@ run(Path(sys.argv[1]), wait)
 '''
 jobs.module_command = lambda module, folder, *words: [sys.executable, "-c", COMMAND, folder]
 running = jobs.Jobs(Path(sys.argv[1]))
-running.start("gap", "gap", "data")
+running.start(measure_error("data"))
 print(running.process.pid, flush=True)
 server = SimpleNamespace(stop=lambda: None)
 app.serve(SimpleNamespace(address="", server=server, tick=lambda _: None, jobs=running), print)
@@ -287,7 +289,7 @@ def test_while_a_command_of_an_earlier_page_lives_no_other_starts(tmp_path):
     jobs = Jobs(tmp_path)
     try:
         with pytest.raises(UsageError, match="earlier"):
-            jobs.start("robot", "robot", "list")
+            jobs.start(use_robot("so101"))
     finally:
         os.close(descriptor)
     assert jobs.running_elsewhere is None

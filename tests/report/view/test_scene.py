@@ -208,8 +208,10 @@ def test_the_browser_gets_a_mesh_for_every_body_where_it_is(four):
         player.advance(0.2)
         body = scene.model.body("gaponet/fore").id
         scene.pose(0.2)
-        np.testing.assert_allclose(player.frames[body].position, scene.data.xpos[body], atol=1e-5)
-        assert "| nominal simulator | 300.0 | 315.4 |" in player.table.content
+        np.testing.assert_allclose(
+            player.bodies.frames[body].position, scene.data.xpos[body], atol=1e-5
+        )
+        assert "| nominal simulator | 300.0 | 315.4 |" in player.errors.text.content
         assert player.worst.label == "Worst moment: 0.40 s"
     finally:
         server.stop()

@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import pytest
 
 from gaponet.base.errors import UsageError
+from gaponet.report.steps import use_robot
 from gaponet.report.view import uploads
 from gaponet.report.view.jobs import Jobs
 from gaponet.report.view.uploads import Uploads, connect_upload_button, move_files
@@ -135,7 +136,7 @@ def test_files_are_moved_back_when_one_cannot_be_moved(box, tmp_path, monkeypatc
 
 def test_an_upload_waits_for_the_running_command_and_is_then_stored(box):
     running = SimpleNamespace(poll=lambda: None)
-    box.jobs.started = box.jobs.add("robot", "robot", "list")
+    box.jobs.started = box.jobs.add(use_robot("so101"))
     box.jobs.process = running
     box.receive("walk.csv", b"1", "logs")
     assert contents(box.logs) == {}

@@ -20,6 +20,7 @@ from pathlib import Path
 from gaponet.base.errors import UsageError
 from gaponet.base.text import escape_markdown
 from gaponet.data.store import Dataset
+from gaponet.report.steps import Step, use_robot
 from gaponet.report.view.controls import Controls
 from gaponet.report.view.job_text import ending
 from gaponet.report.view.jobs import Job, Jobs
@@ -27,15 +28,15 @@ from gaponet.report.view.player import Player
 from gaponet.report.view.scene import Scene
 from gaponet.report.view.server import open_server, run_until_interrupt
 from gaponet.report.view.side_by_side import Clip, SideBySide
-from gaponet.report.view.steps import (
-    CheckStep,
-    GapStep,
-    IdentifyStep,
-    LogsStep,
+from gaponet.report.view.tabs import (
+    CheckTab,
+    GapTab,
+    IdentifyTab,
+    LogsTab,
     Play,
-    RobotStep,
-    Step,
-    UseStep,
+    RobotTab,
+    Tab,
+    UseTab,
 )
 from gaponet.report.view.uploads import PLACES, Uploads
 from gaponet.robot.spec import PACKAGE_FOLDER
@@ -43,8 +44,8 @@ from gaponet.robot.spec import PACKAGE_FOLDER
 POLL_S = 0.5
 PANEL_WIDTH = 560  # pixels
 TEMPLATES = files("gaponet.report").joinpath("templates")
-# Title of a step → the result with which it is done.
-TITLES = {
+# Title of a tab → the step with which it is done.
+TABS = {
     "1 Robot": "robot",
     "2 Logs": "import",
     "3 Check": "doctor",
@@ -54,47 +55,47 @@ TITLES = {
 }
 
 
-class Steps:
-    """The tabs of the six steps.
+class Tabs:
+    """The six tabs.
 
     Attributes:
-        robot, logs, check, gap, identify, use: The steps.
-        onwards: Result → button that opens the next step.
+        robot, logs, check, gap, identify, use: What is in them.
+        onwards: Step → button that opens the next tab.
     """
 
     def __init__(self, controls: Controls, uploads: Uploads, play: Play) -> None:
-        """Add the tabs; `play` shows motions."""
+        """Add them; `play` shows motions."""
         self._jobs = controls.jobs
         self._unreadable = controls.gui.add_markdown("")
-        tabs = controls.gui.add_tab_group()
-        places = [tabs.add_tab(title) for title in TITLES]
+        group = controls.gui.add_tab_group()
+        places = [group.add_tab(title) for title in TABS]
         with places[0]:
-            self.robot = RobotStep(controls, uploads, play)
+            self.robot = RobotTab(controls, uploads, play)
         with places[1]:
-            self.logs = LogsStep(controls, uploads, self.robot)
+            self.logs = LogsTab(controls, uploads, self.robot)
         with places[2]:
-            self.check = CheckStep(controls, self.logs)
+            self.check = CheckTab(controls, self.logs)
         with places[3]:
-            self.gap = GapStep(controls, self.logs, play)
+            self.gap = GapTab(controls, self.logs, play)
         with places[4]:
-            self.identify = IdentifyStep(controls)
+            self.identify = IdentifyTab(controls)
         with places[5]:
-            self.use = UseStep(controls, uploads, self.logs)
-        # The script of the page opens the next step.
-        titles = list(TITLES)
+            self.use = UseTab(controls, uploads, self.logs)
+        # The script of the page opens the next tab.
+        titles = list(TABS)
         self.onwards = {}
         for place, title, following in zip(places, titles, titles[1:], strict=False):
             with place:
-                self.onwards[TITLES[title]] = controls.gui.add_button(f"Next: {following}")
+                self.onwards[TABS[title]] = controls.gui.add_button(f"Next: {following}")
 
     def show(self) -> None:
         """Show the result of each step, and what may be done next.
 
         Raises:
-            Exception: The first one of a step, after all others have been shown.
+            Exception: The first one of a tab, after all others have been shown.
         """
         failed: Exception | None = None
-        steps: tuple[Step, ...] = (
+        tabs: tuple[Tab, ...] = (
             self.robot,
             self.logs,
             self.check,
@@ -102,9 +103,9 @@ class Steps:
             self.identify,
             self.use,
         )
-        for step in steps:
+        for tab in tabs:
             try:
-                step.show()
+                tab.show()
             except Exception as error:  # the others have results too
                 failed = failed or error
         for result, button in self.onwards.items():
@@ -176,7 +177,7 @@ class App:
         self.uploads = Uploads(folder, self.jobs, self._show_notices)
         self.dismiss = self.controls.add_button("Dismiss", self.uploads.notices.dismiss)
         self.dismiss.visible = False
-        self.steps = Steps(self.controls, self.uploads, self.play)
+        self.tabs = Tabs(self.controls, self.uploads, self.play)
         self.controls.attempt(self.refresh)
 
     def tick(self, elapsed: float) -> None:
@@ -204,10 +205,10 @@ class App:
         if living is not None and self.seen != state:
             self.controls.say("")  # how the command before ended is no news beside a running one
         self.running.show(running, elsewhere)
-        self.steps.robot.list_models()
+        self.tabs.robot.list_models()
         if self.seen == state:
             return
-        self.steps.show()
+        self.tabs.show()
         if living is None and every:
             self.controls.say(ending(every[-1]))
             self._compare(every[-1])
@@ -221,7 +222,7 @@ class App:
         if identified is None or identified.number != last.number:
             return
         if self.jobs.started_here(last):
-            self.steps.identify.compare()
+            self.tabs.identify.compare()
 
     def play(
         self, shown: Scene | SideBySide, clip: Clip | None = None, magnify: float = 1.0
@@ -234,7 +235,7 @@ class App:
         self.player = None
         if before is not None:
             before.remove()
-        with self.steps.gap.stage:
+        with self.tabs.gap.stage:
             self.player = Player(self.server, scene, clip, magnify)
 
     def _show_notices(self, text: str, dismissible: bool) -> None:
@@ -297,8 +298,8 @@ def serve_dataset(
     packaged = robot.parent == PACKAGE_FOLDER.resolve()
     outside = (dataset,) if packaged else (robot, dataset)
     jobs = Jobs(folder, outside)
-    jobs.add("robot", "robot", "check", robot.name if packaged else str(robot), result="{}")
-    jobs.add("import", "data", "card", str(dataset), result="{}")
+    jobs.add(use_robot(robot.name if packaged else str(robot)), result="{}")
+    jobs.add(Step("import", ("data", "card", str(dataset))), result="{}")
     page = App(folder, port, outside)
     page.play(scene, clip, magnify)
     try:

@@ -11,6 +11,7 @@ from typing import Any
 
 from gaponet.base.errors import GAPONetError, UsageError
 from gaponet.base.text import escape_markdown
+from gaponet.report.steps import TITLES, Step
 from gaponet.report.view.job_text import picture, report
 from gaponet.report.view.jobs import NEEDS, Job, Jobs
 from gaponet.report.view.uploads import Uploads, connect_upload_button
@@ -79,9 +80,9 @@ class Controls:
         button.on_click(lambda _: self.attempt(act))
         return button
 
-    def add_command(self, label: str, step: str, words: Callable[[], Iterable[str]]) -> Any:
-        """Add a button that starts the command of a step."""
-        return self.add_button(label, lambda: self.jobs.start(step, *words()))
+    def add_step(self, name: str, make: Callable[[], Step]) -> Any:
+        """Add the button of a step; `make` returns the step as the page's fields have it."""
+        return self.add_button(TITLES[name], lambda: self.jobs.start(make()))
 
     def add_upload(self, label: str, uploads: Uploads, place: str) -> None:
         """Add a button that stores files in a folder of the page."""

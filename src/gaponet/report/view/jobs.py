@@ -26,6 +26,7 @@ from gaponet.base.errors import UsageError
 from gaponet.base.files import WINDOWS, lock_file, write_json, write_text
 from gaponet.base.progress import LINE_INTERVAL_VARIABLE
 from gaponet.base.structure import Number, parse_json
+from gaponet.report.steps import Step
 from gaponet.report.view.inside import path_inside, read_inside, require_inside_name
 from gaponet.report.view.run_job import CANCELLED, ENDED, LOCK, WITH_SERVER, write_ending
 from gaponet.robot.finding import Finding
@@ -266,12 +267,12 @@ class Jobs:
     def _has_folder(self, job: Job) -> bool:
         return "--out" not in job.words or (self.folder / job.out).exists()
 
-    def add(self, step: str, *words: str, result: str = "") -> Job:
-        """Write the files of a new job; OUT becomes a new name: step and number."""
-        number = self._new_number(step)
-        folder = self.folder / "jobs" / f"{number:03d}-{step}"
+    def add(self, step: Step, result: str = "") -> Job:
+        """Write the files of a new job; OUT becomes a new name: that of the step, and a number."""
+        number = self._new_number(step.name)
+        folder = self.folder / "jobs" / f"{number:03d}-{step.name}"
         folder.mkdir(parents=True)
-        given = [f"{step}{number}" if word == OUT else word for word in words]
+        given = [f"{step.name}{number}" if word == OUT else word for word in step.words]
         write_json(folder / "command.json", given)
         write_text(folder / "result.json", result)
         write_text(folder / "log.txt", "")
@@ -287,10 +288,10 @@ class Jobs:
             number += 1
         return number
 
-    def start(self, step: str, *words: str) -> None:
-        """Start a command, or raise UsageError if one runs."""
+    def start(self, step: Step) -> None:
+        """Start the command of a step, or raise UsageError if one runs."""
         with self.idle():
-            job = self.add(step, *words)
+            job = self.add(step)
             command = module_command(
                 "gaponet.report.view.run_job", str(job.folder), *job.words, "--json"
             )

@@ -16,7 +16,7 @@ from gaponet.base.arrays import Array
 from gaponet.base.text import escape_markdown
 from gaponet.evaluation.methods import colour, title
 from gaponet.report.view.scene import Scene
-from gaponet.report.view.side_by_side import Clip, largest_error_time
+from gaponet.report.view.side_by_side import Clip, Copy, SideBySide, largest_error_time
 
 CURVE_ROWS = 1000  # of a chart
 # Rgb; a body darker than that cannot be seen on a dark page.
@@ -24,10 +24,96 @@ DARK = 0.22
 LIGHTER = np.array([0.20, 0.26, 0.38])
 
 
-class Player:
-    """The bodies of a scene as viser frames with meshes, and controls in the current container of
-    the page.
+class Bodies:
+    """The bodies of a scene as viser frames with meshes, a floor and labels.
+
+    Attributes:
+        frames: Body of the scene's model → frame.
     """
+
+    def __init__(self, server: Any, scene: Scene) -> None:
+        """Draw a scene in the page of a viser server."""
+        self.server = server
+        self.scene = scene
+        self._root = server.scene.add_frame("/robots", show_axes=False)
+        self.frames: dict[int, Any] = {}
+        self._add_bodies()
+        across = float(2.5 * scene.extent)
+        server.scene.add_grid("/robots/floor", across, across, position=(0, 0, scene.floor))
+        above = scene.view.axes[1] * 1.08 * scene.box[3]
+        for m, base in zip(scene.shown.motions, scene.base, strict=True):
+            server.scene.add_label(
+                f"/robots/label_{m.method}", title(m.method), position=base + above
+            )
+        self._aim()
+
+    def pose(self, now: float) -> None:
+        """Show the scene at a time, s."""
+        self.scene.pose(now)
+        with self.server.atomic():
+            for body, frame in self.frames.items():
+                frame.position = self.scene.data.xpos[body]
+                frame.wxyz = self.scene.data.xquat[body]
+
+    def remove(self) -> None:
+        """Remove them from the page."""
+        self._root.remove()
+
+    def _add_bodies(self) -> None:
+        model = self.scene.model
+        seen = np.flatnonzero(
+            (model.geom_group < 3) & (model.geom_type != mujoco.mjtGeom.mjGEOM_PLANE)
+        )
+        for body in range(model.nbody):
+            geoms = [g for g in seen if model.geom_bodyid[g] == body]
+            if not geoms:
+                continue
+            name = "/robots/" + model.body(body).name.replace("/", "_")
+            self.frames[body] = self.server.scene.add_frame(name, show_axes=False)
+            for g in geoms:
+                vertices, faces = _surface(model, int(g))
+                self.server.scene.add_mesh_simple(
+                    f"{name}/{g}",
+                    vertices,
+                    faces,
+                    color=_page_colour(model.geom_rgba[g, :3]),
+                    opacity=float(model.geom_rgba[g, 3]),
+                    position=model.geom_pos[g],
+                    wxyz=model.geom_quat[g],
+                )
+
+    def _aim(self) -> None:
+        # One robot may point at the camera.
+        scene = self.scene
+        across, up = scene.view.axes
+        far = 2.6 + 0.8 / len(scene.base)
+        self.server.initial_camera.fov = np.radians(45)
+        cameras = [client.camera for client in self.server.get_clients().values()]
+        for camera in (self.server.initial_camera, *cameras):
+            camera.look_at = scene.middle
+            camera.position = scene.middle + far * scene.extent * np.cross(across, up)
+
+
+class ErrorTable:
+    """The simulators' errors now and in the whole motion, as a table."""
+
+    def __init__(self, gui: Any, simulators: Mapping[str, Copy]) -> None:
+        """Add the table to the current container of the page; simulators by what they are called."""
+        self.simulators = simulators
+        self.text = gui.add_markdown("")
+
+    def show(self, row: int) -> None:
+        """Show the errors in a row of the motion."""
+        lines = ["| mean error, mrad | now | whole motion |", "| --- | ---: | ---: |"]
+        for name, simulator in self.simulators.items():
+            error = 1e3 * simulator.error[row]
+            mean = 1e3 * simulator.mpjae
+            lines.append(f"| {escape_markdown(name)} | {error:.1f} | {mean:.1f} |")
+        self.text.content = "\n".join(lines)
+
+
+class Player:
+    """A scene in the page, and controls in the current container of the page."""
 
     def __init__(self, server: Any, scene: Scene, clip: Clip, magnify: float = 1.0) -> None:
         """Draw a scene.
@@ -37,62 +123,40 @@ class Player:
             clip: Part that is played; it repeats.
             magnify: Stated in the page.
         """
-        self.server = server
-        self.scene = scene
         self.clip = clip
-        self.root = server.scene.add_frame("/robots", show_axes=False)
-        self.frames = self._bodies()
-        self._aim()
-        self.copies = {title(m.method): m for m in scene.shown.motions if m.method != "recorded"}
+        self.bodies = Bodies(server, scene)
         shown = scene.shown
-        worst = largest_error_time(scene.shown, clip)
-        meta = shown.real.meta
+        simulators = {title(m.method): m for m in shown.motions if m.method != "recorded"}
+        worst = largest_error_time(shown, clip)
         gui = server.gui
         self.folder = gui.add_folder(None, visible=len(shown.real) > 2)  # otherwise nothing moves
         with self.folder:
-            heading = "**VIRTUAL ROBOT**\n\n" if meta.virtual else ""
-            heading += escape_markdown(
-                f"{meta.robot}, {meta.motion}, unit {meta.unit_id}, {meta.payload_mass:g} kg"
-            )
-            self.title = gui.add_markdown(
-                heading + (f"\n\ndifferences drawn {magnify:g}×" if magnify != 1 else "")
-            )
+            self.title = gui.add_markdown(_heading(shown, magnify))
             self.playing = gui.add_checkbox("play", self.folder.visible)
             self.time: Any = gui.add_slider(
                 "time, s", clip.start, clip.stop, shown.real.dt, clip.start
             )
             self.worst = gui.add_button(f"Worst moment: {worst:.2f} s")
             self.speed = gui.add_slider("speed", 0.05, 2.0, 0.05, min(max(clip.speed, 0.05), 2.0))
-            self.table = gui.add_markdown("")
-            curves = {name: (1e3 * m.error, colour(m.method)) for name, m in self.copies.items()}
-            draw_curves(
-                gui, np.arange(len(shown.real)) * shown.real.dt, curves, "mean |error|, mrad"
-            )
+            self.errors = ErrorTable(gui, simulators)
+            curves = {name: (1e3 * m.error, colour(m.method)) for name, m in simulators.items()}
+            time = np.arange(len(shown.real)) * shown.real.dt
+            draw_curves(gui, time, curves, "mean |error|, mrad")
 
         @self.worst.on_click  # type: ignore[untyped-decorator]
         def _(_: Any) -> None:
             self.playing.value = False
             self.time.value = worst
 
+        self.updated = float(self.time.value)  # s, of what is shown
         self.update()
 
     def update(self) -> None:
         """Show the scene at the slider's time."""
-        scene = self.scene
         now = float(self.time.value)
         self.updated = now
-        scene.pose(now)
-        with self.server.atomic():
-            for body, frame in self.frames.items():
-                frame.position = scene.data.xpos[body]
-                frame.wxyz = scene.data.xquat[body]
-        row = scene.row(now)
-        lines = ["| mean error, mrad | now | whole motion |", "| --- | ---: | ---: |"]
-        for name, copy in self.copies.items():
-            error = 1e3 * copy.error[row]
-            mean = 1e3 * copy.mpjae
-            lines.append(f"| {escape_markdown(name)} | {error:.1f} | {mean:.1f} |")
-        self.table.content = "\n".join(lines)
+        self.bodies.pose(now)
+        self.errors.show(self.bodies.scene.row(now))
 
     def advance(self, elapsed: float) -> None:
         """Advance by `elapsed` s of wall time; the clip repeats."""
@@ -105,53 +169,19 @@ class Player:
     def remove(self) -> None:
         """Remove the robots and the controls."""
         self.folder.remove()
-        self.root.remove()
+        self.bodies.remove()
 
-    def _bodies(self) -> dict[int, Any]:
-        model = self.scene.model
-        frames = {}
-        seen = np.flatnonzero(
-            (model.geom_group < 3) & (model.geom_type != mujoco.mjtGeom.mjGEOM_PLANE)
-        )
-        for body in range(model.nbody):
-            geoms = [g for g in seen if model.geom_bodyid[g] == body]
-            if not geoms:
-                continue
-            name = "/robots/" + model.body(body).name.replace("/", "_")
-            frames[body] = self.server.scene.add_frame(name, show_axes=False)
-            for g in geoms:
-                vertices, faces = _surface(model, int(g))
-                self.server.scene.add_mesh_simple(
-                    f"{name}/{g}",
-                    vertices,
-                    faces,
-                    color=_page_colour(model.geom_rgba[g, :3]),
-                    opacity=float(model.geom_rgba[g, 3]),
-                    position=model.geom_pos[g],
-                    wxyz=model.geom_quat[g],
-                )
-        across = float(2.5 * self.scene.extent)
-        self.server.scene.add_grid(
-            "/robots/floor", across, across, position=(0, 0, self.scene.floor)
-        )
-        above = self.scene.view.axes[1] * 1.08 * self.scene.box[3]
-        for m, base in zip(self.scene.shown.motions, self.scene.base, strict=True):
-            self.server.scene.add_label(
-                f"/robots/label_{m.method}", title(m.method), position=base + above
-            )
-        return frames
 
-    def _aim(self) -> None:
-        # One robot may point at the camera.
-        across, up = self.scene.view.axes
-        far = 2.6 + 0.8 / len(self.scene.base)
-        self.server.initial_camera.fov = np.radians(45)
-        for camera in (
-            self.server.initial_camera,
-            *(c.camera for c in self.server.get_clients().values()),
-        ):
-            camera.look_at = self.scene.middle
-            camera.position = self.scene.middle + far * self.scene.extent * np.cross(across, up)
+def _heading(shown: SideBySide, magnify: float) -> str:
+    """Return what stands above the controls, in Markdown."""
+    meta = shown.real.meta
+    heading = "**VIRTUAL ROBOT**\n\n" if meta.virtual else ""
+    heading += escape_markdown(
+        f"{meta.robot}, {meta.motion}, unit {meta.unit_id}, {meta.payload_mass:g} kg"
+    )
+    if magnify != 1:
+        heading += f"\n\ndifferences drawn {magnify:g}×"
+    return heading
 
 
 def _page_colour(rgb: Array) -> Array:

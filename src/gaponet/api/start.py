@@ -1,7 +1,6 @@
-"""The steps from a model and logs to a report, as one list of commands.
+"""What gaponet start does: from the model and the logs of a laboratory to a report.
 
-gaponet start walks all of them, with the model and the logs of a laboratory. gaponet demo --real
-walks those in between, with public recordings. `StartRecord` remembers which have finished.
+report/steps.py has the list of steps. `StartRecord` remembers which have finished.
 """
 
 from __future__ import annotations
@@ -11,7 +10,7 @@ import shlex
 import tempfile
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 import numpy as np
 from typing_extensions import TypedDict
@@ -19,10 +18,13 @@ from typing_extensions import TypedDict
 from gaponet.api.options import parse_joint_map
 from gaponet.base.errors import LogError, UsageError
 from gaponet.base.files import lock_folder, write_json, write_text
-from gaponet.base.progress import Progress, no_progress
 from gaponet.base.structure import read_json
 from gaponet.data.formats import PositionUnit, ReadOptions, TimeUnit
 from gaponet.data.store import Dataset, dataset_hash
+from gaponet.report.steps import Option, Target, make_robot
+from gaponet.report.steps import Step as Step
+from gaponet.report.steps import measure_error as measure_error
+from gaponet.report.steps import steps_from_logs as steps_from_logs
 from gaponet.robot.finding import abbreviate
 from gaponet.robot.spec import RobotSpec, load_robot, named_robots, robot_argument
 from gaponet.robot.toml_file import RobotOptions
@@ -73,7 +75,7 @@ class StartOptions:
     """Cut bad rows and leave out logs that cannot be read."""
     allow_pickle: bool = False
     """Open pickled files."""
-    to: Literal["mjcf", "mjlab", "isaaclab", "newton", "json"] = "mjcf"
+    to: Target = "mjcf"
     """Engine to export to."""
     budget: str | None = None
     """Time that identification may take, such as 4m; default no limit."""
@@ -87,24 +89,19 @@ class StartOptions:
         """Options of the command that makes a robot."""
         return RobotOptions(self.joints, self.kp, self.kd, self.effort_limit)
 
-    def import_words(self) -> list[str]:
+    def import_options(self) -> dict[str, Option]:
         """Return the options of gaponet import about the recordings."""
-        words = ["--unit-id", self.unit_id, "--payload-mass", f"{self.payload_mass:g}"]
-        words += [f"--map={pair}" for pair in self.map]
-        for name in ("format", "position_unit", "time_unit", "rate", "cut"):
-            value = getattr(self, name)
-            if value is not None:
-                words.append(f"--{name.replace('_', '-')}={value}")
-        if self.skip_bad:
-            words.append("--skip-bad")
-        if self.allow_pickle:
-            words.append("--allow-pickle")
-        return words
-
-    def identify_words(self) -> list[str]:
-        """Return the options of gaponet identify."""
-        words = ["--budget", self.budget] if self.budget else []
-        return [*words, "--despite-errors"] if self.despite_errors else words
+        return {
+            "unit_id": self.unit_id,
+            "payload_mass": f"{self.payload_mass:g}",
+            "map": self.map,
+            "format": self.format,
+            "position_unit": self.position_unit,
+            "time_unit": self.time_unit,
+            "rate": self.rate,
+            "skip_bad": self.skip_bad,
+            "allow_pickle": self.allow_pickle,
+        }
 
     def read_options(self, logs: Path | None = None) -> ReadOptions:
         """Return how a recording is read, by this logs.toml if there is one."""
@@ -117,77 +114,6 @@ class StartOptions:
             rate=self.rate,
             allow_pickle=self.allow_pickle,
         )
-
-
-# ---- the list of steps
-
-
-@dataclass(frozen=True)
-class Step:
-    """One command on the way from logs to a report.
-
-    Attributes:
-        title: What it does.
-        words: The command, without gaponet in front.
-    """
-
-    title: str
-    words: tuple[str, ...]
-
-    @property
-    def command(self) -> str:
-        """Name of the command."""
-        return self.words[0]
-
-    @property
-    def line(self) -> str:
-        """The command as it is typed."""
-        return shlex.join(["gaponet", *self.words])
-
-
-def steps_from_logs(
-    logs: Path,
-    robot: str,
-    import_words: list[str],
-    out: Path,
-    identify_words: list[str],
-    to: str,
-) -> list[Step]:
-    """Return the steps from logs of a robot that exists to a report.
-
-    Args:
-        robot: Value of --robot.
-        import_words: Options of gaponet import.
-        out: Folder for the dataset (OUT/data) and the identified robot (OUT/identified).
-        identify_words: Options of gaponet identify.
-        to: Engine to export to.
-    """
-    data = str(out / "data")
-    identified = out / "identified"
-    read = ("import", str(logs), "--robot", robot, *import_words, "--out", data)
-    fit = ("identify", data, "--out", str(identified), *identify_words)
-    after = ("gap", data, "--robot", robot_argument(identified))
-    return [
-        Step("Import", read),
-        Step("Check", ("doctor", data)),
-        Step("Measure the gap", ("gap", data)),
-        Step("Identify", fit),
-        Step("What each cause removes", after),
-        Step("Export", ("export", str(identified), "--to", to)),
-        Step("Report", ("report", str(identified))),
-    ]
-
-
-def public_recordings(progress: Progress = no_progress) -> tuple[Path, str]:
-    """Return the folder of the public recordings of a real arm, and whose they are.
-
-    Raises:
-        UsageError, RemoteError: They are neither in GAPONET_DATA nor to be had from the network.
-    """
-    from gaponet.share.public_recordings import PublicFiles
-
-    public = PublicFiles.read()
-    return public.provide(progress), public.origin
 
 
 # ---- inspection of a model and logs
@@ -292,29 +218,35 @@ class Start:
         if not robot:
             steps.append(self._make_robot(inspection))
             robot = robot_argument(self.out / "robot")
-        import_words = options.import_words()
+        import_options = options.import_options()
         if inspection.logs_toml or self.logs_toml.is_file():
-            import_words += ["--logs", str(self.logs_toml)]
+            import_options["logs"] = str(self.logs_toml)
         piece = min(PIECE_S, inspection.seconds / MIN_RECORDINGS)
         few = inspection.recordings < MIN_RECORDINGS
+        import_options["cut"] = options.cut
         if options.cut is None and few and piece >= MIN_PIECE_S:
-            import_words += ["--cut", f"{piece:.3g}"]
+            import_options["cut"] = f"{piece:.3g}"
+        identify_options = {"budget": options.budget, "despite_errors": options.despite_errors}
         return steps + steps_from_logs(
-            self.logs, robot, import_words, self.out, options.identify_words(), options.to
+            self.logs, robot, import_options, self.out, identify_options, options.to
         )
 
     def _make_robot(self, inspection: Inspection) -> Step:
         """Return the step that makes a robot folder from a model file."""
-        given = vars(self.options.robot)
+        given = self.options.robot
+        joints = given.joints
         recorded = inspection.log.joint_names
-        if not given["joints"] and len(recorded) < len(inspection.robot.joint_names):
-            given = given | {"joints": recorded}
-        words = ["robot", "new", str(self.model), "--out", str(self.out / "robot")]
-        words += ["--rate", f"{inspection.rate:g}"]
-        for name in ("joints", "kp", "kd", "effort_limit"):
-            if given[name]:
-                words += [f"--{name.replace('_', '-')}", *given[name]]
-        return Step("Make the robot", tuple(words))
+        if not joints and len(recorded) < len(inspection.robot.joint_names):
+            joints = recorded
+        return make_robot(
+            str(self.model),
+            str(self.out / "robot"),
+            rate=f"{inspection.rate:g}",
+            joints=joints,
+            kp=given.kp,
+            kd=given.kd,
+            effort_limit=given.effort_limit,
+        )
 
     def keep_guess(self, text: str) -> None:
         """Write a guessed logs.toml into the folder, for a person to check."""
@@ -416,7 +348,7 @@ class StartRecord:
         Raises:
             UsageError: The data that are there were imported with other options.
         """
-        (options,) = [shlex.join(step.words[2:]) for step in steps if step.command == "import"]
+        (options,) = [shlex.join(step.words[2:]) for step in steps if step.name == "import"]
         if self.fields["options"] not in ("", options):
             raise UsageError(
                 f"{self.data} was imported with {self.fields['options']}, not with {options}. Give "
@@ -432,9 +364,9 @@ class StartRecord:
 
     def inputs(self, step: Step) -> str:
         """Return what a step depends on: the model, the logs, or the recordings in the dataset."""
-        if step.command == "robot":
+        if step.name == "robot":
             return MODEL_INPUT
-        if step.command == "import":
+        if step.name == "import":
             return hashlib.sha256(str(sorted(self.fields["files"].items())).encode()).hexdigest()
         return dataset_hash(Dataset(self.data).entries)
 

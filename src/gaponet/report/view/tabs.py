@@ -1,4 +1,4 @@
-"""The six steps of the page of `gaponet app`: the controls and the commands of each."""
+"""The six tabs of the page of `gaponet app`: the controls of each, and the steps that they start."""
 
 from __future__ import annotations
 
@@ -15,6 +15,8 @@ from gaponet.data.formats import PositionUnit, look
 from gaponet.data.store import Dataset
 from gaponet.evaluation.methods import colour
 from gaponet.evaluation.verdict import NetworkGain
+from gaponet.report import steps
+from gaponet.report.steps import Option, Step, Target
 from gaponet.report.view.controls import Controls
 from gaponet.report.view.inside import read_inside
 from gaponet.report.view.jobs import OUT, Job, Jobs
@@ -28,7 +30,7 @@ from gaponet.sysid.options import IdentifyOptions
 
 MODEL_SUFFIXES = (".xml", ".mjcf", ".urdf")
 POSITION_UNITS = ("as the logs state", *get_args(PositionUnit))
-TARGETS = ("mjcf", "mjlab", "isaaclab", "newton", "json")
+TARGETS = get_args(Target)
 URDF_TARGET = "urdf"  # for a robot that was made from one: the export is an edited copy
 NETWORK_TARGETS = ("onnx", "torch")  # of a trained network
 # Target → engine that applies parameter sets; others read a file.
@@ -37,15 +39,15 @@ FEWEST_WINDOWS = 4  # of an identification
 Play = Callable[[SideBySide], None]  # shows motions in the page
 
 
-class Step(Protocol):
-    """A step of the page."""
+class Tab(Protocol):
+    """A tab of the page."""
 
     def show(self) -> None:
         """Show the results, and what may be done next."""
 
 
-class RobotStep:
-    """Step 1: a robot of the package, or a model of the user's."""
+class RobotTab:
+    """Tab 1: a robot of the package, or a model of the user's."""
 
     def __init__(self, controls: Controls, uploads: Uploads, play: Play) -> None:
         self.controls = controls
@@ -64,23 +66,21 @@ class RobotStep:
             "kd": "N·m·s/rad",
         }
         self.options = {name: gui.add_text(name, "", hint=hint) for name, hint in hints.items()}
-        controls.add_button("Use this robot", self.use)
+        controls.add_step("robot", self.use)
         controls.add_place("robot", "Choose a robot of the package, or upload a model of yours.")
 
-    def use(self) -> None:
-        """Check a robot of the package, or make one of a model."""
-        options = []
+    def use(self) -> Step:
+        """Return the step that checks a robot of the package, or makes one of a model."""
+        options = dict[str, Option]()
         for name, box in self.options.items():
             words = box.value.split()
             if any(word.startswith("-") for word in words):
                 raise UsageError("joints, kp and kd are names and numbers, without a dash in front")
-            if words:
-                options += [f"--{name}", *words]
+            options[name] = tuple(words)
         name = str(self.model.value)
         if name in packaged_robots():
-            self.jobs.start("robot", "robot", "check", name)
-        else:
-            self.jobs.start("robot", "robot", "new", name, "--out", OUT, *options)
+            return steps.use_robot(name)
+        return steps.make_robot(name, OUT, **options)
 
     def chosen(self) -> RobotSpec:
         """Return the robot that was chosen.
@@ -118,10 +118,10 @@ class RobotStep:
             self.drawn = job.number
 
 
-class LogsStep:
-    """Step 2: logs become recordings."""
+class LogsTab:
+    """Tab 2: logs become recordings."""
 
-    def __init__(self, controls: Controls, uploads: Uploads, robot: RobotStep) -> None:
+    def __init__(self, controls: Controls, uploads: Uploads, robot: RobotTab) -> None:
         self.controls = controls
         self.jobs = controls.jobs
         self.folder = controls.folder
@@ -140,7 +140,7 @@ class LogsStep:
         )
         controls.add_button("Guess logs.toml from the logs", self.guess)
         controls.add_button("Set these logs aside", self.set_aside)
-        controls.add_button("Read the logs", self.read)
+        controls.add_step("import", self.read)
         controls.add_place("import", "Upload logs, then read them.")
         self.recording = gui.add_dropdown("recording", ("–",))
         self.joint = gui.add_dropdown("joint", ("–",))
@@ -172,22 +172,23 @@ class LogsStep:
         kind, facts, recordings = look(self.folder / "logs")
         self.described.value = guess_logs(recordings, self.robot.chosen(), kind, dict(facts))
 
-    def read(self) -> None:
-        """Import the logs for the chosen robot."""
-        self.start_import("import", "logs", self.controls.need("robot"))
+    def read(self) -> Step:
+        """Return the step that imports the logs for the chosen robot."""
+        robot = self.controls.need("robot").out
+        return steps.import_logs("logs", robot, OUT, **self.describe("logs"))
 
-    def start_import(self, step: str, logs: str, robot: Job) -> None:
-        """Start the import of a folder of logs with the settings of this step."""
+    def describe(self, logs: str) -> dict[str, Option]:
+        """Write the logs.toml of a folder of logs; return the options of their import."""
         self.jobs.require_idle()
         if self.described.value.strip():  # otherwise a file of the user's stays as it is
             write_text(self.folder / logs / "logs.toml", self.described.value)
-        words = [f"--unit-id={self.unit.value}", f"--payload-mass={self.mass.value:g}"]
-        words += ["--out", OUT]
-        if self.position.value in POSITION_UNITS[1:]:
-            words.append(f"--position-unit={self.position.value}")
-        if self.cut.value > 0:
-            words.append(f"--cut={self.cut.value:g}")
-        self.jobs.start(step, "import", logs, f"--robot={robot.out}", *words)
+        is_stated = self.position.value in POSITION_UNITS[1:]
+        return {
+            "unit_id": self.unit.value,
+            "payload_mass": f"{self.mass.value:g}",
+            "position_unit": self.position.value if is_stated else None,
+            "cut": f"{self.cut.value:g}" if self.cut.value > 0 else None,
+        }
 
     def stored_description(self) -> str:
         """Return the logs.toml of the folder; "" if there is none."""
@@ -225,20 +226,20 @@ class LogsStep:
         self.curves.data = (time, real.ctrl[:, j].astype(float), real.qpos[:, j].astype(float))
 
 
-class CheckStep:
-    """Step 3: are the recordings sound?"""
+class CheckTab:
+    """Tab 3: are the recordings sound?"""
 
-    def __init__(self, controls: Controls, logs: LogsStep) -> None:
+    def __init__(self, controls: Controls, logs: LogsTab) -> None:
         self.controls = controls
         self.logs = logs
-        controls.add_command("Check the recordings", "doctor", self._doctor)
+        controls.add_step("doctor", self._check)
         self.proposal = controls.add_button(
             "Write a proposal for logs.toml into step Logs", self.propose
         )
         controls.add_place("doctor", "Check the recordings.")
 
-    def _doctor(self) -> list[str]:
-        return ["doctor", self.controls.need("import").out, "--figures", OUT]
+    def _check(self) -> Step:
+        return steps.check_recordings(self.controls.need("import").out, figures=OUT)
 
     def propose(self) -> None:
         """Add the lines that mend the findings to the text of step Logs."""
@@ -252,22 +253,22 @@ class CheckStep:
         self.proposal.visible = self.controls.jobs.result("doctor") is not None
 
 
-class GapStep:
-    """Step 4: how far the simulator is from the robot."""
+class GapTab:
+    """Tab 4: how far the simulator is from the robot."""
 
-    def __init__(self, controls: Controls, logs: LogsStep, play: Play) -> None:
+    def __init__(self, controls: Controls, logs: LogsTab, play: Play) -> None:
         self.controls = controls
         self.logs = logs
         self.play = play
-        controls.add_command("Measure the error", "gap", self._gap)
+        controls.add_step("gap", self._measure)
         controls.add_button(
             "Show the recording of step Logs beside its simulation", self.show_recording
         )
         self.stage = controls.gui.add_folder(None)
         controls.add_place("gap", "Measure how far the simulator is from the robot.")
 
-    def _gap(self) -> list[str]:
-        return ["gap", self.controls.need("import").out]
+    def _measure(self) -> Step:
+        return steps.measure_error(self.controls.need("import").out)
 
     def show_recording(self) -> None:
         """Show the chosen recording beside its simulations."""
@@ -288,8 +289,8 @@ class GapStep:
         self.controls.show("gap")
 
 
-class IdentifyStep:
-    """Step 5: the robot's servos from the recordings."""
+class IdentifyTab:
+    """Tab 5: the robot's servos from the recordings."""
 
     def __init__(self, controls: Controls) -> None:
         self.controls = controls
@@ -303,12 +304,12 @@ class IdentifyStep:
             hint="of 8 s, that are fitted; fewer are quicker and less exact",
         )
         self.table = gui.add_checkbox("look for a table under the robot", True)
-        self.button = controls.add_command("Identify", "identify", self.words)
+        self.button = controls.add_step("identify", self.identify)
         controls.add_place("identify", "Identify the robot.")
         controls.add_place("causes", "")
 
-    def words(self) -> list[str]:
-        """Return the command.
+    def identify(self) -> Step:
+        """Return the step that identifies the robot.
 
         Raises:
             UsageError: Identification is locked.
@@ -316,11 +317,9 @@ class IdentifyStep:
         reason = self.locked()
         if reason:
             raise UsageError(reason)
-        words = ["identify", self.controls.need("import").out, "--out", OUT]
-        words += ["--windows", str(int(self.windows.value))]
-        if not self.table.value:
-            words.append("--no-table")
-        return words
+        data = self.controls.need("import").out
+        windows = int(self.windows.value)
+        return steps.identify(data, OUT, windows=windows, no_table=not self.table.value)
 
     def locked(self) -> str:
         """Return why identification may not start; "" if it may."""
@@ -350,67 +349,64 @@ class IdentifyStep:
         """Measure the error of the identified robot beside the nominal one's, by causes."""
         data = self.controls.need("import").out
         identified = self.controls.need("identify").out
-        self.controls.jobs.start("causes", "gap", data, "--robot", identified)
+        self.controls.jobs.start(steps.measure_causes(data, identified))
 
 
-class UseStep:
-    """Step 6: exports, parameter sets, another day or unit, and a network."""
+class UseTab:
+    """Tab 6: exports, parameter sets, another day or unit, and a network."""
 
-    def __init__(self, controls: Controls, uploads: Uploads, logs: LogsStep) -> None:
+    def __init__(self, controls: Controls, uploads: Uploads, logs: LogsTab) -> None:
         self.controls = controls
         self.logs = logs
         gui = controls.gui
         self.target = gui.add_dropdown("for", TARGETS)
-        controls.add_command("Export", "export", self._export)
+        controls.add_step("export", self._export)
         controls.add_place("export", "Export the robot for your simulator.")
-        controls.add_command("Parameter sets for training", "randomization", self._parameter_sets)
+        controls.add_step("randomization", self._draw)
         controls.add_place(
             "randomization",
             "A policy is then trained on robots that these logs cannot tell from yours.",
         )
         controls.add_upload("Upload new logs, of another day or unit", uploads, "new_logs")
         controls.add_button("Set these new logs aside", lambda: logs.set_aside("new_logs"))
-        controls.add_button("Read the new logs", self._read_new_logs)
+        controls.add_step("new", self._read_new_logs)
         controls.add_place("new", "Unit, payload, positions and logs.toml are those of step Logs.")
-        controls.add_command("Check whether the robot changed", "check", self._check)
+        controls.add_step("check", self._check)
         controls.add_place("check", "Check whether the identified robot still fits the new logs.")
-        controls.add_command("Calibrate with the new logs", "adapt", self._adapt)
+        controls.add_step("adapt", self._adapt)
         controls.add_place("adapt", "The calibrated robot is then exported.")
         self.budget = gui.add_text("training time", "10m")
-        controls.add_command("Train a network", "train", self._train)
+        controls.add_step("train", self._train)
         controls.add_place("train", "A network can be exported if validation says that it helps.")
 
-    def _export(self) -> list[str]:
+    def _export(self) -> Step:
         target = str(self.target.value)
         if target in NETWORK_TARGETS:
             exported = self.controls.need("train").out
         else:
             exported = self._best_robot()
-        words = ["export", exported, "--to", target, "--out", OUT]
-        if target == URDF_TARGET:
-            words += ["--into", self.logs.robot.urdf()]
-        return words
+        into = self.logs.robot.urdf() if target == URDF_TARGET else None
+        return steps.export(exported, target, out=OUT, into=into)
 
-    def _parameter_sets(self) -> list[str]:
+    def _draw(self) -> Step:
         engine = ENGINES.get(str(self.target.value), "json")
-        words = ["export", self._best_robot(), "--to", "randomization", "--engine", engine]
-        return [*words, "--out", OUT]
+        return steps.draw_parameter_sets(self._best_robot(), engine, OUT)
 
-    def _read_new_logs(self) -> None:
-        self.logs.start_import("new", "new_logs", self.controls.need("identify"))
+    def _read_new_logs(self) -> Step:
+        robot = self.controls.need("identify").out
+        return steps.import_new_logs("new_logs", robot, OUT, **self.logs.describe("new_logs"))
 
-    def _check(self) -> list[str]:
-        return ["check", self.controls.need("identify").out, self.controls.need("new").out]
+    def _check(self) -> Step:
+        return steps.check_robot(self.controls.need("identify").out, self.controls.need("new").out)
 
-    def _adapt(self) -> list[str]:
+    def _adapt(self) -> Step:
         identified = self.controls.need("identify").out
-        return ["adapt", identified, self.controls.need("new").out, "--out", OUT]
+        return steps.adapt(identified, self.controls.need("new").out, OUT)
 
-    def _train(self) -> list[str]:
+    def _train(self) -> Step:
         data = self.controls.need("import").out
         robot = self.controls.need("identify").out
-        budget = self.budget.value
-        return ["train", data, f"--robot={robot}", f"--budget={budget}", "--out", OUT]
+        return steps.train(data, robot, OUT, budget=str(self.budget.value))
 
     def _best_robot(self) -> str:
         """Return the calibrated robot if there is one, else the identified one."""
