@@ -38,7 +38,7 @@ def test_time_for_planning_and_consent_is_not_simulated(driver, clock):
 def test_after_planning_the_state_is_as_new_as_the_clock(driver, clock):
     clock.wait_until(START_S + LONG_PLANNING_S)
     state = driver.read()
-    assert clock.now() - state.time < 2 * driver.period
+    assert clock.now() - state.time < 2 * driver.unit.live.period
 
 
 def test_after_planning_the_robot_obeys_in_simulated_time(driver, clock):
@@ -49,7 +49,7 @@ def test_after_planning_the_robot_obeys_in_simulated_time(driver, clock):
         clock.wait_until(clock.now() + 0.02)
         state = driver.read()
     assert np.abs(state.qpos - target).max() < 0.15
-    assert clock.now() - state.time < 2 * driver.period
+    assert clock.now() - state.time < 2 * driver.unit.live.period
 
 
 def test_a_commanded_robot_that_falls_behind_the_clock_is_an_error(driver, clock):

@@ -123,8 +123,7 @@ def _serve_humanoid(
         options.interface,
         options.rate,
     )
-    humanoid.fault = options.fault
-    humanoid.fault_at = options.fault_at
+    humanoid.inject(options.fault, options.fault_at)
     where = (
         f"rt/lowstate at {options.rate:g} Hz, DDS domain {options.domain} on {options.interface}"
     )

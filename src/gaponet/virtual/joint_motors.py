@@ -23,11 +23,10 @@ class BatchArrays:
     """Arrays of MuJoCo, (N, active) if not stated; a write counts from the next physics step on."""
 
     def __init__(self, batch: Batch) -> None:
+        self._batch = batch
         self.qpos = batch.bind("qpos")  # rad
         self.qvel = batch.bind("qvel")  # rad/s
         self.ctrl = batch.bind("ctrl")  # rad
-        self.warmstart = batch.bind("qacc_warmstart")
-        self.time = batch.bind("time")  # (N, 1) s
         self.constraint_torque = batch.bind("qfrc_constraint")  # N·m
         self.gain = batch.expand("actuator_gainprm")  # (N, active, 10)
         self.bias = batch.expand("actuator_biasprm")  # (N, active, 10)
@@ -50,10 +49,10 @@ class BatchArrays:
         self.torque_range[:, :, 1] = high
 
     def stand_still(self) -> None:
-        """Set time and velocity to zero."""
-        self.time[:] = 0.0
+        """Set time and velocity to zero, and forget the solution of the last step."""
+        self._batch.bind("time")[:] = 0.0
+        self._batch.bind("qacc_warmstart")[:] = 0.0
         self.qvel[:] = 0.0
-        self.warmstart[:] = 0.0
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ controller.
 from __future__ import annotations
 
 from collections import deque
-from typing import Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -22,6 +22,9 @@ from gaponet.hw.drivers.unitree_states import MOTOR_NAMES, VIRTUAL_MARK
 from gaponet.robot.spec import RobotSpec
 from gaponet.virtual.physics import Physics
 from gaponet.virtual.virtual_driver import LiveUnit
+
+if TYPE_CHECKING:
+    from gaponet.hw.drivers.dds import Writer
 
 FaultKind = Literal[
     "none",
@@ -41,6 +44,9 @@ FaultKind = Literal[
     "machine",
 ]
 
+Readings = tuple[Array, Array, Array, Array]  # qpos, qvel, tau, temperature, (n) each
+
+MACHINE = 6  # mode_machine of an H1-2, by reports; no document of Unitree states it
 LATE_S = 0.3  # delay of messages in the fault "late"
 CLOCK_STEP_S = 10.0  # by which the robot's clock is ahead in the fault "clock"
 L2_AND_B = (0x20, 0x02)  # keys of the remote, bytes 2 and 3 of wireless_remote
@@ -69,12 +75,103 @@ class MotorCommands(NamedTuple):
         return all(np.isfinite(values).all() for values in self)
 
 
+class InjectedFault(NamedTuple):
+    """A fault to simulate, and its time after the first command, s."""
+
+    kind: FaultKind
+    at: float
+
+
+class StateSender:
+    """Sends the states of a robot as LowState messages, right or with a fault."""
+
+    def __init__(self, writer: Writer, robot: RobotSpec) -> None:
+        self._writer = writer
+        self._order = robot.index(MOTOR_NAMES)  # motor → place in the robot's order
+        self._message = hg.LowState.new()
+        hg.LowState.view(self._message, "reserve")[0] = VIRTUAL_MARK
+        self._delayed: deque[tuple[float, Array]] = deque()
+        self._last: Readings | None = None  # that were sent last
+
+    def send(self, readings: Readings, robot_time: float, now: float, fault: FaultKind) -> None:
+        """Send a state.
+
+        Args:
+            readings: Of its sensors.
+            robot_time: Of the robot's clock, s.
+            now: s.
+            fault: What is wrong.
+        """
+        if fault == "stop":
+            return
+        message = hg.LowState
+        data = self._message
+        self._last = self._spoiled(readings, fault)
+        self._set_readings(self._last)
+        if fault != "repeat":
+            ahead = CLOCK_STEP_S if fault == "clock" else 0.0
+            message.view(data, "tick")[0] = round(1000 * (robot_time + ahead)) % 2**32
+        self._set_status(fault)
+        message.seal(data)
+        if fault == "checksum":
+            message.view(data, "crc")[0] ^= 1
+        self._delayed.append((now + (LATE_S if fault == "late" else 0.0), data.copy()))
+        while self._delayed and self._delayed[0][0] <= now:
+            self._writer.send(self._delayed.popleft()[1])
+
+    def _spoiled(self, readings: Readings, fault: FaultKind) -> Readings:
+        """Return readings with a fault."""
+        if fault in ("freeze", "repeat") and self._last is not None:
+            return self._last
+        qpos, qvel, tau, temperature = [values.copy() for values in readings]
+        joint = self._order[MOTOR_NAMES.index("left_elbow_joint")]
+        if fault == "encoder" and self._last is not None:
+            qpos[joint] = self._last[0][joint]
+        if fault == "nan":
+            qpos[joint] = np.nan
+        if fault == "jump":
+            qpos[joint] += 1.5
+        if fault == "hot":
+            temperature[joint] = 120.0
+        return qpos, qvel, tau, temperature
+
+    def _set_readings(self, readings: Readings) -> None:
+        """Set the motors' readings in the message."""
+        motors = len(MOTOR_NAMES)
+        qpos, qvel, tau, temperature = readings
+        for name, values in (("q", qpos), ("dq", qvel), ("tau_est", tau)):
+            column = np.zeros(hg.MOTORS)
+            column[:motors] = values[self._order]
+            hg.LowState.set_motors(self._message, name, column)
+        case_and_winding = np.zeros((hg.MOTORS, 2))
+        case_and_winding[:motors] = temperature[self._order, None]
+        hg.LowState.set_motors(self._message, "temperature", case_and_winding)
+
+    def _set_status(self, fault: FaultKind) -> None:
+        """Set the status fields of the message, with a fault."""
+        message = hg.LowState
+        data = self._message
+        half = 0.5 if fault == "fall" else 0.0  # half of the angle by which it leans forward
+        message.view(data, "imu_state.quaternion")[:] = (np.cos(half), 0.0, np.sin(half), 0.0)
+        message.view(data, "wireless_remote")[2:4] = L2_AND_B if fault == "remote" else 0
+        message.view(data, "mode_machine")[0] = 5 if fault == "machine" else MACHINE
+        errors = np.zeros(hg.MOTORS)
+        if fault == "motor":
+            errors[MOTOR_NAMES.index("left_elbow_joint")] = 4
+        message.set_motors(data, "motorstate", errors)
+
+
 class VirtualH12:
     """The robot on the bus.
 
     Attributes:
-        fault: Fault that is simulated; "none" until it is set.
-        fault_at: Its time after the first command, s.
+        robot: Its model.
+        rate: States per second.
+        live: Its simulation.
+        clock: By which it lives.
+        first_command: When it came, s; None before it.
+        refused: Damaged or senseless commands.
+        missed: Periods in which nothing was simulated.
         heard: Received commands: time (s), topic, weight, and targets, gains, modes and joint
             states then, (n) in motor order.
     """
@@ -99,10 +196,9 @@ class VirtualH12:
         bus = dds.Bus(domain, interface)
         self.robot = robot
         self.rate = rate
-        self.fault: FaultKind = "none"
-        self.fault_at = 0.0
+        self._injected = InjectedFault("none", 0.0)
         self._order = robot.index(MOTOR_NAMES)  # motor → place in the robot's order
-        self._writer = bus.writer("rt/lowstate", dds.LowState)
+        self._states = StateSender(bus.writer("rt/lowstate", dds.LowState), robot)
         self._readers = {
             "arm_sdk": bus.reader("rt/arm_sdk", dds.LowCmd),
             "lowcmd": bus.reader("rt/lowcmd", dds.LowCmd),
@@ -111,13 +207,12 @@ class VirtualH12:
         self.clock = MonotonicClock()
         self.heard = list[dict[str, Any]]()
         self.first_command: float | None = None
-        self.refused = 0  # damaged or senseless commands
-        self.missed = 0  # periods in which nothing was simulated
-        self._message = hg.LowState.new()
-        hg.LowState.view(self._message, "reserve")[0] = VIRTUAL_MARK
-        self.machine = 6  # mode_machine of an H1-2, by reports; no document of Unitree states it
-        self._delayed: deque[tuple[float, Array]] = deque()
-        self._frozen: tuple[Array, ...] | None = None
+        self.refused = 0
+        self.missed = 0
+
+    def inject(self, kind: FaultKind, at: float) -> None:
+        """Simulate a fault from `at` s after the first command on."""
+        self._injected = InjectedFault(kind, at)
 
     @no_garbage_collection()
     def run(self, seconds: float = np.inf) -> None:
@@ -191,62 +286,12 @@ class VirtualH12:
         )
 
     def _send_state(self, k: int, now: float) -> None:
-        wrong = self.first_command is not None and now - self.first_command >= self.fault_at
-        fault = self.fault if wrong else "none"
-        if fault == "stop":
-            return
-        message = hg.LowState
-        data = self._message
-        self._set_readings(fault)
-        if fault != "repeat":
-            ahead = CLOCK_STEP_S if fault == "clock" else 0.0
-            message.view(data, "tick")[0] = round(1000 * (k / self.rate + ahead)) % 2**32
-        self._set_status(fault)
-        message.seal(data)
-        if fault == "checksum":
-            message.view(data, "crc")[0] ^= 1
-        self._delayed.append((now + (LATE_S if fault == "late" else 0.0), data.copy()))
-        while self._delayed and self._delayed[0][0] <= now:
-            self._writer.send(self._delayed.popleft()[1])
+        """Send the state of the k-th period, with the fault if it is time for it."""
+        injected = self._injected
+        is_wrong = self.first_command is not None and now - self.first_command >= injected.at
+        fault = injected.kind if is_wrong else "none"
+        self._states.send(self._readings(), k / self.rate, now, fault)
 
-    def _set_readings(self, fault: str) -> None:
-        """Set the motors' readings in the message, with a fault."""
-        motors = len(MOTOR_NAMES)
-        qpos, qvel, tau, temperature = self._readings(fault)
-        for name, values in (("q", qpos), ("dq", qvel), ("tau_est", tau)):
-            column = np.zeros(hg.MOTORS)
-            column[:motors] = values[self._order]
-            hg.LowState.set_motors(self._message, name, column)
-        case_and_winding = np.zeros((hg.MOTORS, 2))
-        case_and_winding[:motors] = temperature[self._order, None]
-        hg.LowState.set_motors(self._message, "temperature", case_and_winding)
-
-    def _set_status(self, fault: str) -> None:
-        """Set the status fields of the message, with a fault."""
-        message = hg.LowState
-        data = self._message
-        half = 0.5 if fault == "fall" else 0.0  # half of the angle by which it leans forward
-        message.view(data, "imu_state.quaternion")[:] = (np.cos(half), 0.0, np.sin(half), 0.0)
-        message.view(data, "wireless_remote")[2:4] = L2_AND_B if fault == "remote" else 0
-        message.view(data, "mode_machine")[0] = 5 if fault == "machine" else self.machine
-        errors = np.zeros(hg.MOTORS)
-        if fault == "motor":
-            errors[MOTOR_NAMES.index("left_elbow_joint")] = 4
-        message.set_motors(data, "motorstate", errors)
-
-    def _readings(self, fault: str) -> tuple[Array, ...]:
-        """Return qpos, qvel, tau, temperature, (n) each, with a fault."""
-        if fault in ("freeze", "repeat") and self._frozen is not None:
-            return self._frozen
-        qpos, qvel, tau, temperature = [values.copy() for values in self.live.read()]
-        joint = self.robot.index(["left_elbow_joint"])[0]
-        if fault == "encoder" and self._frozen is not None:
-            qpos[joint] = self._frozen[0][joint]
-        if fault == "nan":
-            qpos[joint] = np.nan
-        if fault == "jump":
-            qpos[joint] += 1.5
-        if fault == "hot":
-            temperature[joint] = 120.0
-        self._frozen = qpos, qvel, tau, temperature
-        return self._frozen
+    def _readings(self) -> Readings:
+        """Return what its sensors read."""
+        return self.live.read()

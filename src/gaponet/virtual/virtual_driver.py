@@ -79,12 +79,50 @@ class LiveUnit:
         return reading.qpos[0], reading.qvel[0], reading.tau[0], reading.temperature[0]
 
 
-class VirtualDriver:
-    """A `Driver` of a virtual robot in this process; its time is the controller's clock.
+class ClockedUnit:
+    """A unit whose time is a clock's.
 
-    Until the first command the robot stands still, so time that passes without a reading (planning,
-    the question for consent, compiling) is not simulated. From the first command on all time is.
+    Until the first command it stands still, so time that passes without a reading (planning, the
+    question for consent, compiling) is not simulated. From the first command on all time is.
+
+    Attributes:
+        live: The unit.
+        state: Its newest state.
+        is_commanded: True from the first command on.
     """
+
+    def __init__(self, live: LiveUnit, clock: Clock) -> None:
+        self.live = live
+        self.is_commanded = False
+        self._clock = clock
+        self._begun = clock.now()  # s
+        self._skipped = 0  # state periods that were not simulated
+        self.state = self._measure()
+
+    def periods_due(self) -> int:
+        """Return how many state periods are to be simulated until now; at most one before the
+        first command.
+        """
+        elapsed = int((self._clock.now() - self._begun) / self.live.period + 1e-6)
+        due = elapsed - self._skipped - self.live.steps
+        if due > 1 and not self.is_commanded:
+            self._skipped += due - 1
+            return 1
+        return due
+
+    def advance(self, periods: int) -> None:
+        """Simulate some state periods, and measure."""
+        for _ in range(periods):
+            self.live.step()
+        self.state = self._measure()
+
+    def _measure(self) -> State:
+        time = self._begun + (self._skipped + self.live.steps) * self.live.period
+        return State(time, *self.live.read())
+
+
+class VirtualDriver:
+    """A `Driver` of a virtual robot in this process; its time is the controller's clock."""
 
     virtual = True
     noisy = True
@@ -117,23 +155,20 @@ class VirtualDriver:
         self.address = f"virtual {robot.name} {name} in process {os.getpid()}"
         self.joint_names = robot.joint_names
         self.clock = clock
-        self.period = period
         self._new_unit = partial(LiveUnit, robot, physics, payload, seed, period)
-        self._live: LiveUnit | None = None  # from the connection on
-        self._state: State | None = None  # the newest one, from the connection on
-        self._begun = 0.0  # clock's time at the connection, s
-        self._skipped = 0  # state periods that were not simulated, before the first command
-        self._commanded = False
+        self._unit: ClockedUnit | None = None  # from the connection on
         locked = idle_joints(robot, robot.operated)
         self.commanded = tuple(joint for joint in robot.joint_names if joint not in locked)
         self._at = robot.index(self.commanded)
 
     def connect(self) -> None:
-        self._live = self._new_unit()
-        self._begun = self.clock.now()
-        self._skipped = 0
-        self._commanded = False
-        self._state = self._measure()
+        self._unit = ClockedUnit(self._new_unit(), self.clock)
+
+    @property
+    def unit(self) -> ClockedUnit:
+        """The simulated unit; it exists once the driver is connected."""
+        assert self._unit is not None, "connect first"
+        return self._unit
 
     def read(self) -> State:
         """Simulate until now and return the state.
@@ -142,55 +177,35 @@ class VirtualDriver:
             DriverError: The simulation of a commanded robot is more than MAX_LAG_S behind the
                 clock.
         """
-        assert self._state is not None, "connect first"
-        due = self._periods_due()
-        if due <= 0:
-            return self._state
-        if not self._commanded:
-            self._skipped += due - 1
-            due = 1
-        if due * self.period > MAX_LAG_S:
+        unit = self.unit
+        due = unit.periods_due()
+        if due * unit.live.period > MAX_LAG_S:
             raise DriverError(
                 f"{self.address}: this machine cannot simulate it in real time; run without real "
                 "time (--fast)"
             )
-        for _ in range(due):
-            self.live.step()
-        self._state = self._measure()
-        return self._state
-
-    @property
-    def live(self) -> LiveUnit:
-        """The simulated unit; it exists once the driver is connected."""
-        assert self._live is not None, "connect first"
-        return self._live
-
-    def _periods_due(self) -> int:
-        """Return how many state periods the simulation is behind the clock."""
-        elapsed = int((self.clock.now() - self._begun) / self.period + 1e-6)
-        return elapsed - self._skipped - self.live.steps
-
-    def _measure(self) -> State:
-        time = self._begun + (self._skipped + self.live.steps) * self.period
-        return State(time, *self.live.read())
+        if due > 0:
+            unit.advance(due)
+        return unit.state
 
     def write(self, ctrl: Array, weight: float = 1.0) -> None:
         """Send a command; it takes effect after the unit's own delay."""
-        self._commanded = True
-        self.live.set_gains(self.kp, self.kd)
-        self.live.ctrl[self._at] = ctrl[self._at]
+        self.unit.is_commanded = True
+        live = self.unit.live
+        live.set_gains(self.kp, self.kd)
+        live.ctrl[self._at] = ctrl[self._at]
 
     def verify(self) -> None:
         """Do nothing: a virtual robot always has the right settings."""
 
     def damp(self, weight: float = 1.0, share: float = 0.0) -> None:
         """Stiffness zero, damping four times the robot's, on the commanded joints."""
-        self._commanded = True
+        self.unit.is_commanded = True
         kp = self.kp.copy()
         kd = self.kd.copy()
         kp[self._at] = 0.0
         kd[self._at] = DAMPING_FACTOR * kd[self._at]
-        self.live.set_gains(kp, kd)
+        self.unit.live.set_gains(kp, kd)
 
     def confirm(self) -> str:
         return "damped and let go"

@@ -111,8 +111,8 @@ class Disobedient(VirtualH12):
                 kp, kd, np.where(np.arange(len(kp)) == self._order[left], 0.5, effort), torque
             )
 
-    def _readings(self, fault: str) -> tuple[np.ndarray, ...]:
-        qpos, *more = super()._readings(fault)
+    def _readings(self) -> tuple[np.ndarray, ...]:
+        qpos, *more = super()._readings()
         elbow = self._order[MOTOR_NAMES.index("left_elbow_joint")]
         wrong_for = self.clock.now() - (self.first_command or np.inf) - self.at
         if wrong_for >= 0 and self.way in ("zero", "drifts"):

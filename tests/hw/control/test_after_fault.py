@@ -144,8 +144,7 @@ def test_a_watchdog_holds_the_torso_where_it_is_and_not_where_it_was_at_its_conn
 def test_a_watchdog_damps_although_the_bus_gives_no_states(robot, monkeypatch):
     clock = living(monkeypatch, robot)
     watchdog = watching(robot)
-    clock.robot.fault = "stop"
-    clock.robot.fault_at = 0.0
+    clock.robot.inject("stop", 0.0)
 
     for _ in range(5):
         watchdog.damp(1.0)

@@ -39,9 +39,13 @@ class FaultyArm(NotedArm):
         self.at = at
         self.kind = kind
 
+    def connect(self):
+        super().connect()
+        self.connected = self.clock.now()
+
     def read(self):
         honest = super().read()
-        if self.clock.now() - self._begun < self.at:
+        if self.clock.now() - self.connected < self.at:
             self.last = honest
             return honest
         if self.kind == "bus":

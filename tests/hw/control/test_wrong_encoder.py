@@ -46,11 +46,11 @@ class Swaying:
     def _run(self, wrong: str, topic: str, swing: float) -> tuple[Recording, RobotClock]:
         robot = self.robot
         clock = living(self.monkeypatch, robot)
-        clock.robot.at = clock.robot.fault_at = WRONG_FROM_S
+        clock.robot.at = WRONG_FROM_S
         if wrong == "drifts":
             clock.robot.way = wrong
         else:
-            clock.robot.fault = wrong  # type: ignore[assignment]
+            clock.robot.inject(wrong, WRONG_FROM_S)  # type: ignore[arg-type]
         elbows = robot.index(["left_elbow_joint", "right_elbow_joint"])
 
         def policy(k: int, state: object) -> np.ndarray | None:
