@@ -20,6 +20,8 @@ class DryRun:
     once. Without this the first motion would count as a joint that does not follow.
     """
 
+    reads_back = True  # what was not sent cannot be checked
+
     def __init__(self, driver: Driver) -> None:
         """Take the driver of the robot, which must publish nothing when it connects."""
         self.driver = driver
@@ -30,21 +32,35 @@ class DryRun:
         self.noisy = driver.noisy
         self.at_end = driver.at_end
         self.at_stop = driver.at_stop
-        self.reads_back = True  # what was not sent cannot be checked
-        self.virtual, self.kp, self.kd, self.qpos_range, self.facts = self._known_once_connected()
         self._at = np.array([driver.joint_names.index(name) for name in driver.commanded])
         self._measured: Array | None = None  # qpos of the last state, rad
         self._start: Array | None = None  # qpos at the first command, rad
         self._moved: Array | float = 0.0  # way of the commands since then, rad
 
+    @property
+    def virtual(self) -> bool:
+        """As of the robot's driver, also what follows."""
+        return self.driver.virtual
+
+    @property
+    def kp(self) -> Array:
+        return self.driver.kp
+
+    @property
+    def kd(self) -> Array:
+        return self.driver.kd
+
+    @property
+    def qpos_range(self) -> Array | None:
+        return self.driver.qpos_range
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        return self.driver.facts | {"dry_run": True}
+
     def connect(self) -> None:
         """Connect the robot's driver."""
         self.driver.connect()
-        self.virtual, self.kp, self.kd, self.qpos_range, self.facts = self._known_once_connected()
-
-    def _known_once_connected(self) -> tuple[bool, Array, Array, Array | None, dict[str, Any]]:
-        inner = self.driver
-        return inner.virtual, inner.kp, inner.kd, inner.qpos_range, inner.facts | {"dry_run": True}
 
     def read(self) -> State:
         """Return the robot's state, moved on."""
