@@ -17,7 +17,6 @@ import numpy as np
 
 from gaponet.hw.control.clock import no_garbage_collection
 from gaponet.hw.drivers import feetech as reg
-from gaponet.hw.drivers.so101 import FULL_TORQUE, STALL_CURRENT_STEPS, STIFFNESS_PER_P
 from gaponet.hw.drivers.so101_calibration import (
     CONTINUOUS_JOINT,
     GRIPPER,
@@ -27,6 +26,7 @@ from gaponet.hw.drivers.so101_calibration import (
     ArmCalibration,
     ServoRow,
 )
+from gaponet.hw.drivers.so101_servos import FULL_TORQUE, STALL_CURRENT_STEPS, STIFFNESS_PER_P
 from gaponet.robot.spec import RobotSpec
 from gaponet.robot.toml_file import Table
 from gaponet.virtual.physics import Physics

@@ -158,6 +158,7 @@ def bus(
     so101: RobotSpec, clock: SimulatedClock, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> Iterator[Bus]:
     from gaponet.hw.drivers import so101 as driver
+    from gaponet.hw.drivers import so101_servos
 
     # Other processes may run this test.
     monkeypatch.setattr("gaponet.hw.control.publisher.LOCK_FOLDER", tmp_path)
@@ -165,7 +166,8 @@ def bus(
     arm.live.steps = round(clock.now() / PERIOD)
     bus = Bus(arm, clock)
     monkeypatch.setattr(serial, "Serial", lambda *_, **__: bus)
-    monkeypatch.setattr(driver, "time", SimpleNamespace(monotonic=clock.now))
+    for module in (driver, so101_servos):
+        monkeypatch.setattr(module, "time", SimpleNamespace(monotonic=clock.now))
     yield bus
     arm.close()
 
@@ -352,9 +354,7 @@ def swing(
     clock = living(monkeypatch, robot, **unit)  # type: ignore[arg-type]
     clock.robot.way = way
     clock.robot.at = at
-    # type: ignore[assignment]
-    clock.robot.fault = fault
-    clock.robot.fault_at = at
+    clock.robot.inject(fault, at)  # type: ignore[arg-type]
     left, right = robot.index(["left_elbow_joint", "right_elbow_joint"])
 
     def policy(k: int, state: object) -> np.ndarray | None:
@@ -412,8 +412,7 @@ def test_a_step_of_the_robots_clock_is_no_fault_and_hides_none(monkeypatch):
 
     def step(k: int, robot: VirtualH12) -> None:
         if fault := {10: "clock", 30: "none", 50: "clock", 70: "stop"}.get(k):
-            robot.fault = fault
-            robot.fault_at = 0.0
+            robot.inject(fault, 0.0)
 
     recording, robot = swing(monkeypatch, during=step)
     assert recording.fault.kind == "stale", recording.fault
