@@ -280,7 +280,7 @@ def test_when_targets_end_it_stands_until_a_clear_way_back_is_found_or_ends_ther
     found[at] = HERE
     far[at] = ACROSS
     controller, sent = virtual(robot, found)
-    driver = controller.driver
+    driver = controller.context.driver
     driver.at_end = "hold" if obeys else "hand_over"
 
     def read():
@@ -294,7 +294,7 @@ def test_when_targets_end_it_stands_until_a_clear_way_back_is_found_or_ends_ther
         )
 
     driver.read = read
-    controller.monitor.frozen.noisy = False
+    controller.output.monitor.frozen.noisy = False
     assert judge.along(np.stack([far, found]), 0.02)[0] > 0.1
     legs = itertools.pairwise([found, robot.qpos_home, far])
     rows = np.concatenate(
@@ -306,7 +306,7 @@ def test_when_targets_end_it_stands_until_a_clear_way_back_is_found_or_ends_ther
         *given,
     ):
         for _ in find_points(*given) if found_way else range(50):
-            controller.clock.advance(0.001)
+            controller.context.clock.advance(0.001)
             yield
         return finish_search(find_points(*given)) if found_way else None
 
@@ -352,11 +352,10 @@ def test_the_first_command_is_where_it_was_found_or_none_leaves(so101, beyond, c
     found = so101.qpos_home.copy()
     found[0] = so101.qpos_range[0, 1] + beyond
     controller, sent = virtual(so101, found)
-    honest = controller.driver.read
-    controller.driver.read = lambda: (
-        honest() if sent else dataclasses.replace(honest(), qpos=found.copy())
-    )
-    controller.driver.qpos_range = so101.qpos_range if cuts_goals else None
+    driver = controller.context.driver
+    honest = driver.read
+    driver.read = lambda: honest() if sent else dataclasses.replace(honest(), qpos=found.copy())
+    driver.qpos_range = so101.qpos_range if cuts_goals else None
     recording = controller.run(lambda k, state: so101.qpos_home if k < 5 else None)
     assert (recording.fault.kind if recording.fault else None) == kind, recording.fault
     assert [c[0] for c in sent[:1]] == ([] if kind else [pytest.approx(found[0], abs=2e-3)])

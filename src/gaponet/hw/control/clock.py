@@ -99,6 +99,53 @@ class SimulatedClock:
         return self.suspended_s
 
 
+class Periods:
+    """Control periods of a run: equally long; those that are missed are left out.
+
+    Attributes:
+        number: Of the present period.
+        now: When it began, s.
+        due: When it should have begun, s: the period after the last one.
+    """
+
+    def __init__(self, clock: Clock, dt: float) -> None:
+        """dt: Control period, s."""
+        self.number = 0
+        self.now = 0.0
+        self.due = 0.0
+        self._clock = clock
+        self._dt = dt
+        self._start = 0.0  # of the first period, s
+        self._next = 0  # the period after the last one; `number` is the next one that is possible
+        self._suspended_before = 0.0  # s
+
+    def begin(self) -> None:
+        """Begin the first period now."""
+        self._start = self._clock.now()
+        self.now = self._start
+
+    def forget_suspends(self) -> None:
+        """Let `suspended` count from now on."""
+        self._suspended_before = self._clock.suspended()
+
+    def wait(self) -> float:
+        """Wait for the present period; return how late it begins, s."""
+        self.now = self._clock.wait_until(self._start + self.number * self._dt)
+        self.due = self._start + self._next * self._dt
+        return self.now - self.due
+
+    def end(self) -> int:
+        """End the present period; return the number of periods that were missed meanwhile."""
+        passed = int((self._clock.now() - self._start) / self._dt) - self.number  # whole periods
+        self._next = self.number + 1
+        self.number += max(1, passed)
+        return max(passed - 1, 0)
+
+    def suspended(self) -> float:
+        """Return the s for which the computer was suspended."""
+        return self._clock.suspended() - self._suspended_before
+
+
 @contextmanager
 def no_garbage_collection() -> Iterator[None]:
     """Disable the garbage collector inside the block.

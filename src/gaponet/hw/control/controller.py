@@ -8,12 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import ExitStack
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from gaponet.base.arrays import Array
 from gaponet.base.errors import UsageError
-from gaponet.hw.control.clock import Clock, MonotonicClock, no_garbage_collection
+from gaponet.hw.control.clock import Clock, MonotonicClock, Periods, no_garbage_collection
 from gaponet.hw.control.driver import Driver, DriverError, Fault, State
 from gaponet.hw.control.following import FollowingMonitor
 from gaponet.hw.control.output import Context, Output
@@ -21,10 +22,10 @@ from gaponet.hw.control.phases import (
     COMMANDING,
     ENDED,
     MOVING,
-    TRANSITION_TABLE,
     Action,
     ControlConfig,
     Phase,
+    PhaseMachine,
     Trigger,
 )
 from gaponet.hw.control.plan import Plan, Planner, TargetCompensator
@@ -40,6 +41,67 @@ from gaponet.robot.spec import RobotSpec
 
 # Control periods without a heartbeat after which the watchdog damps the robot.
 WATCHDOG_PERIODS = 5.0
+
+
+@dataclass(frozen=True)
+class Session:
+    """What is around the periods of one run: the lock, the connection, stop keys and signals, the
+    file of the recording, and the watchdog.
+
+    Attributes:
+        output: Gets the watchdog.
+        recording: Of the run.
+        stop: Is called by keys and signals.
+        on_connect: Called with the driver once the robot has answered and nothing was commanded;
+            it refuses the run by an exception.
+        is_watched: A watchdog is started, if the driver supports one.
+        folder: Of the recording; None: a temporary file.
+    """
+
+    output: Output
+    recording: Recording
+    stop: StopRequest
+    on_connect: Callable[[Driver], None]
+    is_watched: bool
+    folder: Path | None
+
+    def start(self, stack: ExitStack, keys: bool) -> StopKeys | None:
+        """Connect, ask `on_connect`, and start all else; `stack` ends it in the opposite order.
+
+        Return the keys that stop the run, if `keys`.
+
+        Raises:
+            DriverError: The robot or the watchdog could not be reached; nothing was commanded.
+            UsageError: Another process commands the robot.
+        """
+        output = self.output
+        context = output.context
+        driver = context.driver
+        # Left last: during a collection no heartbeat is sent.
+        stack.enter_context(no_garbage_collection())
+        lock = stack.enter_context(sole_publisher(driver.address))
+        stack.callback(lambda: driver.close(hold=output.damping_since is None))
+        driver.connect()
+        self.recording.virtual = driver.virtual
+        output.limits = output.servo_limits()
+        self.on_connect(driver)
+        stack.enter_context(stop_on_signals(self.stop))
+        # Keys count from the consent on.
+        pressed = stack.enter_context(StopKeys(self.stop)) if keys else None
+        joints = context.joints
+        gains = {"kp": driver.kp[joints].tolist(), "kd": driver.kd[joints].tolist()}
+        self.recording.meta |= gains | driver.facts
+        if self.folder:
+            self.recording.write_to(self.folder)
+        stack.callback(self.recording.rows.close)
+        spec = driver.watchdog() if self.is_watched else None
+        if spec is not None:
+            patience = WATCHDOG_PERIODS * context.dt
+            watchdog = Watchdog(spec, lock, patience, context.config.damp)
+            output.watchdog = watchdog
+            stack.callback(lambda: watchdog.release(output.unconfirmed))
+            watchdog.wait_ready()
+        return pressed
 
 
 class Controller:
@@ -85,52 +147,50 @@ class Controller:
                 file.
             metadata: Saved with the recording (unit id, model …).
         """
-        self.driver = driver
-        self.clock = clock or MonotonicClock()
-        self.config = config or ControlConfig()
-        self.dt = 1.0 / self.config.rate
+        config = config or ControlConfig()
         safety = safety or SafetyConfig()
         if planner is None and not unchecked and (robot.folder / "collision.toml").is_file():
-            planner = Planner(robot, driver.commanded, self.config, safety)
+            planner = Planner(robot, driver.commanded, config, safety)
+        joints = robot.index(driver.commanded)
+        dt = 1.0 / config.rate
         self.context = Context(
             driver,
             robot,
-            self.config,
+            config,
             safety,
             compensator,
-            self.clock,
+            clock or MonotonicClock(),
             planner,
             payload_mass,
-            robot.index(driver.commanded),
-            self.dt,
+            joints,
+            dt,
         )
-        self.phase = Phase.CONNECT
         self.stop = StopRequest()
         self.recording = Recording(
             robot.name,
             driver.virtual,
             driver.joint_names,
             driver.commanded,
-            self.dt,
+            dt,
             meta=(metadata or {}) | {"payload_mass": payload_mass},
         )
-        self.monitor = StateMonitor(
-            driver.joint_names, self.context.joints, self.dt, safety, driver.noisy
-        )
+        self.periods = Periods(self.context.clock, dt)
+        monitor = StateMonitor(driver.joint_names, joints, dt, safety, driver.noisy)
         self.following = FollowingMonitor(self.context)
-        self.output = Output(self.context, self.monitor)
+        self.output = Output(self.context, monitor, self.periods)
         self.readiness = Readiness(self.context, self.output)
+        self._machine = PhaseMachine()
+        self._session = Session(
+            self.output, self.recording, self.stop, on_connect, watchdog, folder
+        )
         self._targets: TargetGenerator | None = None
-        self._folder = folder
-        self._use_watchdog = watchdog
         self._on_event = on_event
-        self._on_connect = on_connect
-        self._k = 0  # this period
-        self._now = 0.0  # its start, s
-        self._phase_start = 0  # first period of the phase
-        self._state: State | None = None  # last one
         self._error: BaseException | None = None  # of other code; raised when the robot is damped
-        self._reported_full_disk = False
+
+    @property
+    def phase(self) -> Phase:
+        """Present phase of the run."""
+        return self._machine.phase
 
     @property
     def plan(self) -> Plan | None:
@@ -161,33 +221,8 @@ class Controller:
         """
         if self.phase is not Phase.CONNECT:
             raise UsageError("a controller runs once; make a new one")
-        driver = self.driver
-        output = self.output
         with ExitStack() as stack:
-            # Left last: during a collection no heartbeat is sent.
-            stack.enter_context(no_garbage_collection())
-            lock = stack.enter_context(sole_publisher(driver.address))
-            stack.callback(lambda: driver.close(hold=output.damping_since is None))
-            driver.connect()
-            self.recording.virtual = driver.virtual
-            output.limits = output.servo_limits()
-            self._on_connect(driver)
-            stack.enter_context(stop_on_signals(self.stop))
-            # Keys count from the consent on.
-            pressed = stack.enter_context(StopKeys(self.stop)) if keys else None
-            joints = self.context.joints
-            gains = {"kp": driver.kp[joints].tolist(), "kd": driver.kd[joints].tolist()}
-            self.recording.meta |= gains | driver.facts
-            if self._folder:
-                self.recording.write_to(self._folder)
-            stack.callback(self.recording.rows.close)
-            spec = driver.watchdog() if self._use_watchdog else None
-            if spec is not None:
-                patience = WATCHDOG_PERIODS * self.dt
-                watchdog = Watchdog(spec, lock, patience, self.config.damp)
-                output.watchdog = watchdog
-                stack.callback(lambda: watchdog.release(output.unconfirmed))
-                watchdog.wait_ready()
+            pressed = self._session.start(stack, keys)
             self._loop(policy or self._policy_of_plan(), pressed)
             self._verify()
         if self._error:
@@ -202,27 +237,21 @@ class Controller:
         """
         if self.plan is None or self.plan.motion is None:
             raise UsageError("there is nothing to play: give a policy, or a plan with a motion")
-        return motion_policy(self.plan.motion, self.dt)
+        return motion_policy(self.plan.motion, self.context.dt)
 
     def _loop(self, policy: Policy, keys: StopKeys | None) -> None:
         """Run periods until the robot has stopped."""
-        start = self.clock.now()
-        due = 0  # the period after the last one; self._k is the next one that is possible
-        self._now = start
-        self.readiness.since = start
+        periods = self.periods
+        periods.begin()
+        self.readiness.since = periods.now
         self._fire(Trigger.CONSENT, "waiting for fresh states")
-        for remark in self.driver.facts.get("remarks", ()):
+        for remark in self.context.driver.facts.get("remarks", ()):
             self._note(remark)
-        self.output.suspended_before = self.clock.suspended()
+        periods.forget_suspends()
         while self.phase is not Phase.STOPPED:
-            self._now = self.clock.wait_until(start + self._k * self.dt)
-            self.output.due = start + due * self.dt
-            self.recording.late.append(self._now - self.output.due)
+            self.recording.late.append(periods.wait())
             self._period(policy, keys)
-            passed = int((self.clock.now() - start) / self.dt) - self._k  # whole periods
-            self.recording.missed += max(passed - 1, 0)
-            due = self._k + 1
-            self._k += max(1, passed)
+            self.recording.missed += periods.end()
 
     def _period(self, policy: Policy, keys: StopKeys | None) -> None:
         """Look for stops, read, check, send, record. After any error in it the robot damps."""
@@ -231,7 +260,6 @@ class Controller:
         try:
             self._look_for_stops(keys)
             state, fault = self._read()
-            self._state = state or self._state
             if fault:
                 self._fail(fault)
             if self.phase is Phase.IDLE and state:
@@ -251,11 +279,12 @@ class Controller:
         """Append a row; sent: target and command, (n) rad each, if there was one."""
         target, ctrl = sent or (None, None)
         rows = self.recording.rows
-        rows.append(Row(self._now, phase.value, target, ctrl, state))
-        if rows.error and not self._reported_full_disk:
-            self._reported_full_disk = True
+        rows.append(Row(self.periods.now, phase.value, target, ctrl, state))
+        if rows.error:
             reason = rows.error.strerror
-            self._note(f"nothing more is recorded ({reason}); what was written is kept")
+            text = f"nothing more is recorded ({reason}); what was written is kept"
+            if not self._has_noted(text):
+                self._note(text)
 
     def _look_for_stops(self, keys: StopKeys | None) -> None:
         """Request a stop if a key was pressed, or if the watchdog could not damp the robot."""
@@ -269,7 +298,7 @@ class Controller:
         """Return the newest state, and the fault that stops the robot now."""
         state = None
         try:
-            state = self.driver.read()
+            state = self.context.driver.read()
         except (DriverError, OSError) as error:
             fault: Fault | None = Fault("driver", str(error))
         else:
@@ -283,8 +312,9 @@ class Controller:
         # While the robot is let go no joint must follow.
         ctrl = None if self.recording.disobedience else self.output.ctrl
         requested = None if ctrl is None else self.output.expected()
-        late = self._now - self.output.due
-        fault = self.monitor.check(self._now, state, ctrl, late, requested)
+        now = self.periods.now
+        late = now - self.periods.due
+        fault = self.output.monitor.check(now, state, ctrl, late, requested)
         if self.phase in MOVING:
             return fault or self.following.check(state, self.output)
         if self.phase is Phase.IDLE and (fault is None or fault.kind != "stop"):
@@ -294,13 +324,14 @@ class Controller:
 
     def _start(self, state: State, policy: Policy) -> None:
         """Leave idle if the robot may be commanded."""
-        first = self.readiness.first_target(self._now, state, policy)
+        first = self.readiness.first_target(self.periods.now, state, policy)
         if isinstance(first, Fault):
             self._fail(first)
         elif first is not None:
             self.output.begin(state.qpos)
             self._targets = TargetGenerator(self.context, self.following, self.plan, state, first)
-            self._fire(Trigger.READY, f"to the first target in {self._targets.path.duration:.1f} s")
+            duration = self._targets.approach.path.duration
+            self._fire(Trigger.READY, f"to the first target in {duration:.1f} s")
 
     def _send(self, state: State, policy: Policy) -> tuple[Array, Array] | None:
         """Send this period's command.
@@ -308,7 +339,8 @@ class Controller:
         Return target and command of all joints, (n) rad; None if none was sent.
         """
         while self._targets and self.phase in COMMANDING:
-            target = self._targets.step(self.phase, self._k - self._phase_start, state, policy)
+            period = self.periods.number - self._machine.begun
+            target = self._targets.step(self.phase, period, state, policy)
             while self._targets.remarks:
                 self._note(self._targets.remarks.pop(0))
             if isinstance(target, PhaseChange):
@@ -323,18 +355,18 @@ class Controller:
         return None
 
     def _damp(self) -> None:
-        left = self.output.damping_left(self._now)
+        left = self.output.damping_left(self.periods.now)
         try:
             self.output.damp(left)
         except Exception as error:  # of any kind: damp again next period, raise it at the end
             if not isinstance(error, DriverError | OSError):
                 self._error = self._error or error
-            if not any(e.text == str(error) for e in self.recording.events):
-                self._note(str(error), "driver", self.clock.now())
+            if not self._has_noted(str(error)):
+                self._note(str(error), "driver", self.context.clock.now())
         if not left:
             text, kind = self.output.confirm()
             fault = self.recording.fault
-            obeys = fault is None or fault.kind != "obedience" or self.driver.reads_back
+            obeys = fault is None or fault.kind != "obedience" or self.context.driver.reads_back
             if not kind and not obeys:
                 text = "let go; the robot did not obey, and cannot say whether it damped"
             self._fire(Trigger.DAMPED, text, kind)
@@ -344,16 +376,16 @@ class Controller:
         if self.output.weight is None or self.recording.fault:
             return
         try:
-            fault = self.driver.verify()
+            fault = self.context.driver.verify()
         except (DriverError, OSError) as error:
             fault = Fault("driver", f"at the end: {error}")
         if fault:
-            self._note(fault.text, fault.kind, self.clock.now())
+            self._note(fault.text, fault.kind, self.context.clock.now())
         elif self.following.share and not self.following.shown.any():
             self.recording.disobedience = (
                 "no joint was told to go far enough to show whether the robot obeys"
             )
-            self._note(f"no data: {self.recording.disobedience}", now=self.clock.now())
+            self._note(f"no data: {self.recording.disobedience}", now=self.context.clock.now())
 
     def _fail(self, fault: Fault) -> None:
         """Stop the robot after a fault, as TRANSITIONS has it."""
@@ -370,21 +402,19 @@ class Controller:
 
     def _fire(self, trigger: Trigger, text: str, kind: str = "") -> None:
         """Make the transition of an event, and record it."""
-        phase, action = TRANSITION_TABLE[self.phase, trigger]
+        action = self._machine.fire(trigger, self.periods.number)
         if action is Action.IGNORE:
             return
-        if action is Action.RAISE:
-            raise AssertionError(f"{trigger.name} in phase {self.phase}: {text}")
-        self.phase = phase
-        self._phase_start = self._k
         if action is Action.DAMP:
-            self.output.begin_damping(self._now, lowers(kind))
-        elif action is Action.GO_BACK and self._targets and self._state:
-            self._targets.go_back(self._state)
+            self.output.begin_damping(self.periods.now, lowers(kind))
         self._note(text, kind)
 
+    def _has_noted(self, text: str) -> bool:
+        return any(event.text == text for event in self.recording.events)
+
     def _note(self, text: str, kind: str = "", now: float | None = None) -> None:
-        event = Event(self._now if now is None else now, self.phase.value, kind, text)
+        time = self.periods.now if now is None else now
+        event = Event(time, self.phase.value, kind, text)
         if spoils_data(kind):
             self.recording.disobedience = self.recording.disobedience or text
         self.recording.events.append(event)

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gaponet.base.arrays import Array
-from gaponet.hw.control.clock import Clock
+from gaponet.hw.control.clock import Clock, Periods
 from gaponet.hw.control.driver import Driver, DriverError, Fault, State
 from gaponet.hw.control.phases import ControlConfig
 from gaponet.hw.control.plan import MAX_START_DRIFT_RAD, Planner, TargetCompensator
@@ -46,34 +46,59 @@ class Context:
     dt: float
 
 
+class Request:
+    """Where the joints are asked to be, (n) rad: targets with their correction, within range and
+    rate, but without the torque limit.
+
+    This is not the last command: that never goes further from a joint than its torque limit
+    allows, and so stays with a joint that does not move.
+    """
+
+    def __init__(self, start: Array) -> None:
+        """Begin where the joints are."""
+        self._start = start
+        self._place = start
+        self._correction = np.zeros(len(start))  # the last one
+
+    def go_to(self, target: Array, corrected: Array, dt: float, limits: Limits) -> Array:
+        """Take a target; return it with its correction, which is bounded in size and rate."""
+        self._correction = limit_delta(corrected - target, self._correction, dt, limits)
+        wanted: Array = target + self._correction
+        step = limits.speed * dt
+        place = np.clip(wanted, self._place - step, self._place + step)
+        self._place = np.clip(place, limits.low, limits.high)
+        return wanted
+
+    def place(self, handed: float) -> Array:
+        """Return where the joints are asked to be, by a share of which the robot is handed over."""
+        place: Array = self._start + handed * (self._place - self._start)
+        return place
+
+
 class Output:
     """Corrects, limits and sends commands to one robot, and damps it.
 
     Arrays are of the commanded joints.
 
     Attributes:
+        monitor: Checks the states; it says whether a period is too late to send a command.
         limits: Limits of commands; final once the driver is connected and `admit` has accepted the
             start.
         watchdog: Gets a heartbeat before each command; None: there is none.
-        due: When the present period should have begun, s.
-        suspended_before: s for which the computer was suspended before the run.
+        periods: Of the run.
         ctrl: The command in force, rad; None before the first one, and while the robot is damped.
         weight: Weight of the last command; None if nothing was ever commanded.
         damping_since: s of the clock; None if the robot was not damped.
         unconfirmed: The robot was damped and did not confirm it.
     """
 
-    def __init__(self, context: Context, monitor: StateMonitor) -> None:
+    def __init__(self, context: Context, monitor: StateMonitor, periods: Periods) -> None:
         self.context = context
         self.monitor = monitor
         self.watchdog: Watchdog | None = None
         self.limits = self.servo_limits()
-        self.due = 0.0
-        self.suspended_before = 0.0
-        at_rest = np.zeros(len(context.joints))
-        self._start = at_rest
-        self._requested = at_rest
-        self._delta = at_rest  # last correction of the target
+        self.periods = periods
+        self._request = Request(np.zeros(len(context.joints)))
         self.ctrl: Array | None = None
         self.weight: float | None = None
         self.damping_since: float | None = None
@@ -92,7 +117,7 @@ class Output:
         """Return a fault if the computer was suspended: time stood still for this process, not for
         the robot.
         """
-        duration = self.context.clock.suspended() - self.suspended_before
+        duration = self.periods.suspended()
         if duration <= MAX_SUSPENDED_S:
             return None
         return Fault(
@@ -130,18 +155,13 @@ class Output:
     def begin(self, qpos: Array) -> None:
         """Take the measured position, (n) rad, as the command in force."""
         at = qpos[self.context.joints]
-        self._start = at
-        self._requested = at
+        self._request = Request(at)
         self.ctrl = at
 
     def expected(self) -> Array:
-        """Return where the joints are requested to be, rad, as far as the robot is handed over.
-
-        This is not the last command: that never goes further from a joint than its torque limit
-        allows, and so stays with a joint that does not move.
-        """
+        """Return where the joints are asked to be, rad, as far as the robot is handed over."""
         handed = (self.weight or 0.0) if self.context.driver.at_end == "hand_over" else 1.0
-        return self._start + handed * (self._requested - self._start)
+        return self._request.place(handed)
 
     def send(self, target: Array, weight: float, state: State) -> tuple[Array, Array] | Fault:
         """Send a target, corrected and limited.
@@ -149,7 +169,6 @@ class Output:
         Return target and command of all joints, or why nothing was sent.
         """
         context = self.context
-        limits = self.limits
         joints = self.context.joints
         full = state.qpos_with(joints, target)
         corrected = full
@@ -157,11 +176,8 @@ class Output:
             corrected = context.compensator.step(full, state.qpos, state.qvel)
         if not np.isfinite(target).all() or not np.isfinite(corrected[joints]).all():
             return Fault("target", "the motion or the model gave something that is not a number")
-        self._delta = limit_delta(corrected[joints] - target, self._delta, context.dt, limits)
-        step = limits.speed * context.dt
-        requested = np.clip(target + self._delta, self._requested - step, self._requested + step)
-        self._requested = np.clip(requested, limits.low, limits.high)
-        command = self._write(target + self._delta, weight, state)
+        wanted = self._request.go_to(target, corrected[joints], context.dt, self.limits)
+        command = self._write(wanted, weight, state)
         return command if isinstance(command, Fault) else (full, command)
 
     def _write(self, ctrl: Array, weight: float, state: State) -> Array | Fault:
@@ -207,7 +223,7 @@ class Output:
 
     def _stood_still(self, now: float) -> Fault | None:
         """Return a fault if this period, the computer or this process stood still until now."""
-        fault = self.monitor.overrun(now - self.due) or self.suspended()
+        fault = self.monitor.overrun(now - self.periods.due) or self.suspended()
         if fault:
             return fault
         if self.watchdog and self.watchdog.fired():

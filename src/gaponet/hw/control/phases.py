@@ -110,6 +110,33 @@ def _transition_table() -> dict[tuple[Phase, Trigger], tuple[Phase, Action]]:
 TRANSITION_TABLE = _transition_table()
 
 
+class PhaseMachine:
+    """The state machine of one run.
+
+    Attributes:
+        phase: The present phase.
+        begun: Its first period.
+    """
+
+    def __init__(self) -> None:
+        self.phase = Phase.CONNECT
+        self.begun = 0
+
+    def fire(self, trigger: Trigger, period: int) -> Action:
+        """Make the transition of an event, and return its action.
+
+        Raises:
+            AssertionError: The event cannot happen in this phase.
+        """
+        phase, action = TRANSITION_TABLE[self.phase, trigger]
+        if action is Action.RAISE:
+            raise AssertionError(f"{trigger.name} in phase {self.phase}")
+        if action is not Action.IGNORE:
+            self.phase = phase
+            self.begun = period
+        return action
+
+
 @dataclass(frozen=True)
 class ControlConfig:
     """Timing of a controller."""

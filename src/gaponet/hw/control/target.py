@@ -153,12 +153,116 @@ class PhaseChange(NamedTuple):
     kind: str = ""
 
 
+class Approach:
+    """The way to the first target, on which the robot is handed over to us.
+
+    Attributes:
+        path: From where the robot was found to about its goal.
+        handed: Weight that was reached.
+    """
+
+    def __init__(
+        self, context: Context, following: FollowingMonitor, path: Trajectory, start: Array
+    ) -> None:
+        """start: Where the robot was found, rad."""
+        self.path = path
+        self.handed = 0.0
+        self._context = context
+        self._following = following
+        self._start = start
+        self._progress = 0.0  # s on the path
+
+    def is_over(self) -> bool:
+        """Return True at the goal and settled, with weight 1."""
+        return self._has_arrived() and self.handed > FULL_WEIGHT
+
+    def _has_arrived(self) -> bool:
+        return self._progress >= self.path.duration + self._context.config.settle
+
+    def step(self, goal: Array) -> Array | Fault:
+        """Return the place in this period on the way to the first target, rad, or why the robot
+        may not be handed over.
+        """
+        distance = np.abs(goal - self._start)
+        is_far = bool(distance.max() >= FAR_RAD)
+        unproven = is_far and self._is_unproven()
+        if unproven and self._has_arrived():
+            return self._following.fault(int(distance.argmax()))
+        place = _on_path(self.path, self._progress, self._start, goal, self._context.joints)
+        self._hand_over(MAX_UNPROVEN_WEIGHT if unproven else 1.0)
+        # While it is handed over joints lag, each in its own way: a far target stands meanwhile.
+        if unproven or not (is_far and self._is_partly_handed_over()):
+            self._progress += self._context.dt
+        return place
+
+    def _is_unproven(self) -> bool:
+        """Return true if joints must show that they follow, and none has."""
+        return bool(self._following.share) and not self._following.shown.any()
+
+    def _is_partly_handed_over(self) -> bool:
+        return self._context.driver.at_end == "hand_over" and self.handed < FULL_WEIGHT
+
+    def _hand_over(self, max_weight: float) -> None:
+        """Raise the weight by a period of the blend, up to max_weight; never lower it."""
+        step = self._context.dt / self._context.config.blend
+        self.handed = max(self.handed, min(self.handed + step, max_weight))
+
+
+class WayBack:
+    """The way back to where the robot was found."""
+
+    def __init__(
+        self,
+        context: Context,
+        path: Trajectory,
+        start: Array,
+        goal: Array,
+        search: Search[Trajectory] | None,
+    ) -> None:
+        """
+        Args:
+            path: It is taken if nothing is searched.
+            start, goal: Its ends, rad.
+            search: For a path that keeps clear; it may take several periods.
+        """
+        self._context = context
+        self._path = path
+        self._start = start
+        self._goal = goal
+        self._search = search
+        self._since = 0  # period of the phase in which it begins
+
+    def find(self, n: int) -> bool:
+        """Go on searching in the n-th period of the phase; return True once there is a path.
+
+        Raises:
+            UsageError: There is none.
+        """
+        if self._search is None:
+            return True
+        path = advance(self._search, self._context.clock, SEARCH_SHARE * self._context.dt)
+        if path is None:
+            return False
+        self._search = None
+        self._since = n
+        self._path = path
+        return True
+
+    def place(self, n: int) -> Array | None:
+        """Return the place in the n-th period of the phase; None at the end."""
+        passed = (n - self._since) * self._context.dt
+        if passed > self._path.duration + self._context.config.settle:
+            return None
+        return _on_path(self._path, passed, self._start, self._goal, self._context.joints)
+
+
 class TargetGenerator:
     """Generates the targets of one run. Arrays are of the commanded joints, rad.
 
     Attributes:
         weight: Weight of the last target: how far the robot is handed over.
-        path: To the first target; later the way back.
+        start: Where the robot was found.
+        approach: To the first target.
         remarks: Sentences for the recording; the controller takes them out.
     """
 
@@ -174,26 +278,22 @@ class TargetGenerator:
         straight.
         """
         self.context = context
-        self.following = following
         self.plan = plan
         self.start = state.qpos[context.joints]
+        self.weight = 0.0
+        self.remarks: list[str] = []
         self._last: Array = self.start
-        self._origin = self.start  # of the way back
         if plan:
-            self.path = plan.approach
+            path = plan.approach
         else:
-            self.path = self._straight(self.start, first[context.joints], state)
+            path = self._straight(self.start, first[context.joints], state)
+        self.approach = Approach(context, following, path, self.start)
+        self._way_back: WayBack | None = None
         self._guard: CollisionGuard | None = None
         if context.planner and plan and plan.motion is None:  # targets are live
             self._guard = CollisionGuard(context.planner, state.qpos)
-        self._search: Search[Trajectory] | None = None  # for the way back
-        self._back_since = 0  # period of blend_out in which the way back began
-        self.weight = 0.0
-        self._handed = 0.0  # weight that was reached before the run
-        self._progress = 0.0  # s on the path to the first target
         self._obstacle = ""
         self._checked_payload = False
-        self.remarks: list[str] = []
 
     def step(
         self, phase: Phase, n: int, state: State, policy: Policy
@@ -204,63 +304,28 @@ class TargetGenerator:
         elif phase is Phase.RUN:
             out = self._run(n, state, policy)
         elif phase is Phase.BLEND_OUT:
-            out = self._blend_out(n)
+            out = self._blend_out(n, state)
         else:
             out = self._release(n)
         if self._guard and isinstance(out, np.ndarray) and np.isfinite(out).all():
             return self._clear(self._guard, out, state)
         return out
 
-    def go_back(self, state: State) -> None:
-        """Begin the way back to the start."""
-        planner = self.context.planner
-        joints = self.context.joints
-        self._origin = self._last
-        retreat = self.plan.retreat if self.plan else None
-        self.path = retreat or self._straight(self._last, self.start, state)
-        if self._guard and planner:
-            self._guard.allow_start_clearance()
-            self._search = None
-            if self.context.dt >= MIN_SEARCH_PERIOD_S:
-                last = state.qpos_with(joints, self._last)
-                start = state.qpos_with(joints, self.start)
-                self._search = planner.back(last, start)
-
     def _blend_in(self, state: State, policy: Policy) -> Array | PhaseChange | Fault:
         """Go to the first target, and raise the weight to 1."""
-        config = self.context.config
-        arrived = self._progress >= self.path.duration + config.settle
-        if arrived and self._handed > FULL_WEIGHT:
+        if self.approach.is_over():
             return PhaseChange(Trigger.ARRIVED, "motion")
         first = policy(0, state)
         self._take_remarks(policy)
         if isinstance(first, Fault):
             return first
         goal = self.start if first is None else first[self.context.joints]
-        distance = np.abs(goal - self.start)
-        is_far = bool(distance.max() >= FAR_RAD)
-        unproven = is_far and self._is_unproven()
-        if unproven and arrived:
-            return self.following.fault(int(distance.argmax()))
-        self._last = self._on_path(self._progress, self.start, goal)
-        self._hand_over(MAX_UNPROVEN_WEIGHT if unproven else 1.0)
-        # While it is handed over joints lag, each in its own way: a far target stands meanwhile.
-        if unproven or not (is_far and self._is_partly_handed_over()):
-            self._progress += self.context.dt
-        return self._last
-
-    def _is_unproven(self) -> bool:
-        """Return true if joints must show that they follow, and none has."""
-        return bool(self.following.share) and not self.following.shown.any()
-
-    def _is_partly_handed_over(self) -> bool:
-        return self.context.driver.at_end == "hand_over" and self._handed < FULL_WEIGHT
-
-    def _hand_over(self, max_weight: float) -> None:
-        """Raise the weight by a period of the blend, up to max_weight; never lower it."""
-        step = self.context.dt / self.context.config.blend
-        self._handed = max(self._handed, min(self._handed + step, max_weight))
-        self.weight = self._handed
+        place = self.approach.step(goal)
+        if isinstance(place, Fault):
+            return place
+        self._last = place
+        self.weight = self.approach.handed
+        return place
 
     def _take_remarks(self, policy: Policy) -> None:
         """Take over what a policy has to remark; only that of live targets has remarks."""
@@ -287,20 +352,19 @@ class TargetGenerator:
             return PhaseChange(Trigger.RETURN, "end of the motion", "end")
         return self._end("end of the motion")
 
-    def _blend_out(self, n: int) -> Array | PhaseChange:
-        if self._search:
-            try:
-                path = advance(self._search, self.context.clock, SEARCH_SHARE * self.context.dt)
-            except UsageError as error:
-                return self._end(f"where it is: {error}")
-            if path is None:
-                return self._last
-            self._search = None
-            self._back_since = n
-            self.path = path
-        passed = (n - self._back_since) * self.context.dt
-        if passed <= self.path.duration + self.context.config.settle:
-            return self._on_path(passed, self._origin, self.start)
+    def _blend_out(self, n: int, state: State) -> Array | PhaseChange:
+        """Go back to the start."""
+        if self._way_back is None:
+            self._way_back = self._begin_way_back(state)
+        try:
+            is_found = self._way_back.find(n)
+        except UsageError as error:
+            return self._end(f"where it is: {error}")
+        if not is_found:
+            return self._last
+        place = self._way_back.place(n)
+        if place is not None:
+            return place
         if self._guard and np.abs(self._last - self.start).max() > MAX_START_DRIFT_RAD:
             return self._end(
                 f"where it is: {self._guard.obstacle} would come too near on the way back"
@@ -308,10 +372,26 @@ class TargetGenerator:
         self._last = self.start
         return self._end("back where it was found")
 
+    def _begin_way_back(self, state: State) -> WayBack:
+        """Return the way from the last target to the start; with live targets it is searched."""
+        planner = self.context.planner
+        joints = self.context.joints
+        retreat = self.plan.retreat if self.plan else None
+        path = retreat or self._straight(self._last, self.start, state)
+        search = None
+        if self._guard and planner:
+            self._guard.allow_start_clearance()
+            if self.context.dt >= MIN_SEARCH_PERIOD_S:
+                last = state.qpos_with(joints, self._last)
+                start = state.qpos_with(joints, self.start)
+                search = planner.back(last, start)
+        return WayBack(self.context, path, self._last, self.start, search)
+
     def _release(self, n: int) -> Array | PhaseChange:
         if self.weight == 0.0:
             return PhaseChange(Trigger.RELEASED, "handed over")
-        self.weight = max(1.0 - n * self.context.dt / self.context.config.damp, 0.0) * self._handed
+        left = max(1.0 - n * self.context.dt / self.context.config.damp, 0.0)
+        self.weight = left * self.approach.handed
         return self._last
 
     def _end(self, text: str) -> PhaseChange:
@@ -336,14 +416,14 @@ class TargetGenerator:
         points = np.stack([state.qpos_with(joints, start), state.qpos_with(joints, goal)])
         return Trajectory.minimum_jerk(points, config.blend_speed, np.inf, config.blend)
 
-    def _on_path(self, passed: float, start: Array, goal: Array) -> Array:
-        """Return the place on the path after some s, with its ends moved to the true start and
-        goal.
-        """
-        joints = self.context.joints
-        share = float(blend(np.array(passed / self.path.duration)))
-        first = self.path.points[0][joints]
-        last = self.path.points[-1][joints]
-        moved_ends: Array = (1 - share) * (start - first) + share * (goal - last)
-        place: Array = self.path.at(passed)[joints] + moved_ends
-        return place
+
+def _on_path(path: Trajectory, passed: float, start: Array, goal: Array, joints: Array) -> Array:
+    """Return the place of the joints on a path after some s, with its ends moved to the true start
+    and goal, rad.
+    """
+    share = float(blend(np.array(passed / path.duration)))
+    first = path.points[0][joints]
+    last = path.points[-1][joints]
+    moved_ends: Array = (1 - share) * (start - first) + share * (goal - last)
+    place: Array = path.at(passed)[joints] + moved_ends
+    return place

@@ -99,11 +99,7 @@ def find_servos(
         _require_sts3215(where, settings_blocks[servo])
     settings = Settings({servo: settings_in(settings_blocks[servo]) for servo in servos})
     running = [running_blocks[servo] for servo in servos]
-    registers = {}
-    for name in GAINS:
-        registers[name] = [settings.stored[servo][name] for servo in servos]
-    for name, register in (LIMITS | {"voltage": reg.PRESENT_VOLTAGE}).items():
-        registers[name] = [register.value_in(reg.RUNNING, block) for block in running]
+    registers = _registers(settings, running)
     stored = {}
     for joint, servo in numbers.items():
         row = {name: settings.stored[servo][name] for name in CALIBRATION}
@@ -128,6 +124,16 @@ def _require_sts3215(where: str, settings: bytes) -> None:
             f"{where} is model {model} in mode {mode}; the driver needs an STS3215 "
             f"({reg.STS3215}) in position mode (0)"
         )
+
+
+def _registers(settings: Settings, running: list[bytes]) -> dict[str, list[int]]:
+    """Return GAINS, LIMITS and voltage by name; one value of each servo."""
+    registers = {}
+    for name in GAINS:
+        registers[name] = [values[name] for values in settings.stored.values()]
+    for name, register in (LIMITS | {"voltage": reg.PRESENT_VOLTAGE}).items():
+        registers[name] = [register.value_in(reg.RUNNING, block) for block in running]
+    return registers
 
 
 def _stiffness(registers: dict[str, list[int]]) -> Array:
