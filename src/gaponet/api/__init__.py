@@ -17,9 +17,9 @@ from gaponet.api.logs import collect as collect
 from gaponet.api.logs import doctor as doctor
 from gaponet.api.logs import excite as excite
 from gaponet.api.logs import import_logs as import_logs
-from gaponet.api.logs import pair as pair
 from gaponet.api.measure import check as check
 from gaponet.api.measure import evaluate as evaluate
 from gaponet.api.measure import gap as gap
+from gaponet.api.measure import pair as pair
 from gaponet.api.measure import replay as replay
 from gaponet.api.robots import networks as networks

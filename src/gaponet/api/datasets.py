@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from gaponet.api.opening import Place, as_dataset
+from gaponet.api.opening import Place, open_dataset
 from gaponet.base.progress import Progress, no_progress
 from gaponet.base.result_table import ResultTable
 from gaponet.data.store import Dataset, Entry
@@ -218,7 +218,7 @@ def draw_dataset(
     """
     from gaponet.report.figures.dataset_figures import write_figures
 
-    data, spec = as_dataset(dataset, robot)
+    data, spec = open_dataset(dataset, robot)
     written, left_out = write_figures(data, spec, Path(out), progress)
     return FiguresResult(written=written, left_out=left_out)
 

@@ -15,10 +15,10 @@ import numpy as np
 from gaponet.api.logs import unit_recordings
 from gaponet.api.opening import (
     Place,
-    as_dataset,
     as_robot,
     as_run,
     entries_of_unit,
+    open_dataset,
     require_commands,
 )
 from gaponet.api.options import IdentifyOptions, TrainOptions
@@ -91,7 +91,7 @@ def identify(
 
     began = time.monotonic()
     folder = Path(out)
-    data, spec = as_dataset(dataset, robot)
+    data, spec = open_dataset(dataset, robot)
     data.require_robot(spec)
     data.require_sequences()
     require_commands(data)
@@ -242,7 +242,7 @@ def identify_torque(
     from gaponet.robot.folder import require_other_folder, save_robot
     from gaponet.sysid.torque_motors import fit_torque_driven
 
-    data, spec = as_dataset(dataset, robot)
+    data, spec = open_dataset(dataset, robot)
     data.require_robot(spec)
     folder = Path(out)
     split = _split_or_all(data)
@@ -386,7 +386,7 @@ def train(
     folder = Path(out)
     shared: dict[str, Any] = {}  # what the trainings of several networks compute once
     with lock_folder(folder, "run"):
-        data, spec = as_dataset(dataset, robot)
+        data, spec = open_dataset(dataset, robot)
         require_commands(data)
         entries = used_recordings(data, training_splits(data, config, options.holdout_units))
         gate = pass_gate(data, entries, spec, despite_errors=options.despite_errors)
@@ -469,7 +469,7 @@ def adapt_model(
         "an adaptation",
         f"copy it with gaponet export {folder.name} --to onnx --out FOLDER and adapt the copy",
     )
-    data, spec = as_dataset(dataset, robot, folder)
+    data, spec = open_dataset(dataset, robot, folder)
     data.require_robot(spec)
     model = GapModel.load(folder)
     simulator = corrected_robot(folder, spec)

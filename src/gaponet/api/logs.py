@@ -1,4 +1,4 @@
-"""From a robot, real or virtual, to a dataset: excite, collect, import_logs, doctor, pair."""
+"""From a robot, real or virtual, to a dataset: excite, collect, import_logs, doctor."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from gaponet.api.opening import Place, as_dataset, as_robot, entries_of_unit
+from gaponet.api.opening import Place, as_robot, entries_of_unit, open_dataset
 from gaponet.api.options import CollectOptions, ExciteOptions, ImportOptions
-from gaponet.api.results import ExciteResult, PairResult, Prediction
+from gaponet.api.results import ExciteResult, Prediction
 from gaponet.base.errors import DatasetError, UsageError
-from gaponet.base.progress import Progress, no_progress, with_note
+from gaponet.base.progress import Progress, no_progress
 from gaponet.data.store import Dataset, Entry
 from gaponet.robot.folder import MOVE_STORED_ROBOT
 from gaponet.robot.spec import RobotSpec
@@ -165,7 +165,7 @@ def doctor(
     from gaponet.data.doctor import DoctorResult
     from gaponet.sim.dynamics import dynamics_of, gravity_of
 
-    data, spec = as_dataset(dataset, robot)
+    data, spec = open_dataset(dataset, robot)
     return DoctorResult.of(
         data,
         spec,
@@ -191,37 +191,9 @@ def draw_findings(
     from gaponet.base.files import lock_folder
     from gaponet.report.figures import dataset_figures
 
-    data, spec = as_dataset(dataset, robot)
+    data, spec = open_dataset(dataset, robot)
     with lock_folder(Path(out), "figures"):
         return dataset_figures.draw_findings(data, spec, list(diagnosis.findings), Path(out))
-
-
-def pair(
-    dataset: Dataset | Place,
-    *,
-    robot: RobotSpec | Place | None = None,
-    executor: str | Executor = "local",
-    progress: Progress = no_progress,
-) -> PairResult:
-    """Simulate the commands of every recording in the nominal simulator and store the result
-    beside it.
-
-    Recordings that have a paired simulation keep it.
-
-    Args:
-        dataset: Recordings.
-        robot: Another robot than the one that the dataset keeps.
-        executor: Where they are simulated: local, ray, ray:ADDRESS (docs/install.md), or one of
-            concurrent.futures.
-
-    Raises:
-        DatasetError, JointMismatchError: The folder is no dataset, or one of another robot.
-    """
-    from gaponet.sim.replay import pair_dataset
-
-    data, spec = as_dataset(dataset, robot)
-    made = pair_dataset(data, spec, with_note(progress, "control steps"), executor=executor)
-    return PairResult(dataset=data, simulated=made, present=len(data) - made)
 
 
 def collect(
@@ -421,7 +393,7 @@ def unit_recordings(
                 payload_mass=payload_mass,
             ).dataset
         else:
-            data, _ = as_dataset(source, robot)
+            data, _ = open_dataset(source, robot)
         data.require_robot(robot)
         unit, entries = entries_of_unit(data, unit, motions)
         if payload_mass is not None:

@@ -1,4 +1,4 @@
-"""Errors of simulators against recordings: gap, evaluate, check, replay."""
+"""Simulators beside recordings: pair, gap, evaluate, check, replay."""
 
 from __future__ import annotations
 
@@ -8,20 +8,50 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from gaponet.api.logs import import_logs, pair, unit_recordings
-from gaponet.api.opening import Place, as_dataset, as_robot, as_run, require_commands
+from gaponet.api.logs import import_logs, unit_recordings
+from gaponet.api.opening import Place, as_robot, as_run, open_dataset, require_commands
 from gaponet.api.options import ImportOptions
-from gaponet.api.results import CheckResult, EvalResult, GapResult, ReplayResult
+from gaponet.api.results import CheckResult, EvalResult, GapResult, PairResult, ReplayResult
 from gaponet.base.errors import UsageError
 from gaponet.base.files import FOLDER_MARKER, write_text
-from gaponet.base.progress import Progress, no_progress
+from gaponet.base.progress import Progress, no_progress, with_note
 from gaponet.data.store import Dataset
 from gaponet.nn.packaged_networks import is_packaged, named_folder
 from gaponet.robot.spec import RobotSpec, load_robot
 
 if TYPE_CHECKING:
+    from concurrent.futures import Executor
+
     from gaponet.base.arrays import Array
     from gaponet.nn.artifact import GapModel
+
+
+def pair(
+    dataset: Dataset | Place,
+    *,
+    robot: RobotSpec | Place | None = None,
+    executor: str | Executor = "local",
+    progress: Progress = no_progress,
+) -> PairResult:
+    """Simulate the commands of every recording in the nominal simulator and store the result
+    beside it.
+
+    Recordings that have a paired simulation keep it.
+
+    Args:
+        dataset: Recordings.
+        robot: Another robot than the one that the dataset keeps.
+        executor: Where they are simulated: local, ray, ray:ADDRESS (docs/install.md), or one of
+            concurrent.futures.
+
+    Raises:
+        DatasetError, JointMismatchError: The folder is no dataset, or one of another robot.
+    """
+    from gaponet.sim.replay import pair_dataset
+
+    data, spec = open_dataset(dataset, robot)
+    made = pair_dataset(data, spec, with_note(progress, "control steps"), executor=executor)
+    return PairResult(dataset=data, simulated=made, present=len(data) - made)
 
 
 def gap(
@@ -38,8 +68,8 @@ def gap(
 
     Args:
         dataset: Recordings; those without a paired simulation are simulated first.
-        robot: Another robot than the one that the dataset keeps. An identified one is measured as
-            `run` is.
+        robot: Another robot than the one that the dataset keeps. If the robot is identified, it is
+            measured as `run` is.
         motions: Only these.
         run: Robot folder that `identify` wrote, a run of `train`, or a network of the package by
             name. The result then says how much each identified cause and the model reduce the
@@ -51,10 +81,10 @@ def gap(
     from gaponet.sim.metrics import Run, summary
     from gaponet.sim.model import model_hash
 
-    spec = None if robot is None else as_robot(robot)
-    if run is not None or (spec is not None and spec.is_identified):
-        return _gap_by_cause(dataset, spec, None if run is None else as_run(run), motions, progress)
-    data, spec = as_dataset(dataset, spec)
+    folder = None if run is None else as_run(run)
+    data, spec = open_dataset(dataset, robot, folder)
+    if folder is not None or spec.is_identified:
+        return _gap_by_cause(data, spec, folder, motions, progress)
     require_commands(data)
     pair(data, robot=spec, executor=executor, progress=progress)
     entries = data.select(motions)
@@ -82,8 +112,8 @@ def gap(
 
 
 def _gap_by_cause(
-    dataset: Dataset | Place,
-    robot: RobotSpec | None,
+    data: Dataset,
+    spec: RobotSpec,
     folder: Path | None,
     motions: tuple[str, ...],
     progress: Progress,
@@ -92,10 +122,10 @@ def _gap_by_cause(
     from gaponet.evaluation.gap import gap_by_step
     from gaponet.report.figures.evaluation import write_gap
 
-    data, spec = as_dataset(dataset, robot, folder)
-    candidate = (
-        Candidate(spec.folder, spec, None) if folder is None else Candidate.load(folder, spec)
-    )
+    if folder is None:
+        candidate = Candidate(spec.folder, spec, None)
+    else:
+        candidate = Candidate.load(folder, spec)
     table = gap_by_step(candidate, data, motions, progress)
     if _may_be_written(candidate.folder, given=folder is not None):
         write_gap(table, candidate.folder)
@@ -148,7 +178,7 @@ def evaluate(
     from gaponet.sim.model import model_hash
 
     folder = as_run(run)
-    data, spec = as_dataset(dataset, robot, folder)
+    data, spec = open_dataset(dataset, robot, folder)
     target = None
     own = spec
     if robot is not None and (is_robot(folder) or has_stored_robot(folder)):

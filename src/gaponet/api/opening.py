@@ -11,6 +11,7 @@ from gaponet.base.errors import UsageError
 from gaponet.data.store import Dataset, Entry
 from gaponet.nn.packaged_networks import named_folder
 from gaponet.robot.spec import RobotSpec, load_robot
+from gaponet.sim.dataset_robot import open_dataset as open_dataset
 
 if TYPE_CHECKING:
     from gaponet.data.sequence import Sequence
@@ -32,15 +33,6 @@ def as_run(run: GapModel | Place) -> Path:
     if isinstance(run, (str, Path)):
         return named_folder(run)
     return run.path.parent if run.path.name == "model" else run.path
-
-
-def as_dataset(
-    dataset: Dataset | Place, robot: RobotSpec | Place | None, run: Path | None = None
-) -> tuple[Dataset, RobotSpec]:
-    """Return a dataset and its robot, or the robot that is given."""
-    from gaponet.sim.dataset_robot import open_dataset
-
-    return open_dataset(dataset, robot, run)
 
 
 def entries_of_unit(data: Dataset, unit: str, motions: tuple[str, ...]) -> tuple[str, list[Entry]]:

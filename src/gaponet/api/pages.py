@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gaponet.api.opening import Place, as_dataset, as_run
+from gaponet.api.opening import Place, as_run, open_dataset
 from gaponet.base.errors import UsageError
 from gaponet.base.progress import Progress, no_progress
 from gaponet.robot.folder import load_stored_robot
@@ -305,7 +305,7 @@ def compare(
     from gaponet.report.view.side_by_side import Clip, select_entry, side_by_side
 
     models = tuple(as_run(folder) for folder in options.model)
-    data, spec = as_dataset(dataset, robot, models[0] if models else None)
+    data, spec = open_dataset(dataset, robot, models[0] if models else None)
     candidates = (*models, spec.folder) if spec.is_identified else models
     entry = select_entry(data, candidates, options.motion, options.unit, options.payload_mass)
     shown = side_by_side(data, entry, spec, models, progress)

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from gaponet.api.opening import Place, as_dataset
+from gaponet.api.opening import Place, open_dataset
 from gaponet.base.progress import Running
 from gaponet.data.store import Dataset
 from gaponet.experiments.paper.options import DEMO as DEMO
@@ -60,5 +60,5 @@ def paper_experiment(
     """
     from gaponet.experiments.paper.experiment import run_paper_experiment
 
-    data, robot = as_dataset(dataset, options.robot)
+    data, robot = open_dataset(dataset, options.robot)
     return run_paper_experiment(data, robot, Path(out), options, open_bar, open_bars)

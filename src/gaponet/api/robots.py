@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from gaponet.api.opening import Place, as_dataset, as_robot
+from gaponet.api.opening import Place, as_robot, open_dataset
 from gaponet.base.errors import UsageError
 from gaponet.robot.card import ROBOT_HEADINGS, RobotCard, robot_cards
 from gaponet.robot.spec import RobotSpec, ServoType, load_robot, packaged_robots, servo_table
@@ -354,7 +354,7 @@ def check_robot(
     spec = as_robot(robot)
     postures: Array | None = None
     if data is not None:
-        recordings, _ = as_dataset(data, spec)
+        recordings, _ = open_dataset(data, spec)
         recorded = sorted({entry.meta.payload_mass for entry in recordings.entries})
         payloads = payloads or tuple(recorded)
         rows = np.concatenate([recordings.read(entry).qpos for entry in recordings.entries])

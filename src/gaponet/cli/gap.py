@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from gaponet import api
-from gaponet.api.opening import as_dataset, as_run
+from gaponet.api.opening import as_run
 from gaponet.base.executor import LOCAL
 from gaponet.base.progress import progress_bar
 from gaponet.cli.options import Data, Json, Motions, Robot, like
@@ -34,25 +34,24 @@ def gap(
     error are shown.
     """
     screen = Out(json)
-    run = None if run is None else as_run(run)
-    data, spec = as_dataset(dataset, robot, run)
     with progress_bar("gap") as update:
         result = api.gap(
-            data, robot=spec, motions=motions, run=run, executor=executor, progress=update
+            dataset, robot=robot, motions=motions, run=run, executor=executor, progress=update
         )
-    folder = run
-    if folder is None:
-        folder = spec.folder if robot is None else Path(robot)
-    if result.by_cause:
-        show_steps(screen, result.table)
-        if (folder / "gap.png").is_file():
-            screen.say(f"figure: {folder / 'gap.png'}")
-    else:
+    candidate: Path | None = None  # whose causes are shown
+    if result.by_cause and run is not None:
+        candidate = as_run(run)
+    elif result.by_cause and robot is not None:
+        candidate = Path(robot)
+    if candidate is None:
         show_methods(screen, result.to_dict())
+    else:
+        show_steps(screen, result.table)
+        if (candidate / "gap.png").is_file():
+            screen.say(f"figure: {candidate / 'gap.png'}")
     baselines = result.table["baselines"]
     count = len(result.methods["nominal"]["by_independent_motion"])
     show_baselines(screen, baselines, count)
-    candidate = folder if result.by_cause else None
     show_verdict(screen, result.methods, str(dataset), candidate, baselines)
     screen.result(result.to_dict())
 

@@ -8,7 +8,7 @@ from typing import Annotated
 import tyro
 
 from gaponet import api
-from gaponet.api.opening import as_dataset, driven_by_torque, require_torque_for_current
+from gaponet.api.opening import driven_by_torque, open_dataset, require_torque_for_current
 from gaponet.api.options import IdentifyOptions
 from gaponet.api.results import IdentifyResult, TorqueResult
 from gaponet.base.progress import progress_bar
@@ -47,7 +47,7 @@ def identify(
         details: List the parameters of every joint that these logs do not determine.
     """
     screen = Out(json)
-    data, spec = as_dataset(dataset, robot)
+    data, spec = open_dataset(dataset, robot)
     made: IdentifyResult | TorqueResult
     if current:
         require_torque_for_current(data)

@@ -12,7 +12,7 @@ import tyro
 
 from gaponet import api
 from gaponet.api import logs as recordings
-from gaponet.api.opening import as_dataset, driven_by_torque
+from gaponet.api.opening import driven_by_torque, open_dataset
 from gaponet.api.options import ImportOptions, parse_joint_map
 from gaponet.base.errors import UsageError
 from gaponet.base.progress import progress_bar
@@ -121,7 +121,7 @@ def doctor(
         figures: Folder for a picture of each finding.
     """
     screen = Out(json)
-    data, spec = as_dataset(dataset, robot)
+    data, spec = open_dataset(dataset, robot)
     with progress_bar("examining") as update:
         diagnosis = api.doctor(data, robot=spec, progress=update)
     screen.say(f", {diagnosis.inventory(data)}", spec.name)
