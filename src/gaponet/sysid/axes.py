@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from collections.abc import Sequence as ListOf
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -25,12 +26,14 @@ Values = dict[str, Array]  # field → (…, n) of the operated joints
 
 CLASSIC = ("kp", "damping", "frictionloss", "armature", "offset", "delay")  # that every fit has
 WARM = TERMS["temperature"]
+WARM_SLOPES = ("friction_per_kelvin", "damping_per_kelvin")  # of WARM; the temperature is stated
 MIN_PER_KELVIN = 1e-3  # 1/K, of friction by temperature and of damping; less counts as none
 START_DELAY_S = 0.02  # a start without delay has no slope over it
 MIN_STEPS_PER_RADIAN = 5.0  # physics steps in a radian of the stiffest oscillation of a start
 MAX_KP_LOG_CHANGE = 5.0
 LARGE_KP_LOG_CHANGE = 0.2
 MAX_ARMATURE_TIME_S = 0.3
+MIN_ARMATURE_OVER_KP = 1e-6  # s², of a start
 MAX_ON_AXIS = {f.name: f.bounds[1] for f in SERVO_FIELDS.values() if f.bounds}
 MIN_EXCITATION_RAD = 0.01  # commands that differ by less do not excite a joint
 # What is fitted of an unexcited joint, as others move it.
@@ -49,8 +52,8 @@ def to_axis(field: str, value: Array, kp: Array) -> Array:
     """Return values of a field on its axis."""
     axis = SERVO_FIELDS[field].axis
     if axis == "inverse":
-        inverse = np.divide(1.0, value, out=np.zeros_like(value, float), where=value > 0)
-        return np.asarray(inverse)
+        none = np.zeros_like(value, float)
+        return np.asarray(np.divide(1.0, value, out=none, where=value > 0))
     if axis == "log":
         return np.asarray(np.log(np.maximum(value, 1e-9)))
     if axis == "over kp":
@@ -63,17 +66,17 @@ def from_axis(x: dict[str, Array], kp: Array | None = None) -> Values:
     if "kp" in x:
         kp = np.exp(x["kp"])
     values = {}
-    for field, v in x.items():
+    for field, on_axis in x.items():
         axis = SERVO_FIELDS[field].axis
         if axis == "log":
-            values[field] = np.exp(v)
+            values[field] = np.exp(on_axis)
         elif axis == "inverse":
-            none = np.zeros_like(v, float)
-            values[field] = np.divide(1.0, v, out=none, where=v > MIN_INVERSE)
+            none = np.zeros_like(on_axis, float)
+            values[field] = np.divide(1.0, on_axis, out=none, where=on_axis > MIN_INVERSE)
         elif axis == "over kp":
-            values[field] = v * kp
+            values[field] = on_axis * kp
         else:
-            values[field] = v
+            values[field] = on_axis
     return values
 
 
@@ -109,8 +112,10 @@ def identified_joints(robot: RobotSpec) -> set[str]:
     """
     now = first_values(robot)
     then = first_values(robot.before_identification)
-    moved = np.any([~np.isclose(now[f], then[f], rtol=1e-3, atol=1e-6) for f in CLASSIC], axis=0)
-    return {joint for joint, by in zip(robot.operated, moved, strict=True) if by}
+    has_changed = np.zeros(len(robot.operated), bool)
+    for field in CLASSIC:
+        has_changed |= ~np.isclose(now[field], then[field], rtol=1e-3, atol=1e-6)
+    return {joint for joint, changed in zip(robot.operated, has_changed, strict=True) if changed}
 
 
 def with_values(robot: RobotSpec, values: Mapping[str, Array]) -> RobotSpec:
@@ -183,14 +188,27 @@ class Changes:
 
         A bound of zero is met exactly.
         """
-        changes = dict(zip(self.fields, np.moveaxis(x * self._large, -1, 0), strict=True))
-        values = {f: np.broadcast_to(v, x.shape[:-1]) for f, v in self._first.items()}
-        for field, change in changes.items():
+        values = {}
+        for field, own in self._first.items():
+            values[field] = np.broadcast_to(own, x.shape[:-1])
+        changes = np.moveaxis(x * self._large, -1, 0)  # (P, …, n)
+        for field, change in zip(self.fields, changes, strict=True):
             own = self._first[field]
-            values[field] = own * np.exp(change) if field == "kp" else own + change
+            if field == "kp":
+                values[field] = own * np.exp(change)
+            else:
+                values[field] = own + change
             if field in ("armature", "frictionloss", "delay"):
                 values[field] = np.maximum(values[field], 0.0)
         return values
+
+
+class Limits(NamedTuple):
+    """Limits of a field on its axis, (n,) each."""
+
+    low: Array
+    high: Array
+    large_change: Array
 
 
 class Bounds:
@@ -205,18 +223,18 @@ class Bounds:
         kd: The servos' kd, (n,) N·m·s/rad. Damping may take from it, stated or not: firmware
             filters the velocity.
         unexcited: Joints that no command moves, (n,) bool.
-        limits: Field → lowest, highest, a large change on its axis, (n,) each.
+        limits: Field → its limits.
         guess: Field of the servo model → value from which its search begins, (n,) SI.
     """
 
     def __init__(self, robot: RobotSpec, sequences: ListOf[Sequence]) -> None:
         op = robot.operated_index
-        self.n = len(robot.operated)
-        self._joints = robot.operated
-        self.kd = robot.servo.kd[op]
-        model = build_model(robot.with_table(None))
         kp = robot.servo.kp[op]
-        limit = robot.servo.effort_limit[op]
+        effort_limit = robot.servo.effort_limit[op]
+        model = build_model(robot.with_table(None))
+        self._joints = robot.operated
+        self.n = len(robot.operated)
+        self.kd = robot.servo.kd[op]
         self.first = first_values(robot)
         self.stated = all(s.meta.recorded_gains[0] is not None for s in sequences)
         excitation = np.max([np.ptp(s.ctrl[:, op], axis=0) for s in sequences], axis=0)
@@ -224,17 +242,15 @@ class Bounds:
         self.inertia = (model.dof_M0 - model.dof_armature)[op]
         self.start = self._start(kp, model.opt.timestep)
         slow = 1 / greatest_speeds(sequences, robot)  # s/rad
-        encoder_steps = np.zeros(self.n)
-        for i, j in enumerate(op):
-            encoder_steps[i] = encoder_step([s.qpos[:, j] for s in sequences])
+        encoder_steps = _encoder_steps(sequences, op)
         varies = temperature_varies(sequences, robot)
-        self.limits = self._limits(kp, limit, slow, encoder_steps, varies)
-        self.guess = self._guess(kp, varies) | {
-            "effort_limit": 0.6 * limit,  # one that is too high has no slope
-            "encoder_step": encoder_steps,
-            "no_load_speed": np.where(self.unexcited, 0.0, 2 / slow),
-            WARM[2]: np.nan_to_num(recorded_temperatures(sequences, op)).mean(axis=0).round(),
-        }
+        self.limits = self._limits(kp, effort_limit, slow, encoder_steps, varies)
+        temperature = np.nan_to_num(recorded_temperatures(sequences, op)).mean(axis=0)  # °C
+        self.guess = self._guess(kp, varies)
+        self.guess["effort_limit"] = 0.6 * effort_limit  # one that is too high has no slope
+        self.guess["encoder_step"] = encoder_steps
+        self.guess["no_load_speed"] = np.where(self.unexcited, 0.0, 2 / slow)
+        self.guess["friction_temperature"] = temperature.round()
 
     def _start(self, kp: Array, timestep: float) -> Values:
         """Return the start of a search: the own values, but for delay and armature of joints that
@@ -243,8 +259,9 @@ class Bounds:
         delay = np.maximum(self.first["delay"], START_DELAY_S)
         least_inertia = kp * (MIN_STEPS_PER_RADIAN * timestep) ** 2
         lacking = least_inertia - self.inertia
-        armature = np.maximum(np.maximum(self.first["armature"], 1e-6 * kp), lacking)
-        start = {f: self.first[f] for f in CLASSIC}
+        armature = np.maximum(self.first["armature"], MIN_ARMATURE_OVER_KP * kp)
+        armature = np.maximum(armature, lacking)
+        start = {field: self.first[field] for field in CLASSIC}
         start["delay"] = np.where(self.unexcited, self.first["delay"], delay)
         start["armature"] = np.where(self.unexcited, self.first["armature"], armature)
         for field in (*SERVO_TERMS, *WARM):
@@ -254,8 +271,8 @@ class Bounds:
 
     def _limits(
         self, kp: Array, effort_limit: Array, slow: Array, encoder_steps: Array, varies: Array
-    ) -> dict[str, tuple[Array, Array, Array]]:
-        """Return field → lowest, highest and a large change on its axis, (n,) each.
+    ) -> dict[str, Limits]:
+        """Return field → its limits.
 
         Bounds that do not depend on the robot are those of SERVO_FIELDS.
 
@@ -267,25 +284,26 @@ class Bounds:
         """
         one = np.ones(self.n)
         limits = {}
-        for f in SERVO_FIELDS.values():
-            if f.bounds:
-                low, high, large = f.bounds
-                limits[f.name] = low * one, high * one, large * one
-        limits["kp"] = np.log(kp) - MAX_KP_LOG_CHANGE, np.log(kp) + MAX_KP_LOG_CHANGE, 0.3 * one
-        own_armature = np.maximum(self.start["armature"] / kp, 1e-6)
+        for field in SERVO_FIELDS.values():
+            if field.bounds:
+                low, high, large_change = field.bounds
+                limits[field.name] = Limits(low * one, high * one, large_change * one)
+        log_kp = np.log(kp)
+        limits["kp"] = Limits(log_kp - MAX_KP_LOG_CHANGE, log_kp + MAX_KP_LOG_CHANGE, 0.3 * one)
+        own_armature = np.maximum(self.start["armature"] / kp, MIN_ARMATURE_OVER_KP)
         large_armature = np.clip(0.4 * own_armature, 1e-5, 1e-3)
-        limits["armature"] = 0 * one, MAX_ARMATURE_TIME_S**2 * one, large_armature
-        limits["effort_limit"] = (
-            0.05 * effort_limit / kp,
-            5 * effort_limit / kp,
-            0.2 * effort_limit / kp,
+        limits["armature"] = Limits(0 * one, MAX_ARMATURE_TIME_S**2 * one, large_armature)
+        limits["effort_limit"] = Limits(
+            0.05 * effort_limit / kp, 5 * effort_limit / kp, 0.2 * effort_limit / kp
         )
-        limits["encoder_step"] = encoder_steps, encoder_steps, one
-        limits["no_load_speed"] = 0 * one, 2 * slow, LARGE_LINE_CHANGE * slow
-        for name in WARM[:2]:
-            lowest, highest, change = limits[name]
+        limits["encoder_step"] = Limits(encoder_steps, encoder_steps, one)
+        limits["no_load_speed"] = Limits(0 * one, 2 * slow, LARGE_LINE_CHANGE * slow)
+        for name in WARM_SLOPES:
+            usual = limits[name]
             own = to_axis(name, self.first[name], kp)
-            limits[name] = np.where(varies, lowest, own), np.where(varies, highest, own), change
+            low = np.where(varies, usual.low, own)
+            high = np.where(varies, usual.high, own)
+            limits[name] = Limits(low, high, usual.large_change)
         return limits
 
     def _guess(self, kp: Array, varies: Array) -> Values:
@@ -293,27 +311,30 @@ class Bounds:
         as of `_limits`.
         """
         guess = {}
-        for f in SERVO_FIELDS.values():
-            if f.guess is None:
+        for field in SERVO_FIELDS.values():
+            if field.guess is None:
                 continue
-            guess[f.name] = np.full(self.n, f.guess)
-            if f.name in WARM:
-                guess[f.name] = np.where(varies, guess[f.name], 0.0)
+            guess[field.name] = np.full(self.n, field.guess)
+            if field.name in WARM:
+                guess[field.name] = np.where(varies, guess[field.name], 0.0)
         return from_axis(guess, kp)
 
     def visible(self, field: str, values: Values) -> Array:
         """Return a field of values (n,), 0 where it is a torque-speed line of less than MIN_LINE,
         or of friction and damping that change by less than MIN_PER_KELVIN.
         """
-        if field == WARM[0]:
-            total = np.maximum(values["damping"] + self.kd, 0.0)
-            slow = np.abs(values[WARM[1]]) < MIN_PER_KELVIN * total
-            return np.where(slow & (np.abs(values[field]) < MIN_PER_KELVIN), 0.0, values[field])
-        if SERVO_FIELDS[field].axis != "inverse":
-            return values[field]
-        least = MIN_LINE / LARGE_LINE_CHANGE * self.limits[field][2]
-        line = to_axis(field, values[field], values["kp"])
-        return np.where(line < least, 0.0, values[field])
+        value = values[field]
+        if field == "friction_per_kelvin":
+            total_damping = np.maximum(values["damping"] + self.kd, 0.0)
+            damping_change = np.abs(values["damping_per_kelvin"])
+            damping_stays = damping_change < MIN_PER_KELVIN * total_damping
+            friction_stays = np.abs(value) < MIN_PER_KELVIN
+            return np.where(damping_stays & friction_stays, 0.0, value)
+        if SERVO_FIELDS[field].axis == "inverse":
+            least = MIN_LINE / LARGE_LINE_CHANGE * self.limits[field].large_change
+            line = to_axis(field, value, values["kp"])
+            return np.where(line < least, 0.0, value)
+        return value
 
     def warnings(self, values: Values, names: ListOf[str]) -> tuple[str, ...]:
         """Return a sentence for each field of values (n,) at its bound; no friction, armature or
@@ -323,18 +344,32 @@ class Bounds:
         x = axes.normalize(values)
         warnings = []
         for i, joint in enumerate(self._joints):
-            for k, f in enumerate(names):
-                low = axes.low[i, k]
-                high = axes.high[i, k]
-                without = f == "stribeck_speed" and not values["stribeck"][i]
-                if low == high or without:
-                    continue
-                zero_is_ordinary = f != "damping" and low == 0
-                if x[i, k] - low < BOUND_TOLERANCE and not zero_is_ordinary:
-                    warnings.append(_at_bound(joint, f, values[f][i], "least"))
-                elif high - x[i, k] < BOUND_TOLERANCE:
-                    warnings.append(_at_bound(joint, f, values[f][i], "most"))
+            for k, field in enumerate(names):
+                has_no_effect = field == "stribeck_speed" and not values["stribeck"][i]
+                end = _end_of_range(field, x[i, k], axes.low[i, k], axes.high[i, k])
+                if end and not has_no_effect:
+                    warnings.append(_at_bound(joint, field, values[field][i], end))
         return tuple(warnings)
+
+
+def _encoder_steps(sequences: ListOf[Sequence], joints: Array) -> Array:
+    """Return the steps of the encoders of joints, by number, (n,) rad; 0 where none is seen."""
+    steps = [encoder_step([s.qpos[:, joint] for s in sequences]) for joint in joints]
+    return np.array(steps, float)
+
+
+def _end_of_range(field: str, x: float, low: float, high: float) -> Literal["", "least", "most"]:
+    """Return at which end of its range a field is, in large changes; nothing where it is fixed or
+    at a zero that is ordinary.
+    """
+    if low == high:
+        return ""
+    zero_is_ordinary = field != "damping" and low == 0
+    if x - low < BOUND_TOLERANCE and not zero_is_ordinary:
+        return "least"
+    if high - x < BOUND_TOLERANCE:
+        return "most"
+    return ""
 
 
 def _at_bound(joint: str, field: str, value: float, end: str) -> str:
@@ -363,26 +398,32 @@ class Axes:
         low, high, self.unit = np.stack(limits, axis=-1)  # (n, P) each
         self.low = low / self.unit
         self.high = high / self.unit
-        here = self._unclipped(rest)
-        fixed = bounds.unexcited[:, None] & ~np.isin(self.names, UNEXCITED_FIELDS)
-        self.low = np.where(fixed, here, self.low)
-        self.high = np.where(fixed, here, self.high)
+        own = self._unclipped(rest)
+        is_fixed = bounds.unexcited[:, None] & ~np.isin(self.names, UNEXCITED_FIELDS)
+        self.low = np.where(is_fixed, own, self.low)
+        self.high = np.where(is_fixed, own, self.high)
 
     def normalize(self, values: Values) -> Array:
         """Return values (…, n) on the axes, inside the bounds."""
         return np.asarray(np.clip(self._unclipped(values), self.low, self.high))
 
     def _unclipped(self, values: Values) -> Array:
-        own = {f: values[f] for f in self.names}
-        if "damping" in own:
-            own["damping"] = own["damping"] + self._kd_slack
-        on_axes = [to_axis(f, x, values["kp"]) for f, x in own.items()]
+        """Return values (…, n) on the axes."""
+        on_axes = []
+        for field in self.names:
+            value = values[field]
+            if field == "damping":
+                value = value + self._kd_slack
+            on_axes.append(to_axis(field, value, values["kp"]))
         return np.asarray(np.stack(on_axes, axis=-1) / self.unit)
 
     def values(self, x: Array) -> Values:
         """Return values of x on the axes; fields that are not searched stay."""
-        own = dict(zip(self.names, np.moveaxis(x * self.unit, -1, 0), strict=True))
-        values = {f: np.broadcast_to(v, x.shape[:-1]) for f, v in self.rest.items()}
+        values = {}
+        for field, value in self.rest.items():
+            values[field] = np.broadcast_to(value, x.shape[:-1])
+        on_axes = np.moveaxis(x * self.unit, -1, 0)  # (P, …, n)
+        own = dict(zip(self.names, on_axes, strict=True))
         values |= from_axis(own, values["kp"])
         if "damping" in own:
             values["damping"] = values["damping"] - self._kd_slack
