@@ -34,7 +34,7 @@ from gaponet.base.text import format_uncertainty
 from gaponet.data.formats import ReadOptions, read_logs
 from gaponet.data.log import Log
 from gaponet.robot.spec import load_robot
-from gaponet.sysid.torque import Gains, servo_gains
+from gaponet.sysid.steps.torque_fit import Gains, servo_gains
 
 MIN_MOVE_RAD = 0.05  # of a command that moves a joint
 MAX_END_DIFFERENCE = 0.05  # of two commands that count as one, over the range of a joint's commands

@@ -17,13 +17,14 @@ from gaponet.sysid.axes import Bounds
 from gaponet.sysid.identify import identify
 from gaponet.sysid.motion_limits import with_stops
 from gaponet.sysid.options import IdentifyOptions
-from gaponet.sysid.problem import KinematicChains, contradicted_gains
+from gaponet.sysid.problem import KinematicChains
 from gaponet.sysid.robot_rollouts import cut
 from gaponet.sysid.search_progress import (
     FIRST_ROBOT_ITERATIONS,
     ROBOT_ITERATIONS,
     SearchProgress,
 )
+from gaponet.sysid.standard_errors import contradicted_gains
 from gaponet.sysid.steps.classic import robot_candidates
 from gaponet.sysid.steps.step import Fits
 

@@ -15,8 +15,9 @@ from gaponet.sysid.identify import identify
 from gaponet.sysid.joint_rollouts import JointRollouts
 from gaponet.sysid.motion_limits import default_terms
 from gaponet.sysid.options import IdentifyOptions
-from gaponet.sysid.problem import JointFit, contradicted_gains, standard_errors
+from gaponet.sysid.problem import JointFit
 from gaponet.sysid.robot_rollouts import cut
+from gaponet.sysid.standard_errors import contradicted_gains, standard_errors
 
 SERVO = {
     "kp": 20.0,

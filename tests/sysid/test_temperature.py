@@ -11,7 +11,8 @@ from gaponet.evaluation.gap import cause_steps
 from gaponet.sim.replay import replay
 from gaponet.sysid.axes import WARM, Bounds, identified_joints
 from gaponet.sysid.joint_rollouts import JointRollouts
-from gaponet.sysid.problem import JointFit, standard_errors
+from gaponet.sysid.problem import JointFit
+from gaponet.sysid.standard_errors import standard_errors
 
 SERVO = {
     "kp": 3.0,

@@ -16,7 +16,7 @@ from gaponet.sim.model import build_model, model_hash
 from gaponet.sim.replay import replay
 from gaponet.sysid.identify import identify
 from gaponet.sysid.options import IdentifyOptions
-from gaponet.sysid.torque import TorqueFit
+from gaponet.sysid.steps.torque_fit import TorqueFit
 
 
 def moved(robot, metres, hand):

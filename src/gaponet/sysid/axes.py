@@ -301,9 +301,9 @@ class Bounds:
         for name in WARM_SLOPES:
             usual = limits[name]
             own = to_axis(name, self.first[name], kp)
-            low = np.where(varies, usual.low, own)
-            high = np.where(varies, usual.high, own)
-            limits[name] = Limits(low, high, usual.large_change)
+            lowest = np.where(varies, usual.low, own)
+            highest = np.where(varies, usual.high, own)
+            limits[name] = Limits(lowest, highest, usual.large_change)
         return limits
 
     def _guess(self, kp: Array, varies: Array) -> Values:

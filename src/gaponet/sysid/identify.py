@@ -9,7 +9,7 @@ links. `identify` goes this way:
 (steps/classic.py).
 2. Propose one step after the other: terms (steps/servo_term.py), links (steps/link_masses.py). Each
    is fitted to the same recordings; motions that were not fitted accept or reject it (`Judge`).
-3. Fit the table under the tips (table_contact.py), and estimate standard errors (problem.py).
+3. Fit the table under the tips (table_contact.py), and estimate standard errors (standard_errors.py).
 4. Compare with a fit that begins with recorded torque (steps/recorded_torque.py), and with
    speed-limited targets (steps/speed_limits.py).
 
@@ -34,16 +34,15 @@ from gaponet.sysid.axes import Bounds, with_values
 from gaponet.sysid.joint_rollouts import JointRollouts
 from gaponet.sysid.motion_limits import default_terms, stop_questions, with_stops
 from gaponet.sysid.options import IdentifyOptions
-from gaponet.sysid.problem import (
-    JointFit,
-    StandardErrors,
-    contradicted_gains,
-    fitted_fields,
-    standard_errors,
-)
+from gaponet.sysid.problem import JointFit, fitted_fields
 from gaponet.sysid.robot_rollouts import cut
 from gaponet.sysid.search_progress import SearchProgress
 from gaponet.sysid.servo_types import far_from_servo_type
+from gaponet.sysid.standard_errors import (
+    StandardErrors,
+    contradicted_gains,
+    standard_errors,
+)
 from gaponet.sysid.steps import backlash
 from gaponet.sysid.steps.classic import fit_classic
 from gaponet.sysid.steps.link_masses import LinkMasses

@@ -20,8 +20,8 @@ from gaponet.sysid.acceptance import HeldOut
 from gaponet.sysid.axes import CLASSIC, Axes, Bounds, first_values
 from gaponet.sysid.joint_rollouts import ERROR_SCALE_RAD, JointRollouts
 from gaponet.sysid.least_squares import slopes
-from gaponet.sysid.problem import cluster_sums
 from gaponet.sysid.robot_rollouts import cut
+from gaponet.sysid.standard_errors import cluster_sums
 from gaponet.sysid.table_contact import contact_height, tip_heights
 from gaponet.sysid.uncertainty import (
     JointUncertainty,

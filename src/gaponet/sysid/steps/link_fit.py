@@ -29,7 +29,8 @@ from gaponet.sysid.least_squares import (
     slopes,
     soft_l1,
 )
-from gaponet.sysid.problem import MIN_COST_DECREASE, PRIOR_LOG_STD, PRIORS, RobotFit, cluster_sums
+from gaponet.sysid.problem import MIN_COST_DECREASE, PRIOR_LOG_STD, PRIORS, RobotFit
+from gaponet.sysid.standard_errors import cluster_sums
 
 DYNAMICS_ROWS = 400  # of recordings, about, whose torques choose directions
 MIN_INFORMATION = 1.0  # of a direction that is fitted, over the prior's
@@ -307,7 +308,7 @@ class LinkFit:
 
     def _scatter(self, jac: Array, gradient: Array) -> Array:
         """Return the scatter of the cost's gradient over windows, and that of the prior, (P, P);
-        see `_covariance` of problem.py.
+        see `_covariance` of standard_errors.py.
 
         Args:
             jac, gradient: Slopes of all errors and of their costs, (m, P).

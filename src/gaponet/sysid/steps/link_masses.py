@@ -6,7 +6,7 @@ from dataclasses import replace
 
 from gaponet.sysid.steps.link_fit import LinkFit
 from gaponet.sysid.steps.step import Fits, FitState
-from gaponet.sysid.torque import TorqueFit
+from gaponet.sysid.steps.torque_fit import TorqueFit
 
 ONE_PAYLOAD = (
     "masses and gains are known up to a common factor: record two payloads before you trust a third"

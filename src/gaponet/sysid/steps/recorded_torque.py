@@ -12,9 +12,10 @@ from gaponet.sim.replay import motion_errors, replay
 from gaponet.sysid.acceptance import HeldOut, Identified, Split, held_out_errors
 from gaponet.sysid.axes import CLASSIC, Bounds
 from gaponet.sysid.joint_rollouts import JointRollouts
-from gaponet.sysid.problem import JointFit, StandardErrors, standard_errors
+from gaponet.sysid.problem import JointFit
 from gaponet.sysid.robot_rollouts import cut
-from gaponet.sysid.torque import MAX_WINDOWS, OPTIONS, TorqueFit, TorqueOptions
+from gaponet.sysid.standard_errors import StandardErrors, standard_errors
+from gaponet.sysid.steps.torque_fit import MAX_WINDOWS, OPTIONS, TorqueFit, TorqueOptions
 
 
 def with_torque(
