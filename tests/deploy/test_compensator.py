@@ -185,7 +185,7 @@ def test_a_payload_that_is_not_stated_is_estimated(robot, model):
     targets = np.repeat([[0.3, -0.2]], 500, axis=0)
     arm, compensator = WeakArm(robot), Compensator(robot, model, config=NOW, payload_step=0.1)
     q, _ = play(arm, targets, compensator, None, {100: lambda: arm.load(1)})
-    assert compensator.payload_mass[0] == pytest.approx(
+    assert compensator.payload.mass[0] == pytest.approx(
         0.4, abs=0.12
     )  # the servo law overrates torque by 1 / 0.8
     assert np.abs(q[-20:] - targets[-20:]).max() < 0.02
@@ -194,8 +194,7 @@ def test_a_payload_that_is_not_stated_is_estimated(robot, model):
 
 def test_a_payload_is_estimated_from_the_moment_on_at_which_its_torques_suffice(robot):
     """At rest the leverage is the integral of the squared torque per kg, with forgetting, in (N·m/kg)² s."""
-    estimate = Compensator(robot).payload_estimate
-    estimate.reset(1)
+    estimate = Compensator(robot).payload.estimate
     posture = np.array([[1.2, 0.3]])
     empty, full = estimate.gravity(posture[0])
     leverage = float(np.sum(((full - empty) / estimate.max_mass) ** 2))
@@ -213,8 +212,7 @@ def test_a_payload_is_estimated_from_the_moment_on_at_which_its_torques_suffice(
 def test_torques_contradict_a_payload_that_is_wrong_by_more_than_half_of_the_largest(
     robot, mass, contradicts
 ):
-    estimate = Compensator(robot, config=CompensatorConfig(payload_max=3.0)).payload_estimate
-    estimate.reset(1)
+    estimate = Compensator(robot, config=CompensatorConfig(payload_max=3.0)).payload.estimate
     posture = np.array([[1.2, 0.3]])
     empty, full = estimate.gravity(posture[0])
     held = empty + (full - empty) * mass / estimate.max_mass
@@ -236,20 +234,20 @@ def test_a_stated_payload_is_compared_with_the_servo_torques(robot, model, held,
     assert (
         f"{told:g} kg were stated, but the torques are those of about" in compensator.doubt
     ) == doubted
-    assert compensator.payload_mass[0] == told
+    assert compensator.payload.mass[0] == told
 
 
 def test_torques_unlike_a_payload_give_mass_zero(robot, model):
     target = np.array([0.3, -0.2])
     compensator = Compensator(robot, model, config=NOW, payload_step=0.1)
     compensator.reset(target, None)
-    per_kg = np.subtract(*compensator.payload_estimate.gravity(target)[::-1])
+    per_kg = np.subtract(*compensator.payload.estimate.gravity(target)[::-1])
     across = 6.0 * np.array([-per_kg[1], per_kg[0]]) + 2.0 * per_kg  # mostly what no payload does
     for _ in range(200):
         compensator.step(
-            target, target, np.zeros(2), compensator.payload_estimate.gravity(target)[0] + across
+            target, target, np.zeros(2), compensator.payload.estimate.gravity(target)[0] + across
         )
-    assert compensator.payload_mass[0] == 0.0
+    assert compensator.payload.mass[0] == 0.0
 
 
 def test_the_integral_of_a_blocked_joint_is_limited(robot, model):
@@ -261,7 +259,7 @@ def test_the_integral_of_a_blocked_joint_is_limited(robot, model):
     wound = compensator.feedback.integral.copy()
     assert np.abs(wound).max() <= NOW.feedback_limit
     periods = 0
-    while (compensator.feedback.saturation > 0).any():  # it slips free, a little beyond the target
+    while (compensator.limits.saturation > 0).any():  # it slips free, a little beyond the target
         compensator.step(target, np.array([0.4, 0.4]))
         periods += 1
     assert periods <= 50
@@ -376,7 +374,7 @@ def test_payloads_beyond_the_training_data_are_refused_without_extrapolate(robot
 
     light, loaded = Compensator(robot, trained(0.0, 0.2)), Compensator(robot, trained(0.1, 0.2))
     light.reset(np.zeros(2), 0.2)
-    assert light.masses.max() == 0.2
+    assert light.payload.masses.max() == 0.2
     for compensator, mass in ((light, 0.3), (loaded, 0.0), (loaded, 0.3)):
         with pytest.raises(ModelError, match="extrapolate"):
             compensator.reset(np.zeros(2), mass)
@@ -387,7 +385,7 @@ def test_payloads_beyond_the_training_data_are_refused_without_extrapolate(robot
             light.set_payload(mass)
     beyond = Compensator(robot, trained(0.0, 0.2), extrapolate=True)
     beyond.reset(np.zeros(2), 0.4)
-    assert beyond.masses.max() == 0.4
+    assert beyond.payload.masses.max() == 0.4
     with pytest.raises(ModelError):
         AlignedSim(robot, trained(0.0, 0.2), 0.3)
     AlignedSim(robot, trained(0.0, 0.2), 0.3, extrapolate=True)
@@ -413,7 +411,7 @@ def test_values_that_are_not_finite_have_no_lasting_effect(robot, model, payload
         np.testing.assert_array_equal(part[1], whole[1])  # the other robot never notices
         q = q + 0.3 * (target - q)
     np.testing.assert_allclose(part[0], whole[0], atol=0.02)
-    assert np.isfinite(one.payload_mass).all()
+    assert np.isfinite(one.payload.mass).all()
 
 
 def test_an_adapted_unit_follows_where_the_model_alone_does_not(robot):

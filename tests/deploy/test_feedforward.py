@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from arm import commands, write_arm
 
-from gaponet.deploy.feedforward import MAX_ACCELERATION, MAX_SPEED, Feedforward
+from gaponet.deploy.feedforward import MAX_ACCELERATION, MAX_SPEED, MotionTorque
 from gaponet.sim.batch import BatchSim
 
 
@@ -16,7 +16,7 @@ def robot(tmp_path_factory):
 
 def make(robot, num=1, acceleration_time=0.0):
     sim = BatchSim(robot, [(0.4, "both", 0.02)] * num, 1)
-    return sim, Feedforward(sim, np.arange(2), robot, 0.02, acceleration_time)
+    return sim, MotionTorque(sim, np.arange(2), robot, 0.02, acceleration_time)
 
 
 def test_feed_forward_equals_inverse_dynamics(robot):

@@ -140,7 +140,7 @@ def test_after_a_torque_limit_the_robot_follows_again(robot):
     follower = Compensator(weak, config=NOW, follow="nominal")
     followed, _ = play(weak, jump, follower)
 
-    assert follower.limited_periods.sum() > 0
+    assert follower.limits.limited_periods.sum() > 0
     assert np.abs(followed - expected)[-50:].max() < 0.01
 
 

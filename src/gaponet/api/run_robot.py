@@ -492,7 +492,7 @@ class Compensation:
 
 def _extremes(compensator: Compensator) -> tuple[float, ...]:
     """Return the smallest and the largest payload that a compensator can carry, kg."""
-    masses = compensator.masses
+    masses = compensator.payload.masses
     return tuple(sorted({float(masses[0]), float(masses[-1])}))
 
 

@@ -1,9 +1,9 @@
 """Compensator: commands with which the real robot does what it is asked to do.
 
-A shadow simulates the robot, with nominal, identified or adapted parameters. It receives targets a′
-and shows how the robot should move. Without a model, the command is u = a′. With a model, the robot
-with command u moves like the shadow with target u + G(u), G being the model's correction. So u +
-G(u) = a′ is solved by u ← u + γ (a′ − u − G(u)).
+A shadow simulates the robot, with nominal, identified or adapted parameters (shadow.py). It
+receives targets a′ and shows how the robot should move. Without a model, the command is u = a′.
+With a model, the robot with command u moves like the shadow with target u + G(u), G being the
+model's correction. So u + G(u) = a′ is solved by u ← u + γ (a′ − u − G(u)) (network_inverse.py).
 
     aim "target":     a′ = a + τ / kp. τ is the torque with which the shadow follows the targets:
                       gravity and, with dynamics, the torque for their velocity and acceleration
@@ -21,9 +21,8 @@ Where the network's answer is not finite, G counts as zero (nn/bound.py). The it
 the correction: it falls to (1 − γ)² of itself in each control period, and what remains is the
 feed-forward.
 
-The remaining error is integrated, slowly and with a low-pass. A loaded arm swings on its servo with
-little damping (3 kg on H1-2's shoulder yaw: 10 rad/s, damping ratio 0.1). There, an integrator
-alone is unstable above 2ζω, 2 1/s.
+The remaining error is integrated, slowly and with a low-pass (feedback.py). Commands are limited
+(command_limits.py).
 """
 
 from __future__ import annotations
@@ -31,21 +30,23 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-import mujoco
 import numpy as np
 
 from gaponet.base.arrays import Array, within
 from gaponet.base.errors import ModelError, RobotError, UsageError
 from gaponet.data.describe.plausibility import require_radians
-from gaponet.deploy.feedforward import Feedforward
+from gaponet.deploy.command_limits import CommandLimits
+from gaponet.deploy.feedback import Feedback, LowPass
+from gaponet.deploy.feedforward import Feedforward, MotionTorque
 from gaponet.deploy.follow import Follower
-from gaponet.deploy.payload import PayloadEstimate, PayloadFields
-from gaponet.deploy.transfer import own_context
+from gaponet.deploy.network_inverse import NetworkInverse
+from gaponet.deploy.payload import Carrier, Payload, PayloadFields
+from gaponet.deploy.payload_estimate import PayloadEstimate
+from gaponet.deploy.shadow import Shadow
 from gaponet.nn.adaptation import Adaptation
 from gaponet.nn.artifact import GAIN_TOLERANCE, GapModel
-from gaponet.nn.loop import DeltaLoop
 from gaponet.robot.spec import RobotSpec
-from gaponet.sim.batch import BatchSim, Condition
+from gaponet.sim.batch import Condition
 from gaponet.sim.model import idle_joints
 
 SETTLING_PERIODS = 100  # control periods in which the shadow comes to rest at a start
@@ -149,61 +150,49 @@ class Compensator:
                 robot is too different from the nominal one to follow it, without `extrapolate`.
             UsageError: `follow` with a model, or with a robot that is not identified.
         """
-        self.dt = robot.dt if dt is None else dt
+        dt = robot.dt if dt is None else dt
         if follow is not None and model is not None:
             raise UsageError(
                 "compensator: follow takes no model. A model of the nominal simulator follows it "
                 'with CompensatorConfig(aim="simulator")'
             )
         if model is not None:
-            robot = _simulator_of(model, robot, self.dt, config)
+            robot = _simulator_of(model, robot, dt, config)
         if adaptation is not None:
             robot = adaptation.robot(robot)
+        num = 1 if num_envs is None else num_envs
+        masses = _possible_masses(robot, model, config, extrapolate, payload_step)
+        loads = [Condition(float(mass), payload_side, dt) for mass in masses]
+        locked = idle_joints(robot, robot.operated)
         self.robot = robot
         self.model = model
-        self.config = config
-        self.single = num_envs is None
         self.extrapolate = extrapolate
-        num = 1 if num_envs is None else num_envs
-        self.num_envs = num
-        max_mass = _max_payload(robot, model, config, extrapolate)
-        steps = int(np.ceil(max_mass / payload_step - 1e-9))
-        self.masses = np.linspace(0.0, max_mass, 1 + steps)
-        locked = idle_joints(robot, robot.operated)
-        empty = Condition(0.0, payload_side, self.dt)
-        loads = [Condition(float(mass), payload_side, self.dt) for mass in self.masses]
-        self.shadow = BatchSim(robot, [empty] * num, nthread, locked)
-        self._loaded = PayloadFields(self.shadow, loads, locked)
-        self.op = robot.operated_index
-        self.free = robot.index(self.shadow.joint_names)
-        self.operated = np.searchsorted(self.free, self.op)  # operated joints among the shadow's
-        self.low, self.high = robot.qpos_range[self.op].T
-        self.kp = robot.servo.kp[self.op]
-        self.zero_offset = robot.servo.offset[self.op]
-        self.bias: Array = self.shadow.batch.bind("qfrc_bias")
-        self.loop: DeltaLoop | None = None
-        self._contexts: Array | None = None
-        if model is not None:
-            self.loop = model.loop(num)
-            self._contexts = own_context(model, robot, loads)
-        self.feedforward = Feedforward(
-            self.shadow, self.operated, robot, self.dt, config.acceleration_time
-        )
-        self.feedback = Feedback(config, self.dt)
-        self.payload_estimate = PayloadEstimate(robot, max_mass, payload_side, self.dt, locked)
-        self._carried = np.full(num, -1)  # index of the mass that each shadow carries
+        self.shadow = Shadow(robot, loads[0], num, nthread, locked)
+        carriers: list[Carrier] = [PayloadFields(self.shadow.sim, loads, locked)]
+        self.inverse: NetworkInverse | None = None
         self.follower: Follower | None = None
+        self.feedforward: Feedforward | None = None
+        if model is not None:
+            self.inverse = NetworkInverse(model, robot, loads, num, config.gain, config.iterations)
+            carriers.append(self.inverse)
+        shape = (num, len(robot.operated))
         if follow is not None:
-            self.follower = Follower(robot, empty, self.masses, num, locked, extrapolate)
-        self.payload_mass = np.zeros(num)
-        self.payload_stated = False
-        self.periods = 0
-        self.offset = np.zeros((num, len(self.op)))  # u − a′ of the iteration, rad
-        self.command = np.zeros((num, len(self.op)))  # the last one, rad
+            deviation = LowPass(config.observation_time, config.feedback_limit, dt, shape)
+            self.follower = Follower(robot, loads, locked, deviation, extrapolate)
+            carriers.append(self.follower)
+        elif config.aim == "target":
+            self.feedforward = _feedforward(self.shadow, robot, config, dt)
+        error = LowPass(config.feedback_time, config.feedback_limit, dt, shape)
+        self.feedback = Feedback(config.feedback, error, dt)
+        self.limits = CommandLimits(
+            config.limit, config.blend, dt, self.shadow.low, self.shadow.high, num
+        )
+        estimate = PayloadEstimate(robot, loads, num, locked)
+        self.payload = Payload(
+            masses, config.payload_max, num, carriers, estimate, compared=num_envs is None
+        )
+        self._rows = JointRows(robot, num_envs)
         self._target: Array | None = None  # last finite target; None before `reset`
-        self._deviation = np.zeros((num, len(self.op)))  # of the robot from the shadow, slow, rad
-        # Control periods in which a motor or the command was at its limit, (num, n).
-        self.limited_periods = np.zeros((num, len(self.op)), int)
 
     # ---- use
 
@@ -241,35 +230,29 @@ class Compensator:
             ModelError: The payload is outside the training data, without `extrapolate`.
             UsageError, LogError: The target or the payload is not finite; the target is in degrees.
         """
-        self.payload_stated = payload_mass is not None or len(self.masses) == 1
-        self.payload_estimate.reset(self.num_envs)
-        if payload_mass is None:
-            self._carry(np.zeros(self.num_envs))
-        else:
-            self.set_payload(payload_mass)
-        a = self._as_rows(target)
+        if payload_mass is not None:
+            self.require_payload(payload_mass)
+        self.payload.reset(payload_mass)
+        a = self._rows.all_joints(target)
         if not np.isfinite(a).all():
             raise UsageError("compensator: the target to begin at is not a number")
         require_radians(
             a, self.robot.joint_names, self.robot, lambda row: "compensator: the target to begin at"
         )
         self._target = a
-        self.command = a[:, self.op]
-        self.periods = 0
-        if self.loop is not None:
-            self.loop.reset()
-        self.offset = np.zeros(self.command.shape)
-        self.feedback.reset(self.command.shape)
-        self.feedforward.reset(self.command)
-        rest = within(a[:, self.free], *self.shadow.range.T)
-        self.shadow.reset(slice(None), rest, 0.0, past=rest[:, None])  # type: ignore[arg-type]
-        self.shadow.batch.forward(stage=mujoco.mjtStage.mjSTAGE_VEL.value)
+        operated = a[:, self._rows.operated]
+        self.limits.reset(operated)
+        self.feedback.reset()
+        if self.inverse is not None:
+            self.inverse.reset()
+        if self.feedforward is not None:
+            self.feedforward.reset(operated)
+        rest = within(a[:, self.shadow.free], *self.shadow.sim.range.T)
+        self.shadow.reset(rest)
         if self.follower is not None:
             self.follower.reset(rest, SETTLING_PERIODS)
         for _ in range(SETTLING_PERIODS):
-            self._step_shadow(rest, self._shadow_target(rest))
-        self.limited_periods[:] = 0
-        self._deviation[:] = 0.0
+            self.shadow.step(rest, self._shadow_target(rest))
 
     def set_payload(self, payload_mass: Array | float) -> None:
         """Set the payload after a pick or place, kg, one number or (num_envs,).
@@ -277,32 +260,14 @@ class Compensator:
         Errors as of `reset`.
         """
         self.require_payload(payload_mass)
-        self._carry(np.array(np.broadcast_to(np.asarray(payload_mass, float), self.num_envs)))
+        self.payload.set(payload_mass)
 
     def require_payload(self, payload_mass: Array | float) -> None:
         """Refuse payloads, kg, that are not physical, or that model or shadow cannot carry."""
         if self.model is not None:
             self.model.require_payload(payload_mass, self.extrapolate)
-            return
-        mass = np.asarray(payload_mass, float)
-        if not ((mass >= 0) & (mass <= self.config.payload_max)).all():
-            raise UsageError(
-                f"payload_mass is {payload_mass}; give kg, 0 when empty, up to "
-                f"{self.config.payload_max:g}, or raise payload_max (--compensation.payload-max)"
-            )
-
-    def _carry(self, payload_mass: Array) -> None:
-        """Let the shadow carry the nearest of `masses`."""
-        self.payload_mass = payload_mass
-        nearest = np.abs(self.payload_mass[:, None] - self.masses).argmin(axis=1)
-        if (nearest != self._carried).any():
-            robots = np.arange(self.num_envs)
-            self._loaded.carry(robots, nearest)
-            if self.follower is not None:
-                self.follower.carry(robots, nearest)
-            if self.loop is not None and self._contexts is not None:
-                self.loop.set_context(self._contexts[nearest])
-            self._carried = nearest
+        else:
+            self.payload.require(payload_mass)
 
     def step(
         self, target: Array, qpos: Array | None, qvel: Array | None = None, tau: Array | None = None
@@ -324,38 +289,26 @@ class Compensator:
                 "compensator: step before reset; call reset(target) once, then step every control "
                 "period"
             )
-        given = self._as_rows(target)
+        given = self._rows.all_joints(target)
         targets = np.where(np.isfinite(given), given, self._target)
         self._target = targets
-        a = targets[:, self.op]
         if qpos is not None:
-            if self.periods == 0:
-                measured = self._as_rows(qpos)
-                require_radians(
-                    measured,
-                    self.robot.joint_names,
-                    self.robot,
-                    lambda row: "compensator: the position",
-                )
-            q = self._as_rows(qpos)[:, self.op]
-            v = np.zeros_like(q) if qvel is None else self._as_rows(qvel)[:, self.op]
-            torque = None if tau is None else self._as_rows(tau)[:, self.op]
-            self._process_state(q, v, torque)
-        if self.config.dynamics:
+            self._process_state(qpos, qvel, tau)
+        of_free = targets[:, self.shadow.free]
+        a = of_free[:, self.shadow.operated]
+        if self.feedforward is not None:
             self.feedforward.update(a)
-        shadow_target = self._shadow_target(targets[:, self.free])
-        u = self._invert(shadow_target) + self.feedback.integral
-        share = min(1.0, self.periods * self.dt / self.config.blend) if self.config.blend else 1.0
-        unlimited = a + share * (u - a)
-        limit = self.config.limit
-        self.command = within(within(unlimited, a - limit, a + limit), self.low, self.high)
-        self.feedback.saturation = np.sign(unlimited - self.command)
-        self.limited_periods += self._at_limit()
-        self.periods += 1
-        self._step_shadow(targets[:, self.free], shadow_target)
+        shadow_target = self._shadow_target(of_free)
+        u = shadow_target
+        if self.inverse is not None:
+            u = self.inverse.command(
+                self.shadow.qpos, self.shadow.qvel, shadow_target, self.payload.mass
+            )
+        u = u + self.feedback.integral
         commands = targets.copy()
-        commands[:, self.op] = self.command
-        return commands[0] if self.single else commands
+        commands[:, self._rows.operated] = self.limits.apply(a, u, self._exhausted())
+        self.shadow.step(of_free, shadow_target)
+        return self._rows.back(commands)
 
     @property
     def started(self) -> bool:
@@ -381,26 +334,16 @@ class Compensator:
         """
         if self.follower is None or self._target is None:
             raise UsageError('compensator: observe needs follow="nominal", and reset before')
-        shape = (self.num_envs, len(self.robot.joint_names))
-        positions = np.tile(self.robot.qpos_home, (self.num_envs, 1))
-        velocities = np.zeros(shape)
-        if qpos is not None:
-            positions = self._as_rows(qpos).copy()
-            self._update_deviation(positions[:, self.op])
-        positions[:, self.op] = self.follower.qpos[:, self.operated] + self._deviation
-        velocities[:, self.op] = self.follower.qvel[:, self.operated]
-        if self.single:
-            return positions[0], velocities[0]
-        return positions, velocities
-
-    def _update_deviation(self, measured: Array) -> None:
-        """Update the slow deviation of robots from their shadows; (num_envs, n) rad."""
-        deviation = measured - self.shadow.qpos[:, self.operated]
-        valid = np.isfinite(deviation).all(axis=1, keepdims=True)
-        limit = self.config.feedback_limit
-        share = min(1.0, self.dt / max(self.config.observation_time, self.dt))
-        change = share * (within(deviation, -limit, limit) - self._deviation)
-        self._deviation += np.where(valid, change, 0.0)
+        op = self._rows.operated
+        deviation = None
+        if qpos is None:
+            positions = np.tile(self.robot.qpos_home, (len(self._target), 1))
+        else:
+            positions = self._rows.all_joints(qpos).copy()
+            deviation = positions[:, op] - self.shadow.qpos
+        velocities = np.zeros_like(positions)
+        positions[:, op], velocities[:, op] = self.follower.observe(deviation)
+        return self._rows.back(positions), self._rows.back(velocities)
 
     @property
     def doubt(self) -> str:
@@ -414,8 +357,7 @@ class Compensator:
         if self.limited_shares:
             shares = [f"{joint} {share:.0%}" for joint, share in self.limited_shares.items()]
             sentences.append(f"at a limit of torque or correction: {', '.join(shares)} of the time")
-        if self.payload_stated and self.single:
-            sentences.append(self.payload_estimate.contradiction(float(self.payload_mass[0])))
+        sentences.append(self.payload.contradiction)
         return "; ".join(sentence for sentence in sentences if sentence)
 
     @property
@@ -426,8 +368,7 @@ class Compensator:
         motor. Joints with a share below MIN_LIMITED_SHARE are left out; of several robots the mean
         counts.
         """
-        shares = self.limited_periods.mean(axis=0) / max(self.periods, 1)
-        named = zip(self.robot.operated, shares.tolist(), strict=True)
+        named = zip(self.robot.operated, self.limits.limited_shares.tolist(), strict=True)
         return {joint: share for joint, share in named if share >= MIN_LIMITED_SHARE}
 
     @property
@@ -436,110 +377,103 @@ class Compensator:
 
         One answer per robot and iteration.
         """
-        return 0 if self.loop is None else self.loop.refused_answers
+        return 0 if self.inverse is None else self.inverse.loop.refused_answers
 
     # ---- internals
-
-    def _at_limit(self) -> Array:
-        """Return which commands, or motors that follow, are at their limits, (num_envs, n)."""
-        # A motor that is weaker than the identified one cannot follow, whatever the feedback adds.
-        feedback_limit = self.config.feedback_limit
-        exhausted = (feedback_limit > 0) & (np.abs(self.feedback.integral) >= feedback_limit)
-        at_limit: Array = (self.feedback.saturation != 0) | exhausted
-        if self.follower is not None:
-            at_limit = at_limit | self.follower.saturated[:, self.operated]
-        return at_limit
 
     def _shadow_target(self, targets: Array) -> Array:
         """Return a′, the shadow's targets of the operated joints, (num_envs, n) rad.
 
-        Targets of the free ones.
+        targets: Of the free joints, (num_envs, n_free) rad.
         """
         if self.follower is not None:
-            commands = self.follower.command(targets)[:, self.operated]
-            return np.asarray(within(commands, self.low, self.high))
-        a = targets[:, self.operated]
-        if self.config.aim == "simulator":
-            return np.asarray(within(a, self.low, self.high))
-        tau = self.bias[:, self.operated]
-        if self.config.dynamics:
-            tau = tau + self.feedforward.torque(tau)
-        held = a + tau / self.kp - self.zero_offset
-        return np.asarray(within(held, self.low, self.high))
+            wanted = self.follower.command(targets)
+        else:
+            wanted = targets[:, self.shadow.operated]
+            if self.feedforward is not None:
+                wanted = self.feedforward.targets(wanted)
+        return within(wanted, self.shadow.low, self.shadow.high)
 
-    def _invert(self, shadow_target: Array) -> Array:
-        """Return u with u + G(u) = a′. Without a model, u = a′."""
-        if self.loop is None:
-            return shadow_target
-        q = self.shadow.qpos[:, self.operated]
-        v = self.shadow.qvel[:, self.operated]
-        gain = self.config.gain
-        iterations = self.config.iterations
-        return self.loop.solve(
-            q, v, shadow_target, self.payload_mass, self.offset, gain, iterations
-        )
+    def _exhausted(self) -> Array:
+        """Return the joints whose feedback, or whose motor, can give no more, (num_envs, n)."""
+        # A motor that is weaker than the identified one cannot follow, whatever the feedback adds.
+        exhausted = self.feedback.exhausted
+        if self.follower is not None:
+            exhausted = exhausted | self.follower.saturated
+        return exhausted
 
-    def _process_state(self, q: Array, v: Array, tau: Array | None) -> None:
-        """Update feedback and payload estimate from a measured state."""
-        valid = np.isfinite(q + v + (0.0 if tau is None else tau)).all(axis=1)  # robots
-        if self.periods:
-            self.feedback.update(self.shadow.qpos[:, self.operated] - q, valid)
-        doubts = self.payload_stated and self.single and len(self.masses) > 1
-        if doubts or not self.payload_stated:
-            self.payload_estimate.observe(q, v, self.command, tau, valid)
-        if not self.payload_stated:
-            self._carry(self.payload_estimate.update())
-
-    def _step_shadow(self, targets: Array, operated_targets: Array) -> None:
-        full = targets.copy()
-        full[:, self.operated] = operated_targets
-        self.shadow.step(full)
-
-    def _as_rows(self, values: Array) -> Array:
-        """Return (n,) or (num_envs, n) as (num_envs, n)."""
-        values = np.asarray(values, float)
-        shape = (self.num_envs, len(self.robot.joint_names))
-        if values.shape != (shape[1:] if self.single else shape):
-            raise UsageError(
-                f"compensator: arrays hold all {shape[1]} joints of {self.robot.name}, got "
-                f"{values.shape}"
+    def _process_state(self, qpos: Array, qvel: Array | None, tau: Array | None) -> None:
+        """Update feedback and payload from a measured state, arrays as of `step`."""
+        started = self.limits.periods > 0
+        if not started:
+            require_radians(
+                self._rows.all_joints(qpos),
+                self.robot.joint_names,
+                self.robot,
+                lambda row: "compensator: the position",
             )
-        return values.reshape(shape)
+        q = self._rows.operated_joints(qpos)
+        v = np.zeros_like(q) if qvel is None else self._rows.operated_joints(qvel)
+        torque = None if tau is None else self._rows.operated_joints(tau)
+        valid = np.isfinite(q + v + (0.0 if torque is None else torque)).all(axis=1)  # robots
+        if started:
+            self.feedback.update(self.shadow.qpos - q, valid, self.limits.saturation)
+        self.payload.observe(q, v, self.limits.command, torque, valid)
 
 
-class Feedback:
-    """Integrator of the remaining position error, with a low-pass, limits and anti-windup.
-
-    Arrays are (num_envs, n).
+class JointRows:
+    """Arrays of all joints, as they are given and returned, and one row for each robot.
 
     Attributes:
-        integral: Correction of the command, rad.
-        saturation: +1 where the command is at its upper limit, −1 at its lower one, else 0.
+        operated: Operated joints among all, (n_operated,).
     """
 
-    def __init__(self, config: CompensatorConfig, dt: float) -> None:
-        """dt: Control period, s."""
-        self.config = config
-        self.dt = dt
-        self.integral, self.saturation, self._filtered = np.zeros((3, 0, 0))
+    def __init__(self, robot: RobotSpec, num_envs: int | None) -> None:
+        n = len(robot.joint_names)
+        self.operated = robot.operated_index
+        self._robot = robot.name
+        self._shape = (n,) if num_envs is None else (num_envs, n)
 
-    def reset(self, shape: tuple[int, ...]) -> None:
-        """Start without correction."""
-        self.integral, self.saturation, self._filtered = np.zeros((3, *shape))
+    def all_joints(self, values: Array) -> Array:
+        """Return (n,) or (num_envs, n) as (num_envs, n)."""
+        values = np.asarray(values, float)
+        if values.shape != self._shape:
+            raise UsageError(
+                f"compensator: arrays hold all {self._shape[-1]} joints of {self._robot}, got "
+                f"{values.shape}"
+            )
+        return values.reshape(-1, self._shape[-1])
 
-    def update(self, error: Array, valid: Array) -> None:
-        """Process position errors, rad, of the robots `valid`, (num_envs,)."""
-        config = self.config
-        limit = self.config.feedback_limit
-        # A blocked joint has a large error, which must not take long to decrease.
-        limited = within(error, -limit, limit)
-        filtered = self._filtered + (limited - self._filtered) * min(
-            1.0, self.dt / max(config.feedback_time, self.dt)
-        )
-        winds_up = filtered * self.saturation > 0
-        integral = self.integral + config.feedback * self.dt * np.where(winds_up, 0.0, filtered)
-        self._filtered = np.where(valid[:, None], filtered, self._filtered)
-        self.integral = np.where(valid[:, None], within(integral, -limit, limit), self.integral)
+    def operated_joints(self, values: Array) -> Array:
+        """Return the columns of the operated joints, (num_envs, n_operated)."""
+        return self.all_joints(values)[:, self.operated]
+
+    def back(self, rows: Array) -> Array:
+        """Return (num_envs, n) as the arrays that are given, (n,) for a single robot."""
+        return rows.reshape(self._shape)
+
+
+def _feedforward(
+    shadow: Shadow, robot: RobotSpec, config: CompensatorConfig, dt: float
+) -> Feedforward:
+    """Return the feed-forward of holding or, with dynamics, of motion too."""
+    motion = None
+    if config.dynamics:
+        motion = MotionTorque(shadow.sim, shadow.operated, robot, dt, config.acceleration_time)
+    return Feedforward(shadow, robot, motion)
+
+
+def _possible_masses(
+    robot: RobotSpec,
+    model: GapModel | None,
+    config: CompensatorConfig,
+    extrapolate: bool,
+    step: float,
+) -> Array:
+    """Return the masses that the shadow can carry in each hand, at most `step` apart, kg."""
+    largest = _max_payload(robot, model, config, extrapolate)
+    steps = int(np.ceil(largest / step - 1e-9))
+    return np.linspace(0.0, largest, 1 + steps)
 
 
 def _max_payload(

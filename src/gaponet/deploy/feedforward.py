@@ -1,6 +1,7 @@
-"""Feed-forward torque for motion: inertia, damping and friction.
+"""Feed-forward: targets with which servos give the torque that holds a posture, or moves it too.
 
-It comes on top of the torque that holds a posture.
+The torque of motion is that of inertia, damping and friction. It comes on top of the torque that
+holds a posture.
 
 Velocity and acceleration come from the last targets, so the feed-forward is causal. It amplifies
 noise of the targets by inertia / (kp dt²); the low-pass of the acceleration reduces that. The delay
@@ -12,6 +13,7 @@ from __future__ import annotations
 import numpy as np
 
 from gaponet.base.arrays import Array, within
+from gaponet.deploy.shadow import Shadow
 from gaponet.robot.servo_fields import SERVO_TERMS
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.batch import BatchSim
@@ -26,6 +28,40 @@ FRICTION_SPEED = 0.05
 
 
 class Feedforward:
+    """Targets a + τ / kp, under which the servos of a shadow follow a; all (num, n operated)."""
+
+    def __init__(self, shadow: Shadow, robot: RobotSpec, motion: MotionTorque | None) -> None:
+        """
+        Args:
+            shadow: Its present state gives the torque that holds it.
+            robot: Servos of the shadow.
+            motion: Torque of motion of the same shadow; None for holding alone.
+        """
+        self._kp = robot.servo.kp[robot.operated_index]
+        self._offset = robot.servo.offset[robot.operated_index]
+        self._operated = shadow.operated
+        self._bias: Array = shadow.sim.batch.bind("qfrc_bias")
+        self._motion = motion
+
+    def reset(self, target: Array) -> None:
+        """Start at rest at targets, rad."""
+        if self._motion is not None:
+            self._motion.reset(target)
+
+    def update(self, target: Array) -> None:
+        """Set the targets of the coming control period, rad."""
+        if self._motion is not None:
+            self._motion.update(target)
+
+    def targets(self, wanted: Array) -> Array:
+        """Return the targets under which servos follow the wanted positions, rad."""
+        torque = self._bias[:, self._operated]
+        if self._motion is not None:
+            torque = torque + self._motion.torque(torque)
+        return np.asarray(wanted + torque / self._kp - self._offset)
+
+
+class MotionTorque:
     """Torques for the motion of the first `num` simulations of a batch; all have the same joints.
 
     Attributes:

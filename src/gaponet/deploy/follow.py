@@ -19,6 +19,7 @@ import numpy as np
 
 from gaponet.base.arrays import Array
 from gaponet.base.errors import UsageError
+from gaponet.deploy.feedback import LowPass
 from gaponet.deploy.payload import PayloadFields
 from gaponet.deploy.transfer import Transfer, require_measured_range
 from gaponet.robot.spec import RobotSpec
@@ -27,27 +28,28 @@ from gaponet.sim.inverse import AnalyticInverse
 
 
 class Follower:
-    """Targets of num policies → commands of num robots.
+    """Targets of num policies → commands of num robots, and what these policies are to see.
 
-    Arrays are (num, n), of the joints that are not locked.
+    Attributes:
+        deviation: Slow part of what distinguishes the robots from their identified simulators,
+            (num, n operated) rad.
     """
 
     def __init__(
         self,
         robot: RobotSpec,
-        condition: Condition,
-        masses: Array,
-        num: int,
+        loads: list[Condition],
         locked: tuple[str, ...],
+        deviation: LowPass,
         extrapolate: bool = False,
     ) -> None:
         """
         Args:
             robot: The identified robot, which knows its nominal one.
-            condition: Control period, and the hands that carry a payload; its mass is not used.
-            masses: Payloads that a robot can carry, kg; it starts with the first.
-            num: Number of robots.
+            loads: Control period, and the payloads that a robot can carry; it starts with the
+                first.
             locked: Joints that are clamped at home.
+            deviation: Low-pass for `observe`, with one row for each robot.
             extrapolate: Accept a robot outside the ranges in which transfer was measured.
 
         Raises:
@@ -60,47 +62,66 @@ class Follower:
                 f"{robot.folder} is not identified: it would follow itself. Give the robot folder "
                 "of gaponet identify (--robot)"
             )
-        conditions = [condition._replace(payload_mass=float(masses[0]))] * num
+        conditions = [loads[0]] * len(deviation.value)
         plant = BatchSim(robot, conditions, 1, locked)
         inverse = AnalyticInverse.of(plant)
         self._transfer = Transfer(nominal, inverse, conditions, locked, 1, extrapolate=True)
         self._nominal = self._transfer.sim
         if not extrapolate:
             require_measured_range(inverse, AnalyticInverse.of(self._nominal), plant.joint_names)
-        loads = [condition._replace(payload_mass=float(mass)) for mass in masses]
         self._carried = [PayloadFields(sim, loads, locked) for sim in (plant, self._nominal)]
+        self._operated = np.array([plant.joint_names.index(name) for name in robot.operated])
+        self.deviation = deviation
 
     @property
     def saturated(self) -> Array:
-        """Joints whose motors cannot give the torque of the nominal motion, (num, n)."""
-        return self._transfer.inverse.saturated
+        """Operated joints whose motors cannot give the torque of the nominal motion, (num, n)."""
+        saturated: Array = self._transfer.inverse.saturated[:, self._operated]
+        return saturated
 
-    @property
-    def qpos(self) -> Array:
-        """Positions of the nominal simulators, rad; live."""
-        return self._nominal.qpos
-
-    @property
-    def qvel(self) -> Array:
-        """Velocities of the nominal simulators, rad/s; live."""
-        return self._nominal.qvel
-
-    def carry(self, simulations: Array, mass: Array) -> None:
-        """Let robots, (k,) indices, carry masses, (k,) indices."""
+    def carry(self, mass: Array) -> None:
+        """Let each robot carry one of the loads, (num,) indices."""
         for fields in self._carried:
-            fields.carry(simulations, mass)
+            fields.carry(mass)
 
     def reset(self, target: Array, periods: int) -> None:
-        """Let the nominal simulators come to rest under targets, rad, in some control periods."""
+        """Let the nominal simulators come to rest in some control periods.
+
+        target: Of the joints that are not locked, (num, n_free) rad.
+        """
         self._transfer.reset(slice(None), target, np.zeros_like(target), past=target[:, None])
         for _ in range(periods):
             self._nominal.step(target)
+        self.deviation.reset()
 
     def command(self, target: Array) -> Array:
-        """Return the commands of the coming control period, rad. Call this once per period."""
+        """Return the commands of the coming control period. Call this once per period.
+
+        Args:
+            target: Of the joints that are not locked, (num, n_free) rad.
+
+        Returns:
+            Of the operated joints, (num, n) rad.
+        """
         inverse = self._transfer.inverse
         period = self._transfer.step_reference(target)
         way = period.next_qpos - period.qpos
         ahead = inverse.delay / inverse.dt * way
         moved = replace(period, qpos=period.qpos + ahead, next_qpos=period.next_qpos + ahead)
-        return inverse.targets_in_force(moved)
+        commands: Array = inverse.targets_in_force(moved)[:, self._operated]
+        return commands
+
+    def observe(self, deviation: Array | None) -> tuple[Array, Array]:
+        """Return the positions, rad, and velocities, rad/s, that policies are to see.
+
+        They are the nominal simulators', plus the slow part of the deviation.
+
+        Args:
+            deviation: Measured positions less those of the identified simulators, (num, n) rad, of
+                the operated joints; None if nothing new was measured.
+        """
+        if deviation is not None:
+            self.deviation.update(deviation, np.isfinite(deviation).all(axis=1))
+        qpos = self._nominal.qpos[:, self._operated] + self.deviation.value
+        qvel = self._nominal.qvel[:, self._operated]
+        return qpos, qvel

@@ -1,25 +1,24 @@
-"""Estimate of the payload mass from the torques that hold the arms, if nobody states the mass."""
+"""The mass in the hands of robots, and the simulators and networks that must carry it too."""
 
 from __future__ import annotations
 
-import mujoco
+from collections.abc import Sequence as ListOf
+from typing import Protocol
+
 import numpy as np
 
-from gaponet.base.arrays import Array, within
-from gaponet.robot.spec import RobotSpec
+from gaponet.base.arrays import Array
+from gaponet.base.errors import UsageError
+from gaponet.deploy.payload_estimate import PayloadEstimate
 from gaponet.sim.batch import BatchSim, Condition, differing_fields
 from gaponet.sim.model import build_model
 
-FORGETTING_TIME_S = 1.0  # time constant
-MAX_RATE_KG_S = 1.0  # of the estimate: a payload that appears at once must not make commands jump
-HALF_WEIGHT_SPEED = 0.5  # rad/s; samples at this speed have half the weight, faster ones less
-# Time between two samples of the torques: payloads change slowly, and control periods are short.
-SAMPLE_TIME_S = 0.06
-MIN_LEVERAGE = 0.4  # (N·m/kg)² s; below it, the estimate does not change
-# Least share of the excess torque over the empty arm's that must look like the largest payload's.
-# On a virtual H1-2, 3 kg give 0.57 to 0.97, and no payload with positions wrong by 0.12 rad up to
-# 0.56. Friction lowers the share of smaller payloads.
-MIN_SIMILARITY = 0.55
+
+class Carrier(Protocol):
+    """Something of num robots that depends on their payload."""
+
+    def carry(self, mass: Array) -> None:
+        """Let each robot carry one of the possible masses, (num,) indices."""
 
 
 class PayloadFields:
@@ -41,127 +40,91 @@ class PayloadFields:
         self._values = differing_fields(models)  # (masses, …)
         self._fields = {name: sim.batch.expand(name) for name in self._values}  # (simulations, …)
 
-    def carry(self, simulations: Array, mass: Array) -> None:
-        """Let simulations, (k,) indices, carry masses, (k,) indices."""
+    def carry(self, mass: Array) -> None:
+        """Let each simulation carry one of the masses, (simulations,) indices."""
         for name, field in self._fields.items():
-            field[simulations] = self._values[name][mass]
+            field[:] = self._values[name][mass]
 
 
-class PayloadEstimate:
-    """Least squares with forgetting: τ = τ_0(q) + m dτ(q) is linear in the mass m per hand.
-
-    Friction hides a few N·m, so the error is some hundred grams on an arm with 40 N·m. The estimate
-    is slow on purpose. Torques that do not look like a payload's give the mass 0.
+class Payload:
+    """The mass in each hand of num robots, stated or estimated.
 
     Attributes:
-        mass: Estimate of each robot, (num,) kg, with a limited rate.
+        masses: Those that can be carried, (k,) kg. Of a stated or estimated mass, the nearest one
+            is carried.
+        mass: Of each robot, (num,) kg, as stated or estimated.
+        stated: Whether it was stated, or can only be zero.
+        estimate: From the torques of the same robots.
     """
 
     def __init__(
         self,
-        robot: RobotSpec,
-        max_mass: float,
-        payload_side: str,
-        dt: float,
-        locked: tuple[str, ...],
+        masses: Array,
+        max_stated: float,
+        num: int,
+        carriers: ListOf[Carrier],
+        estimate: PayloadEstimate,
+        compared: bool,
     ) -> None:
         """
         Args:
-            max_mass: Largest payload per hand, kg.
-            payload_side: The hands that carry it.
-            dt: Control period, s.
-            locked: Joints that are clamped at home; no operated one.
+            masses: Those that can be carried, (k,) kg.
+            max_stated: Largest mass that `require` accepts, kg.
+            num: Number of robots.
+            carriers: Everything that depends on the mass.
+            estimate: From the torques of the same robots.
+            compared: Whether a stated mass is compared with the torques of the first robot.
         """
-        self.max_mass = max_mass
-        self.kp = robot.servo.kp[robot.operated_index]
-        self.kd = robot.servo.kd[robot.operated_index]
-        self.sample_periods = max(1, round(SAMPLE_TIME_S / dt))
-        self.dt = dt
-        self.sample_time = dt * self.sample_periods  # s
-        self.keep = np.exp(-self.sample_time / FORGETTING_TIME_S)  # share of the sums
-        # Two robots at rest, with empty hands and with the largest payload.
-        empty = Condition(0.0, payload_side, dt)
-        self.sim = BatchSim(robot, [empty, empty._replace(payload_mass=max_mass)], 1, locked)
-        self.operated = np.flatnonzero(np.isin(self.sim.joint_names, robot.operated))
-        self.bias: Array = self.sim.batch.bind("qfrc_bias")
-        self.sim.qpos[:] = robot.qpos_home[robot.index(self.sim.joint_names)]
-        self.reset(0)
-
-    def reset(self, num: int) -> None:
-        """Start with empty hands of num robots."""
+        self.masses = masses
         self.mass = np.zeros(num)
-        self._period = 0
-        # Of each robot: torque that looks like a payload's per kg, N²·m²·s/kg; leverage,
-        # N²·m²·s/kg²; energy of the torque beyond the empty arm's, N²·m²·s. (3, num)
-        self._sums = np.zeros((3, num))
+        self.stated = False
+        self.estimate = estimate
+        self._max_stated = max_stated
+        self._carriers = carriers
+        self._carried = np.full(num, -1)  # index of the mass that is carried for each robot
+        self._compared = compared and len(masses) > 1
+
+    def require(self, mass: Array | float) -> None:
+        """Refuse masses, kg, that are not physical or too large."""
+        given = np.asarray(mass, float)
+        if not ((given >= 0) & (given <= self._max_stated)).all():
+            raise UsageError(
+                f"payload_mass is {mass}; give kg, 0 when empty, up to {self._max_stated:g}, or "
+                "raise payload_max (--compensation.payload-max)"
+            )
+
+    def reset(self, mass: Array | float | None) -> None:
+        """Start with a stated mass, kg, one number or (num,); None to estimate it, from 0 on."""
+        self.stated = mass is not None or len(self.masses) == 1
+        self.estimate.reset()
+        self.set(0.0 if mass is None else mass)
+
+    def set(self, mass: Array | float) -> None:
+        """Set the mass, kg, one number or (num,)."""
+        self.mass = np.array(np.broadcast_to(np.asarray(mass, float), self.mass.shape))
+        self._carry_nearest()
 
     def observe(
         self, qpos: Array, qvel: Array, command: Array, tau: Array | None, valid: Array
     ) -> None:
-        """Take the torques of one control period of all robots into account.
-
-        Args:
-            qpos, qvel: Measured, (num, n operated) rad, rad/s.
-            command: Command in force, (num, n operated) rad.
-            tau: Measured torque, (num, n operated) N·m; None for the servo model's.
-            valid: Robots with a finite state, (num,). The others are skipped.
-        """
-        self._period += 1
-        if self._period % self.sample_periods:
+        """Estimate the mass, or compare the stated one; arguments as of PayloadEstimate."""
+        if self.stated and not self._compared:
             return
-        torque = self.kp * (command - qpos) - self.kd * qvel if tau is None else tau
-        for i in valid.nonzero()[0]:
-            empty, full = self.gravity(qpos[i])
-            per_kg = (full - empty) / self.max_mass
-            excess = torque[i] - empty
-            speed = max(qvel[i].max(), -qvel[i].min())
-            weight = self.sample_time / (1.0 + (speed / HALF_WEIGHT_SPEED) ** 2)
-            self._sums[:, i] *= self.keep
-            self._sums[:, i] += (
-                weight * (per_kg @ excess),
-                weight * (per_kg @ per_kg),
-                weight * (excess @ excess),
-            )
-
-    def update(self) -> Array:
-        """Return the estimate after the latest torques, (num,) kg. Call this once per period."""
-        latest = np.where(self.certain, self.latest, self.mass)
-        change = MAX_RATE_KG_S * self.dt
-        self.mass = self.mass + within(latest - self.mass, -change, change)
-        return self.mass
+        self.estimate.observe(qpos, qvel, command, tau, valid)
+        if not self.stated:
+            self.mass = self.estimate.update()
+            self._carry_nearest()
 
     @property
-    def certain(self) -> Array:
-        """Robots whose postures had enough leverage, (num,)."""
-        _, leverage, _ = self._sums
-        return np.asarray(leverage > MIN_LEVERAGE)
+    def contradiction(self) -> str:
+        """Message if torques are those of another mass than stated; else ""."""
+        if self.stated and self._compared:
+            return self.estimate.contradiction(float(self.mass[0]))
+        return ""
 
-    @property
-    def latest(self) -> Array:
-        """Estimate without the limit of its rate, (num,) kg."""
-        projection, leverage, energy = self._sums
-        mass = within(projection / np.maximum(leverage, 1e-9), 0.0, self.max_mass)
-        explained = projection * np.abs(projection)
-        similarity = explained / np.maximum(leverage * energy, 1e-9)
-        similar = similarity >= MIN_SIMILARITY * (mass / self.max_mass) ** 2
-        return np.where(similar, mass, 0.0)
-
-    def contradiction(self, stated: float) -> str:
-        """Return a message if torques are those of another payload than stated, kg; else "".
-
-        They are the first robot's.
-        """
-        if not self.certain[0] or abs(self.latest[0] - stated) <= self.max_mass / 2:
-            return ""
-        estimate = f"{self.latest[0]:.1f} kg"
-        return (
-            f"{stated:g} kg were stated, but the torques are those of about {estimate}: what is "
-            "in the hand?"
-        )
-
-    def gravity(self, qpos: Array) -> Array:
-        """Return the torques that hold a posture, empty and with most payload, (2, n) N·m."""
-        self.sim.qpos[:, self.operated] = qpos
-        self.sim.batch.forward(stage=mujoco.mjtStage.mjSTAGE_VEL.value)
-        torques: Array = self.bias[:, self.operated]
-        return torques
+    def _carry_nearest(self) -> None:
+        nearest = np.abs(self.mass[:, None] - self.masses).argmin(axis=1)
+        if (nearest != self._carried).any():
+            for carrier in self._carriers:
+                carrier.carry(nearest)
+            self._carried = nearest
