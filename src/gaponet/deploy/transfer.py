@@ -22,7 +22,6 @@ from gaponet.base.arrays import Array
 from gaponet.base.errors import ModelError
 from gaponet.data.sequence import Sequence
 from gaponet.nn.artifact import RATE_TOLERANCE, GapModel
-from gaponet.nn.loop import DeltaLoop
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.batch import BatchSim, Condition
 from gaponet.sim.inverse import AnalyticInverse, Period
@@ -40,11 +39,66 @@ RANGE_TOLERANCE = 1e-6  # of the ends of these ranges
 STICTION_SPEED = 0.02
 
 
-class Transfer:
-    """Commands for num_envs simulations of the target, each with one of the reference.
+class HeldCorrection:
+    """Corrections of a network, which has the control period of its training.
 
-    Arrays are (num_envs, n) in the order of `joint_names`, the reference's joints that are not
+    That can be several control periods of the simulations: the correction is held meanwhile.
+    """
+
+    def __init__(
+        self, model: GapModel, robot: RobotSpec, conditions: list[Condition], operated: Array
+    ) -> None:
+        """
+        Args:
+            robot: Simulator of training.
+            conditions: Payload and control period of each simulation.
+            operated: Operated joints among the simulations', (n_operated,).
+
+        Raises:
+            ModelError: The control period does not fit the model.
+        """
+        self._periods = max(control_periods_of(model, c.dt) for c in dict.fromkeys(conditions))
+        self._loop = model.loop(len(conditions), own_context(model, robot, conditions))
+        self._payload_mass = np.array([c.payload_mass for c in conditions])
+        self._operated = operated
+        self._delta = np.zeros((len(conditions), len(operated)))
+        self._elapsed = 0  # control periods since the start
+
+    def reset(self, ids: Array | slice) -> None:
+        """Start simulations anew, without history."""
+        self._delta[ids] = 0.0
+        self._loop.reset(ids)
+        num = len(self._delta)
+        if len(np.arange(num)[ids]) == num:
+            self._elapsed = 0
+
+    def corrected(self, qpos: Array, qvel: Array, target: Array) -> Array:
+        """Return target + Δa, (num, n) rad. Call this once per control period.
+
+        Args:
+            qpos, qvel: Present state, (num, n) rad, rad/s.
+            target: Targets of the coming period, (num, n) rad.
+        """
+        corrected = np.array(target, float)
+        op = self._operated
+        if self._elapsed % self._periods == 0:
+            self._delta[:] = self._loop.delta(
+                qpos[:, op], qvel[:, op], corrected[:, op], self._payload_mass
+            )
+        self._elapsed += 1
+        corrected[:, op] += self._delta
+        return corrected
+
+
+class Transfer:
+    """Commands for simulations of the target, each with one of the reference.
+
+    Arrays are (num_envs, n) in the order of `sim.joint_names`, the reference's joints that are not
     locked.
+
+    Attributes:
+        inverse: Inverse dynamics of the target.
+        sim: Simulations of the reference.
     """
 
     def __init__(
@@ -69,24 +123,16 @@ class Transfer:
             ModelError: The control period does not fit the model, or the target is outside the
                 measured ranges.
         """
-        model = reference if isinstance(reference, GapModel) else None
         robot = reference.simulator() if isinstance(reference, GapModel) else reference
         self.inverse = inverse
-        self.num_envs = len(conditions)
         sim = BatchSim(robot, conditions, nthread, locked)
         self.sim = sim
         if not extrapolate:
             _require_measured(inverse, AnalyticInverse.of(sim), sim.joint_names)
-        self.joint_names = sim.joint_names
-        self.op = np.array([sim.joint_names.index(name) for name in robot.operated])
-        self.periods = 1  # control periods of the target in one of the model
-        self.loop: DeltaLoop | None = None
-        if model is not None:
-            self.periods = max(control_periods_of(model, c.dt) for c in dict.fromkeys(conditions))
-            self.loop = model.loop(self.num_envs, own_context(model, robot, conditions))
-        self.payload_mass = np.array([c.payload_mass for c in conditions])
-        self._delta = np.zeros((self.num_envs, len(self.op)))
-        self._elapsed = 0  # control periods since the start
+        self._correction: HeldCorrection | None = None
+        if isinstance(reference, GapModel):
+            operated = np.array([sim.joint_names.index(name) for name in robot.operated])
+            self._correction = HeldCorrection(reference, robot, conditions, operated)
         self._frictionloss = sim.batch.expand("dof_frictionloss")  # the servo model writes it
         self._constraint_force: Array = sim.batch.bind("qfrc_constraint")
         self._dt = (sim.nstep * sim.timestep)[:, None]
@@ -94,11 +140,8 @@ class Transfer:
     def reset(self, ids: Array | slice, qpos: Array, qvel: Array, past: Array) -> None:
         """Reset simulations to a state, (k, n), with targets of past periods, (k, depth, n)."""
         self.sim.reset(ids, qpos, qvel, past=past)
-        self._delta[ids] = 0.0
-        if self.loop is not None:
-            self.loop.reset(ids)
-        if len(np.arange(self.num_envs)[ids]) == self.num_envs:
-            self._elapsed = 0
+        if self._correction is not None:
+            self._correction.reset(ids)
 
     def command(self, qpos: Array, qvel: Array, target: Array) -> Array:
         """Return the commands of the coming control period, rad, without joint limits.
@@ -111,29 +154,15 @@ class Transfer:
         """
         self.sim.qpos[:] = qpos
         self.sim.qvel[:] = qvel
-        corrected = self._corrected(qpos, qvel, target)
+        corrected = np.asarray(target, float)
+        if self._correction is not None:
+            corrected = self._correction.corrected(qpos, qvel, corrected)
         periods = [self.step_reference(corrected)]
         if self.inverse.ahead:
             state = self.sim.state()
             periods += [self.step_reference(corrected) for _ in range(self.inverse.ahead)]
             self.sim.set_state(state)
         return self.inverse(periods)
-
-    def _corrected(self, qpos: Array, qvel: Array, target: Array) -> Array:
-        """Return target + Δa.
-
-        The model has the control period of training, which can be several of these.
-        """
-        corrected = np.array(target, float)
-        if self.loop is not None:
-            if self._elapsed % self.periods == 0:
-                op = self.op
-                self._delta[:] = self.loop.delta(
-                    qpos[:, op], qvel[:, op], corrected[:, op], self.payload_mass
-                )
-            self._elapsed += 1
-            corrected[:, self.op] += self._delta
-        return corrected
 
     def step_reference(self, targets: Array) -> Period:
         """Simulate a control period of the reference under targets, rad, without the model."""
@@ -180,7 +209,7 @@ class TransferCorrector:
         self.transfer = Transfer(
             self.reference, AnalyticInverse.of(own), reference, locked, 0, self.extrapolate
         )
-        self.free = self.robot.index(self.transfer.joint_names)
+        self.free = self.robot.index(self.transfer.sim.joint_names)
         qpos = np.stack([s.qpos[0, self.free] for s in start])
         qvel = np.stack([s.qvel[0, self.free] for s in start])
         ctrl = np.stack([s.ctrl[0, self.free] for s in start])
