@@ -97,7 +97,8 @@ def bench_aligned(run: Path, num_envs: int, rounds: int) -> dict[str, dict[str, 
     aligned = AlignedSim(robot, model, num_envs=num_envs, options=options)
     phase = np.random.default_rng(0).uniform(0, 2 * np.pi, (num_envs, nominal.n))
     angles = np.pi * robot.dt * np.arange(TURN_STEPS)
-    targets = [aligned.qpos_home + 0.3 * np.sin(phase + angle) for angle in angles]
+    home = robot.qpos_home[robot.index(aligned.joint_names)]
+    targets = [home + 0.3 * np.sin(phase + angle) for angle in angles]
 
     def run_nominal() -> None:
         start = targets[0]

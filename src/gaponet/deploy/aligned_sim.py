@@ -85,33 +85,28 @@ class AlignedSim:
             if name in options.locked:
                 raise UsageError(f"joint '{name}' is corrected by the model and cannot be locked")
         self.robot = robot
-        self.model = model
-        self.options = options
         self.dt = robot.dt if dt is None else dt
         self.single = num_envs is None
         self.num_envs = 1 if num_envs is None else num_envs
         self.payload_mass = np.array(np.broadcast_to(payload_mass, self.num_envs), float)
-        stated = self._conditions(self.payload_mass)
+        stated = self._conditions(self.payload_mass, options.payload_side)
         carried = stated
         if options.simulator_payload is not None:
-            carried = self._conditions(np.broadcast_to(options.simulator_payload, self.num_envs))
+            held = np.broadcast_to(options.simulator_payload, self.num_envs)
+            carried = self._conditions(held, options.payload_side)
         self.sim = BatchSim(robot, carried, options.nthread, options.locked)
         self.joint_names = self.sim.joint_names
-        self.n = self.sim.n
-        self.qpos_home = robot.qpos_home[robot.index(self.joint_names)]
-        self.qpos_range = self.sim.range
         self.op = np.array([self.joint_names.index(name) for name in robot.operated])
         self.loop: DeltaLoop | None = None
         self.transfer: Transfer | None = None
         if model is not None:
-            self._correct_with(model, stated, carried, extrapolate)
-        self.target = np.zeros((self.num_envs, self.n))
+            self._correct_with(model, stated, carried, extrapolate, options)
+        self.target = np.zeros(self.sim.qpos.shape)
         self._uncorrected = self.target[:, self.op]
         self.reset()
 
-    def _conditions(self, payload_mass: Array) -> list[Condition]:
+    def _conditions(self, payload_mass: Array, side: str) -> list[Condition]:
         """Return the condition of each simulation; payload_mass (num_envs,), kg."""
-        side = self.options.payload_side
         return [Condition(float(mass), side, self.dt) for mass in payload_mass]
 
     def _correct_with(
@@ -120,6 +115,7 @@ class AlignedSim:
         stated: list[Condition],
         carried: list[Condition],
         extrapolate: bool,
+        options: AlignedSimOptions,
     ) -> None:
         """Use a network directly in the simulator of its training; elsewhere transfer commands.
 
@@ -127,11 +123,11 @@ class AlignedSim:
             model: A network with its simulator, or a simulator.
             stated: Conditions of the robot that the simulations are to move like.
             carried: Conditions of the simulations.
-            extrapolate: As in `__init__`.
+            extrapolate, options: As in `__init__`.
         """
         robot = self.robot
-        nthread = self.options.nthread
-        locked = self.options.locked
+        nthread = options.nthread
+        locked = options.locked
         # With another payload than stated, this is not the simulator of training.
         network = model if isinstance(model, GapModel) and carried is stated else None
         if network is not None and network.is_trained_in(robot) and self._has_rate_of(network):
@@ -183,12 +179,12 @@ class AlignedSim:
                 follow; default qpos.
             ids: Which simulations, (k,); arrays are then (k, n).
         """
-        count = len(np.arange(self.num_envs)[ids])
-        q = np.broadcast_to(
-            self.qpos_home if qpos is None else np.asarray(qpos, float), (count, self.n)
-        )
-        v = np.broadcast_to(np.asarray(qvel, float), (count, self.n))
-        u = q if ctrl is None else np.broadcast_to(np.asarray(ctrl, float), (count, self.n))
+        if qpos is None:
+            qpos = self.robot.qpos_home[self.robot.index(self.joint_names)]
+        shape = self.target[ids].shape
+        q = np.broadcast_to(np.asarray(qpos, float), shape)
+        v = np.broadcast_to(np.asarray(qvel, float), shape)
+        u = q if ctrl is None else np.broadcast_to(np.asarray(ctrl, float), shape)
         past = u[:, None]  # delayed servos hold the oldest target that is given
         self.sim.reset(ids, q, v, past=past)
         if self.loop is not None:

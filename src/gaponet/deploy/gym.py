@@ -56,8 +56,9 @@ class TrackingEnv(gymnasium.Env):
                 "TrackingEnv has a single simulation: leave num_envs out; gymnasium.make_vec "
                 "copies it"
             )
-        if not len(references) or any(r.shape[1] != sim.n or len(r) < 3 for r in references):
-            raise UsageError(f"give motions (T, {sim.n}) of at least 3 rows")
+        joints = len(sim.joint_names)
+        if not len(references) or any(r.shape[1] != joints or len(r) < 3 for r in references):
+            raise UsageError(f"give motions (T, {joints}) of at least 3 rows")
         self.sim = sim
         self.references = references
         self.reach = reach
