@@ -8,19 +8,20 @@ import sys
 import time
 from collections import defaultdict
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
 pytest.importorskip("cyclonedds", reason="pip install 'gaponet[dds]'")
 
-from hw.control.loopback import Loopback
+from hw.control.loopback import Loopback, RobotClock, living
 
 from gaponet.base.errors import UsageError
 from gaponet.hw.control.driver import DriverError, State
 from gaponet.hw.drivers import hg
 from gaponet.hw.drivers.unitree import UnitreeDriver
-from gaponet.hw.drivers.unitree_commands import WEIGHT_MOTOR, CommandMessages
+from gaponet.hw.drivers.unitree_commands import CommandMessages
 from gaponet.hw.drivers.unitree_states import (
     MOTOR_NAMES,
     FirstMessages,
@@ -31,6 +32,9 @@ from gaponet.hw.drivers.unitree_states import (
 from gaponet.robot.spec import RobotSpec, load_robot
 from gaponet.virtual.fleet import load_fleet
 from gaponet.virtual.unitree_virtual import VirtualH12
+
+TORSO = MOTOR_NAMES.index("torso_joint")
+ELBOW = MOTOR_NAMES.index("left_elbow_joint")
 
 
 @pytest.fixture(scope="module")
@@ -122,43 +126,59 @@ def test_what_one_of_several_messages_says_stops_for_good(robot):
     assert [states.read().fault.kind, states.read().fault.kind] == ["stop", "stop"]
 
 
-def unplugged(robot: RobotSpec, **how: str) -> tuple[UnitreeDriver, list[np.ndarray]]:
-    """A driver without a bus, and the list of what it sends."""
+@pytest.fixture
+def clock(robot: RobotSpec, monkeypatch: pytest.MonkeyPatch) -> RobotClock:
+    return living(monkeypatch, robot)
+
+
+def connected(robot: RobotSpec, **how: Any) -> UnitreeDriver:
+    """A driver of the robot that lives by `clock`."""
     driver = UnitreeDriver(robot, **how)
-    sent = []
-    driver._link._bus = object()
-    driver._link._writer = SimpleNamespace(send=lambda data: sent.append(data.copy()))
-    return driver, sent
+    driver.connect()
+    return driver
 
 
-def test_on_arm_sdk_the_torso_is_held_where_it_was_found_with_its_gains(robot):
-    at = MOTOR_NAMES.index("torso_joint")
+def heard(clock: RobotClock) -> list[dict]:
+    """The commands that the robot has received by now."""
+    clock.wait_until(clock.now() + 0.02)
+    return clock.robot.heard
+
+
+def test_on_arm_sdk_the_torso_is_held_where_it_was_found_with_its_gains(robot, clock):
     torso = robot.index(["torso_joint"])[0]
-    for how, held in (({}, True), ({"joints": "upper_body"}, False), ({"topic": "lowcmd"}, False)):
-        driver, sent = unplugged(robot, **how)
-        for angle in (0.3, 0.7):
-            driver.write(np.where(np.arange(27) == torso, angle, 0.0), 1.0)
-        driver.damp()
-        q, kp, kd, mode = (
-            [hg.LowCmd.motors(data, name)[at] for data in sent]
-            for name in ("q", "kp", "kd", "mode")
-        )
-        if held:
-            assert (q, kp, mode) == (pytest.approx([0.3] * 3), [robot.servo.kp[torso]] * 3, [1] * 3)
-            assert kd == [robot.servo.kd[torso]] * 3
-        else:
-            assert kp[-1] == 0, "what is commanded is damped, what is not is off"
+    driver = connected(robot)
+    found = driver.read().qpos[torso]
+
+    for angle in (0.3, 0.7):
+        driver.write(np.where(np.arange(27) == torso, angle, 0.0), 1.0)
+    driver.damp()
+
+    rows = heard(clock)
+    assert [row["ctrl"][TORSO] for row in rows] == pytest.approx([found] * 3)
+    assert [row["kp"][TORSO] for row in rows] == [robot.servo.kp[torso]] * 3
+    assert [row["kd"][TORSO] for row in rows] == [robot.servo.kd[torso]] * 3
+    assert [row["mode"][TORSO] for row in rows] == [1] * 3
 
 
-def test_an_identified_robot_is_commanded_with_the_gains_of_its_real_servos(robot):
-    driver, sent = unplugged(robot.with_identified({"left_elbow_joint": {"kp": 60.0}}))
+@pytest.mark.parametrize("how", [{"joints": "upper_body"}, {"topic": "lowcmd"}])
+def test_a_torso_that_is_commanded_is_damped_and_one_that_is_not_is_off_on_lowcmd(
+    robot, clock, how
+):
+    driver = connected(robot, **how)
+
+    driver.write(np.zeros(27))
+    driver.damp()
+
+    assert heard(clock)[-1]["kp"][TORSO] == 0
+
+
+def test_an_identified_robot_is_commanded_with_the_gains_of_its_real_servos(robot, clock):
+    driver = connected(robot.with_identified({"left_elbow_joint": {"kp": 60.0}}))
+
     driver.write(robot.qpos_home)
-    at = MOTOR_NAMES.index("left_elbow_joint")
-    assert (
-        hg.LowCmd.motors(sent[0], "kp")[at]
-        == robot.servo.kp[robot.index(["left_elbow_joint"])[0]]
-        != 60.0
-    )
+
+    real = robot.servo.kp[robot.index(["left_elbow_joint"])[0]]
+    assert heard(clock)[0]["kp"][ELBOW] == real != 60.0
 
 
 @pytest.mark.parametrize("speed", [0.0, 1.0, 100.0])
@@ -178,26 +198,35 @@ def test_damping_gains_are_four_times_the_robots_but_no_more_than_the_effort_lim
     np.testing.assert_allclose(kd, most, rtol=1e-6)
 
 
-def test_after_damping_the_last_message_gives_the_arms_back_and_a_hold_sends_nothing(robot):
-    driver, sent = unplugged(robot)
+def test_after_damping_the_last_message_gives_the_arms_back(robot, clock):
+    driver = connected(robot)
+
     driver.write(robot.qpos_home, 1.0)
     driver.damp(0.5)
     driver.close()
-    weights = [hg.LowCmd.motors(data, "q")[WEIGHT_MOTOR] for data in sent]
-    assert weights == [1.0, 0.5, 0.0]
-    assert hg.LowCmd.motors(sent[-1], "kp")[16] == 0
-    driver, sent = unplugged(robot)
+
+    rows = heard(clock)
+    assert [row["weight"] for row in rows] == [1.0, 0.5, 0.0]
+    assert rows[-1]["kp"][ELBOW] == 0
+
+
+def test_a_hold_sends_nothing(robot, clock):
+    driver = connected(robot)
+
     driver.write(robot.qpos_home, 1.0)
     driver.close(hold=True)
-    assert len(sent) == 1
+
+    assert len(heard(clock)) == 1
 
 
-def test_a_silent_driver_publishes_nothing(robot):
-    driver, sent = unplugged(robot, silent=True)
+def test_a_silent_driver_publishes_nothing(robot, clock):
+    driver = connected(robot, silent=True)
+
     driver.write(robot.qpos_home)
     driver.damp()
     driver.close()
-    assert sent == []
+
+    assert heard(clock) == []
 
 
 def test_another_publisher_of_the_topic_is_refused(robot, monkeypatch):
