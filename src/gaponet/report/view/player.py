@@ -98,7 +98,7 @@ class ErrorTable:
     """The simulators' errors now and in the whole motion, as a table."""
 
     def __init__(self, gui: Any, simulators: Mapping[str, Copy]) -> None:
-        """Add the table to the current container of the page; simulators by what they are called."""
+        """Add the table to the current container of the page; simulators by title."""
         self.simulators = simulators
         self.text = gui.add_markdown("")
 

@@ -1,4 +1,4 @@
-"""The six tabs of the page of `gaponet app`: the controls of each, and the steps that they start."""
+"""The six tabs of the page of `gaponet app`: the controls of each, and the steps they start."""
 
 from __future__ import annotations
 
