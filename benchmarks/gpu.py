@@ -102,7 +102,7 @@ def measure(robot: RobotSpec, num_envs: int, device: str, seconds: float) -> dic
         sim.step(target)
 
     begin(torch.arange(num_envs, device=home.device))
-    (worlds,) = sim._worlds
+    (worlds,) = sim._worlds.of_rates
     turns: dict[str, Callable[[], object]] = {"graph": lambda: worlds.launch(worlds.period)}
     turns |= {"gaponet": lambda: sim.step(target), "resets": with_resets}
     rates = {"plain": plain_rate(robot, num_envs, device, seconds)}

@@ -13,7 +13,7 @@ from gaponet.deploy.aligned_sim import AlignedSim
 from gaponet.deploy.compensator import Compensator, CompensatorConfig
 from gaponet.nn.adaptation import Adaptation
 from gaponet.nn.artifact import GapModel, make_card
-from gaponet.sim.batch import BatchSim
+from gaponet.sim.batch import BatchSim, differing_fields
 
 NOW = CompensatorConfig(blend=0.0)
 
@@ -35,7 +35,8 @@ class WeakArm:
             self.step(np.array(qpos))
 
     def load(self, heavy):
-        for field in self.sim.fields.values():
+        for name in differing_fields(list(self.sim.models.values())):
+            field = self.sim.batch.expand(name)
             field[0] = field[1 + heavy]
 
     def step(self, u):

@@ -7,7 +7,8 @@ from arm import XML, write_arm
 
 from gaponet.base.errors import UsageError
 from gaponet.robot.servo_fields import SERVO_FIELDS, SERVO_TERMS, STOP_FIELDS, TERMS
-from gaponet.sim.batch import BatchSim, OneByOne, speed_limited
+from gaponet.sim.batch import BatchSim, OneByOne
+from gaponet.sim.commands import speed_limited
 from gaponet.sim.model import build_model
 
 
@@ -34,7 +35,7 @@ def test_a_batch_is_bit_identical_to_mj_step(tmp_path):
 def test_targets_beyond_the_joint_range_are_clipped(tmp_path):
     sim = BatchSim(write_arm(tmp_path), [(0.0, "both", 0.02)])
     sim.step(np.array([[9.0, -9.0]]))
-    np.testing.assert_array_equal(sim.ctrl, [[1.5, -1.5]])
+    np.testing.assert_array_equal(sim.commands.ctrl, [[1.5, -1.5]])
 
 
 @pytest.mark.parametrize("rates", [(0.02, 0.02, 0.02), (0.02, 0.02, 0.01), (0.01, 0.02, 0.02)])
@@ -159,7 +160,7 @@ def test_ramps_of_simulations_left_out_of_a_step_stand_still(tmp_path):
     )
     sim.reset(slice(None), np.zeros(2), 0.0)
     sim.step(np.ones((2, 2)), np.array([1]))
-    np.testing.assert_allclose(sim.ctrl, [[0, 0], [0.01, 0.01]])
+    np.testing.assert_allclose(sim.commands.ctrl, [[0, 0], [0.01, 0.01]])
 
 
 OTHER = {

@@ -49,7 +49,7 @@ class Both:
     def __init__(self, robot, **how):
         self.ours = worlds(robot, **how)
         self.theirs, self.apart = WarpSim(self.ours, DEVICE), 0.0
-        low, high = np.clip(self.ours.range.T, -3, 3)
+        low, high = np.clip(self.ours.commands.range.T, -3, 3)
         home, inside = robot.qpos_home[robot.index(self.ours.joint_names)], 0.1 * (high - low)
         self.at = np.clip(home, low + inside, high - inside)
         self.at = self.at + np.random.default_rng(1).uniform(-0.05, 0.05, self.ours.qpos.shape)
@@ -164,15 +164,15 @@ def test_the_servo_model_of_a_physics_step_agrees_with_mujoco_up_to_rounding(tmp
     ours.batch.expand("actuator_forcerange")[:] *= np.array([1.0, 0.5, 0.1])[:, None, None]
     ours.servo_model.servos.records["effort_limit"] *= np.array([[1.0], [0.5], [0.1]])
     theirs, rng = WarpSim(ours, DEVICE), np.random.default_rng(0)
-    model = theirs._worlds[0].model
+    model = theirs._worlds.of_rates[0].model
     for ids in (np.arange(3), np.array([0, 2])):
         qpos, qvel, past = (rng.normal(0, 0.3, (len(ids), *more)) for more in ((2,), (2,), (1, 2)))
-        target = np.clip(ours.qpos + rng.choice([1e-4, 0.1], (3, 2)), *ours.range.T)
+        target = np.clip(ours.qpos + rng.choice([1e-4, 0.1], (3, 2)), *ours.commands.range.T)
         for sim in (ours, theirs):
             sim.reset(ids, qpos, qvel, past=past)
         for name, x in ours.state().items():
             np.testing.assert_allclose(theirs.state()[name].cpu(), x, rtol=1e-5, atol=1e-6)
-        ours.ctrl[:] = target
+        ours.commands.ctrl[:] = target
         ours.servo_model.before()
         theirs.step(target)
         for name in ("actuator_biasprm", "dof_frictionloss", "actuator_forcerange"):

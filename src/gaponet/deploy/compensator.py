@@ -247,7 +247,7 @@ class Compensator:
             self.inverse.reset()
         if self.feedforward is not None:
             self.feedforward.reset(operated)
-        rest = within(a[:, self.shadow.free], *self.shadow.sim.range.T)
+        rest = within(a[:, self.shadow.free], *self.shadow.sim.commands.range.T)
         self.shadow.reset(rest)
         if self.follower is not None:
             self.follower.reset(rest, SETTLING_PERIODS)

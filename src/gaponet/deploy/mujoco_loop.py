@@ -75,7 +75,7 @@ class MujocoAligner:
         self.loop: DeltaLoop | None = None
         self.transfer: Transfer | None = None
         of_reference = AnalyticInverse.of(reference)
-        if not can_agree or not inverse.agrees_with(of_reference, reference.range):
+        if not can_agree or not inverse.agrees_with(of_reference, reference.commands.range):
             try:
                 self.transfer = Transfer(model, inverse, [condition], locked, 1, extrapolate)
             except ModelError:

@@ -135,7 +135,7 @@ class Transfer:
             self._correction = HeldCorrection(reference, robot, conditions, operated)
         self._frictionloss = sim.batch.expand("dof_frictionloss")  # the servo model writes it
         self._constraint_force: Array = sim.batch.bind("qfrc_constraint")
-        self._dt = (sim.nstep * sim.timestep)[:, None]
+        self._dt = sim.periods.seconds[:, None]
 
     def reset(self, ids: Array | slice, qpos: Array, qvel: Array, past: Array) -> None:
         """Reset simulations to a state, (k, n), with targets of past periods, (k, depth, n)."""

@@ -28,7 +28,8 @@ from gaponet.evaluation.candidate import read_origin
 from gaponet.robot.by_name import identified_catalogue
 from gaponet.robot.servo_fields import SERVO_FIELDS, SERVO_TERMS
 from gaponet.robot.spec import RobotSpec, load_robot
-from gaponet.sim.batch import Condition, speed_limited
+from gaponet.sim.batch import Condition
+from gaponet.sim.commands import speed_limited
 from gaponet.sim.model import model_hash
 from gaponet.sim.replay import replay, rollout_errors
 from gaponet.sysid.identify import identify

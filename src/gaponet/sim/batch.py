@@ -12,13 +12,14 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import mujoco
 import numpy as np
 
-from gaponet.base.arrays import Array, array_like, array_module
+from gaponet.base.arrays import Array
 from gaponet.base.errors import UsageError
 from gaponet.data.sequence import Sequence
 from gaponet.robot.servo_fields import SERVO_TERMS, STOP_FIELDS
 from gaponet.robot.simulator_change import SimulatorChange
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.changed_model import changed_model
+from gaponet.sim.commands import CommandHistory, Commands, ControlPeriods
 from gaponet.sim.model import build_model, qpos_range
 from gaponet.sim.servo_model import ServoModel
 
@@ -107,31 +108,6 @@ else:
         }
 
 
-# of a ramp beyond its joint: fixed, and at the ramp's speed
-MAX_RAMP_LEAD_RAD = 0.05
-MAX_RAMP_LEAD_S = 0.1
-
-
-def ramp_start(target: Any, qpos: Any, speed: Any) -> Any:
-    """Return where a ramp towards `target` (…, n), rad, is when the joint is at qpos; numpy or
-    torch.
-    """
-    lead = MAX_RAMP_LEAD_RAD + MAX_RAMP_LEAD_S * speed
-    return array_module(target).clip(target, qpos - lead, qpos + lead)
-
-
-def speed_limited(ctrl: Array, qpos: Array, speed: Array, dt: Array | float) -> Array:
-    """Return targets (T, …), rad, limited to `speed` (…), rad/s, from qpos (…) on; dt in s, one or
-    (…).
-    """
-    limited = np.empty_like(ctrl)
-    at = ramp_start(ctrl[0], qpos, speed)
-    for t, target in enumerate(ctrl):
-        at = np.clip(target, at - speed * dt, at + speed * dt)
-        limited[t] = at
-    return limited
-
-
 class Condition(NamedTuple):
     """Condition of a recording: payload, control period, and gains (n) where they are not the
     robot's own.
@@ -192,44 +168,42 @@ class BatchSim:
         """
         self.robot = robot
         self.joint_names = tuple(name for name in robot.joint_names if name not in locked)
-        free = robot.index(self.joint_names)
-        self.num_envs = len(conditions)
-        self.n = len(self.joint_names)
         conditions = [Condition(*condition) for condition in conditions]
         robots = _under_conditions(robot, conditions)
-        added_delay = _largest_added_delay(conditions)
-        self.longest_delay = float(robot.servo.delay.max()) + added_delay  # s
-        self.models = _compiled(robots, self.joint_names, locked, added_delay)
+        self.models = _compiled(robots, self.joint_names, locked, _largest_added_delay(conditions))
         models = [self.models[condition] for condition in conditions]
         first = models[0]
-        own = [robots[condition] for condition in conditions]
-        self._kp_ratio, self._kd = _recorded_gains(robot, own)
-        self.batch = Batch(
-            first, nsim=self.num_envs, nthread=nthread or _useful_threads(self.num_envs)
-        )
-        # Model fields that differ between conditions, each (num_envs, …): a row may be copied over
-        # another's.
-        self.fields = expand_differences(self.batch, models)
+        self._gains = _recorded_gains(robot, [robots[condition] for condition in conditions])
+        self.batch = Batch(first, nsim=len(models), nthread=nthread or _useful_threads(len(models)))
+        expand_differences(self.batch, models)
         bind: Callable[[str], Array] = self.batch.bind
         self.qpos = bind("qpos")
         self.qvel = bind("qvel")
-        self.ctrl = bind("ctrl")
         self.torque = bind("actuator_force")
         self._warmstart = bind("qacc_warmstart")
         self.servo_model: ServoModel | None = None
         if robot.servo.has_terms or servo_model:
             self.servo_model = ServoModel(self.batch, first)
-        self._history: CommandHistory | None = None
+        nstep = np.array([robot.steps_per(condition.dt) for condition in conditions])
+        timestep = np.array([model.opt.timestep for model in models])
+        self.periods = ControlPeriods(nstep, timestep)
+        history = None
         if first.nhistory:
-            self._history = CommandHistory(bind("history"), bind("time"), first)
-        # Physics steps per control period, and their length in s, of each simulation.
-        self.nstep = np.array([robot.steps_per(condition.dt) for condition in conditions])
-        self._one_rate = bool((self.nstep == self.nstep[0]).all())
-        self.timestep = np.array([model.opt.timestep for model in models])
-        self.range = qpos_range(first)
-        self.max_change: Array | None = None  # without speed limits
-        if robot.servo.target_speed[free].any():
-            self.max_change = self._max_change(robot.servo.target_speed[free])
+            history = CommandHistory(bind("history"), bind("time"), first)
+        self.commands = Commands(bind("ctrl"), qpos_range(first), self.periods, history)
+        speed = robot.servo.target_speed[robot.index(self.joint_names)]
+        if speed.any():
+            self.commands.limit_speed(speed)
+
+    @property
+    def num_envs(self) -> int:
+        """Number of simulations."""
+        return len(self.qpos)
+
+    @property
+    def n(self) -> int:
+        """Number of joints that are not locked."""
+        return len(self.joint_names)
 
     def array(self, values: Any) -> Array:
         """Return values as an array of this simulator: numpy here, torch in sim/warp.py."""
@@ -246,15 +220,7 @@ class BatchSim:
         self.qpos[ids] = qpos
         self.qvel[ids] = qvel
         self._warmstart[ids] = 0.0
-        if self.max_change is not None:
-            speed = self.max_change[ids] / (self.nstep * self.timestep)[ids, None]
-            self.ctrl[ids] = qpos if past is None else ramp_start(past[:, 0], self.qpos[ids], speed)
-        if self._history is not None:
-            if past is None:
-                raise UsageError(
-                    f"{self.robot.name} has delayed servos: give the targets before as `past`"
-                )
-            self._history.fill(ids, past, self.nstep[ids], self.timestep[ids])
+        self.commands.reset(ids, self.qpos[ids], past)
         if self.servo_model is not None:
             rows = np.arange(self.num_envs)[ids]
             self.servo_model.reset(rows, self.qpos[rows] if past is None else past[:, 0])
@@ -266,19 +232,9 @@ class BatchSim:
             ctrl: Targets, (num_envs, n), rad; clipped to the joint range, as a servo would.
             ids: Only these simulations move, (k,) sorted; default all.
         """
-        if self.max_change is not None:
-            near = np.clip(ctrl, self.ctrl - self.max_change, self.ctrl + self.max_change)
-            ctrl = near
-            if ids is not None:
-                moves = np.isin(np.arange(self.num_envs), ids)
-                ctrl = np.where(moves[:, None], near, self.ctrl)
-        np.clip(ctrl, self.range[:, 0], self.range[:, 1], out=self.ctrl)
-        if self._one_rate:
-            self._advance(ids, int(self.nstep[0]))
-            return
-        moving = np.arange(self.num_envs) if ids is None else ids
-        for n in np.unique(self.nstep[moving]):
-            self._advance(moving[self.nstep[moving] == n], int(n))
+        self.commands.send(ctrl, ids)
+        for count, moving in self.periods.by_nstep(ids):
+            self._advance(moving, count)
 
     def _advance(self, ids: Array | None, count: int) -> None:
         if self.servo_model is None:
@@ -310,8 +266,8 @@ class BatchSim:
         own = self.robot.index(joints)
         gain = batch.expand("actuator_gainprm")
         bias = batch.expand("actuator_biasprm")
-        kp = values["kp"] * self._kp_ratio[:, own]
-        kd = values.get("kd", self._kd[:, own])
+        kp = values["kp"] * self._gains.kp_ratio[:, own]
+        kd = values.get("kd", self._gains.kd[:, own])
         gain[:, at, 0] = kp
         bias[:, at, 0] = kp * values["offset"]
         bias[:, at, 1] = -kp
@@ -332,7 +288,7 @@ class BatchSim:
             speed = self.robot.servo.target_speed[self.robot.index(self.joint_names)]
             each = np.tile(speed, (self.num_envs, 1))
             each[:, at] = values["target_speed"]
-            self.max_change = self._max_change(each)
+            self.commands.limit_speed(each)
         if self.servo_model is not None:
             self.servo_model.state.bias[:, at] = bias[:, at, 0]
             self.servo_model.servos.set(at, values)
@@ -351,14 +307,6 @@ class BatchSim:
                 "give them to the robot (with_identified) that BatchSim is made with"
             )
 
-    def _max_change(self, speed: Array) -> Array:
-        """Return the largest change of targets per period at `speed`, (…, n) rad/s (0: no limit),
-        (num_envs, n) rad.
-        """
-        return np.asarray(
-            (self.nstep * self.timestep)[:, None] * np.where(speed > 0, speed, np.inf)
-        )
-
     def state(self) -> dict[str, Array]:
         """Return copies of the complete state."""
         return {name: values.copy() for name, values in self._state().items()}
@@ -370,12 +318,9 @@ class BatchSim:
 
     def _state(self) -> dict[str, Array]:
         state = {"qpos": self.qpos, "qvel": self.qvel, "warmstart": self._warmstart}
-        if self._history is not None:
-            state |= {"history": self._history.buffer, "time": self._history.time}
+        state |= self.commands.memory()
         if self.servo_model is not None:
             state |= self.servo_model.memory()
-        if self.max_change is not None:
-            state["ctrl"] = self.ctrl
         return state
 
 
@@ -388,18 +333,30 @@ def _under_conditions(robot: RobotSpec, conditions: list[Condition]) -> dict[Con
     return robots
 
 
+def longest_delay(robot: RobotSpec, conditions: list[Condition]) -> float:
+    """Return the longest delay of a servo under these conditions, s."""
+    return float(robot.servo.delay.max()) + _largest_added_delay(conditions)
+
+
 def _largest_added_delay(conditions: list[Condition]) -> float:
     """Return the largest delay that a changed simulator adds, s."""
     changes = [condition.simulator for condition in conditions]
     return max((change.delay for change in changes if change), default=0.0)
 
 
-def _recorded_gains(robot: RobotSpec, robots: list[RobotSpec]) -> tuple[Array, Array]:
-    """Return kp as a ratio to the robot's own, and kd, of each simulation, (num_envs, n)."""
+class _RecordedGains(NamedTuple):
+    """Gains of each simulation's condition, of all joints of the robot, (num_envs, joints)."""
+
+    kp_ratio: Array  # to the robot's own kp
+    kd: Array  # N·m·s/rad
+
+
+def _recorded_gains(robot: RobotSpec, robots: list[RobotSpec]) -> _RecordedGains:
+    """Return the gains of the robot in each simulation."""
     own_kp = np.where(robot.servo.kp > 0, robot.servo.kp, 1.0)
     ratio = np.array([one.servo.kp / own_kp for one in robots])
     kd = np.array([one.servo.kd for one in robots])
-    return ratio, kd
+    return _RecordedGains(ratio, kd)
 
 
 def _useful_threads(num_envs: int) -> int:
@@ -452,18 +409,15 @@ def _compiled(
     return models
 
 
-def expand_differences(batch: Batch, models: list[mujoco.MjModel]) -> dict[str, Array]:
-    """Expand every model field that differs between simulations, (nsim) models, and return those
-    fields, live.
+def expand_differences(batch: Batch, models: list[mujoco.MjModel]) -> None:
+    """Expand every model field that differs between simulations, (nsim) models: a row may be
+    copied over another's.
     """
     unique = list({id(model): model for model in models}.values())
     place = {id(model): i for i, model in enumerate(unique)}
     rows = [place[id(model)] for model in models]
-    fields: dict[str, Array] = {}
     for name, values in differing_fields(unique).items():
-        fields[name] = batch.expand(name)
-        fields[name][:] = values[rows]
-    return fields
+        batch.expand(name)[:] = values[rows]
 
 
 def differing_fields(models: list[mujoco.MjModel]) -> dict[str, Array]:
@@ -487,35 +441,3 @@ def _field(model: mujoco.MjModel, name: str) -> Any:
         return None if value is None or callable(value) else np.asarray(value)
     value = getattr(model, name, None)
     return value if isinstance(value, np.ndarray) else None
-
-
-class CommandHistory:
-    """MuJoCo's buffer of past commands of all simulations in a batch; the same length for all
-    actuators.
-
-    Layout of an actuator's part: one user number, the cursor, the samples' times, the samples
-    (mj_initCtrlHistory).
-    """
-
-    def __init__(self, buffer: Any, time: Any, model: mujoco.MjModel) -> None:
-        """buffer: Of the batch, (nsim, nhistory), numpy or torch; time: (nsim,) s."""
-        self.buffer = buffer
-        self.time = time
-        self.samples = int(model.actuator_history[0, 0])
-        parts = buffer.reshape(len(buffer), model.nu, 2 + 2 * self.samples)  # a view
-        self.cursor = parts[..., :2]
-        self.times = parts[..., 2 : -self.samples]
-        self.values = parts[..., -self.samples :]
-        self.ago = array_like(time, np.arange(self.samples, 0, -1))  # oldest first
-        self._newest = array_like(time, [0.0, self.samples - 1.0])
-        self._each = array_like(time, np.arange(len(time))[:, None])
-
-    def fill(self, ids: Any, past: Any, nstep: Any, timestep: Any) -> None:
-        """Write past targets, newest first, each held for nstep (k,) physics steps of timestep
-        (k,) s; time is 0.
-        """
-        self.time[ids] = 0.0
-        self.cursor[ids] = self._newest
-        self.times[ids] = (-self.ago * timestep[:, None])[:, None]
-        frame = ((self.ago - 1) // nstep[:, None]).clip(max=past.shape[1] - 1)  # (k, samples)
-        self.values[ids] = past[self._each[: len(past)], frame].swapaxes(1, 2)

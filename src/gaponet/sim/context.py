@@ -20,7 +20,8 @@ import numpy as np
 
 from gaponet.base.arrays import Array
 from gaponet.robot.spec import RobotSpec
-from gaponet.sim.batch import Batch, BatchSim, CommandHistory, Condition
+from gaponet.sim.batch import Batch, BatchSim, Condition
+from gaponet.sim.commands import CommandHistory
 
 PROBE_RAD = 0.2
 READ_AFTER_S = (0.04, 0.2)  # the start of the motion, and most of it
@@ -61,7 +62,7 @@ def _of_simulators(robot: RobotSpec, conditions: list[Condition], nthread: int) 
         by_simulation += [condition] * probes
     sim = BatchSim(robot, by_simulation, nthread)
     home = np.tile(robot.qpos_home, (count * probes, 1))
-    moved, towards = _probe_targets(robot.qpos_home, robot.operated_index, sim.range)
+    moved, towards = _probe_targets(robot.qpos_home, robot.operated_index, sim.commands.range)
     target = np.tile(moved, (count, 1))
     sim.reset(slice(None), home, np.zeros_like(home), past=home[:, None])
 

@@ -135,7 +135,11 @@ class AnalyticInverse:
     def of(cls, sim: BatchSim) -> AnalyticInverse:
         """Return the inverse of a simulation that nothing else uses."""
         return cls(
-            sim.batch, next(iter(sim.models.values())), sim.joint_names, sim.nstep, sim.timestep
+            sim.batch,
+            next(iter(sim.models.values())),
+            sim.joint_names,
+            sim.periods.nstep,
+            sim.periods.timestep,
         )
 
     def set_state(self, data: mujoco.MjData) -> None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from types import FunctionType
-from typing import Any
+from typing import Any, NamedTuple
 
 import mujoco
 import mujoco_warp
@@ -20,7 +20,8 @@ from torch import Tensor
 
 from gaponet.base.errors import UsageError
 from gaponet.sim import servo
-from gaponet.sim.batch import BatchSim, CommandHistory, ramp_start
+from gaponet.sim.batch import BatchSim
+from gaponet.sim.commands import CommandHistory, Commands, ControlPeriods
 from gaponet.sim.servo_model import ServoModel
 
 # of a simulation whose links collide
@@ -28,9 +29,8 @@ MAX_CONTACTS = 48
 CONSTRAINTS_PER_CONTACT = 4
 # field of Data → name in BatchSim.state
 STATE = {"qpos": "qpos", "qvel": "qvel", "qacc_warmstart": "warmstart"}
-HISTORY = {"history": "history", "time": "time"}
 SERVO = {"actuator_force": "servo_torque", "qfrc_bias": "servo_load"}
-TARGET = {"ctrl": "ctrl"}
+HISTORY = ("history", "time")
 
 _Floats: Any = warp.array2d(dtype=float)
 _Pairs: Any = warp.array2d(dtype=warp.vec2)
@@ -114,7 +114,7 @@ class _Worlds:
 
     def __init__(self, sim: BatchSim, rows: np.ndarray, device: str) -> None:
         self.device = warp.get_device(device)
-        self.nstep = int(sim.nstep[rows[0]])
+        self.nstep = int(sim.periods.nstep[rows[0]])
         self._graphs = dict[Any, Any]()
         model = next(iter(sim.models.values()))
         timestep = sim.batch.expanded("opt.timestep")
@@ -231,23 +231,61 @@ def _warp_device(device: str) -> str:
     return name
 
 
-def _stored_fields(sim: BatchSim) -> dict[str, str]:
-    """Return field of Data → name in BatchSim.state, of the state that a BatchSim has."""
-    stored = dict(STATE)
-    if next(iter(sim.models.values())).nhistory > 0:
-        stored |= HISTORY
-    if sim.servo_model:
-        stored |= SERVO
-    if sim.max_change is not None:
-        stored |= TARGET
-    return stored
+class _AllWorlds:
+    """Worlds of all control periods, and their fields for all simulations together.
+
+    Attributes:
+        of_rates: Worlds of each control period.
+        fields: Field of Data → values of all simulations, (num_envs, …); live.
+    """
+
+    def __init__(self, sim: BatchSim, device: str, names: list[str]) -> None:
+        """names: Fields that are seen together."""
+        nstep = sim.periods.nstep
+        rates = [np.flatnonzero(nstep == n) for n in np.unique(nstep)]
+        self.of_rates = [_Worlds(sim, rows, device) for rows in rates]
+        self._views = [worlds.bind_all(names) for worlds in self.of_rates]
+        self.fields = self._views[0]
+        if len(rates) > 1:
+            self.fields = {}
+            for name, view in self._views[0].items():
+                self.fields[name] = view.new_zeros(sim.num_envs, *view.shape[1:])
+        at = self.fields["qpos"].device
+        self._rows = [torch.as_tensor(rows).to(at, non_blocking=True) for rows in rates]
+
+    def each_rate(self) -> Iterator[_Worlds]:
+        """Yield the worlds of each control period with their simulations' state, and copy it
+        back.
+        """
+        if len(self.of_rates) == 1:
+            yield self.of_rates[0]
+            return
+        for worlds, views, rows in zip(self.of_rates, self._views, self._rows, strict=True):
+            for name, view in views.items():
+                view.copy_(self.fields[name][rows])
+            yield worlds
+            for name, view in views.items():
+                self.fields[name][rows] = view
+
+
+class _Motors(NamedTuple):
+    """Motors of the servo model, (num_envs, n) each, that ask for gain · (target − q) + bias."""
+
+    gain: Tensor  # N·m/rad
+    bias: Tensor  # N·m
+    most: Tensor  # largest torque, N·m
+
+    def torque(self, ids: Any, ahead: Any) -> Tensor:
+        """Return the torque of simulations whose targets are `ahead` of q, (k, n) rad, in N·m."""
+        most = self.most[ids]
+        return torch.clamp(self.gain[ids] * ahead + self.bias[ids], -most, most)
 
 
 class WarpSim:
     """Copy of a BatchSim on a device, with its payloads, control periods, servos and state.
 
-    `qpos`, `qvel`, `ctrl` and `torque` are live (num_envs, n) float32 tensors on the device: a
-    write is the state at the next step.
+    `qpos`, `qvel` and `torque` are live (num_envs, n) float32 tensors on the device: a write is the
+    state at the next step.
     """
 
     def __init__(self, sim: BatchSim, device: str = "cuda") -> None:
@@ -263,43 +301,36 @@ class WarpSim:
                 "= 0"
             )
         model = next(iter(sim.models.values()))
-        name = _warp_device(device)
-        self.robot = sim.robot
-        self.joint_names = sim.joint_names
-        self.num_envs = sim.num_envs
-        self.n = sim.n
-        self.range = sim.range
-        rates = [np.flatnonzero(sim.nstep == n) for n in np.unique(sim.nstep)]
-        self._worlds = [_Worlds(sim, rows, name) for rows in rates]
-        self._delayed = model.nhistory > 0
-        self._stored = _stored_fields(sim)
-        names = [*self._stored, "ctrl", "actuator_force"]
-        self._views = [worlds.bind_all(names) for worlds in self._worlds]
-        self._all = self._views[0]
-        if len(self._worlds) > 1:
-            self._all = {name: self._zeros_like(view) for name, view in self._all.items()}
-        self.qpos = self._all["qpos"]
-        self.qvel = self._all["qvel"]
-        self.ctrl = self._all["ctrl"]
-        self.torque = self._all["actuator_force"]
-        self._ids = [self.array(rows) for rows in rates]
-        self._low, self._high = self.array(self.range.T)
-        self._max_change: Tensor | None = None
-        if sim.max_change is not None:
-            self._max_change = self.array(sim.max_change)
-        if sim.servo_model:
-            self._gain = self.array(sim.batch.expand("actuator_gainprm")[..., 0])
-            self._bias = self.array(sim.servo_model.state.bias)
-            self._effort = self.array(sim.servo_model.servos.records["effort_limit"])
-        self.nstep = self.array(sim.nstep)
-        self.timestep = self.array(sim.timestep)
-        if self._delayed:
-            self._commands = CommandHistory(self._all["history"], self._all["time"], model)
+        names = [*STATE, "ctrl", "actuator_force"]
+        if model.nhistory:
+            names += HISTORY
+        if sim.servo_model is not None:
+            names.append("qfrc_bias")
+        self._worlds = _AllWorlds(sim, _warp_device(device), names)
+        fields = self._worlds.fields
+        self.qpos = fields["qpos"]
+        self.qvel = fields["qvel"]
+        self.torque = fields["actuator_force"]
+        periods = ControlPeriods(self.array(sim.periods.nstep), self.array(sim.periods.timestep))
+        history = None
+        if model.nhistory:
+            history = CommandHistory(fields["history"], fields["time"], model)
+        joint_range = self.array(sim.commands.range)
+        self.commands = Commands(fields["ctrl"], joint_range, periods, history)
+        if sim.commands.max_change is not None:
+            self.commands.max_change = self.array(sim.commands.max_change)
+        self._motors: _Motors | None = None  # without the servo model
+        if sim.servo_model is not None:
+            gain = self.array(sim.batch.expand("actuator_gainprm")[..., 0])
+            bias = self.array(sim.servo_model.state.bias)
+            most = self.array(sim.servo_model.servos.records["effort_limit"])
+            self._motors = _Motors(gain, bias, most)
         self.set_state(sim.state())
 
-    def _zeros_like(self, view: Tensor) -> Tensor:
-        """Return zeros for all simulations in the shape of some worlds' field, (nworld, …)."""
-        return view.new_zeros(self.num_envs, *view.shape[1:])
+    @property
+    def num_envs(self) -> int:
+        """Number of simulations."""
+        return len(self.qpos)
 
     def array(self, values: Any) -> Tensor:
         """Copy values to the device, floats as float32, without waiting."""
@@ -314,58 +345,33 @@ class WarpSim:
     def reset(self, ids: Any, qpos: Any, qvel: Any, past: Any = None) -> None:
         """Reset as BatchSim.reset does; arrays of any kind."""
         ids = ids if isinstance(ids, slice) else self.array(ids)
+        past = None if past is None else self.array(past)
         self.qpos[ids] = self.array(qpos)
         self.qvel[ids] = self.array(qvel)
-        self._all["qacc_warmstart"][ids] = 0.0
-        if self._max_change is not None:
-            speed = self._max_change[ids] / (self.nstep * self.timestep)[ids, None]
-            here = self.qpos[ids]
-            self.ctrl[ids] = (
-                here if past is None else ramp_start(self.array(past)[:, 0], here, speed)
-            )
-        if self._delayed:
-            if past is None:
-                raise UsageError(
-                    f"{self.robot.name} has delayed servos: give the targets before as `past`"
-                )
-            self._commands.fill(ids, self.array(past), self.nstep[ids], self.timestep[ids])
-        if SERVO.keys() <= self._stored.keys():
-            ahead = 0.0 if past is None else self.array(past)[:, 0] - self.qpos[ids]
-            most = self._effort[ids]
-            self.torque[ids] = torch.clamp(self._gain[ids] * ahead + self._bias[ids], -most, most)
-            load = self._all["qfrc_bias"]
-            before = self._all["qfrc_bias"].clone()
-            for worlds in self._each_rate():
-                worlds.launch(worlds.bias_forces)
-            before[ids] = load[ids]
-            load.copy_(before)
-
-    def _each_rate(self) -> Iterator[_Worlds]:
-        """Yield the worlds of each control period with their simulations' state, and copy it
-        back.
-        """
-        for worlds, views, rows in zip(self._worlds, self._views, self._ids, strict=True):
-            if views is not self._all:
-                for name, view in views.items():
-                    view.copy_(self._all[name][rows])
-            yield worlds
-            if views is not self._all:
-                for name, view in views.items():
-                    self._all[name][rows] = view
+        self._worlds.fields["qacc_warmstart"][ids] = 0.0
+        self.commands.reset(ids, self.qpos[ids], past)
+        if self._motors is None:
+            return
+        ahead = 0.0 if past is None else past[:, 0] - self.qpos[ids]
+        self.torque[ids] = self._motors.torque(ids, ahead)
+        load = self._worlds.fields["qfrc_bias"]
+        before = load.clone()
+        for worlds in self._worlds.each_rate():
+            worlds.launch(worlds.bias_forces)
+        before[ids] = load[ids]
+        load.copy_(before)
 
     def step(self, ctrl: Any, ids: Any = None) -> None:
         """Step as BatchSim.step does: all are stepped, and the others are restored."""
         before = {} if ids is None else self.state()
-        ctrl = self.array(ctrl)
-        if self._max_change is not None:
-            ctrl = torch.clamp(ctrl, self.ctrl - self._max_change, self.ctrl + self._max_change)
-        torch.clamp(ctrl, self._low, self._high, out=self.ctrl)
-        for worlds in self._each_rate():
+        self.commands.send(self.array(ctrl))
+        for worlds in self._worlds.each_rate():
             worlds.launch(worlds.period)
-        # a float32 tells physics steps apart for minutes only, so the clock starts again
-        if self._delayed:
-            self._commands.times -= self._commands.time[:, None, None]
-            self._commands.time.zero_()
+        history = self.commands.history
+        if history is not None:
+            # a float32 tells physics steps apart for minutes only, so the clock starts again
+            history.times -= history.time[:, None, None]
+            history.time.zero_()
         if ids is not None:
             moved = self.array(ids)
             for name, values in self._state().items():
@@ -381,4 +387,9 @@ class WarpSim:
             values.copy_(self.array(state[name]))
 
     def _state(self) -> dict[str, Tensor]:
-        return {name: self._all[field] for field, name in self._stored.items()}
+        fields = self._worlds.fields
+        state = {name: fields[field] for field, name in STATE.items()}
+        state |= self.commands.memory()
+        if self._motors is not None:
+            state |= {name: fields[field] for field, name in SERVO.items()}
+        return state

@@ -23,7 +23,7 @@ from gaponet.base.arrays import Array
 from gaponet.data.sequence import Sequence
 from gaponet.data.signals import differentiate, lowpass
 from gaponet.robot.spec import RobotSpec
-from gaponet.sim.batch import speed_limited
+from gaponet.sim.commands import speed_limited
 from gaponet.sim.dynamics import tips_of
 from gaponet.sim.model import build_model
 from gaponet.sim.servo import JOINT_RECORD, Windows, compiled, simulate_joints

@@ -19,7 +19,7 @@ from gaponet.base.arrays import Array
 from gaponet.data.sequence import Sequence
 from gaponet.robot.servo_fields import DEFAULT_TERMS, Term
 from gaponet.robot.spec import RobotSpec
-from gaponet.sim.batch import speed_limited
+from gaponet.sim.commands import speed_limited
 from gaponet.sim.temperature import temperature_varies
 from gaponet.sysid.axes import GREATEST_SPEED_QUANTILE, greatest_speeds
 

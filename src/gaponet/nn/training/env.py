@@ -24,7 +24,7 @@ from gaponet.nn.training.config import RewardConfig
 from gaponet.nn.training.playback import Playback, take_rows
 from gaponet.nn.training.recorded_rows import RecordedRows
 from gaponet.robot.spec import RobotSpec
-from gaponet.sim.batch import BatchSim, Condition
+from gaponet.sim.batch import BatchSim, Condition, longest_delay
 from gaponet.sim.context import contexts
 from gaponet.sysid.robot_rollouts import IMMOVABLE_ARMATURE
 
@@ -108,13 +108,13 @@ class DeltaEnv:
         self.nan_where_unobserved = place(np.where(unobserved, np.nan, 0).astype(np.float32))
         self._operated = place(rows.operated)
         self._preview = place(CRITIC_PREVIEW)
-        self._low, self._high = place(host_sim.range[rows.operated].T)
+        self._low, self._high = place(host_sim.commands.range[rows.operated].T)
         self._target = zeros_like(self.sim.qpos, *host_sim.qpos.shape)
         # 1 where the actor observes the recorded state
         self._real_state_visible = zeros_like(self.playback.track, options.num_envs, 1)
         self._rewards = MeanReward()
 
-        joint_limits = host_sim.range[rows.operated]
+        joint_limits = host_sim.commands.range[rows.operated]
         like = self.playback.recorded
         self.loop = DeltaLoop(config, joint_limits, options.num_envs, like=like)
         self._connect_inputs(conditions)
@@ -366,7 +366,7 @@ def _condition_features(payload: Array, conditions: list[Condition], config: Mod
 def _delay_periods(sim: BatchSim, rows: RecordedRows) -> int:
     """Return the longest delay of commands, control periods of the fastest recording."""
     shortest_dt = min(condition.dt for condition in rows.conditions)
-    return int(np.ceil(sim.longest_delay / shortest_dt))
+    return int(np.ceil(longest_delay(sim.robot, rows.conditions) / shortest_dt))
 
 
 def _float32(x: Any) -> Any:
