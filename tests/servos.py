@@ -65,9 +65,9 @@ class Servos:
             request, self._pending = self._pending[at:end], self._pending[end:]
             assert sum(request[2:]) % 256 == 255, "the request's checksum is wrong"
             self.heard.append(request)
-            said += self._obey(request[2], request[4], request[5:-1])
+            said += self.obey(request[2], request[4], request[5:-1])
 
-    def _obey(self, who: int, instruction: int, words: bytes) -> bytes:
+    def obey(self, who: int, instruction: int, words: bytes) -> bytes:
         everyone = range(1, 7)
         if instruction == 0x82:  # sync read
             return b"".join(

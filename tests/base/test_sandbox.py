@@ -73,8 +73,8 @@ def test_a_failing_parser_gives_one_line_and_the_next_file_is_read(
 
 def test_an_idle_child_ends_and_the_next_file_starts_another(tmp_path, monkeypatch):
     first = parsed(tmp_path, "prints")
-    sandbox._Child.current.process.stdin.close()  # as after IDLE_S
-    sandbox._Child.current.process.wait()
+    sandbox.Child.current.process.stdin.close()  # as after IDLE_S
+    sandbox.Child.current.process.wait()
     second = parsed(tmp_path, "prints")
     assert first != second == parsed(tmp_path, "prints")
 
@@ -133,7 +133,7 @@ def test_a_plain_or_already_accepted_robot_starts_no_child(tmp_path, monkeypatch
     mesh(tmp_path / "meshed")
     meshed = load_robot(tmp_path / "meshed" / "arm")
     assert meshed.qpos_range.shape == (2, 2)
-    monkeypatch.setattr(sandbox, "_answer_of_child", None)
+    monkeypatch.setattr(sandbox, "answer_of_child", None)
     assert robot.qpos_range.shape == (2, 2)
     assert load_robot("so101").qpos_range.shape == (6, 2)
     assert load_robot(tmp_path / "meshed" / "arm").qpos_range.shape == (2, 2)

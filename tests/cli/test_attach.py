@@ -90,10 +90,10 @@ def test_a_chunk_is_corrected_as_its_rows_would_be_and_the_next_goes_on_where_it
 
 def test_the_arms_calibration_is_found_by_the_id_it_was_calibrated_under(tmp_path, plugin):
     robot = plugin.GaponetSO101(plugin.GaponetSO101Config(id="mine", calibration_dir=tmp_path))
-    assert "--calibration" not in robot._command("ipc://x")
+    assert "--calibration" not in robot.command("ipc://x")
     (tmp_path / "so_follower").mkdir()
     (tmp_path / "so_follower" / "mine.json").write_text("{}")
-    words = robot._command("ipc://x")
+    words = robot.command("ipc://x")
     assert words[words.index("--calibration") + 1] == str(tmp_path / "so_follower" / "mine.json")
     with pytest.raises(NotImplementedError, match=r"--robot\.id=mine"):
         robot.calibrate()

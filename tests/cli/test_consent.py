@@ -140,7 +140,7 @@ def test_without_yes_no_servo_is_written_to(command, person, bus, first, tmp_pat
 
 def test_after_yes_servos_are_written_to_and_a_key_lets_them_go(person, bus, first, monkeypatch):
     port, servos = bus
-    obey, typed = servos._obey, []
+    obey, typed = servos.obey, []
 
     def obeyed(who: int, instruction: int, words: bytes) -> bytes:
         if instruction in WRITES and not typed:
@@ -148,7 +148,7 @@ def test_after_yes_servos_are_written_to_and_a_key_lets_them_go(person, bus, fir
             person.type("\x1a")  # Ctrl-Z
         return obey(who, instruction, words)
 
-    monkeypatch.setattr(servos, "_obey", obeyed)
+    monkeypatch.setattr(servos, "obey", obeyed)
     person.will("yes\n")
     with pytest.raises(SystemExit, match="3"):
         main(["run", *first, *SERIAL, "--port", port])

@@ -117,7 +117,7 @@ def test_new_that_ends_before_its_picture_leaves_no_robot(tmp_path, monkeypatch)
     def stop(*args):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("gaponet.api.robots._picture", stop)
+    monkeypatch.setattr("gaponet.report.view.picture.still", stop)
     model, mine = write_mjcf(tmp_path / "repo"), tmp_path / "mine"
     told = ["robot", "new", str(model), "--out", str(mine), "--joints", "shoulder", "elbow"]
     assert main(told) == 130

@@ -45,7 +45,7 @@ def test_stored_trees_answer_as_they_are_written_in_torch_and_onnx():
     config = ModelConfig("trees")
     net = build_network(config, 2).eval()
     with torch.no_grad():
-        net._store(1, ensemble())
+        net.store(1, ensemble())
     x = torch.zeros(4, config.input_dim(2))
     # Velocity of the first joint; 0.1 is above LIMIT in float64.
     x[:, 2] = torch.tensor([-1.0, 0.1, 0.3, 0.6])
@@ -57,7 +57,7 @@ def test_stored_trees_answer_as_they_are_written_in_torch_and_onnx():
 def test_the_correction_is_clipped_and_has_a_gain():
     net = build_network(ModelConfig("trees", delta_max=0.03), 1).eval()
     with torch.no_grad():
-        net._store(0, ensemble())
+        net.store(0, ensemble())
         x = torch.full((1, net.config.input_dim(1)), 0.6)
         assert net(x).item() == pytest.approx(-0.01)  # input 2 is a − q = 0
         net.base.fill_(0.2)

@@ -15,7 +15,6 @@ from gaponet.cli.main import main
 from gaponet.data.store import Dataset
 from gaponet.evaluation.run_files import read_gap
 from gaponet.nn.artifact import GapModel
-from gaponet.report import report
 from gaponet.report.figures import evaluation as figures
 from gaponet.report.report import warnings, write_report
 from gaponet.robot.folder import save_robot
@@ -38,6 +37,17 @@ def run(evaluated, tmp_path):
     return tmp_path / "run"
 
 
+def draw(robot, meta, dt, qpos):
+    """Draw a motion of 160 rows in all its forms, as a picture of three bytes."""
+    assert list(qpos) == ["command", "nominal", "identified+gaponet", "recorded"]
+    assert all(q.shape == (160, 2) for q in qpos.values())
+    return b"PNG"
+
+
+def blind(*_):
+    raise UsageError("no OpenGL here <b>")
+
+
 def test_the_page_is_one_offline_file_that_names_the_method_everywhere(evaluated):
     gp.gap(evaluated.parent / "data", run=evaluated)
     assert list(read_gap(evaluated)["left"]) == [
@@ -47,7 +57,8 @@ def test_the_page_is_one_offline_file_that_names_the_method_everywhere(evaluated
         "gain",
         "identified+gaponet",
     ]
-    page = write_report(evaluated).read_text()  # the figures are SVG with their words in it
+    page = write_report(evaluated, picture=draw).read_text()  # figures are SVG with their words
+    assert '<img src="data:image/png;base64,UE5H">' in page
     assert not re.findall(r'(?:src|href)="(?!data:|#)[^"]*', page)
     for text in (
         "Undertrained: the budget ended after 3 of 10 rounds",
@@ -92,25 +103,6 @@ def test_a_trained_run_is_not_called_undertrained(run):
     assert GapModel.how_trained(card) == "supervised pre-training (10 rounds), 40 updates of PPO"
 
 
-def test_the_robot_is_drawn_or_the_page_says_why_not(evaluated):
-    robot = load_robot(evaluated / "robot")
-    contents = report._Evaluated.read(evaluated, GapModel.load(evaluated), robot)
-    seen = []
-
-    def draw(robot, meta, dt, qpos):
-        seen.append((robot.name, meta.motion, dt, list(qpos)))
-        assert all(q.shape == (160, 2) for q in qpos.values())
-        return b"PNG"
-
-    def blind(*_):
-        raise UsageError("no OpenGL here <b>")
-
-    photo, _ = report._photo(contents, 0, draw)
-    assert photo == '<img src="data:image/png;base64,UE5H">'
-    assert seen[0][3] == ["command", "nominal", "identified+gaponet", "recorded"]
-    assert report._photo(contents, 0, blind) == (None, "no OpenGL here <b>")
-
-
 @pytest.mark.parametrize("absent", ["date", "command", "moves", "shown"])
 def test_an_incomplete_evaluation_is_refused_with_what_to_do(run, absent):
     metrics = json.loads((run / "metrics.json").read_text())
@@ -151,7 +143,8 @@ def test_trajectories_show_the_command_and_errors_of_a_motion_on_one_scale_movin
 def test_an_identified_robot_has_a_page_without_training(evaluated, tmp_path):
     arm = load_robot(evaluated.parent / "arm")
     save_robot(arm.with_identified({"elbow": {"kp": 11.0}}), tmp_path / "fitted")
-    page = write_report(tmp_path / "fitted", evaluated.parent / "data").read_text()
+    page = write_report(tmp_path / "fitted", evaluated.parent / "data", picture=blind).read_text()
+    assert "no OpenGL here &lt;b&gt;" in page
     assert "After identification the error is" in page
     assert "not a test result" in page  # the folder does not say what it was identified from
     assert "GAPONet" not in page

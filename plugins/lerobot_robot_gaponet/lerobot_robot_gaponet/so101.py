@@ -31,7 +31,7 @@ MAX_RETURN_S = 60.0  # until the arm is back at its first position
 
 
 @dataclass
-class _Controller:
+class Controller:
     """Process of gaponet run, with the connection to it and the file of its messages."""
 
     process: "subprocess.Popen[bytes]"
@@ -40,7 +40,7 @@ class _Controller:
     folder: "tempfile.TemporaryDirectory[str]"
 
     @classmethod
-    def start(cls, command: Callable[[str], list[str]]) -> "_Controller":
+    def start(cls, command: Callable[[str], list[str]]) -> "Controller":
         """Start the command for an address and wait for the first state.
 
         Raises:
@@ -129,13 +129,13 @@ class GaponetSO101(Robot):
         self.cameras = make_cameras_from_configs(config.cameras)
         self.spec = load_robot("so101")
         self.units = Units(self.spec)
-        self._controller: _Controller | None = None
+        self.controller: Controller | None = None
 
     @cached_property
     def observation_features(self) -> dict[str, type | tuple]:
-        return self.action_features | {name: shape for name, shape, _ in self._pictures()}
+        return self.action_features | {name: shape for name, shape, _ in self.pictures()}
 
-    def _pictures(self) -> Iterator[tuple[str, tuple[int, int, int], Callable[[], Any]]]:
+    def pictures(self) -> Iterator[tuple[str, tuple[int, int, int], Callable[[], Any]]]:
         """Yield key, shape and reader of each camera's colour and depth images.
 
         Keys are those of LeRobot's robots.
@@ -153,7 +153,7 @@ class GaponetSO101(Robot):
 
     @property
     def is_connected(self) -> bool:
-        return self._controller is not None and all(
+        return self.controller is not None and all(
             camera.is_connected for camera in self.cameras.values()
         )
 
@@ -189,11 +189,11 @@ class GaponetSO101(Robot):
                 f"The SO-101 at {self.config.port} will move as LeRobot commands.",
                 option="--robot.yes=true",
             )
-        self._controller = _Controller.start(self._command)
+        self.controller = Controller.start(self.command)
         for camera in self.cameras.values():
             camera.connect()
 
-    def _command(self, address: str) -> list[str]:
+    def command(self, address: str) -> list[str]:
         config = self.config
         rate = config.fps
         if rate is None and config.model is not None:
@@ -219,30 +219,30 @@ class GaponetSO101(Robot):
         return child_process.module_command("gaponet", "run", *words, *shlex.split(config.options))
 
     def get_observation(self) -> dict[str, Any]:
-        state = next(self._controller.states, None) if self._controller else None
+        state = next(self.controller.states, None) if self.controller else None
         if state is None:
-            end = self._controller.messages().splitlines()[-2:] if self._controller else []
+            end = self.controller.messages().splitlines()[-2:] if self.controller else []
             raise DeviceNotConnectedError(
                 f"{self} is not connected, or was stopped: {' '.join(end)}"
             )
         set_observation(self.units.named(state.qpos))
         seen = state.qpos
         if self.config.follow:
-            seen = self._controller.remote.nominal_qpos
-        return self.units.named(seen) | {name: read() for name, _, read in self._pictures()}
+            seen = self.controller.remote.nominal_qpos
+        return self.units.named(seen) | {name: read() for name, _, read in self.pictures()}
 
     def send_action(self, action: dict[str, Any]) -> dict[str, Any]:
-        if self._controller is None:
+        if self.controller is None:
             raise DeviceNotConnectedError(f"{self} is not connected")
         target = self.units.rad(action)
         named = zip(self.spec.joint_names, target.tolist(), strict=True)
-        self._controller.remote.send({joint: rad for joint, rad in named if np.isfinite(rad)})
+        self.controller.remote.send({joint: rad for joint, rad in named if np.isfinite(rad)})
         return action
 
     def disconnect(self) -> None:
         """Return the arm to its first position, where it is held."""
-        if self._controller is not None:
-            self._controller.stop()
-            self._controller = None
+        if self.controller is not None:
+            self.controller.stop()
+            self.controller = None
         for camera in self.cameras.values():
             camera.disconnect()

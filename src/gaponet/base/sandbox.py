@@ -80,14 +80,14 @@ def sandboxed(
     def wrap(function: Callable[..., T]) -> Callable[..., T]:
         @functools.wraps(function)
         def call(file: Path, *arguments: Any) -> T:
-            if _Child.is_this_process:
+            if Child.is_this_process:
                 return function(file, *arguments)
             path = Path(os.path.abspath(file))
             seconds = PROCESSOR_S + 1e-6 * seconds_per_mb * _size(path)
             request = _Request(
                 function.__module__, function.__name__, path, file, arguments, seconds
             )
-            result: T = _answer_of_child(request, error)
+            result: T = answer_of_child(request, error)
             return result
 
         call.sandboxed = function, library  # type: ignore[attr-defined]
@@ -98,7 +98,7 @@ def sandboxed(
 
 def in_sandbox() -> bool:
     """Return True in the child."""
-    return _Child.is_this_process
+    return Child.is_this_process
 
 
 class _Request(NamedTuple):
@@ -112,7 +112,7 @@ class _Request(NamedTuple):
     seconds: float  # processor time that it may take
 
 
-def _answer_of_child(request: _Request, error: type[GAPONetError]) -> Any:
+def answer_of_child(request: _Request, error: type[GAPONetError]) -> Any:
     """Return the result of a request.
 
     Raises:
@@ -120,9 +120,9 @@ def _answer_of_child(request: _Request, error: type[GAPONetError]) -> Any:
         Exception: That of the function.
     """
     with _LOCK:
-        answer, failure = _Child.current_or_new().request(request)
+        answer, failure = Child.current_or_new().request(request)
         if failure == IDLE:  # it ended before it could read the request
-            answer, failure = _Child.current_or_new().request(request)
+            answer, failure = Child.current_or_new().request(request)
     file = request.file
     if failure == "memory":
         raise error(
@@ -155,11 +155,11 @@ def _size(path: Path) -> int:
     return 0
 
 
-class _Child:
+class Child:
     """The child process, seen from its parent."""
 
     is_this_process = False
-    current: _Child | None = None
+    current: Child | None = None
 
     def __init__(self) -> None:
         inherited = {name: os.environ[name] for name in INHERITED_VARIABLES if name in os.environ}
@@ -174,7 +174,7 @@ class _Child:
         )
 
     @classmethod
-    def current_or_new(cls) -> _Child:
+    def current_or_new(cls) -> Child:
         child = cls.current
         if child is None or child.owner != os.getpid() or child.process.poll() is not None:
             child = cls()
@@ -216,8 +216,8 @@ _LOCK = threading.Lock()
 
 @atexit.register
 def _close() -> None:
-    if _Child.current is not None:
-        _Child.current.close()
+    if Child.current is not None:
+        Child.current.close()
 
 
 def _write(stream: IO[bytes], value: Any) -> None:
@@ -233,7 +233,7 @@ def _serve() -> None:
     """Answer requests in the child until it is idle."""
     out = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # a library may print; that is no answer
-    _Child.is_this_process = True
+    Child.is_this_process = True
     while os.name == "nt" or select.select([0], [], [], IDLE_S)[0]:
         try:
             request: _Request = pickle.load(sys.stdin.buffer)

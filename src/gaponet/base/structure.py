@@ -117,7 +117,7 @@ def parse_json(
 ) -> T:
     """Convert JSON text to a value of type `kind`; arguments and error as for `validated`."""
     try:
-        value = _type_adapter(cast("Any", kind)).validate_json(
+        value = type_adapter(cast("Any", kind)).validate_json(
             text, extra="allow" if allow_extra else "forbid"
         )
     except ValidationError as invalid:
@@ -227,7 +227,8 @@ def read_limited(
 
 
 @functools.cache
-def _type_adapter(kind: Any) -> Any:
+def type_adapter(kind: Any) -> Any:
+    """Return pydantic's strict validator of a type, made once."""
     # pydantic accepts no configuration for a dataclass, but passes that of a union on to its
     # members.
     return TypeAdapter(kind | None, config=ConfigDict(strict=True, allow_inf_nan=False))

@@ -114,7 +114,7 @@ class TreesNet(DeltaNet):
                 min_samples_leaf=MIN_LEAF_ROWS,
                 early_stopping=False,
             ).fit(inputs[labelled], column[labelled])
-            self._store(j, ensemble)
+            self.store(j, ensemble)
             some = inputs[labelled[:MIN_LEAF_ROWS]]
             stored = self._sums(torch.from_numpy(some).to(x.device))[:, j].cpu().numpy()
             difference = np.abs(stored - ensemble.predict(some)).max()
@@ -125,7 +125,7 @@ class TreesNet(DeltaNet):
         error = self(x[rows[:MEASURED_ROWS]]).cpu().numpy() - targets[:MEASURED_ROWS]
         return np.array([np.nanmean(error**2)])
 
-    def _store(self, j: int, ensemble: Any) -> None:
+    def store(self, j: int, ensemble: Any) -> None:
         """Copy the trees of joint j; scikit-learn has no public access to them."""
         for t, (tree,) in enumerate(ensemble._predictors):
             nodes = tree.nodes

@@ -41,7 +41,7 @@ def test_a_cameras_depth_is_observed_beside_its_colours(plugin, so101):
     robot.cameras = {"wrist": wrist, "front": front}
     shapes = {"wrist": (4, 6, 3), "front": (4, 6, 3), "front_depth": (4, 6, 1)}
     assert robot.observation_features == robot.action_features | shapes
-    assert [read() for *_, read in robot._pictures()] == ["colours", "colours", "depth"]
+    assert [read() for *_, read in robot.pictures()] == ["colours", "colours", "depth"]
 
 
 def test_an_arm_is_not_moved_without_consent(plugin, monkeypatch):
@@ -59,7 +59,7 @@ def test_a_controller_that_ends_at_its_start_is_an_error_with_its_messages(plugi
     pytest.importorskip("zmq")
     command = [sys.executable, "-c", "raise SystemExit('no arm at the port')"]
     with pytest.raises(ConnectionError, match="port"):
-        plugin.so101._Controller.start(lambda address: command)
+        plugin.so101.Controller.start(lambda address: command)
 
 
 def test_its_motions_are_one_plan_from_where_the_arm_is_and_the_gripper_keeps_what_it_holds(
@@ -77,7 +77,8 @@ def test_its_motions_are_one_plan_from_where_the_arm_is_and_the_gripper_keeps_wh
         motion.get_action()
     plugin.set_observation(seen(gripper=62.0))
     said = [motion.get_action()]
-    said += [motion.get_action() for _ in range(len(motion._rows) + 5)]
+    said += [motion.get_action() for _ in range(1000)]
+    assert said[-1] == said[-2], "the plan is over"
     units = motion.units
     rows = np.array([units.rad(action) for action in said])
     np.testing.assert_allclose(
@@ -112,7 +113,7 @@ def test_an_arm_that_follows_shows_the_policy_the_nominal_simulator(plugin, so10
     robot.config = plugin.GaponetSO101Config(known=Path("known"), follow=True)
     remote = SimpleNamespace(nominal_qpos=nominal)
     states = iter([SimpleNamespace(qpos=measured)])
-    robot._controller = SimpleNamespace(states=states, remote=remote)
+    robot.controller = SimpleNamespace(states=states, remote=remote)
 
     seen = robot.units.rad(robot.get_observation())
 

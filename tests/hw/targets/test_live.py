@@ -10,7 +10,7 @@ from arm import commands
 from hw.noted_arm import DT, NotedArm, control, phases, run
 
 from gaponet.base.errors import UsageError
-from gaponet.base.structure import _type_adapter
+from gaponet.base.structure import type_adapter
 from gaponet.hw.control.clock import SimulatedClock
 from gaponet.hw.control.controller import Controller
 from gaponet.hw.control.phases import ControlConfig
@@ -428,11 +428,11 @@ def test_times_and_acceleration_must_be_positive():
 
 
 def test_nothing_is_taken_apart_for_the_first_time_while_the_robot_moves(arm):
-    _type_adapter.cache_clear()
+    type_adapter.cache_clear()
     LiveTargets(SimpleNamespace(address="here"), arm, arm.joint_names, SimulatedClock(), DT, 5.0)
-    made = _type_adapter.cache_info().misses
+    made = type_adapter.cache_info().misses
     assert decode("a", b'{"time": 1.0, "target": {"shoulder": 0.1}}').error == ""
-    assert made == _type_adapter.cache_info().misses == 1
+    assert made == type_adapter.cache_info().misses == 1
 
 
 def test_the_sender_is_told_what_a_policy_is_to_see_beside_what_is_measured(arm):

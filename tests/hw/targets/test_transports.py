@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import json
 import os
+import socket
 import subprocess
 import time
 from pathlib import Path
@@ -39,11 +40,17 @@ def received(transport, count, seconds=20.0):
     return found
 
 
+def free_port():
+    """A port of this machine that nobody listens at."""
+    with socket.socket() as server:
+        server.bind(("127.0.0.1", 0))
+        return server.getsockname()[1]
+
+
 @pytest.fixture
 def listening():
     zeromq = pytest.importorskip("gaponet.hw.targets.zeromq")
-    transport = zeromq.ZeroMQTransport("tcp://127.0.0.1:*")
-    transport.address = transport._socket.last_endpoint.decode()
+    transport = zeromq.ZeroMQTransport(f"tcp://127.0.0.1:{free_port()}")
     yield transport
     transport.close("over")
 

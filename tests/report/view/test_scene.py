@@ -12,7 +12,7 @@ from gaponet.data.sequence import Sequence, SequenceMeta
 from gaponet.evaluation.evaluate import ORDER
 from gaponet.evaluation.methods import colour
 from gaponet.report.view.picture import Camera, require_writable, write
-from gaponet.report.view.player import _page_colour
+from gaponet.report.view.player import page_colour
 from gaponet.report.view.scene import GHOST_RGBA, Scene, View, rgb, visual_spec
 from gaponet.report.view.side_by_side import Clip, Copy, SideBySide
 from gaponet.robot.spec import Table, load_robot
@@ -228,14 +228,14 @@ def test_every_copy_is_seen_on_a_light_and_a_dark_page():
 
     own = {method: np.array(rgb(colour(method))[:3]) for method in ("target", *ORDER)}
     assert all(
-        (_page_colour(x) == (255 * x).astype(int)).all()
+        (page_colour(x) == (255 * x).astype(int)).all()
         for limb in own.values()
         for x in (limb, 0.55 * limb)
     )
     recorded = np.array(rgb(colour("recorded"))[:3])
     for x in (recorded, 0.55 * recorded, np.array(GHOST_RGBA[:3])):
-        light = luminance(_page_colour(x) / 255)
+        light = luminance(page_colour(x) / 255)
         assert 1.05 / (light + 0.05) > 3  # on white
         assert (light + 0.05) / (luminance(np.full(3, 0.1)) + 0.05) > 1.5
-    light = luminance(_page_colour(recorded) / 255)
+    light = luminance(page_colour(recorded) / 255)
     assert (light + 0.05) / (luminance(np.full(3, 0.1)) + 0.05) > 3

@@ -62,14 +62,14 @@ def fit_sensors(
         return None
     device = next(net.parameters()).device
     net.cpu()  # C MuJoCo answers the probes
-    probed = _probe(net, env, states, seed, nthread, refit)
+    probed = probe_states(net, env, states, seed, nthread, refit)
     report = _fit_predictor(net, *probed, env.robot.operated, seed, refit)
     net.predictor.requires_grad_(False)
     net.to(device)
     return report
 
 
-def _probe(
+def probe_states(
     net: DeltaNet, env: DeltaEnv, states: int, seed: int, nthread: int, refit: bool
 ) -> tuple[Tensor, Tensor]:
     """Probe the simulator at recorded start states, or on `refit` at the environment's present

@@ -76,7 +76,7 @@ class Bodies:
                     f"{name}/{g}",
                     vertices,
                     faces,
-                    color=_page_colour(model.geom_rgba[g, :3]),
+                    color=page_colour(model.geom_rgba[g, :3]),
                     opacity=float(model.geom_rgba[g, 3]),
                     position=model.geom_pos[g],
                     wxyz=model.geom_quat[g],
@@ -184,7 +184,7 @@ def _heading(shown: SideBySide, magnify: float) -> str:
     return heading
 
 
-def _page_colour(rgb: Array) -> Array:
+def page_colour(rgb: Array) -> Array:
     """Return a colour (3,) of 0 to 1 as one of 0 to 255 that a light and a dark page show: black
     becomes slate.
     """
