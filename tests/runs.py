@@ -24,7 +24,9 @@ TINY_TRAINING = TrainConfig(
     model=ModelConfig(
         history=2, num_probes=4, branch_hidden=(16,), trunk_hidden=(16,), sensor_hidden=(16,)
     ),
-    pretraining=PretrainingConfig(rounds=2, num_envs=8, steps=30, gradient_steps=10, batch_size=64),
+    pretraining=PretrainingConfig(
+        rounds=2, num_envs=8, steps=30, gradient_steps=10, batch_size=64, sensor_states=64
+    ),
     ppo=PPOConfig(
         num_envs=8, num_steps=8, epochs=1, mini_batches=2, critic_warmup=1, explained=-1e9
     ),

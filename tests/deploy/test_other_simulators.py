@@ -27,7 +27,7 @@ OTHER_KP = 0.7  # of the robot's
 CONFIG = TrainConfig(
     model=ModelConfig(history=2, branch_hidden=(32,), trunk_hidden=(16,)),
     pretraining=PretrainingConfig(
-        rounds=2, num_envs=48, steps=60, gradient_steps=200, batch_size=256
+        rounds=2, num_envs=48, steps=60, gradient_steps=200, batch_size=256, sensor_states=512
     ),
     ppo=PPOConfig(num_envs=48, num_steps=8, epochs=1, critic_warmup=1, explained=-1e9),
     simulators=SIMULATORS,

@@ -97,6 +97,12 @@ def lawful(robot):
     return robot.with_identified(LAWS)
 
 
+@pytest.fixture(autouse=True)
+def short_motions(monkeypatch):
+    """Motions of the robot itself last three seconds."""
+    monkeypatch.setattr(plain_servos, "OWN_MOTION_S", 3.0)
+
+
 @pytest.fixture
 def mine(tmp_path):
     """A user's scene: includes, degrees, defaults, a mesh, a tendon, sensors, a keyframe, a servo and a body before."""

@@ -160,7 +160,7 @@ def test_masses_are_accepted_where_motions_that_were_not_fitted_gain(robot, monk
         train,
         robot,
         judges,
-        options=IdentifyOptions(windows=4, terms=(), table=False, nthread=1, masses=True),
+        options=IdentifyOptions(windows=4, terms=(), table=False, nthread=1, masses=True, folds=1),
     )
     comparison = fitted.comparisons[-1]
     assert comparison.name == "masses"

@@ -69,7 +69,9 @@ def test_identification_finds_a_ramp_and_warns(tmp_path, servos):
         logs[:3],
         robot,
         logs[3:],
-        options=IdentifyOptions(windows=3, terms=(), table=False, nthread=1, folds=1),
+        options=IdentifyOptions(
+            windows=3, terms=(), table=False, joints_alone=True, nthread=1, folds=1
+        ),
     )
     assert found.robot.servo.target_speed == pytest.approx([0.6, 0.0], rel=0.04)
     assert found.after < 0.1 * found.before

@@ -27,6 +27,7 @@ def moved(robot, metres, hand):
     return replace(robot, payload_mounts=tuple(mounts))
 
 
+QUICK = IdentifyOptions(terms=(), table=False, joints_alone=True, nthread=1)
 POST = '<body name="post" pos="0 1 0"><geom size="0.02" mass="0.1" contype="0" conaffinity="0"/></body>'
 FIRST_MOUNT = '[[payload_mount]]\nside = "post"\nbody = "post"\npos = [0.2, 0.0, 0.0]\n[[payload_mount]]\nside = "hand"'
 
@@ -111,7 +112,7 @@ def loaded(robot):
 def test_the_fit_from_torque_is_used_if_validation_motions_accept_it(tmp_path):
     robot = write_arm(tmp_path / "arm")
     windows = loaded(robot)
-    found = identify(windows[:12], robot, windows[12:], options=IdentifyOptions(terms=()))
+    found = identify(windows[:12], robot, windows[12:], options=QUICK)
     (tried,) = found.comparisons
     assert (found.chosen, tried.name, tried.accepted, len(tried.before)) == (
         "torque",
@@ -143,7 +144,7 @@ def test_a_refit_with_the_validation_motions_is_dropped_if_it_follows_them_worse
         )
 
     monkeypatch.setattr(TorqueFit, "fit", astray)
-    found = identify(windows[:12], robot, windows[12:], options=IdentifyOptions(terms=(), folds=1))
+    found = identify(windows[:12], robot, windows[12:], options=replace(QUICK, folds=1))
     assert found.chosen == "torque"
     assert found.held_out[0].robot is found.robot
     assert abs(found.robot.servo.offset).max() < 0.05

@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from arm import write_arm
 from logs import late, wave, write_sage
 
 import gaponet
@@ -50,7 +51,7 @@ from gaponet.cli.main import main
 from gaponet.nn.training.config import TrainConfig, PretrainingConfig
 
 work = Path(sys.argv[1])
-gp.import_logs(work / "logs", robot="so101", out=work / "data", unit_id="a", payload_mass=0.0)
+gp.import_logs(work / "logs", robot=work / "arm", out=work / "data", unit_id="a", payload_mass=0.0)
 small = PretrainingConfig(rounds=1, num_envs=4, steps=20, gradient_steps=5, batch_size=64, sensor_states=16)
 gp.train(work / "data", out=work / "run", budget="120", config=TrainConfig(pretraining=small))
 for words in ("doctor data", "eval run data", "report run", "report . --list"):
@@ -81,12 +82,11 @@ def without_posix(code: str, *args: object) -> str:
 
 
 def test_the_way_from_logs_to_a_report_needs_nothing_that_windows_has_not(tmp_path):
+    robot = write_arm(tmp_path / "arm")
+    motions = tmp_path / "logs" / "real" / "arm" / "custom"
     for i in range(5):
-        ctrl = wave(80, 6, hertz=0.3 + 0.2 * i)
-        ctrl[:, 5] = 0.5 + ctrl[:, 5]
-        write_sage(
-            tmp_path / "logs" / "real" / "so101" / "custom" / f"wave_{i}", ctrl, late(ctrl, 2)
-        )
+        ctrl = wave(80, 2, hertz=0.3 + 0.2 * i)
+        write_sage(motions / f"wave_{i}", ctrl, late(ctrl, 2), names=robot.joint_names)
     assert "all the way" in without_posix(WAY, tmp_path)
 
 

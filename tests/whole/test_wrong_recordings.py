@@ -16,7 +16,7 @@ from gaponet.nn.artifact import GapModel
 
 pytest.importorskip("torch")
 
-QUICK = IdentifyOptions(windows=2, terms=(), table=False)
+QUICK = IdentifyOptions(windows=2, terms=(), table=False, threads=1, budget="1s")
 STOPPED = "stopped at what the doctor calls an error, sign: shoulder moves against its command"
 
 

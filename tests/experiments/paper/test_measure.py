@@ -81,7 +81,10 @@ def test_gaps_are_counted_above_each_threshold(robot, recorded):
     assert 0.0 == max(large["0.5"]) <= min(large["0.1"])
 
 
-def test_an_untrained_network_earns_nothing_in_delivery(robot, unit):
+def test_an_untrained_network_earns_nothing_in_delivery(robot, unit, monkeypatch):
+    monkeypatch.setattr(measure, "HOLD_S", 0.2)  # that the hands come to rest does not matter
+    monkeypatch.setattr(measure, "AVERAGED_S", 0.1)
+    monkeypatch.setattr(goals, "REST_S", 0.1)
     delivery = Delivery.plan(unit)
     plain = measure_delivery(unit, delivery, None)
     untrained = measure_delivery(unit, delivery, model(robot, 0.0))

@@ -18,6 +18,14 @@ UPDATE = 8 * 8
 STEPS = Budget(steps=2 * WARM + 6 * UPDATE)
 
 
+@pytest.fixture(scope="module", autouse=True)
+def short_fits():
+    """Sensor predictors are fitted in a few steps: how well does not matter."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("gaponet.nn.training.sensor_fit.FIT_STEPS", 30)
+        yield
+
+
 @pytest.fixture(scope="module")
 def world(tmp_path_factory):
     place = tmp_path_factory.mktemp("world")

@@ -25,7 +25,7 @@ SMALL = TrainConfig(
         history=2, num_probes=4, branch_hidden=(32,), trunk_hidden=(32,), sensor_hidden=(32,)
     ),
     pretraining=PretrainingConfig(
-        rounds=3, num_envs=16, steps=60, gradient_steps=80, batch_size=256
+        rounds=3, num_envs=16, steps=60, gradient_steps=80, batch_size=256, sensor_states=512
     ),
     ppo=PPOConfig(num_envs=16, num_steps=16, epochs=1, critic_warmup=1, explained=-1e9),
     validate_every=4,
@@ -35,6 +35,14 @@ STEPS = Budget(steps=3 * 16 * 60 + 8 * 16 * 16)
 
 def dataset(folder, robot, **how):
     return write_dataset(folder, robot, recordings(robot, 8, **how))
+
+
+@pytest.fixture(scope="module", autouse=True)
+def short_fits():
+    """Sensor predictors are fitted in a third of the steps."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("gaponet.nn.training.sensor_fit.FIT_STEPS", 200)
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -143,9 +151,8 @@ def test_threads_reach_every_simulation(robot, tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("sensors", ["predicted", "off"])
 def test_ppo_alone_has_statistics_of_its_inputs_and_a_fitted_predictor(
-    sensors, trained, robot, tmp_path, monkeypatch
+    sensors, trained, robot, tmp_path
 ):
-    monkeypatch.setattr("gaponet.nn.training.sensor_fit.FIT_STEPS", 200)
     config = replace(
         SMALL,
         pretraining=replace(SMALL.pretraining, rounds=0),
