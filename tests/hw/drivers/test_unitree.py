@@ -79,7 +79,9 @@ def receiver(robot: RobotSpec, found: np.ndarray, *later: list[np.ndarray]) -> S
     """A receiver that found a robot by one message, and what comes before each reading."""
     queue = list(later)
     source = SimpleNamespace(receive=lambda: queue.pop(0), second="")
-    return StateReceiver(source, motor_numbers(robot), FirstMessages([0.0], [found], 0))
+    states = StateReceiver(motor_numbers(robot))
+    states.begin(source, FirstMessages([0.0], [found], 0))
+    return states
 
 
 @pytest.mark.parametrize(
@@ -227,6 +229,20 @@ def test_a_silent_driver_publishes_nothing(robot, clock):
     driver.close()
 
     assert heard(clock) == []
+
+
+def test_what_the_robot_reported_stops_also_after_a_new_connection(robot, clock):
+    driver = connected(robot)
+    clock.robot.inject("remote", 0.0)
+    driver.write(robot.qpos_home)
+    clock.wait_until(clock.now() + 0.1)
+    assert driver.read().fault.kind == "stop"
+    driver.close()
+
+    clock.robot.inject("none", 0.0)
+    driver.connect()
+
+    assert driver.read().fault.kind == "stop"
 
 
 def test_another_publisher_of_the_topic_is_refused(robot, monkeypatch):

@@ -103,7 +103,7 @@ class UnitreeDriver:
         self._joints = joints
         self._at = robot.index(self.commanded)
         self._link = UnitreeLink(topic, domain, interface, sole, silent)
-        self._states: StateReceiver | None = None  # while it is connected
+        self._states = StateReceiver(motor_numbers(robot))
         self._commands = CommandMessages(robot, self.commanded, topic == "arm_sdk")
 
     @property
@@ -118,8 +118,8 @@ class UnitreeDriver:
 
     @property
     def received(self) -> int:
-        """Intact messages since the connection."""
-        return 0 if self._states is None else self._states.received
+        """Intact messages since the robot was found."""
+        return self._states.received
 
     def connect(self) -> None:
         """Find the robot, learn its tick and machine mode, and refuse if another participant
@@ -130,7 +130,7 @@ class UnitreeDriver:
         first = listen(source, f"domain {link.domain}, interface {link.interface}")
         link.require_one_robot(source)
         require_h1_2(first.messages, link.interface)
-        self._states = StateReceiver(source, motor_numbers(self.robot), first)
+        self._states.begin(source, first)
         self._commands.set_machine(self._states.machine)
         self.virtual = self._states.virtual
         self.facts = {
@@ -144,7 +144,6 @@ class UnitreeDriver:
 
         Its time is the robot's, mapped to ours.
         """
-        assert self._states is not None
         return self._states.read()
 
     def write(self, ctrl: Array, weight: float = 1.0) -> None:
@@ -158,8 +157,7 @@ class UnitreeDriver:
         if problem := range_violation(self.robot, ctrl, self._at):
             raise DriverError(f"{problem}; it was not sent")
         if self._link.can_send:
-            state = None if self._states is None else self._states.newest
-            self._link.send(self._commands.positions(ctrl, weight, state))
+            self._link.send(self._commands.positions(ctrl, weight, self._states.newest))
 
     def verify(self) -> None:
         """Do nothing: nothing can be read back. The controller checks that the joints follow."""
@@ -176,10 +174,9 @@ class UnitreeDriver:
         The watchdog reads nothing until it damps. The state from its connection may be minutes old:
         a torso that is held there, with stiffness, would jump back to it.
         """
-        if self._states is None:
-            return None
-        with contextlib.suppress(DriverError):
-            self.read()
+        if self._states.is_open:
+            with contextlib.suppress(DriverError):
+                self.read()
         return self._states.newest
 
     def confirm(self) -> str:
@@ -200,7 +197,7 @@ class UnitreeDriver:
             if not hold:
                 self.damp(0.0)
         self._link.close()
-        self._states = None
+        self._states.end()
 
     def publishers(self) -> dict[str, list[str]]:
         """Return the other publishers on the bus: topic → programs.

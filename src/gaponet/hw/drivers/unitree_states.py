@@ -131,39 +131,54 @@ def _machine_in(data: Array) -> int:
 
 
 class StateReceiver:
-    """Receives the states of one H1-2.
+    """Receives the states of one H1-2. What the robot reports stays, also over a new connection.
 
     Attributes:
         machine: Its mode_machine when it was found.
         virtual: True if it says that it is our virtual robot.
-        newest: The newest state.
+        newest: The newest state; None before the robot was found.
         received: Intact messages since it was found.
     """
 
-    def __init__(self, source: SoleSource, motors: Array, first: FirstMessages) -> None:
-        """
-        Args:
-            source: Of its messages.
-            motors: Number of each joint's motor, (n,).
-            first: Messages in which it was found.
-        """
-        self._source = source
+    def __init__(self, motors: Array) -> None:
+        """motors: Number of each joint's motor, (n,)."""
+        self.machine = 0
+        self.virtual = False
+        self.newest: State | None = None
+        self.received = 0
         self._motors = motors
-        self._refused = first.refused
+        self._source: SoleSource | None = None
+        self._clock: TickClock | None = None
+        self._refused = 0  # messages
         # the first one that the robot reported; it may be in one message only
         self._fault: Fault | None = None
+
+    @property
+    def is_open(self) -> bool:
+        """True between `begin` and `end`."""
+        return self._source is not None
+
+    def begin(self, source: SoleSource, first: FirstMessages) -> None:
+        """Take the messages of a source from now on; `first` are those in which it was found."""
+        self._source = source
+        self._refused += first.refused
         ticks = [_tick_in(data) for data in first.messages]
         self._clock = TickClock(first.arrivals, ticks)
         self.machine = _machine_in(first.messages[-1])
-        self.virtual = False
-        self.received = 0
-        self.newest = self._decode(first.messages[-1], first.arrivals[-1])
+        self.newest = self._decode(first.messages[-1], self._clock, first.arrivals[-1])
+
+    def end(self) -> None:
+        """Take no more messages."""
+        self._source = None
 
     def read(self) -> State:
         """Return the newest state with a right checksum.
 
         Its time is the robot's, mapped to ours (TickClock).
         """
+        assert self._source is not None
+        assert self._clock is not None
+        assert self.newest is not None
         now = time.monotonic()
         newest = None
         messages = self._source.receive()
@@ -182,7 +197,7 @@ class StateReceiver:
             else:
                 self._refused += 1
         if newest is not None:
-            self.newest = self._decode(newest, now)
+            self.newest = self._decode(newest, self._clock, now)
         elif self._refused != self.newest.refused:
             self.newest = replace(self.newest, refused=self._refused)
         return self.newest
@@ -206,10 +221,10 @@ class StateReceiver:
             return Fault("robot", f"{MOTOR_NAMES[motor]} reports error 0x{errors[motor]:x}")
         return None
 
-    def _decode(self, data: Array, now: float) -> State:
+    def _decode(self, data: Array, clock: TickClock, now: float) -> State:
         message = hg.LowState
         at = self._motors
-        measured = self._clock.time(_tick_in(data), now)
+        measured = clock.time(_tick_in(data), now)
         self.virtual = int(message.view(data, "reserve")[0]) == VIRTUAL_MARK
         q = message.motors(data, "q")[at].astype(float)
         dq = message.motors(data, "dq")[at].astype(float)
