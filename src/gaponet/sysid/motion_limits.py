@@ -29,6 +29,8 @@ LAGS = 16  # that are tried
 SPEED_RATIOS = np.geomspace(0.7, 1.25, 30)  # ramps that are tried, over a joint's greatest speed
 SPEED_SPAN_S = 0.06  # over which a speed is measured
 LAG_TIME_CONSTANTS_S = (0.0, 0.02, 0.04, 0.08, 0.16, 0.32)  # of a servo without a ramp
+MIN_SPEED = 1e-6  # rad/s, of a ramp that is tried
+MIN_LAG_ERROR_RAD = 1e-9  # so that it can be divided by
 MAX_ERROR_RATIO = 0.8  # of a ramp over the best lag, in both halves of the recordings
 MIN_RAMP_ERROR_RAD = 0.02  # RMS by which a ramp must be behind its command
 MIN_RAMP_DELAY_S = 0.3  # by which it must be behind it at least once
@@ -55,36 +57,58 @@ def with_stops(robot: RobotSpec, sequences: ListOf[Sequence]) -> RobotSpec:
     """
     servos: dict[str, dict[str, float]] = {}
     for joint, i in zip(robot.operated, robot.operated_index, strict=True):
-        for name, sign in (("stop_low", -1.0), ("stop_high", 1.0)):
-            paths = [(sign * s.ctrl[:, i], sign * s.qpos[:, i]) for s in sequences]
-            end = max(float(qpos.max()) for _, qpos in paths)
-            end_of_range = sign * robot.qpos_range[i, int(sign > 0)]
-            if _meets_stop(paths, end) and end_of_range > end + MIN_NARROWING_RAD:
-                servos.setdefault(joint, {})[name] = round(sign * end, 4)
-    return robot.with_identified(servos) if servos else robot
+        low, high = robot.qpos_range[i].tolist()
+        paths = [_Path(s.ctrl[:, i], s.qpos[:, i]) for s in sequences]
+        mirrored = [_Path(-ctrl, -qpos) for ctrl, qpos in paths]
+        stop_low = _stop(mirrored, -low)
+        stop_high = _stop(paths, high)
+        if stop_low is not None:
+            servos.setdefault(joint, {})["stop_low"] = round(-stop_low, 4)
+        if stop_high is not None:
+            servos.setdefault(joint, {})["stop_high"] = round(stop_high, 4)
+    if not servos:
+        return robot
+    return robot.with_identified(servos)
 
 
-def _meets_stop(paths: list[tuple[Array, Array]], end: float) -> bool:
-    """Return True if commands and positions of a joint, (T,) rad each, show a stop at the end of
-    its path.
+class _Path(NamedTuple):
+    """Commands and positions of one joint in a recording, (T,) rad each."""
+
+    ctrl: Array
+    qpos: Array
+
+
+def _stop(paths: list[_Path], end_of_range: float) -> float | None:
+    """Return the highest position of a joint, rad, if commands show a stop there, inside the
+    joint's range; else None.
     """
+    end = max(float(path.qpos.max()) for path in paths)
+    if end_of_range <= end + MIN_NARROWING_RAD or not _meets_stop(paths, end):
+        return None
+    return end
+
+
+def _meets_stop(paths: list[_Path], end: float) -> bool:
+    """Return True if commands go on where a joint is at the end of its path, rad."""
     pushes: list[Array] = []
-    for ctrl, qpos in paths:
-        pushes += _pushes(ctrl, qpos, end)
+    for path in paths:
+        pushes += _pushes(path, end)
     rows = sum(len(push) for push in pushes)
     went_on = [push for push in pushes if push.max() - push[0] > MIN_BEYOND_STOP_RAD]
     return rows >= MIN_STOP_ROWS and len(went_on) > 1
 
 
-def _pushes(ctrl: Array, qpos: Array, end: float) -> list[Array]:
-    """Return the commands well beyond the end of a joint's path while the joint is there, push by
-    push.
+def _pushes(path: _Path, end: float) -> list[Array]:
+    """Return the commands well beyond the end of a joint's path, rad, while the joint is there,
+    push by push.
     """
-    rows = np.flatnonzero((ctrl > end + MIN_BEYOND_STOP_RAD) & (qpos > end - AT_STOP_RAD))
+    is_beyond = path.ctrl > end + MIN_BEYOND_STOP_RAD
+    is_there = path.qpos > end - AT_STOP_RAD
+    rows = np.flatnonzero(is_beyond & is_there)
     if not len(rows):
         return []
-    ends = np.flatnonzero(np.diff(rows) > 1) + 1
-    return np.split(ctrl[rows], ends)
+    first_of_push = np.flatnonzero(np.diff(rows) > 1) + 1
+    return np.split(path.ctrl[rows], first_of_push)
 
 
 def stop_questions(given: RobotSpec, stopped: RobotSpec) -> list[str]:
@@ -95,12 +119,12 @@ def stop_questions(given: RobotSpec, stopped: RobotSpec) -> list[str]:
     for joint, i in zip(given.operated, given.operated_index, strict=True):
         for name, direction in (("stop_low", "lower"), ("stop_high", "higher")):
             stop = float(stopped.servo[name][i])
-            if np.isfinite(stop) and stop != given.servo[name][i]:
-                questions.append(
-                    f"{joint}: stayed at {stop:.3f} rad where commands went "
-                    f"{direction}: if that is a stop, identify with --stops; if something was in "
-                    "its way, leave those motions out"
-                )
+            if not np.isfinite(stop) or stop == given.servo[name][i]:
+                continue
+            questions.append(
+                f"{joint}: stayed at {stop:.3f} rad where commands went {direction}: if that is a "
+                "stop, identify with --stops; if something was in its way, leave those motions out"
+            )
     return questions
 
 
@@ -110,30 +134,35 @@ def default_terms(sequences: ListOf[Sequence], robot: RobotSpec) -> tuple[Term, 
     These are "limit" and "speed", if gains and recorded errors ask some joint for such torques as
     the constants above say; DEFAULT_TERMS; and "temperature", if recordings vary it.
     """
-    op = robot.operated_index
     fast = FAST * greatest_speeds(sequences, robot)
-    limit = robot.servo.effort_limit[op]
-    limited_rows = np.zeros(len(op))
-    fast_rows = np.zeros(len(op))
-    rows = np.zeros(len(op))
-    for s in sequences:
-        own = robot.with_gains(*s.meta.recorded_gains)
-        torque = (own.servo.kp * (s.ctrl - s.qpos) - own.servo.kd * s.qvel)[:, op]
-        qvel = s.qvel[:, op]
-        recorded = s.meta.records(robot.operated)
-        limited_rows += recorded * (np.abs(torque) > AT_TORQUE_LIMIT * limit).sum(axis=0)
-        driven = (torque * np.sign(qvel) > DRIVEN_FAST * limit) & (np.abs(qvel) > fast)
-        fast_rows += recorded * driven.sum(axis=0)
-        rows += len(s) * recorded
+    counts = [_demanding_rows(s, robot, fast) for s in sequences]
+    rows, limited_rows, driven_rows = np.sum(counts, axis=0)  # (n,) each
     terms: list[Term] = []
     if (limited_rows > MIN_LIMITED_SHARE * rows).any():
         terms.append("limit")
-    if (fast_rows > MIN_FAST_SHARE * rows).any():
+    if (driven_rows > MIN_FAST_SHARE * rows).any():
         terms.append("speed")
     terms += DEFAULT_TERMS
     if temperature_varies(sequences, robot).any():
         terms.append("temperature")
     return tuple(terms)
+
+
+def _demanding_rows(s: Sequence, robot: RobotSpec, fast: Array) -> Array:
+    """Return how many rows of a recording hold each joint, how many of these ask for its torque
+    limit, and in how many it is driven while it moves faster than `fast` (n,), rad/s; (3, n).
+    """
+    op = robot.operated_index
+    servo = robot.with_gains(*s.meta.recorded_gains).servo
+    asked = (servo.kp * (s.ctrl - s.qpos) - servo.kd * s.qvel)[:, op]  # (T, n) N·m
+    qvel = s.qvel[:, op]
+    limit = robot.servo.effort_limit[op]
+    is_limited = np.abs(asked) > AT_TORQUE_LIMIT * limit
+    is_driven = asked * np.sign(qvel) > DRIVEN_FAST * limit
+    is_fast = np.abs(qvel) > fast
+    every = np.ones_like(is_limited)
+    counts = np.stack([every, is_limited, is_driven & is_fast]).sum(axis=1)
+    return np.asarray(counts * s.meta.records(robot.operated))
 
 
 class _Part(NamedTuple):
@@ -160,13 +189,16 @@ def target_speeds(sequences: ListOf[Sequence], robot: RobotSpec) -> Array:
     parts = _parts(sequences, robot)
     if len(parts) < 2:
         return np.zeros(len(op))
-    tried = np.maximum(SPEED_RATIOS[:, None] * _greatest_measured(parts), 1e-6)  # (k, n) rad/s
+    tried = SPEED_RATIOS[:, None] * _greatest_measured(parts)  # (k, n) rad/s
+    tried = np.maximum(tried, MIN_SPEED)
     errors = _aim_errors(parts, tried)
-    ramp_rms, lag_rms = np.split(errors.rms, [len(tried)], axis=1)
+    ramp_rms = errors.rms[:, : len(tried)]  # (2, k, n) rad
+    lag_rms = errors.rms[:, len(tried) :]  # (2, lags, n) rad
     best = ramp_rms.sum(axis=0).argmin(axis=0)  # number of each joint's ramp, (n,)
     joints = np.arange(len(op))
-    ratio = ramp_rms[:, best, joints] / np.maximum(lag_rms.min(axis=1), 1e-9)  # (2, n)
     speed = tried[best, joints]
+    best_lag_rms = np.maximum(lag_rms.min(axis=1), MIN_LAG_ERROR_RAD)
+    ratio = ramp_rms[:, best, joints] / best_lag_rms  # (2, n)
     fits_better = (ratio < MAX_ERROR_RATIO).all(axis=0)
     is_behind = errors.rms_behind[best, joints] > MIN_RAMP_ERROR_RAD
     is_late = errors.most_behind[best, joints] > MIN_RAMP_DELAY_S * speed
@@ -199,7 +231,8 @@ def _greatest_measured(parts: list[_Part]) -> Array:
     for _, qpos, dt in parts:
         span = max(1, round(SPEED_SPAN_S / dt))
         if len(qpos) > span:
-            speeds.append(np.abs(qpos[span:] - qpos[:-span]) / (span * dt))
+            way = np.abs(qpos[span:] - qpos[:-span])
+            speeds.append(way / (span * dt))
     return np.asarray(np.quantile(np.concatenate(speeds), GREATEST_SPEED_QUANTILE, axis=0))
 
 
@@ -207,8 +240,8 @@ def _aim_errors(parts: list[_Part], tried: Array) -> _AimErrors:
     """Return the errors of ramps with speeds (k, n), rad/s, and of lags, each with the delay and
     the offset that suit it best.
     """
-    aims_count = len(tried) + len(LAG_TIME_CONSTANTS_S)
-    squares = np.zeros((2, aims_count, tried.shape[1], LAGS))
+    ramps_and_lags = len(tried) + len(LAG_TIME_CONSTANTS_S)
+    squares = np.zeros((2, ramps_and_lags, tried.shape[1], LAGS))
     squares_behind = np.zeros(tried.shape)
     most_behind = np.zeros(tried.shape)
     rows = np.zeros(2)
@@ -220,33 +253,45 @@ def _aim_errors(parts: list[_Part], tried: Array) -> _AimErrors:
         squares_behind += (behind**2).sum(axis=0)
         most_behind = np.maximum(most_behind, behind.max(axis=0))
         aims = np.concatenate([ramps, _lagged(ctrl, dt)], axis=1)  # (T, k + lags, n)
-        for i, lag in enumerate(np.linspace(0, MAX_LAG_S, LAGS)):
-            late = round(lag / dt)
-            away = qpos[late:, None] - aims[: len(aims) - late]
-            squares[half, ..., i] += ((away - away.mean(axis=0)) ** 2).sum(axis=0)
+        squares[half] += _squared_errors(aims, qpos, dt)
         rows[half] += len(ctrl)
     rms = np.sqrt(squares.min(axis=-1) / rows[:, None, None])
-    return _AimErrors(rms, np.sqrt(squares_behind / rows.sum()), most_behind)
+    rms_behind = np.sqrt(squares_behind / rows.sum())
+    return _AimErrors(rms, rms_behind, most_behind)
+
+
+def _squared_errors(aims: Array, qpos: Array, dt: float) -> Array:
+    """Return the sums of squared distances of positions (T, n) from aims (T, aims, n), rad², for
+    each lag up to MAX_LAG_S, without their offset; (aims, n, LAGS).
+    """
+    squares = []
+    for lag in np.linspace(0, MAX_LAG_S, LAGS):
+        late = round(lag / dt)
+        away = qpos[late:, None] - aims[: len(aims) - late]
+        without_offset = away - away.mean(axis=0)
+        squares.append((without_offset**2).sum(axis=0))
+    return np.stack(squares, axis=-1)
 
 
 def _speed_behind(parts: list[_Part], speed: Array) -> Array:
     """Return the median speed of joints while they are well behind a ramp of about `speed` (n,)
     rad/s: then they are as fast as their ramp.
     """
-    seen = []
+    seen = [speed[None]]
     for ctrl, qpos, dt in parts:
-        behind = np.abs(speed_limited(ctrl, qpos[0], speed, dt) - ctrl)
+        ramp = speed_limited(ctrl, qpos[0], speed, dt)
+        behind = np.abs(ramp - ctrl)
         span = max(1, round(SPEED_SPAN_S / dt))
         late = round(MIN_RAMP_DELAY_S / 2 / dt)
-        moved = np.abs(qpos[late + span :] - qpos[late:-span]) / (span * dt)
-        is_far_behind = behind[: len(moved)] > MIN_RAMP_DELAY_S / 2 * speed
-        seen.append(np.where(is_far_behind, moved, np.nan))
-    return np.asarray(np.nanmedian(np.concatenate([*seen, speed[None]]), axis=0))
+        way = np.abs(qpos[late + span :] - qpos[late:-span])
+        is_far_behind = behind[: len(way)] > MIN_RAMP_DELAY_S / 2 * speed
+        seen.append(np.where(is_far_behind, way / (span * dt), np.nan))
+    return np.asarray(np.nanmedian(np.concatenate(seen), axis=0))
 
 
 def _lagged(ctrl: Array, dt: float) -> Array:
     """Return commands (T, n) behind first-order lags of LAG_TIME_CONSTANTS_S, (T, lags, n)."""
-    share = np.minimum(dt / np.maximum(LAG_TIME_CONSTANTS_S, dt), 1)[:, None]
+    share = np.minimum(dt / np.maximum(LAG_TIME_CONSTANTS_S, dt), 1)[:, None]  # of the way, a row
     lagged = np.empty((len(ctrl), len(LAG_TIME_CONSTANTS_S), ctrl.shape[1]))
     aim = np.repeat(ctrl[:1], len(LAG_TIME_CONSTANTS_S), axis=0)
     for t, target in enumerate(ctrl):

@@ -46,40 +46,53 @@ def servos_like(robot: RobotSpec, like: RobotSpec) -> tuple[RobotSpec, dict[str,
             f"{like.folder}: no identified joint of it has the name, the mirrored name or the "
             f"type of servo of a joint of {robot.name}"
         )
-    before = like.before_identification
-    taken = [f.name for f in SERVO_FIELDS.values() if f.shared or f.name == "delay"]
-    taken.remove("effort_limit")
-    servos: dict[str, dict[str, float]] = {}
+    servos = {}
     for joint, source in sources.items():
-        i = robot.joint_names.index(joint)
-        k = like.joint_names.index(source)
-        servos[joint] = like.servo.of_joint(k, taken)
-        for gain in ("kp", "kd"):
-            own = float(robot.servo[gain][i])
-            theirs = float(before.servo[gain][k])
-            if own > 0 and theirs > 0:
-                servos[joint][gain] *= own / theirs
-    same = like if like.name == robot.name else robot
-    taken_over = replace(
-        robot.with_identified(servos), payload_mounts=same.payload_mounts, links=same.links
-    )
-    return taken_over, sources
+        servos[joint] = _servo_like(robot, joint, like, source)
+    started = robot.with_identified(servos)
+    if like.name == robot.name:
+        started = replace(started, payload_mounts=like.payload_mounts, links=like.links)
+    return started, sources
+
+
+def _servo_like(robot: RobotSpec, joint: str, like: RobotSpec, source: str) -> dict[str, float]:
+    """Return the identified servo of a joint of `like` for a joint of `robot`: field → value."""
+    taken = [field.name for field in SERVO_FIELDS.values() if field.shared or field.name == "delay"]
+    taken.remove("effort_limit")
+    i = robot.joint_names.index(joint)
+    k = like.joint_names.index(source)
+    servo = like.servo.of_joint(k, taken)
+    before = like.before_identification
+    for gain in ("kp", "kd"):
+        own = float(robot.servo[gain][i])
+        theirs = float(before.servo[gain][k])
+        if own > 0 and theirs > 0:
+            servo[gain] *= own / theirs
+    return servo
 
 
 def _sources(robot: RobotSpec, like: RobotSpec) -> dict[str, str]:
     """Return joint of `robot` → identified joint of `like` that its values come from."""
     identified = identified_joints(like)
-    types = dict(zip(like.joint_names, like.servo.types, strict=True))
     sources: dict[str, str] = {}
     for i, joint in zip(robot.operated_index, robot.operated, strict=True):
-        candidates = [joint, mirrored(joint)]
-        servo = robot.servo.types[i]
-        if servo is not None:
-            candidates += [j for j, other in types.items() if other and other.name == servo.name]
-        found = [j for j in candidates if j in identified]
-        if found:
-            sources[joint] = found[0]
+        candidates = [joint, mirrored(joint), *_joints_with(like, robot.servo.types[i])]
+        for candidate in candidates:
+            if candidate in identified:
+                sources[joint] = candidate
+                break
     return sources
+
+
+def _joints_with(robot: RobotSpec, servo: ServoType | None) -> list[str]:
+    """Return the joints of a robot with a type of servo; none if the type is unknown."""
+    if servo is None:
+        return []
+    joints = []
+    for joint, own in zip(robot.joint_names, robot.servo.types, strict=True):
+        if own is not None and own.name == servo.name:
+            joints.append(joint)
+    return joints
 
 
 def mirrored(joint: str) -> str:
@@ -128,24 +141,28 @@ def measured_types(robots: ListOf[RobotSpec], source: str, licence: str) -> list
     Raises:
         UsageError: No identified joint names a servo type.
     """
-    joints: list[_MeasuredServo] = []
+    by_type: dict[str, list[_MeasuredServo]] = {}
     for number, robot in enumerate(robots):
-        joints += _measured_servos(number, robot)
-    if not joints:
+        for measured in _measured_servos(number, robot):
+            by_type.setdefault(measured.servo.name, []).append(measured)
+    if not by_type:
         raise UsageError(
             "no identified joint names a servo type; write servo = into the [[joint]] of its "
             "robot.toml"
         )
-    types = []
-    for servo in {joint.servo.name: joint.servo for joint in joints}.values():
-        same = [joint for joint in joints if joint.servo.name == servo.name]
-        units = set[tuple[int, str]]().union(*(joint.units for joint in same))
-        measured: dict[str, Any] = {}
-        for f in MEASURED_FIELDS:
-            measured[f] = _spread(f, [joint.estimates[f] for joint in same if f in joint.estimates])
-        measured |= {"source": source, "licence": licence, "gaponet": __version__}
-        types.append(replace(servo, **measured, joints=len(same), robots=len(units)))
-    return types
+    return [_measured_type(joints, source, licence) for joints in by_type.values()]
+
+
+def _measured_type(joints: list[_MeasuredServo], source: str, licence: str) -> ServoType:
+    """Return the type that joints have, with their measured values."""
+    units: set[tuple[int, str]] = set()
+    for joint in joints:
+        units |= joint.units
+    values: dict[str, Any] = {"source": source, "licence": licence, "gaponet": __version__}
+    for field in MEASURED_FIELDS:
+        estimates = [joint.estimates[field] for joint in joints if field in joint.estimates]
+        values[field] = _spread(field, estimates)
+    return replace(joints[-1].servo, **values, joints=len(joints), robots=len(units))
 
 
 class _MeasuredServo(NamedTuple):
@@ -162,29 +179,37 @@ def _measured_servos(number: int, robot: RobotSpec) -> list[_MeasuredServo]:
     """Return the servos of a robot's identified joints whose type is known; `number` tells robots
     apart.
     """
-    nominal = robot.before_identification
-    known = ParameterUncertainty.load(robot)
     op = robot.operated_index
+    nominal = robot.before_identification
     now = first_values(robot)
     then = first_values(nominal)
     now["damping"] = now["damping"] + robot.servo.kd[op] - nominal.servo.kd[op]
-    sources = known.sources if known else ({"unit": ""},)
-    units = set[tuple[int, str]]()
-    for source in sources:
-        units.update((number, unit) for unit in source["unit"].split(", "))
+    uncertainty = ParameterUncertainty.load(robot)
+    units = {(number, unit) for unit in _units(uncertainty)}
     identified = identified_joints(robot)
     servos = []
     for k, joint in enumerate(robot.operated):
         servo = robot.servo.types[op[k]]
         if servo is None or joint not in identified:
             continue
-        errors = summarize(known, joint).errors if known else {}
+        errors = summarize(uncertainty, joint).errors if uncertainty else {}
         estimates = {}
-        for f in MEASURED_FIELDS:
-            if abs(now[f][k] - then[f][k]) >= MIN_CHANGE * abs(then[f][k]):
-                estimates[f] = (float(now[f][k]), errors.get(f, 0.0))
+        for field in MEASURED_FIELDS:
+            change = abs(now[field][k] - then[field][k])
+            if change >= MIN_CHANGE * abs(then[field][k]):
+                estimates[field] = (float(now[field][k]), errors.get(field, 0.0))
         servos.append(_MeasuredServo(servo, units, estimates))
     return servos
+
+
+def _units(uncertainty: ParameterUncertainty | None) -> set[str]:
+    """Return the ids of the units that were recorded; one without a name if nothing is known."""
+    if uncertainty is None:
+        return {""}
+    units: set[str] = set()
+    for source in uncertainty.sources:
+        units.update(source["unit"].split(", "))
+    return units
 
 
 def _spread(field: str, estimates: list[tuple[float, float]]) -> Spread | None:
@@ -198,17 +223,23 @@ def _spread(field: str, estimates: list[tuple[float, float]]) -> Spread | None:
     if field != "damping":  # which is negative where it takes from the servo's kd
         draws = np.maximum(draws, 0.0)
     low, high = np.quantile(draws, (0.05, 0.95))
-    return Spread(*(float(f"{x:.3g}") for x in (np.median(values), low, high)))
+    return Spread(
+        value=_three_digits(np.median(values)), low=_three_digits(low), high=_three_digits(high)
+    )
+
+
+def _three_digits(value: float) -> float:
+    return float(f"{value:.3g}")
 
 
 def toml_entry(servo: ServoType) -> str:
     """Return a servo type as a [[servo]] table."""
     lines = ["[[servo]]"]
-    for f in fields(servo):
-        value = getattr(servo, f.name)
+    for field in fields(servo):
+        value = getattr(servo, field.name)
         if isinstance(value, Spread):
-            value = ", ".join(f"{name} = {x!r}" for name, x in vars(value).items())
-            lines.append(f"{f.name} = {{ {value} }}  # {SERVO_FIELDS[f.name].unit}")
-        elif value != f.default:
-            lines.append(f"{f.name} = {json.dumps(value, ensure_ascii=False)}")
+            numbers = ", ".join(f"{name} = {number!r}" for name, number in vars(value).items())
+            lines.append(f"{field.name} = {{ {numbers} }}  # {SERVO_FIELDS[field.name].unit}")
+        elif value != field.default:
+            lines.append(f"{field.name} = {json.dumps(value, ensure_ascii=False)}")
     return "\n".join([*lines, ""])

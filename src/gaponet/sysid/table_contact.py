@@ -35,6 +35,7 @@ MAX_WINDOWS = 14
 MAX_WINDOWS_PER_MOTION = 2
 START_HEIGHTS = 10  # that are tried, from below the lowest tip upwards
 START_HEIGHT_STEP_M = 0.005
+FAR_BELOW_M = 10.0  # the lowest tip: a table that nothing touches
 ITERATIONS = 6  # of the search from one start
 FIRST_COMPARISON = 2  # iterations after which a start goes on only if no other cost less by then
 HEIGHT_CHANGE_M = 0.004  # a large change
@@ -84,8 +85,10 @@ def tip_heights(sequences: ListOf[Sequence], robot: RobotSpec) -> list[Array]:
     """Return the height of the lowest tip in every row, (rows,) m each; nothing if robot.toml
     names no tip.
     """
-    heights = tips_of(robot)
-    return [heights(s.qpos) for s in sequences] if heights else []
+    lowest_tip = tips_of(robot)
+    if lowest_tip is None:
+        return []
+    return [lowest_tip(s.qpos) for s in sequences]
 
 
 def contact_height(robot: RobotSpec, heights: ListOf[Array]) -> float:
@@ -97,8 +100,10 @@ def contact_height(robot: RobotSpec, heights: ListOf[Array]) -> float:
     if not robot.scene.tips or not heights:
         return -np.inf
     rows = np.concatenate(heights)
-    table = rows.min() if robot.scene.table is None else robot.scene.table.height
-    return float(min(table + CONTACT_CLEARANCE_M, np.median(rows)))
+    surface = rows.min()
+    if robot.scene.table is not None:
+        surface = robot.scene.table.height
+    return float(min(surface + CONTACT_CLEARANCE_M, np.median(rows)))
 
 
 def low_windows(
@@ -108,8 +113,7 @@ def low_windows(
     windows = []
     for s, height in zip(sequences, heights, strict=True):
         rows = min(round(WINDOW_S / s.dt), len(s))
-        starts = range(0, len(s) - rows + 1, rows)
-        for start in starts:
+        for start in range(0, len(s) - rows + 1, rows):
             window = slice(start, start + rows)
             if (height[window] < below).any():
                 windows.append(s.rows(window))
@@ -155,23 +159,35 @@ def fit_table(
         return TableFit(robot, False, np.zeros(0), np.zeros(0), ())
     measured = robot.scene.table
     zeros = np.zeros(len(robot.operated))
-    away = np.array([[lowest - 10.0, FRICTION.guess, LOG_STIFFNESS.guess, *zeros]])
+    away = np.array([[lowest - FAR_BELOW_M, FRICTION.guess, LOG_STIFFNESS.guess, *zeros]])
     scene = _most_wrong_windows(parts, robot, away, lowest, nthread)
     heights = lowest + START_HEIGHT_STEP_M * np.arange(-2, START_HEIGHTS - 2)
     if measured is not None:
         heights = np.array([measured.height])
-    results = _searches(scene, _starts(scene, away, heights), report, measured=measured is not None)
-    tables = [_with_table(robot, x) for x, _ in results]
+    starts = _starts(scene, away, heights)
+    results = _searched(scene, starts, report, is_measured=measured is not None)
+    robots = [_with_table(robot, x) for x, _ in results]
     errors = [cost for _, cost in results]
     if validation:
-        errors = [float(rollout_errors(validation, one, nthread).mean()) for one in tables]
+        errors = [float(rollout_errors(validation, one, nthread).mean()) for one in robots]
     best = int(np.argmin(errors))
-    before = scene.mean(away[0])
-    after = scene.mean(results[best][0])
-    metas = [s.meta for s in scene.parts]
+    best_x, _ = results[best]
+    return _judged(scene, robot, robots[best], scene.mean(away[0]), scene.mean(best_x))
+
+
+def _judged(
+    scene: _TableRollouts, given: RobotSpec, fitted: RobotSpec, before: Array, after: Array
+) -> TableFit:
+    """Return the fitted robot with a table if the windows' motions accept it, else the given one.
+
+    Args:
+        before, after: Mean |error| of the windows without and with table, (windows,) rad.
+    """
+    metas = [window.meta for window in scene.parts]
     motions = tuple(dict.fromkeys(meta.independent_motion for meta in metas))
-    accepted = Comparison("table", by_motion(metas, before), by_motion(metas, after)).accepted
-    return TableFit(tables[best] if accepted else robot, accepted, before, after, motions)
+    comparison = Comparison("table", by_motion(metas, before), by_motion(metas, after))
+    robot = fitted if comparison.accepted else given
+    return TableFit(robot, comparison.accepted, before, after, motions)
 
 
 def _most_wrong_windows(
@@ -191,62 +207,91 @@ def _starts(scene: _TableRollouts, away: Array, heights: Array) -> Array:
     3 + n).
     """
     stiffnesses = np.array(START_LOG_STIFFNESS)
-    guesses = np.tile(away, (len(stiffnesses), len(heights), 1))
+    guesses = np.tile(away, (len(stiffnesses), len(heights), 1))  # (starts, heights, 3 + n)
     guesses[..., 0] = heights
     guesses[..., 2] = stiffnesses[:, None]
-    costs = soft_l1(scene.soft_errors(guesses.reshape(-1, guesses.shape[-1])))
-    costs = costs.reshape(guesses.shape[:2])
+    candidates = guesses.reshape(-1, guesses.shape[-1])
+    costs = soft_l1(scene.soft_errors(candidates)).reshape(guesses.shape[:2])
     starts = guesses[np.arange(len(guesses)), costs.argmin(axis=1)]
-    return np.asarray(starts[costs.min(axis=1).argsort()])
-
-
-def _searches(
-    scene: _TableRollouts, starts: Array, report: Callable[[float], object], *, measured: bool
-) -> list[tuple[Array, float]]:
-    """Return the best tables near starts (k, 3 + n), as of `_searched`, until `report` says that
-    the time is over.
-    """
-    over = False
-    pace = [np.inf]
-
-    def tell(error: float) -> bool:
-        nonlocal over
-        over = bool(report(error))
-        return over
-
-    results = []
-    for start in starts:
-        if not over:
-            results.append(_searched(scene, start, measured, tell, pace))
-    return results
+    best_first = costs.min(axis=1).argsort()
+    return np.asarray(starts[best_first])
 
 
 def _searched(
     scene: _TableRollouts,
-    start: Array,
-    measured: bool,
-    report: Callable[[float], bool],
-    pace: list[float],
-) -> tuple[Array, float]:
-    """Return the best table and zeros (3 + n,) near a start, and their cost.
+    starts: Array,
+    report: Callable[[float], object],
+    *,
+    is_measured: bool,
+) -> list[tuple[Array, float]]:
+    """Return the best table and zeros (3 + n,) near each start (k, 3 + n), and their cost, until
+    `report` says that the time is over.
 
     A measured height stays.
-
-    The search ends after FIRST_COMPARISON iterations if another start cost less by then; `pace`
-    lists such costs.
     """
+    progress = _TableProgress(report, len(scene.window) * scene.n)
+    results = []
+    for start in starts:
+        if progress.is_over:
+            break
+        progress.begin_start()
+        results.append(_search_near(scene, start, progress, is_measured=is_measured))
+    return results
+
+
+class _TableProgress:
+    """Progress of searches from one start after another; which of them go on.
+
+    Attributes:
+        is_over: Whether the time is over.
+    """
+
+    def __init__(self, report: Callable[[float], object], rows: int) -> None:
+        """Report to a function of the RMS error, rad, of so many rows of all joints."""
+        self.is_over = False
+        self._report = report
+        self._rows = rows
+        self._iterations = 0  # of the present start
+        self._least_cost = np.inf  # of the starts before, after FIRST_COMPARISON iterations
+
+    def begin_start(self) -> None:
+        """Begin with the next start."""
+        self._iterations = 0
+
+    def ends(self, costs: Array) -> bool:
+        """Report an iteration; return whether the search from this start ends: the time is over,
+        or another start cost less after FIRST_COMPARISON iterations.
+        """
+        self._iterations += 1
+        cost = float(costs.sum())
+        rms = ERROR_SCALE_RAD * float(np.sqrt(2 * cost / self._rows))
+        self.is_over = bool(self._report(rms))
+        if self._iterations != FIRST_COMPARISON:
+            return self.is_over
+        if cost > self._least_cost:
+            return True
+        self._least_cost = cost
+        return self.is_over
+
+
+def _search_near(
+    scene: _TableRollouts, start: Array, progress: _TableProgress, *, is_measured: bool
+) -> tuple[Array, float]:
+    """Return the best table and zeros (3 + n,) near a start, and their cost."""
     rows = len(scene.window) * scene.n
     one = np.ones(scene.n)
-    large_change = np.r_[
-        HEIGHT_CHANGE_M, FRICTION.large_change, LOG_STIFFNESS.large_change, ZERO_CHANGE_RAD * one
-    ]
-    height_range = 0.0 if measured else MAX_HEIGHT_CHANGE_M
+    large_change = np.concatenate(
+        [
+            [HEIGHT_CHANGE_M, FRICTION.large_change, LOG_STIFFNESS.large_change],
+            ZERO_CHANGE_RAD * one,
+        ]
+    )
+    height_range = 0.0 if is_measured else MAX_HEIGHT_CHANGE_M
     lowest = start[0] - height_range
     highest = start[0] + height_range
-    low = np.r_[lowest, FRICTION.low, LOG_STIFFNESS.low, -MAX_ZERO_RAD * one]
-    high = np.r_[highest, FRICTION.high, LOG_STIFFNESS.high, MAX_ZERO_RAD * one]
+    low = np.concatenate([[lowest, FRICTION.low, LOG_STIFFNESS.low], -MAX_ZERO_RAD * one])
+    high = np.concatenate([[highest, FRICTION.high, LOG_STIFFNESS.high], MAX_ZERO_RAD * one])
     price_of_zero = np.sqrt(2 * ZERO_PRICE * rows / PRIOR_ROWS) / ZERO_STD_RAD
-    costs: list[float] = []
 
     def errors(changes: Array) -> Array:
         """Return errors and the price of the zeros, (k, 1, …), of changes (k, 1, 3 + n) in large
@@ -257,23 +302,11 @@ def _searched(
         both = np.concatenate([scene.soft_errors(xs), priced], axis=1)
         return both[:, None].astype(np.float32)
 
-    def ends(cost: Array) -> bool:
-        """Show the error, and return whether the time is over, or another start was better after
-        as many iterations.
-        """
-        costs.append(float(cost.sum()))
-        over = report(ERROR_SCALE_RAD * float(np.sqrt(2 * costs[-1] / rows)))
-        if len(costs) != FIRST_COMPARISON:
-            return over
-        behind = costs[-1] > min(pace)
-        if not behind:
-            pace.append(costs[-1])
-        return behind or over
-
-    problems = Problems(
-        errors, ((low - start) / large_change)[None], ((high - start) / large_change)[None]
-    )
-    changes, cost = descend(problems, np.zeros((1, 1, len(start))), ITERATIONS, ends)
+    lowest_change = (low - start) / large_change
+    highest_change = (high - start) / large_change
+    problems = Problems(errors, lowest_change[None], highest_change[None])
+    no_change = np.zeros((1, 1, len(start)))
+    changes, cost = descend(problems, no_change, ITERATIONS, progress.ends)
     return start + large_change * changes[0, 0], float(cost[0, 0])
 
 
@@ -300,11 +333,12 @@ class _TableRollouts(RobotRollouts):
         """Return q_sim − q_real of candidates (k, 3 + n), (k, n, rows) rad."""
         conditions = [Condition.of(s, self.robot) for s in self.parts] * len(xs)
         sim = BatchSim(self.robot, conditions, self.nthread, self.locked)
-        rows = np.repeat(xs, len(self.parts), axis=0)
         model = sim.models[conditions[0]]
-        write_table(sim.batch, model, rows[:, 0], rows[:, 1], np.exp(rows[:, 2]))
-        dof = np.array([model.joint(j).dofadr[0] for j in self.robot.operated])
-        sim.batch.expand("qpos0")[:, dof] -= rows[:, 3:]
+        of_simulations = np.repeat(xs, len(self.parts), axis=0)  # (k · windows, 3 + n)
+        height, friction, log_stiffness = of_simulations[:, :3].T
+        write_table(sim.batch, model, height, friction, np.exp(log_stiffness))
+        dof = np.array([model.joint(joint).dofadr[0] for joint in self.robot.operated])
+        sim.batch.expand("qpos0")[:, dof] -= of_simulations[:, 3:]
         return self.simulated_errors(sim)
 
     def soft_errors(self, xs: Array) -> Array:

@@ -33,7 +33,11 @@ MIN_SPEED = 0.05  # rad/s of rows that show friction
 DELAYS_S = np.arange(0.0, 0.0405, 0.001)
 JACKKNIFE_BLOCKS = 10  # of the rows, each left out once
 HORIZONS_S = (0.1, 0.5, 1.0)
+PARAMETERS = (*PASSIVE_FIELDS, "bias", "constant")  # of the regression, in the order of its columns
+LOWEST = np.array([0.0, 0.0, 0.0, -np.inf, 1e-9])  # of PARAMETERS
+WITHOUT_ROWS = np.array([0.0, 0.0, 0.0, 0.0, 1.0])  # PARAMETERS where too few rows move
 PART_S = 4.0  # of recordings that fit and judge in turn
+MIN_PART_S = 2.0  # of the last one of a recording
 MIN_ROWS = 20  # of a regression
 HUBER_SCALE = 1.345  # standard deviations, beyond which a row counts less: somebody pushed
 HUBER_ROUNDS = 10
@@ -93,18 +97,18 @@ def fit_torque_driven(
     _require_torque([*train, *judging], robot)
     if train is judging:
         train, judging = _parts_in_turn(judging)
-    fitted_rows = [_rows(s, robot) for s in train]
-    judging_rows = [_rows(s, robot) for s in judging]
-    joints = _fit_joints(fitted_rows, robot.operated, constant)
+    joints = _fit_joints([_rows(s, robot) for s in train], robot.operated, constant)
     fitted = robot.with_identified(joints.servos)
-    one = np.ones_like(joints.constant)
-    given = build_model(robot)
     op = robot.operated_index
-    old = {f: np.ravel(getattr(given, f"dof_{f}"))[op] for f in PASSIVE_FIELDS}
-    new = {f: fitted.servo[f][op] for f in PASSIVE_FIELDS}
-    torque_before = _residual(judging_rows, old, one, 0 * joints.lags)
-    torque_after = _residual(judging_rows, new, joints.constant, joints.lags)
-    angle_before = _ahead(judging, robot, one)
+    model = build_model(robot)
+    of_file = {field: np.ravel(getattr(model, f"dof_{field}"))[op] for field in PASSIVE_FIELDS}
+    of_fit = {field: fitted.servo[field][op] for field in PASSIVE_FIELDS}
+    newton_metres = np.ones_like(joints.constant)
+    no_lags = np.zeros_like(joints.lags)
+    rows = [_rows(s, robot) for s in judging]
+    torque_before = _residual(rows, of_file, newton_metres, no_lags)
+    torque_after = _residual(rows, of_fit, joints.constant, joints.lags)
+    angle_before = _ahead(judging, robot, newton_metres)
     angle_after = _ahead(judging, fitted, joints.constant)
     return TorqueDrivenFit(
         robot=fitted,
@@ -112,7 +116,7 @@ def fit_torque_driven(
         bias=joints.bias,
         std=joints.std,
         torque=(torque_before, torque_after),
-        angle={h: (angle_before[h], angle_after[h]) for h in HORIZONS_S},
+        angle={horizon: (angle_before[horizon], angle_after[horizon]) for horizon in HORIZONS_S},
         windows=sum(len(_starts(s)) for s in judging),
     )
 
@@ -121,7 +125,7 @@ class _JointFits(NamedTuple):
     """Fits of n joints one by one."""
 
     servos: dict[str, dict[str, float]]  # joint → PASSIVE_FIELDS and delay
-    std: dict[str, dict[str, float]]  # joint → standard error of PASSIVE_FIELDS, bias and constant
+    std: dict[str, dict[str, float]]  # joint → standard error of each of PARAMETERS
     constant: Array  # N·m per unit of the recorded torque, (n,)
     bias: Array  # N·m, (n,)
     lags: Array  # numbers of DELAYS_S, (n,)
@@ -133,12 +137,12 @@ def _fit_joints(rows: ListOf[_Rows], names: ListOf[str], constant: bool) -> _Joi
     fits = _JointFits({}, {}, np.ones(n), np.zeros(n), np.zeros(n, int))
     for j, name in enumerate(names):
         x, lag = _joint(rows, j, constant)
+        found = dict(zip(PARAMETERS, x.tolist(), strict=True))
         errors = _jackknife(rows, j, constant, lag).tolist()
-        fits.servos[name] = dict(zip(PASSIVE_FIELDS, x[:3].tolist(), strict=True))
-        fits.servos[name]["delay"] = float(DELAYS_S[lag])
-        fits.std[name] = dict(zip((*PASSIVE_FIELDS, "bias", "constant"), errors, strict=True))
-        fits.bias[j] = x[3]
-        fits.constant[j] = x[4]
+        fits.std[name] = dict(zip(PARAMETERS, errors, strict=True))
+        fits.bias[j] = found.pop("bias")
+        fits.constant[j] = found.pop("constant")
+        fits.servos[name] = found | {"delay": float(DELAYS_S[lag])}
         fits.lags[j] = lag
     return fits
 
@@ -160,7 +164,7 @@ def _parts_in_turn(sequences: ListOf[Sequence]) -> tuple[list[Sequence], list[Se
     parts = []
     for s in sequences:
         rows = round(PART_S / s.dt)
-        for start in range(0, len(s) - round(2 / s.dt), rows):
+        for start in range(0, len(s) - round(MIN_PART_S / s.dt), rows):
             parts.append(s.rows(slice(start, start + rows)))
     if len(parts) < 2:
         raise UsageError(
@@ -170,35 +174,46 @@ def _parts_in_turn(sequences: ListOf[Sequence]) -> tuple[list[Sequence], list[Se
 
 
 def _rows(s: Sequence, robot: RobotSpec) -> _Rows:
+    """Return the filtered rows of a recording with torque."""
     op = robot.operated_index
     dt = s.dt
     model = build_model(robot, s.meta.payload_mass, s.meta.payload_side)
-    model.dof_armature[op] = model.dof_damping[op] = 0.0
-    smooth = lowpass(s.qpos.astype(float), dt, DIFFERENTIATION_CUTOFF_HZ)
-    v = differentiate(smooth, dt)
-    a = differentiate(v, dt)
-    assert s.tau is not None
-    time = np.arange(len(s)) * dt
-    tau = s.tau[:, op].astype(float)
-    torques = []
-    for delay in DELAYS_S:
-        late = [np.interp(time - delay, time, torque) for torque in tau.T]
-        torques.append(lowpass(np.stack(late, axis=1), dt, CUTOFF_HZ))
-    required = inverse_dynamics(model, smooth, v, a)[:, op]
-    v = v[:, op]
+    model.dof_armature[op] = 0.0
+    model.dof_damping[op] = 0.0
+    qpos = lowpass(s.qpos.astype(float), dt, DIFFERENTIATION_CUTOFF_HZ)
+    qvel = differentiate(qpos, dt)
+    qacc = differentiate(qvel, dt)
+    required = inverse_dynamics(model, qpos, qvel, qacc)[:, op]
+    velocity = qvel[:, op]
     return _Rows(
-        np.array(torques),
-        lowpass(required, dt, CUTOFF_HZ),
-        lowpass(a[:, op], dt, CUTOFF_HZ),
-        lowpass(v, dt, CUTOFF_HZ),
-        lowpass(np.tanh(v / MIN_SPEED), dt, CUTOFF_HZ),
-        np.abs(v) > MIN_SPEED,
+        torque=_late_torques(s, op),
+        required=lowpass(required, dt, CUTOFF_HZ),
+        acceleration=lowpass(qacc[:, op], dt, CUTOFF_HZ),
+        velocity=lowpass(velocity, dt, CUTOFF_HZ),
+        sign=lowpass(np.tanh(velocity / MIN_SPEED), dt, CUTOFF_HZ),
+        moving=np.abs(velocity) > MIN_SPEED,
     )
 
 
+def _late_torques(s: Sequence, joints: Array) -> Array:
+    """Return the filtered torques of joints, by number, after each of DELAYS_S, (delays, T, n)."""
+    assert s.tau is not None
+    time = np.arange(len(s)) * s.dt
+    torque_of_joint = s.tau[:, joints].astype(float).T
+    torques = []
+    for delay in DELAYS_S:
+        late = [np.interp(time - delay, time, torque) for torque in torque_of_joint]
+        torques.append(lowpass(np.stack(late, axis=1), s.dt, CUTOFF_HZ))
+    return np.array(torques)
+
+
 def _system(rows: ListOf[_Rows], j: int, constant: bool, lag: int) -> tuple[Array, Array]:
-    """Return the regression's columns armature, damping, friction, bias and constant, and its
-    right-hand side.
+    """Return the regression's columns, in the order of PARAMETERS, and its right-hand side, of the
+    rows in which joint j moves.
+
+    Args:
+        constant: Whether there is a column for the constant.
+        lag: Number of the torque's delay.
     """
     matrices = []
     targets = []
@@ -206,7 +221,8 @@ def _system(rows: ListOf[_Rows], j: int, constant: bool, lag: int) -> tuple[Arra
         use = r.moving[:, j]
         torque = r.torque[lag][use, j]
         required = r.required[use, j]
-        columns = [r.acceleration[use, j], r.velocity[use, j], r.sign[use, j], np.ones_like(torque)]
+        one = np.ones_like(torque)
+        columns = [r.acceleration[use, j], r.velocity[use, j], r.sign[use, j], one]
         if constant:
             columns.append(-torque)
             targets.append(-required)
@@ -217,48 +233,67 @@ def _system(rows: ListOf[_Rows], j: int, constant: bool, lag: int) -> tuple[Arra
 
 
 def _solved(a: Array, y: Array) -> tuple[Array, float]:
-    """Return armature, damping, friction ≥ 0, bias and constant, and the robust squared
-    residual.
+    """Return PARAMETERS, (5,), and the robust squared residual, by least squares with bounds and
+    Huber's weights; `a` and `y` as of `_system`.
     """
-    low = np.array([0.0, 0.0, 0.0, -np.inf, 1e-9])[: a.shape[1]]
+    columns = a.shape[1]
     if len(y) < MIN_ROWS:
-        return np.array([0.0, 0.0, 0.0, 0.0, 1.0]), np.inf
+        return WITHOUT_ROWS, np.inf
     weight = np.ones(len(y))
     for _ in range(HUBER_ROUNDS):
         q, r = np.linalg.qr(a * weight[:, None])
-        x = lsq_linear(r, q.T @ (y * weight), (low, np.inf), method="bvls").x
+        bounds = (LOWEST[:columns], np.inf)
+        x = lsq_linear(r, q.T @ (y * weight), bounds, method="bvls").x
         residual = np.abs(a @ x - y)
-        scale = MAD_TO_STD * float(np.median(residual))
-        weight = np.sqrt(np.minimum(1.0, HUBER_SCALE * scale / np.maximum(residual, 1e-12)))
-    return np.append(x, np.ones(5 - len(x))), scale**2
+        std = MAD_TO_STD * float(np.median(residual))
+        huber = HUBER_SCALE * std / np.maximum(residual, 1e-12)
+        weight = np.sqrt(np.minimum(1.0, huber))
+    constant = np.ones(len(PARAMETERS) - columns)  # if it is no column
+    return np.append(x, constant), std**2
 
 
 def _joint(rows: ListOf[_Rows], j: int, constant: bool) -> tuple[Array, int]:
-    """Return a joint's parameters, and the index of the delay with the least residual."""
-    fits = [_solved(*_system(rows, j, constant, lag)) for lag in range(len(DELAYS_S))]
-    lag = int(np.argmin([residual / (x[4] ** 2) for x, residual in fits]))
-    return fits[lag][0], lag
+    """Return PARAMETERS of joint j, and the number of the delay with the least residual."""
+    parameters = []
+    residuals = []
+    for lag in range(len(DELAYS_S)):
+        x, squared_residual = _solved(*_system(rows, j, constant, lag))
+        unit = x[PARAMETERS.index("constant")]
+        parameters.append(x)
+        residuals.append(squared_residual / unit**2)
+    best = int(np.argmin(residuals))
+    return parameters[best], best
 
 
 def _jackknife(rows: ListOf[_Rows], j: int, constant: bool, lag: int) -> Array:
-    """Return standard errors, (5,), by a jackknife over blocks of rows."""
+    """Return standard errors of PARAMETERS, (5,), by a jackknife over blocks of rows."""
     a, y = _system(rows, j, constant, lag)
-    block = np.arange(len(y)) * JACKKNIFE_BLOCKS // max(len(y), 1)
+    block_of_row = np.arange(len(y)) * JACKKNIFE_BLOCKS // max(len(y), 1)
     solutions = []
-    for k in range(JACKKNIFE_BLOCKS):
-        kept = block != k
-        x, _ = _solved(a[kept], y[kept])
+    for block in range(JACKKNIFE_BLOCKS):
+        is_kept = block_of_row != block
+        x, _ = _solved(a[is_kept], y[is_kept])
         solutions.append(x)
     return np.asarray(np.sqrt((JACKKNIFE_BLOCKS - 1) * np.var(solutions, axis=0)))
 
 
-def _residual(rows: ListOf[_Rows], terms: dict[str, Array], constant: Array, lags: Array) -> Array:
-    """Return the median |recorded − required torque|, (n,) N·m."""
+def _residual(
+    rows: ListOf[_Rows], passive: dict[str, Array], constant: Array, lags: Array
+) -> Array:
+    """Return the median |recorded − required torque|, (n,) N·m.
+
+    Args:
+        passive: Field of PASSIVE_FIELDS → value, (n,).
+        constant: N·m per unit of the recorded torque, (n,).
+        lags: Numbers of the torques' delays, (n,).
+    """
     residuals = []
     for r in rows:
-        torque = constant * np.stack([r.torque[lag][:, j] for j, lag in enumerate(lags)], axis=1)
-        required = r.required + terms["armature"] * r.acceleration + terms["damping"] * r.velocity
-        residuals.append(np.abs(torque - required - terms["frictionloss"] * r.sign))
+        late = [r.torque[lag][:, j] for j, lag in enumerate(lags)]
+        recorded = constant * np.stack(late, axis=1)  # (rows, n) N·m
+        required = r.required + passive["armature"] * r.acceleration
+        required = required + passive["damping"] * r.velocity
+        residuals.append(np.abs(recorded - required - passive["frictionloss"] * r.sign))
     return np.asarray(np.median(np.concatenate(residuals), axis=0))
 
 
@@ -274,28 +309,48 @@ def _ahead(sequences: ListOf[Sequence], robot: RobotSpec, constant: Array) -> di
     """Return horizon → median |error| of the operated joints, driven by the torque from recorded
     states, (n,) rad.
     """
-    op = robot.operated_index
-    errors = dict[float, list[Array]]()
+    errors: dict[float, list[Array]] = {}
     for s in sequences:
         model = build_model(robot, s.meta.payload_mass, s.meta.payload_side, dt=s.dt)
-        model.actuator_gainprm[:] = model.actuator_biasprm[:] = 0.0
-        data = mujoco.MjData(model)
-        steps = round(s.dt / model.opt.timestep)
-        assert s.tau is not None
-        time = np.arange(len(s)) * s.dt
-        tau = s.tau.astype(float)
-        for j, i in enumerate(op):
-            tau[:, i] = constant[j] * np.interp(time - robot.servo.delay[i], time, tau[:, i])
-        v = differentiate(lowpass(s.qpos.astype(float), s.dt, DIFFERENTIATION_CUTOFF_HZ), s.dt)
+        model.actuator_gainprm[:] = 0.0
+        model.actuator_biasprm[:] = 0.0
+        torque = _acting_torque(s, robot, constant)
+        qpos = lowpass(s.qpos.astype(float), s.dt, DIFFERENTIATION_CUTOFF_HZ)
+        qvel = differentiate(qpos, s.dt)
         for start in _starts(s):
-            mujoco.mj_resetData(model, data)
-            data.qpos[:] = s.qpos[start]
-            data.qvel[:] = v[start]
-            for before, horizon in pairwise((0.0, *HORIZONS_S)):
-                first = start + round(before / s.dt)
-                last = start + round(horizon / s.dt)
-                for torque in tau[first:last]:
-                    data.qfrc_applied[:] = torque
-                    mujoco.mj_step(model, data, steps)
-                errors.setdefault(horizon, []).append(np.abs(data.qpos - s.qpos[last])[op])
-    return {horizon: np.median(each, axis=0) for horizon, each in errors.items()}
+            played = _played(s, model, torque, qvel, start)
+            for horizon, away in zip(HORIZONS_S, played, strict=True):
+                errors.setdefault(horizon, []).append(away[robot.operated_index])
+    return {horizon: np.median(away, axis=0) for horizon, away in errors.items()}
+
+
+def _acting_torque(s: Sequence, robot: RobotSpec, constant: Array) -> Array:
+    """Return the recorded torques after the robot's delay, (T, joints) N·m."""
+    assert s.tau is not None
+    time = np.arange(len(s)) * s.dt
+    torque = s.tau.astype(float)
+    for j, i in enumerate(robot.operated_index):
+        late = np.interp(time - robot.servo.delay[i], time, torque[:, i])
+        torque[:, i] = constant[j] * late
+    return torque
+
+
+def _played(
+    s: Sequence, model: mujoco.MjModel, torque: Array, qvel: Array, start: int
+) -> list[Array]:
+    """Return |simulated − recorded position| of all joints at each of HORIZONS_S, (joints,) rad,
+    from the recorded state in row `start`.
+    """
+    data = mujoco.MjData(model)
+    data.qpos[:] = s.qpos[start]
+    data.qvel[:] = qvel[start]
+    steps = round(s.dt / model.opt.timestep)
+    away = []
+    for before, horizon in pairwise((0.0, *HORIZONS_S)):
+        first = start + round(before / s.dt)
+        last = start + round(horizon / s.dt)
+        for row in torque[first:last]:
+            data.qfrc_applied[:] = row
+            mujoco.mj_step(model, data, steps)
+        away.append(np.abs(data.qpos - s.qpos[last]))
+    return away

@@ -31,16 +31,19 @@ from gaponet.sysid.least_squares import Problems, descend
 from gaponet.sysid.robot_rollouts import cut
 
 MAX_WINDOWS = 80  # more than elsewhere, since they may be short
-ROW_STEP = 5  # at least, between rows for the payload's place
-MAX_ROWS = 6000  # for the payload's place
+MIN_BALANCE_STRIDE = 5  # rows of a recording, between those that place the payload
+MAX_BALANCE_ROWS = 6000  # of all recordings
 MOUNT_PRIOR_NM_PER_M = 3.0  # price of moving the payload
+MIN_VARIANCE = 1e-12  # (N·m)², so that it can be divided by
 MIN_MOVE_RAD = 0.05  # of a command that excites a joint
 MIN_EXPLAINED = 0.9  # of a torque's variance, from which its gains are used
+AVERAGED_ROWS = 5  # of which the regression takes the mean
 INSTRUMENTS = 12  # periods whose commands are instruments for measured position and speed
-MAX_LATE = 3  # periods between a command and its torque
+MAX_LATE_PERIODS = 3  # between a command and its torque
 START_DELAY = 0.25  # of the fit of positions, large changes of 20 ms
 ITERATIONS = 10  # of that fit
-MAX_HAND_MASS = 5.0  # kg
+GRAVITY = 9.81  # m/s²
+MAX_HAND_MASS_KG = 5.0
 MAX_MOVE_M = 0.3  # of the payload from where the robot's file has it, along each axis
 MAX_OWN = 20.0  # of a joint's own friction, armature and damping, SI
 
@@ -74,7 +77,7 @@ class Gains(NamedTuple):
     @property
     def trusted(self) -> bool:
         """Return True if the recorded torque is that of a PD servo."""
-        return self.explained > MIN_EXPLAINED and self.kp > 0 <= self.kd
+        return self.explained > MIN_EXPLAINED and self.kp > 0 and self.kd >= 0
 
 
 def servo_gains(recordings: ListOf[Array], last: int = 0, late: int = 1) -> Gains:
@@ -101,16 +104,23 @@ def servo_gains(recordings: ListOf[Array], last: int = 0, late: int = 1) -> Gain
             z = x
         sums.append(np.concatenate([z.T @ z, z.T @ x, z.T @ torque[:, None]], axis=1))
         rows.append(np.concatenate([x, torque[:, None]], axis=1))
-    every = np.concatenate(rows)
-    n = len(sums)
     total = np.sum(sums, axis=0)
     kp, kd, constant = _two_stage_least_squares(total)
-    # The jackknife: kp without each recording in turn.
-    kp_without = np.array([_two_stage_least_squares(total - own)[0] for own in sums])
-    error = np.sqrt((n - 1) / n * np.square(kp_without - kp_without.mean()).sum())
-    left = every[:, 3] - every[:, :3] @ [kp, kd, constant]
-    explained = 1 - float(left.var() / max(every[:, 3].var(), 1e-12))
-    return Gains(float(kp), float(error), float(kd), explained)
+    every = np.concatenate(rows)
+    torque = every[:, 3]
+    unexplained = torque - every[:, :3] @ [kp, kd, constant]
+    share = float(unexplained.var() / max(torque.var(), MIN_VARIANCE))
+    return Gains(float(kp), _jackknife_error(sums), float(kd), 1 - share)
+
+
+def _jackknife_error(sums: list[Array]) -> float:
+    """Return the standard error of kp, N·m/rad, by leaving out each recording in turn; arguments as
+    of `_two_stage_least_squares`, of each recording.
+    """
+    n = len(sums)
+    total = np.sum(sums, axis=0)
+    kp = np.array([_two_stage_least_squares(total - own)[0] for own in sums])
+    return float(np.sqrt((n - 1) / n * np.square(kp - kp.mean()).sum()))
 
 
 def _regression_rows(recording: Array, late: int) -> tuple[Array, Array, Array]:
@@ -118,14 +128,21 @@ def _regression_rows(recording: Array, late: int) -> tuple[Array, Array, Array]:
     and the instruments, (rows, INSTRUMENTS + 1); arguments as of `servo_gains`.
     """
     ctrl, qpos, qvel, tau = recording
-    t = np.arange(len(tau) - late)
-    past = [ctrl[np.maximum(t - k, 0)] for k in range(INSTRUMENTS)]
-    channels = [ctrl[t] - qpos[late:], -qvel[late:], tau[late:], *past]
-    means_of_five = [np.convolve(x, np.ones(5) / 5, "valid") for x in np.array(channels, float)]
-    error, speed, torque, *commands = means_of_five
+    row = np.arange(len(tau) - late)
+    earlier = [ctrl[np.maximum(row - periods, 0)] for periods in range(INSTRUMENTS)]
+    error = _moving_mean(ctrl[row] - qpos[late:])
+    speed = _moving_mean(-qvel[late:])
+    torque = _moving_mean(tau[late:])
+    commands = [_moving_mean(command) for command in earlier]
     one = np.ones_like(torque)
     x = np.stack([error, speed, one], axis=1)
-    return x, torque, np.stack([*commands, one], axis=1)
+    instruments = np.stack([*commands, one], axis=1)
+    return x, torque, instruments
+
+
+def _moving_mean(x: Array) -> Array:
+    """Return the means of AVERAGED_ROWS successive numbers."""
+    return np.convolve(x.astype(float), np.ones(AVERAGED_ROWS) / AVERAGED_ROWS, "valid")
 
 
 def _two_stage_least_squares(sums: Array) -> Array:
@@ -135,8 +152,9 @@ def _two_stage_least_squares(sums: Array) -> Array:
     zz = sums[:, :-4]
     zx = sums[:, -4:-1]
     zt = sums[:, -1]
-    first = np.linalg.lstsq(zz, zx)[0]
-    return np.asarray(np.linalg.lstsq(first.T @ zx, first.T @ zt)[0])
+    x_by_z, *_ = np.linalg.lstsq(zz, zx)  # the first stage: x by its instruments
+    factors, *_ = np.linalg.lstsq(x_by_z.T @ zx, x_by_z.T @ zt)
+    return np.asarray(factors)
 
 
 class _BalanceRow(NamedTuple):
@@ -188,12 +206,16 @@ class _Balance:
         """
         mounts = self.mass.shape[1]
         places = np.array([_place(number, place) for number in range(mounts)])
+        lever = np.einsum("kmij,mj->kmi", self.frame, places)
+        shift = self.motion[:, :, 0]
+        turn = self.motion[:, :, 1]
         # How far each payload moves for a radian, (k, mounts, 3) m: 0 for a joint that does not
         # carry it.
-        lever = np.einsum("kmij,mj->kmi", self.frame, places)
-        moved = self.motion[:, :, 0] + np.cross(self.motion[:, :, 1], lever)
-        of_a_kilogram = 9.81 * moved[..., 2] + np.square(moved).sum(axis=-1) * self.qacc[:, None]
-        return np.asarray(self.without_payload + ((self.mass + hand) * of_a_kilogram).sum(axis=1))
+        moved = shift + np.cross(turn, lever)
+        inertia = np.square(moved).sum(axis=-1)  # of a kilogram, (k, mounts) m²
+        torque_of_kilogram = GRAVITY * moved[..., 2] + inertia * self.qacc[:, None]
+        of_payloads = ((self.mass + hand) * torque_of_kilogram).sum(axis=1)
+        return np.asarray(self.without_payload + of_payloads)
 
 
 def _solve_balance(balance: _Balance, mount: PayloadMount) -> tuple[Array, Array]:
@@ -201,17 +223,21 @@ def _solve_balance(balance: _Balance, mount: PayloadMount) -> tuple[Array, Array
     armature and damping, (3, joints) SI, by least squares; a place that torque does not determine
     stays.
     """
-    by_own = np.stack([np.tanh(balance.qvel / SLIP_SPEED), balance.qacc, balance.qvel])
+    friction = np.tanh(balance.qvel / SLIP_SPEED)
+    by_own = np.stack([friction, balance.qacc, balance.qvel])  # (3, k)
     count = 3 * len(balance.joints)
     pos = np.array(mount.pos)
     start = np.concatenate([pos, [mount.mass], np.zeros(count)])
     low = np.concatenate([pos - MAX_MOVE_M, [0.0], np.zeros(count)])
-    high = np.concatenate([pos + MAX_MOVE_M, [MAX_HAND_MASS], np.full(count, MAX_OWN)])
+    high = np.concatenate([pos + MAX_MOVE_M, [MAX_HAND_MASS_KG], np.full(count, MAX_OWN)])
 
     def residual(x: Array) -> Array:
-        own = x[4:].reshape(3, -1)[:, balance.column]
-        missing = balance.required(x[:3], x[3]) + (own * by_own).sum(axis=0) - balance.tau
-        return np.concatenate([missing, MOUNT_PRIOR_NM_PER_M * (x[:3] - start[:3])])
+        place = x[:3]
+        hand = x[3]
+        own = x[4:].reshape(3, -1)[:, balance.column]  # (3, k)
+        required = balance.required(place, hand) + (own * by_own).sum(axis=0)
+        price = MOUNT_PRIOR_NM_PER_M * (place - pos)
+        return np.concatenate([required - balance.tau, price])
 
     scale = np.concatenate([0.1 * np.ones(3), [1.0], np.ones(count)])
     first = np.clip(start, low + 1e-6, high - 1e-6)
@@ -233,31 +259,25 @@ class TorqueFit:
         """Recordings whose gains are stated are left out; the robot's payload masses are taken as
         true.
         """
-        self.robot = robot
-        self.sequences = [
-            s for s in sequences if s.tau is not None and s.meta.recorded_gains[0] is None
-        ]
-        gains = self.gains() if len(self.sequences) == len(sequences) else {}
-        self.known = {joint: g for joint, g in gains.items() if g.trusted}
-        self.robot = robot.with_identified(
-            {joint: {"kp": g.kp, "kd": g.kd} for joint, g in self.known.items()}
-        )
+        self.sequences = [s for s in sequences if _has_torque_of_unknown_gains(s)]
+        self._given = robot
+        self.known: dict[str, Gains] = {}
+        if len(self.sequences) == len(sequences):
+            self.known = {joint: gains for joint, gains in self.gains().items() if gains.trusted}
+        servos = {joint: {"kp": gains.kp, "kd": gains.kd} for joint, gains in self.known.items()}
+        self.robot = robot.with_identified(servos)
         masses = {s.meta.payload_mass for s in self.sequences}
         self.several_payloads = bool(robot.payload_mounts) and len(masses) > 1
 
     def gains(self) -> dict[str, Gains]:
         """Return joint → gains; without joints whose command never moves."""
-        parts: dict[str, list[Array]] = {}
+        recordings: dict[str, list[Array]] = {}  # joint → (4, T) each, as of `servo_gains`
         for s in self.sequences:
             assert s.tau is not None
-            for j in _moved(s, self.robot):
-                rows = np.stack([x[:, j] for x in (s.ctrl, s.qpos, s.qvel, s.tau)])
-                parts.setdefault(self.robot.joint_names[j], []).append(rows)
-        gains = {}
-        for joint, each in parts.items():
-            tried = [servo_gains(each, late=late) for late in range(1, MAX_LATE + 1)]
-            gains[joint] = max(tried, key=lambda one: one.explained)
-        return gains
+            for j in _moved(s, self._given):
+                own = np.stack([s.ctrl[:, j], s.qpos[:, j], s.qvel[:, j], s.tau[:, j]])
+                recordings.setdefault(self._given.joint_names[j], []).append(own)
+        return {joint: _best_gains(own) for joint, own in recordings.items()}
 
     def payload_placed(self, friction: bool = False) -> RobotSpec:
         """Return the robot with the payload's place and the mass of the hand, by least squares on
@@ -274,23 +294,27 @@ class TorqueFit:
         mounts = []
         for number, mount in enumerate(robot.payload_mounts):
             mounts.append(replace(mount, pos=_place(number, (x, y, z)), mass=hand))
-        servos = {}
         if friction:
-            of_model = build_model(robot).dof_armature
-            values = own.T.round(4).tolist()
-            for j, (dry, armature, damping) in zip(balance.joints, values, strict=True):
-                servos[robot.joint_names[j]] = {
-                    "frictionloss": dry,
-                    "armature": float(of_model[j]) + armature,
-                    "damping": damping,
-                }
-        return replace(robot.with_identified(servos), payload_mounts=tuple(mounts))
+            robot = robot.with_identified(self._own_servos(balance.joints, own))
+        return replace(robot, payload_mounts=tuple(mounts))
+
+    def _own_servos(self, joints: list[int], own: Array) -> dict[str, dict[str, float]]:
+        """Return joint → friction, armature and damping by torque; `own` as of `_solve_balance`."""
+        armature_of_model = build_model(self.robot).dof_armature
+        servos = {}
+        for j, (dry, armature, damping) in zip(joints, own.T.round(4).tolist(), strict=True):
+            servos[self.robot.joint_names[j]] = {
+                "frictionloss": dry,
+                "armature": float(armature_of_model[j]) + armature,
+                "damping": damping,
+            }
+        return servos
 
     def _balance(self) -> _Balance:
         """Return the torques that inverse dynamics require, in rows of all recordings."""
         empty = tuple(replace(mount, mass=0.0) for mount in self.robot.payload_mounts)
         model = build_model(replace(self.robot, payload_mounts=empty))
-        stride = max(ROW_STEP, sum(map(len, self.sequences)) // MAX_ROWS)
+        stride = max(MIN_BALANCE_STRIDE, sum(map(len, self.sequences)) // MAX_BALANCE_ROWS)
         rows: list[_BalanceRow] = []
         for s in self.sequences:
             rows += self._balance_rows(s, model, stride)
@@ -303,12 +327,12 @@ class TorqueFit:
         if not moved:
             return []
         mounts = self.robot.payload_mounts
-        carried = [s.meta.payload_side in ("both", mount.side) for mount in mounts]
-        mass = s.meta.payload_mass * np.array(carried)
+        is_loaded = [s.meta.payload_side in ("both", mount.side) for mount in mounts]
+        mass = s.meta.payload_mass * np.array(is_loaded)
         bodies = [model.body(mount.body).id for mount in mounts]
         data = mujoco.MjData(model)
         inertia = np.empty((model.nv, model.nv))
-        # Of each mount's body: position and rotation.
+        # Of each mount's body: its shift and its turn by each joint.
         jac = np.empty((len(mounts), 2, 3, model.nv))
         speed = differentiate(lowpass(s.qpos.astype(float), s.dt, CUTOFF_HZ), s.dt)
         qacc = differentiate(speed, s.dt)
@@ -337,25 +361,42 @@ class TorqueFit:
 
     def fit(self, options: TorqueOptions) -> RobotSpec:
         """Return the robot with values from torque, and near those with values from positions."""
-        start = self.payload_placed(options.friction) if options.place else self.robot
+        start = self.robot
+        if options.place:
+            start = self.payload_placed(options.friction)
         rollouts = JointRollouts(cut(self.sequences, MAX_WINDOWS), start)
         fields = CLASSIC[1:]  # without kp
         changes = Changes(first_values(start), fields)
 
         def errors(x: Array) -> Array:
-            own = rollouts.flat_errors(changes.values(x))
-            return np.concatenate([own, options.prior * x], axis=2) / ERROR_SCALE_RAD
+            of_rollouts = rollouts.flat_errors(changes.values(x))
+            of_prior = options.prior * x
+            return np.concatenate([of_rollouts, of_prior], axis=2) / ERROR_SCALE_RAD
 
         first = np.zeros((1, *changes.low.shape))
         first[..., fields.index("delay")] = START_DELAY
         x, _ = descend(Problems(errors, changes.low, changes.high), first, ITERATIONS)
         values = changes.values(x)
-        return with_values(start, {f: values[f][0] for f in fields})
+        return with_values(start, {field: values[field][0] for field in fields})
+
+
+def _has_torque_of_unknown_gains(s: Sequence) -> bool:
+    """Return whether a recording has torque, and does not state the gains that made it."""
+    return s.tau is not None and s.meta.recorded_gains[0] is None
+
+
+def _best_gains(recordings: list[Array]) -> Gains:
+    """Return a servo's gains with the delay that explains most of its torque."""
+    tried = [servo_gains(recordings, late=late) for late in range(1, MAX_LATE_PERIODS + 1)]
+    return max(tried, key=lambda gains: gains.explained)
 
 
 def _place(mount: int, first: ListOf[float] | Array) -> tuple[float, float, float]:
     """Return the payload's position at a mount for that at the first mount: mirrored, m."""
-    return first[0], first[1] if mount == 0 else -first[1], first[2]
+    x, y, z = first
+    if mount > 0:
+        y = -y
+    return x, y, z
 
 
 def _moved(sequence: Sequence, robot: RobotSpec) -> list[int]:
