@@ -5,7 +5,7 @@ import pytest
 from arm import TOML, XML, commands, record, write_arm
 
 from gaponet.sim.batch import BatchSim, Condition
-from gaponet.sim.inverse import AnalyticInverse, Inertia, Period
+from gaponet.sim.inverse import AnalyticInverse, Inertia, Period, weights_within_period
 from gaponet.sim.model import build_model
 from gaponet.sim.replay import replay
 
@@ -55,7 +55,7 @@ def test_states_within_a_period_follow_parabolic_speeds(count):
     speed = 0.3 + 0.2 * i - 0.03 * i**2
     position = np.concatenate([[0.0], np.cumsum(h * speed[1:])])
     known = np.array([h * speed[0], h * speed[-1], position[-1]])
-    before, speeds = (weights @ known for weights in AnalyticInverse.within_period(count, 12))
+    before, speeds = (weights @ known for weights in weights_within_period(count, 12))
     np.testing.assert_allclose(before[:count], position[:-1], atol=1e-12)
     np.testing.assert_allclose(speeds[: count + 1] / h, speed, atol=1e-12)
 
@@ -90,7 +90,7 @@ def test_a_torque_speed_line_bounds_the_targets_of_a_moving_joint(tmp_path):
     inverse = AnalyticInverse.of(BatchSim(robot, [CONDITION]))
     at, speed = np.zeros((1, 2)), np.ones((1, 2))
     targets = inverse([Period(at, speed, at + 0.02, speed + 1.0, at)])
-    assert inverse.high.max() == 0.4
+    assert inverse.servos.high.max() == 0.4
     np.testing.assert_allclose(
-        inverse.kp * (targets - 0.01), 0.2, rtol=1e-3
+        inverse.servos.kp * (targets - 0.01), 0.2, rtol=1e-3
     )  # 0.01 rad: the mean position

@@ -14,6 +14,7 @@ from gaponet.nn.artifact import GapModel
 from gaponet.nn.loop import DeltaLoop
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.batch import Batch, BatchSim, Condition
+from gaponet.sim.commands import ControlPeriods
 from gaponet.sim.context import scene_context
 from gaponet.sim.inverse import AnalyticInverse
 
@@ -107,7 +108,7 @@ class MujocoAligner:
         elif self.transfer is not None:  # else the scene equals the robot
             if self._fresh:
                 self.transfer.reset(slice(None), q, v, a[:, None])
-            self.transfer.inverse.set_state(data)
+            self.transfer.inverse.dynamics.set_state(data)
             out[self.actuator] = self.transfer.command(q, v, a)[0]
         self._fresh = False
         return out
@@ -162,9 +163,8 @@ def _of_scene(scene: mujoco.MjModel, joints: tuple[str, ...], dt: float) -> Anal
     model = copy.copy(scene)
     h = scene.opt.timestep
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
-    return AnalyticInverse(
-        Batch(model, nsim=1, nthread=1), model, joints, np.array([round(dt / h)]), np.array([h])
-    )
+    periods = ControlPeriods(np.array([round(dt / h)]), np.array([h]))
+    return AnalyticInverse(Batch(model, nsim=1, nthread=1), model, joints, periods)
 
 
 def _addresses(scene: mujoco.MjModel, joints: list[str]) -> tuple[Array, Array, Array]:

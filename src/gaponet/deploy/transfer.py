@@ -228,7 +228,7 @@ def _require_measured(
     inverse: AnalyticInverse, reference: AnalyticInverse, joints: tuple[str, ...]
 ) -> None:
     """Refuse a target outside the measured ranges."""
-    extra_delay = (inverse.delay - reference.delay).max(axis=0)  # (n,)
+    extra_delay = (inverse.servos.delay - reference.servos.delay).max(axis=0)  # (n,)
     if extra_delay.max() > MAX_EXTRA_DELAY_S:
         joint = joints[extra_delay.argmax()]
         raise ModelError(
@@ -248,10 +248,11 @@ def require_measured_range(
     Raises:
         ModelError: It names the joint and the quantity.
     """
-    friction_band = inverse.frictionloss / inverse.kp
-    timestep = np.tile(inverse.h, len(joints))
+    friction_band = inverse.servos.frictionloss / inverse.servos.kp
+    timestep = np.tile(inverse.steps.h, len(joints))
+    kp_ratio = inverse.servos.kp / reference.servos.kp
     measured = (
-        ("kp, as a ratio to the reference's,", inverse.kp / reference.kp, KP_RATIO_BOUNDS),
+        ("kp, as a ratio to the reference's,", kp_ratio, KP_RATIO_BOUNDS),
         ("frictionloss / kp, rad,", friction_band, (0.0, MAX_FRICTION_BAND_RAD)),
         ("the physics step, s,", timestep, (0.0, MAX_TIMESTEP_S)),
     )

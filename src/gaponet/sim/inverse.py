@@ -19,7 +19,8 @@ from gaponet.base.arrays import Array
 from gaponet.base.errors import UsageError
 from gaponet.robot.servo_fields import SERVO_TERMS
 from gaponet.sim.batch import Batch, BatchSim
-from gaponet.sim.servo import overcome_friction, present, torque_range
+from gaponet.sim.commands import ControlPeriods
+from gaponet.sim.servo import ServoTerms, overcome_friction, present, torque_range
 
 # Agreement of two simulators: largest difference of targets, and number of random motions that are
 # compared.
@@ -69,10 +70,164 @@ class Inertia:
         return full
 
 
+class InverseDynamics:
+    """Torque of motion of n joints in a batch's simulations, without dry friction."""
+
+    def __init__(self, batch: Batch, model: mujoco.MjModel, joints: tuple[str, ...]) -> None:
+        self._batch = batch
+        self._at = np.array([model.joint(name).qposadr[0] for name in joints])
+        self._dof = np.array([model.joint(name).dofadr[0] for name in joints])
+        self._qpos = batch.bind("qpos")
+        self._qvel = batch.bind("qvel")
+        self._bias = batch.bind("qfrc_bias")
+        self._passive = batch.bind("qfrc_passive")
+        self._inertia = Inertia(batch, model, self._dof)
+
+    def set_state(self, data: mujoco.MjData) -> None:
+        """Copy positions and velocities of a scene, (nq,) rad and (nv,) rad/s."""
+        self._qpos[:] = data.qpos
+        self._qvel[:] = data.qvel
+
+    def torques(self, qpos: Array, qvel: Array, qacc: Array) -> tuple[Array, Array]:
+        """Return the torque of motions (num, n), rad and its derivatives, and the part of gravity
+        and Coriolis forces, (num, n) N·m.
+        """
+        self._qpos[:, self._at] = qpos
+        self._qvel[:, self._dof] = qvel
+        self._batch.forward(stage=mujoco.mjtStage.mjSTAGE_VEL.value)
+        load = self._bias[:, self._dof]
+        inertia = self._inertia.matrix(self._batch.nsim)
+        torque = load - self._passive[:, self._dof] + np.einsum("kij,kj->ki", inertia, qacc)
+        return torque, load
+
+
+@dataclass(frozen=True)
+class PositionServos:
+    """Position actuators of n joints, and the joints' friction; (num, n), or (1, n) where all
+    simulations have the same.
+
+    Attributes:
+        kp, kd: Gains, N·m/rad and N·m·s/rad.
+        offset: Zero offset, rad.
+        delay: Age of the target in force, s.
+        low, high: Least and largest torque at rest, (n,) N·m; ±inf without a limit.
+        frictionloss, damping: Of the joints, N·m and N·m·s/rad.
+        terms: Terms of the servo model, as of `present`.
+    """
+
+    kp: Array
+    kd: Array
+    offset: Array
+    delay: Array
+    low: Array
+    high: Array
+    frictionloss: Array
+    damping: Array
+    terms: ServoTerms
+
+    @classmethod
+    def of(cls, batch: Batch, model: mujoco.MjModel, joints: tuple[str, ...]) -> PositionServos:
+        """Return the servos of a batch's simulations.
+
+        Raises:
+            UsageError: A joint without exactly one position actuator.
+        """
+        dof = np.array([model.joint(name).dofadr[0] for name in joints])
+        act = np.array([_position_actuator(model, name) for name in joints])
+        bias = _own(batch, model, "actuator_biasprm")[:, act]
+        kp = _own(batch, model, "actuator_gainprm")[:, act, 0]
+        low, high = _most_torque(model, joints, act)
+        terms = {}
+        if model.nuser_actuator == len(SERVO_TERMS):
+            terms = dict(zip(SERVO_TERMS, model.actuator_user[act].T, strict=True))
+        return cls(
+            kp=kp,
+            kd=-bias[..., 2],
+            offset=bias[..., 0] / kp,
+            delay=_own(batch, model, "actuator_delay")[:, act],
+            low=low,
+            high=high,
+            frictionloss=_own(batch, model, "dof_frictionloss")[:, dof],
+            damping=_own(batch, model, "dof_damping")[:, dof],
+            terms=present(terms),
+        )
+
+    def torque_limits(self, speed: Array) -> tuple[Array, Array]:
+        """Return the least and the largest torque at joint speeds (…, n) rad/s, in N·m; (n,) where
+        they do not depend on them.
+        """
+        no_load = self.terms.get("no_load_speed")
+        if no_load is None:
+            return self.low, self.high
+        low, high = torque_range(self.high, speed / no_load)
+        return low, high
+
+
+class PhysicsSteps:
+    """Physics steps within the control periods of num simulations, whose motion is known at the
+    periods' ends.
+
+    Attributes:
+        h: Length of a physics step, (num, 1) s.
+        dt: Length of a period, (num, 1) s.
+    """
+
+    def __init__(self, periods: ControlPeriods) -> None:
+        nstep = periods.nstep
+        self.h = periods.timestep[:, None]
+        self.dt = periods.seconds[:, None]
+        within = [weights_within_period(int(n), int(nstep.max())) for n in nstep]
+        positions, speeds = zip(*within, strict=True)
+        self._positions = np.array(positions).transpose(1, 2, 0)[..., None]
+        self._speeds = np.array(speeds).transpose(1, 2, 0)[..., None]
+        # of each physics step, (steps, num)
+        self._share = (np.arange(nstep.max())[:, None] < nstep) / nstep
+
+    def states(self, period: Period) -> tuple[Array, Array]:
+        """Return positions at the start of each step, (steps, num, n) rad, and speeds at the start
+        of the first and at the end of each, (steps + 1, num, n) rad/s.
+        """
+        displacement = period.next_qpos - period.qpos
+        ends = np.stack([self.h * period.qvel, self.h * period.next_qvel, displacement])
+        qpos = period.qpos + np.einsum("ibkx,bkj->ikj", self._positions, ends)
+        speeds = np.einsum("ibkx,bkj->ikj", self._speeds, ends) / self.h
+        return qpos, speeds
+
+    def mean(self, values: Array) -> Array:
+        """Return the mean over the steps of a period, (steps, num, n) → (num, n)."""
+        mean: Array = np.einsum("ik,ikj->kj", self._share, values)
+        return mean
+
+
+def weights_within_period(count: int, rows: int) -> tuple[Array, Array]:
+    """Return positions before each of `count` physics steps of h, and speeds, from the states
+    at a period's ends.
+
+    Speeds follow a parabola; MuJoCo's positions follow from the speeds after each step.
+
+    Returns:
+        Weights of h·q̇ at the start, of h·q̇ at the end, and the way: of positions beyond the
+        first, (rows, 3), and of h·speeds from the first to that after the last step, (rows + 1,
+        3). Rows beyond the period are zero.
+    """
+    i = np.arange(count + 1.0)
+    # α, β of v = v_0 + α i + β i²
+    shape = np.linalg.pinv([[count, count**2], [i.sum(), (i**2).sum()]])
+    weights = shape @ [[-1.0, 1.0, 0.0], [-count, 0.0, 1.0]]
+    speeds = np.zeros((rows + 1, 3))
+    before = np.zeros((rows, 3))
+    speeds[: count + 1] = np.stack([i, i**2], axis=1) @ weights + [1.0, 0.0, 0.0]
+    before[1:count] = speeds[1:count].cumsum(axis=0)
+    return before, speeds
+
+
 class AnalyticInverse:
     """Targets of position actuators along a motion, without contacts and joint limits.
 
     Attributes:
+        servos: The actuators.
+        steps: Physics steps of a control period.
+        dynamics: Torque of motion.
         ahead: Number of control periods after the coming one that a call needs, because servos have
             a delay.
         saturated: Joints whose motors cannot give the torque of the last period of a call, (num,
@@ -84,68 +239,29 @@ class AnalyticInverse:
         batch: Batch,
         model: mujoco.MjModel,
         joints: tuple[str, ...],
-        nstep: Array,
-        timestep: Array,
+        periods: ControlPeriods,
     ) -> None:
         """
         Args:
             batch: Simulations to compute in, one per robot, with `model`; payloads may differ.
                 Nothing else may use them.
-            nstep, timestep: Physics steps per control period, their length in s; (num,) each.
+            periods: Their control periods.
 
         Raises:
             UsageError: A joint without exactly one position actuator.
         """
-        self.batch = batch
-        self.num = batch.nsim
-        self.at = np.array([model.joint(name).qposadr[0] for name in joints])
-        self.dof = np.array([model.joint(name).dofadr[0] for name in joints])
-        act = np.array([_position_actuator(model, name) for name in joints])
-        bias = _own(batch, model, "actuator_biasprm")[:, act]
-        self.kp = _own(batch, model, "actuator_gainprm")[:, act, 0]
-        self.kd = -bias[..., 2]
-        self.offset = bias[..., 0] / self.kp
-        self.delay = _own(batch, model, "actuator_delay")[:, act]
-        self.low, self.high = _most_torque(model, joints, act)
-        self.frictionloss = _own(batch, model, "dof_frictionloss")[:, self.dof]
-        self.damping = _own(batch, model, "dof_damping")[:, self.dof]
-        terms = {}
-        if model.nuser_actuator == len(SERVO_TERMS):
-            terms = dict(zip(SERVO_TERMS, model.actuator_user[act].T, strict=True))
-        self.terms = present(terms)
+        self.servos = PositionServos.of(batch, model, joints)
+        self.steps = PhysicsSteps(periods)
+        self.dynamics = InverseDynamics(batch, model, joints)
         # kd takes the speed before the step
-        self.explicit = model.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER
-        self.h = timestep[:, None]
-        self.dt = (nstep * timestep)[:, None]
-        self.ahead = int(np.ceil((self.delay / self.dt).max() - 1e-9))
-        within = [self.within_period(int(n), int(nstep.max())) for n in nstep]
-        before, speeds = zip(*within, strict=True)
-        self.before = np.array(before).transpose(1, 2, 0)[..., None]
-        self.speeds = np.array(speeds).transpose(1, 2, 0)[..., None]
-        # of each physics step, (steps, num)
-        self.share = (np.arange(nstep.max())[:, None] < nstep) / nstep
-        self.qpos = batch.bind("qpos")
-        self.qvel = batch.bind("qvel")
-        self.bias = batch.bind("qfrc_bias")
-        self.passive = batch.bind("qfrc_passive")
-        self.inertia = Inertia(batch, model, self.dof)
-        self.saturated = np.zeros((self.num, len(joints)), bool)
+        self._explicit = model.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER
+        self.ahead = int(np.ceil((self.servos.delay / self.steps.dt).max() - 1e-9))
+        self.saturated = np.zeros((batch.nsim, len(joints)), bool)
 
     @classmethod
     def of(cls, sim: BatchSim) -> AnalyticInverse:
         """Return the inverse of a simulation that nothing else uses."""
-        return cls(
-            sim.batch,
-            next(iter(sim.models.values())),
-            sim.joint_names,
-            sim.periods.nstep,
-            sim.periods.timestep,
-        )
-
-    def set_state(self, data: mujoco.MjData) -> None:
-        """Copy positions and velocities of a scene, (nq,) rad and (nv,) rad/s."""
-        self.qpos[:] = data.qpos
-        self.qvel[:] = data.qvel
+        return cls(sim.batch, next(iter(sim.models.values())), sim.joint_names, sim.periods)
 
     def __call__(self, periods: ListOf[Period]) -> Array:
         """Return the targets to send, (num, n) rad, not limited to any range.
@@ -156,7 +272,7 @@ class AnalyticInverse:
         if not self.ahead:
             undelayed: Array = held[0]
             return undelayed
-        late = np.broadcast_to(self.delay / self.dt, held[0].shape)
+        late = np.broadcast_to(self.servos.delay / self.steps.dt, held[0].shape)
         whole = np.minimum(late.astype(int), self.ahead - 1)
         first = np.take_along_axis(held, whole[None], axis=0)[0]
         second = np.take_along_axis(held, whole[None] + 1, axis=0)[0]
@@ -167,68 +283,54 @@ class AnalyticInverse:
         """Return the targets that must be in force in a period, (num, n) rad, not limited to any
         range.
         """
-        displacement = period.next_qpos - period.qpos
-        gain = period.next_qvel - period.qvel
-        ends = np.stack([self.h * period.qvel, self.h * period.next_qvel, displacement])
-        # at which physics steps begin
-        qpos = period.qpos + np.einsum("ibkx,bkj->ikj", self.before, ends)
-        before = np.einsum("ibkx,bkj->ikj", self.speeds, ends) / self.h
-        after = before[1:]
-        mean = self._mean
-        torque = self._torque(mean(qpos), mean(before[:-1]), gain / self.dt, period.friction)
-        torque += self.damping * (mean(after) - mean(before[:-1]))
-        back = self.kp * (qpos - self.offset) + self.kd * (before[:-1] if self.explicit else after)
-        low = self.low
-        high = self.high
+        servos = self.servos
+        mean = self.steps.mean
+        qpos, speeds = self.steps.states(period)
+        before = speeds[:-1]
+        after = speeds[1:]
+        qacc = (period.next_qvel - period.qvel) / self.steps.dt
+        torque = self._torque(mean(qpos), mean(before), qacc, period.friction)
+        torque += servos.damping * (mean(after) - mean(before))
+        damped = before if self._explicit else after
+        back = servos.kp * (qpos - servos.offset) + servos.kd * damped
+        low, high = servos.torque_limits(before)
         mean_low = low
         mean_high = high
-        no_load = self.terms.get("no_load_speed")
-        if no_load is not None:
-            low, high = torque_range(self.high, before[:-1] / no_load)
+        if low.ndim == before.ndim:
             mean_low = mean(low)
             mean_high = mean(high)
         self.saturated = (torque < mean_low) | (torque > mean_high)
         return self._targets(np.clip(torque, mean_low, mean_high), back, low, high)
 
-    def _mean(self, values: Array) -> Array:
-        """Return the mean over the physics steps of a period, (steps, num, n) → (num, n)."""
-        mean: Array = np.einsum("ik,ikj->kj", self.share, values)
-        return mean
+    def _torque(self, qpos: Array, qvel: Array, qacc: Array, friction: Array) -> Array:
+        """Return the motors' torque in motion, (num, n) N·m; friction over its limit."""
+        servos = self.servos
+        torque, load = self.dynamics.torques(qpos, qvel, qacc)
+        against = overcome_friction(servos.terms, servos.frictionloss, qvel, friction, torque, load)
+        return np.asarray(torque + against)
 
     def _targets(self, torque: Array, back: Array, low: Array, high: Array) -> Array:
         """Return targets u (num, n) for which the mean over steps of kp·u − back, (steps, num, n),
         within the motors' limits, (n,) or (steps, num, n), is torque (num, n).
         """
-        mean = self._mean
-        out = (torque + mean(back)) / self.kp
+        kp = self.servos.kp
+        mean = self.steps.mean
+        out = (torque + mean(back)) / kp
         for _ in range(len(back)):
-            requested = self.kp * out - back
+            requested = kp * out - back
             applied = np.clip(requested, low, high)
             if (applied == requested).all():
                 break
             free = np.maximum(mean((applied == requested).astype(float)), 1 / len(back))
-            out = out + (torque - mean(applied)) / (self.kp * free)
+            out = out + (torque - mean(applied)) / (kp * free)
         result: Array = out
         return result
-
-    def _torque(self, qpos: Array, qvel: Array, qacc: Array, friction: Array) -> Array:
-        self.qpos[:, self.at] = qpos
-        self.qvel[:, self.dof] = qvel
-        self.batch.forward(stage=mujoco.mjtStage.mjSTAGE_VEL.value)
-        load = self.bias[:, self.dof]
-        torque = (
-            load
-            - self.passive[:, self.dof]
-            + np.einsum("kij,kj->ki", self.inertia.matrix(self.num), qacc)
-        )
-        against = overcome_friction(self.terms, self.frictionloss, qvel, friction, torque, load)
-        return np.asarray(torque + against)
 
     def agrees_with(self, other: AnalyticInverse, limits: Array) -> bool:
         """Return True if the inverses of two simulators of the same joints, limits (n, 2) rad,
         agree for any motion.
         """
-        if self.ahead != other.ahead or not np.allclose(self.dt, other.dt):
+        if self.ahead != other.ahead or not np.allclose(self.steps.dt, other.steps.dt):
             return False
         rng = np.random.default_rng(0)
         n = len(limits)
@@ -238,36 +340,14 @@ class AnalyticInverse:
             v = rng.uniform(-1.0, 1.0, (1, n))
             a = rng.uniform(-5.0, 5.0, (1, n))
             friction = rng.uniform(-1.0, 1.0, (1, n))
-            q_end = q + self.dt * (v + 0.5 * self.dt * a)
-            v_end = v + self.dt * a
+            q_end = q + self.steps.dt * (v + 0.5 * self.steps.dt * a)
+            v_end = v + self.steps.dt * a
             period = Period(q, v, q_end, v_end, friction)
             mine = self([period] * (1 + self.ahead))
             theirs = other([period] * (1 + other.ahead))
             if np.abs(mine - theirs).max() > MAX_TARGET_DIFFERENCE_RAD:
                 return False
         return True
-
-    @staticmethod
-    def within_period(count: int, rows: int) -> tuple[Array, Array]:
-        """Return positions before each of `count` physics steps of h, and speeds, from the states
-        at a period's ends.
-
-        Speeds follow a parabola; MuJoCo's positions follow from the speeds after each step.
-
-        Returns:
-            Weights of h·q̇ at the start, of h·q̇ at the end, and the way: of positions beyond the
-            first, (rows, 3), and of h·speeds from the first to that after the last step, (rows + 1,
-            3). Rows beyond the period are zero.
-        """
-        i = np.arange(count + 1.0)
-        # α, β of v = v_0 + α i + β i²
-        shape = np.linalg.pinv([[count, count**2], [i.sum(), (i**2).sum()]])
-        weights = shape @ [[-1.0, 1.0, 0.0], [-count, 0.0, 1.0]]
-        speeds = np.zeros((rows + 1, 3))
-        before = np.zeros((rows, 3))
-        speeds[: count + 1] = np.stack([i, i**2], axis=1) @ weights + [1.0, 0.0, 0.0]
-        before[1:count] = speeds[1:count].cumsum(axis=0)
-        return before, speeds
 
 
 def _own(batch: Batch, model: mujoco.MjModel, name: str) -> Array:
