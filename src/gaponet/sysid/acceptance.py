@@ -25,7 +25,8 @@ Links = dict[str, Link]  # MJCF body → mass, centre of mass and inertia
 # joint → fields (P), (P, P) on the axes of uncertainty.py
 Covariance = dict[str, tuple[list[str], Array]]
 
-MIN_CROSS_VALIDATED = 4  # motions; a fit to two of three says little about a fit to all
+# Motions: a fit to two of three says little about a fit to all.
+MIN_CROSS_VALIDATED = 4
 # Motions of each set of recorded joints; fewer cannot validate without cross-validation.
 MIN_JUDGES = 3
 
@@ -58,7 +59,9 @@ Split = tuple[list[Sequence], list[Sequence]]  # recordings to fit, recordings t
 
 
 def cross_validation(
-    sequences: ListOf[Sequence], validation: ListOf[Sequence], folds: int
+    sequences: ListOf[Sequence],
+    validation: ListOf[Sequence],
+    folds: int,
 ) -> list[Split]:
     """Return folds by motion, or the given split if at least MIN_JUDGES motions validate each set
     of recorded joints.
@@ -102,7 +105,12 @@ def _needs_cross_validation(motions: _Motions, judges: _Motions) -> bool:
     return min(judges_of_sets, default=0) < MIN_JUDGES
 
 
-def _split(sequences: ListOf[Sequence], motions: _Motions, number: int, folds: int) -> Split:
+def _split(
+    sequences: ListOf[Sequence],
+    motions: _Motions,
+    number: int,
+    folds: int,
+) -> Split:
     """Return the recordings outside and inside one of some folds: each takes every so many motions
     of a set of joints, and none of a set with a single motion.
     """
@@ -194,7 +202,11 @@ class Judge:
     """
 
     def __init__(
-        self, folds: ListOf[ListOf[Sequence]], robot: RobotSpec, contact_height: float, nthread: int
+        self,
+        folds: ListOf[ListOf[Sequence]],
+        robot: RobotSpec,
+        contact_height: float,
+        nthread: int,
     ) -> None:
         """Take the recordings that judge, fold by fold; rows with a tip below `contact_height`, m,
         do not count.
@@ -388,7 +400,9 @@ def _mixed(candidates: dict[str, list[Values]], winner: Array) -> list[Values]:
 
 
 def _contact_rows(
-    sequences: ListOf[Sequence], robot: RobotSpec, contact_height: float
+    sequences: ListOf[Sequence],
+    robot: RobotSpec,
+    contact_height: float,
 ) -> Array | None:
     """Return the rows in which a tip is below a height, (sequences, rows)."""
     if not robot.scene.tips:

@@ -34,7 +34,8 @@ SHARED_FIELDS = ("damping", "frictionloss", "delay")
 MAX_ITERATIONS = 4
 MIN_DECREASE = 1e-3  # relative, of the cost, for another iteration
 MAX_FOLDS = 4  # of motions that judge
-MAX_SHORT_WINDOW_S = 4.0  # a window of this length is too short to validate another one
+# A window of this length is too short to validate another one.
+MAX_SHORT_WINDOW_S = 4.0
 START_DELAY_S = 0.005  # a delay of zero has no slope
 
 
@@ -83,11 +84,12 @@ def adapt(
     accepted = True
     if judge:
         motions_of_sets = _motions_that_judge(windows)
-        judged = _cross_validated(motions_of_sets, robot, corrector)
-        accepted = windows[0].duration > MAX_SHORT_WINDOW_S
         if motions_of_sets:
+            judged = _cross_validated(motions_of_sets, robot, corrector)
             accepted = not Comparison("adapted", *judged).harmful
             windows = _windows_of(motions_of_sets)
+        else:
+            accepted = windows[0].duration > MAX_SHORT_WINDOW_S
     rollouts = RobotRollouts(windows, robot, corrector=corrector)
     problem = _Problem(rollouts, first_values(robot), robot.servo.kd[rollouts.op])
     done = 0
@@ -101,12 +103,13 @@ def adapt(
     start = problem.changes.start(START_DELAY_S).reshape(1, 1, -1)
     problems = Problems(problem.errors, problem.low, problem.high, problem.slopes)
     x, _ = descend(problems, start, MAX_ITERATIONS, report, MIN_DECREASE)
-    before = problem.rms(np.zeros_like(x[0, 0]))
-    after = problem.rms(x[0, 0])
+    found = x[0, 0]  # (P,)
+    before = problem.rms(np.zeros_like(found))
+    after = problem.rms(found)
     if judge and after > (1 - MIN_RELATIVE_GAIN) * before:
         accepted = False
-    values = problem.values(x[0])
-    adapted = with_values(robot, {str(f): values[f][0] for f in FIELDS})
+    values = problem.values(found[None])
+    adapted = with_values(robot, {str(field): values[field][0] for field in FIELDS})
     return Adapted(adapted, before, after, judged, accepted)
 
 
@@ -144,14 +147,17 @@ def _windows_of(motions_of_sets: list[list[_Motion]]) -> list[Sequence]:
 
 
 def _cross_validated(
-    motions_of_sets: list[list[_Motion]], robot: RobotSpec, corrector: Corrector | None
+    motions_of_sets: list[list[_Motion]],
+    robot: RobotSpec,
+    corrector: Corrector | None,
 ) -> tuple[Array, Array]:
     """Return the mean |error| of motions, of the robot and of the fit to the other motions,
     (motions,) rad each.
     """
     before = []
     after = []
-    folds = min(MAX_FOLDS, max(map(len, motions_of_sets), default=0))
+    most_motions = max(len(motions) for motions in motions_of_sets)
+    folds = min(MAX_FOLDS, most_motions)
     for number in range(folds):
         test: list[_Motion] = []
         rest: list[Sequence] = []
@@ -179,7 +185,7 @@ class _Problem:
     def __init__(self, rollouts: RobotRollouts, first: Values, kd_slack: Array) -> None:
         self.rollouts = rollouts
         self.n = rollouts.n
-        self.size = int(rollouts.rows.sum())
+        self.size = int(rollouts.rows.sum())  # number of errors
         self.changes = Changes(first, FIELDS, kd_slack)
         self.low = self.changes.low.reshape(1, -1)
         self.high = self.changes.high.reshape(1, -1)
@@ -215,27 +221,27 @@ class _Problem:
         """Return errors of candidates (k, 1, P), (k, 1, rows) in ERROR_SCALE_RAD: of all joints,
         then of the prior.
         """
-        own = self._errors(xs[:, 0]).reshape(len(xs), -1)
-        return np.concatenate([own, xs[:, 0] @ self.prior.T], axis=1)[:, None]
+        x = xs[:, 0]  # (k, P)
+        of_rollouts = self._errors(x).reshape(len(xs), -1)
+        of_prior = x @ self.prior.T
+        return np.concatenate([of_rollouts, of_prior], axis=1)[:, None]
 
     def slopes(self, x: Array, high: Array, errors: Errors) -> tuple[Array, Array]:
         """Return what least_squares.slopes does, for one start, by fewer candidates: x as it is,
         and each field changed in all joints at once.
         """
-        here = x[0, 0]  # (P,)
-        count = len(FIELDS)
-        field = np.tile(np.arange(count), self.n)  # number of the field of each entry of x
-        step = np.where(here + DIFFERENCE_STEP > high[0], -DIFFERENCE_STEP, DIFFERENCE_STEP)
-        changes = np.zeros((1 + count, len(here)))
-        for number in range(count):
-            changes[1 + number] = np.where(field == number, step, 0.0)
-        tried = self._errors(here + changes)  # (1 + count, n, rows)
-        jac = np.zeros((*tried.shape[1:], len(here)), np.float32)
-        for i in range(len(here)):
-            joint = i // count
-            jac[joint, :, i] = (tried[1 + field[i], joint] - tried[0, joint]) / step[i]
-        with_prior = np.concatenate([tried[0].ravel(), self.prior @ here])
-        slopes = np.concatenate([jac.reshape(-1, len(here)), self.prior])
+        own = x[0, 0]  # (P,)
+        joint_of, field_of = np.divmod(np.arange(len(own)), len(FIELDS))  # of each entry of x
+        step = np.where(own + DIFFERENCE_STEP > high[0], -DIFFERENCE_STEP, DIFFERENCE_STEP)
+        candidates = [own]
+        for number in range(len(FIELDS)):
+            candidates.append(own + np.where(field_of == number, step, 0.0))
+        here, *moved = self._errors(np.stack(candidates))  # (n, rows) each
+        jac = np.zeros((*here.shape, len(own)), np.float32)
+        for i, (joint, number) in enumerate(zip(joint_of, field_of, strict=True)):
+            jac[joint, :, i] = (moved[number][joint] - here[joint]) / step[i]
+        with_prior = np.concatenate([here.ravel(), self.prior @ own])
+        slopes = np.concatenate([jac.reshape(-1, len(own)), self.prior])
         return with_prior[None, None], slopes[None, None]
 
     def _errors(self, xs: Array) -> Array:

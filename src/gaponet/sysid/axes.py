@@ -24,12 +24,16 @@ from gaponet.sim.temperature import recorded_temperatures, temperature_varies
 
 Values = dict[str, Array]  # field → (…, n) of the operated joints
 
-CLASSIC = ("kp", "damping", "frictionloss", "armature", "offset", "delay")  # that every fit has
+# Fields that every fit has.
+CLASSIC = ("kp", "damping", "frictionloss", "armature", "offset", "delay")
 WARM = TERMS["temperature"]
-WARM_SLOPES = ("friction_per_kelvin", "damping_per_kelvin")  # of WARM; the temperature is stated
-MIN_PER_KELVIN = 1e-3  # 1/K, of friction by temperature and of damping; less counts as none
+# Those of WARM that are fitted; the temperature is stated.
+WARM_SLOPES = ("friction_per_kelvin", "damping_per_kelvin")
+# Of friction by temperature, and of damping over damping, 1/K: less counts as none.
+MIN_PER_KELVIN = 1e-3
 START_DELAY_S = 0.02  # a start without delay has no slope over it
-MIN_STEPS_PER_RADIAN = 5.0  # physics steps in a radian of the stiffest oscillation of a start
+# Physics steps in a radian of the stiffest oscillation of a start.
+MIN_STEPS_PER_RADIAN = 5.0
 MAX_KP_LOG_CHANGE = 5.0
 LARGE_KP_LOG_CHANGE = 0.2
 MAX_ARMATURE_TIME_S = 0.3
@@ -45,7 +49,8 @@ MIN_LINE = 0.2
 LARGE_LINE_CHANGE = 0.1
 GREATEST_SPEED_QUANTILE = 0.995  # of a joint's recorded speeds
 MIN_GREATEST_SPEED = 0.1  # rad/s
-BOUND_TOLERANCE = 0.02  # of a large change: a value as near to its bound is at it
+# Large changes: a value as near to its bound is at it.
+BOUND_TOLERANCE = 0.02
 
 
 def to_axis(field: str, value: Array, kp: Array) -> Array:
@@ -135,7 +140,12 @@ class Changes:
         low, high: Bounds, (n, P).
     """
 
-    def __init__(self, first: Values, fields: ListOf[str], kd_slack: Array | float = 0.0) -> None:
+    def __init__(
+        self,
+        first: Values,
+        fields: ListOf[str],
+        kd_slack: Array | float = 0.0,
+    ) -> None:
         """
         Args:
             first: Own values, (n,).
@@ -270,7 +280,12 @@ class Bounds:
         return start
 
     def _limits(
-        self, kp: Array, effort_limit: Array, slow: Array, encoder_steps: Array, varies: Array
+        self,
+        kp: Array,
+        effort_limit: Array,
+        slow: Array,
+        encoder_steps: Array,
+        varies: Array,
     ) -> dict[str, Limits]:
         """Return field → its limits.
 
@@ -358,7 +373,12 @@ def _encoder_steps(sequences: ListOf[Sequence], joints: Array) -> Array:
     return np.array(steps, float)
 
 
-def _end_of_range(field: str, x: float, low: float, high: float) -> Literal["", "least", "most"]:
+def _end_of_range(
+    field: str,
+    x: float,
+    low: float,
+    high: float,
+) -> Literal["", "least", "most"]:
     """Return at which end of its range a field is, in large changes; nothing where it is fixed or
     at a zero that is ordinary.
     """

@@ -9,7 +9,8 @@ links. `identify` goes this way:
 (steps/classic.py).
 2. Propose one step after the other: terms (steps/servo_term.py), links (steps/link_masses.py). Each
    is fitted to the same recordings; motions that were not fitted accept or reject it (`Judge`).
-3. Fit the table under the tips (table_contact.py), and estimate standard errors (standard_errors.py).
+3. Estimate standard errors (standard_errors.py), and fit the table under the tips
+   (table_contact.py).
 4. Compare with a fit that begins with recorded torque (steps/recorded_torque.py), and with
    speed-limited targets (steps/speed_limits.py).
 
@@ -30,7 +31,7 @@ from gaponet.robot.spec import RobotSpec
 from gaponet.sim.metrics import Comparison
 from gaponet.sim.temperature import temperature_findings
 from gaponet.sysid.acceptance import HeldOut, Identified, Judge, Split, cross_validation
-from gaponet.sysid.axes import Bounds, with_values
+from gaponet.sysid.axes import Bounds, Values, with_values
 from gaponet.sysid.joint_rollouts import JointRollouts
 from gaponet.sysid.motion_limits import default_terms, stop_questions, with_stops
 from gaponet.sysid.options import IdentifyOptions
@@ -122,7 +123,10 @@ def identify(
 
 
 def _identify(
-    recordings: Recordings, robot: RobotSpec, options: IdentifyOptions, progress: Progress
+    recordings: Recordings,
+    robot: RobotSpec,
+    options: IdentifyOptions,
+    progress: Progress,
 ) -> Identified:
     """Fit to positions, and then from recorded torque, with the speed limits that the robot's
     servos have.
@@ -137,7 +141,10 @@ def _identify(
 
 
 def _fit_positions(
-    recordings: Recordings, given: RobotSpec, options: IdentifyOptions, progress: Progress
+    recordings: Recordings,
+    given: RobotSpec,
+    options: IdentifyOptions,
+    progress: Progress,
 ) -> Identified:
     """Fit to positions."""
     # Stops that nobody confirmed are taken back in the end.
@@ -150,30 +157,30 @@ def _fit_positions(
     state, comparisons, untried = with_steps(steps, fits, classic)
     errors = _standard_errors(state)
     robots = _robots(fits, state)
-    without_table = robots[-1] if state.chosen != "given" else robot
+    without_table = robot if state.chosen == "given" else robots[-1]
     table = None
     if options.table and robot.scene.tips:
         windows = low_windows(recordings.fitted, heights, contact)
         lowest = min(float(height.min()) for height in heights)
-        table = _fit_table(windows, without_table, lowest, fits, recordings.validation)
+        table = _fit_table(fits, windows, without_table, lowest, recordings.validation)
     fitted = _fitted(given, without_table, state, table, keep_stops=options.stops)
     warnings = _warnings_of_steps(steps, state, untried)
     warnings += _warnings_of_values(fits, state, errors)
     warnings += stop_questions(given, robot)
     warnings += far_from_servo_type(fitted)
     warnings += errors.sentences
-    first = FitState("given", [fit.bounds.first for fit in fits.joints], [], [], together=False)
     fits.progress.show("validation motions, with the fitted robot and from recorded torque")
+    first_values = [joints.bounds.first for joints in fits.joints]
     return Identified(
         robot=fitted,
-        before=float(fits.judge.errors(first.values).mean()),
+        before=float(fits.judge.errors(first_values).mean()),
         after=float(fits.judge.errors(state.values, state.links).mean()),
         chosen=state.chosen,
         warnings=tuple(warnings),
         std=errors.std,
         comparisons=comparisons,
         table_fit=table,
-        by_joint=_errors_by_joint(fits, first, state),
+        by_joint=_errors_by_joint(fits, first_values, state),
         covariance=errors.covariance,
         undetermined=errors.undetermined,
         held_out=tuple(_held_out(recordings, fitted, robots)),
@@ -199,9 +206,11 @@ def _fits(
     shown = SearchProgress(options.seconds, steps, len(sets), progress)
     joints = []
     for train in sets:
-        rollouts = JointRollouts(cut(train, options.windows), robot, contact, options.nthread)
+        windows = cut(train, options.windows)
+        rollouts = JointRollouts(windows, robot, contact, options.nthread)
         joints.append(JointFit(rollouts, robot, Bounds(robot, train)))
-    judging = [held_out or joints[0].rollouts.parts for _, held_out in recordings.splits]
+    fitted_windows = joints[0].rollouts.parts
+    judging = [held_out or fitted_windows for _, held_out in recordings.splits]
     judge = Judge(judging, robot, contact, options.nthread)
     return Fits(sets, given, joints, judge, shown, options.nthread)
 
@@ -210,14 +219,19 @@ def _steps(fits: Fits, options: IdentifyOptions) -> list[Step]:
     """Return the steps after the classic fit, in their order."""
     steps: list[Step] = []
     for term in options.terms or NO_TERMS:
-        steps.append(Backlash(fits) if term == "backlash" else ServoTerm(term, fits))
+        if term == "backlash":
+            steps.append(Backlash(fits))
+        else:
+            steps.append(ServoTerm(term, fits))
     if options.masses:
         steps.append(LinkMasses(fits))
     return steps
 
 
 def with_steps(
-    steps: ListOf[Step], fits: Fits, state: FitState
+    steps: ListOf[Step],
+    fits: Fits,
+    state: FitState,
 ) -> tuple[FitState, tuple[Comparison, ...], list[str]]:
     """Return the state with the steps that the judge accepts, its comparisons, and names of steps
     without time.
@@ -234,28 +248,34 @@ def with_steps(
         comparison = fits.judge.compare(step.name, state, proposed)
         comparisons.append(comparison)
         state = state.after(proposed, accepted=comparison.accepted)
-    if state.chosen == "given" and any(c.accepted for c in comparisons):
+    is_any_accepted = any(comparison.accepted for comparison in comparisons)
+    if state.chosen == "given" and is_any_accepted:
         state = replace(state, chosen="whole")
-    if state.link_fit is not None:
-        fit, result = state.link_fit
-        slopes = fit.servo_slopes(result)
-        state = replace(state, link_fit=(fit, replace(result, servo_slopes=slopes)))
-    return state, tuple(comparisons), untried
+    return _with_servo_slopes(state), tuple(comparisons), untried
+
+
+def _with_servo_slopes(state: FitState) -> FitState:
+    """Return the state with how the servos follow its links, if it has some."""
+    if state.link_fit is None:
+        return state
+    fit, result = state.link_fit
+    slopes = fit.servo_slopes(result)
+    return replace(state, link_fit=(fit, replace(result, servo_slopes=slopes)))
 
 
 def _standard_errors(state: FitState) -> StandardErrors:
     """Return the standard errors of the last set's values, in the simulator of the whole robot."""
     whole = state.robots[-1]
-    links = state.links[-1] if state.links else whole.rollouts.robot.links
-    whole.rollouts.robot = replace(whole.rollouts.robot, links=links)
+    if state.links:
+        whole.rollouts.robot = replace(whole.rollouts.robot, links=state.links[-1])
     return standard_errors(whole, state.values[-1])
 
 
 def _fit_table(
+    fits: Fits,
     windows: list[Sequence],
     robot: RobotSpec,
     lowest: float,
-    fits: Fits,
     validation: ListOf[Sequence],
 ) -> TableFit:
     """Fit the table under a robot with fitted servos, in the time that is left.
@@ -265,10 +285,15 @@ def _fit_table(
         lowest: Least height of a tip, m.
     """
     fits.progress.begin_table()
-    return fit_table(windows, robot, lowest, fits.nthread, fits.progress.report_table, validation)
+    report = fits.progress.report_table
+    return fit_table(windows, robot, lowest, fits.nthread, report, validation)
 
 
-def _warnings_of_steps(steps: ListOf[Step], state: FitState, untried: ListOf[str]) -> list[str]:
+def _warnings_of_steps(
+    steps: ListOf[Step],
+    state: FitState,
+    untried: ListOf[str],
+) -> list[str]:
     """Return what the user has to know about steps; `untried` are the names of those without
     time.
     """
@@ -281,7 +306,11 @@ def _warnings_of_steps(steps: ListOf[Step], state: FitState, untried: ListOf[str
     return warnings
 
 
-def _warnings_of_values(fits: Fits, state: FitState, errors: StandardErrors) -> list[str]:
+def _warnings_of_values(
+    fits: Fits,
+    state: FitState,
+    errors: StandardErrors,
+) -> list[str]:
     """Return sentences about fitted values at a bound, and values that contradict the file."""
     bounds = fits.joints[-1].bounds
     values = state.values[-1]
@@ -291,11 +320,14 @@ def _warnings_of_values(fits: Fits, state: FitState, errors: StandardErrors) -> 
 
 def _robots(fits: Fits, state: FitState) -> list[RobotSpec]:
     """Return the robot of each set."""
-    robots = [fits.given for _ in state.values]
-    if state.chosen != "given":
-        robots = [with_values(fits.joints[0].robot, v) for v in state.values]
-    if state.links:
-        robots = [replace(one, links=own) for one, own in zip(robots, state.links, strict=True)]
+    robots = []
+    for i, values in enumerate(state.values):
+        robot = fits.given
+        if state.chosen != "given":
+            robot = with_values(fits.joints[i].robot, values)
+        if state.links:
+            robot = replace(robot, links=state.links[i])
+        robots.append(robot)
     return robots
 
 
@@ -308,19 +340,30 @@ def _fitted(
     keep_stops: bool,
 ) -> RobotSpec:
     """Return the robot with the table, and with the given stops unless the fitted ones are kept."""
-    fitted = without_table if table is None else table.robot
+    fitted = without_table
+    has_table = False
+    if table is not None:
+        fitted = table.robot
+        has_table = table.accepted
     if keep_stops:
         return fitted
-    if state.chosen == "given" and not (table and table.accepted):
+    if state.chosen == "given" and not has_table:
         return given
     return fitted.with_servo(stop_low=given.servo.stop_low, stop_high=given.servo.stop_high)
 
 
-def _without_terms(fits: Fits, classic: FitState, fitted: RobotSpec) -> RobotSpec | None:
+def _without_terms(
+    fits: Fits,
+    classic: FitState,
+    fitted: RobotSpec,
+) -> RobotSpec | None:
     """Return the classic fit with the table, zeros and stops of `fitted`, which has terms of the
     servo model.
     """
-    if not fitted.servo.has_terms or fitted.links != fits.given.links or fits.given.servo.has_terms:
+    given = fits.given
+    if given.servo.has_terms or not fitted.servo.has_terms:
+        return None
+    if fitted.links != given.links:
         return None
     plain = with_values(fits.joints[-1].robot, classic.base[-1]).with_table(fitted.scene.table)
     return plain.with_servo(
@@ -331,33 +374,43 @@ def _without_terms(fits: Fits, classic: FitState, fitted: RobotSpec) -> RobotSpe
 
 
 def _held_out(
-    recordings: Recordings, fitted: RobotSpec, robots: ListOf[RobotSpec]
+    recordings: Recordings,
+    fitted: RobotSpec,
+    robots: ListOf[RobotSpec],
 ) -> list[HeldOut]:
     """Return the recordings that judge, and the robot that was fitted without them."""
+    if not recordings.validation:
+        return []
     if len(recordings.splits) == 1:
-        return [HeldOut(recordings.validation, fitted)] if recordings.validation else []
+        return [HeldOut(recordings.validation, fitted)]
     folds = []
-    for (_, part), one in zip(recordings.splits, robots, strict=False):
-        own = one.with_table(fitted.scene.table).with_servo(
+    for i, (_, held_out) in enumerate(recordings.splits):
+        with_table = robots[i].with_table(fitted.scene.table)
+        own = with_table.with_servo(
             stop_low=fitted.servo.stop_low, stop_high=fitted.servo.stop_high
         )
-        folds.append(HeldOut(part, own))
+        folds.append(HeldOut(held_out, own))
     return folds
 
 
 def _errors_by_joint(
-    fits: Fits, first: FitState, state: FitState
+    fits: Fits,
+    first_values: list[Values],
+    state: FitState,
 ) -> dict[str, tuple[float, float]]:
     """Return joint → mean |error| on motions that judge, of the given robot and of the fitted one,
     rad.
     """
-    before = fits.judge.errors_by_joint(first.values).tolist()
+    before = fits.judge.errors_by_joint(first_values).tolist()
     after = fits.judge.errors_by_joint(state.values, state.links).tolist()
-    return dict(zip(fits.given.operated, zip(before, after, strict=True), strict=True))
+    return {joint: (before[i], after[i]) for i, joint in enumerate(fits.given.operated)}
 
 
 def _findings(
-    recordings: Recordings, state: FitState, fitted: RobotSpec, errors: StandardErrors
+    recordings: Recordings,
+    state: FitState,
+    fitted: RobotSpec,
+    errors: StandardErrors,
 ) -> tuple[str, ...]:
     """Return sentences about temperature, backlash and links."""
     findings = [*temperature_findings(recordings.fitted, fitted, errors.std)]

@@ -16,7 +16,8 @@ import numpy as np
 from gaponet.base.arrays import Array
 
 DIFFERENCE_STEP = 0.1  # large changes, of finite differences
-DAMPING_FACTORS = np.array([1e-3, 0.1, 1.0, 30.0])  # of the last damping, evaluated together
+# Of the last damping; all are evaluated together.
+DAMPING_FACTORS = np.array([1e-3, 0.1, 1.0, 30.0])
 DAMPING_BOUNDS = (1e-6, 1e3)
 FIRST_DAMPING = 1e-2
 MIN_RELATIVE_DECREASE = 1e-4  # of the cost, for another iteration
@@ -108,7 +109,13 @@ def descend(
     return _better(best_x, best_cost, x, cost)
 
 
-def _damped_steps(problems: Problems, x: Array, errors: Array, jac: Array, damping: Array) -> Array:
+def _damped_steps(
+    problems: Problems,
+    x: Array,
+    errors: Array,
+    jac: Array,
+    damping: Array,
+) -> Array:
     """Return the points after the Levenberg-Marquardt steps of all DAMPING_FACTORS from x (S, n,
     P), (factors, S, n, P).
 
@@ -125,7 +132,12 @@ def _damped_steps(problems: Problems, x: Array, errors: Array, jac: Array, dampi
     return np.asarray(np.stack(steps) + x)
 
 
-def _better(x: Array, cost: Array, other_x: Array, other_cost: Array) -> tuple[Array, Array]:
+def _better(
+    x: Array,
+    cost: Array,
+    other_x: Array,
+    other_cost: Array,
+) -> tuple[Array, Array]:
     """Return points (S, n, P) and their costs (S, n); of each start the other ones where these
     cost less in the sum over problems.
     """
@@ -146,7 +158,12 @@ def _normal_equations(errors: Array, jac: Array) -> tuple[Array, Array]:
     return normal.astype(float), gradient[..., 0].astype(float)
 
 
-def agreed_slopes(x: Array, low: Array, high: Array, errors: Errors) -> tuple[Array, Array]:
+def agreed_slopes(
+    x: Array,
+    low: Array,
+    high: Array,
+    errors: Errors,
+) -> tuple[Array, Array]:
     """Return errors and differences that both sides agree on: the smaller one, 0 where their signs
     differ.
 
@@ -162,7 +179,13 @@ def agreed_slopes(x: Array, low: Array, high: Array, errors: Errors) -> tuple[Ar
     return here, np.where(signs_agree, smaller, 0)
 
 
-def step(normal: Array, gradient: Array, low: Array, high: Array, damping: Array) -> Array:
+def step(
+    normal: Array,
+    gradient: Array,
+    low: Array,
+    high: Array,
+    damping: Array,
+) -> Array:
     """Return the minima of damped quadratics inside boxes, (…, P): parameters that leave a box are
     fixed at its edge, and the others are solved again.
 

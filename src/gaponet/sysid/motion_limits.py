@@ -26,12 +26,15 @@ from gaponet.sysid.axes import GREATEST_SPEED_QUANTILE, greatest_speeds
 MIN_PERIOD_S = 0.01  # between rows that are compared
 MAX_LAG_S = 0.3  # of a state behind its ramp or command
 LAGS = 16  # that are tried
-SPEED_RATIOS = np.geomspace(0.7, 1.25, 30)  # ramps that are tried, over a joint's greatest speed
+# Of the ramps that are tried, over a joint's greatest speed.
+SPEED_RATIOS = np.geomspace(0.7, 1.25, 30)
 SPEED_SPAN_S = 0.06  # over which a speed is measured
-LAG_TIME_CONSTANTS_S = (0.0, 0.02, 0.04, 0.08, 0.16, 0.32)  # of a servo without a ramp
+# Of servos without a ramp.
+LAG_TIME_CONSTANTS_S = (0.0, 0.02, 0.04, 0.08, 0.16, 0.32)
 MIN_SPEED = 1e-6  # rad/s, of a ramp that is tried
 MIN_LAG_ERROR_RAD = 1e-9  # so that it can be divided by
-MAX_ERROR_RATIO = 0.8  # of a ramp over the best lag, in both halves of the recordings
+# Of a ramp's error over that of the best lag, in both halves of the recordings.
+MAX_ERROR_RATIO = 0.8
 MIN_RAMP_ERROR_RAD = 0.02  # RMS by which a ramp must be behind its command
 MIN_RAMP_DELAY_S = 0.3  # by which it must be behind it at least once
 MIN_BEYOND_STOP_RAD = 0.1  # that commands go beyond a stop, and further there

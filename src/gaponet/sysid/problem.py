@@ -27,7 +27,8 @@ from gaponet.sysid.robot_rollouts import RobotRollouts
 
 ROBOT_WINDOWS = 8  # windows of the fit in the robot's simulator
 STARTS = 4  # of each joint's search
-START_STD = 2.0  # standard deviation of the starts around the first one, large changes
+# Standard deviation of the starts around the first one, large changes.
+START_STD = 2.0
 SHORT_WINDOW_S = 0.5  # a search begins with windows this short
 # Iterations of a joint's search: all starts on short windows, all on whole windows, and the better
 # half.
@@ -47,7 +48,8 @@ MIN_CORRELATION = 0.05  # of an error with itself later; less counts as none
 PRIOR_LOG_STD = {"kp": 0.5, "armature": 1.5, "damping": 1.0}
 PRIORS = len(PRIOR_LOG_STD)
 STATED_KP_LOG_STD = 0.1  # of a kp that recordings state, instead
-MIN_GAIN_OVER_FILE = 1e-3  # over the file's value; a smaller gain counts as this
+# Over the file's value: a smaller gain counts as this.
+MIN_GAIN_OVER_FILE = 1e-3
 
 
 class _GainPrior:
@@ -158,7 +160,12 @@ class JointFit(FitProblem):
 
     rollouts: JointRollouts
 
-    def __init__(self, rollouts: JointRollouts, robot: RobotSpec, bounds: Bounds) -> None:
+    def __init__(
+        self,
+        rollouts: JointRollouts,
+        robot: RobotSpec,
+        bounds: Bounds,
+    ) -> None:
         step = rollouts.dt / rollouts.windows.steps
         super().__init__(rollouts, robot, bounds, _GainPrior(bounds, rollouts.dt), step)
 
@@ -247,14 +254,21 @@ class RobotFit(FitProblem):
 
     rollouts: RobotRollouts
 
-    def search(self, fields: ListOf[str], rest: Values, starts: ListOf[Values]) -> RobotSearch:
+    def search(
+        self,
+        fields: ListOf[str],
+        rest: Values,
+        starts: ListOf[Values],
+    ) -> RobotSearch:
         """Return a search for fields from starts (n,); fields of `rest` that are not fitted
         stay.
         """
         return RobotSearch(self, Axes(self.bounds, fields, rest), starts)
 
     def descend_chains(
-        self, values: Values, report: Callable[[tuple[str, ...], Array], Progress]
+        self,
+        values: Values,
+        report: Callable[[tuple[str, ...], Array], Progress],
     ) -> Values:
         """Fit values (n,) once more, with a joint's parameters judged by all joints of its
         kinematic chain.

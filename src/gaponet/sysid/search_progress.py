@@ -19,13 +19,20 @@ JOINTS_TIME_SHARE = 0.3  # of a time budget
 ROBOT_TIME_SHARE = 0.4
 STEPS_TIME_SHARE = 0.3
 TABLE_ITERATIONS = 20  # of all starts together; only the bar depends on it
-END_TIME_SHARE = 0.15  # of a time budget, for standard errors and comparisons after the searches
+# Of a time budget, for standard errors and comparisons after the searches.
+END_TIME_SHARE = 0.15
 
 
 class SearchProgress:
     """Progress of the searches; and the time that each may take, where the time is limited."""
 
-    def __init__(self, seconds: float | None, steps: int, fits: int, progress: Progress) -> None:
+    def __init__(
+        self,
+        seconds: float | None,
+        steps: int,
+        fits: int,
+        progress: Progress,
+    ) -> None:
         """Begin the time of the searches of so many steps after the classic fit, in so many fits.
 
         Args:
@@ -108,7 +115,12 @@ class SearchProgress:
         """Return whether the time of all searches is over."""
         return self._seconds is not None and time.monotonic() - self._began > self._seconds
 
-    def reporter(self, what: str, joints: tuple[str, ...], rows: Array) -> Callable[[Array], bool]:
+    def reporter(
+        self,
+        what: str,
+        joints: tuple[str, ...],
+        rows: Array,
+    ) -> Callable[[Array], bool]:
         """Return a function of the costs (n,) of problems of so many rows (n,), which says whether
         to end the search.
 

@@ -20,9 +20,12 @@ from gaponet.robot.toml_file import MEASURED_FIELDS, Spread
 from gaponet.sysid.axes import first_values, identified_joints
 from gaponet.sysid.uncertainty import ParameterUncertainty, summarize
 
-MAX_RATIO = 10.0  # of a value to the nearest end of its servo type's interval, or the reverse
-MIN_CHANGE = 0.01  # relative; a value that differs less from the nominal one was not determined
-NORMAL_QUANTILES = norm.ppf((np.arange(400) + 0.5) / 400)  # a normal distribution as 400 numbers
+# Of a value to the nearest end of its servo type's interval, or the reverse.
+MAX_RATIO_TO_TYPE = 10.0
+# A value that differs less from the nominal one was not determined.
+MIN_RELATIVE_CHANGE = 0.01
+# A normal distribution as 400 numbers.
+NORMAL_QUANTILES = norm.ppf((np.arange(400) + 0.5) / 400)
 # Parts of a joint's name, separated by _, that are exchanged for its mirror image.
 SIDES = {"left": "right", "l": "r", "fl": "fr", "rl": "rr", "lf": "rf", "lh": "rh"}
 OTHER_SIDE = SIDES | {right: left for left, right in SIDES.items()}
@@ -55,7 +58,12 @@ def servos_like(robot: RobotSpec, like: RobotSpec) -> tuple[RobotSpec, dict[str,
     return started, sources
 
 
-def _servo_like(robot: RobotSpec, joint: str, like: RobotSpec, source: str) -> dict[str, float]:
+def _servo_like(
+    robot: RobotSpec,
+    joint: str,
+    like: RobotSpec,
+    source: str,
+) -> dict[str, float]:
     """Return the identified servo of a joint of `like` for a joint of `robot`: field → value."""
     taken = [field.name for field in SERVO_FIELDS.values() if field.shared or field.name == "delay"]
     taken.remove("effort_limit")
@@ -121,7 +129,7 @@ def far_from_servo_type(robot: RobotSpec) -> list[str]:
                 continue
             value = float(robot.servo[field][i])
             nearest = float(np.clip(value, usual.low, usual.high))
-            is_far = max(value, nearest) > MAX_RATIO * min(value, nearest)
+            is_far = max(value, nearest) > MAX_RATIO_TO_TYPE * min(value, nearest)
             if nearest > 0 and is_far:
                 sentences.append(
                     f"{robot.joint_names[i]}: {field} {value:.3g} is {value / nearest:.2g} times "
@@ -130,7 +138,11 @@ def far_from_servo_type(robot: RobotSpec) -> list[str]:
     return sentences
 
 
-def measured_types(robots: ListOf[RobotSpec], source: str, licence: str) -> list[ServoType]:
+def measured_types(
+    robots: ListOf[RobotSpec],
+    source: str,
+    licence: str,
+) -> list[ServoType]:
     """Return the servo types of identified joints with their measured values.
 
     A value is the median of its joints. Its interval holds 5 to 95 % of the joints' estimates, each
@@ -153,7 +165,11 @@ def measured_types(robots: ListOf[RobotSpec], source: str, licence: str) -> list
     return [_measured_type(joints, source, licence) for joints in by_type.values()]
 
 
-def _measured_type(joints: list[_MeasuredServo], source: str, licence: str) -> ServoType:
+def _measured_type(
+    joints: list[_MeasuredServo],
+    source: str,
+    licence: str,
+) -> ServoType:
     """Return the type that joints have, with their measured values."""
     units: set[tuple[int, str]] = set()
     for joint in joints:
@@ -196,7 +212,7 @@ def _measured_servos(number: int, robot: RobotSpec) -> list[_MeasuredServo]:
         estimates = {}
         for field in MEASURED_FIELDS:
             change = abs(now[field][k] - then[field][k])
-            if change >= MIN_CHANGE * abs(then[field][k]):
+            if change >= MIN_RELATIVE_CHANGE * abs(then[field][k]):
                 estimates[field] = (float(now[field][k]), errors.get(field, 0.0))
         servos.append(_MeasuredServo(servo, units, estimates))
     return servos

@@ -18,7 +18,8 @@ from gaponet.sysid.axes import MIN_EXCITATION_RAD, Axes, Bounds, Values
 from gaponet.sysid.least_squares import agreed_slopes
 from gaponet.sysid.problem import MIN_GAIN_OVER_FILE, PRIORS, FitProblem, fitted_fields
 
-MIN_CLUSTERS = 24  # parts of the recordings that count as independent of each other
+# Parts of the recordings that count as independent of each other.
+MIN_CLUSTERS = 24
 # Of a fitted gain to the file's, or the reverse: one standard deviation of damping's prior. A
 # larger ratio is doubted.
 MAX_GAIN_RATIO = 2.7
@@ -31,7 +32,8 @@ UNIFORM_STD = 0.29  # of what is uniformly distributed over one step
 MIN_SLOPE = 3e-5
 UNKNOWN_STD = 1e3  # large changes, of a parameter that no row depends on
 DERIVATIVE_STEP = 1e-3  # large changes, of the delta method
-MAX_RELATIVE_STD = 0.15  # of a value and of its scale; beyond it the parameter is not determined
+# Of a value and of its scale: beyond it the parameter is not determined.
+MAX_RELATIVE_STD = 0.15
 # Speed → the field without which it has no effect.
 NEEDED_BY_SPEED = {"stribeck_speed": "stribeck", "no_load_speed": "no_load_speed"}
 
@@ -133,7 +135,13 @@ def _in_axis_units(axes: Axes, covariance: Array, unseen: Array) -> Array:
     return np.asarray(unit * (covariance + of_unseen) * np.swapaxes(unit, -1, -2))
 
 
-def _std_in_si(axes: Axes, x: Array, values: Values, covariance: Array, unseen: Array) -> Values:
+def _std_in_si(
+    axes: Axes,
+    x: Array,
+    values: Values,
+    covariance: Array,
+    unseen: Array,
+) -> Values:
     """Return the standard errors of fields in SI units, (n,), by the delta method.
 
     Args:
@@ -260,7 +268,11 @@ class _Undetermined(NamedTuple):
 
 
 def _undetermined(
-    problem: FitProblem, values: Values, axes: Axes, std: Values, std_on_axes: Array
+    problem: FitProblem,
+    values: Values,
+    axes: Axes,
+    std: Values,
+    std_on_axes: Array,
 ) -> dict[str, _Undetermined]:
     """Return what the recordings do not determine, by joint: all fields of unexcited joints.
 
@@ -292,7 +304,11 @@ def _undetermined(
 
 
 def _wide_fields(
-    values: Values, axes: Axes, std: Values, std_on_axes: Array, joint: int
+    values: Values,
+    axes: Axes,
+    std: Values,
+    std_on_axes: Array,
+    joint: int,
 ) -> tuple[list[str], list[str]]:
     """Return the fields of a joint that the recordings do not determine, and which of them not
     even over kp.

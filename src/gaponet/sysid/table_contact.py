@@ -30,14 +30,16 @@ from gaponet.sysid.robot_rollouts import RobotRollouts
 
 # Above the lowest tip, or above the table. Below this a joint's wrong zero may hide a contact.
 CONTACT_CLEARANCE_M = 0.045
-WINDOW_S = 2.5  # of a rollout; longer ones cost more and do not find a better table
+# Of a rollout: longer ones cost more and do not find a better table.
+WINDOW_S = 2.5
 MAX_WINDOWS = 14
 MAX_WINDOWS_PER_MOTION = 2
 START_HEIGHTS = 10  # that are tried, from below the lowest tip upwards
 START_HEIGHT_STEP_M = 0.005
 FAR_BELOW_M = 10.0  # the lowest tip: a table that nothing touches
 ITERATIONS = 6  # of the search from one start
-FIRST_COMPARISON = 2  # iterations after which a start goes on only if no other cost less by then
+# After so many iterations a start goes on only if no other cost less by then.
+COMPARED_AFTER_ITERATIONS = 2
 HEIGHT_CHANGE_M = 0.004  # a large change
 MAX_HEIGHT_CHANGE_M = 0.03  # from the start
 ZERO_STD_RAD = 0.02  # of a usual zero
@@ -45,7 +47,8 @@ ZERO_CHANGE_RAD = 0.01  # a large change
 MAX_ZERO_RAD = 0.1
 ZERO_DECIMALS = 6  # of rad; a joint that turns no tip keeps a zero of exactly 0
 ZERO_PRICE = 2e-3  # cost of a zero of ZERO_STD_RAD, per row
-PRIOR_ROWS = 1000  # that share the price of the zeros, so that its soft L1 cost is nearly quadratic
+# Rows that share the price of the zeros, so that its soft L1 cost is nearly quadratic.
+PRIOR_ROWS = 1000
 
 
 class _Search(NamedTuple):
@@ -58,8 +61,9 @@ class _Search(NamedTuple):
 
 
 FRICTION = _Search(0.0, 1.5, 0.15, 0.3)
-LOG_STIFFNESS = _Search(np.log(100.0), np.log(1e5), 0.7, np.log(2000.0))  # of N/m
-START_LOG_STIFFNESS = tuple(np.log((500.0, 8000.0)))  # of searches by themselves
+# Logarithms of N/m: of the search, and of starts that are searched by themselves.
+LOG_STIFFNESS = _Search(np.log(100.0), np.log(1e5), 0.7, np.log(2000.0))
+START_LOG_STIFFNESS = tuple(np.log((500.0, 8000.0)))
 
 
 @dataclass(frozen=True)
@@ -107,7 +111,9 @@ def contact_height(robot: RobotSpec, heights: ListOf[Array]) -> float:
 
 
 def low_windows(
-    sequences: ListOf[Sequence], heights: ListOf[Array], below: float
+    sequences: ListOf[Sequence],
+    heights: ListOf[Array],
+    below: float,
 ) -> list[Sequence]:
     """Return the windows in which a tip comes below a height, m, the longest first."""
     windows = []
@@ -176,7 +182,11 @@ def fit_table(
 
 
 def _judged(
-    scene: _TableRollouts, given: RobotSpec, fitted: RobotSpec, before: Array, after: Array
+    scene: _TableRollouts,
+    given: RobotSpec,
+    fitted: RobotSpec,
+    before: Array,
+    after: Array,
 ) -> TableFit:
     """Return the fitted robot with a table if the windows' motions accept it, else the given one.
 
@@ -191,7 +201,11 @@ def _judged(
 
 
 def _most_wrong_windows(
-    parts: list[Sequence], robot: RobotSpec, away: Array, lowest: float, nthread: int
+    parts: list[Sequence],
+    robot: RobotSpec,
+    away: Array,
+    lowest: float,
+    nthread: int,
 ) -> _TableRollouts:
     """Return rollouts of the windows that go most wrong with a table `away`, on a robot with a
     table: its own, or one at `lowest`, m.
@@ -252,7 +266,9 @@ class _TableProgress:
         self._report = report
         self._rows = rows
         self._iterations = 0  # of the present start
-        self._least_cost = np.inf  # of the starts before, after FIRST_COMPARISON iterations
+        self._least_cost = (
+            np.inf
+        )  # of the starts before, after COMPARED_AFTER_ITERATIONS iterations
 
     def begin_start(self) -> None:
         """Begin with the next start."""
@@ -260,13 +276,13 @@ class _TableProgress:
 
     def ends(self, costs: Array) -> bool:
         """Report an iteration; return whether the search from this start ends: the time is over,
-        or another start cost less after FIRST_COMPARISON iterations.
+        or another start cost less after COMPARED_AFTER_ITERATIONS iterations.
         """
         self._iterations += 1
         cost = float(costs.sum())
         rms = ERROR_SCALE_RAD * float(np.sqrt(2 * cost / self._rows))
         self.is_over = bool(self._report(rms))
-        if self._iterations != FIRST_COMPARISON:
+        if self._iterations != COMPARED_AFTER_ITERATIONS:
             return self.is_over
         if cost > self._least_cost:
             return True
@@ -275,7 +291,11 @@ class _TableProgress:
 
 
 def _search_near(
-    scene: _TableRollouts, start: Array, progress: _TableProgress, *, is_measured: bool
+    scene: _TableRollouts,
+    start: Array,
+    progress: _TableProgress,
+    *,
+    is_measured: bool,
 ) -> tuple[Array, float]:
     """Return the best table and zeros (3 + n,) near a start, and their cost."""
     rows = len(scene.window) * scene.n

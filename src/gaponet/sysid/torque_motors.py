@@ -33,15 +33,19 @@ MIN_SPEED = 0.05  # rad/s of rows that show friction
 DELAYS_S = np.arange(0.0, 0.0405, 0.001)
 JACKKNIFE_BLOCKS = 10  # of the rows, each left out once
 HORIZONS_S = (0.1, 0.5, 1.0)
-PARAMETERS = (*PASSIVE_FIELDS, "bias", "constant")  # of the regression, in the order of its columns
+# Of the regression, in the order of its columns.
+PARAMETERS = (*PASSIVE_FIELDS, "bias", "constant")
 LOWEST = np.array([0.0, 0.0, 0.0, -np.inf, 1e-9])  # of PARAMETERS
-WITHOUT_ROWS = np.array([0.0, 0.0, 0.0, 0.0, 1.0])  # PARAMETERS where too few rows move
+# PARAMETERS where too few rows move.
+UNFITTED = np.array([0.0, 0.0, 0.0, 0.0, 1.0])
 PART_S = 4.0  # of recordings that fit and judge in turn
 MIN_PART_S = 2.0  # of the last one of a recording
 MIN_ROWS = 20  # of a regression
-HUBER_SCALE = 1.345  # standard deviations, beyond which a row counts less: somebody pushed
+# Standard deviations, beyond which a row counts less: somebody pushed.
+HUBER_SCALE = 1.345
 HUBER_ROUNDS = 10
-MAD_TO_STD = 1.4826  # standard deviation of normal numbers over their median absolute deviation
+# Standard deviation of normal numbers over their median absolute deviation.
+MAD_TO_STD = 1.4826
 
 
 class _Rows(NamedTuple):
@@ -81,7 +85,10 @@ class TorqueDrivenFit:
 
 
 def fit_torque_driven(
-    train: ListOf[Sequence], judging: ListOf[Sequence], robot: RobotSpec, constant: bool = False
+    train: ListOf[Sequence],
+    judging: ListOf[Sequence],
+    robot: RobotSpec,
+    constant: bool = False,
 ) -> TorqueDrivenFit:
     """Fit the joints one by one, and judge all together.
 
@@ -207,7 +214,12 @@ def _late_torques(s: Sequence, joints: Array) -> Array:
     return np.array(torques)
 
 
-def _system(rows: ListOf[_Rows], j: int, constant: bool, lag: int) -> tuple[Array, Array]:
+def _system(
+    rows: ListOf[_Rows],
+    j: int,
+    constant: bool,
+    lag: int,
+) -> tuple[Array, Array]:
     """Return the regression's columns, in the order of PARAMETERS, and its right-hand side, of the
     rows in which joint j moves.
 
@@ -238,7 +250,7 @@ def _solved(a: Array, y: Array) -> tuple[Array, float]:
     """
     columns = a.shape[1]
     if len(y) < MIN_ROWS:
-        return WITHOUT_ROWS, np.inf
+        return UNFITTED, np.inf
     weight = np.ones(len(y))
     for _ in range(HUBER_ROUNDS):
         q, r = np.linalg.qr(a * weight[:, None])
@@ -278,7 +290,10 @@ def _jackknife(rows: ListOf[_Rows], j: int, constant: bool, lag: int) -> Array:
 
 
 def _residual(
-    rows: ListOf[_Rows], passive: dict[str, Array], constant: Array, lags: Array
+    rows: ListOf[_Rows],
+    passive: dict[str, Array],
+    constant: Array,
+    lags: Array,
 ) -> Array:
     """Return the median |recorded − required torque|, (n,) N·m.
 
@@ -305,7 +320,11 @@ def _starts(s: Sequence) -> Array:
     return np.arange(0, last, max(1, round(HORIZONS_S[1] / s.dt)))
 
 
-def _ahead(sequences: ListOf[Sequence], robot: RobotSpec, constant: Array) -> dict[float, Array]:
+def _ahead(
+    sequences: ListOf[Sequence],
+    robot: RobotSpec,
+    constant: Array,
+) -> dict[float, Array]:
     """Return horizon → median |error| of the operated joints, driven by the torque from recorded
     states, (n,) rad.
     """
@@ -336,7 +355,11 @@ def _acting_torque(s: Sequence, robot: RobotSpec, constant: Array) -> Array:
 
 
 def _played(
-    s: Sequence, model: mujoco.MjModel, torque: Array, qvel: Array, start: int
+    s: Sequence,
+    model: mujoco.MjModel,
+    torque: Array,
+    qvel: Array,
+    start: int,
 ) -> list[Array]:
     """Return |simulated − recorded position| of all joints at each of HORIZONS_S, (joints,) rad,
     from the recorded state in row `start`.

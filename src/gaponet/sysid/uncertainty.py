@@ -33,7 +33,8 @@ PLAY = "play"
 # Relative standard errors from which a parameter had no visible effect.
 UNSEEN_ERROR_OF_ZERO = 1.0
 UNSEEN_ERROR = 3.0  # of another value
-AT_BOUND = 0.05  # standard errors: a value nearer to zero has ended at this bound
+# Standard errors: a value nearer to zero has ended at this bound.
+MAX_STDS_AT_BOUND = 0.05
 DERIVATIVE_STEP = 1e-6  # on an axis, of the delta method
 # Parameters that correlate so much, and have at least this relative error, are known only as a set.
 MIN_SET_CORRELATION = 0.9
@@ -109,7 +110,10 @@ class LinkUncertainty:
 
     @classmethod
     def of(
-        cls, result: LinkResult | None, robot: RobotSpec, fields: ListOf[str]
+        cls,
+        result: LinkResult | None,
+        robot: RobotSpec,
+        fields: ListOf[str],
     ) -> LinkUncertainty | None:
         """Return the uncertainty of a fit that began with the file's links, if the robot has the
         fitted ones.
@@ -178,9 +182,8 @@ class ParameterUncertainty:
         for joint, values in to_axes(robot, self.fields).items():
             stored = self.joints.get(joint)
             if stored is None or not np.allclose(values, stored.values, rtol=1e-4, atol=1e-5):
-                raise RobotError(
-                    f"{file}: its values are other values than robot.toml's, at {joint}; {REPAIR_HINT}"
-                )
+                what = f"its values are other values than robot.toml's, at {joint}"
+                raise RobotError(f"{file}: {what}; {REPAIR_HINT}")
         if self.links and not self.links.are_of(robot):
             raise RobotError(f"{file}: its links are other links than robot.toml's; {REPAIR_HINT}")
 
@@ -280,7 +283,7 @@ class JointSummary:
             return "none seen"
         if value != 0 and relative > UNSEEN_ERROR:
             return f"{value:.3g} (no log shows it)"
-        ended_at_zero = not record.signed and value < AT_BOUND * error
+        ended_at_zero = not record.signed and value < MAX_STDS_AT_BOUND * error
         if ended_at_zero:  # a delay below zero does not exist
             return f"at most {value + 2 * error:.2g}"
         return format_uncertainty(value, error)
@@ -305,7 +308,12 @@ def summarize(uncertainty: ParameterUncertainty, joint: str) -> JointSummary:
     return replace(summary, sets=tuple(of_several))
 
 
-def format_change(field: str, change: float, uncertainty: ParameterUncertainty, joint: str) -> str:
+def format_change(
+    field: str,
+    change: float,
+    uncertainty: ParameterUncertainty,
+    joint: str,
+) -> str:
     """Return a change of a field on its axis, or of play, as text."""
     if field == PLAY:
         return f"{1e3 * change:+.1f} mrad"

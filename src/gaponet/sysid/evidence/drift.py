@@ -34,13 +34,16 @@ from gaponet.sysid.evidence.evidence import (
 from gaponet.sysid.joint_rollouts import ERROR_SCALE_RAD
 from gaponet.sysid.uncertainty import PLAY, ParameterUncertainty
 
-FALSE_ALARM_RATE = 0.003  # of a robot that did not change, for all its parameters together
+# Of a robot that did not change, for all its parameters together.
+FALSE_ALARM_RATE = 0.003
 FALSE_CONTRADICTION_RATE = 1e-4  # of recordings that agree
-MIN_EFFECT_RATIO = 0.15  # of a change's effect on the joint's path, over the residual
+# Of a change's effect on the joint's path, over the residual.
+MIN_EFFECT_RATIO = 0.15
 MAX_CHANGES_PER_JOINT = 3
 MAX_PRIOR_CLUSTERS = 40  # that the identification's overdispersion counts as
 MAX_SET_ASIDE = 0.4  # of the recordings; more of them contradict the others
-MIN_INFORMATION_OF_OTHERS = 0.5  # over that of the recording which is compared with them
+# Over that of the recording which is compared with them.
+MIN_INFORMATION_OF_OTHERS = 0.5
 COMMON_FIELDS = ("delay",)  # of one bus: those of all joints change together
 EVERY_JOINT = "every joint"
 FRICTION_FIELDS = ("damping", "frictionloss", "stribeck")
@@ -181,7 +184,9 @@ def _require_identified(robot: RobotSpec, own: Evidence) -> None:
 
 
 def _repeatability(
-    uncertainty: ParameterUncertainty, sequences: ListOf[Sequence], joints: ListOf[str]
+    uncertainty: ParameterUncertainty,
+    sequences: ListOf[Sequence],
+    joints: ListOf[str],
 ) -> dict[str, float]:
     """Return joint → RMS difference between two recordings of one command, rad: that of the
     identification.
@@ -213,7 +218,10 @@ def _far_joints(
 
 
 def _contradictions(
-    own: Evidence, overdispersion: Array, uncertainty: ParameterUncertainty, joints: ListOf[str]
+    own: Evidence,
+    overdispersion: Array,
+    uncertainty: ParameterUncertainty,
+    joints: ListOf[str],
 ) -> list[Contradiction]:
     """Return the recordings that contradict the others, the farthest first; each is left out of
     the others.
@@ -386,7 +394,11 @@ class _Joint:
         return changes
 
 
-def _together(joints: ListOf[_Joint], number: int, threshold: float) -> ParameterChange | None:
+def _together(
+    joints: ListOf[_Joint],
+    number: int,
+    threshold: float,
+) -> ParameterChange | None:
     """Return a parameter that changed in every joint by the same, if that is more significant than
     the joints' own changes; it is then taken out of their gradients.
     """
@@ -464,7 +476,10 @@ class _Difference(NamedTuple):
 
 
 def _differences(
-    own: Evidence, joint: int, recording: int, overdispersion: Array
+    own: Evidence,
+    joint: int,
+    recording: int,
+    overdispersion: Array,
 ) -> list[_Difference]:
     """Return by how much a recording differs from all others together, for one joint; without
     parameters of which the others say too little.

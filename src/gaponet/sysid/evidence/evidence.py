@@ -35,7 +35,8 @@ WINDOWS = 40  # of 8 s
 PLAY_TURN_RAD = 0.002  # servo error at which play has changed sides
 MIN_RELATIVE_INFORMATION = 1e-6  # of a parameter; less counts as none
 BOUND_QUANTILE = 0.9  # of all samples
-MIN_RECORDINGS_AS_CLUSTERS = 6  # fewer recordings are divided into more clusters
+# Fewer recordings are divided into more clusters.
+MIN_RECORDINGS_AS_CLUSTERS = 6
 
 
 @dataclass(frozen=True)
@@ -133,7 +134,9 @@ def evidence(
 
 
 def _slopes_of_joints(
-    rollouts: JointRollouts, bounds: Bounds, fields: ListOf[str]
+    rollouts: JointRollouts,
+    bounds: Bounds,
+    fields: ListOf[str],
 ) -> tuple[Array, Array]:
     """Return the errors at the robot's own values, (n, rows) in ERROR_SCALE_RAD, and their slopes
     over the fields on their axes and over play, (n, rows, Q).
@@ -292,7 +295,10 @@ def _fitted_fields(robot: RobotSpec) -> tuple[str, ...]:
 
 
 def _no_better(
-    today: JointUncertainty, old: JointUncertainty, *, errors_are_of_fit: bool
+    today: JointUncertainty,
+    old: JointUncertainty,
+    *,
+    errors_are_of_fit: bool,
 ) -> JointUncertainty:
     """Return a joint's uncertainty with repetitions that differ no less than before.
 
@@ -311,7 +317,9 @@ def _no_better(
 
 
 def _provenance(
-    sequences: ListOf[Sequence], joints: Mapping[str, JointUncertainty], made_by: str
+    sequences: ListOf[Sequence],
+    joints: Mapping[str, JointUncertainty],
+    made_by: str,
 ) -> Provenance:
     """Return where values and covariances come from."""
     return {
@@ -326,7 +334,9 @@ def _provenance(
 
 
 def _overdispersion(
-    own: Evidence, before: ParameterUncertainty | None, joints: ListOf[str]
+    own: Evidence,
+    before: ParameterUncertainty | None,
+    joints: ListOf[str],
 ) -> tuple[int, Array]:
     """Return the number of clusters, and the variance of their gradients over that of independent
     rows, (n, Q).
@@ -375,7 +385,10 @@ def _covariance(
 
 
 def _beside_earlier(
-    joint: str, values: Array, from_rows: Array, before: ParameterUncertainty
+    joint: str,
+    values: Array,
+    from_rows: Array,
+    before: ParameterUncertainty,
 ) -> Array:
     """Return the covariance of a joint's values (P,) by new recordings and by those before, whose
     variance grows by how far the values moved beyond both; (P, P).

@@ -35,8 +35,10 @@ RANGE_SHARE = 0.5  # of a joint's interval, from home, beside others
 # Playing on is worth its time while this time reduces the errors by this share.
 WORTH_INTERVAL_S = 30.0
 MIN_WORTH = 0.05
-MAX_KP_ERROR = 0.1  # relative, after all motions; more means that they do not determine it
-EPSILON = 1e-9  # of information, so that a parameter without any can be divided by it
+# Relative, after all motions: more means that they do not determine it.
+MAX_KP_ERROR = 0.1
+# So that a parameter without any can be divided by it.
+MIN_INFORMATION = 1e-9
 MIN_GAIN = 1e-9  # of the mean log error, by an exchange
 
 
@@ -53,7 +55,10 @@ class ExperimentDesign:
 
     @classmethod
     def from_recordings(
-        cls, robot: RobotSpec, uncertainty: ParameterUncertainty, recordings: ListOf[Sequence]
+        cls,
+        robot: RobotSpec,
+        uncertainty: ParameterUncertainty,
+        recordings: ListOf[Sequence],
     ) -> ExperimentDesign:
         """Make the design from simulated recordings of the identified robot; their names differ."""
         own = evidence(robot, recordings, uncertainty.fields, 10**6).by_recording()
@@ -73,9 +78,11 @@ class ExperimentDesign:
 
     def _covariance_with(self, normal: Array) -> Array:
         """Return the covariance after recordings with this information, (…, n, P, P)."""
-        size = np.sqrt(np.maximum(np.einsum("...ii->...i", normal), EPSILON))
+        size = np.sqrt(np.maximum(np.einsum("...ii->...i", normal), MIN_INFORMATION))
         scale = size[..., :, None] * size[..., None, :]
-        scaled = normal / scale + EPSILON * np.eye(normal.shape[-1])  # with a diagonal of one
+        scaled = normal / scale + MIN_INFORMATION * np.eye(
+            normal.shape[-1]
+        )  # with a diagonal of one
         less_sure = scaled / np.sqrt(self.overdispersion)[:, None, :]
         added = less_sure @ np.linalg.solve(scaled, np.swapaxes(less_sure, -1, -2))
         added = size[..., :, None] * added * size[..., None, :]
@@ -229,7 +236,9 @@ def _at_once(library: Library, variant: int) -> Motion:
 
 
 def simulated_recordings(
-    robot: RobotSpec, motions: ListOf[Motion], payload: float
+    robot: RobotSpec,
+    motions: ListOf[Motion],
+    payload: float,
 ) -> list[Sequence]:
     """Return recordings of motions that the robot would make as it is identified."""
     commanded = []

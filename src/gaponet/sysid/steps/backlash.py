@@ -19,7 +19,8 @@ from gaponet.sysid.axes import Values
 from gaponet.sysid.problem import JointFit
 
 SCREENED_WIDTHS_RAD = (1e-3, 2.5e-3, 5e-3, 1e-2, 2e-2)
-MIN_SCREENED_GAIN = 0.02  # of a joint's squared error, at otherwise equal values
+# Of a joint's squared error, at otherwise equal values.
+MIN_SCREENED_GAIN = 0.02
 MIN_PROBABILITY = 0.9  # of a gap that stays in the robot
 MIN_WIDTH_RAD = 5e-4  # of a gap that is reported though it is not probable
 MIN_SQUARED_ERROR = 1e-12  # rad², so that a ratio of two stays finite
@@ -68,7 +69,11 @@ def _squared_error(fit: JointFit, values: Values) -> Array:
     return np.asarray(np.square(errors).sum(axis=1))
 
 
-def only_probable(without: ListOf[Values], values: ListOf[Values], chance: Array) -> list[Values]:
+def only_probable(
+    without: ListOf[Values],
+    values: ListOf[Values],
+    chance: Array,
+) -> list[Values]:
     """Return values (n,) with backlash at the joints where it is probable, and the others'
     without.
     """
@@ -83,7 +88,10 @@ def only_probable(without: ListOf[Values], values: ListOf[Values], chance: Array
 
 
 def findings(
-    joints: ListOf[str], width: Array, chance: Array, std: Mapping[str, Mapping[str, float]]
+    joints: ListOf[str],
+    width: Array,
+    chance: Array,
+    std: Mapping[str, Mapping[str, float]],
 ) -> tuple[str, ...]:
     """Return a sentence for each joint with backlash, or with a gap that friction explains as well.
 

@@ -73,7 +73,9 @@ def _joint_candidates(joints: JointFit, progress: SearchProgress) -> dict[str, V
 
 
 def robot_candidates(
-    fits: Fits, robots: list[RobotFit], alone: list[Values]
+    fits: Fits,
+    robots: list[RobotFit],
+    alone: list[Values],
 ) -> dict[str, list[Values]]:
     """Fit all joints together, from their own fits and from the robot's file; return nothing if
     that does not help.
@@ -110,7 +112,11 @@ def _loses_much(judge: Judge, alone: list[Values], together: list[Values]) -> bo
     return bool(judge.errors(together).mean() > largest)
 
 
-def _chain_fits(fits: Fits, robots: list[RobotFit], together: list[Values]) -> list[Values]:
+def _chain_fits(
+    fits: Fits,
+    robots: list[RobotFit],
+    together: list[Values],
+) -> list[Values]:
     """Return fits of the kinematic chains that begin with values of all joints together."""
 
     def reporter(joints: tuple[str, ...], rows: Array) -> Progress:
@@ -122,7 +128,11 @@ def _chain_fits(fits: Fits, robots: list[RobotFit], together: list[Values]) -> l
     return chains
 
 
-def _has_time_for_iterations(fits: Fits, robots: list[RobotFit], alone: list[Values]) -> bool:
+def _has_time_for_iterations(
+    fits: Fits,
+    robots: list[RobotFit],
+    alone: list[Values],
+) -> bool:
     """Return whether the time is enough for the first iterations of all joints together.
 
     What they take follows from the time that the judge's motions take, which are simulated once in
@@ -143,7 +153,10 @@ def _has_time_for_iterations(fits: Fits, robots: list[RobotFit], alone: list[Val
 
 
 def _iterate(
-    fits: Fits, robots: list[RobotFit], searches: list[RobotSearch], iterations: int
+    fits: Fits,
+    robots: list[RobotFit],
+    searches: list[RobotSearch],
+    iterations: int,
 ) -> None:
     """Go on with the searches for all joints together."""
     for robot, search in zip(robots, searches, strict=True):

@@ -35,18 +35,24 @@ from gaponet.sysid.standard_errors import cluster_sums
 DYNAMICS_ROWS = 400  # of recordings, about, whose torques choose directions
 MIN_INFORMATION = 1.0  # of a direction that is fitted, over the prior's
 MAX_DIRECTIONS = 12
-MIN_KP_LOG_STD = 0.05  # of a kp from recorded torque, whose scale is a motor constant
+# Of a kp from recorded torque, whose scale is a motor constant.
+MIN_KP_LOG_STD = 0.05
 ITERATIONS = (1, 2)  # with the first residual, and with what that leaves
-FIRST_RESIDUAL_SHARE = 0.25  # of the servos' residual, which wrong links may have caused
-JOINT_WEIGHT_BOUNDS = (0.3, 3.0)  # of a joint's errors, over those of a joint of mean residual
-MAX_SERVO_NUMBERS = 36  # that are fitted with the links; of robots with more, FEW_FIELDS
+# Of the servos' residual, which wrong links may have caused.
+FIRST_RESIDUAL_SHARE = 0.25
+# Of a joint's errors, over those of a joint of mean residual.
+JOINT_WEIGHT_BOUNDS = (0.3, 3.0)
+# That are fitted with the links; of robots with more, only FEW_FIELDS are.
+MAX_SERVO_NUMBERS = 36
 FEW_FIELDS = ("kp", "armature")
 # Of a link's coordinates, in standard deviations of the prior: a smaller change is none.
 MIN_CHANGE = 0.1
 MAX_CHANGE = 6.0
-ENCODER_ZERO_STD_RAD = 0.006  # a third of a degree, as a joint's zero at its stop is set by hand
+# A third of a degree, as a joint's zero at its stop is set by hand.
+ENCODER_ZERO_STD_RAD = 0.006
 PINV_RCOND = 1e-10  # eigenvalues that are smaller by this count as none
-MIN_SIGNIFICANCE = 2.0  # standard errors, of the change along some direction; else all links stay
+# Standard errors, of the change along some direction; else all links stay.
+MIN_SIGNIFICANCE = 2.0
 
 
 class _DynamicsRows(NamedTuple):
@@ -72,7 +78,10 @@ class LinkFit:
     """
 
     def __init__(
-        self, whole: RobotFit, values: Values, torque_kp: dict[str, tuple[float, float]]
+        self,
+        whole: RobotFit,
+        values: Values,
+        torque_kp: dict[str, tuple[float, float]],
     ) -> None:
         """
         Args:

@@ -19,7 +19,10 @@ from gaponet.sysid.steps.torque_fit import MAX_WINDOWS, OPTIONS, TorqueFit, Torq
 
 
 def with_torque(
-    fitted: Identified, splits: ListOf[Split], given: RobotSpec, nthread: int
+    fitted: Identified,
+    splits: ListOf[Split],
+    given: RobotSpec,
+    nthread: int,
 ) -> Identified:
     """Return the fit from torque if motions that were not fitted accept it, else `fitted`.
 
@@ -86,7 +89,11 @@ def _best_options(
     return best, tried[best]
 
 
-def _standard_errors(robot: RobotSpec, recordings: list[Sequence], nthread: int) -> StandardErrors:
+def _standard_errors(
+    robot: RobotSpec,
+    recordings: list[Sequence],
+    nthread: int,
+) -> StandardErrors:
     """Return the standard errors of a robot's classic fields, from positions."""
     bounds = Bounds(robot, recordings)
     rollouts = JointRollouts(cut(recordings, MAX_WINDOWS), robot, nthread=nthread)
@@ -95,7 +102,9 @@ def _standard_errors(robot: RobotSpec, recordings: list[Sequence], nthread: int)
 
 
 def _before_and_after(
-    fitted: Identified, folds: ListOf[HeldOut], nthread: int
+    fitted: Identified,
+    folds: ListOf[HeldOut],
+    nthread: int,
 ) -> dict[str, tuple[float, float]]:
     """Return joint → mean |error| of the given robot, as `fitted` has it, and of the fit from
     torque, over recordings that were not fitted, rad.

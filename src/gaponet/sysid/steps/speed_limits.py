@@ -27,7 +27,11 @@ def seen_speed_limits(sequences: ListOf[Sequence], robot: RobotSpec) -> SpeedLim
     return limits
 
 
-def better_of(plain: Identified, limited: Identified, limits: SpeedLimits) -> Identified:
+def better_of(
+    plain: Identified,
+    limited: Identified,
+    limits: SpeedLimits,
+) -> Identified:
     """Return the fit with speed limits if motions that were not fitted accept it, else the one
     without.
     """

@@ -31,20 +31,23 @@ from gaponet.sysid.least_squares import Problems, descend
 from gaponet.sysid.robot_rollouts import cut
 
 MAX_WINDOWS = 80  # more than elsewhere, since they may be short
-MIN_BALANCE_STRIDE = 5  # rows of a recording, between those that place the payload
+# Rows of a recording, between those that place the payload.
+MIN_BALANCE_STRIDE = 5
 MAX_BALANCE_ROWS = 6000  # of all recordings
 MOUNT_PRIOR_NM_PER_M = 3.0  # price of moving the payload
 MIN_VARIANCE = 1e-12  # (N·m)², so that it can be divided by
 MIN_MOVE_RAD = 0.05  # of a command that excites a joint
 MIN_EXPLAINED = 0.9  # of a torque's variance, from which its gains are used
 AVERAGED_ROWS = 5  # of which the regression takes the mean
-INSTRUMENTS = 12  # periods whose commands are instruments for measured position and speed
+# Periods whose commands are instruments for measured position and speed.
+INSTRUMENTS = 12
 MAX_LATE_PERIODS = 3  # between a command and its torque
 START_DELAY = 0.25  # of the fit of positions, large changes of 20 ms
 ITERATIONS = 10  # of that fit
 GRAVITY = 9.81  # m/s²
 MAX_HAND_MASS_KG = 5.0
-MAX_MOVE_M = 0.3  # of the payload from where the robot's file has it, along each axis
+# Of the payload from where the robot's file has it, along each axis.
+MAX_MOVE_M = 0.3
 MAX_OWN = 20.0  # of a joint's own friction, armature and damping, SI
 
 
@@ -320,7 +323,12 @@ class TorqueFit:
             rows += self._balance_rows(s, model, stride)
         return _Balance.of_rows(rows)
 
-    def _balance_rows(self, s: Sequence, model: mujoco.MjModel, stride: int) -> list[_BalanceRow]:
+    def _balance_rows(
+        self,
+        s: Sequence,
+        model: mujoco.MjModel,
+        stride: int,
+    ) -> list[_BalanceRow]:
         """Return a row for each moved joint in every `stride`th row of a recording."""
         assert s.tau is not None
         moved = _moved(s, self.robot)
