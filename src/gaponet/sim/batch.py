@@ -413,9 +413,14 @@ def expand_differences(batch: Batch, models: list[mujoco.MjModel]) -> None:
     """Expand every model field that differs between simulations, (nsim) models: a row may be
     copied over another's.
     """
-    unique = list({id(model): model for model in models}.values())
-    place = {id(model): i for i, model in enumerate(unique)}
-    rows = [place[id(model)] for model in models]
+    unique: list[mujoco.MjModel] = []
+    place: dict[int, int] = {}  # id of a model → its place among the unique ones
+    rows = []
+    for model in models:
+        if id(model) not in place:
+            place[id(model)] = len(unique)
+            unique.append(model)
+        rows.append(place[id(model)])
     for name, values in differing_fields(unique).items():
         batch.expand(name)[:] = values[rows]
 

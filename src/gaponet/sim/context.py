@@ -22,6 +22,7 @@ from gaponet.base.arrays import Array
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.batch import Batch, BatchSim, Condition
 from gaponet.sim.commands import CommandHistory
+from gaponet.sim.model import joint_addresses
 
 PROBE_RAD = 0.2
 READ_AFTER_S = (0.04, 0.2)  # the start of the motion, and most of it
@@ -90,8 +91,7 @@ def scene_context(scene: mujoco.MjModel, robot: RobotSpec, dt: float, prefix: st
     names = [name for name in robot.joint_names if prefix + name in driven]
     home = robot.qpos_home[robot.index(names)]
     operated = np.array([names.index(name) for name in robot.operated])
-    address = np.array([model.joint(prefix + name).qposadr[0] for name in names])
-    dof = np.array([model.joint(prefix + name).dofadr[0] for name in names])
+    address, dof = joint_addresses(model, [prefix + name for name in names])
     actuator = np.array([driven[prefix + name] for name in names])
     moved, towards = _probe_targets(home, operated, robot.qpos_range[robot.index(names)])
 

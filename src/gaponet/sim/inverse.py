@@ -20,6 +20,7 @@ from gaponet.base.errors import UsageError
 from gaponet.robot.servo_fields import SERVO_TERMS
 from gaponet.sim.batch import Batch, BatchSim
 from gaponet.sim.commands import ControlPeriods
+from gaponet.sim.model import joint_addresses
 from gaponet.sim.servo import ServoTerms, overcome_friction, present, torque_range
 
 # Agreement of two simulators: largest difference of targets, and number of random motions that are
@@ -75,8 +76,7 @@ class InverseDynamics:
 
     def __init__(self, batch: Batch, model: mujoco.MjModel, joints: tuple[str, ...]) -> None:
         self._batch = batch
-        self._at = np.array([model.joint(name).qposadr[0] for name in joints])
-        self._dof = np.array([model.joint(name).dofadr[0] for name in joints])
+        self._at, self._dof = joint_addresses(model, joints)
         self._qpos = batch.bind("qpos")
         self._qvel = batch.bind("qvel")
         self._bias = batch.bind("qfrc_bias")
@@ -132,7 +132,7 @@ class PositionServos:
         Raises:
             UsageError: A joint without exactly one position actuator.
         """
-        dof = np.array([model.joint(name).dofadr[0] for name in joints])
+        _, dof = joint_addresses(model, joints)
         act = np.array([_position_actuator(model, name) for name in joints])
         bias = _own(batch, model, "actuator_biasprm")[:, act]
         kp = _own(batch, model, "actuator_gainprm")[:, act, 0]
@@ -360,15 +360,14 @@ def _own(batch: Batch, model: mujoco.MjModel, name: str) -> Array:
 def _most_torque(model: mujoco.MjModel, joints: tuple[str, ...], actuators: Array) -> Array:
     """Return the least and the largest torque of motors, (2, n) N·m; ±inf without a limit."""
     at = np.array([model.joint(name).id for name in joints])
-    limits = [
-        (model.actuator_forcelimited[actuators], model.actuator_forcerange[actuators]),
-        (model.jnt_actfrclimited[at], model.jnt_actfrcrange[at]),
-    ]
-    low, high = zip(
-        *(np.where(limited[:, None], both, [-np.inf, np.inf]).T for limited, both in limits),
-        strict=True,
-    )
-    return np.array([np.max(low, axis=0), np.min(high, axis=0)])
+    low = np.full(len(joints), -np.inf)
+    high = np.full(len(joints), np.inf)
+    of_actuators = (model.actuator_forcelimited[actuators], model.actuator_forcerange[actuators])
+    of_joints = (model.jnt_actfrclimited[at], model.jnt_actfrcrange[at])
+    for limited, limits in (of_actuators, of_joints):
+        low = np.where(limited, np.maximum(low, limits[:, 0]), low)
+        high = np.where(limited, np.minimum(high, limits[:, 1]), high)
+    return np.array([low, high])
 
 
 def _position_actuator(model: mujoco.MjModel, joint: str) -> int:

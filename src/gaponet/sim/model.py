@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import hashlib
 import math
+from collections.abc import Sequence as ListOf
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -78,8 +79,9 @@ def build_model(
             f"robot.toml names {len(robot.joint_names)} hinge joints. Name each actuated joint "
             "once; weld or delete the others"
         )
-    address = [model.joint(name).qposadr[0] for name in robot.joint_names if name not in locked]
-    if address != list(range(model.nq)):
+    free = [name for name in robot.joint_names if name not in locked]
+    address, _ = joint_addresses(model, free)
+    if address.tolist() != list(range(model.nq)):
         order = ", ".join(model.joint(i).name for i in range(model.njnt))
         raise RobotError(
             f"{robot.mjcf}: robot.toml must list the joints in the MJCF's order: {order}"
@@ -87,6 +89,12 @@ def build_model(
     stiffen_friction(model)
     soften_table(model, robot)
     return model
+
+
+def joint_addresses(model: mujoco.MjModel, names: ListOf[str]) -> tuple[Array, Array]:
+    """Return the places of hinge joints in qpos and in qvel, (n,) each."""
+    joints = np.array([model.joint(name).id for name in names])
+    return model.jnt_qposadr[joints], model.jnt_dofadr[joints]
 
 
 def stiffen_friction(model: mujoco.MjModel) -> None:

@@ -86,9 +86,10 @@ def _simulations(
     sequences: ListOf[Sequence], robot: RobotSpec, clamped: Clamped, nthread: int, *, creeps: bool
 ) -> BatchSim:
     """Return a simulation of each recording, in which joints are clamped where they stand."""
-    joints = tuple(joint for joint, _ in clamped)
+    angles = dict(clamped)
+    joints = tuple(angles)
     home = np.array(robot.qpos_home)
-    home[robot.index(joints)] = [angle for _, angle in clamped]
+    home[robot.index(joints)] = list(angles.values())
     conditions = [Condition.of(s, robot) for s in sequences]
     sim = BatchSim(replace(robot, qpos_home=home), conditions, nthread, joints)
     if creeps:  # MuJoCo's own mobility and impedance
@@ -292,15 +293,16 @@ def pair_dataset(
     parts = [todo[start : start + BATCH] for start in range(0, len(todo), BATCH)]
     sequences = map(dataset.sequences, parts)
     work = partial(replay, robot=robot, lock_idle=lock_idle, creeps=creeps)
+
+    def replay_here(part: list[Sequence]) -> list[SimulatedReplay]:
+        return work(part, progress=lambda steps, _: progress(done + steps, total))
+
     with dataset.writing_replays(), ExitStack() as stack:
         if executor == LOCAL:
-            replayed: Iterator[list[SimulatedReplay]] = (
-                work(part, progress=lambda k, of: progress(done + k, total)) for part in sequences
-            )
+            replayed: Iterator[list[SimulatedReplay]] = map(replay_here, sequences)
         else:
-            replayed = stack.enter_context(open_pool(executor, 0)).map(
-                partial(work, nthread=1), sequences
-            )
+            pool = stack.enter_context(open_pool(executor, 0))
+            replayed = pool.map(partial(work, nthread=1), sequences)
         for part, replays in zip(parts, replayed, strict=True):
             for entry, simulated in zip(part, replays, strict=True):
                 dataset.write_replay(entry, simulated)

@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from copy import copy
 from dataclasses import replace
-from itertools import product
 from typing import NamedTuple
 
 import mujoco
@@ -277,9 +276,17 @@ def _steps(
     them, is left out.
     """
     thin = [robot.qpos_home, *postures[:: max(1, len(postures) // MAX_POSTURES)][:MAX_POSTURES]]
-    cases = [(mass, model, q) for (mass, model), q in product(models.items(), thin)]
-    each = [(_growth(model, q), mass) for mass, model, q in cases]
-    (growth, joint, oscillates), mass = max(each, key=lambda one: one[0].factor)
+    cases = []
+    worst = _Growth(0.0, 0, False)
+    mass = 0.0  # with which it grows
+    for payload, model in models.items():
+        for posture in thin:
+            cases.append((model, posture))
+            found = _growth(model, posture)
+            if found.factor > worst.factor:
+                worst = found
+                mass = payload
+    growth, joint, oscillates = worst
     name = robot.joint_names[joint]
     if growth <= 1 + MAX_GROWTH:
         yield Finding(
@@ -297,20 +304,28 @@ def _steps(
 
 
 def _unstable_step(
-    robot: RobotSpec, cases: list[tuple[float, mujoco.MjModel, Array]], joint: int, growth: float
+    robot: RobotSpec, cases: list[tuple[mujoco.MjModel, Array]], joint: int, growth: float
 ) -> Finding:
     """Return the finding about a joint that is unstable in the robot's physics steps, with what
     would cure it.
     """
 
     def is_stable(timestep: float, armature: float) -> bool:
-        growths = (_growth(model, q, timestep, armature).factor for _, model, q in cases)
-        return all(growth <= 1 + MAX_GROWTH for growth in growths)
+        most = 1 + MAX_GROWTH
+        return all(_growth(model, q, timestep, armature).factor <= most for model, q in cases)
 
-    steps = (robot.timestep / 2**k for k in range(1, 7))
-    step = next((h for h in steps if is_stable(h, 0.0)), None)
-    armatures = (1e-4 * 2**k for k in range(14))
-    armature = next((a for a in armatures if is_stable(robot.timestep, a)), None)
+    step = None
+    for halvings in range(1, 7):
+        shorter = robot.timestep / 2**halvings
+        if is_stable(shorter, 0.0):
+            step = shorter
+            break
+    armature = None
+    for doublings in range(14):
+        larger = 1e-4 * 2**doublings
+        if is_stable(robot.timestep, larger):
+            armature = larger
+            break
     cures = []
     if step:
         cures.append(f"timestep = {step:g} in robot.toml")

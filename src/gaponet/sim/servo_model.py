@@ -1,4 +1,4 @@
-"""Servo models of all simulations in a batch: the formulas of sim/servo.py before every physics step."""
+"""Servo models of the simulations in a batch, which run sim/servo.py before every physics step."""
 
 from __future__ import annotations
 

@@ -39,9 +39,16 @@ def warm_values(values: Mapping[str, Array], temperature: Array) -> tuple[Array,
     windows) each.
     """
     zero = np.zeros_like(values["kp"])
-    names = ("damping", "frictionloss", *TERMS["temperature"])
-    *now, reference = [values.get(name, zero)[..., None] for name in names]
-    damping, friction = warmed(np.nan_to_num(temperature - reference), *now)
+    given = {}  # (k, n, 1)
+    for name in ("damping", "frictionloss", *TERMS["temperature"]):
+        given[name] = values.get(name, zero)[..., None]
+    damping, friction = warmed(
+        np.nan_to_num(temperature - given["friction_temperature"]),
+        given["damping"],
+        given["frictionloss"],
+        given["friction_per_kelvin"],
+        given["damping_per_kelvin"],
+    )
     return damping, friction
 
 

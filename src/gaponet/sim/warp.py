@@ -204,9 +204,10 @@ class _Worlds:
 
     def _captured(self, kernels: Callable[[], None]) -> Any:
         """Return the kernels as a CUDA graph; they are compiled by a launch that is undone."""
-        moved = [
-            self.bind(name) for name in (*STATE, *HISTORY, *SERVO) if getattr(self.data, name).size
-        ]
+        moved = []
+        for name in (*STATE, *HISTORY, *SERVO):
+            if getattr(self.data, name).size:
+                moved.append(self.bind(name))
         before = [view.clone() for view in moved]
         torch.cuda.synchronize()
         kernels()
@@ -241,17 +242,22 @@ class _AllWorlds:
 
     def __init__(self, sim: BatchSim, device: str, names: list[str]) -> None:
         """names: Fields that are seen together."""
+        self.of_rates: list[_Worlds] = []
+        self._views: list[dict[str, Tensor]] = []
+        self._rows: list[Tensor] = []  # of each one's simulations
         nstep = sim.periods.nstep
-        rates = [np.flatnonzero(nstep == n) for n in np.unique(nstep)]
-        self.of_rates = [_Worlds(sim, rows, device) for rows in rates]
-        self._views = [worlds.bind_all(names) for worlds in self.of_rates]
+        for n in np.unique(nstep):
+            rows = np.flatnonzero(nstep == n)
+            worlds = _Worlds(sim, rows, device)
+            views = worlds.bind_all(names)
+            self.of_rates.append(worlds)
+            self._views.append(views)
+            self._rows.append(torch.as_tensor(rows).to(views["qpos"].device))
         self.fields = self._views[0]
-        if len(rates) > 1:
+        if len(self.of_rates) > 1:
             self.fields = {}
             for name, view in self._views[0].items():
                 self.fields[name] = view.new_zeros(sim.num_envs, *view.shape[1:])
-        at = self.fields["qpos"].device
-        self._rows = [torch.as_tensor(rows).to(at, non_blocking=True) for rows in rates]
 
     def each_rate(self) -> Iterator[_Worlds]:
         """Yield the worlds of each control period with their simulations' state, and copy it

@@ -22,7 +22,7 @@ from gaponet.robot.spec import RobotSpec, Table
 from gaponet.sim.batch import BatchSim, Condition
 from gaponet.sim.dynamics import tips_of
 from gaponet.sim.metrics import Comparison, by_motion
-from gaponet.sim.model import write_table
+from gaponet.sim.model import joint_addresses, write_table
 from gaponet.sim.replay import rollout_errors
 from gaponet.sysid.joint_rollouts import ERROR_SCALE_RAD
 from gaponet.sysid.least_squares import Problems, descend, soft_l1
@@ -357,7 +357,7 @@ class _TableRollouts(RobotRollouts):
         of_simulations = np.repeat(xs, len(self.parts), axis=0)  # (k · windows, 3 + n)
         height, friction, log_stiffness = of_simulations[:, :3].T
         write_table(sim.batch, model, height, friction, np.exp(log_stiffness))
-        dof = np.array([model.joint(joint).dofadr[0] for joint in self.robot.operated])
+        _, dof = joint_addresses(model, self.robot.operated)
         sim.batch.expand("qpos0")[:, dof] -= of_simulations[:, 3:]
         return self.simulated_errors(sim)
 
