@@ -16,7 +16,7 @@ from gaponet.robot.spec import Link, RobotSpec
 from gaponet.sim.links import LinkResult
 from gaponet.sim.metrics import MIN_RELATIVE_GAIN, MIN_RELATIVE_GAIN_ONE_MOTION, Comparison
 from gaponet.sim.replay import motion_errors
-from gaponet.sysid.axes import Values
+from gaponet.sysid.axes import Values, one_candidate
 from gaponet.sysid.robot_rollouts import RobotRollouts
 from gaponet.sysid.table_contact import TableFit, tip_heights
 
@@ -368,8 +368,8 @@ class _Fold:
 
     def sums(self, values: Values, links: ListOf[Links]) -> Array:
         """Return the sums of |error| over the rows of each judge, (judges, n) rad; values (n,)."""
-        one_candidate = {field: value[None] for field, value in values.items()}
-        size = np.abs(self.rollouts.flat_errors(one_candidate, links))[0]  # (n, rows) rad
+        errors = self.rollouts.flat_errors(one_candidate(values), links)[0]  # (n, rows) rad
+        size = np.abs(errors)
         return np.stack([size[:, rows].sum(axis=1) for rows in self.rows])
 
     def counts(self) -> Array:

@@ -53,6 +53,16 @@ MIN_GREATEST_SPEED = 0.1  # rad/s
 BOUND_TOLERANCE = 0.02
 
 
+def one_candidate(values: Values) -> Values:
+    """Return values (n,) as a single candidate, (1, n)."""
+    return {field: value[None] for field, value in values.items()}
+
+
+def first_candidate(values: Values) -> Values:
+    """Return values (n,) of the first of k candidates (k, n), as arrays of their own."""
+    return {field: value[0].copy() for field, value in values.items()}
+
+
 def to_axis(field: str, value: Array, kp: Array) -> Array:
     """Return values of a field on its axis."""
     axis = SERVO_FIELDS[field].axis
@@ -183,9 +193,9 @@ class Changes:
             "offset": MAX_ON_AXIS["offset"] * one,
             "delay": MAX_ON_AXIS["delay"] - delay,
         }
-        self._large = np.stack([large[f] for f in fields], axis=1)  # (n, P)
-        self.low = np.stack([lowest[f] for f in fields], axis=1) / self._large
-        self.high = np.stack([highest[f] for f in fields], axis=1) / self._large
+        self._large = np.stack([large[field] for field in fields], axis=1)  # (n, P)
+        self.low = np.stack([lowest[field] for field in fields], axis=1) / self._large
+        self.high = np.stack([highest[field] for field in fields], axis=1) / self._large
 
     def start(self, delay: float) -> Array:
         """Return no change, but for a delay of at least so many seconds, (n, P)."""
@@ -369,8 +379,10 @@ class Bounds:
 
 def _encoder_steps(sequences: ListOf[Sequence], joints: Array) -> Array:
     """Return the steps of the encoders of joints, by number, (n,) rad; 0 where none is seen."""
-    steps = [encoder_step([s.qpos[:, joint] for s in sequences]) for joint in joints]
-    return np.array(steps, float)
+    steps = np.zeros(len(joints))
+    for i, joint in enumerate(joints):
+        steps[i] = encoder_step([s.qpos[:, joint] for s in sequences])
+    return steps
 
 
 def _end_of_range(

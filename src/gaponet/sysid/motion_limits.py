@@ -42,13 +42,13 @@ MIN_STOP_ROWS = 50  # that show a stop
 AT_STOP_RAD = 0.005  # from the end of a joint's path
 MIN_NARROWING_RAD = 0.01  # of the robot's range by a stop
 # A joint shows its torque limit if in this share of its rows this share of the limit is asked.
-AT_TORQUE_LIMIT = 0.9
-MIN_LIMITED_SHARE = 0.01
+LIMITED_TORQUE_SHARE = 0.9
+MIN_LIMITED_ROWS_SHARE = 0.01
 # It shows its motor's torque-speed line if in this share of its rows it moves at this share of its
 # greatest speed, while this share of the torque limit is asked in the direction of motion.
-FAST = 0.5
-DRIVEN_FAST = 0.8
-MIN_FAST_SHARE = 0.003
+FAST_SPEED_SHARE = 0.5
+DRIVEN_TORQUE_SHARE = 0.8
+MIN_FAST_ROWS_SHARE = 0.003
 
 
 def with_stops(robot: RobotSpec, sequences: ListOf[Sequence]) -> RobotSpec:
@@ -137,13 +137,13 @@ def default_terms(sequences: ListOf[Sequence], robot: RobotSpec) -> tuple[Term, 
     These are "limit" and "speed", if gains and recorded errors ask some joint for such torques as
     the constants above say; DEFAULT_TERMS; and "temperature", if recordings vary it.
     """
-    fast = FAST * greatest_speeds(sequences, robot)
+    fast = FAST_SPEED_SHARE * greatest_speeds(sequences, robot)
     counts = [_demanding_rows(s, robot, fast) for s in sequences]
     rows, limited_rows, driven_rows = np.sum(counts, axis=0)  # (n,) each
     terms: list[Term] = []
-    if (limited_rows > MIN_LIMITED_SHARE * rows).any():
+    if (limited_rows > MIN_LIMITED_ROWS_SHARE * rows).any():
         terms.append("limit")
-    if (driven_rows > MIN_FAST_SHARE * rows).any():
+    if (driven_rows > MIN_FAST_ROWS_SHARE * rows).any():
         terms.append("speed")
     terms += DEFAULT_TERMS
     if temperature_varies(sequences, robot).any():
@@ -160,8 +160,8 @@ def _demanding_rows(s: Sequence, robot: RobotSpec, fast: Array) -> Array:
     asked = (servo.kp * (s.ctrl - s.qpos) - servo.kd * s.qvel)[:, op]  # (T, n) N·m
     qvel = s.qvel[:, op]
     limit = robot.servo.effort_limit[op]
-    is_limited = np.abs(asked) > AT_TORQUE_LIMIT * limit
-    is_driven = asked * np.sign(qvel) > DRIVEN_FAST * limit
+    is_limited = np.abs(asked) > LIMITED_TORQUE_SHARE * limit
+    is_driven = asked * np.sign(qvel) > DRIVEN_TORQUE_SHARE * limit
     is_fast = np.abs(qvel) > fast
     every = np.ones_like(is_limited)
     counts = np.stack([every, is_limited, is_driven & is_fast]).sum(axis=1)

@@ -13,7 +13,15 @@ from gaponet.base.arrays import Array
 from gaponet.robot.servo_fields import SERVO_FIELDS, SERVO_TERMS
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.model import build_model
-from gaponet.sysid.axes import CLASSIC, WARM_SLOPES, Axes, Bounds, Values
+from gaponet.sysid.axes import (
+    CLASSIC,
+    WARM_SLOPES,
+    Axes,
+    Bounds,
+    Values,
+    first_candidate,
+    one_candidate,
+)
 from gaponet.sysid.joint_rollouts import ERROR_SCALE_RAD, JointRollouts, balanced_values
 from gaponet.sysid.least_squares import (
     DAMPING_FACTORS,
@@ -40,6 +48,7 @@ MAX_CHAIN_CANDIDATES = 160
 MIN_COST_DECREASE = 2e-3
 MIN_CHAIN_COST_DECREASE = 2e-4
 MIN_ROW_PERIOD_S = 0.01  # of rows that count as measurements of their own
+FIRST_RESIDUAL_RAD = 1e-3  # before the first search
 MIN_RESIDUAL_RAD = 1e-5
 MIN_CORRELATION_TIME_S = 1.0
 FIRST_CORRELATION_TIME_S = 4.0  # before it is estimated
@@ -65,7 +74,7 @@ class _GainPrior:
     """
 
     def __init__(self, bounds: Bounds, row_period: float) -> None:
-        self.residual = np.full(bounds.n, 1e-3)
+        self.residual = np.full(bounds.n, FIRST_RESIDUAL_RAD)
         self.correlation_time = np.full(bounds.n, FIRST_CORRELATION_TIME_S)
         self._row_period = max(row_period, MIN_ROW_PERIOD_S)
         self.log_std: dict[str, float | Array] = dict(PRIOR_LOG_STD)
@@ -120,8 +129,7 @@ class _GainPrior:
         which less than MIN_CORRELATION is left. The autocorrelation is the transform of the power
         spectrum; zeros as long as the window keep its ends apart.
         """
-        one_candidate = {field: value[None] for field, value in values.items()}
-        errors = rollouts.errors(one_candidate)[0]  # (n, windows, rows)
+        errors = rollouts.errors(one_candidate(values))[0]  # (n, windows, rows)
         rows = errors.shape[-1]
         power = (np.abs(np.fft.rfft(errors, 2 * rows)) ** 2).sum(axis=1)
         correlation = np.fft.irfft(power)[:, :rows]  # (n, rows), by lag
@@ -235,7 +243,7 @@ class JointFit(FitProblem):
             self.prior.update_residual(cost.min(axis=0), rollouts.rows)
             if rollouts is self.rollouts:
                 x = better_half(x, cost)
-        return _first_candidate(axes.values(x[:1]))
+        return first_candidate(axes.values(x[:1]))
 
     def robot_fit(self, nthread: int) -> RobotFit:
         """Return the fit of the same robot in its simulator, with fewer windows; its prior begins
@@ -292,7 +300,7 @@ class RobotFit(FitProblem):
         iterations = max(1, min(MAX_CHAIN_ITERATIONS, MAX_CHAIN_CANDIDATES // candidates))
         problems = Problems(errors, low, high)
         x, _ = descend(problems, x, iterations, report(names, rows), MIN_CHAIN_COST_DECREASE)
-        return _first_candidate(axes.values(chains.unpack(x)))
+        return first_candidate(axes.values(chains.unpack(x)))
 
 
 class RobotSearch:
@@ -306,7 +314,7 @@ class RobotSearch:
         """Begin at starts (n,)."""
         self._fit = fit
         self._axes = axes
-        self._x = np.stack([axes.normalize(v) for v in starts])  # (starts, n, P)
+        self._x = np.stack([axes.normalize(values) for values in starts])  # (starts, n, P)
         self._cost = np.zeros((len(starts), fit.bounds.n))  # of each start and joint
 
     def iterate(self, count: int, report: Progress = lambda cost: None) -> None:
@@ -332,7 +340,7 @@ class RobotSearch:
     @property
     def values(self) -> Values:
         """Values (n,) of the best start."""
-        return _first_candidate(self._axes.values(self._x[self._best()]))
+        return first_candidate(self._axes.values(self._x[self._best()]))
 
     def _best(self) -> slice:
         """Return where the start with the least cost in the sum over joints is: a slice of one."""
@@ -372,11 +380,6 @@ class KinematicChains:
         place_of_joint = [joint_in_place.index(joint) for joint in range(joints)]
         in_places = x.reshape(*x.shape[:-2], self.joints.size, -1)
         return np.asarray(in_places[..., place_of_joint, :])
-
-
-def _first_candidate(values: Values) -> Values:
-    """Return values (n,) of the first of k candidates (k, n), as arrays of their own."""
-    return {field: value[0].copy() for field, value in values.items()}
 
 
 def fitted_fields(values: dict[str, object] | Values, encoder: bool = False) -> list[str]:

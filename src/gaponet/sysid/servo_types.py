@@ -65,11 +65,9 @@ def _servo_like(
     source: str,
 ) -> dict[str, float]:
     """Return the identified servo of a joint of `like` for a joint of `robot`: field → value."""
-    taken = [field.name for field in SERVO_FIELDS.values() if field.shared or field.name == "delay"]
-    taken.remove("effort_limit")
     i = robot.joint_names.index(joint)
     k = like.joint_names.index(source)
-    servo = like.servo.of_joint(k, taken)
+    servo = like.servo.of_joint(k, _fields_taken_over())
     before = like.before_identification
     for gain in ("kp", "kd"):
         own = float(robot.servo[gain][i])
@@ -77,6 +75,16 @@ def _servo_like(
         if own > 0 and theirs > 0:
             servo[gain] *= own / theirs
     return servo
+
+
+def _fields_taken_over() -> list[str]:
+    """Return the fields that a servo has wherever it is mounted, without the given torque limit."""
+    fields = []
+    for field in SERVO_FIELDS.values():
+        is_of_servo = field.shared or field.name == "delay"
+        if is_of_servo and field.name != "effort_limit":
+            fields.append(field.name)
+    return fields
 
 
 def _sources(robot: RobotSpec, like: RobotSpec) -> dict[str, str]:

@@ -294,7 +294,9 @@ def _undetermined(
         wide, also_over_kp = _wide_fields(values, axes, std, std_on_axes, i)
         if not wide:
             continue
-        texts = [f"{f} {format_uncertainty(values[f][i], std[f][i])}" for f in wide]
+        texts = []
+        for field in wide:
+            texts.append(f"{field} {format_uncertainty(values[field][i], std[field][i])}")
         advice = ""
         if also_over_kp == ["kp"] and len(wide) > 1:
             advice = "; known as multiples of kp: take the values as a set"

@@ -108,8 +108,11 @@ def fit_torque_driven(
     fitted = robot.with_identified(joints.servos)
     op = robot.operated_index
     model = build_model(robot)
-    of_file = {field: np.ravel(getattr(model, f"dof_{field}"))[op] for field in PASSIVE_FIELDS}
-    of_fit = {field: fitted.servo[field][op] for field in PASSIVE_FIELDS}
+    of_file = {}
+    of_fit = {}
+    for field in PASSIVE_FIELDS:
+        of_file[field] = np.ravel(getattr(model, f"dof_{field}"))[op]
+        of_fit[field] = fitted.servo[field][op]
     newton_metres = np.ones_like(joints.constant)
     no_lags = np.zeros_like(joints.lags)
     rows = [_rows(s, robot) for s in judging]
@@ -117,13 +120,16 @@ def fit_torque_driven(
     torque_after = _residual(rows, of_fit, joints.constant, joints.lags)
     angle_before = _ahead(judging, robot, newton_metres)
     angle_after = _ahead(judging, fitted, joints.constant)
+    angle = {}
+    for horizon in HORIZONS_S:
+        angle[horizon] = (angle_before[horizon], angle_after[horizon])
     return TorqueDrivenFit(
         robot=fitted,
         constant=joints.constant,
         bias=joints.bias,
         std=joints.std,
         torque=(torque_before, torque_after),
-        angle={horizon: (angle_before[horizon], angle_after[horizon]) for horizon in HORIZONS_S},
+        angle=angle,
         windows=sum(len(_starts(s)) for s in judging),
     )
 

@@ -298,7 +298,9 @@ def summarize(uncertainty: ParameterUncertainty, joint: str) -> JointSummary:
     size = np.where(errors > 0, errors, 1.0)
     correlation = np.abs(covariance / np.outer(size, size))  # (P, P)
     is_correlated = (correlation > MIN_SET_CORRELATION) & (errors > 0)
-    is_loose = np.array([summary.relative_error(f) > MIN_SET_RELATIVE_ERROR for f in fields])
+    is_loose = np.array(
+        [summary.relative_error(field) > MIN_SET_RELATIVE_ERROR for field in fields]
+    )
     both_are_loose = is_loose[:, None] & is_loose[None, :]
     _, set_of_field = connected_components(is_correlated & both_are_loose)  # numbers, (P,)
     sets: dict[int, list[str]] = {}

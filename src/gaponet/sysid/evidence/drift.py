@@ -134,25 +134,25 @@ def drift(
     Raises:
         UsageError: The recordings are too short, or move no joint that was identified.
     """
-    own = evidence(robot, sequences, uncertainty.fields, nthread=nthread)
-    if not own.rows.any():
+    seen = evidence(robot, sequences, uncertainty.fields, nthread=nthread)
+    if not seen.rows.any():
         raise UsageError(
             "no recording moves an operated joint away from what it may touch; record gaponet "
             "excite's"
         )
     joints = robot.operated
-    _require_identified(robot, own)
+    _require_identified(robot, seen)
     repeatability = _repeatability(uncertainty, sequences, joints)
-    far = _far_joints(uncertainty, own, joints, repeatability)
+    far = _far_joints(uncertainty, seen, joints, repeatability)
     stored = [uncertainty.array(joint, "overdispersion") for joint in joints]
     overdispersion = np.maximum(np.stack(stored), 1.0)  # (n, Q)
-    against = _contradictions(own, overdispersion, uncertainty, joints)
+    against = _contradictions(seen, overdispersion, uncertainty, joints)
     set_aside = {contradiction.recording for contradiction in against}
-    is_contradictory = len(set_aside) > MAX_SET_ASIDE * len(own.names)
+    is_contradictory = len(set_aside) > MAX_SET_ASIDE * len(seen.names)
     if not is_contradictory:
-        own = own.without(set_aside)
+        seen = seen.without(set_aside)
     gradients, threshold = _gradients_to_explain(
-        own, overdispersion, uncertainty, joints, repeatability
+        seen, overdispersion, uncertainty, joints, repeatability
     )
     moved, largest = _changes(gradients, threshold)
     verdict: Verdict = "same"
@@ -173,9 +173,9 @@ def drift(
     )
 
 
-def _require_identified(robot: RobotSpec, own: Evidence) -> None:
+def _require_identified(robot: RobotSpec, seen: Evidence) -> None:
     """Raise UsageError if no joint that the recordings hold was identified."""
-    held = {j for j, rows in zip(robot.operated, own.rows, strict=True) if rows}
+    held = {j for j, rows in zip(robot.operated, seen.rows, strict=True) if rows}
     if not held & identified_joints(robot):
         raise UsageError(
             f"{robot.folder}: these recordings hold only joints that were never identified: "
@@ -203,13 +203,13 @@ def _repeatability(
 
 def _far_joints(
     uncertainty: ParameterUncertainty,
-    own: Evidence,
+    seen: Evidence,
     joints: ListOf[str],
     repeatability: Mapping[str, float],
 ) -> dict[str, float]:
     """Return joint → error over the identification's residual, where it exceeds FAR_RATIO."""
     far = {}
-    for joint, errors in zip(joints, own.window_rms, strict=True):
+    for joint, errors in zip(joints, seen.window_rms, strict=True):
         usual = max(uncertainty.joints[joint].residual_rms, repeatability[joint], 1e-9)
         times = float(np.median(errors)) / usual
         if times > FAR_RATIO:
@@ -218,7 +218,7 @@ def _far_joints(
 
 
 def _contradictions(
-    own: Evidence,
+    seen: Evidence,
     overdispersion: Array,
     uncertainty: ParameterUncertainty,
     joints: ListOf[str],
@@ -227,7 +227,7 @@ def _contradictions(
     the others.
     """
     against: list[Contradiction] = []
-    rest = own.by_recording()
+    rest = seen.by_recording()
     fields = (*uncertainty.fields, PLAY)
     while len(rest.names) > 1:
         worst = _farthest(rest, overdispersion, uncertainty, joints, fields)
@@ -239,7 +239,7 @@ def _contradictions(
 
 
 def _gradients_to_explain(
-    own: Evidence,
+    seen: Evidence,
     overdispersion: Array,
     uncertainty: ParameterUncertainty,
     joints: ListOf[str],
@@ -252,17 +252,17 @@ def _gradients_to_explain(
     beside those of these recordings; Student's t has their degrees of freedom, and all parameters
     together raise FALSE_ALARM_RATE.
     """
-    if len(own.names) > 1:
-        own = own.by_recording()
-    clusters = own.gradients.shape[1]
+    if len(seen.names) > 1:
+        seen = seen.by_recording()
+    clusters = seen.gradients.shape[1]
     trusted = min(uncertainty.clusters, MAX_PRIOR_CLUSTERS)
     freedom = trusted + clusters - 1
     tests = len(joints) * (len(uncertainty.fields) + 1) + len(COMMON_FIELDS)
     threshold = float(student.isf(FALSE_ALARM_RATE / tests / 2, freedom))
-    information = own.information.sum(axis=1)  # (n, Q, Q)
+    information = seen.information.sum(axis=1)  # (n, Q, Q)
     expected = trusted * widened(information, overdispersion)
-    scatter = expected + (clusters - 1) * gradient_covariance(own.gradients)
-    gradients = own.gradients.sum(axis=1)  # (n, Q)
+    scatter = expected + (clusters - 1) * gradient_covariance(seen.gradients)
+    gradients = seen.gradients.sum(axis=1)  # (n, Q)
     each = []
     for i, joint in enumerate(joints):
         one = _Joint(
@@ -271,7 +271,7 @@ def _gradients_to_explain(
             information=information[i],
             gradient=gradients[i],
             scatter=scatter[i] / freedom,
-            rows=int(own.rows[i]),
+            rows=int(seen.rows[i]),
             repeatability=repeatability[joint],
         )
         each.append(one)
@@ -333,7 +333,7 @@ class _Joint:
         # Change of the axes and play by a change of one parameter in SI units, column by column: a
         # softer motor has the friction that it had, so its friction over kp is larger.
         by_field = np.eye(len(self.fields))
-        over_kp = [SERVO_FIELDS[f].axis == "over kp" for f in uncertainty.fields]
+        over_kp = [SERVO_FIELDS[field].axis == "over kp" for field in uncertainty.fields]
         by_field[:-1, self.fields.index("kp")] -= uncertainty.array(name, "values") * over_kp
         step_covariance = uncertainty.array(name, "gauss_newton_covariance")
         variance = scatter + information @ step_covariance @ information
@@ -441,7 +441,7 @@ def _solved(columns: Array, weight: Array, pull: Array) -> tuple[Array, Array]:
 
 
 def _farthest(
-    own: Evidence,
+    seen: Evidence,
     overdispersion: Array,
     uncertainty: ParameterUncertainty,
     joints: ListOf[str],
@@ -450,17 +450,17 @@ def _farthest(
     """Return the recording that differs most from the others, by more than recordings scatter, and
     its field.
     """
-    count = len(own.names)
+    count = len(seen.names)
     rate = FALSE_CONTRADICTION_RATE / (count * len(joints) * len(fields))
     limit = float(student.isf(rate / 2, min(uncertainty.clusters, MAX_PRIOR_CLUSTERS)))
     worst = None
     for i, joint in enumerate(joints):
         residual = uncertainty.joints[joint].residual_rms
         for recording in range(count):
-            for found in _differences(own, i, recording, overdispersion[i]):
+            for found in _differences(seen, i, recording, overdispersion[i]):
                 if abs(found.sigmas) > limit and found.effect > residual:
                     limit = abs(found.sigmas)
-                    name = own.names[recording]
+                    name = seen.names[recording]
                     field = fields[found.number]
                     worst = Contradiction(name, joint, field, found.by, found.sigmas)
     return worst
@@ -476,7 +476,7 @@ class _Difference(NamedTuple):
 
 
 def _differences(
-    own: Evidence,
+    seen: Evidence,
     joint: int,
     recording: int,
     overdispersion: Array,
@@ -484,18 +484,18 @@ def _differences(
     """Return by how much a recording differs from all others together, for one joint; without
     parameters of which the others say too little.
     """
-    mine = own.information[joint, recording]  # (Q, Q)
-    rest = own.information[joint].sum(axis=0) - mine
-    gradient = own.gradients[joint, recording]  # (Q,)
-    gradient_of_rest = own.gradients[joint].sum(axis=0) - gradient
+    mine = seen.information[joint, recording]  # (Q, Q)
+    rest = seen.information[joint].sum(axis=0) - mine
+    gradient = seen.gradients[joint, recording]  # (Q,)
+    gradient_of_rest = seen.gradients[joint].sum(axis=0) - gradient
     # The others' Gauss-Newton step as a gradient of this recording.
     carried = mine @ inverted(rest[None])[0]
     difference = carried @ gradient_of_rest - gradient
     of_mine = widened(mine, overdispersion)
     of_rest = carried @ widened(rest, overdispersion) @ carried.T
     weight = np.linalg.pinv(of_mine + of_rest, rcond=1e-9, hermitian=True)
-    recordings = len(own.names)
-    rows = max(float(own.rows[joint]), 1)  # of all recordings
+    recordings = len(seen.names)
+    rows = max(float(seen.rows[joint]), 1)  # of all recordings
     differences = []
     for number in range(len(mine)):
         own_information = mine[number, number]

@@ -146,8 +146,8 @@ def _slopes_of_joints(
     def scaled_errors(x: Array) -> Array:
         return rollouts.flat_errors(axes.values(x)) / np.float32(ERROR_SCALE_RAD)
 
-    own = axes.normalize(bounds.first)  # (n, P)
-    errors, by_large_change = slopes(own[None], axes.high, scaled_errors)
+    start = axes.normalize(bounds.first)  # (n, P)
+    errors, by_large_change = slopes(start[None], axes.high, scaled_errors)
     is_free = axes.low < axes.high  # (n, P)
     by_field = by_large_change[0] / axes.unit[:, None] * is_free[:, None]  # (n, rows, P)
     by_play = _slopes_over_play(rollouts, bounds).reshape(bounds.n, -1, 1)
@@ -228,9 +228,9 @@ def estimate_uncertainty(
             `robot` was fitted to them as well.
     """
     fields = before.fields if before else _fitted_fields(robot)
-    own = evidence(robot, sequences, fields, nthread=nthread)
-    clusters, overdispersion = _overdispersion(own, before, robot.operated)
-    step = _gauss_newton_step(own, overdispersion)
+    seen = evidence(robot, sequences, fields, nthread=nthread)
+    clusters, overdispersion = _overdispersion(seen, before, robot.operated)
+    step = _gauss_newton_step(seen, overdispersion)
     values = to_axes(robot, fields)
     repeatability = repetition_difference(sequences, robot.operated)
     folds = held_out or [HeldOut(list(judges or sequences), robot)]
@@ -246,7 +246,7 @@ def estimate_uncertainty(
             gauss_newton_step=_nested(step.change[i]),
             gauss_newton_covariance=_nested(step.covariance[i]),
             overdispersion=_nested(overdispersion[i]),
-            parameter_rms=_predicted_rms(covariance, step.information[i, :-1, :-1], own.rows[i]),
+            parameter_rms=_predicted_rms(covariance, step.information[i, :-1, :-1], seen.rows[i]),
             residual_rms=float(np.sqrt(np.mean(np.concatenate(errors[joint]) ** 2))),
             residual_p90=_error_bound(errors[joint]),
             repeatability=float(repeatability[i]),
@@ -269,10 +269,10 @@ class _GaussNewtonStep(NamedTuple):
     information: Array  # of all clusters, (n, Q, Q)
 
 
-def _gauss_newton_step(own: Evidence, overdispersion: Array) -> _GaussNewtonStep:
+def _gauss_newton_step(seen: Evidence, overdispersion: Array) -> _GaussNewtonStep:
     """Return the step that evidence asks for; overdispersion (n, Q) makes it less sure."""
-    information = own.information.sum(axis=1)
-    gradient = own.gradients.sum(axis=1)
+    information = seen.information.sum(axis=1)
+    gradient = seen.gradients.sum(axis=1)
     inverse = inverted(information)
     change = -(inverse @ gradient[..., None])[..., 0]
     scatter = widened(information, np.maximum(overdispersion, 1.0))
@@ -290,8 +290,12 @@ def _predicted_rms(covariance: Array, information: Array, rows: float) -> float:
 def _fitted_fields(robot: RobotSpec) -> tuple[str, ...]:
     """Return the fields that a robot's fit has: the classic ones, and those of its terms."""
     first = first_values(robot)
-    of_terms = [f for f in SERVO_TERMS if SERVO_FIELDS[f].prior_std and first[f].any()]
-    return (*CLASSIC, *of_terms)
+    fields = [*CLASSIC]
+    for field in SERVO_TERMS:
+        has_prior = bool(SERVO_FIELDS[field].prior_std)
+        if has_prior and first[field].any():
+            fields.append(field)
+    return tuple(fields)
 
 
 def _no_better(
@@ -334,7 +338,7 @@ def _provenance(
 
 
 def _overdispersion(
-    own: Evidence,
+    seen: Evidence,
     before: ParameterUncertainty | None,
     joints: ListOf[str],
 ) -> tuple[int, Array]:
@@ -343,17 +347,17 @@ def _overdispersion(
 
     It is averaged with that of `before`, in proportion to the clusters of both.
     """
-    if len(own.names) >= MIN_RECORDINGS_AS_CLUSTERS:
-        own = own.by_recording()
-    clusters = own.gradients.shape[1]
-    independent = np.einsum("nckk->nk", own.information)
-    scatter = np.einsum("nkk->nk", gradient_covariance(own.gradients))
+    if len(seen.names) >= MIN_RECORDINGS_AS_CLUSTERS:
+        seen = seen.by_recording()
+    clusters = seen.gradients.shape[1]
+    independent = np.einsum("nckk->nk", seen.information)
+    scatter = np.einsum("nkk->nk", gradient_covariance(seen.gradients))
     none = np.zeros_like(independent)
-    seen = np.divide(scatter, independent, out=none, where=independent > 0)
+    of_these = np.divide(scatter, independent, out=none, where=independent > 0)
     if before is None:
-        return clusters, seen
+        return clusters, of_these
     old = np.stack([before.array(joint, "overdispersion") for joint in joints])
-    total = before.clusters * old + clusters * seen
+    total = before.clusters * old + clusters * of_these
     return clusters, total / (before.clusters + clusters)
 
 

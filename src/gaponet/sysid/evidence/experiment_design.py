@@ -61,12 +61,12 @@ class ExperimentDesign:
         recordings: ListOf[Sequence],
     ) -> ExperimentDesign:
         """Make the design from simulated recordings of the identified robot; their names differ."""
-        own = evidence(robot, recordings, uncertainty.fields, 10**6).by_recording()
+        seen = evidence(robot, recordings, uncertainty.fields, 10**6).by_recording()
         covariance = np.stack([uncertainty.array(j, "covariance") for j in robot.operated])
         overdispersion = np.stack([uncertainty.array(j, "overdispersion") for j in robot.operated])
         seconds = np.array([s.duration for s in recordings])
         return cls(
-            own.information[..., :-1, :-1],
+            seen.information[..., :-1, :-1],
             seconds,
             covariance,
             np.maximum(overdispersion[:, :-1], 1.0),
@@ -223,9 +223,10 @@ def _at_once(library: Library, variant: int) -> Motion:
         i = robot.index([joint])[0]
         interval = library.excitation_range(joint)
         ready = library.kit.ready[i]
-        ends = [ready + RANGE_SHARE * (end - ready) for end in (interval.low, interval.high)]
+        low = ready + RANGE_SHARE * (interval.low - ready)
+        high = ready + RANGE_SHARE * (interval.high - ready)
         kind = kinds[rng.integers(len(kinds))]
-        signals[i] = kind(min(ends), max(ends), rng, GRID)
+        signals[i] = kind(low, high, rng, GRID)
     rows = max(map(len, signals.values()))
     ctrl = np.repeat(library.kit.ready[None], rows, axis=0)
     for i, signal in signals.items():

@@ -15,7 +15,7 @@ from scipy.special import expit
 
 from gaponet.base.arrays import Array
 from gaponet.base.text import format_uncertainty
-from gaponet.sysid.axes import Values
+from gaponet.sysid.axes import Values, one_candidate
 from gaponet.sysid.problem import JointFit
 
 SCREENED_WIDTHS_RAD = (1e-3, 2.5e-3, 5e-3, 1e-2, 2e-2)
@@ -64,8 +64,7 @@ def probability(fit: JointFit, without: Values, values: Values) -> Array:
 
 def _squared_error(fit: JointFit, values: Values) -> Array:
     """Return the sum of squared errors of each joint at values (n,), (n,) rad²."""
-    one_candidate = {field: value[None] for field, value in values.items()}
-    errors = fit.rollouts.flat_errors(one_candidate)[0]
+    errors = fit.rollouts.flat_errors(one_candidate(values))[0]  # (n, rows) rad
     return np.asarray(np.square(errors).sum(axis=1))
 
 

@@ -59,17 +59,18 @@ def _joint_candidates(joints: JointFit, progress: SearchProgress) -> dict[str, V
     fields.
     """
     bounds = joints.bounds
-    given = {f: bounds.first[f] for f in bounds.start}  # without terms that the robot does not have
+    # Without terms that the robot does not have.
+    given = {field: bounds.first[field] for field in bounds.start}
     residual_before = joints.prior.residual
     progress.begin_search()
-    late = joints.search_fields(
+    delay_and_offset = joints.search_fields(
         ("offset", "delay"), given, report=lambda cost: progress.search_is_over()
     )
     joints.prior.residual = residual_before  # that of two fields is not that of all
     report = progress.reporter("each joint alone", joints.robot.operated, joints.rollouts.rows)
     alone = joints.search(bounds.start, joints.regressed(), report=report)
     joints.prior.update_correlation_time(joints.rollouts, alone)
-    return {"given": given, "joints": alone, "delay and offset": late}
+    return {"given": given, "joints": alone, "delay and offset": delay_and_offset}
 
 
 def robot_candidates(
@@ -83,9 +84,9 @@ def robot_candidates(
     if not _has_time_for_iterations(fits, robots, alone):
         return {}
     searches = []
-    for robot, own in zip(robots, alone, strict=True):
+    for robot, values in zip(robots, alone, strict=True):
         of_file = robot.bounds.start
-        searches.append(robot.search(CLASSIC, of_file, (own, of_file)))
+        searches.append(robot.search(CLASSIC, of_file, (values, of_file)))
     _iterate(fits, robots, searches, FIRST_ROBOT_ITERATIONS)
     if _loses_much(fits.judge, alone, [search.values for search in searches]):
         return {}

@@ -19,7 +19,7 @@ from gaponet.data.signals import differentiate, lowpass
 from gaponet.sim.dynamics import CUTOFF_HZ, inverse_dynamics
 from gaponet.sim.links import COORDINATES, LinkAxes, LinkResult
 from gaponet.sim.model import build_model, with_links
-from gaponet.sysid.axes import CLASSIC, Axes, Values
+from gaponet.sysid.axes import CLASSIC, Axes, Values, first_candidate
 from gaponet.sysid.joint_rollouts import ERROR_SCALE_RAD, SLIP_SPEED
 from gaponet.sysid.least_squares import (
     DIFFERENCE_STEP,
@@ -256,7 +256,7 @@ class LinkFit:
         by_noise, by_zeros = self._covariances(x[0, 0])
         changed = self._significant(self._coordinates(x)[0], by_noise)
         covariance = self.directions @ (by_noise + by_zeros) @ self.directions.T + self._rest
-        fitted = {field: value[0].copy() for field, value in self._servo_values(x).items()}
+        fitted = first_candidate(self._servo_values(x))
         return LinkResult(self.axes, changed, covariance, fitted)
 
     def _searched(self, report: Progress) -> Array:

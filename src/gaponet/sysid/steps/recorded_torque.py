@@ -98,7 +98,7 @@ def _standard_errors(
     bounds = Bounds(robot, recordings)
     rollouts = JointRollouts(cut(recordings, MAX_WINDOWS), robot, nthread=nthread)
     whole = JointFit(rollouts, robot, bounds).robot_fit(nthread)
-    return standard_errors(whole, {f: bounds.first[f] for f in CLASSIC})
+    return standard_errors(whole, {field: bounds.first[field] for field in CLASSIC})
 
 
 def _before_and_after(

@@ -265,9 +265,12 @@ class TorqueFit:
         self.sequences = [s for s in sequences if _has_torque_of_unknown_gains(s)]
         self._given = robot
         self.known: dict[str, Gains] = {}
+        servos = {}
         if len(self.sequences) == len(sequences):
-            self.known = {joint: gains for joint, gains in self.gains().items() if gains.trusted}
-        servos = {joint: {"kp": gains.kp, "kd": gains.kd} for joint, gains in self.known.items()}
+            for joint, gains in self.gains().items():
+                if gains.trusted:
+                    self.known[joint] = gains
+                    servos[joint] = {"kp": gains.kp, "kd": gains.kd}
         self.robot = robot.with_identified(servos)
         masses = {s.meta.payload_mass for s in self.sequences}
         self.several_payloads = bool(robot.payload_mounts) and len(masses) > 1
@@ -395,7 +398,9 @@ def _has_torque_of_unknown_gains(s: Sequence) -> bool:
 
 def _best_gains(recordings: list[Array]) -> Gains:
     """Return a servo's gains with the delay that explains most of its torque."""
-    tried = [servo_gains(recordings, late=late) for late in range(1, MAX_LATE_PERIODS + 1)]
+    tried = []
+    for periods in range(1, MAX_LATE_PERIODS + 1):
+        tried.append(servo_gains(recordings, late=periods))
     return max(tried, key=lambda gains: gains.explained)
 
 
