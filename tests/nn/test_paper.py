@@ -227,7 +227,7 @@ def test_options_add_the_observation_to_the_branch_and_the_lag_to_the_trunk():
     assert torch.equal(net.prepare(x)[:, :3], relative[:, -3:])  # payload and A − q
     assert torch.equal(
         net.prepare(x)[:, 3 : 3 + net.config.observation_dim(2)],
-        relative[:, : net.observation.stop],
+        relative[:, : net.features.layout.observation.stop],
     )
     assert net.branch[0].in_features == net.config.observation_dim(2) + 16
 

@@ -26,41 +26,37 @@ class Layout:
     """Columns of x as slices. Features of a network have the same columns.
 
     Attributes:
-        q, v, past, payload, action, sensors, real, context: The parts of x in their order.
-        state, observation, query: [q | q̇], o_t and [o_t | a_t].
+        q, v, past, payload, action, sensors, real, context: The parts of x in their order. A part
+            that a network does not have is empty.
+        dim: Number of columns.
     """
 
     def __init__(self, config: ModelConfig, n: int) -> None:
-        self.n = n
-        self.history = config.history
+        self.q = slice(0, n)
+        self.v = _after(self.q, n)
+        self.past = _after(self.v, 3 * n * config.history)
+        self.payload = _after(self.past, int(config.payload_input))
+        self.action = _after(self.payload, n)
         answers = config.sensor_dim(n) if config.needs_simulator else 0
-        sizes = {
-            "q": n,
-            "v": n,
-            "past": 3 * n * config.history,
-            "payload": int(config.payload_input),
-            "action": n,
-            "sensors": answers,
-            "real": config.real_state_dim(n),
-            "context": config.context_dim(n),
-        }
-        parts = {}
-        start = 0
-        for name, size in sizes.items():
-            parts[name] = slice(start, start + size)
-            start += size
-        self.q = parts["q"]
-        self.v = parts["v"]
-        self.past = parts["past"]
-        self.payload = parts["payload"]
-        self.action = parts["action"]
-        self.sensors = parts["sensors"]
-        self.real = parts["real"]
-        self.context = parts["context"]
-        self.state = slice(0, self.v.stop)
-        self.observation = slice(0, self.payload.stop)
-        self.query = slice(0, self.action.stop)
-        self.dim = config.input_dim(n)
+        self.sensors = _after(self.action, answers)
+        self.real = _after(self.sensors, config.real_state_dim(n))
+        self.context = _after(self.real, config.context_dim(n))
+        self.dim = self.context.stop
+
+    @property
+    def state(self) -> slice:
+        """[q | q̇]."""
+        return slice(0, self.v.stop)
+
+    @property
+    def observation(self) -> slice:
+        """o_t."""
+        return slice(0, self.payload.stop)
+
+    @property
+    def query(self) -> slice:
+        """[o_t | a_t]."""
+        return slice(0, self.action.stop)
 
     def shifted(self, shift: Array) -> Array:
         """Return the change of x, (k, dim), when positions and targets of [o_t | a_t] change by
@@ -68,11 +64,17 @@ class Layout:
         """
         k, n = shift.shape
         frame = np.concatenate([shift, np.zeros((k, n)), shift], axis=1)  # [q | q̇ | u]
+        history = (self.past.stop - self.past.start) // (3 * n)  # frames
         out = np.zeros((k, self.dim))
         out[:, self.q] = shift
         out[:, self.action] = shift
-        out[:, self.past] = np.tile(frame, (1, self.history))
+        out[:, self.past] = np.tile(frame, (1, history))
         return out
+
+
+def _after(part: slice, size: int) -> slice:
+    """Return the next `size` columns."""
+    return slice(part.stop, part.stop + size)
 
 
 class History:

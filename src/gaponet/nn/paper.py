@@ -173,11 +173,9 @@ class PaperNet(DeltaNet):
     `features` (relative to q) are for the critic of PPO, branch_observation and relative_action.
 
     Attributes:
-        observation: Columns of x with o_t.
         predictor_columns: Columns of x for equation (1), the recorded state aside: o_t or [o_t |
             a_t].
         query: Columns of x for the trunk: {P, A} or A.
-        queries: Number of trunk inputs.
         probes: atanh(e_k / probe_limit) of learned probes, (m, n); else None.
         extra_inputs: Number of branch inputs besides S.
         real_state_scale: Scales of [q_real − q | q̇_real − q̇ | visible], (2n + 1,).
@@ -189,14 +187,12 @@ class PaperNet(DeltaNet):
         super().__init__(config, n)
         layout = self.features.layout
         outputs = config.num_basis * n
-        self.observation = layout.observation
         self.predictor_columns = layout.observation
         if config.predictor_inputs == "equation_1":
             self.predictor_columns = layout.query
         self.query = layout.action
         if config.payload_trunk:
             self.query = slice(layout.payload.start, layout.action.stop)
-        self.queries = self.query.stop - self.query.start
         self.observation_scale = Standardise(self.predictor_columns.stop)
         self.query_scale = Standardise(self.queries)
         scales = [REAL_POSITION_SCALE_RAD] * n + [REAL_VELOCITY_SCALE_RAD_S] * n + [1.0]
@@ -205,12 +201,17 @@ class PaperNet(DeltaNet):
         sensors = self._add_sensors()
         self.extra_inputs = 0
         if config.branch_observation:
-            self.extra_inputs += self.observation.stop
+            self.extra_inputs += layout.observation.stop
         if config.real_state:
             self.extra_inputs += len(scales)
         branch = dense(self.extra_inputs + sensors, BRANCH_HIDDEN, outputs)
         self.branch = nn.Sequential(*branch, nn.ELU())
         self.trunk = dense(self.queries, TRUNK_HIDDEN, outputs, zero_output=True)
+
+    @property
+    def queries(self) -> int:
+        """Number of trunk inputs."""
+        return int(self.query.stop - self.query.start)
 
     def _add_sensors(self) -> int:
         """Create what gives the sensor values.
@@ -219,7 +220,7 @@ class PaperNet(DeltaNet):
         """
         config = self.config
         n = self.n
-        observed = self.predictor_columns.stop
+        observed: int = self.predictor_columns.stop
         sensors = config.sensor_dim(n)
         if config.sensor_source == "none":
             return observed
@@ -257,7 +258,7 @@ class PaperNet(DeltaNet):
             query = relative[:, self.query]
         parts = [query]
         if config.branch_observation:
-            parts.append(relative[:, self.observation])
+            parts.append(relative[:, self.features.layout.observation])
         if config.real_state:
             parts.append(self.real_state(x))
         parts.append(self.sensors(x, z))

@@ -37,7 +37,7 @@ def test_input_statistics_stay_fixed_after_the_predictor_is_fitted(fitted):
     assert before.abs().max() > 0
     fitted.round(lambda: 0.0)
     assert torch.equal(net.features.standardise.mean, before)
-    assert fitted.pool_x[0].shape == (32 * 64, net.config.input_dim(2))
+    assert fitted.pool.x.shape == (32 * 64, net.config.input_dim(2))
 
 
 def test_a_full_pool_takes_a_part_of_the_environments_of_each_period_in_turn(fitted, monkeypatch):

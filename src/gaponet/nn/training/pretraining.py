@@ -16,7 +16,7 @@ import math
 from collections.abc import Callable
 from collections.abc import Sequence as ListOf
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -135,10 +135,32 @@ def _unlabelled(sequences: ListOf[Sequence], robot: RobotSpec) -> Array:
     return unlabelled
 
 
+class VisitedStates(NamedTuple):
+    """States of rollouts, with their labels.
+
+    Attributes:
+        x: Inputs of the network, (states, dim).
+        labels: Δa*, (states, n) rad; NaN where there is none.
+    """
+
+    x: Tensor
+    labels: Tensor
+
+    def followed_by(self, later: VisitedStates) -> VisitedStates:
+        """Return these and later states."""
+        return VisitedStates(torch.cat([self.x, later.x]), torch.cat([self.labels, later.labels]))
+
+
 class Pretraining:
     """Pool of visited states, and the optimiser.
 
     `round` extends the pool and fits the network to it.
+
+    Attributes:
+        labels: Δa* of each row of the environment's recordings, (rows, n) rad, on its device.
+        label_rms: Their root mean square, rad.
+        pool: States that the rollouts of all rounds visited; None before round 1.
+        rollout_states: Network and random numbers before the rollouts of each round.
     """
 
     def __init__(
@@ -160,16 +182,14 @@ class Pretraining:
         self.labels: Any = env.sim.array(labels)
         self.label_rms = float(np.sqrt(np.nanmean(np.square(labels)))) or 1.0
         self.generator = torch.Generator().manual_seed(seed)
-        self.pool_x: list[Tensor] = []
-        self.pool_labels: list[Tensor] = []
-        self.parameters = []
+        self.pool: VisitedStates | None = None
+        fitted = []
         for name, parameter in net.named_parameters():
             if not name.startswith(("predictor", "probes")):
-                self.parameters.append(parameter)
+                fitted.append(parameter)
         self.optimiser = torch.optim.AdamW(
-            self.parameters, lr=config.learning_rate, weight_decay=config.weight_decay
+            fitted, lr=config.learning_rate, weight_decay=config.weight_decay
         )
-        # Network and random numbers before the rollouts of each round.
         self.rollout_states: list[dict[str, Any]] = []
 
     @property
@@ -182,19 +202,15 @@ class Pretraining:
 
         Call before round 1.
         """
-        x, _ = self.rollout(follow_labels=True)
+        visited = self.rollout(follow_labels=True)
         self.net.bounded.scale.fill_(self.label_rms)
+        x = visited.x
         return fit_inputs(self.net, self.env, x, self.config.sensor_states, self.seed, self.nthread)
 
-    def rollout(self, follow_labels: bool) -> tuple[Tensor, Tensor]:
+    def rollout(self, follow_labels: bool) -> VisitedStates:
         """Simulate config.steps control periods; environments restart where their recording ends.
 
-        Args:
-            follow_labels: Apply the labels instead of the network's corrections.
-
-        Returns:
-            Visited inputs, (states, dim), and their labels, (states, n) rad; NaN where there is
-            none.
+        follow_labels: Apply the labels instead of the network's corrections.
         """
         env = self.env
         net = self.net
@@ -219,7 +235,7 @@ class Pretraining:
             for _ in range(hold):
                 env.advance(delta)
             env.restart()
-        return torch.cat(xs), torch.cat(ys)
+        return VisitedStates(torch.cat(xs), torch.cat(ys))
 
     def round(self, tick: Callable[[], object]) -> dict[str, float]:
         """Extend the pool by rollouts, and fit the network to the pool.
@@ -235,33 +251,32 @@ class Pretraining:
             "net": {k: x.clone() for k, x in self.net.state_dict().items()},
             "rng": self.env.rng_state,
         }
-        self._extend_pool(follow_labels=self.rounds_done == 0)
+        pool = self._extend_pool(follow_labels=self.rounds_done == 0)
         self.rollout_states.append(before)
-        squares = self._fit_trees(self.net) if isinstance(self.net, TreesNet) else self._fit(tick)
+        if isinstance(self.net, TreesNet):
+            squares = self.net.fit(pool.x, pool.labels, self.seed)
+        else:
+            squares = self._fit(pool, tick)
         quarter = max(len(squares) // 4, 1)
         last = squares[-quarter:]
         earlier = squares[-2 * quarter : -quarter]
         return {"label_rmse": _rms(last), "label_rmse_before": _rms(earlier)}
 
-    def _extend_pool(self, follow_labels: bool) -> None:
-        x, labels = self.rollout(follow_labels)
-        # One tensor each: the pool is in memory once.
-        self.pool_x = [torch.cat([*self.pool_x, x])]
-        self.pool_labels = [torch.cat([*self.pool_labels, labels])]
+    def _extend_pool(self, follow_labels: bool) -> VisitedStates:
+        """Add the states of a rollout to the pool, and return the pool."""
+        visited = self.rollout(follow_labels)
+        self.pool = visited if self.pool is None else self.pool.followed_by(visited)
+        return self.pool
 
-    def _fit_trees(self, net: TreesNet) -> Array:
-        """Fit trees to the pool; return the mean squared label error, (1,) rad²."""
-        return net.fit(self.pool_x[0], self.pool_labels[0], self.seed)
-
-    def _fit(self, tick: Callable[[], object]) -> Array:
+    def _fit(self, pool: VisitedStates, tick: Callable[[], object]) -> Array:
         """Fit the network to the pool.
 
         Return the mean squared label error of each gradient step, rad².
         """
         config = self.config
         net = self.net
-        (x,) = self.pool_x
-        (labels,) = self.pool_labels
+        x = pool.x
+        labels = pool.labels
         # On the device until the last step: reading it in each step would wait.
         squares = torch.zeros(config.gradient_steps, dtype=torch.double, device=x.device)
         net.train()

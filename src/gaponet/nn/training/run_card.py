@@ -43,7 +43,7 @@ def run_card(
         motions=motions,
         sensor_r2=state.sensor_r2,
         seed=config.seed,
-        gain=state.best_state["bounded.gain"].item(),
+        gain=state.best.weights["bounded.gain"].item(),
         steps=state.steps,
         stages={
             "pretraining_rounds": [state.pretraining_rounds, config.pretraining.rounds],

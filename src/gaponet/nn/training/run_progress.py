@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -83,18 +82,15 @@ class RunProgress:
                 seconds=self.seconds(),
                 reward=self.update.reward,
                 val_mpjae=state.val_error,
-                best_mpjae=state.best_error,
+                best_mpjae=state.best.error,
                 nominal_mpjae=self.nominal_error,
             )
         )
 
     def validate_and_save(self, metrics: dict[str, float]) -> None:
         """Validate the network in training, and save it with these metrics of its stage."""
-        state = self.state
         error = float(self._validator.errors(self._net).mean())
-        if error < state.best_trained_error:
-            state.best_trained_error = error
-            state.best_trained_state = copy.deepcopy(self._net.state_dict())
+        self.state.best_trained.offer(self._net, error)
         self.save_if_best(self._net, error, metrics)
 
     def save_if_best(
@@ -105,15 +101,12 @@ class RunProgress:
         error: Its validation error, rad.
         """
         state = self.state
-        state.val_error = float(error)
-        if state.val_error < state.best_error:
-            state.best_error = state.val_error
-            state.best_state = copy.deepcopy(net.state_dict())
+        state.best.offer(net, error)
         line = {
             "stage": self.stage,
             "steps": state.steps,
             "seconds": round(self.seconds(), 1),
-            "val_mpjae": state.val_error,
+            "val_mpjae": error,
             "nominal_mpjae": self.nominal_error,
         } | (metrics or {})
         state.progress.append({k: v if v == v else None for k, v in line.items()})
@@ -122,3 +115,7 @@ class RunProgress:
         self._started_at = time.monotonic()
         state.write(self._out, self._net)
         self.report()
+
+    def close_loggers(self) -> None:
+        """Close the files and connections of `--log`."""
+        self._loggers.close()

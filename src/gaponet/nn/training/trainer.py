@@ -27,7 +27,7 @@ from gaponet.nn.delay_offset import DelayOffset
 from gaponet.nn.layers import DeltaNet
 from gaponet.nn.networks import build_network
 from gaponet.nn.onnx_export import export
-from gaponet.nn.training.checkpoint import Checkpoint, StateDict
+from gaponet.nn.training.checkpoint import BestNetwork, Checkpoint, PPOState, StateDict
 from gaponet.nn.training.config import Budget, Status, TrainConfig
 from gaponet.nn.training.env import UNLIMITED, DeltaEnv, EnvOptions
 from gaponet.nn.training.ppo import PPO
@@ -89,7 +89,6 @@ class Trainer:
         """
         config = validated(TrainConfig, asdict(config), "training options", UsageError).sized()
         require_suitable(out, robot, resume)
-        self.robot = robot
         self.out = out
         self.config = config
         self.gate = gate or GateReport()
@@ -98,7 +97,9 @@ class Trainer:
         torch.set_num_threads(config.learner_threads)
         self.net = build_network(config.model, len(robot.operated))
         weights = copy.deepcopy(self.net.state_dict())
-        state = Checkpoint(weights, weights, dataset_hash=dataset_hash(dataset.entries))
+        state = Checkpoint(
+            BestNetwork(weights), BestNetwork(weights), dataset_hash=dataset_hash(dataset.entries)
+        )
         with lock_folder(out, "run"):
             if resume:
                 state = Checkpoint.read(out, self.net, state.dataset_hash)
@@ -106,15 +107,13 @@ class Trainer:
             write_setup(out, self.data, config, budget, resume, despite_errors)
             state.write_progress(out)
         self.net.to(config.network_device())
-        self.loggers = Loggers(log, out, asdict(config))
+        loggers = Loggers(log, out, asdict(config))
         self.baseline: DelayOffset | None = None
         self.shared = {} if shared is None else shared
         self.validator = Validator(self.data.val, robot, config.model, config.threads)
         self.rng_state = torch.get_rng_state()
         self.interrupted = False
-        self.progress = RunProgress(
-            out, self.net, state, budget, self.validator, self.loggers, show
-        )
+        self.progress = RunProgress(out, self.net, state, budget, self.validator, loggers, show)
 
     def run(self) -> GapModel:
         """Train until the budget is spent or Ctrl-C, and return the exported best model.
@@ -125,7 +124,7 @@ class Trainer:
         """
         with lock_folder(self.out, "run"):
             self.baseline = self._write_baseline()
-            nominal_errors = self.validator.errors(None, self.robot.nominal)
+            nominal_errors = self.validator.errors(None, self.data.robot.nominal)
             self.progress.nominal_error = float(nominal_errors.mean())
             try:
                 self._run_stages()
@@ -146,9 +145,9 @@ class Trainer:
         """Run the stages that are left."""
         state = self.progress.state
         rounds = self.config.pretraining.rounds
-        if not np.isfinite(state.best_error):
+        if not np.isfinite(state.best.error):
             # The untrained network corrects nothing: this is the error to improve on.
-            self.progress.save_if_best(self.net, self.validator.errors(None).mean())
+            self.progress.save_if_best(self.net, float(self.validator.errors(None).mean()))
         if state.ppo is None and state.pretraining_rounds < rounds:
             self._pretrain()
         elif state.ppo is None and not rounds:
@@ -164,7 +163,7 @@ class Trainer:
         return baseline
 
     def _fit_baseline(self) -> DelayOffset:
-        robot = self.robot.before_identification
+        robot = self.data.robot.before_identification
         return DelayOffset.fit(self.data.recorded, robot, self.config.threads)
 
     def _once(self, name: str, make: Callable[[], Any]) -> Any:
@@ -185,6 +184,7 @@ class Trainer:
         """Supervised pre-training (nn/training/pretraining.py)."""
         progress = self.progress
         state = progress.state
+        robot = self.data.robot
         config = self.config.pretraining
         threads = self.config.threads
         progress.stage = "labels"
@@ -193,7 +193,7 @@ class Trainer:
         largest = MAX_LABEL_SHARE * self.config.model.delta_max
         labels = self._once(
             "labels",
-            lambda: trajectory_labels(sequences, self.robot, largest, threads, progress.report),
+            lambda: trajectory_labels(sequences, robot, largest, threads, progress.report),
         )
         pretraining = Pretraining(self.net, env, labels, config, self.config.seed, threads)
         if state.pretraining_rounds == 0:
@@ -219,7 +219,7 @@ class Trainer:
         states = self.config.pretraining.sensor_states
         state = self.progress.state
         state.sensor_r2 = fit_inputs(self.net, env, x, states, seed, self.config.threads)
-        state.best_trained_state = copy.deepcopy(self.net.state_dict())
+        state.best_trained.weights = copy.deepcopy(self.net.state_dict())
 
     def _train_by_ppo(self) -> None:
         """Train by PPO (nn/training/ppo.py) until the budget is spent."""
@@ -232,9 +232,9 @@ class Trainer:
         if state.ppo is None:
             self.net.load_state_dict(self._initial_ppo_weights())
         ppo = PPO(env, self.net, config)
-        if state.ppo is not None and state.env is not None:
-            ppo.load_state_dict(state.ppo)
-            env.set_state(state.env)
+        if state.ppo is not None:
+            ppo.load_state_dict(state.ppo.learner)
+            env.set_state(state.ppo.env)
             torch.set_rng_state(self.rng_state)
         state.pretraining = None
         while not progress.is_budget_spent():
@@ -250,8 +250,7 @@ class Trainer:
 
     def _save_ppo(self, ppo: PPO, env: DeltaEnv) -> None:
         """Validate the network, and store it with the states of PPO and its environments."""
-        self.progress.state.ppo = ppo.state_dict()
-        self.progress.state.env = env.state()
+        self.progress.state.ppo = PPOState(ppo.state_dict(), env.state())
         self.progress.validate_and_save(vars(self.progress.update))
 
     def _refit_sensors(self, env: DeltaEnv) -> None:
@@ -269,9 +268,9 @@ class Trainer:
         stays as it is.
         """
         state = self.progress.state
-        too_large = state.best_trained_error > state.untrained_error
+        too_large = state.best_trained.error > state.untrained_error
         state.ppo_from_untrained = bool(self.config.pretraining.rounds) and too_large
-        weights = dict(state.best_trained_state)
+        weights = dict(state.best_trained.weights)
         if not state.ppo_from_untrained:
             return weights
         with torch.random.fork_rng():
@@ -289,22 +288,22 @@ class Trainer:
         """
         state = self.progress.state
         has_gain = self.config.model.kind != "paper"
-        if not np.isfinite(state.best_trained_error) or not has_gain:
+        if not np.isfinite(state.best_trained.error) or not has_gain:
             return
         self.progress.begin_stage("gain")
-        net = self._network(state.best_trained_state)
+        net = self._network(state.best_trained.weights)
         gain = choose_gain(
-            net, lambda: float(self.validator.errors(net).mean()), state.best_trained_error
+            net, lambda: float(self.validator.errors(net).mean()), state.best_trained.error
         )
         if gain < 1.0:
-            self.progress.save_if_best(net, self.validator.errors(net).mean())
+            self.progress.save_if_best(net, float(self.validator.errors(net).mean()))
 
     def _finish(self) -> GapModel:
         """Export the best network."""
         self.progress.begin_stage("export")
-        net = self._network(self.progress.state.best_state).eval()
+        net = self._network(self.progress.state.best.weights).eval()
         env = self._env(max(EXPORT_ENVS, len(self.data.conditions)), 10, 0, device="cpu")
-        self.loggers.close()
+        self.progress.close_loggers()
         samples = env.get_observations()["actor"].numpy()
         export(net, self.out / "model", self._card(net), samples)
         return GapModel.load(self.out)
@@ -315,7 +314,7 @@ class Trainer:
         state = self.progress.state
         reduction, standard_error = self.validator.improvement(net)
         errors = {
-            "model": state.best_error,
+            "model": state.best.error,
             "nominal": self.progress.nominal_error,
             "start": state.untrained_error,
             "added": reduction,
@@ -353,7 +352,7 @@ class Trainer:
         config = self.config
         return DeltaEnv(
             sequences or self.data.train,
-            self.robot,
+            self.data.robot,
             config.model,
             EnvOptions(
                 num_envs=num_envs,
