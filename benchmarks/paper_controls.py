@@ -48,7 +48,8 @@ class PermutedPayloadEnv(DeltaEnv):
     def __init__(self, *args: Any, **options: Any) -> None:
         super().__init__(*args, **options)
         rng = np.random.default_rng(0)
-        self.payload = rng.permutation(self.payload)
+        told = self.observations
+        told.payload = rng.permutation(told.payload)
 
 
 def noise_instead_of_sensors(net: PaperNet, x: Tensor, z: Tensor) -> Tensor:

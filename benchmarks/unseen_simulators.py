@@ -376,7 +376,7 @@ class OtherContext(DeltaCorrector):
         super().reset(start)
         assert self.loop is not None
         conditions = [Condition.of(replace(s, simulator=self.other), self.robot) for s in start]
-        self.loop.set_context(contexts(self.robot, conditions))
+        self.loop.network_input.set_context(contexts(self.robot, conditions))
 
 
 def table(found: dict[str, dict[str, list[list[float]]]]) -> ResultTable:

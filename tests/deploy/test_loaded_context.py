@@ -78,7 +78,7 @@ def test_a_compensator_knows_the_payload_that_it_carries(model):
     for mass in (0.0, PAYLOAD):
         compensator = gp.Compensator(model.simulator(), model, payload_step=PAYLOAD)
         compensator.reset(model.simulator().qpos_home, mass)
-        loop = compensator.inverse.loop
-        contexts_seen = loop.x[:, loop.layout.context]
+        seen = compensator.inverse.loop.network_input
+        contexts_seen = seen.x[:, seen.layout.context]
         sent[mass] = np.array(contexts_seen)
     assert np.abs(sent[0.0] - sent[PAYLOAD]).max() > 1e-3

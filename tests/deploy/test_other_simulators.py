@@ -96,9 +96,9 @@ def test_a_simulator_that_cannot_be_transferred_is_corrected_by_its_answers(trai
     sim = AlignedSim(late(trained.robot), trained.model)
 
     assert sim.transfer is None
-    assert (
-        np.abs(sim.loop.x[0, sim.loop.layout.context] - trained.model.nominal_context).max() > 1e-3
-    )
+    told = sim.loop.network_input
+    context = told.x[0, told.layout.context]
+    assert np.abs(context - trained.model.nominal_context).max() > 1e-3
 
 
 def test_a_simulator_with_neither_is_refused(trained) -> None:

@@ -133,4 +133,4 @@ def test_torch_and_numpy_arrays_give_the_same_corrections(change):
             tensors.reset(np.array([1, 3]))
         theirs = tensors.delta(*(torch.from_numpy(values) for values in (q, v, a, payload)))
         np.testing.assert_allclose(theirs.numpy(), host.delta(q, v, a, payload), atol=1e-6)
-        np.testing.assert_allclose(tensors.x.numpy(), host.x, atol=1e-6)
+        np.testing.assert_allclose(tensors.network_input.x.numpy(), host.network_input.x, atol=1e-6)

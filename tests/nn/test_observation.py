@@ -5,8 +5,7 @@ import pytest
 import torch
 
 from gaponet.nn.config import ModelConfig
-from gaponet.nn.loop import DeltaLoop
-from gaponet.nn.observation import History, Layout
+from gaponet.nn.observation import History, Layout, NetworkInput
 
 
 @pytest.mark.parametrize(("history", "dim"), [(2, 80), (4, 140), (6, 200), (8, 260)])
@@ -16,12 +15,12 @@ def test_dimensions_are_the_papers(history, dim):
 
 
 def test_layout_is_state_then_frames_newest_first_then_payload_and_action():
-    loop = DeltaLoop(ModelConfig(history=2, payload_max=2.0), np.array([[-9.0, 9.0]]), num_envs=1)
-    loop.begin(slice(None), *np.full((3, 1, 1, 1), 9.0))
+    made = NetworkInput(ModelConfig(history=2, payload_max=2.0), n=1, num_envs=1)
+    made.begin(slice(None), *np.full((3, 1, 1, 1), 9.0))
     one = lambda value: np.array([[value]])  # noqa: E731
-    loop.history.push(one(1.0), one(2.0), one(3.0))
-    loop.history.push(one(4.0), one(5.0), one(6.0))
-    x = loop.observe(one(7.0), one(8.0), one(10.0), np.array([1.0]))
+    made.push(one(1.0), one(2.0), one(3.0))
+    made.push(one(4.0), one(5.0), one(6.0))
+    x = made.update(one(7.0), one(8.0), one(10.0), np.array([1.0]))
     np.testing.assert_array_equal(x, [[7, 8, 4, 5, 6, 1, 2, 3, 0.5, 10]])
 
 

@@ -143,7 +143,7 @@ def test_held_sensors_see_the_observation_of_the_last_refresh_and_the_trunk_the_
     for t in range(6):
         held.delta(*np.full((3, 2, 2), float(t)), 0.0)
     inputs = np.array(inputs)[:, 0]
-    at = held.layout
+    at = held.network_input.layout
     assert inputs[:, at.q.start].tolist() == [0, 0, 0, 3, 3, 3]
     assert inputs[:, at.past.start].tolist() == [0, 0, 0, 2, 2, 2]
     assert inputs[:, at.action.start].tolist() == [0, 1, 2, 3, 4, 5]
@@ -303,7 +303,7 @@ def test_on_a_robot_the_measured_state_reaches_the_predictor_of_equation_1(tmp_p
     robot = write_arm(tmp_path / "arm")
     export(net, tmp_path / "run", make_card(EQUATION_1, robot, dt=[0.02]), sample_inputs(net))
     hidden, measured = (GapModel.load(tmp_path / "run").loop() for _ in range(2))
-    measured.extra = lambda: np.array([[0.05, -0.05, 0.1, 0.1, 1.0]])
+    measured.network_input.extra = lambda: np.array([[0.05, -0.05, 0.1, 0.1, 1.0]])
     state = np.full((3, 2), 0.1)
     assert np.abs(measured.delta(*state, 0.0) - hidden.delta(*state, 0.0)).max() > 1e-4
 
@@ -426,7 +426,7 @@ def test_half_of_the_episodes_show_the_recorded_state(tmp_path, config):
     robot = write_arm(tmp_path)
     env = DeltaEnv(recordings(robot, 2, rows=30), robot, config, EnvOptions(200, nthread=1))
     env.sim.qpos[:] -= 0.1
-    real = env.get_observations()["actor"][:, env.loop.layout.real]
+    real = env.get_observations()["actor"][:, env.observations.network_input.layout.real]
     shown = real[:, 4] == 1
     assert 60 < shown.sum() < 140
     assert not real[~shown].any()
@@ -443,7 +443,7 @@ def test_missing_extra_inputs_are_zero():
         real_state=True,
     )
     for width in (0, 16, 21):  # nothing, the simulator's answers, these and the recorded state
-        given.extra = (lambda: np.ones((2, width))) if width else None  # noqa: B023
+        given.network_input.extra = (lambda: np.ones((2, width))) if width else None  # noqa: B023
         given.delta(*np.zeros((3, 2, 2)), 0.0)
     assert np.array(seen).tolist() == [[1] * width + [0] * (21 - width) for width in (0, 16, 21)]
 

@@ -43,3 +43,8 @@ def copy_array(x: Any) -> Any:
 def to_numpy(x: Any) -> Array:
     """Return a numpy or torch array in numpy; a tensor on a GPU is copied to the host."""
     return x if isinstance(x, np.ndarray) else x.cpu().numpy()
+
+
+def float32(x: Any) -> Any:
+    """Return a numpy or torch array as float32."""
+    return x.astype(np.float32) if isinstance(x, np.ndarray) else x.float()

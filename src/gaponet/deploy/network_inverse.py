@@ -47,7 +47,7 @@ class NetworkInverse:
     def carry(self, mass: Array) -> None:
         """Let each robot carry one of the loads, (num,) indices."""
         if self._contexts is not None:
-            self.loop.set_context(self._contexts[mass])
+            self.loop.network_input.set_context(self._contexts[mass])
 
     def reset(self) -> None:
         """Start without history and correction."""

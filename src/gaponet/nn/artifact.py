@@ -397,7 +397,7 @@ class GapModel:
             )
         loop = DeltaLoop(self.config, self.qpos_range, num_envs, self.infer)
         if self.config.context:
-            loop.set_context(self.nominal_context if context is None else context)
+            loop.network_input.set_context(self.nominal_context if context is None else context)
         return loop
 
     def is_trained_in(self, robot: RobotSpec) -> bool:

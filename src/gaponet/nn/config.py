@@ -65,7 +65,7 @@ class ModelConfig:
     """paper: inputs of the sensor predictor. observation: positions, velocities, past targets and
     the payload. equation_1: also the present target, the joint index and the recorded state
     relative to the simulated one, as the paper writes it. Training hides the recorded state in half
-    of the episodes. gaponet eval never gives it; a control loop can (DeltaLoop.extra)."""
+    of the episodes. gaponet eval never gives it; a control loop can (NetworkInput.extra)."""
     sensor_hold: Annotated[int, Interval(ge=1, le=1000)] = 1
     """paper: number of control periods for which the sensor values are held."""
     sensor_target: Literal["delta", "absolute"] = "delta"
@@ -81,7 +81,7 @@ class ModelConfig:
     real_state: bool = False
     """paper: the recorded state, relative to the simulated one, is an input of the branch too.
     Training hides it in half of the episodes. gaponet eval never gives it; a control loop can
-    (DeltaLoop.extra)."""
+    (NetworkInput.extra)."""
     num_probes: Annotated[int, Interval(ge=1, le=1000)] = 20
     """m, number of probes: targets for which the simulator gives its next state."""
     probe_small: Annotated[float, Interval(ge=0, le=10)] = 0.05
@@ -180,6 +180,11 @@ class ModelConfig:
                 raise UsageError(
                     f"{name} {value}: model {self.kind} has no such switch; use --model paper"
                 )
+
+    @property
+    def history_depth(self) -> int:
+        """Number of past frames that are stored; the network sees every stride-th."""
+        return (self.history - 1) * self.stride + 1
 
     @property
     def holds(self) -> bool:

@@ -1,6 +1,7 @@
-"""Control loop around a network: history, held values and joint limits.
+"""Control loop around a network: held corrections, joint limits and the bound of its answers.
 
-Training, rollouts, simulators and robots share it.
+Rollouts, simulators and robots share it. The network's input is that of training
+(nn/observation.py).
 
 Arrays are numpy's or, if the loop's buffers are tensors, torch's. They have the operated joints,
 (num_envs, n).
@@ -10,17 +11,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from collections.abc import Sequence as ListOf
-from functools import partial
 from typing import Any
 
 import numpy as np
 
-from gaponet.base.arrays import Array, array_like, array_module, copy_array, zeros_like
+from gaponet.base.arrays import Array, array_like, array_module, zeros_like
 from gaponet.base.errors import UsageError
 from gaponet.data.sequence import Sequence
 from gaponet.nn.bound import AnswerBound
 from gaponet.nn.config import ModelConfig
-from gaponet.nn.observation import History, Layout
+from gaponet.nn.observation import NetworkInput, per_joint
 from gaponet.nn.onnx_network import Network, OnnxNetwork
 from gaponet.robot.spec import RobotSpec
 
@@ -29,13 +29,9 @@ class DeltaLoop:
     """Corrections for num_envs robots or simulations, each with its own history.
 
     Attributes:
-        x: Input of the network, (num_envs, dim) float32; `observe` updates it.
-        extra: Returns the columns of x after [o_t | a_t], (num_envs, k): the simulator's answers,
-            then the recorded state's 2n + 1 numbers (nn/observation.py). Missing columns stay zero;
-            all do if extra is None.
+        network_input: Input of the network. Its `extra` gives the columns that a robot does not
+            have by itself.
         held: The correction that is held, (num_envs, n) rad, or (n,) for one robot.
-        age: Control periods since the start, (num_envs,).
-        fresh: Robots without a history, (num_envs,).
     """
 
     def __init__(
@@ -43,48 +39,32 @@ class DeltaLoop:
         config: ModelConfig,
         qpos_range: Array,
         num_envs: int,
-        network: Network | None = None,
+        network: Network,
         like: Any = None,
     ) -> None:
         """
         Args:
             qpos_range: Limits of the operated joints, (n, 2) rad.
-            network: The model. Without one, call `observe` and `history.push` only, as in training.
+            network: The model.
             like: A float32 array or tensor. All buffers are of its kind and device; default numpy.
         """
         n = len(qpos_range)
         self.config = config
         self.n = n
         self.num_envs = num_envs
-        layout = Layout(config, n)
-        self.layout = layout
-        if like is None:
-            like = np.empty(0, np.float32)
-        x = zeros_like(like, num_envs, layout.dim)
-        self.x = x
-        self.history = History(config, n, x)
-        self._numpy = isinstance(x, np.ndarray)
+        self.network_input = NetworkInput(config, n, num_envs, like)
+        x = self.network_input.x
         self._xp = array_module(x)
         # Internal arrays of one robot have one dimension: numpy needs half the time.
         shape = (n,) if num_envs == 1 else (num_envs, n)
         self._shapes = {shape, (num_envs, n)}
-        rows = x[0] if num_envs == 1 else x
-        self._q = rows[..., layout.q]
-        self._v = rows[..., layout.v]
-        self._action = rows[..., layout.action]
-        self._payload = x[:, layout.payload.start] if config.payload_input else None
         self._bound = AnswerBound(config.delta_max)
-        self.answer = self._bind(network, shape)
+        self._answer = self._bind(network, shape)
         low, high = np.transpose(qpos_range)
-        self.low = np.array(low, float) if self._numpy else x.new_tensor(low)
-        self.high = np.array(high, float) if self._numpy else x.new_tensor(high)
-        self._applied: Any = zeros_like(x, *shape)
-        self.holds = config.holds
-        self.age = zeros_like(x, num_envs)
+        self._low = array_like(x, np.array(low, float))
+        self._high = array_like(x, np.array(high, float))
         self.held: Any = zeros_like(x, *shape)
-        self.extra: Callable[[], Any] | None = None
-        self.fresh = np.ones(num_envs, bool)
-        self.any_fresh = True
+        self._applied: Any = zeros_like(x, *shape)
 
     @property
     def applied(self) -> Any:
@@ -101,80 +81,12 @@ class DeltaLoop:
         """
         return self._bound.refused
 
-    def set_context(self, context: Any) -> None:
-        """Set the answers of each robot's simulator to fixed probes, (num_envs, 8n) or (8n) rad
-        (sim/context.py).
-        """
-        if self._numpy:
-            self.x[:, self.layout.context] = context
-        else:
-            self.x[:, self.layout.context] = array_like(self.x, context)
-
-    # ---- history
-
     def reset(self, ids: Array | slice = slice(None)) -> None:
         """Delete the history of robots `ids`.
 
-        At the next observation, their present frame is repeated as history.
+        At the next correction, their present frame is repeated as history.
         """
-        self.fresh[ids] = True
-        self.any_fresh = True
-
-    def begin(self, ids: Array | slice, qpos: Any, qvel: Any, u: Any) -> None:
-        """Set the history of robots `ids`: frames (k, depth, n), newest first, or (k, 1, n),
-        repeated; rad, rad/s, rad.
-
-        u: Applied targets.
-        """
-        self.history.reset(ids, qpos, qvel, u)
-        if self.holds:
-            self.age[ids] = 0
-        if self.any_fresh:
-            self.fresh[ids] = False
-            self.any_fresh = bool(self.fresh.any())
-
-    def push(self, qpos: Any, qvel: Any, u: Any) -> None:
-        """End a control period: append the state before it and its target, (num_envs, n) each, to
-        the history.
-        """
-        self.history.push(qpos, qvel, u)
-        if self.holds:
-            self.age += 1
-
-    # ---- a control period
-
-    def observe(self, qpos: Any, qvel: Any, ctrl: Any, payload_mass: Any) -> Any:
-        """Update x and return it. It is the loop's buffer: copy it to keep it.
-
-        Args:
-            qpos, qvel: Present state, (num_envs, n) rad, rad/s.
-            ctrl: Target of the coming period, (num_envs, n) rad.
-            payload_mass: kg, one number or (num_envs,).
-        """
-        if self.any_fresh:
-            q = qpos.reshape(-1, 1, self.n)[self.fresh]
-            v = qvel.reshape(-1, 1, self.n)[self.fresh]
-            u = ctrl.reshape(-1, 1, self.n)[self.fresh]
-            self.begin(self.fresh.copy(), q, v, u)
-        if self.config.sensor_hold == 1:
-            self._q[...] = qpos
-            self._v[...] = qvel
-            self.history.write()
-        else:  # the sensor predictor's input is the observation of the last refresh
-            due, column = self._due(self.config.sensor_hold)
-            self._q[...] = self._xp.where(column, qpos, self._q)
-            self._v[...] = self._xp.where(column, qvel, self._v)
-            self.history.write(due)
-        self._action[...] = ctrl
-        if self._payload is not None:
-            self._payload[...] = payload_mass / self.config.payload_max
-        if self.extra is not None:
-            due, _ = self._due(self.config.sensor_hold)
-            if due.any():
-                extra = self.extra()
-                start = self.layout.query.stop
-                self.x[due, start : start + extra.shape[1]] = extra[due]
-        return self.x
+        self.network_input.reset(ids)
 
     def delta(self, qpos: Any, qvel: Any, ctrl: Any, payload_mass: Any) -> Any:
         """Return the correction of the coming control period. Call this once per period.
@@ -195,7 +107,8 @@ class DeltaLoop:
         Raises:
             UsageError: Arrays have another shape.
         """
-        if self._numpy:
+        numpy = self._xp is np
+        if numpy:
             qpos = np.asarray(qpos)
             qvel = np.asarray(qvel)
             ctrl = np.asarray(ctrl)
@@ -207,20 +120,21 @@ class DeltaLoop:
                 "model.loop(num_envs)"
             )
         # The fastest test for finite numbers.
-        if not (self._numpy and np.vdot(ctrl, ctrl) < np.inf):
+        if not (numpy and np.vdot(ctrl, ctrl) < np.inf):
             ctrl = self._finite(qpos, ctrl)
-        self.observe(qpos, qvel, ctrl, payload_mass)
-        delta = self.answer()
+        network_input = self.network_input
+        network_input.update(qpos, qvel, ctrl, payload_mass)
+        delta = self._answer()
         if self.config.delta_hold > 1:
-            _, due = self._due(self.config.delta_hold)
+            due = per_joint(network_input.due(self.config.delta_hold))
             delta = self._xp.where(due, delta, self.held)
             self.held = delta
-        applied = self._xp.minimum(self._xp.maximum(ctrl + delta, self.low), self.high)
+        applied = self._xp.minimum(self._xp.maximum(ctrl + delta, self._low), self._high)
         self._applied = applied
-        if self.holds:
-            self.push(qpos, qvel, applied)
+        if network_input.age is None:
+            network_input.push(None, None, applied)  # the state in x
         else:
-            self.history.push(None, None, applied)
+            network_input.push(qpos, qvel, applied)
         return applied - ctrl
 
     def solve(
@@ -247,27 +161,24 @@ class DeltaLoop:
             gain: In (0, 1].
             iterations: Number of evaluations of the network.
         """
-        self.observe(qpos, qvel, wanted, payload_mass)
+        self.network_input.update(qpos, qvel, wanted, payload_mass)
         for _ in range(iterations):
-            self._action[...] = wanted + offset
-            offset -= gain * (offset + self.answer())
-        self.push(qpos, qvel, wanted)
+            self.network_input.action[...] = wanted + offset
+            offset -= gain * (offset + self._answer())
+        self.network_input.push(qpos, qvel, wanted)
         result: Array = wanted + offset
         return result
 
-    # ---- internals
-
-    def _bind(self, network: Network | None, shape: tuple[int, ...]) -> Callable[[], Any]:
+    def _bind(self, network: Network, shape: tuple[int, ...]) -> Callable[[], Any]:
         """Return a function without arguments: present x → Δa of this shape, rad, finite and
         within ±delta_max.
         """
-        if network is None:
-            return partial(zeros_like, self.x, *shape)
+        x = self.network_input.x
         bound = self._bound
         if isinstance(network, OnnxNetwork):
-            evaluate = network.bind(self.x, shape)
+            evaluate = network.bind(x, shape)
             return lambda: bound(evaluate())
-        return lambda: bound(network(self.x).reshape(shape))
+        return lambda: bound(network(x).reshape(shape))
 
     def _finite(self, qpos: Any, ctrl: Any) -> Any:
         """Replace targets that are not finite by the last applied ones, or by the positions of
@@ -276,17 +187,8 @@ class DeltaLoop:
         Without this, the correction and the history would stay NaN.
         """
         rows = ctrl.reshape(-1, self.n)
-        last = copy_array(self.history.frames[:, 0, 2 * self.n :])
-        if self.any_fresh:
-            last[self.fresh] = qpos.reshape(-1, self.n)[self.fresh]
+        last = self.network_input.last_targets(qpos)
         return self._xp.where(self._xp.isfinite(rows), rows, last).reshape(ctrl.shape)
-
-    def _due(self, hold: int) -> tuple[Any, Any]:
-        """Return the mask of robots at a multiple of `hold` control periods, (num_envs,), and the
-        mask for joints.
-        """
-        due = self.age % hold == 0
-        return due, due if self.num_envs == 1 else due[:, None]
 
 
 class DeltaCorrector:
@@ -315,7 +217,9 @@ class DeltaCorrector:
         self.payload = np.array([sequence.meta.payload_mass for sequence in start], np.float32)
         conditions = [Condition.of(sequence, self.robot) for sequence in start]
         if self.config.context:
-            loop.set_context(contexts(self.robot, conditions, loaded=self.config.context_is_loaded))
+            loaded = self.config.context_is_loaded
+            context = contexts(self.robot, conditions, loaded=loaded)
+            loop.network_input.set_context(context)
         if self.config.needs_simulator:
             from gaponet.nn.sensor import ProbeOracle
 
@@ -325,7 +229,7 @@ class DeltaCorrector:
                 assert self._state is not None
                 return oracle(*self._state).reshape(len(start), -1)
 
-            loop.extra = answers
+            loop.network_input.extra = answers
         self.loop = loop
 
     def correct(self, t: int, target: Array, qpos: Array, qvel: Array) -> Array:

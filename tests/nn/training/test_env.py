@@ -11,7 +11,8 @@ from gaponet.base.errors import UsageError
 from gaponet.nn.config import ModelConfig
 from gaponet.nn.networks import build_network
 from gaponet.nn.training.config import PretrainingConfig, RewardConfig
-from gaponet.nn.training.env import CRITIC_PREVIEW, DeltaEnv, EnvOptions
+from gaponet.nn.training.env import DeltaEnv, EnvOptions
+from gaponet.nn.training.observations import CRITIC_PREVIEW
 from gaponet.nn.training.pretraining import Pretraining
 from gaponet.sim.batch import Condition
 from gaponet.sim.replay import replay
@@ -32,7 +33,8 @@ def test_without_correction_the_environment_is_the_replay(robot):
     env = make(robot, sequences)
     first = env.playback.first.copy()
     env.playback.start(slice(None), first, first, env.playback.last.copy())
-    env.sim.reset(slice(None), env.qpos[first], env.qvel[first])
+    recorded = env.rows
+    env.sim.reset(slice(None), recorded.qpos[first], recorded.qvel[first])
     for _ in range(59):
         env.advance(np.zeros((env.num_envs, 2)))
     replays = replay(sequences, robot)
@@ -45,7 +47,7 @@ def test_the_reward_of_a_joint_compares_it_one_row_on(robot):
     env = make(robot, recordings(robot, 2, rows=60, kp=0.6), position=0.02, cap=0.1)
     row = env.playback.row.copy()
     reward, done = env.step(np.zeros((env.num_envs, 2), np.float32))
-    error = np.abs(env.sim.qpos - env.qpos[np.minimum(row + 1, len(env.qpos) - 1)])[~done]
+    error = np.abs(env.sim.qpos - env.rows.qpos[np.minimum(row + 1, len(env.rows.qpos) - 1)])[~done]
     assert (error > 0.002).any()
     assert (error < 0.002).any()
     np.testing.assert_allclose(reward[~done], -np.minimum(error / 0.02, 0.1), rtol=1e-4, atol=1e-6)
@@ -93,21 +95,21 @@ def test_the_critic_looks_ahead_of_the_simulation(robot):
     many = len(CRITIC_PREVIEW)
     q = env.sim.qpos
     rows = np.minimum(env.playback.row[:, None] + CRITIC_PREVIEW, env.playback.last[:, None])
-    np.testing.assert_allclose(seen[:, :n], env.qpos[env.playback.row] - q, atol=1e-6)
+    np.testing.assert_allclose(seen[:, :n], env.rows.qpos[env.playback.row] - q, atol=1e-6)
     ahead = seen[:, 2 * n : 2 * n + many * n].reshape(-1, many, n)
-    np.testing.assert_allclose(ahead, env.qpos[rows] - q[:, None], atol=1e-6)
+    np.testing.assert_allclose(ahead, env.rows.qpos[rows] - q[:, None], atol=1e-6)
     commands = seen[:, 2 * n + many * n : 2 * n + 2 * many * n].reshape(-1, many, n)
-    np.testing.assert_allclose(commands, env.ctrl[rows] - q[:, None], atol=1e-6)
+    np.testing.assert_allclose(commands, env.rows.ctrl[rows] - q[:, None], atol=1e-6)
 
 
 def test_payload_of_the_log_is_the_payload_of_the_simulation(robot):
     sequences = recordings(robot, 4, rows=60)
     env = make(robot, sequences)
-    masses = {env.rows.conditions[g][0] for g in env.rows.group}
+    masses = {env.groups.conditions[g][0] for g in env.groups.of_env}
     assert masses == {0.0, 0.2}
     for i in range(env.num_envs):
         member = np.flatnonzero(env.rows.first == env.playback.first[i])[0]
-        assert env.rows.conditions[env.rows.group[i]] == Condition.of(sequences[member], robot)
+        assert env.groups.conditions[env.groups.of_env[i]] == Condition.of(sequences[member], robot)
 
 
 def test_motions_are_drawn_in_proportion_to_their_length_as_numpys_choice_does(robot):
@@ -118,10 +120,10 @@ def test_motions_are_drawn_in_proportion_to_their_length_as_numpys_choice_does(r
     env.reset()
     length = np.array([len(s) for s in sequences])
     drawn = []
-    for g, condition in enumerate(env.rows.conditions):
+    for g, condition in enumerate(env.groups.conditions):
         mine = np.flatnonzero([Condition.of(s, robot) == condition for s in sequences])
         drawn += rng.choice(
-            mine, size=(env.rows.group == g).sum(), p=length[mine] / length[mine].sum()
+            mine, size=(env.groups.of_env == g).sum(), p=length[mine] / length[mine].sum()
         ).tolist()
     np.testing.assert_array_equal(env.playback.first, env.rows.first[drawn])
 
@@ -139,7 +141,7 @@ def test_the_actor_never_sees_the_recorded_state(robot):
     sequences = recordings(robot, 2, rows=60, kp=0.6)
     env = make(robot, sequences)
     before = env.get_observations()
-    env.playback.track[:, :4] += 1.0  # recorded q, q̇
+    env.playback.rows.track[:, :4] += 1.0  # recorded q, q̇
     env.playback.recorded[:, :4] += 1.0
     after = env.get_observations()
     assert torch.equal(before["actor"], after["actor"])

@@ -26,7 +26,7 @@ def fitted(tmp_path_factory):
     env = DeltaEnv(recordings(robot, 4), robot, config, EnvOptions(32, nthread=1))
     net = build_network(config, 2)
     settings = PretrainingConfig(num_envs=32, steps=64, gradient_steps=2)
-    warm = Pretraining(net, env, np.zeros((len(env.qpos), 2), np.float32), settings, seed=0)
+    warm = Pretraining(net, env, np.zeros((len(env.rows.qpos), 2), np.float32), settings, seed=0)
     warm.fit_inputs()
     return warm
 

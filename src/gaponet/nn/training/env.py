@@ -13,22 +13,20 @@ from typing import Any
 import numpy as np
 import torch
 
-from gaponet.base.arrays import Array, array_like, array_module, copy_array, zeros_like
+from gaponet.base.arrays import Array, array_module, float32, zeros_like
 from gaponet.base.errors import UsageError
 from gaponet.data.sequence import Sequence
 from gaponet.nn.config import ModelConfig
-from gaponet.nn.loop import DeltaLoop
-from gaponet.nn.observation import History
 from gaponet.nn.sensor import ProbeOracle
 from gaponet.nn.training.config import RewardConfig
-from gaponet.nn.training.playback import Playback, take_rows
-from gaponet.nn.training.recorded_rows import RecordedRows
+from gaponet.nn.training.observations import Observations
+from gaponet.nn.training.playback import Playback
+from gaponet.nn.training.recorded_rows import EnvGroups, RecordedRows
 from gaponet.robot.spec import RobotSpec
-from gaponet.sim.batch import BatchSim, Condition, longest_delay
+from gaponet.sim.batch import BatchSim, longest_delay
 from gaponet.sim.context import contexts
 from gaponet.sysid.robot_rollouts import IMMOVABLE_ARMATURE
 
-CRITIC_PREVIEW = (1, 2, 5, 10, 20)  # rows of the recording ahead that the critic observes
 UNLIMITED = 10**9  # control periods of an episode
 
 
@@ -53,21 +51,20 @@ class EnvOptions:
 class DeltaEnv:
     """num_envs simulations; each follows one recording from a random row on.
 
-    Observation groups: "actor" is x = [o_t | a_t]. "critic" has the recorded state, recorded
-    positions and commands ahead, payload and rate. The actor observes the recorded state only with
-    model.real_state or equation 1 as written (model.predictor_inputs), and then in a random half of
-    the episodes. An environment never changes its payload, rate and gains. The end of a recording
-    is a time-out, not a failure.
+    The action is a correction of the recorded targets, and the reward of a joint is a small
+    position error one control period later. An environment never changes its payload, rate and
+    gains. The end of a recording is a time-out, not a failure.
 
     Arrays are numpy's on device "cpu", where C MuJoCo steps. Elsewhere they are tensors on the
     device, and mujoco_warp steps (sim/warp.py).
 
     Attributes:
-        rows: Recordings, and the condition of each environment, on the host.
+        rows: Recordings, on the host.
+        groups: Which environment plays which recordings; payload, rate and gains of each.
+        sim: Simulations.
         playback: Row of its recording that each environment has reached.
-        ctrl, qpos, qvel: Recordings, (rows, n_free) rad, rad, rad/s.
-        payload: Payload of each environment, (num_envs,) kg.
-        nan_where_unobserved: 0, or NaN for joints whose positions were not recorded, (num_envs, n).
+        observations: What actor and critic observe.
+        reward: Reward of the joints.
     """
 
     def __init__(
@@ -90,117 +87,61 @@ class DeltaEnv:
         self.num_envs = options.num_envs
         self.num_actions = len(robot.operated)
         self.rng = np.random.default_rng(options.seed)
-        rows = RecordedRows(sequences, robot, config.delta_hold + 1, options.num_envs)
-        conditions = [rows.conditions[group] for group in rows.group]
-        host_sim = _simulations(robot, rows, conditions, options.nthread)
+        rows = RecordedRows(sequences, robot, min_rows=config.delta_hold + 1)
+        groups = EnvGroups(sequences, robot, rows, options.num_envs)
         self.rows = rows
-        self.sim: Any = _on_device(host_sim, options.device)
-
+        self.groups = groups
+        sim = _simulations(robot, rows, groups, options.nthread)
+        self.sim: Any = _on_device(sim, options.device)
         place = self.sim.array
-        self.ctrl = place(rows.ctrl)
-        self.qpos = place(rows.qpos)
-        self.qvel = place(rows.qvel)
-        self.playback = Playback(place(rows.track), options.num_envs, place)
-        payload = np.array([c.payload_mass for c in conditions], np.float32)
-        self.payload = place(payload)
-        self._condition_features = place(_condition_features(payload, conditions, config))
-        unobserved = rows.unobserved[rows.group][:, rows.operated]
-        self.nan_where_unobserved = place(np.where(unobserved, np.nan, 0).astype(np.float32))
-        self._operated = place(rows.operated)
-        self._preview = place(CRITIC_PREVIEW)
-        self._low, self._high = place(host_sim.commands.range[rows.operated].T)
-        self._target = zeros_like(self.sim.qpos, *host_sim.qpos.shape)
-        # 1 where the actor observes the recorded state
-        self._real_state_visible = zeros_like(self.playback.track, options.num_envs, 1)
-        self._rewards = MeanReward()
-
-        joint_limits = host_sim.commands.range[rows.operated]
-        like = self.playback.recorded
-        self.loop = DeltaLoop(config, joint_limits, options.num_envs, like=like)
-        self._connect_inputs(conditions)
-        self._history_rows = max(self.loop.history.depth, 1 + _delay_periods(host_sim, rows))
+        past_rows = max(config.history_depth, 1 + _delay_periods(robot, groups))
+        self.playback = Playback(rows, options.num_envs, past_rows, place)
+        self.observations = Observations(
+            config, self.sim, self.playback, groups.conditions_of_envs, self._oracle()
+        )
+        if config.context:
+            self.observations.network_input.set_context(self._context())
+        unobserved = groups.unobserved[groups.of_env][:, rows.operated]
+        self.reward = PositionReward(options.reward, place(_nan_where(unobserved)))
         self.reset()
 
-    def _connect_inputs(self, conditions: list[Condition]) -> None:
-        """Give the loop the inputs of the network that come from the simulator or the recording."""
-        config = self.config
+    def _oracle(self) -> ProbeOracle | None:
+        """Return the simulator's answers to probes, for a network that observes them."""
+        if not self.config.needs_simulator:
+            return None
         options = self.options
-        if config.needs_simulator:
-            if options.device != "cpu":
-                raise UsageError(
-                    "--model.sensor-source fixed asks C MuJoCo: use --device cpu, not "
-                    f"{options.device}"
-                )
-            self.oracle = ProbeOracle(
-                self.robot, config, conditions, options.nthread, self.rows.locked
+        if options.device != "cpu":
+            raise UsageError(
+                f"--model.sensor-source fixed asks C MuJoCo: use --device cpu, not {options.device}"
             )
-        if config.context:
-            loaded = config.context_is_loaded
-            context = contexts(self.robot, conditions, options.nthread, loaded=loaded)
-            self.loop.set_context(context)
-        if config.needs_simulator or config.observes_real_state:
-            self.loop.extra = self._extra_inputs
+        conditions = self.groups.conditions_of_envs
+        return ProbeOracle(self.robot, self.config, conditions, options.nthread, self.rows.locked)
+
+    def _context(self) -> Array:
+        """Return the simulators' answers to fixed probes at rest, (num_envs, 8n) rad."""
+        conditions = self.groups.conditions_of_envs
+        loaded = self.config.context_is_loaded
+        return contexts(self.robot, conditions, self.options.nthread, loaded=loaded)
 
     def reset(self, ids: Any = slice(None)) -> None:
         """Restart environments at uniformly drawn recorded rows; ids on the host.
 
         The rows before are the history.
         """
-        group = self.rows.group[ids]
-        first, last = self.rows.sample(group, self.rng)
+        first, last = self.groups.sample(self.groups.of_env[ids], self.rng)
         row = self.rng.integers(first, last - self.config.delta_hold + 1)
-        before = first[:, None] + History.rows_before(row - first, self._history_rows)
         self.playback.start(ids, row, first, last)
+        before = self.playback.rows_before(ids)  # (k, rows), newest first
         row = self.sim.array(row)
-        before = self.sim.array(before)  # (k, rows), newest first
         ids = ids if isinstance(ids, slice) else self.sim.array(ids)
-        if self.config.observes_real_state:
-            visible = (self.rng.random((len(group), 1)) < 0.5).astype(np.float32)
-            self._real_state_visible[ids] = self.sim.array(visible)
-        self.sim.reset(ids, self.qpos[row], self.qvel[row], past=self.ctrl[before])
-        before = before[:, : self.loop.history.depth]
-        self.loop.begin(
-            ids,
-            self.qpos[before][..., self._operated],
-            self.qvel[before][..., self._operated],
-            self.ctrl[before][..., self._operated],
-        )
+        recorded = self.playback.rows
+        past = recorded.ctrl[before]
+        self.sim.reset(ids, recorded.qpos[row], recorded.qvel[row], past=past)
+        self.observations.reset(ids, before, self.rng)
 
     def get_observations(self) -> dict[str, torch.Tensor]:
         """Return the observations of actor and critic, float32."""
-        n = self.num_actions
-        recorded = self.playback.recorded
-        q = self.sim.qpos[:, self._operated]
-        v = self.sim.qvel[:, self._operated]
-        actor = copy_array(self.loop.observe(q, v, recorded[:, 2 * n :], self.payload))
-        ahead = self.playback.ahead(self._preview)  # (num_envs, rows ahead, 3n)
-        # Relative to the simulation: an error of 5 mrad is hard to see in angles that span a
-        # radian.
-        parts = [
-            recorded[:, :n] - q,
-            recorded[:, n : 2 * n] - v,
-            (ahead[..., :n] - q[:, None]).reshape(len(q), -1),
-            (ahead[..., 2 * n :] - q[:, None]).reshape(len(q), -1),
-            self._condition_features,
-        ]
-        critic = _float32(array_module(ahead).concatenate(parts, 1))
-        return {"actor": torch.as_tensor(actor), "critic": torch.as_tensor(critic)}
-
-    def _extra_inputs(self) -> Any:
-        """Return the columns of x after [o_t | a_t] (nn/observation.py), (num_envs, …)."""
-        sim = self.sim
-        concatenate = array_module(self.playback.recorded).concatenate
-        parts = []
-        if self.config.needs_simulator:
-            parts.append(self.oracle(sim.qpos, sim.qvel).reshape(self.num_envs, -1))
-        if self.config.observes_real_state:
-            q = sim.qpos[:, self._operated]
-            v = sim.qvel[:, self._operated]
-            recorded_state = self.playback.recorded[:, : 2 * self.num_actions]
-            difference = recorded_state - concatenate([q, v], 1)
-            visible = self._real_state_visible
-            parts.append(concatenate([difference, visible], 1) * visible)
-        return concatenate(parts, 1)
+        return self.observations.get()
 
     def step(self, delta: Any) -> tuple[Any, Any]:
         """Correct targets for delta_hold control periods, and reset environments that have ended.
@@ -212,111 +153,125 @@ class DeltaEnv:
             Mean reward of each joint, (num_envs, n), and the mask of the environments that were
             reset, (num_envs,).
         """
-        delta = self.sim.array(delta).clip(-self.config.delta_max, self.config.delta_max)
+        largest = self.config.delta_max
         hold = self.config.delta_hold
+        delta = self.sim.array(delta).clip(-largest, largest)
         reward = 0.0
         for _ in range(hold):
             self.advance(delta)
-            reward = reward + self._reward()
-        return reward / hold, self.sim.array(self.restart())
-
-    def restart(self) -> Array:
-        """Reset the environments whose recording or time has ended.
-
-        Return their mask, (num_envs,), on the host.
-        """
-        done = self.playback.ended(self.config.delta_hold, self.options.episode_steps)
-        if done.any():
-            self.reset(np.flatnonzero(done))
-        return done
+            reward = reward + self._rewards()
+        done = self.restart()
+        return reward / hold, self.sim.array(done)
 
     def advance(self, delta: Any) -> None:
         """Step all simulations by one control period, without reward or reset.
 
         delta: (num_envs, n) rad.
         """
-        operated = self._operated
         sim = self.sim
-        target = self._target
-        target[:] = take_rows(self.ctrl, self.playback.row_on_device)
-        corrected = target[:, operated] + sim.array(delta)
-        target[:, operated] = corrected.clip(self._low, self._high)
-        self.loop.push(sim.qpos[:, operated], sim.qvel[:, operated], target[:, operated])
+        op = self.playback.rows.operated
+        target = self._targets(delta)
+        network_input = self.observations.network_input
+        network_input.push(sim.qpos[:, op], sim.qvel[:, op], target[:, op])
         sim.step(target)
         self.playback.advance()
 
-    def _reward(self) -> Any:
-        """Return minus the cost of each joint's position error, (num_envs, n) float32."""
-        config = self.options.reward
-        recorded = self.playback.recorded[:, : self.num_actions]
-        error = abs(self.sim.qpos[:, self._operated] - recorded)
-        cost = (error / config.position).clip(max=config.cap)
-        cost = array_module(cost).nan_to_num(cost + self.nan_where_unobserved)
-        reward = -cost
-        self._rewards.add(reward)
-        return _float32(reward)
+    def restart(self) -> Array:
+        """Reset the environments that have ended.
 
-    def mean_reward(self) -> float:
-        """Return the mean reward per control period, environment and joint since the last call."""
-        return self._rewards.take()
+        Return their mask, (num_envs,), on the host.
+        """
+        done = self._dones()
+        if done.any():
+            self.reset(np.flatnonzero(done))
+        return done
+
+    def _targets(self, delta: Any) -> Any:
+        """Return the recorded targets, corrected within the joint limits, (num_envs, n_free)
+        rad.
+        """
+        op = self.playback.rows.operated
+        low, high = self.sim.commands.range[op].T
+        target = zeros_like(self.sim.qpos, *self.sim.qpos.shape)
+        target[:] = self.playback.commanded()
+        corrected = target[:, op] + self.sim.array(delta)
+        target[:, op] = corrected.clip(low, high)
+        return target
+
+    def _rewards(self) -> Any:
+        """Return the reward of each joint in the last control period, (num_envs, n) float32."""
+        q = self.sim.qpos[:, self.playback.rows.operated]
+        return self.reward(q, self.playback.recorded[:, : self.num_actions])
+
+    def _dones(self) -> Array:
+        """Return the environments whose recording or time has ended, (num_envs,), on the host."""
+        return self.playback.ended(self.config.delta_hold, self.options.episode_steps)
 
     # ---- checkpoint
 
-    @property
     def rng_state(self) -> str:
-        """State of the random numbers as JSON, because its integers have 128 bits."""
+        """Return the state of the random numbers as JSON, because its integers have 128 bits."""
         return json.dumps(self.rng.bit_generator.state)
 
-    @rng_state.setter
-    def rng_state(self, text: str) -> None:
+    def set_rng_state(self, text: str) -> None:
+        """Restore an `rng_state`."""
         self.rng.bit_generator.state = json.loads(text)
 
     def state(self) -> dict[str, Any]:
         """Return rows, simulations (with delayed commands), histories and random numbers."""
-        arrays = dict(self.playback.state())
-        arrays["frames"] = self.loop.history.frames
-        arrays |= self.sim.state()
-        if self.config.observes_real_state:
-            arrays["shown"] = self._real_state_visible
-        if self.loop.holds:
-            arrays["age"] = self.loop.age
-            arrays["x"] = self.loop.x
+        arrays = self.playback.state() | self.observations.state() | self.sim.state()
         return {
             "arrays": {name: torch.as_tensor(x).cpu().clone() for name, x in arrays.items()},
-            "reward": self._rewards.state(),
-            "rng": self.rng_state,
+            "reward": self.reward.state(),
+            "rng": self.rng_state(),
         }
 
     def set_state(self, state: dict[str, Any]) -> None:
         """Restore a `state` of an environment with the same arguments."""
         arrays = {name: x.numpy() for name, x in state["arrays"].items()}
         self.playback.set_state(arrays)
-        loop = self.loop
-        loop.history.frames[:] = array_like(loop.history.frames, arrays["frames"])
-        if loop.holds:
-            loop.age[:] = array_like(loop.age, arrays["age"])
-            loop.x[:] = array_like(loop.x, arrays["x"])
-        if self.config.observes_real_state:
-            self._real_state_visible[:] = array_like(self._real_state_visible, arrays["shown"])
+        self.observations.set_state(arrays)
         self.sim.set_state(arrays)
-        self._rewards.set_state(state["reward"])
-        self.rng_state = state["rng"]
+        self.reward.set_state(state["reward"])
+        self.set_rng_state(state["rng"])
 
 
-class MeanReward:
-    """Mean reward over periods, environments and joints. The sum may stay on the device."""
+class PositionReward:
+    """Reward of each joint: minus its position error, in units of config.position, up to
+    config.cap.
 
-    def __init__(self) -> None:
+    It keeps the sum of the rewards since the last `take_mean`, which may stay on the device.
+
+    Attributes:
+        nan_where_unobserved: 0, or NaN for joints whose positions were not recorded, (num_envs, n).
+            Their reward is zero.
+    """
+
+    def __init__(self, config: RewardConfig, nan_where_unobserved: Any) -> None:
+        self.config = config
+        self.nan_where_unobserved = nan_where_unobserved
         self._sum: Any = 0.0
         self._periods = 0
 
-    def add(self, reward: Any) -> None:
-        """Add a period, (num_envs, n)."""
+    def __call__(self, qpos: Any, recorded: Any) -> Any:
+        """Return the reward of a control period, (num_envs, n) float32.
+
+        Args:
+            qpos: Simulated positions, (num_envs, n) rad.
+            recorded: Recorded ones.
+        """
+        error = abs(qpos - recorded)
+        cost = (error / self.config.position).clip(max=self.config.cap)
+        cost = array_module(cost).nan_to_num(cost + self.nan_where_unobserved)
+        reward = -cost
         self._sum = self._sum + reward.mean()
         self._periods += 1
+        return float32(reward)
 
-    def take(self) -> float:
-        """Return the mean, 0 without a period, and start again."""
+    def take_mean(self) -> float:
+        """Return the mean reward per control period, environment and joint since the last call, 0
+        without a period.
+        """
         mean = float(self._sum) / max(self._periods, 1)
         self._sum = 0.0
         self._periods = 0
@@ -331,16 +286,14 @@ class MeanReward:
         self._sum, self._periods = state
 
 
-def _simulations(
-    robot: RobotSpec, rows: RecordedRows, conditions: list[Condition], nthread: int
-) -> BatchSim:
+def _simulations(robot: RobotSpec, rows: RecordedRows, groups: EnvGroups, nthread: int) -> BatchSim:
     """Return the simulations in C MuJoCo.
 
     Joints without recorded positions stay where the recording says, as in identification.
     """
-    sim = BatchSim(robot, conditions, nthread, rows.locked)
-    if rows.unobserved.any():
-        held = IMMOVABLE_ARMATURE * rows.unobserved[rows.group]
+    sim = BatchSim(robot, groups.conditions_of_envs, nthread, rows.locked)
+    if groups.unobserved.any():
+        held = IMMOVABLE_ARMATURE * groups.unobserved[groups.of_env]
         sim.batch.expand("dof_armature")[:] += held
         if sim.servo_model is not None:
             sim.servo_model.servos.armature += held
@@ -357,17 +310,12 @@ def _on_device(sim: BatchSim, device: str) -> Any:
     return WarpSim(sim, device)
 
 
-def _condition_features(payload: Array, conditions: list[Condition], config: ModelConfig) -> Array:
-    """Return what the critic is told of payload and rate, about 1 at most, (num_envs, 2)."""
-    rate = np.array([1 / c.dt for c in conditions], np.float32)  # Hz
-    return np.stack([payload / config.payload_max, rate / 100], axis=1)
-
-
-def _delay_periods(sim: BatchSim, rows: RecordedRows) -> int:
+def _delay_periods(robot: RobotSpec, groups: EnvGroups) -> int:
     """Return the longest delay of commands, control periods of the fastest recording."""
-    shortest_dt = min(condition.dt for condition in rows.conditions)
-    return int(np.ceil(longest_delay(sim.robot, rows.conditions) / shortest_dt))
+    shortest_dt = min(condition.dt for condition in groups.conditions)
+    return int(np.ceil(longest_delay(robot, groups.conditions) / shortest_dt))
 
 
-def _float32(x: Any) -> Any:
-    return x.astype(np.float32) if isinstance(x, np.ndarray) else x.float()
+def _nan_where(mask: Array) -> Array:
+    """Return NaN where the mask is true, else 0, float32."""
+    return np.where(mask, np.nan, 0).astype(np.float32)

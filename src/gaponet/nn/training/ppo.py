@@ -186,7 +186,7 @@ class PPO:
             explained_variance=explained,
             mean_delta=float(size.mean()),
             at_limit=float(at_limit),
-            reward=float(self.env.mean_reward()),
+            reward=float(self.env.reward.take_mean()),
         )
         is_warm = self.updates >= self.config.critic_warmup
         if is_warm and explained >= self.config.explained:

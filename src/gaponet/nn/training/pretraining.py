@@ -224,7 +224,7 @@ class Pretraining:
         for t in range(steps):
             subset = slice(t % every, None, every)
             x = env.get_observations()["actor"]
-            labels = self.labels[env.playback.row_on_device] + env.nan_where_unobserved
+            labels = self.labels[env.playback.row_on_device] + env.reward.nan_where_unobserved
             xs.append(x[subset].contiguous())
             ys.append(torch.as_tensor(labels[subset], device=x.device))
             if follow_labels:
@@ -249,7 +249,7 @@ class Pretraining:
         """
         before = {
             "net": {k: x.clone() for k, x in self.net.state_dict().items()},
-            "rng": self.env.rng_state,
+            "rng": self.env.rng_state(),
         }
         pool = self._extend_pool(follow_labels=self.rounds_done == 0)
         self.rollout_states.append(before)
@@ -308,7 +308,7 @@ class Pretraining:
             "rounds": list(self.rollout_states),
             "optimiser": self.optimiser.state_dict(),
             "generator": self.generator.get_state(),
-            "env_rng": self.env.rng_state,
+            "env_rng": self.env.rng_state(),
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -316,12 +316,12 @@ class Pretraining:
         present = {name: x.clone() for name, x in self.net.state_dict().items()}
         for i, before in enumerate(state["rounds"]):
             self.net.load_state_dict(before["net"])
-            self.env.rng_state = before["rng"]
+            self.env.set_rng_state(before["rng"])
             self._extend_pool(follow_labels=i == 0)
         self.net.load_state_dict(present)
         self.optimiser.load_state_dict(state["optimiser"])
         self.generator.set_state(state["generator"])
-        self.env.rng_state = state["env_rng"]
+        self.env.set_rng_state(state["env_rng"])
         self.rollout_states = list(state["rounds"])
 
 

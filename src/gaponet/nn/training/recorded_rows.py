@@ -1,4 +1,4 @@
-"""Recordings as arrays of rows, and which environment may play which recording."""
+"""Recordings as arrays of rows, and which environment plays which recordings."""
 
 from __future__ import annotations
 
@@ -16,10 +16,7 @@ from gaponet.sim.replay import idle_limbs
 
 
 class RecordedRows:
-    """Recordings as arrays of rows, and their assignment to environments. All arrays are numpy's.
-
-    Environments are divided into groups in proportion to the recorded rows. A group has one
-    payload, rate, gains and set of recorded joints.
+    """Recordings below each other, as arrays of rows. All arrays are numpy's.
 
     Attributes:
         locked: Joints of limbs that no recording commands; they are clamped at home.
@@ -27,21 +24,15 @@ class RecordedRows:
         ctrl, qpos, qvel: Joints that are not locked, (rows, n_free) rad, rad, rad/s.
         track: [q | q̇ | a] of the operated joints, (rows, 3n) float32.
         first, last: First and last row of each recording.
-        conditions, unobserved: Condition of each group, and the joints without recorded positions,
-            (groups, n_free).
-        group: Group of each environment, (num_envs,).
     """
 
-    def __init__(
-        self, sequences: ListOf[Sequence], robot: RobotSpec, min_rows: int, num_envs: int
-    ) -> None:
+    def __init__(self, sequences: ListOf[Sequence], robot: RobotSpec, min_rows: int) -> None:
         """
         Args:
             min_rows: Least number of rows of a recording.
 
         Raises:
-            UsageError: No recording, a recording that is too short, or fewer environments than
-                groups.
+            UsageError: No recording, or one that is too short.
         """
         _require_rows(sequences, min_rows)
         self.locked = idle_limbs(sequences, robot)
@@ -61,14 +52,49 @@ class RecordedRows:
         self.last = np.cumsum(length) - 1
         self.first = self.last - length + 1
 
+
+class EnvGroups:
+    """Groups of environments that play the same recordings. All arrays are numpy's.
+
+    Environments are divided into groups in proportion to the recorded rows. A group has one
+    payload, rate, gains and set of recorded joints.
+
+    Attributes:
+        conditions: Condition of each group.
+        unobserved: Joints without recorded positions, (groups, n_free).
+        of_env: Group of each environment, (num_envs,).
+    """
+
+    def __init__(
+        self, sequences: ListOf[Sequence], robot: RobotSpec, rows: RecordedRows, num_envs: int
+    ) -> None:
+        """
+        Args:
+            sequences: The recordings of `rows`.
+
+        Raises:
+            UsageError: Fewer environments than groups.
+        """
         keys = [(Condition.of(s, robot), s.meta.unrecorded) for s in sequences]
         groups = list(dict.fromkeys(keys))
         group_of_sequence = np.array([groups.index(key) for key in keys])
         self.conditions = [condition for condition, _ in groups]
-        self.unobserved = np.array([[j in unrecorded for j in free] for _, unrecorded in groups])
-        self.group = _groups_of_environments(np.bincount(group_of_sequence, length), num_envs)
+        free = [joint for joint in robot.joint_names if joint not in rows.locked]
+        unobserved = []
+        for _, unrecorded in groups:
+            unobserved.append([joint in unrecorded for joint in free])
+        self.unobserved = np.array(unobserved)
+        length = rows.last - rows.first + 1
+        self.of_env = _groups_of_environments(np.bincount(group_of_sequence, length), num_envs)
 
-        self._members, self._cumulative = _shares_of_groups(group_of_sequence, length)
+        members, self._cumulative = _shares_of_groups(group_of_sequence, length)
+        self._first = rows.first[members]
+        self._last = rows.last[members]
+
+    @property
+    def conditions_of_envs(self) -> list[Condition]:
+        """Condition of each environment."""
+        return [self.conditions[group] for group in self.of_env]
 
     def sample(self, group: Array, rng: Any) -> tuple[Array, Array]:
         """Draw a recording for each of these groups, in proportion to its rows.
@@ -78,8 +104,8 @@ class RecordedRows:
         """
         end_of_group = np.nextafter(group + 1.0, 0.0)
         drawn = np.minimum(group + rng.random(len(group)), end_of_group)
-        sequence = self._members[np.searchsorted(self._cumulative, drawn, side="right")]
-        return self.first[sequence], self.last[sequence]
+        member = np.searchsorted(self._cumulative, drawn, side="right")
+        return self._first[member], self._last[member]
 
 
 def _require_rows(sequences: ListOf[Sequence], min_rows: int) -> None:

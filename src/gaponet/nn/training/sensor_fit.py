@@ -97,8 +97,8 @@ def probe_states(
         # The same states repeat: the copies are moved, so that none is both fitted and held out.
         origin[env.num_envs :] = NEAR + origin[env.num_envs :] % 2
     origin = origin[chosen]
-    groups = env.rows.group[visited.env[chosen]]
-    conditions = [env.rows.conditions[group] for group in groups]
+    groups = env.groups.of_env[visited.env[chosen]]
+    conditions = [env.groups.conditions[group] for group in groups]
     oracle = ProbeOracle(env.robot, net.config, conditions, nthread, env.rows.locked)
     sample = visited.rows(chosen)
 
