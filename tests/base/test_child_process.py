@@ -13,10 +13,9 @@ from arm import write_arm
 
 from gaponet.cli.main import COMMANDS
 
-NAMES = sorted(
-    {*sys.stdlib_module_names, *importlib.metadata.packages_distributions()}
-    - {"gaponet", "__main__"}
-)
+IMPORTABLE = {*sys.stdlib_module_names, *importlib.metadata.packages_distributions()}
+# packages_distributions() of CUDA's packages also has paths, such as nvidia/cusparselt.
+NAMES = sorted(name for name in IMPORTABLE - {"gaponet", "__main__"} if name.isidentifier())
 MARK = "ran.txt"
 POISON = (
     f"import os; open(os.path.join(os.path.dirname(__file__), {MARK!r}), 'a').write(__name__ + "

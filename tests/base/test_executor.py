@@ -88,7 +88,7 @@ def test_ray_is_imported_on_request_and_a_missing_ray_is_named(tmp_path, capsys,
         str(tmp_path / "ray"),
     ]
     assert main(command) == 2
-    assert capsys.readouterr().err.endswith("install ray\n")
+    assert capsys.readouterr().err.endswith(" ray\n")
 
 
 def test_a_pickled_robot_brings_its_folder(tmp_path):
