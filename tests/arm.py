@@ -1,4 +1,6 @@
-"""A two-joint arm for tests: its robot folder, and recordings of a second arm that is not quite like it."""
+"""A two-joint arm for tests: its robot folder, and recordings of a second arm that is not quite
+like it.
+"""
 
 from __future__ import annotations
 
@@ -74,7 +76,9 @@ def record(
     delay: int = 0,
     unit: str = "a",
 ) -> Sequence:
-    """What an arm with other gains and a delay does; kp 1 and delay 0 is the nominal simulator itself."""
+    """What an arm with other gains and a delay does; kp 1 and delay 0 is the nominal simulator
+    itself.
+    """
     model = build_model(robot, payload)
     model.actuator_gainprm[:, 0] *= kp
     model.actuator_biasprm[:, 1] *= kp

@@ -84,7 +84,9 @@ class Browser:
         self.folder.cleanup()
 
     def ask(self, method: str, **parameters: Any) -> dict[str, Any]:
-        """The answer to a command of the DevTools protocol; what happens meanwhile is kept in events."""
+        """The answer to a command of the DevTools protocol; what happens meanwhile is kept in
+        events.
+        """
         self.count += 1
         message = {"id": self.count, "method": method, "params": parameters}
         self.socket.send(
@@ -132,7 +134,9 @@ class Browser:
 
 
 def wait(ask: Any) -> Any:
-    """The first answer that is true; files that are not there yet and elements that are not are waited for."""
+    """The first answer that is true; files that are not there yet and elements that are not are
+    waited for.
+    """
     end = time.monotonic() + PATIENCE
     while True:
         try:

@@ -89,7 +89,9 @@ def iit_z1() -> Path:
 
 @pytest.fixture(scope="session")
 def paper_network() -> Path:
-    """The weights that the paper's authors published, and pairs of inputs and outputs of their code."""
+    """The weights that the paper's authors published, and pairs of inputs and outputs of their
+    code.
+    """
     return public("paper_network")
 
 

@@ -59,7 +59,9 @@ class Contacts:
         self.model.geom_margin[:] = 0.0
 
     def deepest(self, qpos: np.ndarray) -> tuple[float, str]:
-        """How deep the worst contact of a posture (n,) rad is, m, and between which bodies; 0 where nothing touches."""
+        """How deep the worst contact of a posture (n,) rad is, m, and between which bodies; 0 where
+        nothing touches.
+        """
         self.data.qpos = qpos
         mujoco.mj_kinematics(self.model, self.data)
         mujoco.mj_collision(self.model, self.data)
@@ -72,7 +74,9 @@ class Contacts:
         )
 
     def along(self, ctrl: np.ndarray, step: float = 0.01) -> tuple[float, str]:
-        """The deepest along a command (T, n) rad, joint lines between its rows divided into at most `step` rad."""
+        """The deepest along a command (T, n) rad, joint lines between its rows divided into at most
+        `step` rad.
+        """
         worst = (0.0, "")
         for a, b in itertools.pairwise(ctrl):
             for share in np.arange(0, 1, step / max(float(np.abs(b - a).max()), step)):

@@ -1,4 +1,6 @@
-"""Environments for other people's programs, made once in the user's cache folder: make peers, make engines."""
+"""Environments for other people's programs, made once in the user's cache folder: make peers, make
+engines.
+"""
 
 from __future__ import annotations
 

@@ -10,7 +10,9 @@ from gaponet.base.errors import UsageError
 
 
 def dies_at_first(job: tuple[Path, int]) -> tuple[int, str]:
-    """Leave a file for each attempt; jobs with an even number are killed at the first, job 5 at every one, 7 fails."""
+    """Leave a file for each attempt; jobs with an even number are killed at the first, job 5 at
+    every one, 7 fails.
+    """
     folder, number = job
     attempts = len(list(folder.glob(f"{number}-*")))
     (folder / f"{number}-{attempts}").touch()

@@ -44,7 +44,9 @@ class Robot(Base):
 
 
 def make_robot_from_config(config: RobotConfig) -> Robot:
-    """Return the robot of the same name without Config, as LeRobot does for robots that are not its own."""
+    """Return the robot of the same name without Config, as LeRobot does for robots that are not its
+    own.
+    """
     module = sys.modules[type(config).__module__]
     return getattr(module, type(config).__name__.removesuffix("Config"))(config)
 

@@ -31,7 +31,10 @@ FOLLOWING_ERROR = (
 
 
 def late(ctrl: np.ndarray, steps: int) -> np.ndarray:
-    """Nearly the same `steps` rows later, first row held: what a good servo does. Without steps, a copy."""
+    """Nearly the same `steps` rows later, first row held: what a good servo does.
+
+    Without steps, a copy.
+    """
     if not steps:
         return ctrl.copy()
     delayed = np.concatenate([np.repeat(ctrl[:1], steps, axis=0), ctrl[:-steps]])

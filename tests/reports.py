@@ -40,7 +40,9 @@ CONFIG = {
 def evaluated_run(
     arm: RobotSpec, data: Dataset, folder: Path, simulator: RobotSpec | None = None
 ) -> Path:
-    """Evaluated on motions in which only the elbow moves; 3 of 10 rounds of its supervised pre-training are done."""
+    """Evaluated on motions in which only the elbow moves; 3 of 10 rounds of its supervised
+    pre-training are done.
+    """
     for sequence in recordings(arm, 4, rows=160, kp=0.5):
         ctrl = sequence.ctrl * [0.0, 1.0]
         data.append(replace(sequence, ctrl=ctrl.astype(np.float32)))

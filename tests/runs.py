@@ -105,7 +105,9 @@ def corrects_by(delta: float, robot: RobotSpec, folder: Path) -> GapModel:
 def random_run(
     folder: Path, robot: RobotSpec, payload_seen: tuple[float, ...] = (0.0, 0.2), **how: object
 ) -> GapModel:
-    """A run whose operator answers anything, up to some 0.1 rad: whatever it is told makes a difference."""
+    """A run whose operator answers anything, up to some 0.1 rad: whatever it is told makes a
+    difference.
+    """
     small = {"history": 2, "stride": 2, "num_probes": 4}
     small |= dict.fromkeys(("branch_hidden", "trunk_hidden", "sensor_hidden"), (8,))
     torch.manual_seed(0)

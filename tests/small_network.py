@@ -89,7 +89,9 @@ def use_package_folder(monkeypatch, folder: Path) -> None:
 
 
 def ship(run: Path, data: Dataset, package: Path, name: str = NAME) -> Path:
-    """Return the folder that benchmarks/ship_networks.py makes of a run; benchmarks must be importable."""
+    """Return the folder that benchmarks/ship_networks.py makes of a run; benchmarks must be
+    importable.
+    """
     import ship_networks
 
     folder = package / name

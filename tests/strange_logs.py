@@ -82,7 +82,9 @@ def write_mat(folder: Path, rows: int = ROWS) -> None:
 
 
 def write_pace(folder: Path, rows: int = ROWS) -> None:
-    """A dictionary of tensors, and of gains as NumPy arrays, as newer ones of PACE's collectors are."""
+    """A dictionary of tensors, and of gains as NumPy arrays, as newer ones of PACE's collectors
+    are.
+    """
     import torch
 
     ctrl, qpos = map(torch.tensor, motion(rows))

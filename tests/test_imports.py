@@ -13,12 +13,14 @@ from gaponet.cli.main import COMMANDS
 from gaponet.data.formats import FORMATS
 
 PACKAGE = Path(gaponet.__file__).parent
-# Sub-packages and modules of gaponet. Each may import from itself and from those before it, also inside functions.
+# Sub-packages and modules of gaponet. Each may import from itself and from those before it, also
+# inside functions.
 RANKS = (
     "base", "robot", "data", "sim", "motion", "sysid", "nn", "deploy", "evaluation", "hw", "virtual",
     "report", "share", "export", "experiments", "api", "cli", "__main__",
 )  # fmt: skip
-# The same within sub-packages: these folders may be imported by those after them, never by what lies beside them.
+# The same within sub-packages: these folders may be imported by those after them, never by what
+# lies beside them.
 INNER = {
     "nn": ("training",),
     "sysid": ("steps", "evidence"),
@@ -52,7 +54,9 @@ def rank(module: str) -> int:
 
 
 def inner_rank(module: str) -> int:
-    """Place of a module in its sub-package: 0 beside the folders of INNER, then in their order, then BESIDE."""
+    """Place of a module in its sub-package: 0 beside the folders of INNER, then in their order,
+    then BESIDE.
+    """
     _, package, *rest = module.split(".")
     folders = INNER.get(package, ())
     if rest and rest[0] in BESIDE.get(package, ()):

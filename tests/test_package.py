@@ -29,7 +29,9 @@ def test_a_user_can_see_all_extras_at_a_glance():
 
 
 def test_hosted_workflows_call_what_is_here():
-    """A command of a workflow is .ci/run, a make target that the Makefile has, or one of these few words."""
+    """A command of a workflow is .ci/run, a make target that the Makefile has, or one of these few
+    words.
+    """
     targets = set(
         re.findall(r"^([a-z]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE)
     )

@@ -1,4 +1,6 @@
-"""A VIRTUAL robot of LeRobot that is not the SO-101: two joints with names of its own, in degrees, and a lamp."""
+"""A VIRTUAL robot of LeRobot that is not the SO-101: two joints with names of its own, in degrees,
+and a lamp.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Models as vendors write them, for tests: a floating torso with an arm and a gripper, and an arm as URDF."""
+"""Models as vendors write them, for tests: a floating torso with an arm and a gripper, and an arm
+as URDF.
+"""
 
 from __future__ import annotations
 

@@ -12,12 +12,15 @@ from gaponet.nn.config import ModelConfig
 from gaponet.robot.spec import RobotSpec
 from gaponet.virtual.physics import Physics, neutral
 
-WEAK = 0.8  # of the gain: what such a servo does with u, the nominal one does with u + (0.8 − 1) (u − q)
+# of the gain: what such a servo does with u, the nominal one does with u + (0.8 − 1) (u − q)
+WEAK = 0.8
 CONFIG = ModelConfig(history=2, payload_max=0.4)
 
 
 class Operator:
-    """`share` of what the operator of that arm says, in the place of a network; 1 is exact, 0 is untrained."""
+    """`share` of what the operator of that arm says, in the place of a network; 1 is exact, 0 is
+    untrained.
+    """
 
     def __init__(self, share: float) -> None:
         self.share = share

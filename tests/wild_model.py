@@ -35,7 +35,9 @@ class WildNetwork(nn.Module):
 
 
 def wild_model(folder: Path, robot: RobotSpec, answer: float) -> GapModel:
-    """Write a run whose network gives `answer` (rad, or NaN) outside the tested inputs, and load it."""
+    """Write a run whose network gives `answer` (rad, or NaN) outside the tested inputs, and load
+    it.
+    """
     config = ModelConfig(history=2, num_probes=2)
     joints = len(robot.operated)
     content = io.BytesIO()

@@ -1,4 +1,6 @@
-"""gp.run_robot does what gaponet run does: known limits, a plan, consent; the result says what happened."""
+"""gp.run_robot does what gaponet run does: known limits, a plan, consent; the result says what
+happened.
+"""
 
 from __future__ import annotations
 
@@ -41,7 +43,9 @@ DRIVER_OF = {"h1_2": "unitree", "so101": "so101"}
 
 
 def changed(name: str, old: str, new: str, folder: Path) -> Path:
-    """Write a copy of a packaged robot's folder in which a line of robot.toml is another one, everywhere."""
+    """Write a copy of a packaged robot's folder in which a line of robot.toml is another one,
+    everywhere.
+    """
     save_robot(load_robot(name), folder)
     file = folder / "robot.toml"
     assert old in file.read_text()

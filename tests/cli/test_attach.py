@@ -1,4 +1,6 @@
-"""gaponet export --to lerobot, and the LeRobot plug-in on stand-ins for LeRobot 0.6; its own run is make lerobot."""
+"""gaponet export --to lerobot, and the LeRobot plug-in on stand-ins for LeRobot 0.6; its own run is
+make lerobot.
+"""
 
 import json
 

@@ -36,7 +36,9 @@ class Person(io.StringIO):
         monkeypatch.setattr("sys.stdin", open(self.slave))  # noqa: SIM115
 
     def will(self, answer: str) -> None:
-        """Answer so; called by a test, not by a fixture: between them pytest takes standard error back."""
+        """Answer so; called by a test, not by a fixture: between them pytest takes standard error
+        back.
+        """
         self.answer = answer
         self.monkeypatch.setattr("sys.stderr", self)
 

@@ -1,4 +1,6 @@
-"""gaponet import and doctor as a user runs them: one line for what is wrong, and nothing half-written."""
+"""gaponet import and doctor as a user runs them: one line for what is wrong, and nothing
+half-written.
+"""
 
 import json
 from collections.abc import Callable

@@ -28,7 +28,9 @@ def write_rollout(path, sequence):
 
 @pytest.fixture(scope="module")
 def place(tmp_path_factory):
-    """A robot that was identified rightly, a dataset of it, and two rollouts: the nominal simulator's, the robot's."""
+    """A robot that was identified rightly, a dataset of it, and two rollouts: the nominal
+    simulator's, the robot's.
+    """
     folder = tmp_path_factory.mktemp("replay")
     robot = write_arm(folder / "arm")
     save_robot(robot.with_identified(dict.fromkeys(robot.operated, FOUND)), folder / "found")

@@ -1,4 +1,6 @@
-"""gaponet start: a model file and a folder of logs, as a lab has them, to a report by commands that it prints."""
+"""gaponet start: a model file and a folder of logs, as a lab has them, to a report by commands that
+it prints.
+"""
 
 import json
 import re
@@ -22,7 +24,9 @@ ORDER = ["robot", "import", "doctor", "gap", "identify", "gap", "export", "repor
 
 @pytest.fixture
 def place(tmp_path, monkeypatch):
-    """A model file and csv logs of an arm with weaker, later servos; columns and names as no format has them."""
+    """A model file and csv logs of an arm with weaker, later servos; columns and names as no format
+    has them.
+    """
     monkeypatch.chdir(tmp_path)
     Path("arm.xml").write_text(XML.replace("</mujoco>", f"<actuator>{SERVOS}</actuator></mujoco>"))
     robot = write_arm(tmp_path / "nominal")
@@ -154,7 +158,9 @@ def test_other_logs_need_another_folder_and_more_logs_run_again_what_followed_fr
 
 
 def test_what_is_said_of_the_logs_reaches_their_import(place, capsys):
-    """Options that messages of import recommend; by some of them the first recording is read here already."""
+    """Options that messages of import recommend; by some of them the first recording is read here
+    already.
+    """
     for file in Path("logs").iterdir():
         table = np.loadtxt(file, delimiter=",", skiprows=1)
         head = file.read_text().split("\n", 1)[0].replace("shoulder", "a1")

@@ -1,4 +1,6 @@
-"""Joints under each other's names in command and state alike: what gravity, inertia and ranges tell."""
+"""Joints under each other's names in command and state alike: what gravity, inertia and ranges
+tell.
+"""
 
 from dataclasses import replace
 

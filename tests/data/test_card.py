@@ -60,7 +60,9 @@ def test_ranges_are_those_of_the_samples(dataset):
 
 
 def test_repeatability_is_the_spread_over_repetitions(arm, tmp_path):
-    """Repetitions have one command, are compared as far as the shortest goes, and in joints that were commanded."""
+    """Repetitions have one command, are compared as far as the shortest goes, and in joints that
+    were commanded.
+    """
     data = Dataset.create(tmp_path / "data", arm)
     with pytest.raises(DatasetError, match="sequences"):
         make_card(data)

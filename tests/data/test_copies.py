@@ -1,4 +1,6 @@
-"""A command that repeats the state is named, whatever clock and digits; and a robot that is driven by torque."""
+"""A command that repeats the state is named, whatever clock and digits; and a robot that is driven
+by torque.
+"""
 
 import numpy as np
 import pytest

@@ -1,4 +1,6 @@
-"""The doctor finds what is wrong with a recording, says it in words, and finds nothing wrong with a good one."""
+"""The doctor finds what is wrong with a recording, says it in words, and finds nothing wrong with a
+good one.
+"""
 
 import json
 import re
@@ -319,7 +321,9 @@ def test_times_that_do_not_belong_together_are_found_and_others_are_left_alone(
 def test_a_clock_that_drifts_is_late_by_half_in_the_middle_and_motions_that_differ_are_no_drift(
     middle, told
 ):
-    """A trajectory generator follows quick parts of a motion later than slow ones, from one part to the next."""
+    """A trajectory generator follows quick parts of a motion later than slow ones, from one part to
+    the next.
+    """
 
     def surveys(duration):
         tracking = SimpleNamespace(response=SimpleNamespace(duration=duration))

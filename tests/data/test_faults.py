@@ -1,4 +1,6 @@
-"""Faults that need gravity or several recordings, put into good logs of a virtual arm, are found or refused."""
+"""Faults that need gravity or several recordings, put into good logs of a virtual arm, are found or
+refused.
+"""
 
 import numpy as np
 import pytest
@@ -10,7 +12,8 @@ from gaponet.report.figures.dataset_figures import draw_findings
 from gaponet.robot.finding import Finding
 from gaponet.robot.spec import load_robot
 
-# Check, level and words of the finding that names it; no level: the import refuses with these words.
+# Check, level and words of the finding that names it; no level: the import refuses with these
+# words.
 NAMED = {
     "sign of command and state": ("gravity", "warning", "with its angle mirrored at elbow_flex"),
     "offset of 20 mrad": ("offset", "note", "elbow_flex rests +2"),

@@ -1,4 +1,6 @@
-"""Importing: nothing of a bad source, whatever is missing of a good one, into a new dataset or behind what is there."""
+"""Importing: nothing of a bad source, whatever is missing of a good one, into a new dataset or
+behind what is there.
+"""
 
 import errno
 import hashlib
@@ -137,7 +139,9 @@ def test_one_bad_file_leaves_nothing_behind(logs, so101, tmp_path):
 def test_an_import_cut_short_at_any_write_is_finished_by_the_same_call(
     logs, so101, tmp_path, monkeypatch
 ):
-    """Every operation on the disk fails once; the journal lists all files, whole ones; the end is always the same."""
+    """Every operation on the disk fails once; the journal lists all files, whole ones; the end is
+    always the same.
+    """
     whole = import_logs(logs, so101, tmp_path / "whole", LAB, gravity=lambda q, m, s: 0 * q)
     real = {name: getattr(os, name) for name in ("replace", "fsync", "pwrite", "mkdir")}
     left = None

@@ -200,7 +200,9 @@ def test_time_is_never_stretched(arm, short):
 
 @pytest.mark.parametrize("lost", [0, 15])
 def test_rows_that_a_loop_stamps_unevenly_are_of_its_periods(arm, lost):
-    """Each row's command is of the period that the row is nearest to, whatever the stamps' jitter and lost rows."""
+    """Each row's command is of the period that the row is nearest to, whatever the stamps' jitter
+    and lost rows.
+    """
     rng, period = np.random.default_rng(lost), 1 / 30
     stamp = 7.0 + period * (np.arange(600) + np.clip(rng.normal(0, 0.15, 600), -0.3, 0.3))
     kept = np.sort(np.r_[0, rng.permutation(np.arange(1, 600))[: 599 - lost]])

@@ -155,7 +155,8 @@ def test_a_split_file_with_a_sequence_in_two_parts_is_refused(dataset):
         read_split(path, dataset)
 
 
-# Mutants of make fuzz --only samples (seed 0) that once ended in a traceback; the number is the mutant's.
+# Mutants of make fuzz --only samples (seed 0) that once ended in a traceback; the number is the
+# mutant's.
 @pytest.mark.parametrize(
     "change",
     [
@@ -241,7 +242,9 @@ def steps(*targets, rests=40):
 
 
 def test_motions_that_rest_at_one_place_are_not_one():
-    """A motion of three places, two of which all motions have, is none of them; slower or once more it is the same."""
+    """A motion of three places, two of which all motions have, is none of them; slower or once more
+    it is the same.
+    """
     park, there = (0.0, 0.0), (0.5, 0.3)
     walks = [np.concatenate([steps(), walk(400, seed), steps(park)]) for seed in range(4, 8)]
     others = [steps((0.7, 0.1), park), steps((-0.4, 0.3), park), steps(), *walks]
@@ -255,7 +258,9 @@ def test_motions_that_rest_at_one_place_are_not_one():
 
 
 def test_motions_with_equal_commands_are_one_motion_for_every_split(arm, tmp_path):
-    """lift_0kg and lift_1kg are told the same: one in training would show the other's test commands."""
+    """lift_0kg and lift_1kg are told the same: one in training would show the other's test
+    commands.
+    """
     data = Dataset.create(tmp_path / "data", arm)
     for k in range(12):
         ctrl = walk(200, k)

@@ -1,4 +1,6 @@
-"""Rests: where a joint stops depends on the side it came from; half way between is where sag alone would leave it."""
+"""Rests: where a joint stops depends on the side it came from; half way between is where sag alone
+would leave it.
+"""
 
 import numpy as np
 import pytest

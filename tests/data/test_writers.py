@@ -27,7 +27,9 @@ SAID = (
 
 @pytest.fixture
 def dataset(arm, tmp_path):
-    """Two motions, one with a payload and other gains, of a virtual robot, at a rate that is no whole number."""
+    """Two motions, one with a payload and other gains, of a virtual robot, at a rate that is no
+    whole number.
+    """
     data = Dataset.create(tmp_path / "data", arm)
     for i, gains in enumerate(((20.0, 20.0), (12.5, 0.1))):
         ctrl = wave(50, 2, hertz=0.4 + 0.13 * i) + 0.1 * i

@@ -19,7 +19,9 @@ NOW = CompensatorConfig(blend=0.0)
 
 
 class WeakArm:
-    """The robot: weak servos, commands `late` periods under way and sometimes lost, a payload that may change."""
+    """The robot: weak servos, commands `late` periods under way and sometimes lost, a payload that
+    may change.
+    """
 
     masses = (0.0, 0.4)
 
@@ -194,7 +196,9 @@ def test_a_payload_that_is_not_stated_is_estimated(robot, model):
 
 
 def test_a_payload_is_estimated_from_the_moment_on_at_which_its_torques_suffice(robot):
-    """At rest the leverage is the integral of the squared torque per kg, with forgetting, in (N·m/kg)² s."""
+    """At rest the leverage is the integral of the squared torque per kg, with forgetting, in
+    (N·m/kg)² s.
+    """
     estimate = Compensator(robot).payload.estimate
     posture = np.array([[1.2, 0.3]])
     empty, full = estimate.gravity(posture[0])

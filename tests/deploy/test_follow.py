@@ -1,4 +1,6 @@
-"""An arm that is commanded to move as its nominal simulator does: it does, and stays calm whatever happens."""
+"""An arm that is commanded to move as its nominal simulator does: it does, and stays calm whatever
+happens.
+"""
 
 from dataclasses import replace
 
@@ -169,7 +171,9 @@ def test_a_limit_of_the_correction_holds_while_following(robot):
 
 
 def test_a_policy_sees_the_nominal_simulator_and_slowly_what_the_robot_does_differently(robot):
-    """At rest, the robot is 0.05 rad from where its identified simulator is: half a second takes over 63 %."""
+    """At rest, the robot is 0.05 rad from where its identified simulator is: half a second takes
+    over 63 %.
+    """
     known = identified(robot)
     follower = Compensator(known, config=replace(NOW, feedback=0.0), follow="nominal")
     target = np.array([0.3, -0.2])

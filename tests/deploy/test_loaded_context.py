@@ -1,4 +1,6 @@
-"""A network that is not told the payload reads it from its simulator's answers, in every form of use alike."""
+"""A network that is not told the payload reads it from its simulator's answers, in every form of
+use alike.
+"""
 
 import mujoco
 import numpy as np

@@ -44,7 +44,9 @@ def other(robot, **factors):
 
 
 def follow(sim, targets=TARGETS, push=0.0, repeat=1):
-    """Positions at each row under targets, from rest; a push is a torque on both joints for a while."""
+    """Positions at each row under targets, from rest; a push is a torque on both joints for a
+    while.
+    """
     sim.reset(targets[0], ctrl=targets[0])
     applied, out = sim.sim.batch.bind("qfrc_applied"), []
     for t, target in enumerate(targets):

@@ -1,4 +1,6 @@
-"""The command itself and the nominal simulation, later and shifted: what any simulator must do better than."""
+"""The command itself and the nominal simulation, later and shifted: what any simulator must do
+better than.
+"""
 
 import numpy as np
 import pytest
@@ -12,7 +14,9 @@ DT = 0.01
 
 
 def swing(motion, delay=0.0, offset=0.0, recorded=(0, 1)):
-    """A run in which two joints follow their commands later and elsewhere, but for their own frequency alike."""
+    """A run in which two joints follow their commands later and elsewhere, but for their own
+    frequency alike.
+    """
     t = np.arange(400)[:, None] * DT
     rate = 0.7 + 0.1 * motion
     command = np.sin(2 * np.pi * rate * t + [0.0, 1.0])

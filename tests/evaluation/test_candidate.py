@@ -1,4 +1,6 @@
-"""An identified robot folder is judged as a run is, and a network is told apart from what was identified."""
+"""An identified robot folder is judged as a run is, and a network is told apart from what was
+identified.
+"""
 
 import json
 

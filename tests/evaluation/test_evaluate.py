@@ -1,4 +1,6 @@
-"""Against which baseline, and on what: the run's own simulator, and nothing that one of the runs has seen."""
+"""Against which baseline, and on what: the run's own simulator, and nothing that one of the runs
+has seen.
+"""
 
 import json
 import shutil

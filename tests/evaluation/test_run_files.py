@@ -1,4 +1,6 @@
-"""A run folder's files are read as they were written, and refused in one line with file and field otherwise."""
+"""A run folder's files are read as they were written, and refused in one line with file and field
+otherwise.
+"""
 
 import json
 

@@ -1,4 +1,6 @@
-"""The first change on the architecture page: what it shows is there, its robot is recorded, it reaches every engine."""
+"""The first change on the architecture page: what it shows is there, its robot is recorded, it
+reaches every engine.
+"""
 
 import inspect
 import os

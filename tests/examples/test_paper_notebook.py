@@ -1,4 +1,6 @@
-"""The notebook of the paper, on a smaller robot and with tiny trainings, and the command that goes on with it."""
+"""The notebook of the paper, on a smaller robot and with tiny trainings, and the command that goes
+on with it.
+"""
 
 import json
 import re

@@ -1,4 +1,6 @@
-"""The notebook runs from its first cell to its last, and its model is better than the simulator it corrects."""
+"""The notebook runs from its first cell to its last, and its model is better than the simulator it
+corrects.
+"""
 
 import re
 from pathlib import Path

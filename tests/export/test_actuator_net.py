@@ -30,7 +30,9 @@ ADDED = 0.05
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
-    """A robot that moves as if every target were 50 mrad higher, and a run that has learned just that."""
+    """A robot that moves as if every target were 50 mrad higher, and a run that has learned just
+    that.
+    """
     folder = tmp_path_factory.mktemp("actuator")
     robot = write_arm(folder / "arm").with_identified(LATE)
     asked = [s.rows(slice(0, 150)) for s in own_motions(robot, count=4)]

@@ -31,7 +31,9 @@ ENGINES = {  # name → what is exported, what is run, Python, what is installed
 
 @pytest.fixture(scope="module")
 def exported(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A VIRTUAL SO-101 with late servos and a law for every engine; motions of 2 to 4 s, so that worlds end apart."""
+    """A VIRTUAL SO-101 with late servos and a law for every engine; motions of 2 to 4 s, so that
+    worlds end apart.
+    """
     folder, robot = tmp_path_factory.mktemp("engines"), load_robot("so101")
     law = {
         "stribeck": 0.03,

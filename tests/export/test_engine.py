@@ -1,4 +1,6 @@
-"""What other simulators are given: the network in torch, the simulator's numbers, an MJCF, an action term."""
+"""What other simulators are given: the network in torch, the simulator's numbers, an MJCF, an
+action term.
+"""
 
 import re
 import sys
@@ -212,7 +214,9 @@ def test_a_scene_that_is_not_the_simulator_of_training_is_refused_with_the_field
 
 
 def mjlab_servos_of(robot, worlds):
-    """Return the servos of a robot in mjlab's scene of that many worlds, with mjlab's model and data."""
+    """Return the servos of a robot in mjlab's scene of that many worlds, with mjlab's model and
+    data.
+    """
     named = re.sub('="(shoulder|elbow)"', r'="robot/\1"', mjcf_text(robot, robot.dt))
     scene = mujoco.MjModel.from_xml_string(named)
     addresses = servo_addresses(scene, torch.arange(2))
@@ -266,7 +270,9 @@ class Wrapped:
 
 
 class JointPositionAction:
-    """The interface that both engines publish for it; their own runs in make engines (mjlab) or nowhere (Isaac Lab)."""
+    """The interface that both engines publish for it; their own runs in make engines (mjlab) or
+    nowhere (Isaac Lab).
+    """
 
     def __init__(self, dt=0.02):
         self._env, self.num_envs, self.device = SimpleNamespace(step_dt=dt), 2, "cpu"

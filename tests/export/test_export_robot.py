@@ -1,4 +1,6 @@
-"""A robot leaves: a user's own MJCF with identified servos, the law beside it, and a check that needs no gaponet."""
+"""A robot leaves: a user's own MJCF with identified servos, the law beside it, and a check that
+needs no gaponet.
+"""
 
 import json
 import re
@@ -105,7 +107,9 @@ def short_motions(monkeypatch):
 
 @pytest.fixture
 def mine(tmp_path):
-    """A user's scene: includes, degrees, defaults, a mesh, a tendon, sensors, a keyframe, a servo and a body before."""
+    """A user's scene: includes, degrees, defaults, a mesh, a tendon, sensors, a keyframe, a servo
+    and a body before.
+    """
     folder = tmp_path / "mine"
     for name, text in {
         "scene.xml": MAIN.format(step=0.005),
@@ -424,7 +428,9 @@ def test_an_export_takes_the_fit_without_terms_that_identify_kept(lawful, tmp_pa
 
 @pytest.mark.skipif(not hasattr(mujoco.MjsActuator, "set_to_pid"), reason="needs MuJoCo 4")
 def test_the_mjcf_limits_the_speed_of_targets_by_itself(tmp_path):
-    """gaponet moves a target once per period of 20 ms, MuJoCo in each step of 5 ms: up to 0.5 · 0.02 rad apart."""
+    """gaponet moves a target once per period of 20 ms, MuJoCo in each step of 5 ms: up to 0.5 ·
+    0.02 rad apart.
+    """
     speed = 0.5
     slow = {joint: {"target_speed": speed} for joint in FOUND}
     robot = write_arm(tmp_path / "arm").with_identified(slow)

@@ -1,4 +1,6 @@
-"""Units to train on: drawn from what is known of a robot, whole, and refused where something is missing."""
+"""Units to train on: drawn from what is known of a robot, whole, and refused where something is
+missing.
+"""
 
 import json
 import re
@@ -82,7 +84,9 @@ def written(arm, folder, servo=SERVO_FIELDS, errors=ERRORS, sources=1, links=Non
 
 
 def heavy_links(slope=0.0):
-    """Links of the arm, each 0.5 standard deviations heavier; kp rises with the mass of the second one."""
+    """Links of the arm, each 0.5 standard deviations heavier; kp rises with the mass of the second
+    one.
+    """
     covariance = np.diag(np.tile([0.04, *[1.0] * 9], 2))
     slopes = np.zeros((2, len(FIELDS), 2 * COORDINATES))
     slopes[:, 0, COORDINATES] = slope

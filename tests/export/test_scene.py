@@ -27,7 +27,9 @@ def identified(arm, **other):
 
 
 def scene(arm, xml=None):
-    """Somebody's scene: the arm on a turned pedestal, with a ball that falls onto the floor beside it."""
+    """Somebody's scene: the arm on a turned pedestal, with a ball that falls onto the floor beside
+    it.
+    """
     spec = mujoco.MjSpec()
     spec.option.timestep = 0.005
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
@@ -42,7 +44,9 @@ def scene(arm, xml=None):
 
 
 def play_scene(model, targets, servos=None):
-    """Return positions of the arm after each control period, (T, 2) rad; it starts at rest at the first target."""
+    """Return positions of the arm after each control period, (T, 2) rad; it starts at rest at the
+    first target.
+    """
     data = mujoco.MjData(model)
     joints = [model.joint(f"{PREFIX}{name}") for name in ("shoulder", "elbow")]
     at = [joint.qposadr[0] for joint in joints]
@@ -106,7 +110,9 @@ def test_the_servo_model_that_no_scene_holds_is_named(arm):
     not hasattr(mujoco.MjsActuator, "set_to_pid"), reason="MuJoCo without <pid slewmax>"
 )
 def test_a_scene_limits_the_speed_of_targets_within_the_way_of_a_period(arm):
-    """gaponet moves a target once per period of 20 ms, the scene in each step: 0.8 rad/s make 16 mrad."""
+    """gaponet moves a target once per period of 20 ms, the scene in each step: 0.8 rad/s make 16
+    mrad.
+    """
     speed = 0.8
     robot = identified(arm, target_speed=speed)
     targets = np.repeat([[0.3, -0.2], [-0.5, 0.6], [0.3, -0.2]], 80, axis=0)

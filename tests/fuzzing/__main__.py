@@ -25,7 +25,9 @@ GROUPS = {"readers": readers.TARGETS, "structures": structures.TARGETS}
 
 
 class Counted:
-    """Shows how many mutants were tried: on a terminal in place, in a pipe a line every ten seconds."""
+    """Shows how many mutants were tried: on a terminal in place, in a pipe a line every ten
+    seconds.
+    """
 
     def __init__(self, stream: TextIO) -> None:
         self.stream = stream
@@ -53,7 +55,10 @@ def grouped(failures: list[Failure]) -> list[tuple[str, int, Failure]]:
 
 
 def replay(case: Path) -> int:
-    """Read the stored files of a mutant again; return 1 where they still fail. A traceback is raised as it is."""
+    """Read the stored files of a mutant again; return 1 where they still fail.
+
+    A traceback is raised as it is.
+    """
     name = case.name.partition("-")[2].rpartition("-")[0]
     target = next(t for group in GROUPS.values() for t in group if t.name == name)
     with tempfile.TemporaryDirectory() as place:

@@ -188,7 +188,9 @@ class _Worker:
 def _work(
     plan: list[tuple[Target, int]], seed: int, keep: Path | None, room: Path, pipe: Any
 ) -> None:
-    """Try mutants one after the other, below an empty folder, and report when the first begins and when each ends."""
+    """Try mutants one after the other, below an empty folder, and report when the first begins and
+    when each ends.
+    """
     untouched = {target.name: target.files() for target, _ in plan}
     for target in {target.name: target for target, _ in plan}.values():
         _lay(untouched[target.name], room)
@@ -275,7 +277,9 @@ _WATCHED: list[
 
 
 def _watch(event: str, args: tuple[Any, ...]) -> None:
-    """Audit hook: notes what Python opens for writing, makes, renames or deletes outside the folder meant for it."""
+    """Audit hook: notes what Python opens for writing, makes, renames or deletes outside the folder
+    meant for it.
+    """
     if not _WATCHED or event not in (
         "open",
         "os.mkdir",

@@ -246,7 +246,9 @@ def _json_line(content: bytes, rng: random.Random) -> bytes:
 
 
 def _structure(value: Any, rng: random.Random) -> Any:
-    """A parsed structure with one place changed: another value, a key gone, renamed or added, a list longer."""
+    """A parsed structure with one place changed: another value, a key gone, renamed or added, a
+    list longer.
+    """
     places: list[tuple[Any, Any]] = []
 
     def walk(node: Any) -> None:

@@ -1,4 +1,7 @@
-"""What strangers send: logs in every format, column maps, motion files, recipes. Each is read as a user would."""
+"""What strangers send: logs in every format, column maps, motion files, recipes.
+
+Each is read as a user would.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Which of gaponet's own files are changed, and how they are used: datasets, robots, models, runs, fleets."""
+"""Which of gaponet's own files are changed, and how they are used: datasets, robots, models, runs,
+fleets.
+"""
 
 from __future__ import annotations
 

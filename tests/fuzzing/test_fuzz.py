@@ -1,4 +1,6 @@
-"""A slice of make fuzz: changed files end in one clear error, or in data that a robot can have recorded."""
+"""A slice of make fuzz: changed files end in one clear error, or in data that a robot can have
+recorded.
+"""
 
 import json
 import os
@@ -16,7 +18,9 @@ MUTANTS = 10  # of each reader
 
 @pytest.mark.parametrize("group", GROUPS)
 def test_changed_files_end_in_one_clear_error_or_in_sane_data(group, tmp_path):
-    """In a process of its own: its workers are forks, which must not inherit threads of what was tested before."""
+    """In a process of its own: its workers are forks, which must not inherit threads of what was
+    tested before.
+    """
     mutants = MUTANTS * len(GROUPS[group])
     command = [
         sys.executable,

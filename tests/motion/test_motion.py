@@ -41,7 +41,8 @@ def still(robot, shoulder, elbow=0.0, rows=50):
 
 
 def test_torque_demand_of_a_level_arm_is_its_weight(arm):
-    # upper 0.3 kg at 0.1 m, fore 0.2 kg at 0.3 m, payload 0.5 kg at 0.4 m, the fore arm's frame turned level
+    # upper 0.3 kg at 0.1 m, fore 0.2 kg at 0.3 m, payload 0.5 kg at 0.4 m, the fore arm's frame
+    # turned level
     need = Feasibility(arm, 0.5).demand(still(arm, 0.0), GRID)
     weight = 9.81 * (0.3 * 0.1 + 0.2 * 0.3 + 0.5 * 0.4)
     assert need.gravity == pytest.approx(weight / (TORQUE_SHARE * 5.0), rel=1e-6)

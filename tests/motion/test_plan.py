@@ -1,4 +1,6 @@
-"""gaponet excite: motions that a robot can do, as files that come back, and a sheet that says how long."""
+"""gaponet excite: motions that a robot can do, as files that come back, and a sheet that says how
+long.
+"""
 
 import json
 

@@ -1,4 +1,6 @@
-"""Identified robots of the package: found by name, complete, small, with a card, exported without data."""
+"""Identified robots of the package: found by name, complete, small, with a card, exported without
+data.
+"""
 
 import json
 import shutil

@@ -41,7 +41,9 @@ def inertia(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
 
 
 def furthest(made: NewRobot) -> tuple[float, float]:
-    """Largest difference of gravity (N·m) and inertia (kg·m²) at kept joints over 50 postures, other joints at home."""
+    """Largest difference of gravity (N·m) and inertia (kg·m²) at kept joints over 50 postures,
+    other joints at home.
+    """
     ours, theirs = build_model(made.robot), made.vendor
     a, b = mujoco.MjData(ours), mujoco.MjData(theirs)
     places = np.array([theirs.joint(name).qposadr[0] for name in made.robot.joint_names])
@@ -189,7 +191,9 @@ TURN = """<joint name="{0}" type="revolute"><parent link="{1}"/><child link="{2}
 
 
 def hand(*links: str) -> str:
-    """A URDF: base, left_arm, left_palm, and two fingers on it; what `links` say of arm, palm and fingers."""
+    """A URDF: base, left_arm, left_palm, and two fingers on it; what `links` say of arm, palm and
+    fingers.
+    """
     chain = (
         ("base", "left_arm"),
         ("left_arm", "left_palm"),

@@ -7,8 +7,10 @@ import pytest
 from gaponet.robot.spec import load_robot
 from gaponet.sim.model import build_model
 
-# Root mean square of gravity's torque (N·m) and mean inertia without armature (kg·m²) at each joint over 100 postures
-# drawn by numpy's default_rng(0) within the ranges: MuJoCo on Unitree's URDF g1_29dof_rev_1_0, as example-robot-data
+# Root mean square of gravity's torque (N·m) and mean inertia without armature (kg·m²) at each joint
+# over 100 postures
+# drawn by numpy's default_rng(0) within the ranges: MuJoCo on Unitree's URDF g1_29dof_rev_1_0, as
+# example-robot-data
 # 6.0.0 has it. robot.xml was written from the MJCF of that name.
 G1_GRAVITY = [
     9.406, 6.286, 3.734, 2.505, 0.1215, 0.05997, 9.738, 6.314, 4.048, 2.416, 0.1315, 0.06246, 0.0, 9.927, 9.94, 2.569,
@@ -19,7 +21,8 @@ G1_INERTIA = [
     1.134, 0.9802, 0.066, 0.1212, 0.02031, 0.02647, 0.00286, 0.003131, 0.001837, 0.07104, 0.1189, 0.01997, 0.0277,
     0.002657, 0.003438, 0.001837,
 ]  # fmt: skip
-# Of the moving links, kg: google-deepmind/mujoco_menagerie, franka_fr3/fr3.xml and universal_robots_ur10e/ur10e.xml.
+# Of the moving links, kg: google-deepmind/mujoco_menagerie, franka_fr3/fr3.xml and
+# universal_robots_ur10e/ur10e.xml.
 LINKS = {
     "fr3": [2.92747, 2.93554, 2.2449, 2.6156, 2.32712, 1.81704, 0.627143],
     "ur10e": [7.778, 12.93, 3.87, 1.96, 1.96, 0.202],

@@ -1,4 +1,6 @@
-"""Records of servo parameters: the servos have an attribute for each, and every reader gets what it needs."""
+"""Records of servo parameters: the servos have an attribute for each, and every reader gets what it
+needs.
+"""
 
 import dataclasses
 

@@ -1,4 +1,6 @@
-"""Robots and networks of the Hub: what was pushed is loaded by its address, with a card that the Hub understands."""
+"""Robots and networks of the Hub: what was pushed is loaded by its address, with a card that the
+Hub understands.
+"""
 
 import json
 

@@ -17,7 +17,10 @@ CONTENT = {f"arm/motion-{i}/control.csv": f"recording {i}\n".encode() * 100 for 
 
 
 class Server(ThreadingHTTPServer):
-    """Serves `content`; `requested` lists the paths that were asked for. A path in `cut` ends in the middle."""
+    """Serves `content`; `requested` lists the paths that were asked for.
+
+    A path in `cut` ends in the middle.
+    """
 
     def __init__(self):
         super().__init__(("127.0.0.1", 0), Handler)

@@ -58,7 +58,8 @@ def test_a_delayed_servo_moves_as_one_without_delay_under_earlier_commands(tmp_p
     for t in range(2, len(targets)):
         sims[0].step(targets[t][None])
         sims[1].step(shifted[t][None])
-        # Between physics steps MuJoCo interpolates: the new target is fully there one physics step later.
+        # Between physics steps MuJoCo interpolates: the new target is fully there one physics step
+        # later.
         np.testing.assert_allclose(sims[0].qpos, sims[1].qpos, atol=2e-3)
     sims[0].reset(np.array([0]), np.zeros((1, 2)), np.zeros((1, 2)), past=targets[None, 1::-1])
     sims[1].reset(np.array([0]), np.zeros((1, 2)), np.zeros((1, 2)))
@@ -93,7 +94,9 @@ def test_delayed_servos_need_past_targets(tmp_path):
 
 @pytest.mark.parametrize("delay", [(0.0, 0.0), (0.05, 0.013)])
 def test_one_by_one_is_bit_identical_to_mujocos_batch(tmp_path, monkeypatch, delay):
-    """Payloads, rates, laws, late servos, steps of some, forces: all that gaponet writes into a batch."""
+    """Payloads, rates, laws, late servos, steps of some, forces: all that gaponet writes into a
+    batch.
+    """
     pytest.importorskip("mujoco.batch")
     robot = write_arm(tmp_path).with_servo(
         delay=list(delay), stribeck=[0.1, 0.2], friction_motor=[0.1, 0.0]
@@ -207,7 +210,8 @@ def test_servos_set_in_a_batch_move_as_a_robot_made_with_them(tmp_path, field):
         sim.reset(slice(None), np.zeros((1, 2)), 0.0, past=targets[0][:, None])
         path[name] = np.array([sim.step(target) or sim.qpos.copy() for target in targets])
     assert np.abs(path["own"] - path["made"]).max() > 1e-3
-    # Friction holds a little less firmly where MuJoCo computed a joint's mobility with another armature.
+    # Friction holds a little less firmly where MuJoCo computed a joint's mobility with another
+    # armature.
     np.testing.assert_allclose(
         path["set"], path["made"], atol=1e-4 if field == "armature" else 1e-12
     )

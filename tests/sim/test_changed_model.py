@@ -43,7 +43,9 @@ def rebuilt(robot: RobotSpec, change: SimulatorChange) -> RobotSpec:
 
 
 def swing(sim: BatchSim, robot: RobotSpec) -> np.ndarray:
-    """Return the positions of all simulations over half a second of moving targets, (25, simulations, n) rad."""
+    """Return the positions of all simulations over half a second of moving targets, (25,
+    simulations, n) rad.
+    """
     home = np.tile(robot.qpos_home, (sim.num_envs, 1))
     sim.reset(slice(None), home, 0 * home, past=home[:, None])
     positions = []

@@ -21,7 +21,9 @@ from gaponet.sim.model import build_model, model_hash, write_table
 
 
 def hold(model: mujoco.MjModel, ctrl: np.ndarray, seconds: float) -> tuple[np.ndarray, np.ndarray]:
-    """Positions 10 s after a start at the targets, when the swing has died away, and `seconds` later, (n,) rad."""
+    """Positions 10 s after a start at the targets, when the swing has died away, and `seconds`
+    later, (n,) rad.
+    """
     data = mujoco.MjData(model)
     data.qpos[:] = data.ctrl[:] = ctrl
     mujoco.mj_step(model, data, round(10 / model.opt.timestep))

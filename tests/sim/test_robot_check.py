@@ -1,4 +1,6 @@
-"""gaponet robot check steps the simulator: what it calls wrong is wrong, and what it says to write mends it."""
+"""gaponet robot check steps the simulator: what it calls wrong is wrong, and what it says to write
+mends it.
+"""
 
 import re
 from dataclasses import replace
@@ -15,7 +17,8 @@ LIGHT = XML.replace('damping="0.5" armature="0.02" frictionloss="0.05"', "")
 STIFF = TOML.replace("kp = 20.0", "kp = 4000.0\nkd = 1.0").replace(
     "effort_limit = 5.0", "effort_limit = 300.0"
 )
-# The upper arm starts inside a pedestal that is fixed to the world, as links beside a base without its joint do.
+# The upper arm starts inside a pedestal that is fixed to the world, as links beside a base without
+# its joint do.
 WELDED = XML.replace(' contype="0" conaffinity="0"', "").replace(
     '<body name="upper">',
     '<body name="base"><geom type="box" size="0.03 0.03 0.03" pos="0.02 0 0"/></body>'

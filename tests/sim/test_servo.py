@@ -1,4 +1,6 @@
-"""The servo's terms: friction by speed and load, least torque, encoder steps; one definition for every simulator."""
+"""The servo's terms: friction by speed and load, least torque, encoder steps; one definition for
+every simulator.
+"""
 
 from dataclasses import replace
 

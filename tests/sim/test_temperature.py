@@ -1,4 +1,6 @@
-"""Friction follows the recorded temperature; a simulation without one has the robot's reference temperature."""
+"""Friction follows the recorded temperature; a simulation without one has the robot's reference
+temperature.
+"""
 
 from dataclasses import replace
 

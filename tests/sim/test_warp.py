@@ -19,13 +19,17 @@ from gaponet.sim.warp import WarpSim
 
 DEVICE = "cuda" if torch.cuda.is_available() else "warp-cpu"
 PERIODS, HOLD_S = 50, 10.0
-# rad: a few times what a float32 resolves at 2 rad. The band of accelerations in which a joint sticks (sim/model.py) is
-# hardly wider than what one resolves at 100 rad/s², so where a joint stops differs more, mostly by nothing.
+# rad: a few times what a float32 resolves at 2 rad. The band of accelerations in which a joint
+# sticks (sim/model.py) is
+# hardly wider than what one resolves at 100 rad/s², so where a joint stops differs more, mostly by
+# nothing.
 ROUNDING, STOPPED, HELD = 2e-6, {"fr3": 5e-3}, {"fr3": 2e-3}
 
 
 def worlds(robot, friction=True, both_rates=True):
-    """As shipped, with a payload, at another rate, of other gains, with friction × 10, with servos of their own."""
+    """As shipped, with a payload, at another rate, of other gains, with friction × 10, with servos
+    of their own.
+    """
     shipped = Condition(0.0, "both", robot.dt)
     laden = shipped._replace(payload_mass=0.3 if robot.payload_mounts else 0.0)
     fast = shipped._replace(dt=robot.dt / 2 if both_rates and robot.decimation > 1 else robot.dt)
@@ -44,7 +48,9 @@ def worlds(robot, friction=True, both_rates=True):
 
 
 class Both:
-    """The same simulations in C and in Warp, and how far apart each joint's position has been, (num_envs, n) rad."""
+    """The same simulations in C and in Warp, and how far apart each joint's position has been,
+    (num_envs, n) rad.
+    """
 
     def __init__(self, robot, **how):
         self.ours = worlds(robot, **how)

@@ -1,4 +1,6 @@
-"""Backlash is told from friction where the load changes its sign, and is not searched where it cannot be seen."""
+"""Backlash is told from friction where the load changes its sign, and is not searched where it
+cannot be seen.
+"""
 
 from dataclasses import replace
 
@@ -29,7 +31,9 @@ XML = """<mujoco><compiler angle="radian"/><worldbody><body><joint name="turn" a
 
 
 def fitted(folder, width):
-    """The fit of a VIRTUAL joint with this gap, and values without a gap and with it, of the same search."""
+    """The fit of a VIRTUAL joint with this gap, and values without a gap and with it, of the same
+    search.
+    """
     robot, t = write_arm(folder, TOML, XML), np.arange(200)[:, None] * 0.01
     meta, rng = SequenceMeta(robot.name, "a", "m", 0.0, virtual=True), np.random.default_rng(0)
     parts = []

@@ -112,7 +112,9 @@ def test_a_well_identified_robot_needs_no_more_motions(told):
 
 
 def test_kp_of_unloaded_joints_is_reported_as_undetermined(tmp_path, robot, pool, told):
-    """Its joints turn about upright axes, and no log has shown what moves: friction over kp is seen, kp is not."""
+    """Its joints turn about upright axes, and no log has shown what moves: friction over kp is
+    seen, kp is not.
+    """
     assert undetermined_gains(ParameterUncertainty.load(robot), told) == {}
     free = identified(tmp_path, XML.replace('axis="0 1 0"', 'axis="0 0 1"'))
     mine = ParameterUncertainty.load(free)

@@ -229,7 +229,9 @@ def test_pieces_of_one_recording_are_one_motion(arm):
 
 
 def test_a_joint_takes_a_fit_only_if_its_own_motions_accept_it():
-    """Payloads of one motion are one vote: the first joint follows one motion of three better, with both payloads."""
+    """Payloads of one motion are one vote: the first joint follows one motion of three better, with
+    both payloads.
+    """
     errors = {
         1.0: np.full((4, 2), 10.0),
         2.0: np.array([[4.0, 8.0], [4.0, 8.1], [11.0, 7.9], [11.5, 8.2]]),
@@ -298,7 +300,9 @@ def test_all_joints_are_fitted_together_unless_the_first_iterations_lose_much(er
 
 
 def test_all_joints_are_not_fitted_together_where_the_time_is_too_short(monkeypatch):
-    """The judge simulates 100 rows in a second, so that 176 rollouts of 100 rows do not fit into a minute."""
+    """The judge simulates 100 rows in a second, so that 176 rollouts of 100 rows do not fit into a
+    minute.
+    """
     clock = [0.0]
     monkeypatch.setattr("time.monotonic", lambda: clock[0])
 
@@ -319,7 +323,9 @@ def test_all_joints_are_not_fitted_together_where_the_time_is_too_short(monkeypa
 
 
 def robot_fit(values, asked):
-    """A fit in the whole robot's simulator that finds values and notes how many iterations were asked of it."""
+    """A fit in the whole robot's simulator that finds values and notes how many iterations were
+    asked of it.
+    """
 
     search = SimpleNamespace(
         iterate=lambda count, report: asked.append(count),

@@ -100,7 +100,9 @@ def test_recordings_at_several_gains_have_one_servo(tmp_path):
 
 
 def test_unrecorded_joints_stand_still_and_are_not_counted(tmp_path):
-    """Windows of a second in which one joint moves, the other at an angle that was told: nothing is asked of it."""
+    """Windows of a second in which one joint moves, the other at an angle that was told: nothing is
+    asked of it.
+    """
     robot = write_arm(tmp_path / "arm")
     windows = []
     for real in recordings(robot, 3, rows=250, kp=0.7):
@@ -144,7 +146,9 @@ def test_a_single_joint_rollout_stays_within_the_joints_range():
 
 
 def test_windows_of_several_control_rates_are_fitted_together(tmp_path):
-    """Two seconds of one servo, recorded at 50, at 100 and at 400 Hz: its numbers explain all of them."""
+    """Two seconds of one servo, recorded at 50, at 100 and at 400 Hz: its numbers explain all of
+    them.
+    """
     robot = write_arm(tmp_path)
     acting = robot.with_identified(
         {j: FIRST | {"kp": 14.0, "delay": 0.03, "damping": 0.8} for j in robot.joint_names}

@@ -9,7 +9,9 @@ POINTS = np.linspace(-1, 1, 60)
 
 
 def valley(x):
-    """Errors of a·exp(−b·t) + c·t beside known curves: products of parameters bend the valley, (k, n, m)."""
+    """Errors of a·exp(−b·t) + c·t beside known curves: products of parameters bend the valley, (k,
+    n, m).
+    """
     made = lambda p: p[..., :1] * np.exp(-p[..., 1:2] * POINTS) + p[..., 2:] * POINTS  # noqa: E731
     return made(x) - made(ENDS)
 

@@ -1,4 +1,6 @@
-"""Masses of links: physical whatever their coordinates, kept in the robot folder, fitted where recordings show them."""
+"""Masses of links: physical whatever their coordinates, kept in the robot folder, fitted where
+recordings show them.
+"""
 
 from dataclasses import replace
 

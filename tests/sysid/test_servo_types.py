@@ -1,4 +1,6 @@
-"""Servo types: the package's table, entries from identified robots, and values taken over from another robot."""
+"""Servo types: the package's table, entries from identified robots, and values taken over from
+another robot.
+"""
 
 import json
 

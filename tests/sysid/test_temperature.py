@@ -1,4 +1,6 @@
-"""Friction by temperature is fitted to recordings at several temperatures, and is a cause of its own."""
+"""Friction by temperature is fitted to recordings at several temperatures, and is a cause of its
+own.
+"""
 
 from dataclasses import replace
 

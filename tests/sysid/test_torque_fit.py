@@ -1,4 +1,6 @@
-"""What recorded torque says: gains, where a payload hangs, what hand the model lacks; and when it is believed."""
+"""What recorded torque says: gains, where a payload hangs, what hand the model lacks; and when it
+is believed.
+"""
 
 from dataclasses import replace
 
@@ -90,7 +92,9 @@ def test_measurement_noise_does_not_lower_the_estimated_gains(arm):
 
 
 def loaded(robot):
-    """Six motions with three payloads each, of an arm with softer servos, a hand, and a payload hung elsewhere."""
+    """Six motions with three payloads each, of an arm with softer servos, a hand, and a payload
+    hung elsewhere.
+    """
     true, windows = (
         moved(robot, -0.06, 0.3).with_identified(
             {j: {"kp": 12.0, "kd": 0.4} for j in robot.operated}

@@ -22,7 +22,9 @@ tau = "tau_{joint}"
 
 
 def drive(robot, seed, unit=1.0, rows=1200):
-    """A VIRTUAL arm by plain MuJoCo whose controller tells torques: time, angles, torques in `unit` N·m, (rows, 5)."""
+    """A VIRTUAL arm by plain MuJoCo whose controller tells torques: time, angles, torques in `unit`
+    N·m, (rows, 5).
+    """
     model = build_model(robot)
     model.actuator_gainprm[:] = model.actuator_biasprm[:] = 0
     for name, values in TRUE.items():

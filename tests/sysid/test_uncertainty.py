@@ -1,4 +1,6 @@
-"""What is known of a robot: how sure its values are, from which logs, and whether later logs are still of it."""
+"""What is known of a robot: how sure its values are, from which logs, and whether later logs are
+still of it.
+"""
 
 import json
 import shutil
@@ -113,7 +115,9 @@ def test_a_value_that_ended_at_zero_is_shown_as_an_upper_bound():
 
 
 def test_a_parameter_without_information_keeps_its_prior_std(arm):
-    """A joint that nothing loads and that hardly moves shows no gain: kp is believed to a factor, not to the moon."""
+    """A joint that nothing loads and that hardly moves shows no gain: kp is believed to a factor,
+    not to the moon.
+    """
     still = [
         replace(s, ctrl=s.ctrl * [0.02, 1], qpos=s.qpos * [0.02, 1]) for s in played(arm, 0, 3)
     ]
@@ -275,7 +279,9 @@ def test_a_contradicting_recording_is_set_aside_and_half_of_them_are_a_contradic
 
 
 def test_another_arm_that_no_parameter_explains_has_drifted(arm, folder, monkeypatch, tmp_path):
-    """Its links are twice as heavy; even where no change of a number counts it is not called the same."""
+    """Its links are twice as heavy; even where no change of a number counts it is not called the
+    same.
+    """
     xml = XML.replace('mass="0.3"', 'mass="0.6"').replace('mass="0.2"', 'mass="0.4"')
     heavy, robot = write_arm(tmp_path / "heavy", TOML, xml), load_robot(folder)
     mine = ParameterUncertainty.load(robot)

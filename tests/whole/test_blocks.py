@@ -1,4 +1,6 @@
-"""Blocks of README.md and docs: Python is run, each gaponet line is parsed, and quick commands are run."""
+"""Blocks of README.md and docs: Python is run, each gaponet line is parsed, and quick commands are
+run.
+"""
 
 from __future__ import annotations
 
@@ -131,7 +133,10 @@ def actions(command: str) -> dict[str, Any]:
 
 @pytest.fixture
 def parse(monkeypatch: pytest.MonkeyPatch) -> Callable[[list[str]], None]:
-    """Parse a command line without running it. An action runs while it is parsed, so a function stands in for it."""
+    """Parse a command line without running it.
+
+    An action runs while it is parsed, so a function stands in for it.
+    """
 
     def one(argv: list[str]) -> None:
         for note in actions(argv[0]).values() if argv[0] in COMMANDS else ():
@@ -185,7 +190,10 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def quick(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Identification of seconds, done once; and a network that nobody trained. Both have tests of their own."""
+    """Identification of seconds, done once; and a network that nobody trained.
+
+    Both have tests of their own.
+    """
     original = gaponet.api.identify
 
     def identify(dataset: str, *, out: str, **others: object) -> None:
@@ -210,7 +218,9 @@ def in_copy(place: Path, folder: Path) -> None:
 
 
 def names_of_a_reader(page: str, folder: Path) -> dict[str, Any]:
-    """What a page's Python blocks take from their reader: names, and run and robot folders below `folder`."""
+    """What a page's Python blocks take from their reader: names, and run and robot folders below
+    `folder`.
+    """
     if page not in ("deploy.md", "export.md", "network.md"):
         return dict.fromkeys(("qpos", "qvel", "target"), np.zeros(5)) if page == "api.md" else {}
     robot = load_robot("h1_2")
@@ -339,7 +349,9 @@ FOREIGN = {
 
 
 def absent(text: str, options: dict[tuple[str, ...], set[str]]) -> Iterator[str]:
-    """Options that a text gives to a command that has no such option, and options that no command has."""
+    """Options that a text gives to a command that has no such option, and options that no command
+    has.
+    """
     every, seen = set().union(*options.values(), FOREIGN), set()
     for command, action, rest in MENTION.findall(text):
         there = [have for path, have in options.items() if path in ((command,), (command, action))]

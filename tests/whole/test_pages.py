@@ -1,4 +1,6 @@
-"""Three people, a section each: what the pages tell a lab, an RL engineer and a researcher to run, in this order."""
+"""Three people, a section each: what the pages tell a lab, an RL engineer and a researcher to run,
+in this order.
+"""
 
 import re
 import shlex
@@ -21,7 +23,9 @@ SERVOS = "".join(
 
 @pytest.fixture(scope="module")
 def place(tmp_path_factory):
-    """A model file, logs of an arm with weaker and later servos, logs of another day, and a rollout of a simulator."""
+    """A model file, logs of an arm with weaker and later servos, logs of another day, and a rollout
+    of a simulator.
+    """
     folder = tmp_path_factory.mktemp("pages")
     (folder / "arm.xml").write_text(
         XML.replace("</mujoco>", f"<actuator>{SERVOS}</actuator></mujoco>")

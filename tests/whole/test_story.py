@@ -1,4 +1,6 @@
-"""Commands on a trained run, as a user types them: train, gap, eval, adapt, run, and the list of runs."""
+"""Commands on a trained run, as a user types them: train, gap, eval, adapt, run, and the list of
+runs.
+"""
 
 import json
 

@@ -1,4 +1,6 @@
-"""What a stranger named, a user closed or did not install: no command ends in a traceback or in somebody's markup."""
+"""What a stranger named, a user closed or did not install: no command ends in a traceback or in
+somebody's markup.
+"""
 
 import os
 import subprocess

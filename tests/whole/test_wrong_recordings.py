@@ -1,4 +1,6 @@
-"""identify, train, adapt and start stop at recordings in which the doctor finds an error, unless a person insists."""
+"""identify, train, adapt and start stop at recordings in which the doctor finds an error, unless a
+person insists.
+"""
 
 import json
 from dataclasses import replace

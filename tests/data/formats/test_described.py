@@ -1,4 +1,6 @@
-"""logs.toml: patterns, units, signs, clocks, names of recordings, sheets; and the one that --guess writes."""
+"""logs.toml: patterns, units, signs, clocks, names of recordings, sheets; and the one that --guess
+writes.
+"""
 
 import json
 import re

@@ -1,4 +1,6 @@
-"""Several recordings in one table: each is a recording of its own, and no reset between them is a motion."""
+"""Several recordings in one table: each is a recording of its own, and no reset between them is a
+motion.
+"""
 
 import numpy as np
 import pyarrow as pa

@@ -1,4 +1,6 @@
-"""LeRobotDataset v3.0: what goes out comes back; stock sets are read with the unit that the user says."""
+"""LeRobotDataset v3.0: what goes out comes back; stock sets are read with the unit that the user
+says.
+"""
 
 import json
 from dataclasses import replace
@@ -405,7 +407,9 @@ def test_tasks_of_another_type_are_refused(so101, tmp_path):
 
 
 def test_a_set_of_version_2_1_is_read_as_far_as_its_episodes_are_there(so101, tmp_path, caplog):
-    """Names inside a list, in the style of C; one file an episode, of which some were not downloaded."""
+    """Names inside a list, in the style of C; one file an episode, of which some were not
+    downloaded.
+    """
     names = [
         [
             "kShoulderPan",

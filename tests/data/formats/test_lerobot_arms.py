@@ -1,4 +1,6 @@
-"""What stock sets of LeRobot hold: actions that are no joint targets, ticks and percent of a calibrated arm."""
+"""What stock sets of LeRobot hold: actions that are no joint targets, ticks and percent of a
+calibrated arm.
+"""
 
 import json
 

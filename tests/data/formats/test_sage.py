@@ -1,4 +1,6 @@
-"""SAGE folders: real timestamps, the robot's units, and a refusal by file and line of every row that is not one."""
+"""SAGE folders: real timestamps, the robot's units, and a refusal by file and line of every row
+that is not one.
+"""
 
 import numpy as np
 import pytest

@@ -1,4 +1,6 @@
-"""Tables as people have them: slow commands, empty channels, dates, lists in cells, joints that turn on."""
+"""Tables as people have them: slow commands, empty channels, dates, lists in cells, joints that
+turn on.
+"""
 
 import numpy as np
 import pyarrow as pa

@@ -1,4 +1,6 @@
-"""A virtual arm with weak servos: what knows of them is nearer to it, and what knows nothing earns nothing."""
+"""A virtual arm with weak servos: what knows of them is nearer to it, and what knows nothing earns
+nothing.
+"""
 
 import numpy as np
 import pytest

@@ -54,7 +54,9 @@ def wrap(plugin, own, soft, tmp_path):
 
 
 def hold(robot, degrees, periods=150):
-    """Command all joints for a while as LeRobot's loop does, and return what it observes at the end."""
+    """Command all joints for a while as LeRobot's loop does, and return what it observes at the
+    end.
+    """
     action = dict.fromkeys(robot.units.keys, degrees) | LAMP
     for _ in range(periods):
         robot.get_observation()

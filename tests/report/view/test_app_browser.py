@@ -136,7 +136,9 @@ def export_agrees(page):
 
 
 def write_z1_urdf(path):
-    """Write links, joints, inertias and limits of the Z1's model as URDF, as its maker's file has them: no servos."""
+    """Write links, joints, inertias and limits of the Z1's model as URDF, as its maker's file has
+    them: no servos.
+    """
     from real_robots.cards import ROBOTS
 
     from gaponet.robot.spec import load_robot
