@@ -48,8 +48,7 @@ class ControlPeriods:
     def __init__(self, nstep: Any, timestep: Any) -> None:
         self.nstep = nstep
         self.timestep = timestep
-        # where all simulations have as many
-        self._common_nstep = int(nstep[0]) if (nstep == nstep[0]).all() else None
+        self._numbers = sorted(set(nstep.tolist()))  # that occur in nstep
 
     @property
     def seconds(self) -> Any:
@@ -60,11 +59,16 @@ class ControlPeriods:
         """Return each number of physics steps, and the simulations of `ids` that have it; None: all
         simulations.
         """
-        if self._common_nstep is not None:
-            return [(self._common_nstep, ids)]
+        if len(self._numbers) == 1:
+            return [(self._numbers[0], ids)]
         moving = np.arange(len(self.nstep)) if ids is None else ids
         nstep = self.nstep[moving]
-        return [(int(n), moving[nstep == n]) for n in np.unique(nstep)]
+        parts: list[tuple[int, Array | None]] = []
+        for n in self._numbers:
+            rows = moving[nstep == n]
+            if rows.size:
+                parts.append((n, rows))
+        return parts
 
 
 class Commands:
