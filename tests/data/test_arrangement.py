@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from arm import TOML, XML, commands, record, write_arm, write_dataset
 
-from gaponet.data.checks.sides import mirrored_joints
+from gaponet.data.checks.exchanges import mirrored_joints
 from gaponet.data.doctor import DoctorResult
 from gaponet.sim.dynamics import dynamics_of, gravity_of, inverse_dynamics
 from gaponet.sim.model import build_model

@@ -14,18 +14,20 @@ from gaponet.base.arrays import Array
 SAME_INSTANT = 0.1  # of a period by which stamps of one instant may differ
 # fast_speed from which a lag is mostly delay; below, it is mostly stiction
 FAST_COMMAND_RAD_S = 0.3
-# Of a Response: least step; span of the command before and after the state; parts of a recording;
-# shifts of a part.
-MIN_STEP_S = 0.01
-BEFORE_S = 0.12
-AFTER_S = 0.6
-SPLITS = 3
-SHIFTS_S = np.arange(-0.12, 0.1201, 0.002)
-RIDGE = 1e-3
-ONSET_SHARE = 0.05
-MAX_SHARP_CORRELATION = 0.8  # of a command with itself 20 ms later, if it changes sharply
+# Of a Response:
+MIN_STEP_S = 0.01  # between its lags
+BEFORE_S = 0.12  # longest time by which a state may come before its command
+AFTER_S = 0.6  # and after it
+SPLITS = 3  # parts of a recording
+SHIFT_STEP_S = 0.002  # between the shifts of a part that are tried
+SHIFTS_S = np.arange(-0.12, 0.1201, SHIFT_STEP_S)
+RIDGE = 1e-3  # of the command's power, added to the diagonal of the normal equations
+ONSET_SHARE = 0.05  # of a joint's way, after which it has begun to move
+SHARP_LAG_S = 0.02
+MAX_SHARP_CORRELATION = 0.8  # of a command with itself SHARP_LAG_S later, if it changes sharply
 MAX_UNEXPLAINED = 0.7  # share of the state's power, if the joint follows
-# of a joint whose delay is known
+MIN_FOLLOWED_SHARE = 0.3  # of its command's way, the same
+# Of a joint whose delay is known:
 MIN_COMMAND_RAD = 0.02
 MIN_CORRELATION = 0.3
 
@@ -103,20 +105,24 @@ def estimate_delay(ctrl: Array, qpos: Array, dt: float, max_delay: float = 0.4) 
     moved = _smooth_changes(qpos)
     rows = commanded.shape[1]
     shifts = range(min(int(max_delay / dt), rows // 2) + 1)
-    score = np.stack([correlation(commanded[:, : rows - s], moved[:, s:]) for s in shifts])
+    scores = []
+    for shift in shifts:
+        scores.append(correlation(commanded[:, : rows - shift], moved[:, shift:]))
+    score = np.stack(scores)  # (shifts, n)
     delay = np.full(ctrl.shape[1], np.nan)
     for j, best in enumerate(score.argmax(axis=0)):
-        is_moved = np.ptp(ctrl[:, j]) >= MIN_COMMAND_RAD
+        is_commanded = np.ptp(ctrl[:, j]) >= MIN_COMMAND_RAD
         follows = score[best, j] > MIN_CORRELATION
-        if is_moved and follows and best < len(score) - 1:
+        if is_commanded and follows and best < len(score) - 1:
             delay[j] = (best + _peak_offset(score[:, j], best)) * dt
     return delay
 
 
 def _smooth_changes(values: Array) -> Array:
     """Return the change from row to row, averaged over five, (T, n) → (n, T − 1)."""
-    kernel = np.hanning(7)[1:-1] / np.hanning(7).sum()
-    return np.stack([np.convolve(column, kernel, "same") for column in np.diff(values, axis=0).T])
+    kernel = np.hanning(7)[1:-1] / np.hanning(7).sum()  # hanning(7) is 0 at both ends
+    changes = np.diff(values, axis=0).T
+    return np.stack([np.convolve(of_joint, kernel, "same") for of_joint in changes])
 
 
 def _peak_offset(score: Array, best: int) -> float:
@@ -127,7 +133,9 @@ def _peak_offset(score: Array, best: int) -> float:
         return 0.0
     before, peak, after = score[best - 1 : best + 2]
     curvature = before - 2 * peak + after
-    return float(0.5 * (before - after) / curvature) if curvature < 0 else 0.0
+    if not curvature < 0:
+        return 0.0
+    return float(0.5 * (before - after) / curvature)
 
 
 def range_before(values: Array, rows: int) -> Array:
@@ -162,8 +170,11 @@ def _row_products(a: Array, b: Array) -> Array:
 
 def busiest_window(qpos: Array, rows: int) -> int:
     """Return the first row of the window of `rows` rows with the most motion; qpos (T, n) rad."""
-    moved = np.concatenate([[0.0], np.abs(np.diff(qpos, axis=0)).sum(axis=1).cumsum()])
-    return 0 if len(moved) <= rows else int((moved[rows:] - moved[:-rows]).argmax())
+    steps = np.abs(np.diff(qpos, axis=0)).sum(axis=1)
+    way = np.concatenate([[0.0], steps.cumsum()])  # until each row, (T) rad
+    if len(way) <= rows:
+        return 0
+    return int((way[rows:] - way[:-rows]).argmax())
 
 
 def encoder_step(recordings: list[Array]) -> float:
@@ -176,7 +187,8 @@ def encoder_step(recordings: list[Array]) -> float:
     if steps.size < 10:
         return 0.0
     step = float(np.percentile(steps, 5))
-    off = np.abs(steps / step - np.round(steps / step))
+    multiples = steps / step
+    off = np.abs(multiples - np.round(multiples))
     return step if np.median(off) < 0.1 else 0.0
 
 
@@ -209,15 +221,17 @@ class Response:
         power = []
         for part in range(SPLITS):
             rows = slice(part * size, (part + 1) * size)
-            u = np.diff(ctrl[::every][rows].astype(float), axis=0)
-            v = np.diff(qpos[::every][rows].astype(float), axis=0)
-            length = 1 << (2 * max(len(u), lags) - 1).bit_length()
-            a = np.fft.rfft(u, length, axis=0)
-            b = np.fft.rfft(v, length, axis=0)
-            own.append(np.fft.irfft(a.conj() * a, length, axis=0)[:lags].T)
-            later = np.fft.irfft(a.conj() * b, length, axis=0)
-            cross.append(np.concatenate([later[length - before :], later[: lags - before]]).T)
-            power.append((v**2).sum(axis=0))
+            commanded = np.diff(ctrl[::every][rows].astype(float), axis=0)
+            moved = np.diff(qpos[::every][rows].astype(float), axis=0)
+            # correlations by the Fourier transform, with zeros behind so that ends do not meet
+            length = 1 << (2 * max(len(commanded), lags) - 1).bit_length()
+            u = np.fft.rfft(commanded, length, axis=0)
+            v = np.fft.rfft(moved, length, axis=0)
+            own.append(np.fft.irfft(u.conj() * u, length, axis=0)[:lags].T)
+            later = np.fft.irfft(u.conj() * v, length, axis=0)
+            negative_lags = later[length - before :]
+            cross.append(np.concatenate([negative_lags, later[: lags - before]]).T)
+            power.append((moved**2).sum(axis=0))
         return Response(
             step=step,
             own=np.array(own, np.float32),
@@ -232,7 +246,8 @@ class Response:
         if seconds == 0:
             return self
         lags = np.arange(self.cross.shape[-1]) * self.step
-        moved = [np.interp(lags - seconds, lags, x) for x in self.cross.reshape(-1, len(lags))]
+        rows = self.cross.reshape(-1, len(lags))  # of each part and joint
+        moved = [np.interp(lags - seconds, lags, row) for row in rows]
         return replace(self, cross=np.reshape(moved, self.cross.shape).astype(np.float32))
 
     @staticmethod
@@ -240,11 +255,13 @@ class Response:
         """Return the joints whose commands change quickly enough to show when the joint begins to
         move, (n) bool.
         """
-        lags = [max(round(0.02 / r.step), 1) for r in responses]
-        own = [r.own.sum(axis=0) for r in responses]  # (n, L) each
-        now = np.sum([x[:, 0] for x in own], axis=0)
-        soon = np.sum([x[:, lag] for x, lag in zip(own, lags, strict=True)], axis=0)
-        return np.asarray(soon < MAX_SHARP_CORRELATION * now)
+        now = []  # correlation of the command with itself, (n) each
+        soon = []  # and with itself SHARP_LAG_S later
+        for response in responses:
+            own = response.own.sum(axis=0)  # (n, L)
+            now.append(own[:, 0])
+            soon.append(own[:, max(round(SHARP_LAG_S / response.step), 1)])
+        return np.asarray(np.sum(soon, axis=0) < MAX_SHARP_CORRELATION * np.sum(now, axis=0))
 
     @staticmethod
     def common(responses: list[Response], used: list[bool] | None = None) -> CommonResponse:
@@ -313,10 +330,11 @@ class _JointResponse(NamedTuple):
         """
         weights = _ridge_weights(own, cross)
         residual = power - weights @ cross
-        if residual > MAX_UNEXPLAINED * power or weights.sum() < 0.3:
+        if residual > MAX_UNEXPLAINED * power or weights.sum() < MIN_FOLLOWED_SHARE:
             return None
         past = _ridge_weights(own[:-now], cross[now:])
-        return cls(weights, residual, (power - cross[now:] @ past) / residual)
+        residual_of_past = power - cross[now:] @ past
+        return cls(weights, residual, residual_of_past / residual)
 
 
 def _ridge_weights(own: Array, cross: Array) -> Array:
@@ -361,4 +379,6 @@ def _shifted_weights(weights: Array, at: Array) -> tuple[Array, Array]:
 def _best_shifts(fits: Array) -> Array:
     """Return the shift of the best fit, (…, S) → (…) s; NaN at an end, or if all fits are equal."""
     best = SHIFTS_S[fits.argmax(axis=-1)]
-    return np.where((np.abs(best) > SHIFTS_S[-2]) | (np.ptp(fits, axis=-1) == 0), np.nan, best)
+    at_end = np.abs(best) > SHIFTS_S[-2]
+    all_equal = np.ptp(fits, axis=-1) == 0
+    return np.where(at_end | all_equal, np.nan, best)

@@ -10,17 +10,15 @@ gravity and of the other joints' accelerations, which other names would change.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
-from itertools import combinations
 
 import numpy as np
 
 from gaponet.base.arrays import Array
+from gaponet.data.checks.exchanges import Exchange, exchange, mirrored_joints, pairs, shifts
 from gaponet.data.checks.gravity import JOINT_FAULTS, Payload
-from gaponet.data.checks.sides import mirrored_joints
-from gaponet.data.checks.survey import Survey
+from gaponet.data.checks.survey import Movement, Survey
 from gaponet.data.offsets import Dynamics
-from gaponet.robot.finding import Finding, abbreviate
+from gaponet.robot.finding import Finding, abbreviate, masked_names
 from gaponet.robot.spec import RobotSpec
 
 MAX_ROWS = 360  # of all recordings, for which inverse dynamics are computed some hundred times
@@ -33,71 +31,58 @@ MIN_STEP = 0.1  # of evidence, by which one more exchange must fit better
 MIN_EVIDENCE = 0.3
 MIN_EXPLAINED = 0.3  # mean share of the torque's square, with the exchange
 FLOOR = 0.01  # of a share that is unexplained: no model is better
-MIN_OWN_SHARE = (
-    1e-4  # of the model torque's square that offset, damping, friction and armature do not imitate
-)
+# Share of the model torque's square that offset, damping, friction and armature do not imitate; a
+# joint with less shows nothing.
+MIN_OWN_SHARE = 1e-4
 FRICTION_RAD_S = 0.05  # speed at which friction is nearly Coulomb's
 MAX_BEYOND_RAD = 0.1  # of a range, by which a zero may be off
 MAX_INSIDE_RAD = 0.02  # beyond a range, with the exchange
-
-
-@dataclass(frozen=True)
-class _Exchange:
-    """One way in which names may be exchanged: column order[i] of the log belongs to joint i,
-    (n).
-    """
-
-    words: str
-    order: Array
-
-    def after(self, other: _Exchange) -> _Exchange:
-        """Return both exchanges in one, the other first."""
-        words = f"{other.words}, and {self.words}" if other.words else self.words
-        return _Exchange(words, other.order[self.order])
 
 
 class _Motion:
     """Rows of motion of all recordings, and how much of their torque the model explains.
 
     Attributes:
-        qpos, qvel, qacc: (k, n) rad, rad/s, rad/s².
-        effort: Torque in any unit, (k, n).
+        rows: Smoothed motion, (k, n).
+        payloads: Of each row, (k).
+        effort: Torque in any unit, (k, n): recorded, or the distance of the servo from its command.
         judged: Indices of joints that move.
+        imitations: Of each joint, as in _imitation.
     """
 
     def __init__(self, surveys: list[Survey], robot: RobotSpec, model: Dynamics) -> None:
-        parts: list[Array] = []
+        parts: list[Movement] = []
         payloads: list[Payload] = []
         for survey in surveys:
             movement = survey.samples.movement
             if movement is not None:
                 parts.append(movement)
                 payload = (survey.entry.meta.payload_mass, survey.entry.meta.payload_side)
-                payloads += [payload] * movement.shape[1]
-        rows = np.concatenate(parts, axis=1).astype(float)
-        step = -(-rows.shape[1] // MAX_ROWS)
-        self.qpos, self.qvel, self.qacc, torque, error, *target = rows[:, ::step]
-        recorded = bool(np.isfinite(torque).all() and (torque < 0).any())
-        self.effort = torque if recorded else error
-        further = [] if recorded else target
+                payloads += [payload] * len(movement.qpos)
+        step = -(-len(payloads) // MAX_ROWS)  # rounded up
+        self.rows = Movement.joined(parts).at(slice(None, None, step))
         self.payloads = payloads[::step]
         self.model = model
-        moves = np.ptp(self.qpos, axis=0) > MIN_MOTION_RAD
+        torque = self.rows.torque
+        recorded = bool(np.isfinite(torque).all() and (torque < 0).any())
+        self.effort = torque if recorded else self.rows.error
+        moves = np.ptp(self.rows.qpos, axis=0) > MIN_MOTION_RAD
         self.judged = [int(j) for j in robot.operated_index if moves[j]]
-        self.imitations = [self._imitation(j, further) for j in range(rows.shape[2])]
+        self.imitations = [self._imitation(j, recorded) for j in range(len(moves))]
 
-    def _imitation(self, column: int, further: list[Array]) -> Array:
-        """Return an orthonormal basis of offset, damping, friction and armature of one joint, (k,
-        4 to 6).
+    def _imitation(self, joint: int, recorded: bool) -> Array:
+        """Return an orthonormal basis of what imitates the model's torque of one joint: offset,
+        damping, friction and armature, (k, 4 or 6).
 
-        Args:
-            further: Velocity and acceleration of the command, (k, n) each, which a lag that is not
-                quite known adds.
+        Beside the distance to the command (no torque was recorded) these are also velocity and
+        acceleration of the command, which a lag that is not quite known adds.
         """
-        speed = self.qvel[:, column]
+        rows = self.rows
+        speed = rows.qvel[:, joint]
         friction = np.tanh(speed / FRICTION_RAD_S)
-        terms = [np.ones_like(speed), speed, friction, self.qacc[:, column]]
-        terms += [channel[:, column] for channel in further]
+        terms = [np.ones_like(speed), speed, friction, rows.qacc[:, joint]]
+        if not recorded:
+            terms += [rows.command_velocity[:, joint], rows.command_acceleration[:, joint]]
         return np.linalg.qr(np.stack(terms, axis=1))[0]
 
     def torque(self, order: Array, sign: Array | float = 1.0, turn: Array | float = 0.0) -> Array:
@@ -107,16 +92,21 @@ class _Motion:
             order: Column order[i] of the log belongs to joint i.
             sign, turn: Of the angles of each joint, (n).
         """
-        columns: Array = np.empty_like(self.qpos)
+        columns: Array = np.empty_like(self.rows.qpos)
         for payload in dict.fromkeys(self.payloads):
-            rows = np.array([p == payload for p in self.payloads])
-            qpos = sign * self.qpos[rows][:, order] + turn
-            qvel = sign * self.qvel[rows][:, order]
-            qacc = sign * self.qacc[rows][:, order]
+            chosen = np.array([other == payload for other in self.payloads])
+            rows = self.rows.at(chosen)
+            qpos = sign * rows.qpos[:, order] + turn
+            qvel = sign * rows.qvel[:, order]
+            qacc = sign * rows.qacc[:, order]
             torque = np.empty_like(qpos)
             torque[:, order] = sign * self.model(qpos, qvel, qacc, *payload)
-            columns[rows] = torque
+            columns[chosen] = torque
         return columns
+
+    def with_order(self, order: Array) -> Array:
+        """Return what the model does not explain if the columns have this order, (judged)."""
+        return self.unexplained(self.torque(order))
 
     def unexplained(self, torque: Array) -> Array:
         """Return the share of the square of each judged column's torque that the model does not
@@ -125,14 +115,17 @@ class _Motion:
         shares = []
         for j in self.judged:
             basis = self.imitations[j]
-            own = torque[:, j] - basis @ (basis.T @ torque[:, j])
-            measured = self.effort[:, j] - basis @ (basis.T @ self.effort[:, j])
-            power = float(own @ own) * float(measured @ measured)
-            agreement = max(float(own @ measured), 0.0)
-            if own @ own < MIN_OWN_SHARE * (torque[:, j] @ torque[:, j]) or power == 0:
-                agreement = 0.0
-                power = 1.0
-            shares.append(1 - agreement**2 / power + FLOOR)
+            expected = torque[:, j]
+            measured = self.effort[:, j]
+            # what offset, damping, friction and armature do not imitate of both
+            own_expected = expected - basis @ (basis.T @ expected)
+            own_measured = measured - basis @ (basis.T @ measured)
+            explained = 0.0
+            power = float(own_expected @ own_expected) * float(own_measured @ own_measured)
+            shown = own_expected @ own_expected >= MIN_OWN_SHARE * (expected @ expected)
+            if shown and power > 0:
+                explained = max(float(own_expected @ own_measured), 0.0) ** 2 / power
+            shares.append(1 - explained + FLOOR)
         return np.array(shares)
 
 
@@ -140,14 +133,14 @@ def arrangement(surveys: list[Survey], robot: RobotSpec, model: Dynamics) -> Ite
     """Would the joints fit the model better under other names?"""
     by_range = _by_range(surveys, robot)
     movements = [survey.samples.movement for survey in surveys]
-    if sum(rows.shape[1] for rows in movements if rows is not None) < MIN_ROWS:
+    if sum(len(movement.qpos) for movement in movements if movement is not None) < MIN_ROWS:
         yield from by_range
         return
     motion = _Motion(surveys, robot, model)
-    as_logged = motion.unexplained(motion.torque(np.arange(len(robot.joint_names))))
-    first = [
-        (e, motion.unexplained(motion.torque(e.order))) for e in _exchanges(motion.judged, robot)
-    ]
+    as_logged = motion.with_order(np.arange(len(robot.joint_names)))
+    first = []
+    for one in _exchanges(motion.judged, robot):
+        first.append((one, motion.with_order(one.order)))
     found, unexplained = _search(motion, robot, as_logged, first)
     evidence = _evidence(as_logged, unexplained)
     explained = 1 - float(unexplained.mean()) if len(unexplained) else 0.0
@@ -161,7 +154,7 @@ def arrangement(surveys: list[Survey], robot: RobotSpec, model: Dynamics) -> Ite
         f"than as logged ({1 - as_logged.mean():.0%}): names of joints are exchanged in command "
         "and state alike, where neither shows it; check the order of the columns"
     )
-    yield _finding(text, found.order, robot, {"evidence": evidence})
+    yield _finding(text, found, robot, {"evidence": evidence})
 
 
 def _evidence(as_logged: Array, otherwise: Array) -> float:
@@ -172,9 +165,12 @@ def _evidence(as_logged: Array, otherwise: Array) -> float:
     return float(np.log(as_logged / otherwise).sum())
 
 
-def _not_told(as_logged: Array, exchanges: list[tuple[_Exchange, Array]]) -> Finding:
+def _not_told(as_logged: Array, exchanges: list[tuple[Exchange, Array]]) -> Finding:
     """Say which exchanges would not be noticed. exchanges: each with what it leaves unexplained."""
-    alike = [e.words for e, shares in exchanges if _evidence(as_logged, shares) > -MIN_STEP]
+    alike = []
+    for one, unexplained in exchanges:
+        if _evidence(as_logged, unexplained) > -MIN_STEP:
+            alike.append(one.words)
     if not alike:
         return Finding("ok", "order", "the torques of motion fit no other order of the joints")
     text = (
@@ -185,14 +181,14 @@ def _not_told(as_logged: Array, exchanges: list[tuple[_Exchange, Array]]) -> Fin
 
 
 def _search(
-    motion: _Motion, robot: RobotSpec, as_logged: Array, first: list[tuple[_Exchange, Array]]
-) -> tuple[_Exchange, Array]:
+    motion: _Motion, robot: RobotSpec, as_logged: Array, first: list[tuple[Exchange, Array]]
+) -> tuple[Exchange, Array]:
     """Return the best exchange, found step by step, and what it leaves unexplained.
 
     Args:
         first: Single exchanges, each with what it leaves unexplained.
     """
-    best = _Exchange("", np.arange(len(robot.joint_names)))
+    best = Exchange("", (), np.arange(len(robot.joint_names)))
     unexplained = as_logged
     candidates = first
     for _ in motion.judged:
@@ -203,38 +199,32 @@ def _search(
             break
         best = following
         unexplained = left
-        steps = [step.after(best) for step, _ in first]
-        candidates = [(e, motion.unexplained(motion.torque(e.order))) for e in steps]
+        candidates = []
+        for step, _ in first:
+            both = _one_after_the_other(best, step)
+            candidates.append((both, motion.with_order(both.order)))
     return best, unexplained
 
 
-def _exchanges(judged: list[int], robot: RobotSpec) -> Iterator[_Exchange]:
+def _one_after_the_other(first: Exchange, then: Exchange) -> Exchange:
+    """Return two exchanges as one."""
+    words = f"{first.words}, and {then.words}"
+    return Exchange(words, first.joints + then.joints, first.order[then.order])
+
+
+def _exchanges(judged: list[int], robot: RobotSpec) -> Iterator[Exchange]:
     """Yield left and right, front and rear exchanged; pairs; all moved by one place, or
     reversed.
     """
-    same = np.arange(len(robot.joint_names))
-    for words, partners in mirrored_joints(robot.joint_names).items():
-        order = same.copy()
-        for joint, partner in partners.items():
-            if joint in judged and partner in judged:
-                order[joint] = partner
-        if (order != same).any():
-            yield _Exchange(f"{words} in each other's place", order)
-    for a, b in combinations(judged, 2):
-        order = same.copy()
-        order[[a, b]] = [b, a]
-        names = f"{robot.joint_names[a]} and {robot.joint_names[b]}"
-        yield _Exchange(f"{names} in each other's place", order)
-    if len(judged) < 3:
-        return
-    for words, moved in (
-        ("one place on", np.roll(judged, 1)),
-        ("one place back", np.roll(judged, -1)),
-        ("backwards", judged[::-1]),
-    ):
-        order = same.copy()
-        order[judged] = moved
-        yield _Exchange(f"the order of joints {words}", order)
+    names = robot.joint_names
+    for words, partners in mirrored_joints(names).items():
+        both_judged = [j for j, partner in partners.items() if {j, partner} <= set(judged)]
+        columns = [partners[j] for j in both_judged]
+        if both_judged:
+            yield exchange(len(names), both_judged, columns, f"{words} in each other's place")
+    yield from pairs(judged, names)
+    if len(judged) >= 3:
+        yield from shifts(judged, names)
 
 
 def _one_joint_explains(
@@ -244,8 +234,8 @@ def _one_joint_explains(
     same = np.arange(len(robot.joint_names))
     for j in motion.judged:
         one = np.eye(len(same))[j]
-        for sign, turn, _ in JOINT_FAULTS:
-            torque = motion.torque(same, 1 + (sign - 1) * one, turn * one)
+        for fault in JOINT_FAULTS:
+            torque = motion.torque(same, 1 + (fault.sign - 1) * one, fault.turn * one)
             if _evidence(as_logged, motion.unexplained(torque)) > evidence:
                 return True
     return False
@@ -256,19 +246,16 @@ def _by_range(surveys: list[Survey], robot: RobotSpec) -> list[Finding]:
     low = np.min([survey.qpos_limits[:, 0] for survey in surveys], axis=0)
     high = np.max([survey.qpos_limits[:, 1] for survey in surveys], axis=0)
     judged = [int(j) for j in robot.operated_index if high[j] - low[j] > MIN_MOTION_RAD]
-    same = np.arange(len(low))
-    beyond = _beyond(low, high, same, robot)
+    beyond = _beyond(low, high, np.arange(len(low)), robot)
     if beyond.max(initial=0.0) < MAX_BEYOND_RAD:
         return []
     fitting = []
-    for exchange in _exchanges(judged, robot):
-        if _beyond(low, high, exchange.order, robot).max() < MAX_INSIDE_RAD:
-            fitting.append(exchange)
+    for one in _exchanges(judged, robot):
+        if _beyond(low, high, one.order, robot).max() < MAX_INSIDE_RAD:
+            fitting.append(one)
     if not fitting:
         return []
-    outside = [
-        name for name, x in zip(robot.joint_names, beyond, strict=True) if x > MAX_INSIDE_RAD
-    ]
+    outside = list(masked_names(robot, beyond > MAX_INSIDE_RAD))
     text = (
         f"{abbreviate(outside)} is up to {beyond.max():.2f} rad outside of its range, and with "
         f"{fitting[0].words} no joint is"
@@ -278,7 +265,7 @@ def _by_range(surveys: list[Survey], robot: RobotSpec) -> list[Finding]:
     text += (
         ": are names of joints exchanged in command and state alike? Check the order of the columns"
     )
-    return [_finding(text, fitting[0].order, robot, {"beyond_rad": float(beyond.max())})]
+    return [_finding(text, fitting[0], robot, {"beyond_rad": float(beyond.max())})]
 
 
 def _beyond(low: Array, high: Array, order: Array, robot: RobotSpec) -> Array:
@@ -290,7 +277,6 @@ def _beyond(low: Array, high: Array, order: Array, robot: RobotSpec) -> Array:
     return np.asarray(beyond.clip(0.0))
 
 
-def _finding(text: str, order: Array, robot: RobotSpec, values: dict[str, float]) -> Finding:
-    moved = np.flatnonzero(order != np.arange(len(order)))
-    names = {robot.joint_names[order[i]]: robot.joint_names[i] for i in moved}
+def _finding(text: str, found: Exchange, robot: RobotSpec, values: dict[str, float]) -> Finding:
+    names = found.names(robot.joint_names)
     return Finding("warning", "order", text, tuple(names.values()), values, {"names": names})

@@ -7,6 +7,7 @@ from __future__ import annotations
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator
 from itertools import chain
+from typing import NamedTuple
 
 import numpy as np
 
@@ -17,18 +18,22 @@ from gaponet.data.log import COMMANDS
 from gaponet.robot.finding import Finding, abbreviate, masked_names
 from gaponet.robot.spec import RobotSpec
 
-MAX_JITTER = (0.1, 0.5)  # of a period, up to which jitter is ok and a note
+MAX_RATE_DIFFERENCE = 0.05  # of the robot's rate, by which a recorded one may differ untold
+MAX_OK_JITTER = 0.1  # of a period
+MAX_NOTED_JITTER = 0.5  # of a period; more is a warning
 MIN_BLOCKED_S = 0.5
-MIN_STANDSTILL_S = 1.0
+MIN_STANDSTILL_S = 1.0  # of all joints
 MIN_REPEATED_S = 0.25
 MAX_CUT_SHARE = 0.02  # of the rows that are left, from which cut rows are told
 MIN_USED_RAD = 0.05  # range of a joint whose torque is judged
 MIN_COMMANDED_RAD = 0.1  # range of a command that moves a joint
+# A joint that moves by less than both of these, though commanded, stands still.
+MAX_STILL_RAD = 0.03
+MAX_STILL_SHARE = 0.05  # of the command's range
 MAX_RESOLUTION_RAD = 3e-3  # step between positions; twice as much is a warning
 RESOLUTION_TOLERANCE = 0.02  # relative difference of an encoder's steps
-# of torque cut off at one value; of the torque limit
-MIN_FLAT_ROWS = 20
-MIN_FLAT_SHARE = 0.01
+MIN_FLAT_ROWS = 20  # with torque cut off at one value
+MIN_FLAT_SHARE = 0.01  # of the torque limit, for this value
 
 
 def _joined(parts: list[Iterable[str]]) -> tuple[str, ...]:
@@ -45,16 +50,20 @@ def _rate(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     rates: Counter[float] = Counter()
     for survey in surveys:
         rates[_same_rate(survey, rates)] += 1
-    text = ", ".join(f"{count} at {r:.2f} Hz ({1e3 / r:.2f} ms)" for r, count in rates.items())
+    parts = []
+    for rate, count in rates.items():
+        parts.append(f"{count} at {rate:.2f} Hz ({1e3 / rate:.2f} ms)")
+    text = ", ".join(parts)
     deviation = max(abs(survey.timing.rate_hz * robot.dt - 1) for survey in surveys)
     level = "ok"
     if len(rates) > 1:
         level = "warning"
-    elif deviation > 0.05:
+    elif deviation > MAX_RATE_DIFFERENCE:
         level = "note"
     if deviation > 0.001:
         text += f"; robot.toml says {1 / robot.dt:.2f} Hz; the recorded rate is used"
-    yield Finding(level, "rate", text, values={f"{r:.2f}": count for r, count in rates.items()})
+    counts = {f"{rate:.2f}": count for rate, count in rates.items()}
+    yield Finding(level, "rate", text, values=counts)
     resampled = [survey for survey in surveys if _is_resampled(survey)]
     if resampled:
         text = f"{len(resampled)} sequence(s) were put on a uniform grid: {_motions(resampled)}"
@@ -78,13 +87,18 @@ def _is_resampled(survey: Survey) -> bool:
 
 def _regularity(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     """How evenly was it sampled, and what is missing?"""
+    yield _jitter(surveys)
+    yield _gaps(surveys)
+
+
+def _jitter(surveys: list[Survey]) -> Finding:
     timings = [survey.timing for survey in surveys]
     jitter = [timing.jitter_ms * timing.rate_hz / 1e3 for timing in timings]  # of a period
     worst = surveys[int(np.argmax(jitter))]
     level = "warning"
-    if max(jitter) <= MAX_JITTER[0]:
+    if max(jitter) <= MAX_OK_JITTER:
         level = "ok"
-    elif max(jitter) <= MAX_JITTER[1]:
+    elif max(jitter) <= MAX_NOTED_JITTER:
         level = "note"
     where = f" ({worst.motion})" if worst.timing.jitter_ms else ""
     text = f"periods deviate from their median by at most {worst.timing.jitter_ms:.2f} ms{where}"
@@ -94,35 +108,37 @@ def _regularity(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
             f". Delays shorter than {unknown:.0f} ms cannot be told between such rows; log at an "
             "even rate"
         )
-    yield Finding(level, "jitter", text, values={"jitter_ms": worst.timing.jitter_ms})
-    longest = max(surveys, key=lambda survey: survey.timing.longest_gap_ms)
+    return Finding(level, "jitter", text, values={"jitter_ms": worst.timing.jitter_ms})
+
+
+def _gaps(surveys: list[Survey]) -> Finding:
+    worst = max(surveys, key=lambda survey: survey.timing.longest_gap_ms)
+    longest_ms = worst.timing.longest_gap_ms
     gaps = [survey for survey in surveys if survey.timing.missing_samples]
     if not gaps:
-        yield Finding(
-            "ok",
-            "gaps",
-            f"no samples missing; longest period {longest.timing.longest_gap_ms:.2f} ms",
-        )
-        return
+        text = f"no samples missing; longest period {longest_ms:.2f} ms"
+        return Finding("ok", "gaps", text)
     text = (
-        f"{len(gaps)} sequence(s) miss samples, at worst {longest.timing.longest_gap_ms:.0f} ms "
-        f"({longest.motion}): the state there is interpolated; cut the log at long gaps"
+        f"{len(gaps)} sequence(s) miss samples, at worst {longest_ms:.0f} ms ({worst.motion}): the "
+        "state there is interpolated; cut the log at long gaps"
     )
-    yield Finding("warning", "gaps", text, values={"longest_gap_ms": longest.timing.longest_gap_ms})
+    return Finding("warning", "gaps", text, values={"longest_gap_ms": longest_ms})
 
 
 def _jumps(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     """Is the state somewhere that no joint can reach and leave in one period?"""
     for i, name in enumerate(robot.joint_names):
+        # a row of zeros counts as a jump of each joint, and is told below
         hit = [s for s in surveys if s.encoders.jump_rows[i] > s.encoders.zero_rows]
-        if hit:
-            rows = sum(int(survey.encoders.jump_rows[i]) for survey in hit)
-            text = (
-                f"{name} jumps and comes back faster than any motor in {rows} rows of "
-                f"{_motions(hit)}: a misread sample or a wrap of the encoder; repair or cut these "
-                "rows"
-            )
-            yield Finding("warning", "jumps", text, (name,), {"rows": rows})
+        if not hit:
+            continue
+        rows = sum(int(survey.encoders.jump_rows[i]) for survey in hit)
+        text = (
+            f"{name} jumps and comes back faster than any motor in {rows} rows of "
+            f"{_motions(hit)}: a misread sample or a wrap of the encoder; repair or cut these "
+            "rows"
+        )
+        yield Finding("warning", "jumps", text, (name,), {"rows": rows})
     dropped = [survey for survey in surveys if survey.encoders.zero_rows]
     if dropped:
         rows = sum(survey.encoders.zero_rows for survey in dropped)
@@ -137,9 +153,9 @@ def _nonsense(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     """Were impossible values of a channel replaced at import?"""
     for channel, hit in _with_note(surveys, "nonsense").items():
         notes = [survey.entry.meta.notes["nonsense"][channel] for survey in hit]
-        rows = sum(n["rows"] for n in notes)
-        done = ", ".join(dict.fromkeys(n["done"] for n in notes))
-        joints = _joined([n["joints"] for n in notes])
+        rows = sum(note["rows"] for note in notes)
+        done = ", ".join(dict.fromkeys(note["done"] for note in notes))
+        joints = _joined([note["joints"] for note in notes])
         text = (
             f"{channel} of {abbreviate(list(joints))} was what no joint does (first "
             f"{notes[0]['worst']:.4g}) in {rows} rows of {_motions(hit)}, a counter or a bad "
@@ -163,9 +179,12 @@ def _repeated_rows(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]
 
 def _as_logged(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     """What was held, left out, continued or cut at import?"""
-    for note, finding_of in (("slower", _slower), ("absent", _absent), ("turns", _turns)):
-        for name, hit in _with_note(surveys, note).items():
-            yield finding_of(name, hit)
+    for channel, hit in _with_note(surveys, "slower").items():
+        yield _slower(channel, hit)
+    for channel, hit in _with_note(surveys, "absent").items():
+        yield _absent(channel, hit)
+    for joint, hit in _with_note(surveys, "turns").items():
+        yield _turns(joint, hit)
     cut = [survey for survey in surveys if _rows_cut(survey) > MAX_CUT_SHARE * survey.entry.rows]
     if cut:
         rows = sum(_rows_cut(survey) for survey in cut)
@@ -193,10 +212,11 @@ def _rows_cut(survey: Survey) -> int:
 def _slower(channel: str, hit: list[Survey]) -> Finding:
     notes = [survey.entry.meta.notes["slower"][channel] for survey in hit]
     filled = "held" if channel in COMMANDS else "interpolated"
-    rows = sum(n["rows"] for n in notes)
+    rows = sum(note["rows"] for note in notes)
+    of_rows = sum(note["of"] for note in notes)
     text = (
-        f"{channel} stands in {rows} of {sum(n['of'] for n in notes)} rows of {_motions(hit)}: it "
-        f"is {filled} between them"
+        f"{channel} stands in {rows} of {of_rows} rows of {_motions(hit)}: it is {filled} between "
+        "them"
     )
     return Finding("note", "slower", text)
 
@@ -212,8 +232,8 @@ def _absent(channel: str, hit: list[Survey]) -> Finding:
 
 def _turns(joint: str, hit: list[Survey]) -> Finding:
     notes = [survey.entry.meta.notes["turns"][joint] for survey in hit]
-    wraps = sum(n["wraps"] for n in notes)
-    moved = any(n["turns"] for n in notes)
+    wraps = sum(note["wraps"] for note in notes)
+    moved = any(note["turns"] for note in notes)
     if not wraps and not moved:
         text = (
             f"{joint} was counted from zero to a whole turn in {_motions(hit)}: its angles were "
@@ -239,19 +259,19 @@ def _blocked(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     for i, name in enumerate(robot.joint_names):
         blocked = [survey for survey in surveys if survey.standstill.blocked_s[i] >= MIN_BLOCKED_S]
         hit = [survey for survey in blocked if survey not in held]
-        if hit:
-            worst = max(hit, key=lambda survey: survey.standstill.blocked_s[i]).standstill
-            at_rad = float(worst.blocked_at[i])
-            seconds = float(worst.blocked_s[i])
-            text = (
-                f"{name} stood at {at_rad:.2f} rad for {seconds:.1f} s, "
-                f"far from its command, in {_motions(hit)}: a stop, an obstacle, too little "
-                "torque, or not read; leave it out or cut it"
-            )
-            values = {"at_rad": at_rad, "seconds": seconds}
-            yield Finding(
-                "warning" if name in robot.operated else "note", "blocked", text, (name,), values
-            )
+        if not hit:
+            continue
+        worst = max(hit, key=lambda survey: survey.standstill.blocked_s[i]).standstill
+        at_rad = float(worst.blocked_at[i])
+        seconds = float(worst.blocked_s[i])
+        text = (
+            f"{name} stood at {at_rad:.2f} rad for {seconds:.1f} s, far from its command, in "
+            f"{_motions(hit)}: a stop, an obstacle, too little torque, or not read; leave it out "
+            "or cut it"
+        )
+        level = "warning" if name in robot.operated else "note"
+        values = {"at_rad": at_rad, "seconds": seconds}
+        yield Finding(level, "blocked", text, (name,), values)
 
 
 def unsigned_torque(recorded: list[tuple[Survey, Torque]], robot: RobotSpec) -> tuple[str, ...]:
@@ -260,17 +280,29 @@ def unsigned_torque(recorded: list[tuple[Survey, Torque]], robot: RobotSpec) -> 
     """
     if not recorded:
         return ()
-    low, high, used = torque_limits(recorded)
-    alive = used & (low < high)
-    return () if (alive & (low < 0)).any() else masked_names(robot, alive)
+    torques = torque_limits(recorded)
+    changes = torques.moved & (torques.low < torques.high)
+    if (changes & (torques.low < 0)).any():
+        return ()
+    return masked_names(robot, changes)
 
 
-def torque_limits(recorded: list[tuple[Survey, Torque]]) -> tuple[Array, Array, Array]:
-    """Return each joint's least and greatest torque, N·m, and whether it moves, (n)."""
-    low = np.min([t.low for _, t in recorded], axis=0)
-    high = np.max([t.high for _, t in recorded], axis=0)
-    moved = np.max([survey.qpos_range for survey, _ in recorded], axis=0) > MIN_USED_RAD
-    return low, high, moved
+class TorqueLimits(NamedTuple):
+    """What the torque of each joint was in some recordings, (n)."""
+
+    low: Array  # N·m
+    high: Array  # N·m
+    moved: Array  # whether the joint moves, bool
+
+
+def torque_limits(recorded: list[tuple[Survey, Torque]]) -> TorqueLimits:
+    """Return the least and greatest torque of each joint, and whether it moves."""
+    ranges = np.max([survey.qpos_range for survey, _ in recorded], axis=0)  # (n) rad
+    return TorqueLimits(
+        low=np.min([torque.low for _, torque in recorded], axis=0),
+        high=np.max([torque.high for _, torque in recorded], axis=0),
+        moved=ranges > MIN_USED_RAD,
+    )
 
 
 def _saturation(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
@@ -279,78 +311,79 @@ def _saturation(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     if unsigned_torque(recorded, robot):  # the torque check warns of it
         yield Finding("ok", "saturation", "no signed torque recorded")
         return
-    over = [(survey, t) for survey, t in recorded if t.over_limit.any()]
+    over = [(survey, torque) for survey, torque in recorded if torque.over_limit.any()]
     if not over:
-        ok = Finding(
-            "ok", "saturation", "no torque at a limit" if recorded else "no torque recorded"
-        )
-        yield from [*_flat_torque(recorded, robot)] or [ok]
+        text = "no torque at a limit" if recorded else "no torque recorded"
+        flat = [*_flat_torque(recorded, robot)]
+        yield from flat or [Finding("ok", "saturation", text)]
         return
-    worst = np.max([np.maximum(-t.low, t.high) for _, t in over], axis=0)  # (n,) N·m
-    i = int((worst / robot.servo.effort_limit).argmax())
-    rows = sum(int(t.over_limit.sum()) for _, t in over)
+    worst = np.max([torque.largest for _, torque in over], axis=0)  # (n) N·m
+    limit = robot.servo.effort_limit
+    i = int((worst / limit).argmax())
+    name = robot.joint_names[i]
+    rows = sum(int(torque.over_limit.sum()) for _, torque in over)
     motions = _motions([survey for survey, _ in over])
     text = (
-        f"torque beyond the limit of robot.toml in {rows} rows of "
-        f"{motions}; worst {worst[i]:.2f} N·m on {robot.joint_names[i]} "
-        f"(limit {robot.servo.effort_limit[i]:.2f}): a collision, a spike or a wrong limit"
+        f"torque beyond the limit of robot.toml in {rows} rows of {motions}; worst "
+        f"{worst[i]:.2f} N·m on {name} (limit {limit[i]:.2f}): a collision, a spike or a wrong "
+        "limit"
     )
-    yield Finding(
-        "warning",
-        "saturation",
-        text,
-        (robot.joint_names[i],),
-        {"rows": rows, "worst": float(worst[i])},
-    )
+    values = {"rows": rows, "worst": float(worst[i])}
+    yield Finding("warning", "saturation", text, (name,), values)
 
 
 def _flat_torque(recorded: list[tuple[Survey, Torque]], robot: RobotSpec) -> Iterator[Finding]:
     """Find torques that are cut off at one value below the limit of robot.toml."""
     for i, name in enumerate(robot.joint_names):
-        largest = [max(-float(torque.low[i]), float(torque.high[i])) for _, torque in recorded]
-        top = max(largest, default=0.0)
-        near = []
+        top = max((float(torque.largest[i]) for _, torque in recorded), default=0.0)
+        near = []  # recordings that reach this torque
         rows = 0
-        for (survey, torque), most in zip(recorded, largest, strict=True):
-            if most > 0.999 * top:
+        for survey, torque in recorded:
+            if float(torque.largest[i]) > 0.999 * top:
                 near.append(survey)
                 rows += int(torque.flat[i])
-        if top > MIN_FLAT_SHARE * robot.servo.effort_limit[i] and rows >= MIN_FLAT_ROWS:
-            motions = _motions(near)
-            text = (
-                f"torque of {name} is cut off flat at {top:.3g} N·m in {rows} rows of "
-                f"{motions}: the motor or its driver gives no more. Write "
-                f"effort_limit = {top:.3g} in robot.toml, or leave these recordings out"
-            )
-            yield Finding("warning", "saturation", text, (name,), {"rows": rows, "limit": top})
+        if top <= MIN_FLAT_SHARE * robot.servo.effort_limit[i] or rows < MIN_FLAT_ROWS:
+            continue
+        text = (
+            f"torque of {name} is cut off flat at {top:.3g} N·m in {rows} rows of "
+            f"{_motions(near)}: the motor or its driver gives no more. Write "
+            f"effort_limit = {top:.3g} in robot.toml, or leave these recordings out"
+        )
+        yield Finding("warning", "saturation", text, (name,), {"rows": rows, "limit": top})
 
 
 def _resolution(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     """Are positions recorded finely enough?"""
-    step = np.max([survey.encoders.resolution for survey in surveys], axis=0)
-    ratio = np.radians(step) / np.median(step[step > 0]) if step.any() else np.zeros_like(step)
+    step = np.max([survey.encoders.resolution for survey in surveys], axis=0)  # (n) rad
+    yield from _degrees_beside_radians(step, robot)
+    coarse = masked_names(robot, step > MAX_RESOLUTION_RAD)
+    if not coarse:
+        text = f"positions change in steps of at most {step.max() * 1e3:.2f} mrad"
+        yield Finding("ok", "resolution", text)
+        return
+    worst = float(step.max())
+    name = max(masked_names(robot, step == worst))
+    text = (
+        f"positions of {abbreviate(list(coarse))} come in steps of up to {worst * 1e3:.1f} mrad "
+        f"({name}): rounded when logged, or a coarse encoder (12 bits: 1.5 mrad). No error below "
+        "half of that can be seen; log more digits"
+    )
+    level = "warning" if worst > 2 * MAX_RESOLUTION_RAD else "note"
+    yield Finding(level, "resolution", text, coarse, {"step": worst})
+
+
+def _degrees_beside_radians(step: Array, robot: RobotSpec) -> Iterator[Finding]:
+    """Find joints whose steps are 57.3 times those of the others. step: (n) rad, 0 if unknown."""
+    if not step.any():
+        return
+    ratio = np.radians(step) / np.median(step[step > 0])
     degrees = masked_names(robot, np.abs(ratio - 1) < RESOLUTION_TOLERANCE)
     if degrees and len(degrees) < (step > 0).sum() / 2:
         text = (
             f"{', '.join(degrees)} has steps 57.3 times as coarse as other joints: degrees beside "
-            "radians?"
+            "radians? Import again with the right unit"
         )
-        yield Finding("warning", "unit", f"{text} Import again with the right unit", degrees)
-    steps = zip(step.tolist(), robot.joint_names, strict=True)
-    coarse = [(size, name) for size, name in steps if size > MAX_RESOLUTION_RAD]
-    if not coarse:
-        yield Finding(
-            "ok", "resolution", f"positions change in steps of at most {step.max() * 1e3:.2f} mrad"
-        )
-        return
-    worst, name = max(coarse)
-    text = (
-        f"positions of {abbreviate([name for _, name in coarse])} come in steps of up to "
-        f"{worst * 1e3:.1f} mrad ({name}): rounded when logged, or a coarse encoder (12 bits: 1.5 "
-        "mrad). No error below half of that can be seen; log more digits"
-    )
-    level = "warning" if worst > 2 * MAX_RESOLUTION_RAD else "note"
-    yield Finding(level, "resolution", text, tuple(name for _, name in coarse), {"step": worst})
+        yield Finding("warning", "unit", text, degrees)
 
 
 def _stuck(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
@@ -366,8 +399,8 @@ def _stuck(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
             level = "error" if len(still) == len(moved) else "warning"
             yield Finding(level, "stuck", text, (name,))
         repeated = [survey for survey in _repeating(surveys, i) if survey not in still]
-        whole = [s for s in repeated if s.standstill.all_repeated_s > MIN_REPEATED_S]
-        if repeated and not whole:
+        whole_state = any(_repeats_whole_state(survey) for survey in repeated)
+        if repeated and not whole_state:
             seconds = max(survey.standstill.repeated_s[i] for survey in repeated)
             text = (
                 f"{name} repeats one number for up to {seconds:.2f} s while its command moves on "
@@ -380,7 +413,11 @@ def _stuck(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
 def _stands_still(survey: Survey, i: int) -> bool:
     """Return True if joint i moves little, and far less than commanded."""
     moved = survey.qpos_range[i]
-    return bool(moved < 0.03 and moved < 0.05 * survey.ctrl_range[i])
+    return bool(moved < MAX_STILL_RAD and moved < MAX_STILL_SHARE * survey.ctrl_range[i])
+
+
+def _repeats_whole_state(survey: Survey) -> bool:
+    return survey.standstill.all_repeated_s > MIN_REPEATED_S
 
 
 def _repeating(surveys: list[Survey], i: int) -> list[Survey]:
@@ -396,7 +433,7 @@ def _repeating(surveys: list[Survey], i: int) -> list[Survey]:
 
 def _frozen(surveys: list[Survey]) -> Iterator[Finding]:
     """Find recordings whose whole state repeats itself."""
-    repeated = [survey for survey in surveys if survey.standstill.all_repeated_s > MIN_REPEATED_S]
+    repeated = [survey for survey in surveys if _repeats_whole_state(survey)]
     frozen = [survey for survey in repeated if not _all_blocked(survey)]
     if frozen:
         seconds = max(survey.standstill.all_repeated_s for survey in frozen)

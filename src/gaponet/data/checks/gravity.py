@@ -11,48 +11,55 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterable, Iterator
-from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
 
 from gaponet.base.arrays import Array
+from gaponet.data.checks.exchanges import pairs, shifts
 from gaponet.data.checks.survey import Survey
 from gaponet.data.offsets import Gravity
 from gaponet.robot.finding import Finding, Mend
 from gaponet.robot.spec import RobotSpec
 
 Payload = tuple[float, str]  # payload_mass, kg, and payload_side
-Loads = dict[Payload, tuple[Array, Array]]  # angles and torques, (k, n) each
+Loads = dict[Payload, tuple[Array, Array]]  # angles, rad, and torques, N·m; (k, n) each
 
-TURNS_RAD = (0.3, 0.6, 1.0, 1.5708, 2.3, 3.1416)  # of a zero, tried in both directions
-# Hypotheses of one joint: sign of its angle, turn of its zero, sign of its torque.
-JOINT_FAULTS = [
-    (-1, 0.0, -1),
-    (-1, 0.0, 1),
-    (1, 0.0, -1),
-    *((1, turn, 1) for turn in TURNS_RAD),
-    *((1, -turn, 1) for turn in TURNS_RAD),
-]
 MAX_ROWS = 120  # gravity is evaluated some fifteen times for each joint
 MIN_ROWS = 20
-# sum over joints of ln(unexplained as logged / unexplained otherwise); correct recordings: < 0.1
+# Evidence is the sum over joints of ln(unexplained as logged / unexplained otherwise). Correct
+# recordings have less than 0.1.
 MIN_EVIDENCE = 0.4
-# mean share of the torque's square
-MIN_EXPLAINED = 0.5
-MIN_IMPROVEMENT = 0.03
+MIN_EXPLAINED = 0.5  # mean share of the torque's square, with the hypothesis
+MIN_IMPROVEMENT = 0.03  # of this share
 MIN_LOAD = 0.01  # of the torque limit: a joint that gravity loads less shows nothing
+FLOOR = 1e-4  # of a share that is unexplained
+
+
+class JointFault(NamedTuple):
+    """One way in which a joint may be logged wrong: as sign · angle + turn, rad."""
+
+    sign: int = 1
+    turn: float = 0.0
+    torque_sign: int = 1
+
+
+TURNS_RAD = (0.3, 0.6, 1.0, 1.5708, 2.3, 3.1416)  # of a zero, tried in both directions
+JOINT_FAULTS = [
+    JointFault(sign=-1, torque_sign=-1),
+    JointFault(sign=-1),
+    JointFault(torque_sign=-1),
+    *(JointFault(turn=turn) for turn in TURNS_RAD),
+    *(JointFault(turn=-turn) for turn in TURNS_RAD),
+]
 
 
 class _Hypothesis(NamedTuple):
-    """One way in which the logs may be wrong: the angles are sign · logged[order] + turn.
+    """One way in which the logs may be wrong: the angles are sign · logged[order] + turn."""
 
-    words: Description. joints: Indices. mend: Its correction in logs.toml.
-    """
-
-    words: str
-    joints: tuple[int, ...]
-    mend: Mend
+    words: str  # for a person
+    joints: tuple[int, ...]  # indices of those that are wrong
+    mend: Mend  # the correction in logs.toml
     order: Array  # column order[i] of the log belongs to joint i, (n)
     sign: Array | float = 1.0  # (n)
     turn: Array | float = 0.0  # (n) rad
@@ -87,33 +94,31 @@ def gravity(surveys: list[Survey], robot: RobotSpec, model: Gravity) -> Iterator
     if _count_rows(servos) >= MIN_ROWS:
         results.append(_best(servos, robot, model, centred=True))
     if not results:
-        yield Finding(
-            "ok",
-            "gravity",
-            "too few torques and rests: zeros and signs cannot be told from gravity",
-        )
+        text = "too few torques and rests: zeros and signs cannot be told from gravity"
+        yield Finding("ok", "gravity", text)
         return
-    best = max(results, key=lambda b: b.evidence)
-    improvement = best.otherwise - best.as_logged
-    significant = (
-        best.evidence > MIN_EVIDENCE
-        and best.otherwise > MIN_EXPLAINED
-        and improvement > MIN_IMPROVEMENT
-    )
-    if best.hypothesis is not None and significant:
-        joints = tuple(robot.joint_names[j] for j in best.hypothesis.joints)
+    best = max(results, key=lambda result: result.evidence)
+    hypothesis = best.hypothesis
+    if hypothesis is not None and _is_significant(best):
+        joints = tuple(robot.joint_names[j] for j in hypothesis.joints)
         text = (
-            f"with {best.hypothesis.words} the torques fit the weight of the arm better "
+            f"with {hypothesis.words} the torques fit the weight of the arm better "
             f"({best.otherwise:.0%}) than as logged ({best.as_logged:.0%}): wrong in command and "
             "state alike, where neither shows it; check it against the model"
         )
-        yield Finding(
-            "warning", "gravity", text, joints, {"evidence": best.evidence}, best.hypothesis.mend
-        )
+        values = {"evidence": best.evidence}
+        yield Finding("warning", "gravity", text, joints, values, hypothesis.mend)
         return
-    shares = " and ".join(f"{b.as_logged:.0%}" for b in results)
+    shares = " and ".join(f"{result.as_logged:.0%}" for result in results)
     text = f"no other zero, sign or order fits gravity better; it explains {shares} of the torques"
     yield Finding("ok", "gravity", text)
+
+
+def _is_significant(best: _Best) -> bool:
+    """Return True if a hypothesis fits well, and clearly better than the logs as they are."""
+    if best.evidence <= MIN_EVIDENCE or best.otherwise <= MIN_EXPLAINED:
+        return False
+    return best.otherwise - best.as_logged > MIN_IMPROVEMENT
 
 
 def _best(loads: Loads, robot: RobotSpec, model: Gravity, centred: bool) -> _Best:
@@ -121,17 +126,20 @@ def _best(loads: Loads, robot: RobotSpec, model: Gravity, centred: bool) -> _Bes
     joint.
     """
     loads = _thinned(loads, max(1, _count_rows(loads) // MAX_ROWS))
-    as_logged = {key: model(qpos, *key) for key, (qpos, _) in loads.items()}
-    rms = np.sqrt(np.mean(np.concatenate(list(as_logged.values())) ** 2, axis=0))  # (n) N·m
+    weight = {payload: model(qpos, *payload) for payload, (qpos, _) in loads.items()}  # N·m
+    rms = np.sqrt(np.mean(np.concatenate(list(weight.values())) ** 2, axis=0))  # (n) N·m
     loaded = np.flatnonzero(rms > MIN_LOAD * robot.servo.effort_limit)
-    unexplained = _unexplained(as_logged, loads, loaded, centred)
-    best = _Best(0.0, None, 1 - float(unexplained.mean()) if len(unexplained) else 0.0, 0.0)
-    for hypothesis in [*_joint_faults(robot, loaded), *_order_faults(robot)]:
-        torques = {key: hypothesis.torque(model, qpos, key) for key, (qpos, _) in loads.items()}
+    unexplained = _unexplained(weight, loads, loaded, centred)
+    as_logged = 1 - float(unexplained.mean()) if len(unexplained) else 0.0
+    best = _Best(0.0, None, as_logged, 0.0)
+    for hypothesis in (*_joint_faults(robot, loaded), *_order_faults(robot)):
+        torques = {}
+        for payload, (qpos, _) in loads.items():
+            torques[payload] = hypothesis.torque(model, qpos, payload)
         otherwise = _unexplained(torques, loads, loaded, centred)
         evidence = float(np.log(unexplained / otherwise).sum())
         if evidence > best.evidence:
-            best = _Best(evidence, hypothesis, best.as_logged, 1 - float(otherwise.mean()))
+            best = _Best(evidence, hypothesis, as_logged, 1 - float(otherwise.mean()))
     return best
 
 
@@ -153,44 +161,35 @@ def _joint_faults(robot: RobotSpec, loaded: Array) -> Iterator[_Hypothesis]:
     for j in loaded.tolist():
         name = robot.joint_names[j]
         one = np.eye(len(robot.joint_names))[j]
-        for sign, turn, torque_sign in JOINT_FAULTS:
+        for fault in JOINT_FAULTS:
             words = "its torque negated"
             mend: Mend = {}
-            if sign < 0:
+            if fault.sign < 0:
                 words = "its angle mirrored"
-                mend = {"signs": {name: sign}}
-            elif turn:
-                words = f"its zero turned by {turn:+.2f} rad"
-                mend = {"offsets": {name: turn}}
-            factors = (1 + (sign - 1) * one, turn * one, 1 + (torque_sign - 1) * one)
-            yield _Hypothesis(f"{words} at {name}", (j,), mend, np.arange(len(one)), *factors)
+                mend = {"signs": {name: fault.sign}}
+            elif fault.turn:
+                words = f"its zero turned by {fault.turn:+.2f} rad"
+                mend = {"offsets": {name: fault.turn}}
+            yield _Hypothesis(
+                words=f"{words} at {name}",
+                joints=(j,),
+                mend=mend,
+                order=np.arange(len(one)),
+                sign=1 + (fault.sign - 1) * one,
+                turn=fault.turn * one,
+                torque_sign=1 + (fault.torque_sign - 1) * one,
+            )
 
 
 def _order_faults(robot: RobotSpec) -> Iterator[_Hypothesis]:
     """Yield hypotheses with two operated joints swapped, or all of them moved by one place, or
     reversed.
     """
-    op = robot.operated_index
-    for a, b in combinations(op.tolist(), 2):
-        words = f"{robot.joint_names[a]} and {robot.joint_names[b]} in each other's place"
-        yield _order_fault(robot, (a, b), [b, a], words)
-    for words, moved in (
-        ("one place on", np.roll(op, 1)),
-        ("one place back", np.roll(op, -1)),
-        ("backwards", op[::-1]),
-    ):
-        words = f"the order of joints {words}"
-        yield _order_fault(robot, tuple(op.tolist()), moved.tolist(), words)
-
-
-def _order_fault(
-    robot: RobotSpec, joints: tuple[int, ...], replaced: list[int], words: str
-) -> _Hypothesis:
-    """Return the hypothesis that the columns `replaced` belong to these joints."""
-    order = np.arange(len(robot.joint_names))
-    order[list(joints)] = replaced
-    names = {robot.joint_names[o]: robot.joint_names[i] for i, o in enumerate(order) if i != o}
-    return _Hypothesis(words, joints, {"names": names}, order)
+    joints = robot.operated_index.tolist()
+    names = robot.joint_names
+    for exchange in (*pairs(joints, names), *shifts(joints, names)):
+        mend: Mend = {"names": exchange.names(names)}
+        yield _Hypothesis(exchange.words, exchange.joints, mend, exchange.order)
 
 
 def _recorded_torques(surveys: list[Survey]) -> Loads:
@@ -199,9 +198,9 @@ def _recorded_torques(surveys: list[Survey]) -> Loads:
         return {}
     samples = []
     for survey in surveys:
-        if survey.samples.gravity is not None:
-            qpos, torque = survey.samples.gravity
-            samples.append((survey, qpos, torque))
+        rows = survey.samples.slow_rows
+        if rows is not None:
+            samples.append((survey, rows.qpos, rows.torque))
     return _by_payload(samples)
 
 
@@ -216,27 +215,35 @@ def _servo_torques(surveys: list[Survey], robot: RobotSpec) -> Loads:
 
 
 def _by_payload(samples: Iterable[tuple[Survey, Array, Array]]) -> Loads:
+    """Join the angles and torques, (k, n) each, of recordings with equal payloads."""
     parts: dict[Payload, list[tuple[Array, Array]]] = defaultdict(list)
     for survey, qpos, torque in samples:
-        parts[survey.entry.meta.payload_mass, survey.entry.meta.payload_side].append((qpos, torque))
+        meta = survey.entry.meta
+        parts[meta.payload_mass, meta.payload_side].append((qpos, torque))
     loads = {}
-    for payload, pairs in parts.items():
-        qpos_of_parts, torque_of_parts = zip(*pairs, strict=True)
+    for payload, of_payload in parts.items():
+        qpos_of_parts, torque_of_parts = zip(*of_payload, strict=True)
         loads[payload] = (np.concatenate(qpos_of_parts), np.concatenate(torque_of_parts))
     return loads
 
 
 def _unexplained(
-    gravity: dict[Payload, Array], loads: Loads, loaded: Array, centred: bool
+    expected: dict[Payload, Array], loads: Loads, loaded: Array, centred: bool
 ) -> Array:
-    """Return the share of the torques' square that gravity, times a scale ≥ 0 per joint, does not
-    explain, (loaded).
+    """Return the share of the torques' square that the expected ones, times a scale ≥ 0 per joint,
+    do not explain, (loaded).
+
+    Args:
+        expected: Payload → torques of gravity, (k, n) N·m.
+        loaded: Indices of the joints that are judged.
+        centred: A constant of each joint is ignored.
     """
-    x = np.concatenate([gravity[key][:, loaded] for key in loads])
-    y = np.concatenate([torque[:, loaded] for _, torque in loads.values()])
+    weight = np.concatenate([expected[payload][:, loaded] for payload in loads])
+    torque = np.concatenate([of_payload[:, loaded] for _, of_payload in loads.values()])
     if centred:
-        x = x - x.mean(axis=0)
-        y = y - y.mean(axis=0)
-    power = (x**2).sum(axis=0) * (y**2).sum(axis=0)
-    explained = np.maximum((x * y).sum(axis=0), 0) ** 2 / np.where(power > 0, power, np.inf)
-    return np.asarray(1 - explained + 1e-4)
+        weight = weight - weight.mean(axis=0)
+        torque = torque - torque.mean(axis=0)
+    power = (weight**2).sum(axis=0) * (torque**2).sum(axis=0)
+    agreement = np.maximum((weight * torque).sum(axis=0), 0)
+    explained = agreement**2 / np.where(power > 0, power, np.inf)
+    return np.asarray(1 - explained + FLOOR)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import NamedTuple
 
 import numpy as np
 
@@ -10,24 +11,22 @@ from gaponet.base.arrays import Array
 from gaponet.data.checks.check import Check
 from gaponet.data.checks.completeness import torque_limits, unsigned_torque
 from gaponet.data.checks.survey import Survey, Torque
+from gaponet.data.checks.timing import MAX_EXTRA_LAG_S, WHY_LATE, verdict_on
 from gaponet.data.signals import FAST_COMMAND_RAD_S, Response
 from gaponet.data.static_poses import StaticError, StaticPoses
 from gaponet.robot.finding import Finding, abbreviate, masked_names
 from gaponet.robot.spec import RobotSpec
 
 MIN_SAG_RAD = 0.02  # static error that is reported
-# of all joints; of one joint beyond the others
-MAX_DEAD_TIME_S = 0.15
-MAX_EXTRA_LAG_S = 0.05
-DEAD_TIMES = (  # up to s, verdict
-    (0.015, "as good as none"),
-    (0.06, "usual for a bus and a servo's firmware"),
-    (MAX_DEAD_TIME_S, "long, as of hobby servos and slow buses"),
-    (
-        np.inf,
-        "very long: look for a buffer, a filter, or clocks of command and state that are apart",
-    ),
-)
+MAX_SHOWN = 4  # joints whose static error is told
+MAX_DEAD_TIME_S = 0.15  # of all joints
+# Up to so many s → what the lag that kp and damping do not explain is, as a dead time.
+VERDICTS = {
+    0.015: "as good as none",
+    0.06: "usual for a bus and a servo's firmware",
+    MAX_DEAD_TIME_S: "long, as of hobby servos and slow buses",
+    np.inf: "very long: look for a buffer, a filter, or clocks of command and state that are apart",
+}
 
 
 def _lag(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
@@ -36,11 +35,11 @@ def _lag(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     if not lags:
         yield _no_lag(surveys)
         return
-    every = np.concatenate(list(lags.values()))
-    median = float(np.median(every))
+    of_all = np.concatenate(list(lags.values()))
+    median = float(np.median(of_all))
+    low = of_all.min()
+    high = of_all.max()
     period = float(np.median([1 / survey.timing.rate_hz for survey in surveys]))
-    low = every.min()
-    high = every.max()
     text = (
         f"state follows command after {median * 1e3:.0f} ms "
         f"({low * 1e3:.0f}–{high * 1e3:.0f} over joints and motions at {FAST_COMMAND_RAD_S} rad/s "
@@ -51,7 +50,7 @@ def _lag(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     usual = 0.0
     if dead_times:
         usual = float(np.median(list(dead_times.values())))
-        verdict = next(words for limit, words in DEAD_TIMES if usual <= limit)
+        verdict = verdict_on(usual, VERDICTS)
         text += (
             f". kp and damping do not explain {usual * 1e3:.0f} ms of it: dead time, friction or "
             f"inertia (gaponet identify separates them). As a dead time this is {verdict}"
@@ -61,7 +60,7 @@ def _lag(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
         level = "warning"
     elif median > period:
         level = "note"
-    values = {name: lag_values(x) for name, x in lags.items()}
+    values = {name: lag_values(of_joint) for name, of_joint in lags.items()}
     yield Finding(level, "lag", text, tuple(lags), values)
     if len(dead_times) > 2:
         yield from _late_joints(dead_times, usual, expected)
@@ -82,46 +81,45 @@ def _dead_times(
     lags: dict[str, Array],
     surveys: list[Survey],
     robot: RobotSpec,
-    expected: dict[str, tuple[float, float]],
+    expected: dict[str, _ExpectedLag],
 ) -> dict[str, float]:
     """Return by how much longer joints lag than kp and damping explain, s.
 
     Only joints with smooth commands: of the others the timing check sees more.
     """
-    sharp = dict(
-        zip(
-            robot.operated,
-            Response.sharp([survey.tracking.response for survey in surveys]),
-            strict=True,
-        )
-    )
+    sharp = Response.sharp([survey.tracking.response for survey in surveys])  # (operated)
     dead_times = {}
     for name, of_joint in lags.items():
-        if name in robot.operated and not sharp[name]:
-            slow, _ = expected[name]
-            dead_times[name] = float(np.median(of_joint)) - slow
+        if name in robot.operated and not sharp[robot.operated.index(name)]:
+            dead_times[name] = float(np.median(of_joint)) - expected[name].slow
     return dead_times
 
 
 def _late_joints(
-    dead_times: dict[str, float], usual: float, expected: dict[str, tuple[float, float]]
+    dead_times: dict[str, float], usual: float, expected: dict[str, _ExpectedLag]
 ) -> Iterator[Finding]:
     """Find joints that lag longer than the others, whose dead time is `usual`, s."""
     for name, late in dead_times.items():
-        slow, near = expected[name]
-        if late - usual > MAX_EXTRA_LAG_S and late > max(2 * slow, near):
+        explained = max(2 * expected[name].slow, expected[name].resonance)
+        if late - usual > MAX_EXTRA_LAG_S and late > explained:
             text = (
-                f"{name} lags {(late - usual) * 1e3:.0f} ms longer than the other joints: its "
-                "channel is read late, filtered or from another bus, or it moves stiffly"
+                f"{name} lags {(late - usual) * 1e3:.0f} ms longer than the other joints: "
+                f"{WHY_LATE}"
             )
             yield Finding("warning", "lag", text, (name,), {"extra_s": late - usual})
 
 
-def _expected_lag(robot: RobotSpec) -> dict[str, tuple[float, float]]:
-    """Return the lag of a slow motion that kp, kd and the MJCF's damping explain, and the lag that
-    the inertia at home adds at the servo's own frequency √(kp / inertia), a quarter of a period; by
-    joint, s.
-    """
+class _ExpectedLag(NamedTuple):
+    """The lag of a joint without any dead time, s."""
+
+    # of a slow motion, by damping: (kd + the MJCF's damping) / kp
+    slow: float
+    # what the inertia at home adds at the servo's own frequency √(kp / inertia): a quarter period
+    resonance: float
+
+
+def _expected_lag(robot: RobotSpec) -> dict[str, _ExpectedLag]:
+    """Return by joint the lag that gains, damping and inertia explain."""
     import mujoco
 
     from gaponet.robot.mjcf import compile_spec, read_mjcf
@@ -138,8 +136,9 @@ def _expected_lag(robot: RobotSpec) -> dict[str, tuple[float, float]]:
     inertia = np.diag(full)[dofs]
     stiff = np.where(servo.kp > 0, servo.kp, np.inf)
     slow = (damping / stiff).tolist()
-    near = (np.pi / 2 * np.sqrt(inertia / stiff)).tolist()
-    return dict(zip(robot.joint_names, zip(slow, near, strict=True), strict=True))
+    resonance = (np.pi / 2 * np.sqrt(inertia / stiff)).tolist()
+    lags = map(_ExpectedLag, slow, resonance)
+    return dict(zip(robot.joint_names, lags, strict=True))
 
 
 def _sag(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
@@ -149,23 +148,28 @@ def _sag(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     for payload in (payloads[0], payloads[-1]):
         same = [survey for survey in surveys if survey.entry.meta.payload_mass == payload]
         errors[payload] = static_errors(same, robot)
-    largest = {}
+    largest = {}  # joint → static error, rad
     for name in robot.operated:
         largest[name] = max(abs(by_joint[name].middle) for by_joint in errors.values())
     sagging = [name for name in robot.operated if largest[name] >= MIN_SAG_RAD]
     sagging.sort(key=lambda name: -largest[name])
     if sagging:
         yield _sag_finding(sagging, errors)
-        return
-    rests = 0
-    for by_joint in errors.values():
-        rests += sum(error.up + error.down for error in by_joint.values())
-    if rests == 0:
+    elif not _rests(errors):
         text = (
             "the robot never rests under a constant command: sag and offsets are not determined; "
             "add holds"
         )
         yield Finding("note", "sag", text)
+
+
+def _rests(errors: dict[float, dict[str, StaticError]]) -> int:
+    """Return the number of rests. errors: payload → joint → error."""
+    rests = 0
+    for by_joint in errors.values():
+        for error in by_joint.values():
+            rests += error.up + error.down
+    return rests
 
 
 def _sag_finding(sagging: list[str], errors: dict[float, dict[str, StaticError]]) -> Finding:
@@ -174,7 +178,7 @@ def _sag_finding(sagging: list[str], errors: dict[float, dict[str, StaticError]]
     Args:
         errors: Payload → joint → static error.
     """
-    shown = sagging[:4]
+    shown = sagging[:MAX_SHOWN]
     parts = []
     for payload, by_joint in errors.items():
         part = ", ".join(f"{name} {_mrad(by_joint[name])}" for name in shown)
@@ -200,8 +204,8 @@ def _torque(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
             "note", "torque", "no torque recorded; equivalent torque comes from inverse dynamics"
         )
         return
-    low, high, used = torque_limits(recorded)
-    constant = masked_names(robot, used & (low == high))
+    torques = torque_limits(recorded)
+    constant = masked_names(robot, torques.moved & (torques.low == torques.high))
     unsigned = unsigned_torque(recorded, robot)
     if constant:
         text = f"torque of {', '.join(constant)} never changes; ignore it"
@@ -212,24 +216,29 @@ def _torque(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
             "magnitude; do not fit it"
         )
         yield Finding("warning", "torque", text, unsigned)
-    yield from _spikes([(survey, t) for survey, t in recorded if t.spikes.any()], robot)
+    spiky = [(survey, torque) for survey, torque in recorded if torque.spikes.any()]
+    yield from _spikes(spiky, robot)
 
 
 def _spikes(spiky: list[tuple[Survey, Torque]], robot: RobotSpec) -> Iterator[Finding]:
     """Report recordings with torque spikes, and the worst of these."""
     if not spiky:
         return
-    # (sequences, n) N·m
-    height = np.array([np.maximum(-t.low, t.high) * (t.spikes > 0) for _, t in spiky])
+    heights = []  # of the spikes, (n) N·m each; 0 without
+    for _, torque in spiky:
+        heights.append(np.where(torque.spikes > 0, torque.largest, 0.0))
+    height = np.array(heights)  # (sequences, n)
     k, i = np.unravel_index(height.argmax(), height.shape)
-    samples = sum(int(t.spikes.sum()) for _, t in spiky)
+    joint = robot.joint_names[i]
+    worst_survey, _ = spiky[k]
+    samples = sum(int(torque.spikes.sum()) for _, torque in spiky)
     motions = abbreviate([survey.motion for survey, _ in spiky])
     text = (
-        f"torque spikes: {samples} samples in {motions}; "
-        f"worst {height[k, i]:.2f} N·m on {robot.joint_names[i]} in {spiky[k][0].motion}"
+        f"torque spikes: {samples} samples in {motions}; worst {height[k, i]:.2f} N·m on {joint} "
+        f"in {worst_survey.motion}"
     )
     values = {"samples": samples, "worst": height[k, i]}
-    yield Finding("warning", "torque", text, (robot.joint_names[i],), values)
+    yield Finding("warning", "torque", text, (joint,), values)
 
 
 def fast_lags(surveys: list[Survey], robot: RobotSpec) -> dict[str, Array]:
@@ -264,18 +273,17 @@ def lag_values(lags: Array) -> dict[str, float]:
 
 def static_errors(surveys: list[Survey], robot: RobotSpec) -> dict[str, StaticError]:
     """Return the static error of each operated joint over all static poses."""
-    poses = StaticPoses.joined(
-        [survey.samples.static_poses for survey in surveys], len(robot.joint_names)
-    )
+    parts = [survey.samples.static_poses for survey in surveys]
+    poses = StaticPoses.joined(parts, len(robot.joint_names))
     errors = map(poses.static_error, robot.operated_index)
     return dict(zip(robot.operated, errors, strict=True))
 
 
 def _mrad(error: StaticError) -> str:
-    band = (
-        f" ± {error.half_band * 1e3:.0f}" if error.balanced else " (approached from one side only)"
-    )
-    return f"{error.middle * 1e3:+.0f}{band}"
+    middle = f"{error.middle * 1e3:+.0f}"
+    if error.balanced:
+        return f"{middle} ± {error.half_band * 1e3:.0f}"
+    return f"{middle} (approached from one side only)"
 
 
 CHECKS = (

@@ -17,6 +17,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import permutations
+from typing import NamedTuple
 
 import numpy as np
 
@@ -30,36 +31,37 @@ from gaponet.robot.spec import RobotSpec
 MIN_POSES = 12  # of a joint
 MAX_FOLDS = 20  # of the sequences
 SIGNIFICANCE = 4.0  # standard errors
-# a note, a warning
-MIN_OFFSET_RAD = 0.015
-FAR_OFFSET_RAD = 0.05
+MIN_OFFSET_RAD = 0.015  # that is a note
+FAR_OFFSET_RAD = 0.05  # that is a warning
 MIN_SCALE_ERROR = 0.1
 SOFTNESS_BOUNDS = (0.5, 1.8)
 MIN_SAG_RAD = 0.01  # rms of the nominal sag, below which softness is unknown
 MIN_UNIT_DISTANCE_RAD = 0.03  # between sequences of one robot
-# of the heaviest label (or kg); of the misfit that another mass must explain
-MIN_MASS = 0.25
-MIN_MASS_SHARE = 0.5
+MIN_MASS_ERROR = 0.25  # of a label, as a share of the heaviest label, or kg if all are 0
+MIN_MASS_SHARE = 0.5  # of the misfit that another mass must explain
 MIN_LOAD_CHANGE_RAD = 1e-3  # by which a joint rests elsewhere with another label
 MIN_EVIDENCE = 10.0  # for other labels: poses times the logarithm by which their scatter falls
-# between two groups of recordings
-MIN_GROUP_DISTANCE_RAD = 0.006
-MIN_GROUP_SCATTERS = 6.0
-PRIOR = np.array([0.0, 0.0, 1.0, 0.0])  # offset, scale − 1, softness, stiction of a motor as stated
+MIN_GROUP_DISTANCE_RAD = 0.006  # between two groups of recordings
+MIN_GROUP_SCATTERS = 6.0  # the same, over the scatter within the groups
+# Coefficients of a joint by their index, with the values of a motor as stated and the standard
+# deviations that are expected about these.
+OFFSET = 0  # rad
+SCALE_ERROR = 1  # scale − 1
+SOFTNESS = 2
+STICTION = 3  # rad
+PRIOR = np.array([0.0, 0.0, 1.0, 0.0])
 PRIOR_STD = np.array([0.5, 0.5, 1.0, 0.1])
-# of the robust fit
-MIN_SCATTER_RAD = 5e-4
-MAX_ITERATIONS = 12
-SOFTNESS = 2  # index of the coefficient
+MIN_SCATTER_RAD = 5e-4  # of the robust fit
+MAX_ITERATIONS = 12  # of the same
 MAX_ODD_SEQUENCES = 10  # that are reported
 # Of a torque that is fed forward:
 MIN_RECORDINGS = 3
 MIN_LOAD = 0.01  # of the torque limit, by which the weight on a joint changes
+MIN_KP = 1e-9  # N·m/rad, by which torques are divided where kp is 0
 MIN_SHARE = 0.3  # of the weight that the command does not hold
-# share of the torque that PD does not explain; times as much as with it
-MIN_UNEXPLAINED = 0.02
-MIN_IMPROVEMENT = 8.0
-# of the sag that kp and the weight give: at a share of 1, and more per share below
+MIN_UNEXPLAINED = 0.02  # share of the torque that PD does not explain
+MIN_IMPROVEMENT = 8.0  # PD leaves so many times as much unexplained as PD and a share of the weight
+# Of the sag that kp and the weight give, at most this at a share of 1, and more per share below.
 MAX_SAG = 0.25
 MAX_SAG_PER_SHARE = 2.5
 MIN_JOINTS_SHARE = 1 / 3  # of the joints that are judged
@@ -70,7 +72,7 @@ class _Poses:
     """Distinct static poses of single joints (k), ordered by sequence."""
 
     sequence: Array  # indices, (k)
-    joint: Array
+    joint: Array  # indices, (k)
     error: Array  # qpos − ctrl, (k) rad
     columns: Array  # regressors of the four coefficients, (k, 4)
     per_kg: Array  # change of the softness regressor with 1 kg more payload, (k) rad
@@ -80,10 +82,13 @@ class _Poses:
         return _Poses(*(values[keep] for values in vars(self).values()))
 
     def of_joint(self, joint: int) -> _Poses:
+        """Return the poses of a joint."""
         return self.only(self.joint == joint)
 
-    def of_sequence(self, number: int) -> slice:
-        return slice(*np.searchsorted(self.sequence, [number, number + 1]))
+    def rows_of(self, number: int) -> slice:
+        """Return the rows of the sequence with this number."""
+        start, stop = np.searchsorted(self.sequence, [number, number + 1])
+        return slice(start, stop)
 
     def __len__(self) -> int:
         return len(self.error)
@@ -91,30 +96,27 @@ class _Poses:
 
 @dataclass(frozen=True)
 class _Fit:
-    """Coefficients of a joint (4), their standard errors, scatter (rad), and the coefficients
-    without each sequence.
-    """
+    """Coefficients of one joint, fitted to its poses."""
 
-    x: Array
-    std: Array
-    scatter: float
-    without: dict[int, Array]
+    coefficients: Array  # (4)
+    std: Array  # their standard errors, (4)
+    scatter: float  # of the poses about the fit, rad
+    without: dict[int, Array]  # number of a sequence → coefficients without its poses, (4)
 
     @property
     def significant(self) -> Array:
-        return np.asarray(np.abs(self.x - PRIOR) > SIGNIFICANCE * self.std)
+        """Which coefficients are not those of a motor as stated, (4) bool."""
+        away = np.abs(self.coefficients - PRIOR)
+        return np.asarray(away > SIGNIFICANCE * self.std)
 
 
 def static_checks(surveys: list[Survey], robot: RobotSpec, model: Gravity) -> Iterator[Finding]:
     """Do offsets, scales, gains and payload labels agree with the static poses?"""
-    poses = _collect(surveys, robot, model)
+    poses = _collect_poses(surveys, robot, model)
     judged = [j for j in robot.operated_index.tolist() if (poses.joint == j).sum() >= MIN_POSES]
     if not judged:
-        yield Finding(
-            "ok",
-            "rests",
-            "too few rests: offsets, scales, gains and payloads cannot be told; add holds",
-        )
+        text = "too few rests: offsets, scales, gains and payloads cannot be told; add holds"
+        yield Finding("ok", "rests", text)
         return
     findings = _swapped_labels(surveys, poses, judged) or _two_units(surveys, robot, poses, judged)
     if findings:
@@ -122,6 +124,15 @@ def static_checks(surveys: list[Survey], robot: RobotSpec, model: Gravity) -> It
         return
     findings, poses = _odd_sequences(surveys, robot, poses, judged)
     findings = findings or _two_units(surveys, robot, poses, judged, min_size=1, min_joints=3)
+    findings += _odd_motors(robot, poses, judged)
+    if not findings:
+        text = "rests agree with gravity, gains and payload labels"
+        findings.append(Finding("ok", "rests", text))
+    yield from findings
+
+
+def _odd_motors(robot: RobotSpec, poses: _Poses, judged: list[int]) -> Iterator[Finding]:
+    """Find joints with an offset, another scale, or other gains than stated."""
     softness: dict[str, float] = {}
     for j in judged:
         own = poses.of_joint(j)
@@ -129,21 +140,18 @@ def static_checks(surveys: list[Survey], robot: RobotSpec, model: Gravity) -> It
             continue
         name = robot.joint_names[j]
         fit = _fit(own)
-        findings += _offset_and_scale(name, fit)
+        yield from _offset_and_scale(name, fit)
         soft = _odd_softness(own, fit)
         if soft is not None:
             softness[name] = soft
     if softness:
-        findings.append(_wrong_gains(softness))
-    yield from findings or [
-        Finding("ok", "rests", "rests agree with gravity, gains and payload labels")
-    ]
+        yield _wrong_gains(softness)
 
 
 def _odd_softness(poses: _Poses, fit: _Fit) -> float | None:
     """Return how many times as far a joint sags as kp says, if that is odd and known."""
     sag = float(np.sqrt(np.mean(poses.columns[:, SOFTNESS] ** 2)))
-    soft = float(fit.x[SOFTNESS])
+    soft = float(fit.coefficients[SOFTNESS])
     low, high = SOFTNESS_BOUNDS
     if low < soft < high:
         return None
@@ -165,46 +173,67 @@ def _wrong_gains(softness: dict[str, float]) -> Finding:
     return Finding("warning", "gains", text, tuple(softness), {"softness": softness})
 
 
-def _collect(surveys: list[Survey], robot: RobotSpec, model: Gravity) -> _Poses:
-    parts = [(np.zeros(0, int), np.zeros(0, int), np.zeros(0), np.zeros((0, 4)), np.zeros(0))]
+def _collect_poses(surveys: list[Survey], robot: RobotSpec, model: Gravity) -> _Poses:
+    """Return the poses of the operated joints of all sequences."""
+    none = np.zeros(0, int)
+    parts = [_Poses(none, none, np.zeros(0), np.zeros((0, 4)), np.zeros(0))]
     for number, survey in enumerate(surveys):
-        meta = survey.entry.meta
-        poses = survey.samples.static_poses
-        if not len(poses):
-            continue
-        kp = np.where(robot.servo.kp > 0, robot.with_gains(*meta.recorded_gains).servo.kp, np.inf)
-        load = model(poses.qpos, meta.payload_mass, meta.payload_side) / kp
-        heavier = np.zeros_like(load)
-        if robot.payload_mounts:
-            heavier = model(poses.qpos, meta.payload_mass + 1.0, meta.payload_side) / kp - load
-        judged = poses.distinct & (poses.approach != 0)  # (poses, n)
-        nth, pose = np.nonzero(judged[:, robot.operated_index].T)
-        joint = robot.operated_index[nth]
-        at = (pose, joint)
-        ones = np.ones(len(joint))
-        columns = np.column_stack([ones, poses.ctrl[at], -load[at], -poses.approach[at]])
-        error = poses.qpos[at] - poses.ctrl[at]
-        parts.append((np.full(len(joint), number), joint, error, columns, -heavier[at]))
-    return _Poses(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+        if len(survey.samples.static_poses):
+            parts.append(_poses_of(number, survey, robot, model))
+    joined = {}
+    for name in vars(parts[0]):
+        joined[name] = np.concatenate([getattr(part, name) for part in parts])
+    return _Poses(**joined)
+
+
+def _poses_of(number: int, survey: Survey, robot: RobotSpec, model: Gravity) -> _Poses:
+    """Return the poses of the operated joints of one sequence, which has this number."""
+    meta = survey.entry.meta
+    poses = survey.samples.static_poses
+    kp = np.where(robot.servo.kp > 0, robot.with_gains(*meta.recorded_gains).servo.kp, np.inf)
+    # weight over kp, and its change with 1 kg more; (poses, n) rad
+    load = model(poses.qpos, meta.payload_mass, meta.payload_side) / kp
+    heavier = np.zeros_like(load)
+    if robot.payload_mounts:
+        heavier = model(poses.qpos, meta.payload_mass + 1.0, meta.payload_side) / kp - load
+    judged = poses.distinct & (poses.approach != 0)  # (poses, n)
+    nth, pose = np.nonzero(judged[:, robot.operated_index].T)
+    joint = robot.operated_index[nth]
+    at = (pose, joint)
+    columns = np.zeros((len(joint), 4))
+    columns[:, OFFSET] = 1.0
+    columns[:, SCALE_ERROR] = poses.ctrl[at]
+    columns[:, SOFTNESS] = -load[at]
+    columns[:, STICTION] = -poses.approach[at]
+    error = poses.qpos[at] - poses.ctrl[at]
+    return _Poses(np.full(len(joint), number), joint, error, columns, -heavier[at])
 
 
 def _fit(poses: _Poses) -> _Fit:
     """Fit the coefficients of the one joint of these poses."""
-    x, formal_std, scatter = _solve(poses.columns, poses.error)
+    coefficients, formal_std, scatter = _solve(poses.columns, poses.error)
     numbers, index = np.unique(poses.sequence, return_inverse=True)
     fold = index % MAX_FOLDS
-    folds = range(min(len(numbers), MAX_FOLDS))
-    without = {}
-    for f in folds:
-        kept = fold != f
-        without[f], _, _ = _solve(poses.columns[kept], poses.error[kept])
-    every = np.array(list(without.values()))
-    jackknife = np.sqrt(
-        (len(every) - 1) / len(every) * ((every - every.mean(axis=0)) ** 2).sum(axis=0)
-    )
-    std = np.maximum(formal_std, jackknife) if len(every) > 2 else 3 * formal_std
-    left_out = {number: without[i % MAX_FOLDS] for i, number in enumerate(numbers.tolist())}
-    return _Fit(x, std, scatter, left_out)
+    folds = []  # coefficients without the poses of each fold
+    for number in range(min(len(numbers), MAX_FOLDS)):
+        kept = fold != number
+        without_fold, _, _ = _solve(poses.columns[kept], poses.error[kept])
+        folds.append(without_fold)
+    std = 3 * formal_std
+    if len(folds) > 2:
+        std = np.maximum(formal_std, _jackknife(np.array(folds)))
+    without = {number: folds[i % MAX_FOLDS] for i, number in enumerate(numbers.tolist())}
+    return _Fit(coefficients, std, scatter, without)
+
+
+def _jackknife(folds: Array) -> Array:
+    """Return the standard errors of coefficients from those without each fold, (folds, 4) → (4).
+
+    The estimate of Tukey (1958) for folds of about equal size.
+    """
+    count = len(folds)
+    squares = ((folds - folds.mean(axis=0)) ** 2).sum(axis=0)
+    return np.asarray(np.sqrt((count - 1) / count * squares))
 
 
 def _solve(
@@ -212,45 +241,53 @@ def _solve(
 ) -> tuple[Array, Array, float]:
     """Return robust least-squares coefficients, their formal standard errors, and the scatter of
     the residuals.
+
+    Iteratively reweighted: residuals beyond three scatters count less (Huber's weights), and the
+    scatter is 1.48 times the median residual, which is the standard deviation of a normal
+    distribution.
+
+    Args:
+        columns: Regressors, (k, c).
+        error: What they explain, (k) rad.
+        expected, expected_std: Normal prior of the coefficients, (c).
     """
-    x = expected
+    coefficients = expected
     scatter = 0.01
     weight = np.ones(len(error))
     prior = np.diag(1 / expected_std)
-    a = prior
+    rows = prior
     for _ in range(MAX_ITERATIONS):
-        a = np.concatenate([columns * (weight / scatter)[:, None], prior])
-        x = np.linalg.lstsq(
-            a, np.concatenate([error * weight / scatter, prior @ expected]), rcond=None
-        )[0]
-        residual = np.abs(error - columns @ x)
-        scatter = (
-            max(1.48 * float(np.median(residual)), MIN_SCATTER_RAD) if len(residual) else scatter
-        )
+        rows = np.concatenate([columns * (weight / scatter)[:, None], prior])
+        values = np.concatenate([error * weight / scatter, prior @ expected])
+        coefficients = np.linalg.lstsq(rows, values, rcond=None)[0]
+        residual = np.abs(error - columns @ coefficients)
+        if len(residual):
+            scatter = max(1.48 * float(np.median(residual)), MIN_SCATTER_RAD)
         weight = np.sqrt(1 / np.maximum(1, residual / (3 * scatter)))
-    return x, np.sqrt(np.diag(np.linalg.inv(a.T @ a))), scatter
+    return coefficients, np.sqrt(np.diag(np.linalg.inv(rows.T @ rows))), scatter
 
 
 def _offset_and_scale(name: str, fit: _Fit) -> Iterator[Finding]:
-    offset = float(fit.x[0])
-    scale = float(1 + fit.x[1])
-    if fit.significant[1] and abs(scale - 1) > MIN_SCALE_ERROR:
+    offset = float(fit.coefficients[OFFSET])
+    scale = float(1 + fit.coefficients[SCALE_ERROR])
+    if fit.significant[SCALE_ERROR] and abs(scale - 1) > MIN_SCALE_ERROR:
         text = (
             f"{name} goes {scale:.2f} rad where its command goes 1 rad, sag taken off: another "
             "gear ratio, range or ticks a turn in one of them; import again with the right scale"
         )
         yield Finding("warning", "scale", text, (name,), {"scale": scale})
-    elif fit.significant[0] and abs(offset) > MIN_OFFSET_RAD:
-        far = abs(offset) > FAR_OFFSET_RAD
+    elif fit.significant[OFFSET] and abs(offset) > MIN_OFFSET_RAD:
+        level = "note"
         verdict = "as assembly leaves it"
-        if far:
+        if abs(offset) > FAR_OFFSET_RAD:
+            level = "warning"
             verdict = "more than assembly leaves: a wrong zero or a missed homing"
         text = (
-            f"{name} rests {offset * 1e3:+.0f} ± {fit.std[0] * 1e3:.0f} mrad off its command, sag "
-            f"and stiction taken off: a constant offset, {verdict}; gaponet identify finds it, or "
-            "take it off at import"
+            f"{name} rests {offset * 1e3:+.0f} ± {fit.std[OFFSET] * 1e3:.0f} mrad off its command, "
+            f"sag and stiction taken off: a constant offset, {verdict}; gaponet identify finds it, "
+            "or take it off at import"
         )
-        yield Finding("warning" if far else "note", "offset", text, (name,), {"offset": offset})
+        yield Finding(level, "offset", text, (name,), {"offset": offset})
 
 
 def _swapped_labels(surveys: list[Survey], poses: _Poses, judged: list[int]) -> list[Finding]:
@@ -259,27 +296,41 @@ def _swapped_labels(surveys: list[Survey], poses: _Poses, judged: list[int]) -> 
     labels = sorted(set(mass.tolist()))
     if not 1 < len(labels) <= 3:
         return []
-    best = (0.0, labels)
-    for order in [list(p) for p in permutations(labels)][1:]:
-        other = np.array(order)[np.searchsorted(labels, mass)]
-        columns = poses.columns + np.outer((other - mass) * poses.per_kg, np.eye(4)[SOFTNESS])
-        evidence = 0.0
-        for j in judged:
-            own = poses.joint == j
-            scatters = [_solve(c[own], poses.error[own])[2] for c in (poses.columns, columns)]
-            evidence += float(own.sum() * np.log(scatters[0] / scatters[1]))
-        best = max(best, (evidence, order))
+    best_evidence = 0.0
+    rests_as = labels
+    for order in list(permutations(labels))[1:]:
+        other_mass = np.array(order)[np.searchsorted(labels, mass)]
+        evidence = _evidence_for_masses(poses, judged, other_mass - mass)
+        if evidence > best_evidence:
+            best_evidence = evidence
+            rests_as = list(order)
     loaded = np.abs(poses.per_kg) * (labels[-1] - labels[0]) > MIN_LOAD_CHANGE_RAD
-    if best[0] < max(MIN_EVIDENCE, 0.1 * loaded.sum()):
+    if best_evidence < max(MIN_EVIDENCE, 0.1 * loaded.sum()):
         return []
-    swaps = ", ".join(
-        f"{a:g} kg rests as {b:g} kg" for a, b in zip(labels, best[1], strict=True) if a != b
-    )
+    swaps = []
+    for label, other in zip(labels, rests_as, strict=True):
+        if label != other:
+            swaps.append(f"{label:g} kg rests as {other:g} kg")
     text = (
-        f"what is labelled {swaps}: payload labels in each other's place? Import again with the "
-        "right --payload-mass"
+        f"what is labelled {', '.join(swaps)}: payload labels in each other's place? Import again "
+        "with the right --payload-mass"
     )
-    return [Finding("warning", "payload", text, (), {"labels": labels, "rests_as": best[1]})]
+    return [Finding("warning", "payload", text, (), {"labels": labels, "rests_as": rests_as})]
+
+
+def _evidence_for_masses(poses: _Poses, judged: list[int], more: Array) -> float:
+    """Return how much better the poses are explained with more payload, (k) kg, than as labelled:
+    the logarithm by which the scatter falls, over all poses.
+    """
+    columns = poses.columns.copy()
+    columns[:, SOFTNESS] += more * poses.per_kg
+    evidence = 0.0
+    for j in judged:
+        own = poses.joint == j
+        _, _, as_labelled = _solve(poses.columns[own], poses.error[own])
+        _, _, otherwise = _solve(columns[own], poses.error[own])
+        evidence += float(own.sum() * np.log(as_labelled / otherwise))
+    return evidence
 
 
 def _two_units(
@@ -297,10 +348,10 @@ def _two_units(
     known = np.flatnonzero(np.isfinite(rests).all(axis=1))
     if len(known) <= 2:
         return []
-    best = max(_groups(rests, known, min_size), key=lambda g: g.size, default=None)
-    if best is None or best.size[0] < min_joints:
+    best = max(_groups(rests, known, min_size), key=lambda groups: groups.size, default=None)
+    if best is None or best.apart.sum() < min_joints:
         return []
-    names = [robot.joint_names[j] for j, apart in zip(judged, best.apart, strict=True) if apart]
+    names = [robot.joint_names[j] for j in np.array(judged)[best.apart].tolist()]
     members = [surveys[i].motion for i in known if i in best.members]
     others = [surveys[i].motion for i in known if i not in best.members]
     text = (
@@ -319,9 +370,10 @@ def _median_residuals(surveys: list[Survey], poses: _Poses, judged: list[int]) -
     medians = np.full((len(surveys), len(judged)), np.nan)
     for column, j in enumerate(judged):
         own = poses.of_joint(j)
-        residual = own.error - own.columns @ _solve(own.columns, own.error)[0]
+        coefficients, _, _ = _solve(own.columns, own.error)
+        residual = own.error - own.columns @ coefficients
         for number in set(own.sequence.tolist()):
-            part = residual[own.of_sequence(number)]
+            part = residual[own.rows_of(number)]
             if len(part) > 1:
                 medians[number, column] = np.median(part)
     return medians
@@ -351,15 +403,17 @@ def _groups(rests: Array, known: Array, min_size: int) -> Iterator[_Groups]:
     """
     for column in range(rests.shape[1]):
         order = known[np.argsort(rests[known, column])]
-        cuts = np.arange(min_size, len(order) + 1 - min_size)
-        centred = rests[order] - rests[order].mean(axis=0)  # their sum is zero, (N, judged)
+        count = len(order)
+        cuts = np.arange(min_size, count + 1 - min_size)  # sizes of the first group, (cuts)
+        centred = rests[order] - rests[order].mean(axis=0)  # (N, judged)
+        # Of the first group; that of the second is its negative. (cuts, judged)
         sums = centred.cumsum(axis=0)[cuts - 1]
-        per = (1 / cuts + 1 / (len(order) - cuts))[:, None]
-        within = np.sqrt(np.maximum((centred**2).sum(axis=0) - sums**2 * per, 0) / (len(order) - 2))
-        gaps = np.abs(sums) * per
-        least = np.maximum(
-            MIN_GROUP_DISTANCE_RAD, MIN_GROUP_SCATTERS * np.maximum(within, MIN_SCATTER_RAD)
-        )
+        per = (1 / cuts + 1 / (count - cuts))[:, None]
+        gaps = np.abs(sums) * per  # between the means of both groups, (cuts, judged) rad
+        squares = (centred**2).sum(axis=0) - sums**2 * per  # within the groups
+        within = np.sqrt(np.maximum(squares, 0) / (count - 2))  # pooled scatter, rad
+        scatters = MIN_GROUP_SCATTERS * np.maximum(within, MIN_SCATTER_RAD)
+        least = np.maximum(MIN_GROUP_DISTANCE_RAD, scatters)
         for cut, gap, apart in zip(cuts.tolist(), gaps, gaps > least, strict=True):
             yield _Groups(order[:cut], apart, float(gap.max()))
 
@@ -390,92 +444,101 @@ def _odd_sequence(
     by_joint = {j: poses.of_joint(j) for j in judged}
     fits = {j: _fit(own) for j, own in by_joint.items() if len(own) >= MIN_POSES}
     heaviest = max(survey.entry.meta.payload_mass for survey in surveys) or 1.0
-    odd: tuple[float, int, Finding] | None = None
+    furthest = 0.0  # mean square of its residuals
+    odd: tuple[int, Finding] | None = None
     for number in sorted(set(poses.sequence.tolist())):
-        rests = _Rests.of(number, by_joint, fits, robot)
-        judgement = _judge_sequence(surveys[number], heaviest, rests)
-        if judgement is None:
+        rests = _rests_of(number, by_joint, fits, robot)
+        if rests is None:
             continue
-        mean_square, finding = judgement
-        if odd is None or mean_square > odd[0]:
-            odd = (mean_square, number, finding)
-    if odd is None:
-        return None
-    return odd[1], odd[2]
+        finding = _judge_sequence(surveys[number], heaviest, rests)
+        if finding is not None and (odd is None or rests.mean_square > furthest):
+            furthest = rests.mean_square
+            odd = (number, finding)
+    return odd
 
 
 @dataclass(frozen=True)
 class _Rests:
-    """Where one sequence rests, against what the others say.
+    """Where one sequence rests, against what the others say, in k poses of any joints."""
 
-    Attributes:
-        residuals: One array per joint, in scatters of the joint.
-        slopes: Change of these with 1 kg more payload.
-        apart: Joint → distance, rad, of joints that rest far away.
-    """
+    residuals: Array  # in scatters of the joint, (k)
+    slopes: Array  # change of these with 1 kg more payload, (k)
+    apart: dict[str, float]  # joint → distance, rad, of joints that rest far away
 
-    residuals: list[Array]
-    slopes: list[Array]
-    apart: dict[str, float]
-
-    @classmethod
-    def of(
-        cls, number: int, by_joint: dict[int, _Poses], fits: dict[int, _Fit], robot: RobotSpec
-    ) -> _Rests:
-        """Compare the sequence of this number with the fits to the others."""
-        rests = cls([], [], {})
-        for j, fit in fits.items():
-            every = by_joint[j]
-            own = every.only(every.of_sequence(number))
-            if len(own) < 3 or len(every) - len(own) < MIN_POSES:
-                continue
-            x = fit.without[number]
-            residual = own.error - own.columns @ x
-            rests.residuals.append(residual / fit.scatter)
-            rests.slopes.append(x[SOFTNESS] * own.per_kg / fit.scatter)
-            middle = float(np.median(residual))
-            scatter = max(fit.scatter, 1.48 * float(np.median(np.abs(residual - middle))))
-            error = scatter / np.sqrt(len(residual))
-            if abs(middle) > max(MIN_UNIT_DISTANCE_RAD, SIGNIFICANCE * error):
-                rests.apart[robot.joint_names[j]] = middle
-        return rests
+    @property
+    def mean_square(self) -> float:
+        """Of the residuals."""
+        return float(self.residuals @ self.residuals) / len(self.residuals)
 
 
-def _judge_sequence(survey: Survey, heaviest: float, rests: _Rests) -> tuple[float, Finding] | None:
-    """Return the mean square of a sequence's residuals and its finding, if another mass or unit
-    explains them.
-    """
-    if not rests.residuals:
+def _rests_of(
+    number: int, by_joint: dict[int, _Poses], fits: dict[int, _Fit], robot: RobotSpec
+) -> _Rests | None:
+    """Compare the sequence of this number with the fits to the others; None with too few poses."""
+    residuals = []
+    slopes = []
+    apart = {}
+    for j, fit in fits.items():
+        every = by_joint[j]
+        own = every.only(every.rows_of(number))
+        if len(own) < 3 or len(every) - len(own) < MIN_POSES:
+            continue
+        coefficients = fit.without[number]
+        residual = own.error - own.columns @ coefficients
+        residuals.append(residual / fit.scatter)
+        slopes.append(coefficients[SOFTNESS] * own.per_kg / fit.scatter)
+        middle = float(np.median(residual))
+        scatter = max(fit.scatter, 1.48 * float(np.median(np.abs(residual - middle))))
+        error = scatter / np.sqrt(len(residual))
+        if abs(middle) > max(MIN_UNIT_DISTANCE_RAD, SIGNIFICANCE * error):
+            apart[robot.joint_names[j]] = middle
+    if not residuals:
         return None
-    r = np.concatenate(rests.residuals)
-    slope = np.concatenate(rests.slopes)
-    apart = rests.apart
+    return _Rests(np.concatenate(residuals), np.concatenate(slopes), apart)
+
+
+def _judge_sequence(survey: Survey, heaviest: float, rests: _Rests) -> Finding | None:
+    """Return the finding of a sequence, if another mass or another unit explains where it rests.
+
+    Args:
+        heaviest: Of the labels, kg.
+    """
     meta = survey.entry.meta
-    mean_square = float(r @ r) / len(r)
-    power = float(slope @ slope)
-    more = float(slope @ r) / power if power > 0 else 0.0  # kg
-    explained = more**2 * power
-    unexplained = max(1.0, mean_square - explained / len(r))
-    significant = explained > max(MIN_MASS_SHARE * float(r @ r), SIGNIFICANCE**2 * unexplained)
-    if significant and abs(more) > MIN_MASS * heaviest:
+    more = _mass_that_explains(rests)
+    if abs(more) > MIN_MASS_ERROR * heaviest:
         text = (
             f"{meta.motion} rests as with {max(meta.payload_mass + more, 0.0):.2g} kg, its label "
             f"says {meta.payload_mass:g} kg: a wrong payload label? Import it again with "
             "--payload-mass"
         )
-        values = {"motion": meta.motion, "mass": meta.payload_mass + more}
-        return mean_square, Finding("warning", "payload", text, (), values)
-    if apart:
-        worst = max(apart, key=lambda name: abs(apart[name]))
-        text = (
-            f"{meta.motion} rests {apart[worst] * 1e3:+.0f} mrad from where the other recordings "
-            f"of unit {meta.unit_id} say ({abbreviate(list(apart))}): another robot, or zeros set "
-            "in between? Import it with another --unit-id"
-        )
-        return mean_square, Finding(
-            "warning", "unit_id", text, tuple(apart), {"motion": meta.motion, "apart": apart}
-        )
-    return None
+        mass = {"motion": meta.motion, "mass": meta.payload_mass + more}
+        return Finding("warning", "payload", text, (), mass)
+    if not rests.apart:
+        return None
+    worst = max(rests.apart.values(), key=abs)
+    text = (
+        f"{meta.motion} rests {worst * 1e3:+.0f} mrad from where the other recordings "
+        f"of unit {meta.unit_id} say ({abbreviate(list(rests.apart))}): another robot, or zeros "
+        "set in between? Import it with another --unit-id"
+    )
+    unit = {"motion": meta.motion, "apart": rests.apart}
+    return Finding("warning", "unit_id", text, tuple(rests.apart), unit)
+
+
+def _mass_that_explains(rests: _Rests) -> float:
+    """Return by how much more payload than its label says a sequence rests, kg; 0 if that does not
+    explain most of the misfit, or may be chance.
+    """
+    power = float(rests.slopes @ rests.slopes)
+    if not power > 0:
+        return 0.0
+    more = float(rests.slopes @ rests.residuals) / power  # least squares
+    explained = more**2 * power
+    misfit = float(rests.residuals @ rests.residuals)
+    unexplained = max(1.0, rests.mean_square - explained / len(rests.residuals))
+    if explained > max(MIN_MASS_SHARE * misfit, SIGNIFICANCE**2 * unexplained):
+        return more
+    return 0.0
 
 
 def feedforward(surveys: list[Survey], robot: RobotSpec, model: Gravity) -> Iterator[Finding]:
@@ -483,15 +546,15 @@ def feedforward(surveys: list[Survey], robot: RobotSpec, model: Gravity) -> Iter
     recorded = [(survey, survey.torque) for survey in surveys if survey.torque is not None]
     if not recorded or unsigned_torque(recorded, robot):
         return
-    shares: dict[str, tuple[float, float, float]] = {}
+    shares: dict[str, _FedForward] = {}
     for j, name in enumerate(robot.joint_names):
-        of_joint = _shares(surveys, robot, model, j)
+        of_joint = _fed_forward(_joint_holds(surveys, robot, model, j), robot, j)
         if of_joint is not None:
             shares[name] = of_joint
     if not shares:
         yield Finding("ok", "feed-forward", "too few rests with torque to tell")
         return
-    fed = {name: x for name, x in shares.items() if x[0] > 0}
+    fed = {name: of_joint for name, of_joint in shares.items() if of_joint.share > 0}
     if len(fed) < MIN_JOINTS_SHARE * len(shares):
         yield Finding("ok", "feed-forward", "no torque beside the commands is seen at rest")
         return
@@ -504,70 +567,102 @@ def feedforward(surveys: list[Survey], robot: RobotSpec, model: Gravity) -> Iter
         "column in logs.toml (feedforward_torque); without it, gaponet identify takes the missing "
         "sag for stiffer motors, and a simulator needs the same torque"
     )
-    yield Finding(
-        "warning", "feed-forward", text, tuple(fed), {name: x[0] for name, x in fed.items()}
-    )
+    values = {name: of_joint.share for name, of_joint in fed.items()}
+    yield Finding("warning", "feed-forward", text, tuple(fed), values)
 
 
-def _shares(
-    surveys: list[Survey], robot: RobotSpec, model: Gravity, joint: int
-) -> tuple[float, float, float] | None:
-    """Return the share of a joint's weight that is fed forward (0 if it may be none), and the
-    shares of its torque that PD alone and both explain; None with too few holds, or without a
-    weight that changes.
-    """
-    # (k,); torques over kp, rad
-    recording, torque, weight, error, qpos = _holds_of(surveys, robot, model, joint).T
-    numbers, fold = np.unique(recording, return_inverse=True)
-    least = MIN_LOAD * robot.servo.effort_limit[joint] / max(robot.servo.kp[joint], 1e-9)
-    if len(torque) < MIN_POSES or len(numbers) < MIN_RECORDINGS or np.std(weight) < least:
+class _FedForward(NamedTuple):
+    """What holds a joint at rest, as shares."""
+
+    share: float  # of its weight that is fed forward; 0 if it may be none
+    alone: float  # of its torque that PD alone explains
+    both: float  # of its torque that PD and a share of the weight explain
+
+
+@dataclass(frozen=True)
+class _JointHolds:
+    """Rests of one joint under constant commands, (k) each."""
+
+    recording: Array  # number of the recording
+    torque: Array  # over kp, rad
+    weight: Array  # over kp, rad
+    error: Array  # command − position, rad
+    qpos: Array  # rad
+
+
+def _fed_forward(holds: _JointHolds, robot: RobotSpec, joint: int) -> _FedForward | None:
+    """Return what holds a joint; None with too few holds, or without a weight that changes."""
+    numbers, index = np.unique(holds.recording, return_inverse=True)
+    fold = index % MAX_FOLDS
+    least = MIN_LOAD * robot.servo.effort_limit[joint] / max(robot.servo.kp[joint], MIN_KP)
+    few = len(holds.torque) < MIN_POSES or len(numbers) < MIN_RECORDINGS
+    if few or np.std(holds.weight) < least:
         return None
-    fold = fold % MAX_FOLDS
-    sag, _, _ = _explained(error, fold, weight)
+    sag, _, _ = _explained(holds.error, fold, holds.weight)
     # qpos: command and state may differ in scale
-    _, _, alone = _explained(torque, fold, error, qpos)
-    share, std, both = _explained(torque, fold, weight, error, qpos)
+    _, _, alone = _explained(holds.torque, fold, holds.error, holds.qpos)
+    share, std, both = _explained(holds.torque, fold, holds.weight, holds.error, holds.qpos)
     max_sag = MAX_SAG + MAX_SAG_PER_SHARE * max(1 - share, 0.0)
     significant = share > max(MIN_SHARE, SIGNIFICANCE * std) and sag < max_sag
     better = 1 - alone > max(MIN_UNEXPLAINED, MIN_IMPROVEMENT * (1 - both))
-    return (share if significant and better else 0.0), alone, both
+    if not (significant and better):
+        share = 0.0
+    return _FedForward(share, alone, both)
 
 
-def _holds_of(surveys: list[Survey], robot: RobotSpec, model: Gravity, joint: int) -> Array:
-    """Return the holds of a joint: number of the recording, torque over kp, weight over kp, command
-    − position, position, (k, 5) in rad.
-    """
-    parts = [np.zeros((0, 5))]
+def _joint_holds(
+    surveys: list[Survey], robot: RobotSpec, model: Gravity, joint: int
+) -> _JointHolds:
+    """Return the holds of one joint in all recordings."""
+    none = np.zeros(0)
+    parts = [_JointHolds(none, none, none, none, none)]
     for number, survey in enumerate(surveys):
-        if survey.samples.holds is None:
+        holds = survey.samples.holds
+        if holds is None:
             continue
-        own = survey.samples.holds[survey.samples.holds[:, 0] == joint]
-        if not len(own):
+        own = holds.joint == joint
+        if not own.any():
             continue
         meta = survey.entry.meta
-        kp = max(float(robot.with_gains(*meta.recorded_gains).servo.kp[joint]), 1e-9)
-        weight = model(own[:, 3:], meta.payload_mass, meta.payload_side)[:, joint]
-        numbers = np.full(len(own), number)
-        columns = (numbers, own[:, 2] / kp, weight / kp, own[:, 1], own[:, 3 + joint])
-        parts.append(np.stack(columns, axis=1))
-    return np.concatenate(parts)
+        kp = max(float(robot.with_gains(*meta.recorded_gains).servo.kp[joint]), MIN_KP)
+        qpos = holds.qpos[own]
+        weight = model(qpos, meta.payload_mass, meta.payload_side)[:, joint]
+        part = _JointHolds(
+            recording=np.full(len(qpos), number),
+            torque=holds.torque[own] / kp,
+            weight=weight / kp,
+            error=holds.error[own],
+            qpos=qpos[:, joint],
+        )
+        parts.append(part)
+    joined = {}
+    for name in vars(parts[0]):
+        joined[name] = np.concatenate([getattr(part, name) for part in parts])
+    return _JointHolds(**joined)
 
 
 def _explained(values: Array, fold: Array, *columns: Array) -> tuple[float, float, float]:
     """Return the robust coefficient of the first column, its standard error, and the share of the
     variance of the values that fits to the other folds explain.
+
+    Args:
+        values: What is explained, (k).
+        fold: Of each value, (k).
+        columns: Regressors, (k) each; a constant is added.
     """
-    x = np.stack([*columns, np.ones_like(values)], axis=1)
-    start = np.zeros(x.shape[1])
-    free = np.full(x.shape[1], 1e3)
+    regressors = np.stack([*columns, np.ones_like(values)], axis=1)  # (k, c)
+    start = np.zeros(regressors.shape[1])
+    free = np.full(regressors.shape[1], 1e3)
     folds = np.unique(fold)
     without = []
-    for f in folds:
-        kept = fold != f
-        coefficients, _, _ = _solve(x[kept], values[kept], start, free)
+    for number in folds:
+        kept = fold != number
+        coefficients, _, _ = _solve(regressors[kept], values[kept], start, free)
         without.append(coefficients)
-    each = np.array(without)
-    left = values - np.einsum("kc,kc->k", x, each[np.searchsorted(folds, fold)])
+    each = np.array(without)  # (folds, c)
+    of_others = each[np.searchsorted(folds, fold)]  # (k, c)
+    left = values - np.einsum("kc,kc->k", regressors, of_others)
     std = np.sqrt((len(each) - 1) * each[:, 0].var())
     share = 1 - float(np.mean(left**2)) / max(float(np.var(values)), 1e-12)
-    return float(_solve(x, values, start, free)[0][0]), float(std), share
+    coefficients, _, _ = _solve(regressors, values, start, free)
+    return float(coefficients[0]), float(std), share

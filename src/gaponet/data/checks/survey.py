@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterator
 from concurrent.futures import Executor
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -36,55 +36,55 @@ from gaponet.data.store import Dataset, Entry
 from gaponet.robot.spec import RobotSpec
 
 MAX_LAG_S = 0.4
-# a joint that moves less in this time stands still
+# A joint that moves by less than STANDSTILL_RAD within STANDSTILL_S stands still.
 STANDSTILL_S = 0.2
 STANDSTILL_RAD = 0.005
-# distance of a blocked joint from its command; a loaded joint may be as far, so that its command
-# must also move
-BLOCKED_ERROR_RAD = 0.15
+BLOCKED_ERROR_RAD = 0.15  # distance of a blocked joint from its command
+# The command of a blocked joint moves by this: a loaded joint may be as far from a command at rest.
 BLOCKED_COMMAND_RAD = 0.1
 REPEATED_COMMAND_RAD = 0.1  # the command must move by this while the state repeats itself
 SLOPE_MIN_RANGE_RAD = 0.2  # of the command; below, sag and stiction decide the slope
 SLOW_HZ = 0.3  # faster, a servo's resonance changes the slope
-# rows in which torque is compared with gravity, and the highest speed there
-GRAVITY_SAMPLES = 60
-SLOW_RAD_S = 0.5
+SLOW_ROWS = 60  # of a recording, about, in which torque is compared with gravity
+SLOW_RAD_S = 0.5  # highest speed of any joint in such a row
 MOTION_HZ = 4.0  # above it, noise and a servo's resonance outweigh the weight of the links
-# of a recording in which motion is compared with the model
-MOTION_ROWS = 60
-MIN_MOTION_ROWS = 10
+MOTION_ROWS = 60  # of a recording, about, in which motion is compared with the model
+MIN_MOTION_ROWS = 10  # of a recording of which any are taken
 MOTION_MARGIN_S = 0.2  # at both ends, where smoothing is poor
-# time and range of a command that stands still
-HOLD_S = 0.4
-HELD_COMMAND_RAD = 2e-3
+HOLD_S = 0.4  # for which a command stands still before a rest counts
+HELD_COMMAND_RAD = 2e-3  # range of a command that stands still
 TORQUE_TOLERANCE = 0.05  # share of the torque limit by which a reading may exceed it
-# distance from the line between the neighbouring rows that no joint reaches
+# A position that is further from the line between its neighbours than both of these is a jump.
 JUMP_RAD = 0.1
 JUMP_RAD_S2 = 1000.0
 ZERO_JUMP_RAD = 0.05  # step from a row of zeros to the next row
+MAX_ZERO_COMMAND_ROWS = 5  # after which a command of zero is one that was meant
 COMMAND_STEP_RAD = 0.05  # step of a command; the torque may follow it
-# above the running median by this share of the torque limit
-SPIKE_WINDOW_S = 0.3
-SPIKE_SHARE = 0.3
+SPIKE_WINDOW_S = 0.3  # of the running median from which a spike stands out
+SPIKE_SHARE = 0.3  # of the torque limit, by which it does
 SPECTRUM_HZ = np.arange(0.5, 60, 0.1)
-MOVING_RAD = 0.05
-# of one job; from which starting processes pays
-JOB_ROWS = 40_000
-MIN_PARALLEL_ROWS = 600_000
+MOVING_RAD = 0.05  # range of a joint that moves
+JOB_ROWS = 40_000  # of one job of several processes
+MIN_PARALLEL_ROWS = 600_000  # of a dataset for which it pays to start processes
 OVERHEAD_ROWS = 1500  # rows that take as long as the fixed costs of a recording
-# distinct positions from which a step is known; deviation in steps
-LEVELS = 8
-LEVEL_TOLERANCE = 0.1
+MIN_LEVELS = 8  # distinct positions from which the step between them is known
+LEVEL_TOLERANCE = 0.1  # of a step, by which positions lie beside its multiples
+KIND_STEP_S = 0.02  # period at which a command is compared with what it may be
 
 
 class Torque(NamedTuple):
     """Torques of one sequence per joint, (n)."""
 
     low: Array  # N·m
-    high: Array
+    high: Array  # N·m
     over_limit: Array  # rows above the torque limit
     spikes: Array  # rows far above the rows around
     flat: Array  # rows at exactly the greatest magnitude
+
+    @property
+    def largest(self) -> Array:
+        """Greatest magnitude, (n) N·m."""
+        return np.asarray(np.maximum(-self.low, self.high))
 
 
 @dataclass(frozen=True)
@@ -219,19 +219,57 @@ class Encoders:
 
 
 @dataclass(frozen=True)
+class SlowRows:
+    """Rows in which all joints are slow: their torque is mostly that of gravity."""
+
+    qpos: Array  # (k, n) rad
+    torque: Array  # (k, n) N·m
+
+
+@dataclass(frozen=True)
+class Movement:
+    """Rows of smoothed motion, (k, n) each."""
+
+    qpos: Array  # rad
+    qvel: Array  # rad/s
+    qacc: Array  # rad/s²
+    torque: Array  # N·m; NaN if none was recorded
+    error: Array  # command − position, the state's lag taken off, rad
+    command_velocity: Array  # rad/s
+    command_acceleration: Array  # rad/s²
+
+    @classmethod
+    def joined(cls, parts: list[Movement]) -> Movement:
+        """Return the rows of several recordings, in double precision."""
+        channels = {}
+        for field in fields(cls):
+            of_parts = [getattr(part, field.name) for part in parts]
+            channels[field.name] = np.concatenate(of_parts).astype(float)
+        return cls(**channels)
+
+    def at(self, rows: Array | slice) -> Movement:
+        """Return some of the rows."""
+        return Movement(**{name: values[rows] for name, values in vars(self).items()})
+
+
+@dataclass(frozen=True)
+class Holds:
+    """Moments at which one joint rests under a constant command, k of them."""
+
+    joint: Array  # index of the joint that rests, (k)
+    error: Array  # its command − position, (k) rad
+    torque: Array  # its torque, (k) N·m
+    qpos: Array  # positions of all joints, (k, n) rad
+
+
+@dataclass(frozen=True)
 class Samples:
     """Rows of one sequence that are compared with the model of the robot."""
 
     static_poses: StaticPoses
-    # positions and torques in slow rows, (2, k, n); None if no torque was recorded
-    gravity: Array | None
-    # rows of smoothed motion: position, velocity, acceleration, torque (NaN if none was recorded),
-    # command − position (its lag taken off), and the command's velocity and acceleration,
-    # (7, k, n) in SI; None if the recording is too short
-    movement: Array | None
-    # of single joints that rest under a constant command: joint, command − position (rad), torque,
-    # and positions of all joints, (k, 3 + n); None if no torque was recorded
-    holds: Array | None
+    slow_rows: SlowRows | None  # None if no torque was recorded
+    movement: Movement | None  # None if the recording is too short
+    holds: Holds | None  # None if no torque was recorded
 
 
 @dataclass(frozen=True)
@@ -276,7 +314,7 @@ class Survey:
         tracking = Tracking.of(sequence, robot)
         samples = Samples(
             static_poses=StaticPoses.of(sequence, robot.operated_index),
-            gravity=_gravity_samples(sequence),
+            slow_rows=_slow_rows(sequence),
             movement=_movement(sequence, tracking.delay),
             holds=_holds(sequence),
         )
@@ -343,16 +381,18 @@ def _correlations(ctrl: Array, qpos: Array, dt: float) -> tuple[Array, Array]:
     """
     span = max(1, round(0.06 / dt))
     stride = max(1, round(0.04 / dt))
-    u = ctrl[span:] - ctrl[:-span]
-    v = qpos[span:] - qpos[:-span]
-    most, least = np.zeros((2, ctrl.shape[1], ctrl.shape[1]))
-    for lag in range(0, min(round(MAX_LAG_S / dt), len(u) // 2) + 1, stride):
-        a = u[: len(u) - lag]
-        b = v[lag:]
-        a = a - a.mean(axis=0)
-        b = b - b.mean(axis=0)
-        scale = np.sqrt(np.outer((a**2).sum(axis=0), (b**2).sum(axis=0)))
-        coefficients = (a.T @ b) / np.where(scale > 0, scale, np.inf)
+    commanded = ctrl[span:] - ctrl[:-span]
+    moved = qpos[span:] - qpos[:-span]
+    rows, n = commanded.shape
+    most = np.zeros((n, n))
+    least = np.zeros((n, n))
+    for lag in range(0, min(round(MAX_LAG_S / dt), rows // 2) + 1, stride):
+        before = commanded[: rows - lag]
+        after = moved[lag:]
+        before = before - before.mean(axis=0)
+        after = after - after.mean(axis=0)
+        scale = np.sqrt(np.outer((before**2).sum(axis=0), (after**2).sum(axis=0)))
+        coefficients = (before.T @ after) / np.where(scale > 0, scale, np.inf)
         most = np.maximum(most, coefficients)
         least = np.minimum(least, coefficients)
     return most, -least
@@ -387,41 +427,53 @@ def _fitted_slope(command: Array, state: Array, steps: int) -> float:
 
 def _kind_of_command(sequence: Sequence) -> KindOfCommand:
     """Compare the command with the position soon after, with the velocity, and with the torque."""
-    every = max(1, round(0.02 / sequence.dt))
+    every = max(1, round(KIND_STEP_S / sequence.dt))
     ctrl = np.ascontiguousarray(sequence.ctrl[::every].T, float)  # (n, T)
     qpos = np.ascontiguousarray(sequence.qpos[::every].T, float)
     rows = qpos.shape[1]
     speed = np.gradient(qpos, axis=1)
     distances = []
     velocity = []
-    for lag in range(0, min(round(MAX_LAG_S / 0.02), rows // 2), 2):
+    for lag in range(0, min(round(MAX_LAG_S / KIND_STEP_S), rows // 2), 2):
         u = ctrl[:, : rows - lag]
         q = qpos[:, lag:]
-        product = np.abs(u @ q.T) / (rows - lag)  # (n, n)
-        u_power = (u**2).mean(axis=1)[:, None]
-        q_power = (q**2).mean(axis=1)
-        variance = np.maximum(q.var(axis=1), 1e-12)
-        # other checks judge units, signs and names
-        for scale in (1.0, np.degrees(1), np.radians(1)):
-            square = scale**2 * u_power + q_power - 2 * scale * product
-            distances.append((np.maximum(square, 0) / variance).min(axis=1))
+        distances.append(_square_distance(u, q))
         velocity.append(correlation(u, speed[:, lag:]))
-    near = np.where(np.ptp(qpos, axis=1) > MOVING_RAD, np.sqrt(np.min(distances, axis=0)), np.nan)
-    torque = np.full(near.shape, np.nan)
+    moves = np.ptp(qpos, axis=1) > MOVING_RAD
+    distance = np.where(moves, np.sqrt(np.min(distances, axis=0)), np.nan)
+    torque = np.full(distance.shape, np.nan)
     if sequence.tau is not None:
         torque = correlation(ctrl, sequence.tau[::every].T)
     return KindOfCommand(
-        distance=near,
+        distance=distance,
         velocity_correlation=np.max(velocity, axis=0),
         torque_correlation=torque,
     )
 
 
+def _square_distance(ctrl: Array, qpos: Array) -> Array:
+    """Return the mean square distance of each command from the nearest joint's positions, over
+    their variance; (n, T) and (n, T) → (n).
+
+    Any joint, either sign, and rad beside deg count as near: other checks judge names, signs and
+    units.
+    """
+    product = np.abs(ctrl @ qpos.T) / ctrl.shape[1]  # (n, n)
+    ctrl_power = (ctrl**2).mean(axis=1)[:, None]
+    qpos_power = (qpos**2).mean(axis=1)
+    variance = np.maximum(qpos.var(axis=1), 1e-12)
+    distances = []
+    for scale in (1.0, np.degrees(1), np.radians(1)):
+        square = scale**2 * ctrl_power + qpos_power - 2 * scale * product
+        distances.append((np.maximum(square, 0) / variance).min(axis=1))
+    return np.asarray(np.min(distances, axis=0))
+
+
 def _standing(qpos: Array, dt: float) -> Array:
     """Return where joints have not moved for STANDSTILL_S, (T, n) bool."""
-    w = max(1, round(STANDSTILL_S / dt))
+    rows = max(1, round(STANDSTILL_S / dt))
     stands = np.zeros(qpos.shape, bool)
-    stands[w:] = np.abs(qpos[w:] - qpos[:-w]) < STANDSTILL_RAD
+    stands[rows:] = np.abs(qpos[rows:] - qpos[:-rows]) < STANDSTILL_RAD
     return stands
 
 
@@ -429,16 +481,17 @@ def _standstill(ctrl: Array, qpos: Array, dt: float) -> float:
     """Return the longest standstill of all joints (brakes on, drives off) while at least two
     commands move, s.
     """
-    commanded = max(2.0, 0.5 * (np.ptp(ctrl, axis=0) > BLOCKED_COMMAND_RAD).sum())
+    commanded = np.ptp(ctrl, axis=0) > BLOCKED_COMMAND_RAD
+    least = max(2.0, 0.5 * commanded.sum())  # joints whose commands must move
     late = round(MAX_LAG_S / dt)
-    standing = np.asarray(_standing(qpos, dt).all(axis=1))
+    all_stand = np.asarray(_standing(qpos, dt).all(axis=1))
     longest = 0
-    for run in _runs(standing):
+    for run in _runs(all_stand):
         rows = run.stop - run.start
         if rows <= 2 * late:
             continue
         moving = np.ptp(ctrl[run.start : run.stop - late], axis=0) > BLOCKED_COMMAND_RAD
-        if moving.sum() >= commanded:
+        if moving.sum() >= least:
             longest = max(longest, rows)
     return longest * dt
 
@@ -453,11 +506,16 @@ def _copied_rows(sequence: Sequence) -> Array:
 
 
 def _blocked(ctrl: Array, qpos: Array, dt: float) -> tuple[Array, Array]:
-    seconds, places = np.zeros((2, qpos.shape[1]))
-    for j, mask in enumerate((_standing(qpos, dt) & (np.abs(ctrl - qpos) > BLOCKED_ERROR_RAD)).T):
-        runs = [r for r in _runs(mask) if np.ptp(ctrl[r, j]) > BLOCKED_COMMAND_RAD]
+    """Return the longest standstill of each joint far from its moving command, (n) s, and where it
+    stood, (n) rad.
+    """
+    seconds = np.zeros(qpos.shape[1])
+    places = np.zeros(qpos.shape[1])
+    stands_far = _standing(qpos, dt) & (np.abs(ctrl - qpos) > BLOCKED_ERROR_RAD)  # (T, n)
+    for j, mask in enumerate(stands_far.T):
+        runs = [run for run in _runs(mask) if np.ptp(ctrl[run, j]) > BLOCKED_COMMAND_RAD]
         if runs:
-            longest = max(runs, key=lambda r: r.stop - r.start)
+            longest = max(runs, key=lambda run: run.stop - run.start)
             seconds[j] = (longest.stop - longest.start) * dt
             places[j] = qpos[longest.start, j]
     return seconds, places
@@ -467,38 +525,51 @@ def _zero_rows(sequence: Sequence, notes: dict[str, Any], robot: RobotSpec) -> i
     """Count rows of zeros of the joints that were logged in rad or deg; one joint alone may well
     pass through zero.
     """
-    converted = (joint for joint, unit in notes.get("converted_from", {}).items() if unit != "deg")
-    excluded = {*notes.get("held_at_home", ()), *converted}
+    excluded = set(notes.get("held_at_home", ()))
+    for joint, unit in notes.get("converted_from", {}).items():
+        if unit != "deg":
+            excluded.add(joint)
     logged = [i for i, name in enumerate(robot.joint_names) if name not in excluded]
     if len(logged) < 2:
         return 0
     count = 0
-    for values, min_edges in ((sequence.qpos[:, logged], 1), (sequence.ctrl[:, logged], 2)):
-        far = np.abs(np.diff(values, axis=0)).max(axis=1) > ZERO_JUMP_RAD  # (T − 1,)
-        for run in _runs((values == 0).all(axis=1)):
-            edges = 0  # ends of the run at which a joint jumps
-            if run.start > 0:
-                edges += int(far[run.start - 1])
-            if run.stop < len(values):
-                edges += int(far[run.stop - 1])
-            # A command may step away from zero; it does not step there and back within a few rows.
-            if edges >= min_edges and (min_edges == 1 or run.stop - run.start <= 5):
-                count += run.stop - run.start
+    for rows, jumps in _zero_runs(sequence.qpos[:, logged]):
+        if jumps >= 1:
+            count += rows
+    for rows, jumps in _zero_runs(sequence.ctrl[:, logged]):
+        # A command may step away from zero; it does not step there and back within a few rows.
+        if jumps == 2 and rows <= MAX_ZERO_COMMAND_ROWS:
+            count += rows
     return count
 
 
-def _gravity_samples(sequence: Sequence) -> Array | None:
+def _zero_runs(values: Array) -> Iterator[tuple[int, int]]:
+    """Yield the length of each run of rows in which all values are 0, and the number of its ends
+    at which one jumps; values (T, n).
+    """
+    far = np.abs(np.diff(values, axis=0)).max(axis=1) > ZERO_JUMP_RAD  # (T − 1,)
+    for run in _runs((values == 0).all(axis=1)):
+        jumps = 0
+        if run.start > 0:
+            jumps += int(far[run.start - 1])
+        if run.stop < len(values):
+            jumps += int(far[run.stop - 1])
+        yield run.stop - run.start, jumps
+
+
+def _slow_rows(sequence: Sequence) -> SlowRows | None:
     if sequence.tau is None:
         return None
     slow = np.flatnonzero((np.abs(sequence.qvel) < SLOW_RAD_S).all(axis=1))
-    rows = slow[:: max(1, len(slow) // GRAVITY_SAMPLES)]
-    return np.stack([sequence.qpos[rows], sequence.tau[rows]])
+    rows = slow[:: max(1, len(slow) // SLOW_ROWS)]
+    return SlowRows(sequence.qpos[rows], sequence.tau[rows])
 
 
-def _movement(sequence: Sequence, delay: Array) -> Array | None:
-    """Return rows of smoothed motion (Survey.movement).
+def _movement(sequence: Sequence, delay: Array) -> Movement | None:
+    """Return rows of smoothed motion; None if the recording is too short.
 
-    delay: of the state, (n) s; NaN where it is not known.
+    Args:
+        delay: Of the state, (n) s; NaN where it is not known.
     """
     dt = sequence.dt
     margin = max(2, round(MOTION_MARGIN_S / dt))
@@ -508,22 +579,28 @@ def _movement(sequence: Sequence, delay: Array) -> Array | None:
     known = delay[np.isfinite(delay)]
     usual = min(float(np.median(known)), MAX_LAG_S) if len(known) else 0.0
     lag = round(usual / dt)
+    # the command that the state of each row follows, (T, n) rad
     ctrl = np.concatenate([np.repeat(sequence.ctrl[:1], lag, axis=0), sequence.ctrl])
-    target = lowpass(ctrl[: len(sequence)], dt, MOTION_HZ)
-    target_speed = differentiate(target, dt)
+    command = lowpass(ctrl[: len(sequence)], dt, MOTION_HZ)
+    command_velocity = differentiate(command, dt)
     qpos = lowpass(sequence.qpos, dt, MOTION_HZ)
     qvel = differentiate(qpos, dt)
-    qacc = differentiate(qvel, dt)
     torque = np.full_like(qpos, np.nan)
     if sequence.tau is not None:
         torque = lowpass(sequence.tau, dt, MOTION_HZ)
-    chosen = rows[:: max(1, len(rows) // MOTION_ROWS)]
-    target_acceleration = differentiate(target_speed, dt)
-    channels = (qpos, qvel, qacc, torque, target - qpos, target_speed, target_acceleration)
-    return np.stack([channel[chosen] for channel in channels]).astype(np.float32)
+    movement = Movement(
+        qpos=qpos.astype(np.float32),
+        qvel=qvel.astype(np.float32),
+        qacc=differentiate(qvel, dt).astype(np.float32),
+        torque=torque.astype(np.float32),
+        error=(command - qpos).astype(np.float32),
+        command_velocity=command_velocity.astype(np.float32),
+        command_acceleration=differentiate(command_velocity, dt).astype(np.float32),
+    )
+    return movement.at(rows[:: max(1, len(rows) // MOTION_ROWS)])
 
 
-def _holds(sequence: Sequence) -> Array | None:
+def _holds(sequence: Sequence) -> Holds | None:
     if sequence.tau is None:
         return None
     rows = max(2, round(HOLD_S / sequence.dt))
@@ -531,29 +608,45 @@ def _holds(sequence: Sequence) -> Array | None:
     rests = range_before(sequence.ctrl, rows) < HELD_COMMAND_RAD
     rests &= range_before(sequence.qpos, max(2, rows // 4)) < STANDSTILL_RAD
     rests[:rows] = False
-    holds = []
+    joints: list[int] = []
+    errors: list[float] = []
+    torques: list[float] = []
+    postures: list[Array] = []
     for j, mask in enumerate(rests.T):
         for run in _runs(mask):
-            if run.stop - run.start > least:
-                ctrl = sequence.ctrl[run].mean(axis=0)
-                qpos = sequence.qpos[run].mean(axis=0)
-                tau = sequence.tau[run].mean(axis=0)
-                holds.append([j, ctrl[j] - qpos[j], tau[j], *qpos])
-    return np.reshape(holds, (-1, 3 + rests.shape[1])).astype(float)
-
-
-def _qvel_ratio(sequence: Sequence) -> Array:
-    derivative = differentiate(sequence.qpos, sequence.dt)
-    power = (derivative**2).sum(axis=0)
-    moves = np.ptp(sequence.qpos, axis=0) > MOVING_RAD
-    return np.where(
-        moves, (sequence.qvel * derivative).sum(axis=0) / np.where(power > 0, power, 1.0), np.nan
+            if run.stop - run.start <= least:
+                continue
+            ctrl = sequence.ctrl[run].mean(axis=0)
+            qpos = sequence.qpos[run].mean(axis=0)
+            torque = sequence.tau[run].mean(axis=0)
+            joints.append(j)
+            errors.append(ctrl[j] - qpos[j])
+            torques.append(torque[j])
+            postures.append(qpos)
+    return Holds(
+        joint=np.array(joints, int),
+        error=np.array(errors, float),
+        torque=np.array(torques, float),
+        qpos=np.reshape(postures, (-1, rests.shape[1])).astype(float),
     )
 
 
+def _qvel_ratio(sequence: Sequence) -> Array:
+    """Return the slope of the recorded velocity over the derivative of the position, (n); NaN for
+    a joint that hardly moves.
+    """
+    derivative = differentiate(sequence.qpos, sequence.dt)
+    power = (derivative**2).sum(axis=0)
+    product = (sequence.qvel * derivative).sum(axis=0)
+    moves = np.ptp(sequence.qpos, axis=0) > MOVING_RAD
+    return np.where(moves, product / np.where(power > 0, power, 1.0), np.nan)
+
+
 def _all_repeated(sequence: Sequence) -> float:
-    """A resting robot repeats its positions; if every signal repeats while the command moves,
-    nothing was read.
+    """Return for how long the whole state repeats itself while the command moves, s.
+
+    A resting robot repeats its positions; if every signal repeats while the command moves, nothing
+    was read.
     """
     same = np.ones(len(sequence) - 1, bool)
     for name in ("qpos", "qvel", "tau", "temperature"):
@@ -570,16 +663,18 @@ def _all_repeated(sequence: Sequence) -> float:
 
 
 def _repeated(ctrl: Array, qpos: Array, dt: float) -> Array:
-    """A loaded or stuck joint stands still, but noise and encoder steps change its number, and it
+    """Return for how long each joint repeats one number while its command moves, (n) s.
+
+    A loaded or stuck joint stands still, but noise and encoder steps change its number, and it
     moves at last.
     """
     late = round(MAX_LAG_S / 2 / dt)
     seconds = np.zeros(qpos.shape[1])
     for j, same in enumerate((np.diff(qpos, axis=0) == 0).T):
-        for r in _runs(same):
-            command = ctrl[r.start : max(r.stop - late, r.start), j]
+        for run in _runs(same):
+            command = ctrl[run.start : max(run.stop - late, run.start), j]
             if len(command) and np.ptp(command) > REPEATED_COMMAND_RAD:
-                seconds[j] = max(seconds[j], (r.stop - r.start) * dt)
+                seconds[j] = max(seconds[j], (run.stop - run.start) * dt)
     return seconds
 
 
@@ -587,15 +682,17 @@ def _resolution(qpos: Array) -> Array:
     """Return the step of which all differences of positions are multiples, where there are few
     distinct positions.
     """
-    steps = np.zeros(qpos.shape[1])
+    resolution = np.zeros(qpos.shape[1])
     for j, column in enumerate(qpos.T):
         levels = np.unique(column.astype(float))
+        if not MIN_LEVELS <= len(levels) <= len(column) / 4:
+            continue
         gaps = np.diff(levels)
-        if LEVELS <= len(levels) <= len(column) / 4:
-            step = float(np.median(gaps[gaps < 1.5 * gaps.min()]))
-            if np.abs(gaps / step - np.round(gaps / step)).max() < LEVEL_TOLERANCE:
-                steps[j] = step
-    return steps
+        step = float(np.median(gaps[gaps < 1.5 * gaps.min()]))
+        multiples = gaps / step
+        if np.abs(multiples - np.round(multiples)).max() < LEVEL_TOLERANCE:
+            resolution[j] = step
+    return resolution
 
 
 def _runs(mask: Array) -> list[slice]:
@@ -613,11 +710,9 @@ def _torque(sequence: Sequence, robot: RobotSpec) -> Torque | None:
     magnitude = np.abs(tau)
     window = max(3, round(SPIKE_WINDOW_S / sequence.dt))
     usual = median_filter(magnitude, size=(window, 1), mode="nearest")
-    steps = (
-        np.abs(np.diff(sequence.ctrl, axis=0, prepend=sequence.ctrl[:1])).max(axis=1)
-        > COMMAND_STEP_RAD
-    )
-    calm = maximum_filter1d(steps, 2 * window + 1) == 0
+    command_steps = np.abs(np.diff(sequence.ctrl, axis=0, prepend=sequence.ctrl[:1]))  # (T, n)
+    steps = command_steps.max(axis=1) > COMMAND_STEP_RAD
+    calm = maximum_filter1d(steps, 2 * window + 1) == 0  # no command steps near the row, (T,)
     limit = robot.servo.effort_limit
     spikes = (magnitude - usual > SPIKE_SHARE * limit) & calm[:, None]
     return Torque(
@@ -636,11 +731,10 @@ def _spectrum(qpos: Array, dt: float) -> Array:
     moved = qpos[:, np.ptp(qpos, axis=0) > 0.02].astype(float)
     if not moved.size or len(moved) < 100:
         return np.full(len(SPECTRUM_HZ), np.nan)
-    v = np.diff(moved, axis=0)
-    power = np.log(np.abs(np.fft.rfft(v * np.hanning(len(v))[:, None], axis=0)) ** 2 + 1e-30).mean(
-        axis=1
-    )
-    smooth = np.convolve(power, np.ones(3) / 3, "same")
-    return np.where(
-        0.48 / dt > SPECTRUM_HZ, np.interp(SPECTRUM_HZ, np.fft.rfftfreq(len(v), dt), smooth), np.nan
-    )
+    changes = np.diff(moved, axis=0)
+    windowed = changes * np.hanning(len(changes))[:, None]
+    power = np.abs(np.fft.rfft(windowed, axis=0)) ** 2
+    log_power = np.log(power + 1e-30).mean(axis=1)
+    smooth = np.convolve(log_power, np.ones(3) / 3, "same")
+    levels = np.interp(SPECTRUM_HZ, np.fft.rfftfreq(len(changes), dt), smooth)
+    return np.where(0.48 / dt > SPECTRUM_HZ, levels, np.nan)

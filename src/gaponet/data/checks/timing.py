@@ -10,39 +10,48 @@ import numpy as np
 from gaponet.base.arrays import Array
 from gaponet.data.checks.check import Check
 from gaponet.data.checks.survey import SPECTRUM_HZ, Survey
-from gaponet.data.signals import FAST_COMMAND_RAD_S, SHIFTS_S, CommonResponse, Response
+from gaponet.data.signals import (
+    FAST_COMMAND_RAD_S,
+    SHIFT_STEP_S,
+    SHIFTS_S,
+    CommonResponse,
+    Response,
+)
 from gaponet.robot.finding import Finding, abbreviate
 from gaponet.robot.spec import RobotSpec
 
 MAX_ITERATIONS = 6  # of estimating shifts and the common response in turn
 MIN_RECORDINGS = 4  # from which one of them can be compared with the others
-# by which a recording follows later than the others; times their scatter
+# A late recording follows later than the others by all of these.
 MIN_SHIFT_S = 0.012
 SHIFT_SCATTERS = 4.0
-MIN_SHIFT_PERIODS = 0.75  # of the rows, by which it must follow later
+MIN_SHIFT_PERIODS = 0.75
 MIN_AGREEMENT = 0.5  # of such a shift that the delays of single joints must show
 # of the unevenness of rows: a command may be that late, and an interpolated state that early
 UNEVEN_ROWS_SHARE = 2.0
 MIN_LEAD_S = 0.015  # by which joints begin to move before their commands
 # unexplained motion without future commands over that with them, if joints move before them
 MIN_EARLY_RATIO = 1.08
-# of all joints; of one joint beyond the others
-MAX_DEAD_TIME_S = 0.1
-MAX_EXTRA_LAG_S = 0.05
-DEAD_TIMES = (  # up to s, verdict
-    (0.035, "as good as no dead time"), (MAX_DEAD_TIME_S, "usual for a bus, a servo's firmware "
-                                                          "and its inertia"),
-    (np.inf, "long; hobby servos have it: look for a buffer, a filter, or clocks of command and "
-             "state that are apart"),
-)  # fmt: skip
-# s/s; standard errors
-MIN_DRIFT = 3e-4
-MIN_DRIFT_ERRORS = 4.5
-# of the scatter that motions explain; recordings that show a drift
-MOTION_SHARE = 0.7
-MIN_DRIFT_DURATION_S = 10.0
+MAX_DEAD_TIME_S = 0.1  # of all joints
+MAX_EXTRA_LAG_S = 0.05  # of one joint, beyond the others
+WHY_LATE = "its channel is read late, filtered or from another bus, or it moves stiffly"
+# Up to so many s → what a dead time before joints begin to move is.
+VERDICTS = {
+    0.035: "as good as no dead time",
+    MAX_DEAD_TIME_S: "usual for a bus, a servo's firmware and its inertia",
+    np.inf: "long; hobby servos have it: look for a buffer, a filter, or clocks of command and "
+    "state that are apart",
+}
+MIN_DRIFT = 3e-4  # of a clock, s/s
+MIN_DRIFT_ERRORS = 4.5  # standard errors by which a drift, or a lead, is no chance
+MOTION_SHARE = 0.7  # of the scatter of slopes that motions explain
+MIN_DRIFT_DURATION_S = 10.0  # of a recording; in shorter ones friction changes the shift
 MIN_NOTCH_DEPTH = 1.5  # natural logarithm of power
 AVERAGING_WIDTHS_S = np.geomspace(0.04, 0.4, 150)
+MAX_NOTCHES = 4  # of a moving average that are looked at, the lowest frequencies first
+NOTCH_HZ = 0.11  # half the width in which a notch is looked for, at least
+NOTCH_SHARE = 0.012  # of its frequency, the same
+SIDES = (-0.35, 0.35)  # between two notches, where levels are compared with theirs
 
 
 def _timing(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
@@ -51,20 +60,18 @@ def _timing(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     if not surveys:
         yield Finding("ok", "timing", "a command that repeats the state shows no clocks")
         return
-    step = Counter(survey.tracking.response.step for survey in surveys).most_common(1)[0][0]
+    steps = Counter(survey.tracking.response.step for survey in surveys)
+    step = max(steps, key=lambda one: steps[one])  # s
     comparable = [survey for survey in surveys if survey.tracking.response.step == step]
     # Across a gap states are interpolated: they begin to move before anything was measured.
     complete = [survey for survey in comparable if not survey.timing.missing_samples] or comparable
-    unknown = max(survey.timing.uneven_ms for survey in complete) * UNEVEN_ROWS_SHARE / 1e3  # s
+    uneven_ms = max(survey.timing.uneven_ms for survey in complete)
+    unknown = uneven_ms * UNEVEN_ROWS_SHARE / 1e3  # s
     findings = [*_late_recordings(comparable, unknown)]
     common = _common_response(complete, findings)
     onset = _usual_onset(common)
     if _moves_early(common, onset, unknown, step):
-        text = (
-            f"joints begin to move {-onset * 1e3:.0f} ms before their commands: are command and "
-            "state swapped, or are their clocks apart? Shift one of them at import"
-        )
-        findings.append(Finding("error", "copied", text, (), {"onset_s": onset}))
+        findings.append(_early(onset))
     elif np.isfinite(onset):
         yield _dead_time(onset)
     findings += _late_joints(common, onset, robot)
@@ -107,11 +114,24 @@ def _moves_early(common: CommonResponse, onset: float, unknown: float, step: flo
     return surely or onset < -unknown - max(MIN_LEAD_S / 3, step, error)
 
 
+def _early(onset: float) -> Finding:
+    text = (
+        f"joints begin to move {-onset * 1e3:.0f} ms before their commands: are command and "
+        "state swapped, or are their clocks apart? Shift one of them at import"
+    )
+    return Finding("error", "copied", text, (), {"onset_s": onset})
+
+
 def _dead_time(onset: float) -> Finding:
-    verdict = next(words for limit, words in DEAD_TIMES if onset <= limit)
+    verdict = verdict_on(onset, VERDICTS)
     text = f"joints begin to move {max(onset, 0) * 1e3:.0f} ms after their commands: {verdict}"
     level = "warning" if onset > MAX_DEAD_TIME_S else "ok"
     return Finding(level, "lag", text, (), {"onset_s": onset})
+
+
+def verdict_on(seconds: float, verdicts: dict[float, str]) -> str:
+    """Return what a time is. verdicts: up to so many s → what it is, ascending."""
+    return next(words for limit, words in verdicts.items() if seconds <= limit)
 
 
 def _late_joints(common: CommonResponse, onset: float, robot: RobotSpec) -> Iterator[Finding]:
@@ -121,9 +141,8 @@ def _late_joints(common: CommonResponse, onset: float, robot: RobotSpec) -> Iter
     for name, extra in zip(robot.operated, common.onset - onset, strict=True):
         if extra > MAX_EXTRA_LAG_S:
             text = (
-                f"{name} begins to move {extra * 1e3:.0f} ms later than the other joints: its "
-                "channel is read late, filtered or from another bus, or it moves stiffly; shift "
-                "it at import if the time of reading is known"
+                f"{name} begins to move {extra * 1e3:.0f} ms later than the other joints: "
+                f"{WHY_LATE}; shift it at import if the time of reading is known"
             )
             yield Finding("warning", "lag", text, (name,), {"extra_s": float(extra)})
 
@@ -150,7 +169,10 @@ def _standard_error(deviations: Array) -> float:
     count.
     """
     known = np.abs(deviations[np.isfinite(deviations)])
-    return 1.48 * float(np.median(known)) / np.sqrt(len(known)) if len(known) else np.inf
+    if not len(known):
+        return np.inf
+    scatter = 1.48 * float(np.median(known))  # standard deviation, of a normal distribution
+    return float(scatter / np.sqrt(len(known)))
 
 
 def _shifts(responses: list[Response]) -> Array:
@@ -175,12 +197,17 @@ def _shifts(responses: list[Response]) -> Array:
 
 
 def _late_recordings(surveys: list[Survey], unknown: float) -> Iterator[Finding]:
-    shifts = _shifts([one.tracking.response for one in surveys])
+    """Find recordings that follow their commands later, or sooner, than the others.
+
+    Args:
+        unknown: Time that uneven rows leave open, s.
+    """
+    shifts = _shifts([survey.tracking.response for survey in surveys])
     if np.isfinite(shifts).sum() < MIN_RECORDINGS:
         return
     shifts = shifts - np.nanmedian(shifts)
     scatter = max(1.48 * float(np.nanmedian(np.abs(shifts))), 1e-3)
-    period = float(np.median([1 / one.timing.rate_hz for one in surveys]))
+    period = float(np.median([1 / survey.timing.rate_hz for survey in surveys]))
     limit = max(MIN_SHIFT_S, SHIFT_SCATTERS * scatter, unknown, MIN_SHIFT_PERIODS * period)
     delays = _relative_delays(surveys)
     far: list[tuple[Survey, float]] = []
@@ -188,8 +215,8 @@ def _late_recordings(surveys: list[Survey], unknown: float) -> Iterator[Finding]
         fast = max(survey.tracking.speed) >= FAST_COMMAND_RAD_S  # stiction delays slow motions
         if abs(late) > limit and fast and _agree(late, delay):
             far.append((survey, late))
-    yield from _shifted("later", [(one, late) for one, late in far if late > 0])
-    yield from _shifted("sooner", [(one, late) for one, late in far if late < 0])
+    yield from _shifted("later", [(survey, late) for survey, late in far if late > 0])
+    yield from _shifted("sooner", [(survey, late) for survey, late in far if late < 0])
 
 
 def _shifted(word: str, group: list[tuple[Survey, float]]) -> Iterator[Finding]:
@@ -252,30 +279,36 @@ def _agree(late: float, delay: float) -> bool:
 
 
 def clock_drift(surveys: list[Survey], shifts: Array, unknown: float = 0.0) -> Iterator[Finding]:
-    """Find a clock drift from the shifts (recordings, parts) s of the parts of each recording."""
+    """Find a drift between the clocks of command and state.
+
+    Args:
+        shifts: Of the parts of each recording, (recordings, parts) s.
+        unknown: Time that uneven rows leave open, s.
+    """
     duration = np.array([survey.tracking.response.duration for survey in surveys])
-    long = duration >= MIN_DRIFT_DURATION_S  # in shorter recordings friction changes the shift
-    between = duration[long] * (1 - 1 / shifts.shape[1])
+    long = duration >= MIN_DRIFT_DURATION_S
+    between = duration[long] * (1 - 1 / shifts.shape[1])  # from the first part to the last, s
     first = shifts[long, 0]
     middle = shifts[long, 1:-1].mean(axis=1)
     last = shifts[long, -1]
+    # Of each recording, s/s. A drift has a slope and no curvature; scaled so that independent
+    # errors of the parts scatter both alike, curvature shows the scatter of slopes.
     slope = (last - first) / between
     curvature = (last + first - 2 * middle) / between / np.sqrt(3)
-    # a drift has no curvature
     slope = slope[np.isfinite(slope)]
     curvature = curvature[np.isfinite(curvature)]
     if len(slope) < MIN_RECORDINGS:
         return
     drift = float(np.median(slope))
-    resolution = 2e-3 / float(between.max()) / np.sqrt(len(slope))
-    error = max(
-        MOTION_SHARE * _standard_error(slope - drift), _standard_error(curvature), resolution
-    )
-    if abs(drift) > max(MIN_DRIFT, MIN_DRIFT_ERRORS * error, unknown / float(between.max())):
+    longest = float(between.max())
+    resolution = SHIFT_STEP_S / longest / np.sqrt(len(slope))
+    scatter = MOTION_SHARE * _standard_error(slope - drift)
+    error = max(scatter, _standard_error(curvature), resolution)
+    if abs(drift) > max(MIN_DRIFT, MIN_DRIFT_ERRORS * error, unknown / longest):
+        word = "later" if drift > 0 else "sooner"
         text = (
-            f"to its end each recording follows its commands {'later' if drift > 0 else 'sooner'} "
-            f"({abs(drift) * 1e6:.0f} ± {error * 1e6:.0f} ppm): the clocks of both drift apart; "
-            "log them with one"
+            f"to its end each recording follows its commands {word} ({abs(drift) * 1e6:.0f} ± "
+            f"{error * 1e6:.0f} ppm): the clocks of both drift apart; log them with one"
         )
         yield Finding("error", "clock", text, (), {"drift": drift})
 
@@ -284,21 +317,30 @@ def _averaging(levels: Array, widths: Array = AVERAGING_WIDTHS_S) -> tuple[float
     """Return the width, s, of the moving average that best explains notches in a spectrum (H), and
     their depth.
     """
-    best = (0.0, 0.0)
     known = SPECTRUM_HZ[np.isfinite(levels)]
+    best_width = 0.0
+    best_depth = 0.0
     if not len(known):
-        return best
+        return best_width, best_depth
     for width in widths:
         depths = []
-        for k in range(1, 5):
+        for k in range(1, MAX_NOTCHES + 1):
             if (k + 0.4) / width > known[-1]:
                 break
-            notch = levels[np.abs(SPECTRUM_HZ - k / width) < max(0.11, 0.012 * k / width)].min()
-            sides = np.interp([(k - 0.35) / width, (k + 0.35) / width], SPECTRUM_HZ, levels)
-            depths.append(sides.mean() - notch)
-        if depths and min(depths) > best[1]:
-            best = (float(width), float(min(depths)))
-    return best
+            depths.append(_notch_depth(levels, width, k))
+        if depths and min(depths) > best_depth:
+            best_width = float(width)
+            best_depth = min(depths)
+    return best_width, best_depth
+
+
+def _notch_depth(levels: Array, width: float, k: int) -> float:
+    """Return how far a spectrum (H) falls at the k-th zero, k / width, of a moving average."""
+    notch_hz = k / width
+    near = np.abs(SPECTRUM_HZ - notch_hz) < max(NOTCH_HZ, NOTCH_SHARE * k / width)
+    sides_hz = [(k + side) / width for side in SIDES]
+    sides = np.interp(sides_hz, SPECTRUM_HZ, levels)
+    return float(sides.mean() - levels[near].min())
 
 
 CHECKS = (Check(_timing, "timing", "", may_be_error=True, needs_commands=True),)

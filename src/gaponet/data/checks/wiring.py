@@ -11,32 +11,43 @@ import numpy as np
 from gaponet.base.arrays import Array
 from gaponet.data.checks.check import Check
 from gaponet.data.checks.survey import Survey, Tracking
-from gaponet.robot.finding import Finding, abbreviate
+from gaponet.robot.finding import Finding, abbreviate, masked_names
 from gaponet.robot.spec import RobotSpec
 
 MIN_COMMAND_RAD = 0.05  # a joint with a smaller command range shows neither order, sign nor unit
-# a loaded joint falls short of its command, or passes it if its load is on top
+MAX_REST_RAD = 0.02  # command range of a joint that was not told to move
+# Slope of the state over the command: a loaded joint falls short of its command, or passes it if
+# its load is on top. Below the least slope of a scale, a joint is stuck or has another unit.
 SLOPE_BOUNDS = (0.5, 1.25)
-# of a swap that shows in several motions
+MIN_SCALE_SLOPE = 0.1
+# Correlations of commanded with measured velocities, in one motion:
+MAX_UNRELATED = 0.3  # of a joint that does not follow a command
+MIN_RELATED = 0.6  # of one that does
+# and in several motions, where a swap shows more surely:
+MIN_MOTIONS = 3
 MAX_OWN_CORRELATION = 0.8
 MIN_OTHER_CORRELATION = 0.95
-# of motion against the command, also where motion along it shows; by which it must be greater
+# Motion against the command counts, also where motion along it shows, if it correlates so much, and
+# by the margin more.
 MIN_OPPOSITION = 0.9
 MIN_OPPOSITION_MARGIN = 0.1
-MIN_MOTIONS = 3
 MAX_DISTANCE = 0.7  # of positions from position commands, in standard deviations of the positions
 MIN_KIND_CORRELATION = 0.7  # of the command with what else it may be
 # correlation of velocities, from which commands are positions that a weak motor does not reach
 MIN_FOLLOWING = 0.75
 # measured over commanded range; between 0.03 and 0.1 a joint may be stuck
 RATIO_BOUNDS = (0.03, 10.0)
-QVEL_RATIO_BOUNDS = (0.5, 2.0)
+QVEL_RATIO_BOUNDS = (0.5, 2.0)  # recorded velocity over the derivative of the position
+MIN_ENCODER_STEPS = 20  # that a joint passes whose velocity is judged
 MIN_WIDEST_COMMAND_RAD = 0.12
 MAX_READ_AS_DEGREES_RAD = np.radians(3.3)
+MAX_COMMANDED_BEYOND_RAD = 0.01  # of a joint's range
+MAX_MEASURED_BEYOND_RAD = 0.05
 
 
 def _moved(surveys: list[Survey], joint: int) -> list[Survey]:
-    return [s for s in surveys if s.ctrl_range[joint] > MIN_COMMAND_RAD]
+    """Return the recordings in which a joint is commanded to move."""
+    return [survey for survey in surveys if survey.ctrl_range[joint] > MIN_COMMAND_RAD]
 
 
 def _follow_small_commands(survey: Survey) -> Array:
@@ -44,30 +55,18 @@ def _follow_small_commands(survey: Survey) -> Array:
     units, (n).
     """
     follow = np.diag(survey.tracking.follows) > MIN_FOLLOWING
-    return follow & (
-        survey.qpos_range > np.maximum(MIN_COMMAND_RAD, RATIO_BOUNDS[1] * survey.ctrl_range)
-    )
+    far = np.maximum(MIN_COMMAND_RAD, RATIO_BOUNDS[1] * survey.ctrl_range)
+    return np.asarray(follow & (survey.qpos_range > far))
 
 
 def _order(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     """Does each command move its own joint?"""
-    candidates: dict[tuple[int, int], list[float]] = defaultdict(list)
-    motions = np.zeros(len(robot.joint_names), int)
-    for s in surveys:
-        moved = s.ctrl_range > MIN_COMMAND_RAD
-        motions += moved | _follow_small_commands(s)
-        follows = s.tracking.follows
-        itself = np.diag(follows)
-        for i in np.flatnonzero(moved & (itself < 0.3) & (np.diag(s.tracking.opposes) < 0.6)):
-            others = np.flatnonzero(
-                (follows[i] > 0.6) & ((s.ctrl_range < 0.02) | (follows[:, i] > 0.6).any())
-            )
-            if others.size:
-                j = int(others[follows[i, others].argmax()])
-                candidates[int(i), j].append(float(follows[i, j]))
-    candidates |= _swapped_pairs(surveys, motions)
+    motions = np.zeros(len(robot.joint_names), int)  # that command each joint, (n)
+    for survey in surveys:
+        motions += (survey.ctrl_range > MIN_COMMAND_RAD) | _follow_small_commands(survey)
+    moves_another = _swapped_in_one_motion(surveys) | _swapped_pairs(surveys, motions)
     swapped = False
-    for (own, other), correlations in candidates.items():
+    for (own, other), correlations in moves_another.items():
         if 2 * len(correlations) < motions[own]:
             continue
         swapped = True
@@ -80,41 +79,69 @@ def _order(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
             f'columns in logs.toml ([columns] "ctrl.{b}" = "what is ctrl.{a} now") and import again'
         )
         yield Finding("error", "order", text, (a, b))
-    idle = tuple(name for name, count in zip(robot.joint_names, motions, strict=True) if not count)
-    if idle:
-        level = "warning" if set(idle) & set(robot.operated) else "note"
-        text = f"no motion commands {abbreviate(list(idle))} over more than {MIN_COMMAND_RAD:g} rad"
-        if set(idle) & set(_read_as_degrees(surveys)):
-            text += ", read as degrees; were they logged in rad?"
-        yield Finding(level, "order", f"{text}: nothing can be learned there", idle)
+    yield from _never_commanded(surveys, robot, motions)
     if not swapped:
         yield Finding("ok", "order", "each command moves the joint of its name")
 
 
-def _swapped_pairs(surveys: list[Survey], motions: Array) -> dict[tuple[int, int], list[float]]:
+# indices of a command and of the joint that it moves → correlations, one per motion
+_Swaps = dict[tuple[int, int], list[float]]
+
+
+def _swapped_in_one_motion(surveys: list[Survey]) -> _Swaps:
+    """Return commands that move another joint than their own, by each motion for itself."""
+    swaps: _Swaps = defaultdict(list)
+    for survey in surveys:
+        follows = survey.tracking.follows  # (n, n)
+        unrelated = np.diag(follows) < MAX_UNRELATED
+        unrelated &= np.diag(survey.tracking.opposes) < MIN_RELATED
+        at_rest = survey.ctrl_range < MAX_REST_RAD
+        for i in np.flatnonzero((survey.ctrl_range > MIN_COMMAND_RAD) & unrelated):
+            # the other joint was not told to move, or another command moves this one
+            explained = at_rest | (follows[:, i] > MIN_RELATED).any()
+            others = np.flatnonzero((follows[i] > MIN_RELATED) & explained)
+            if others.size:
+                j = int(others[follows[i, others].argmax()])
+                swaps[int(i), j].append(float(follows[i, j]))
+    return swaps
+
+
+def _never_commanded(surveys: list[Survey], robot: RobotSpec, motions: Array) -> Iterator[Finding]:
+    """Report joints that no motion commands. motions: that command each joint, (n)."""
+    idle = masked_names(robot, motions == 0)
+    if not idle:
+        return
+    level = "warning" if set(idle) & set(robot.operated) else "note"
+    text = f"no motion commands {abbreviate(list(idle))} over more than {MIN_COMMAND_RAD:g} rad"
+    if set(idle) & set(_read_as_degrees(surveys)):
+        text += ", read as degrees; were they logged in rad?"
+    yield Finding(level, "order", f"{text}: nothing can be learned there", idle)
+
+
+def _swapped_pairs(surveys: list[Survey], motions: Array) -> _Swaps:
     """Return swapped joints over several motions; in one motion, joints that move together look
     alike.
     """
-    follows = np.array([s.tracking.follows for s in surveys])  # (sequences, n, n)
-    own = np.median(np.diagonal(follows, axis1=1, axis2=2), axis=0)
-    cross = np.median(follows, axis=0)
-    pairs = {}
-    for i in np.flatnonzero((motions >= MIN_MOTIONS) & (own < MAX_OWN_CORRELATION)):
+    follows = np.array([survey.tracking.follows for survey in surveys])  # (sequences, n, n)
+    own = np.median(np.diagonal(follows, axis1=1, axis2=2), axis=0)  # (n)
+    cross = np.median(follows, axis=0)  # (n, n)
+    candidates = (motions >= MIN_MOTIONS) & (own < MAX_OWN_CORRELATION)
+    swaps: _Swaps = {}
+    for i in np.flatnonzero(candidates):
         j = int(cross[i].argmax())
-        if (
-            j != i
-            and min(cross[i, j], cross[j, i]) > MIN_OTHER_CORRELATION
-            and own[j] < MAX_OWN_CORRELATION
-        ):
-            pairs[int(i), j] = follows[follows[:, i, j] > MIN_OTHER_CORRELATION, i, j].tolist()
-    return pairs
+        both_ways = min(cross[i, j], cross[j, i])
+        if j == i or own[j] >= MAX_OWN_CORRELATION or both_ways <= MIN_OTHER_CORRELATION:
+            continue
+        of_motions = follows[:, i, j]
+        swaps[int(i), j] = of_motions[of_motions > MIN_OTHER_CORRELATION].tolist()
+    return swaps
 
 
 def _command(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     """Are the commands positions?"""
     operated = robot.operated_index
-    distance = np.stack([s.kind.distance for s in surveys])[:, operated]
-    spans = np.stack([s.ctrl_range for s in surveys])[:, operated]
+    distance = np.stack([survey.kind.distance for survey in surveys])[:, operated]
+    spans = np.stack([survey.ctrl_range for survey in surveys])[:, operated]
     judged = np.isfinite(distance) & (spans > 0)  # (sequences, operated)
     if not judged.any() or float(np.median(distance[judged])) < MAX_DISTANCE:
         return
@@ -123,15 +150,16 @@ def _command(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
         return float(np.median(np.stack(by_sequence)[:, operated][judged]))
 
     correlation = {
-        "velocities": median([s.kind.velocity_correlation for s in surveys]),
-        "torques": median([s.kind.torque_correlation for s in surveys]),
+        "velocities": median([survey.kind.velocity_correlation for survey in surveys]),
+        "torques": median([survey.kind.torque_correlation for survey in surveys]),
     }
+    following = median([np.diag(survey.tracking.follows) for survey in surveys])
     text = (
         f"states are {np.median(distance[judged]):.2f} times as far from their commands as from "
         "their own mean"
     )
     alike = max(np.nan_to_num(list(correlation.values()))) >= MIN_KIND_CORRELATION
-    if not alike and median([np.diag(s.tracking.follows) for s in surveys]) > MIN_FOLLOWING:
+    if not alike and following > MIN_FOLLOWING:
         text += (
             ", though they move with them: motors too weak for their load, or a wrong kp; check "
             "payload and kp"
@@ -177,7 +205,7 @@ def _opposes(tracking: Tracking, i: int) -> bool:
     """
     against = float(tracking.opposes[i, i])
     along = float(tracking.follows[i, i])
-    if against > 0.6 and along < 0.3:
+    if against > MIN_RELATED and along < MAX_UNRELATED:
         return True
     return against > MIN_OPPOSITION and against - along > MIN_OPPOSITION_MARGIN
 
@@ -236,10 +264,11 @@ def _copies(surveys: list[Survey], robot: RobotSpec) -> dict[int, dict[str, list
     """Return where a state repeats its command: rows between both → joint → motions."""
     copies: dict[int, dict[str, list[str]]] = {}
     for i, name in enumerate(robot.joint_names):
-        for s in _moved(surveys, i):
-            if np.isfinite(s.tracking.copied_rows[i]):
-                motions = copies.setdefault(round(float(s.tracking.copied_rows[i])), {})
-                motions.setdefault(name, []).append(s.motion)
+        for survey in _moved(surveys, i):
+            rows = float(survey.tracking.copied_rows[i])
+            if np.isfinite(rows):
+                motions_of = copies.setdefault(round(rows), {})
+                motions_of.setdefault(name, []).append(survey.motion)
     return copies
 
 
@@ -325,7 +354,7 @@ def _scale(surveys: list[Survey], i: int, name: str) -> Iterator[Finding]:
     """Does joint i go 1 rad where its command goes 1 rad?"""
     slopes = [s.tracking.slope[i] for s in surveys]
     slope = _median_or_one([one for one in slopes if np.isfinite(one)])
-    if slope > SLOPE_BOUNDS[1] or 0.1 < slope < SLOPE_BOUNDS[0]:
+    if slope > SLOPE_BOUNDS[1] or MIN_SCALE_SLOPE < slope < SLOPE_BOUNDS[0]:
         text = (
             f"{name} goes {slope:.2f} rad where its command goes 1 rad: another scale (a "
             "gear, a range, ticks a turn), or a motor that does not reach its targets; check "
@@ -337,9 +366,10 @@ def _scale(surveys: list[Survey], i: int, name: str) -> Iterator[Finding]:
 def _velocity_unit(surveys: list[Survey], i: int, name: str) -> Iterator[Finding]:
     """Is the recorded velocity of joint i the derivative of its position?"""
     ratios = []
-    for s in surveys:
-        ratio = s.encoders.qvel_ratio[i]
-        if np.isfinite(ratio) and s.qpos_range[i] > 20 * s.encoders.resolution[i]:
+    for survey in surveys:
+        ratio = survey.encoders.qvel_ratio[i]
+        least_range = MIN_ENCODER_STEPS * survey.encoders.resolution[i]
+        if np.isfinite(ratio) and survey.qpos_range[i] > least_range:
             ratios.append(ratio)
     ratio = _median_or_one(ratios)
     if not QVEL_RATIO_BOUNDS[0] < ratio < QVEL_RATIO_BOUNDS[1]:
@@ -396,35 +426,55 @@ def _converted(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
 
 def _limits(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     """Do commands and positions stay in the joint ranges of the MJCF?"""
-    for i, name in enumerate(robot.joint_names):
-        low, high = robot.qpos_range[i]
-        for kind, level, tolerance, limits in (
-            ("commanded", "warning", 0.01, [s.ctrl_limits[i] for s in surveys]),
-            ("measured", "note", 0.05, [s.qpos_limits[i] for s in surveys]),
-        ):
-            beyond = np.array([max(low - a, b - high) for a, b in limits])
-            if (beyond > tolerance).any():
-                clips = ", and the simulator clips there" if kind == "commanded" else ""
-                text = (
-                    f"{name} is {kind} up to {beyond.max():.3f} rad beyond [{low:.2f}, "
-                    f"{high:.2f}] in {(beyond > tolerance).sum()} sequence(s), worst "
-                    f"{surveys[int(beyond.argmax())].motion}{clips}: check its zero, or its range "
-                    "in robot.xml"
-                )
-                yield Finding(level, "range", text, (name,), {"beyond_rad": float(beyond.max())})
+    for i in range(len(robot.joint_names)):
+        ctrl = np.array([survey.ctrl_limits[i] for survey in surveys])
+        qpos = np.array([survey.qpos_limits[i] for survey in surveys])
+        yield from _beyond_range(surveys, robot, i, "commanded", ctrl)
+        yield from _beyond_range(surveys, robot, i, "measured", qpos)
+
+
+def _beyond_range(
+    surveys: list[Survey], robot: RobotSpec, i: int, kind: str, limits: Array
+) -> Iterator[Finding]:
+    """Report positions of joint i beyond its range.
+
+    Args:
+        kind: commanded or measured.
+        limits: The least and the greatest of each sequence, (sequences, 2) rad.
+    """
+    level = "note"
+    tolerance = MAX_MEASURED_BEYOND_RAD
+    clips = ""
+    if kind == "commanded":
+        level = "warning"
+        tolerance = MAX_COMMANDED_BEYOND_RAD
+        clips = ", and the simulator clips there"
+    name = robot.joint_names[i]
+    low, high = robot.qpos_range[i]
+    beyond = np.maximum(low - limits[:, 0], limits[:, 1] - high)  # (sequences) rad
+    if not (beyond > tolerance).any():
+        return
+    worst = surveys[int(beyond.argmax())].motion
+    text = (
+        f"{name} is {kind} up to {beyond.max():.3f} rad beyond [{low:.2f}, {high:.2f}] in "
+        f"{(beyond > tolerance).sum()} sequence(s), worst {worst}{clips}: check its zero, or its "
+        "range in robot.xml"
+    )
+    yield Finding(level, "range", text, (name,), {"beyond_rad": float(beyond.max())})
 
 
 def _labels(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     """Is one recording filed under two payloads or units, and were all made with the same gains?"""
-    if (kinds := len({(s.entry.meta.kp, s.entry.meta.kd) for s in surveys})) > 1:
+    gains = {(survey.entry.meta.kp, survey.entry.meta.kd) for survey in surveys}
+    if len(gains) > 1:
         text = (
-            f"{kinds} sets of kp and kd while recording: each recording is simulated with its "
-            "own; is that meant?"
+            f"{len(gains)} sets of kp and kd while recording: each recording is simulated with "
+            "its own; is that meant?"
         )
         yield Finding("note", "labels", text)
     ids: dict[str, list[str]] = defaultdict(list)
-    for s in surveys:
-        ids[s.content].append(s.entry.id)
+    for survey in surveys:
+        ids[survey.content].append(survey.entry.id)
     for same in ids.values():
         if len(same) > 1:
             text = f"same samples under different labels: {', '.join(same)}; remove the wrong one"
