@@ -19,6 +19,7 @@ from gaponet.data.checks.static_checks import feedforward, static_checks
 from gaponet.data.checks.survey import Survey, survey_all
 from gaponet.data.checks.wiring import driven_by_torque
 from gaponet.data.offsets import Dynamics, Gravity
+from gaponet.data.static_poses import StaticError
 from gaponet.data.store import Dataset
 from gaponet.robot.finding import LEVELS, Finding
 from gaponet.robot.spec import RobotSpec
@@ -44,15 +45,16 @@ class DoctorResult:
     @property
     def verdict(self) -> str:
         """The result in one sentence."""
-        count = {level: self.count(level) for level in ("error", "warning")}
-        texts = [f"{n} {level}{'s' * (n > 1)}" for level, n in count.items() if n]
-        if count["error"]:
-            return f"Do not train on this yet: {' and '.join(texts)}."
-        return (
-            f"Usable. Read the {texts[0].removeprefix('1 ')} first."
-            if texts
-            else "Good: no error and no warning."
-        )
+        errors = self.count("error")
+        warnings = self.count("warning")
+        if errors and warnings:
+            problems = f"{_counted(errors, 'error')} and {_counted(warnings, 'warning')}"
+            return f"Do not train on this yet: {problems}."
+        if errors:
+            return f"Do not train on this yet: {_counted(errors, 'error')}."
+        if warnings:
+            return f"Usable. Read the {_counted(warnings, 'warning').removeprefix('1 ')} first."
+        return "Good: no error and no warning."
 
     def to_dict(self) -> dict[str, Any]:
         """Return the result as plain data."""
@@ -135,12 +137,18 @@ def _examine_loads(
     return result
 
 
+def _counted(count: int, word: str) -> str:
+    return f"1 {word}" if count == 1 else f"{count} {word}s"
+
+
 def _warns(findings: list[Finding]) -> bool:
     return any(finding.level == "warning" for finding in findings)
 
 
 def _sequence_row(survey: Survey, robot: RobotSpec) -> dict[str, Any]:
-    lags = {name: round(x[0], 4) for name, x in fast_lags([survey], robot).items()}
+    lags = {}  # joint → its lag, s
+    for name, (lag,) in fast_lags([survey], robot).items():
+        lags[name] = round(lag, 4)
     meta = survey.entry.meta
     return {
         "motion": meta.motion,
@@ -165,18 +173,27 @@ def _joint_rows(surveys: list[Survey], robot: RobotSpec) -> list[dict[str, Any]]
     torques = [survey.torque for survey in surveys if survey.torque]
     rows = []
     for i, name in enumerate(robot.joint_names):
-        error = errors.get(name)
-        rows.append(
-            {
-                "joint": name,
-                "operated": name in robot.operated,
-                "commanded_rad": [float(ctrl[:, i, 0].min()), float(ctrl[:, i, 1].max())],
-                "measured_rad": [float(qpos[:, i, 0].min()), float(qpos[:, i, 1].max())],
-                "lag_s": lag_values(lags[name]) if name in lags else None,
-                "static_error_rad": error.middle if error and np.isfinite(error.middle) else None,
-                "stiction_band_rad": error.half_band if error and error.balanced else None,
-                "rests": error.up + error.down if error else 0,
-                "torque_spikes": sum(int(torque.spikes[i]) for torque in torques),
-            }
-        )
+        row = {
+            "joint": name,
+            "operated": name in robot.operated,
+            "commanded_rad": [float(ctrl[:, i, 0].min()), float(ctrl[:, i, 1].max())],
+            "measured_rad": [float(qpos[:, i, 0].min()), float(qpos[:, i, 1].max())],
+            "lag_s": lag_values(lags[name]) if name in lags else None,
+            **_static_values(errors.get(name)),
+            "torque_spikes": sum(int(torque.spikes[i]) for torque in torques),
+        }
+        rows.append(row)
     return rows
+
+
+def _static_values(error: StaticError | None) -> dict[str, Any]:
+    """Return static error and stiction of a joint, as far as they are known."""
+    values: dict[str, Any] = {"static_error_rad": None, "stiction_band_rad": None, "rests": 0}
+    if error is None:
+        return values
+    values["rests"] = error.up + error.down
+    if np.isfinite(error.middle):
+        values["static_error_rad"] = error.middle
+    if error.balanced:
+        values["stiction_band_rad"] = error.half_band
+    return values

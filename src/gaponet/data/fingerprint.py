@@ -23,10 +23,10 @@ ROW_RESOLUTION_RAD = 1e-5  # rows that differ by less are equal
 # of the sampled rows; one common resting place is not enough
 MIN_SHARED_ROWS = 2
 MIN_SHARED_SHARE = 0.3
-# shares of the outline's range and of the duration
-MAX_OUTLINE_DIFFERENCE = 0.004
-MAX_DURATION_DIFFERENCE = 0.01
+MAX_OUTLINE_DIFFERENCE = 0.004  # of the outline's range
+MAX_DURATION_DIFFERENCE = 0.01  # of the duration
 MAX_START_SHIFT = 0.1  # outline points by which one command may begin later
+HASH_FACTOR = np.uint64(0x9E3779B97F4A7C15)  # 2⁶⁴ over the golden ratio: spreads the upper bits
 OUTLIERS = 2  # outline points that may differ by more: a step is a row early or late
 
 
@@ -50,9 +50,8 @@ def fingerprint(ctrl: Array, dt: float) -> CommandFingerprint:
     steps = np.round(np.asarray(ctrl, float) / ROW_RESOLUTION_RAD).astype(np.int64)
     rng = np.random.default_rng(0)
     weights = rng.integers(1, 2**62, ctrl.shape[1], dtype=np.int64) | 1
-    hashes = (
-        (steps * weights).sum(axis=1).astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15)
-    ) >> np.uint64(32)
+    sums = (steps * weights).sum(axis=1).astype(np.uint64)
+    hashes = (sums * HASH_FACTOR) >> np.uint64(32)  # (T) 32 bits
     distinct = hashes[hashes != hashes[0]]
     changed = np.flatnonzero((steps[1:] != steps[:-1]).any(axis=1))
     first = 0
@@ -79,14 +78,14 @@ def equal_commands(fingerprints: Sequence[CommandFingerprint]) -> list[tuple[int
     for i in np.flatnonzero(ranges > 0):
         longer = np.abs(seconds[i + 1 :] - seconds[i])
         others = i + 1 + np.flatnonzero(longer <= MAX_DURATION_DIFFERENCE * seconds[i])
-        difference = outlines[others] - outlines[i]
+        difference = outlines[others] - outlines[i]  # (others, OUTLINE_POINTS)
         slope = slopes[i]
-        shift = np.clip(
-            difference @ slope / max(slope @ slope, 1e-12), -MAX_START_SHIFT, MAX_START_SHIFT
-        )
+        fitted = difference @ slope / max(slope @ slope, 1e-12)  # least squares, points
+        shift = np.clip(fitted, -MAX_START_SHIFT, MAX_START_SHIFT)
         residual = np.abs(difference - shift[:, None] * slope)
         worst = np.partition(residual, -1 - OUTLIERS, axis=1)[:, -1 - OUTLIERS]
-        pairs |= {(int(i), int(j)) for j in others[worst <= MAX_OUTLINE_DIFFERENCE * ranges[i]]}
+        equal = others[worst <= MAX_OUTLINE_DIFFERENCE * ranges[i]]
+        pairs.update((int(i), int(j)) for j in equal)
     return sorted(pairs)
 
 
@@ -94,7 +93,8 @@ def _pairs_with_shared_rows(samples: list[set[int]]) -> Iterator[tuple[int, int]
     """Yield pairs that share enough of the least row hashes of both."""
     from scipy.sparse import csr_matrix
 
-    index = {row: k for k, row in enumerate(sorted(set().union(*samples)))}
+    different = sorted(set().union(*samples))
+    index = {row: k for k, row in enumerate(different)}
     owners: list[int] = []
     columns: list[int] = []
     for i, sample in enumerate(samples):
@@ -102,11 +102,16 @@ def _pairs_with_shared_rows(samples: list[set[int]]) -> Iterator[tuple[int, int]
         columns += [index[row] for row in sample]
     ones = np.ones(len(columns), np.int32)
     contains = csr_matrix((ones, (owners, columns)), (len(samples), len(index)))
-    common = (contains @ contains.T).tocoo()
-    for i, j, n in zip(common.row.tolist(), common.col.tolist(), common.data.tolist(), strict=True):
-        a = samples[i]
-        b = samples[j]
-        if i < j and (a == b or n >= max(MIN_SHARED_ROWS, MIN_SHARED_SHARE * min(len(a), len(b)))):
-            least = set(sorted(a | b)[: min(len(a), len(b))])
-            if len(a & b & least) >= MIN_SHARED_SHARE * len(least):
-                yield i, j
+    common = (contains @ contains.T).tocoo()  # number of hashes that two samples share
+    for i, j in zip(common.row.tolist(), common.col.tolist(), strict=True):
+        if i < j and _share_enough(samples[i], samples[j]):
+            yield i, j
+
+
+def _share_enough(one: set[int], other: set[int]) -> bool:
+    """Return True if two samples have many of their least hashes in common."""
+    size = min(len(one), len(other))
+    if one != other and len(one & other) < max(MIN_SHARED_ROWS, MIN_SHARED_SHARE * size):
+        return False
+    least = set(sorted(one | other)[:size])
+    return len(one & other & least) >= MIN_SHARED_SHARE * len(least)

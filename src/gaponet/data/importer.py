@@ -8,7 +8,7 @@ from __future__ import annotations
 import hashlib
 import os
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -29,9 +29,9 @@ from gaponet.data.static_poses import StaticPoses
 from gaponet.data.store import KIND, Dataset, Entry
 from gaponet.robot.spec import RobotSpec
 
-# of samples that are held between checking and writing; a larger source is read twice
+# Of the samples that are held between checking and writing; a larger source is read twice.
 MAX_HELD_BYTES = 1 << 26
-MIN_PIECE_S = 0.8
+MIN_PIECE_S = 0.8  # of a recording that is cut
 UNSTATED_REPETITION = -1
 
 
@@ -221,9 +221,10 @@ class _Source:
             content_hash = sequence.content_hash()
             source = sequence.meta.source
             self.hashes.append(content_hash)
+            first = source_of.get(content_hash)
             # Pieces of one recording may be equal, where the robot rested.
-            if content_hash in source_of and not (self.cut and source_of[content_hash] == source):
-                duplicates.append((source, source_of[content_hash]))
+            if first is not None and not (self.cut and first == source):
+                duplicates.append((source, first))
             source_of.setdefault(content_hash, source)
             if existing is not None:
                 _refuse_relabelled(sequence, existing)
@@ -242,10 +243,11 @@ class _Source:
                 )
             raise LogError(f"{self.src}: no recording found")
         if duplicates:
+            again, first = duplicates[0]
             raise DatasetError(
                 f"{len(duplicates)} of {len(self.hashes)} recordings are there twice (same "
-                f"samples, unit and payload): {duplicates[0][0]} is {duplicates[0][1]}. Nothing "
-                "was imported; leave one of them out"
+                f"samples, unit and payload): {again} is {first}. Nothing was imported; leave one "
+                "of them out"
             )
 
     def write(
@@ -261,7 +263,9 @@ class _Source:
         found = map(dataset.find, self.hashes)
         present = [entry for entry in found if entry is not None]
         repetitions = Counter(entry.meta.repetition_key for entry in dataset.entries)
-        sequences = self.held if self.held is not None else (s for s, _ in self.sequences())
+        sequences: Iterable[Sequence] = (sequence for sequence, _ in self.sequences())
+        if self.held is not None:
+            sequences = self.held
         added = []
         with dataset.appending():
             for content_hash, sequence in zip(self.hashes, sequences, strict=True):
@@ -271,9 +275,8 @@ class _Source:
                     continue
                 key = sequence.meta.repetition_key
                 if sequence.meta.repetition == UNSTATED_REPETITION:
-                    sequence = replace(
-                        sequence, meta=replace(sequence.meta, repetition=repetitions[key])
-                    )
+                    numbered = replace(sequence.meta, repetition=repetitions[key])
+                    sequence = replace(sequence, meta=numbered)
                 added.append(dataset.append(sequence, measure_delays(sequence), content_hash))
                 repetitions[key] += 1
         return added, present
@@ -296,8 +299,10 @@ class _Source:
 
     def _meta(self, log: Log, motion: str, sha256: str) -> SequenceMeta:
         """Combine what the user and the format state; refuse contradictions and gaps."""
-        stated = {k: v for k, v in log.meta.get("stated", {}).items() if v is not None}
-        stated |= {k: tuple(stated[k]) for k in ("kp", "kd") if k in stated}
+        stated: dict[str, Any] = {}
+        for name, value in log.meta.get("stated", {}).items():
+            if value is not None:
+                stated[name] = tuple(value) if name in ("kp", "kd") else value
         for name, value in self.labels.items():
             if name in stated and stated[name] != value:
                 flag = "--" + name.replace("_", "-")
@@ -316,14 +321,16 @@ class _Source:
                 f"{' and '.join(missing)}"
             )
         # A relative path: no home folder gets into a dataset.
-        source = Path(
-            os.path.relpath(log.source, Path(os.path.abspath(self.src)).parent)
-        ).as_posix()
-        origin = {"source": source, "source_sha256": sha256, "repetition": UNSTATED_REPETITION}
-        fields: dict[str, Any] = (
-            origin | self.labels | {"robot": self.robot.name, "motion": motion} | stated
-        )
-        return SequenceMeta(**fields)
+        root = Path(os.path.abspath(self.src)).parent
+        source = Path(os.path.relpath(log.source, root)).as_posix()
+        fields: dict[str, Any] = {
+            "source": source,
+            "source_sha256": sha256,
+            "repetition": UNSTATED_REPETITION,
+        }
+        fields |= self.labels
+        fields |= {"robot": self.robot.name, "motion": motion}
+        return SequenceMeta(**(fields | stated))
 
 
 def _count_bytes(sequence: Sequence) -> int:
@@ -333,15 +340,18 @@ def _count_bytes(sequence: Sequence) -> int:
 
 def _pieces(sequence: Sequence, seconds: float | None) -> Iterator[Sequence]:
     """Yield a recording, or equal pieces of it; each piece notes its start."""
-    count = max(1, round(sequence.duration / seconds)) if seconds else 1
+    count = 1
+    if seconds:
+        count = max(1, round(sequence.duration / seconds))
     if count == 1:
         yield sequence
         return
+    meta = sequence.meta
     rows = len(sequence) // count
     for start in range(0, count * rows, rows):
-        at = round(start * sequence.dt, 3)
-        meta = sequence.meta
-        named = replace(meta, motion=f"{meta.motion}@{at:.0f}s", notes=meta.notes | {"from_s": at})
+        from_s = round(start * sequence.dt, 3)
+        notes = meta.notes | {"from_s": from_s}
+        named = replace(meta, motion=f"{meta.motion}@{from_s:.0f}s", notes=notes)
         yield replace(sequence.rows(slice(start, start + rows)), meta=named)
 
 
@@ -392,21 +402,24 @@ def _refuse_relabelled(sequence: Sequence, existing: Dataset) -> None:
     wrong.
     """
     meta = sequence.meta
-    same_length = [entry.meta for entry in existing.entries if entry.rows == len(sequence)]
-    for unit, mass, side in {(m.unit_id, m.payload_mass, m.payload_side) for m in same_length}:
-        other = replace(meta, unit_id=unit, payload_mass=mass, payload_side=side)
-        entry = existing.find(replace(sequence, meta=other).content_hash())
-        if entry is not None and (unit, mass, side) != (
-            meta.unit_id,
-            meta.payload_mass,
-            meta.payload_side,
-        ):
+    labels = _labels(meta)
+    same_length = [entry for entry in existing.entries if entry.rows == len(sequence)]
+    for other_labels in {_labels(entry.meta) for entry in same_length} - {labels}:
+        unit, mass, side = other_labels
+        relabelled = replace(meta, unit_id=unit, payload_mass=mass, payload_side=side)
+        entry = existing.find(replace(sequence, meta=relabelled).content_hash())
+        if entry is not None:
             raise DatasetError(
                 f"{meta.source}: known samples under new labels: {existing.path} holds them as "
                 f"unit {unit}, {mass:g} kg ({side}), not unit {meta.unit_id}, "
                 f"{meta.payload_mass:g} kg ({meta.payload_side}). Nothing was imported; where the "
                 f"old label is the wrong one: gaponet data remove {existing.path} {entry.id}"
             )
+
+
+def _labels(meta: SequenceMeta) -> tuple[str, float, str]:
+    """Return unit, payload and side: what a person says of a recording, and may say wrongly."""
+    return meta.unit_id, meta.payload_mass, meta.payload_side
 
 
 def _require_side(robot: RobotSpec, side: str) -> None:

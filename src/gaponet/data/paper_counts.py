@@ -54,7 +54,6 @@ class DatasetCounts:
     signals: int
 
 
-# The paper's robots are real: three H1-2 and an unseen fourth.
 PAPER = DatasetCounts(
     hours=28.46,
     sequences=11_198,

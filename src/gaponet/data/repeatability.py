@@ -16,10 +16,10 @@ from gaponet.data.sequence import Sequence
 MAX_COMMAND_DIFFERENCE_RAD = 1e-3  # repetitions whose commands differ by more have another command
 # the same, of the command's range, on average: of commands computed twice
 MAX_COMMAND_DIFFERENCE_SHARE = 0.02
-# by which clocks differ; of recordings that are compared
-MAX_SHIFT_ROWS = 5
-MAX_PAIRS = 100
+MAX_SHIFT_ROWS = 5  # by which the clocks of two recordings differ
+MAX_PAIRS = 100  # of recordings that are compared, about
 MIN_PERIOD_S = 0.5  # of a periodic motion
+FEW_ROWS = 97  # every so many are compared before all of them
 MIN_MOTION_RAD = 0.02  # joints that are commanded to move by less are left out
 CHANNELS = ("qpos", "qvel", "tau", "temperature")
 
@@ -35,30 +35,36 @@ def repetition_difference(sequences: ListOf[Sequence], joints: ListOf[str]) -> A
         sequences: Recordings; only those of one unit, payload and rate are compared.
         joints: Names of the n joints.
     """
-    marks = [fingerprint(s.ctrl, s.dt) for s in sequences]
     pairs = []
-    for i, j in equal_commands(marks):
-        a = sequences[i]
-        b = sequences[j]
-        if a.meta.repetition_key[1:] == b.meta.repetition_key[1:] and a.dt == b.dt:
-            pairs.append((a, b))
-    total, count = np.zeros((2, len(joints)))
-    for a, b in pairs[:: max(1, len(pairs) // MAX_PAIRS)]:
-        unrecorded = {*a.meta.unrecorded, *b.meta.unrecorded}
-        columns = [i for i, name in enumerate(joints) if name not in unrecorded]
-        if not columns:
+    commands = [fingerprint(sequence.ctrl, sequence.dt) for sequence in sequences]
+    for i, j in equal_commands(commands):
+        one = sequences[i]
+        other = sequences[j]
+        _, *labels = one.meta.repetition_key
+        _, *other_labels = other.meta.repetition_key
+        if labels == other_labels and one.dt == other.dt:
+            pairs.append((one, other))
+    total = np.zeros(len(joints))
+    count = np.zeros(len(joints))
+    for one, other in pairs[:: max(1, len(pairs) // MAX_PAIRS)]:
+        unrecorded = {*one.meta.unrecorded, *other.meta.unrecorded}
+        recorded = [i for i, name in enumerate(joints) if name not in unrecorded]
+        if not recorded:
             continue
-        places = [a.joint_names.index(joints[i]) for i in columns]
-        difference = _tracking_difference(a, b, places)
+        columns = [one.joint_names.index(joints[i]) for i in recorded]
+        difference = _tracking_difference(one, other, columns)
         if difference is not None:
-            total[columns] += difference
-            count[columns] += 1
+            total[recorded] += difference
+            count[recorded] += 1
     return np.sqrt(total / np.maximum(count, 1))
 
 
 def _tracking_difference(a: Sequence, b: Sequence, columns: list[int]) -> Array | None:
     """Return the mean squared difference of the tracking errors of two recordings, (n) rad²; None
     for two commands.
+
+    Args:
+        columns: Of the n joints that are compared.
     """
     n = len(columns)
     one = _command_and_position(a, columns)
@@ -66,13 +72,15 @@ def _tracking_difference(a: Sequence, b: Sequence, columns: list[int]) -> Array 
     rows = np.arange(MAX_SHIFT_ROWS, min(len(a), len(b)) - MAX_SHIFT_ROWS)
     if not len(rows):
         return None
-    shifts = range(-MAX_SHIFT_ROWS, MAX_SHIFT_ROWS + 1)
-    differences = [one[rows] - other[rows + shift] for shift in shifts]
-    difference = min(differences, key=lambda x: np.abs(x[:, :n]).mean())
+    differences = []  # at each shift
+    for shift in range(-MAX_SHIFT_ROWS, MAX_SHIFT_ROWS + 1):
+        differences.append(one[rows] - other[rows + shift])
+    difference = min(differences, key=lambda both: np.abs(both[:, :n]).mean())
     command = difference[:, :n]
     position = difference[:, n:]
-    limit = MAX_COMMAND_DIFFERENCE_SHARE * float(np.ptp(a.ctrl[:, columns], axis=0).max())
-    if np.abs(command).mean() > max(MAX_COMMAND_DIFFERENCE_RAD, limit):
+    widest = float(np.ptp(a.ctrl[:, columns], axis=0).max())
+    limit = max(MAX_COMMAND_DIFFERENCE_RAD, MAX_COMMAND_DIFFERENCE_SHARE * widest)
+    if np.abs(command).mean() > limit:
         return None
     return np.asarray(np.square(position - command).mean(axis=0))
 
@@ -109,7 +117,10 @@ class Repetitions:
         self._squares: dict[str, Array] = {}
 
     def add(self, sequence: Sequence) -> None:
-        """Add a repetition (Welford's update: only sums are stored)."""
+        """Add a repetition.
+
+        Welford's update (1962): mean and squared deviations so far are enough.
+        """
         arrays = {}
         for channel in CHANNELS:
             values = getattr(sequence, channel)
@@ -119,7 +130,7 @@ class Repetitions:
             self.count = 1
             self._ctrl = sequence.ctrl
             self._mean = arrays
-            self._squares = {c: np.zeros_like(x) for c, x in arrays.items()}
+            self._squares = {name: np.zeros_like(values) for name, values in arrays.items()}
             return
         rows = min(len(self._ctrl), len(sequence))
         if np.abs(self._ctrl[:rows] - sequence.ctrl[:rows]).max() > MAX_COMMAND_DIFFERENCE_RAD:
@@ -127,18 +138,19 @@ class Repetitions:
             return
         self.count += 1
         self._ctrl = self._ctrl[:rows]
-        for name in [c for c in self._mean if c in arrays]:
+        for name in self._mean.keys() & arrays.keys():
             mean = self._mean[name][:rows]
             value = arrays[name][:rows]
-            step = value - mean
-            self._mean[name] = mean + step / self.count
-            self._squares[name] = self._squares[name][:rows] + step * (value - self._mean[name])
+            deviation = value - mean
+            self._mean[name] = mean + deviation / self.count
+            squares = deviation * (value - self._mean[name])
+            self._squares[name] = self._squares[name][:rows] + squares
 
     def result(self) -> RepetitionResult:
         """Return the result of two or more repetitions."""
-        variance = {
-            c: squares.mean(axis=0) / (self.count - 1) for c, squares in self._squares.items()
-        }
+        variance = {}
+        for name, squares in self._squares.items():
+            variance[name] = squares.mean(axis=0) / (self.count - 1)
         moved = np.ptp(self._ctrl, axis=0) > MIN_MOTION_RAD
         return RepetitionResult(self.count, self.other_commands, moved, variance)
 
@@ -147,23 +159,12 @@ class Repetitions:
         """Return the periods of a periodic motion, without the first, which starts elsewhere; []
         if it has none.
         """
-        ctrl = sequence.ctrl
-        rows = len(ctrl)
-        for period in range(max(1, round(MIN_PERIOD_S / sequence.dt)), rows // 3 + 1):
-            before = ctrl[:-period]
-            after = ctrl[period:]
-            # a few rows first
-            differences = (np.abs(after[::every] - before[::every]).max() for every in (97, 1))
-            if all(difference <= MAX_COMMAND_DIFFERENCE_RAD for difference in differences):
-                break
-        else:
+        rows = len(sequence)
+        period = _period_rows(sequence.ctrl, max(1, round(MIN_PERIOD_S / sequence.dt)))
+        if period is None or np.ptp(sequence.ctrl, axis=0).max() <= MIN_MOTION_RAD:
             return []
-        starts = (
-            range(period, rows - period + 1, period)
-            if np.ptp(ctrl, axis=0).max() > MIN_MOTION_RAD
-            else ()
-        )
-        return [sequence.rows(slice(a, a + period)) for a in starts]
+        starts = range(period, rows - period + 1, period)
+        return [sequence.rows(slice(start, start + period)) for start in starts]
 
     @staticmethod
     def summary(results: list[RepetitionResult], joint_names: tuple[str, ...]) -> dict[str, Any]:
@@ -179,14 +180,15 @@ class Repetitions:
         """
         channels = {}
         for name in CHANNELS:
-            variances = [
-                np.where(r.moved, r.variance[name], np.nan) for r in results if name in r.variance
-            ]
+            variances = []  # of each motion, (n); NaN for joints that did not move
+            for result in results:
+                if name in result.variance:
+                    variances.append(np.where(result.moved, result.variance[name], np.nan))
             values = {}
             for j, joint in enumerate(joint_names):
-                column = np.array([v[j] for v in variances])
-                if np.isfinite(column).any():
-                    values[joint] = float(f"{np.sqrt(np.nanmean(column)):.6g}")
+                of_joint = np.array([variance[j] for variance in variances])
+                if np.isfinite(of_joint).any():
+                    values[joint] = float(f"{np.sqrt(np.nanmean(of_joint)):.6g}")
             if values:
                 channels[name] = {
                     "unit": UNITS[name],
@@ -195,7 +197,24 @@ class Repetitions:
                 }
         return {
             "groups": len(results),
-            "sequences": sum(r.count for r in results),
-            "left_out_other_command": sum(r.other_commands for r in results),
+            "sequences": sum(result.count for result in results),
+            "left_out_other_command": sum(result.other_commands for result in results),
             "channels": channels,
         }
+
+
+def _period_rows(ctrl: Array, least: int) -> int | None:
+    """Return the shortest period of commands (T, n) that fits in three times, rows; None without.
+
+    Args:
+        least: Shortest period that is tried, rows.
+    """
+    for period in range(least, len(ctrl) // 3 + 1):
+        before = ctrl[:-period]
+        after = ctrl[period:]
+        few = np.abs(after[::FEW_ROWS] - before[::FEW_ROWS]).max()
+        if few > MAX_COMMAND_DIFFERENCE_RAD:
+            continue
+        if np.abs(after - before).max() <= MAX_COMMAND_DIFFERENCE_RAD:
+            return period
+    return None

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass, field, replace
-from typing import Annotated, Any
+from dataclasses import dataclass, field, replace
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from annotated_types import Interval
@@ -16,22 +16,28 @@ from gaponet.base.structure import Json
 from gaponet.data.describe.row_copies import copied_rows
 from gaponet.data.log import COMMANDS, FEEDFORWARD, Log
 from gaponet.data.signals import SAME_INSTANT, differentiate, resample_linear, resample_zoh
+from gaponet.robot.finding import masked_names
 from gaponet.robot.log_joints import Follower
 from gaponet.robot.simulator_change import SimulatorChange
 from gaponet.robot.spec import GAIN_TOLERANCE, RobotSpec
 
 ARRAYS = ("ctrl", "qpos", "qvel", "qacc", "tau", "tau_eq", "temperature")
 OPTIONAL = ("qacc", "tau", "tau_eq", "temperature")
-# periods, s
 MIN_PERIOD_S = 1e-4
 MAX_PERIOD_S = 1.0
-# between two samples of the state, s: what moved there is not known, and a clock that jumps is no
-# clock
-MAX_GAP = 2.0
+# Between two samples of the state: what moved there is not known, and a clock that jumps is no
+# clock.
+MAX_GAP_S = 2.0
 MAX_UNEVEN_SHARE = 0.1  # of the median period, by which the periods of even rows differ from it
 EXACT_PERIOD_S = 2e-6  # by which the periods of a clock that does not waver differ from their mean
 MAX_GROWTH = 3  # times as many rows as were recorded: a few bursts must not set the period of all
-FEW = 16  # rows of which a loop's period is told first
+FIRST_LOOP_ROWS = 16  # from which the period of a loop is told first
+MAX_LOOP_DIFFERENCE = 0.1  # of the median period, by which that of a loop differs from it
+MAX_OFF_LOOP = 0.2  # of a period, by which most rows of a loop lie beside their instants
+MAX_ADDED_DRIFT = 0.1  # of a period, over all rows, by which a rounder period may move the last row
+MIN_LOST_END_S = 1.0  # by which states end before the commands where a file was cut short
+MIN_LOST_END_SHARE = 0.1  # of the recording, the same
+MAX_PAYLOAD_KG = 100.0
 ASSUMED = "of robot.toml"  # note of gains that the log did not say
 LEVELS = ("joint", "upper_body", "whole_body")
 
@@ -63,14 +69,13 @@ class SequenceMeta:
         for name in ("unit_id", "motion", "source"):  # a file's name need not be text
             text = getattr(self, name).encode("utf-8", "backslashreplace").decode()
             object.__setattr__(self, name, text)
+        where = self.source or self.motion
         for name in ("kp", "kd"):
-            if (gains := getattr(self, name)) is not None:
-                object.__setattr__(self, name, _gains(name, gains, self.source or self.motion))
-        if not (np.isfinite(self.payload_mass) and 0 <= self.payload_mass <= 100):
-            raise LogError(
-                f"{self.source or self.motion}: payload_mass is {self.payload_mass}; give kg, 0 "
-                "when empty"
-            )
+            gains = getattr(self, name)
+            if gains is not None:
+                object.__setattr__(self, name, _gains(name, gains, where))
+        if not 0 <= self.payload_mass <= MAX_PAYLOAD_KG:
+            raise LogError(f"{where}: payload_mass is {self.payload_mass}; give kg, 0 when empty")
         if not self.unit_id or not self.motion:
             raise LogError(f"{self.source}: unit_id and motion must be named")
         if self.level not in LEVELS:
@@ -79,8 +84,12 @@ class SequenceMeta:
     @property
     def recorded_gains(self) -> tuple[tuple[float, ...] | None, tuple[float, ...] | None]:
         """kp and kd; None where the log did not say them and those of robot.toml stand for them."""
-        kp, _, kd = str(self.notes.get("gains", "")).removeprefix("kp ").partition(", kd ")
-        return None if kp == ASSUMED else self.kp, None if (kd or kp) == ASSUMED else self.kd
+        note = str(self.notes.get("gains", ""))  # "as stated", or "kp as stated, kd …"
+        kp_origin, _, kd_origin = note.removeprefix("kp ").partition(", kd ")
+        kd_origin = kd_origin or kp_origin
+        kp = None if kp_origin == ASSUMED else self.kp
+        kd = None if kd_origin == ASSUMED else self.kd
+        return kp, kd
 
     @property
     def unrecorded(self) -> tuple[str, ...]:
@@ -218,10 +227,10 @@ def _recorded(name: str, log: Log, robot: RobotSpec) -> tuple[float, ...]:
 
 def _gains(name: str, values: Any, where: str) -> tuple[float, ...]:
     try:
-        gains = tuple(float(x) for x in values)
+        gains = tuple(float(value) for value in values)
     except (TypeError, ValueError):
         gains = (np.nan,)
-    if not all(np.isfinite(x) and x >= 0 for x in gains):
+    if not all(np.isfinite(gain) and gain >= 0 for gain in gains):
         raise LogError(f"{where}: {name} is {values!r}; give one finite number ≥ 0 for each joint")
     return gains
 
@@ -284,19 +293,21 @@ def to_sequence(log: Log, robot: RobotSpec, meta: SequenceMeta) -> Sequence:
     if copies:
         notes["copied_rows"] = copies
     notes |= _posture_notes(log, robot)
-    gains = {name: getattr(meta, name) or _recorded(name, log, robot) for name in ("kp", "kd")}
-    origins = {name: _gain_origin(name, meta, log) for name in gains}
-    different = f"kp {origins['kp']}, kd {origins['kd']}"
-    notes["gains"] = origins["kp"] if origins["kp"] == origins["kd"] else different
+    kp = meta.kp or _recorded("kp", log, robot)
+    kd = meta.kd or _recorded("kd", log, robot)
+    kp_origin = _gain_origin("kp", meta, log)
+    kd_origin = _gain_origin("kd", meta, log)
+    notes["gains"] = f"kp {kp_origin}, kd {kd_origin}"
+    if kp_origin == kd_origin:
+        notes["gains"] = kp_origin
     if FEEDFORWARD in arrays:
         torque = arrays.pop(FEEDFORWARD)
-        assumed = origins["kp"] == ASSUMED
-        further = _feedforward_position(torque, np.array(gains["kp"]), assumed, log, robot)
+        assumed = kp_origin == ASSUMED
+        further = _feedforward_position(torque, np.array(kp), assumed, log, robot)
         arrays["ctrl"] = arrays["ctrl"] + further
         notes |= _feedforward_notes(further, robot)
-    meta = SequenceMeta(**(asdict(meta) | gains | {"notes": notes}))
     channels: dict[str, Any] = dict(arrays)
-    return Sequence(meta, robot.joint_names, dt, **channels)
+    return Sequence(replace(meta, kp=kp, kd=kd, notes=notes), robot.joint_names, dt, **channels)
 
 
 def _on_grid(log: Log, median: float, usual: float) -> tuple[dict[str, Array], float, bool]:
@@ -309,13 +320,16 @@ def _on_grid(log: Log, median: float, usual: float) -> tuple[dict[str, Array], f
     time = log.channels["qpos"].time
     period = np.diff(time)
     shared = _share_clock(log)
-    if shared and bool((np.abs(period - median) <= MAX_UNEVEN_SHARE * median).all()):
+    even = bool((np.abs(period - median) <= MAX_UNEVEN_SHARE * median).all())
+    if shared and even:
         dt = _row_period(time, _even_periods(log, median))
         if dt is not None:
             return {name: channel.values for name, channel in log.channels.items()}, dt, True
+    loop = None
     if shared and "dt" not in log.meta:
-        begin, dt = _loop(time, median, usual)
-        return _resample(log, dt, begin), dt, False
+        loop = _loop(time, median, usual)
+    if loop is not None:
+        return _resample(log, loop.period, loop.begin), loop.period, False
     dt = round(median, 5)
     return _resample(log, dt, None), dt, False
 
@@ -348,7 +362,10 @@ def _add_velocities(arrays: dict[str, Array], dt: float, log: Log, robot: RobotS
 def _posture_notes(log: Log, robot: RobotSpec) -> dict[str, Any]:
     """Return notes of joints that the log does not hold, and of units that were converted."""
     notes: dict[str, Any] = {}
-    posture = {j: x for j, x in log.meta.get("posture", {}).items() if j not in log.joint_names}
+    posture = {}
+    for joint, angle in log.meta.get("posture", {}).items():
+        if joint not in log.joint_names:
+            posture[joint] = angle
     known = {*log.joint_names, *posture, *_led(log, robot)}
     absent = [name for name in robot.joint_names if name not in known]
     if posture:
@@ -368,10 +385,10 @@ def _gain_origin(name: str, meta: SequenceMeta, log: Log) -> str:
 
 def _feedforward_notes(further: Array, robot: RobotSpec) -> dict[str, Any]:
     """Return notes of positions (T, n) rad that were added to the command for a torque."""
-    most = np.abs(further).max(axis=0)
-    largest = {
-        name: round(float(x), 4) for name, x in zip(robot.joint_names, most, strict=True) if x
-    }
+    largest = {}
+    for name, most in zip(robot.joint_names, np.abs(further).max(axis=0), strict=True):
+        if most:
+            largest[name] = round(float(most), 4)
     if not largest:
         return {}
     return {FEEDFORWARD: {"in": "ctrl, as torque / kp", "largest_rad": largest}}
@@ -382,8 +399,11 @@ def _copies(log: Log) -> dict[str, int]:
     not.
     """
     rows = copied_rows(log.channels["ctrl"], log.channels["qpos"])
-    by_joint = zip(log.joint_names, rows.tolist(), strict=True)
-    return {name: int(shift) for name, shift in by_joint if np.isfinite(shift)}
+    copies = {}
+    for name, shift in zip(log.joint_names, rows.tolist(), strict=True):
+        if np.isfinite(shift):
+            copies[name] = int(shift)
+    return copies
 
 
 def _row_notes(log: Log, median: float, dt: float, regular: bool) -> dict[str, Any]:
@@ -427,7 +447,9 @@ def _require_both_ends(log: Log) -> None:
     states = log.channels["qpos"].time
     commands = log.channels["ctrl"].time
     missing = float(commands[-1] - states[-1])
-    if commands[0] < states[-1] and missing > max(1.0, 0.1 * float(commands[-1] - commands[0])):
+    duration = float(commands[-1] - commands[0])
+    least = max(MIN_LOST_END_S, MIN_LOST_END_SHARE * duration)
+    if commands[0] < states[-1] and missing > least:
         raise LogError(
             f"{log.source}: its states end {missing:.1f} s before its commands do: the file may "
             "be cut short; copy it again, or cut the commands where the robot stopped (--skip-bad "
@@ -436,11 +458,15 @@ def _require_both_ends(log: Log) -> None:
 
 
 def _row_period(time: Array, periods: tuple[float, ...]) -> float | None:
-    """The first period, s, by which row t is never further than half a period from where t·period
-    puts it.
+    """Return the first period, s, by which row t is never further than half a period from where
+    t·period puts it; None if there is none.
     """
     rows = np.arange(len(time))
-    return next((p for p in periods if np.abs(time - time[0] - p * rows).max() <= 0.5 * p), None)
+    for period in periods:
+        off = np.abs(time - time[0] - period * rows)
+        if off.max() <= 0.5 * period:
+            return period
+    return None
 
 
 def _median_period(log: Log) -> float:
@@ -456,18 +482,19 @@ def _median_period(log: Log) -> float:
             f"{log.source}: the median period is {median:.3g} s, expected {MIN_PERIOD_S} to "
             f"{MAX_PERIOD_S:g}; is the unit of time right (tables: --time-unit)?"
         )
-    if period[longest] > MAX_GAP:
+    if period[longest] > MAX_GAP_S:
         raise LogError(
             f"{log.row('qpos', longest + 1)}: {period[longest]:.4g} s after the row before it; "
-            f"longer gaps than {MAX_GAP:g} s are not filled: cut the log there, or mend a clock "
+            f"longer gaps than {MAX_GAP_S:g} s are not filled: cut the log there, or mend a clock "
             "that jumped"
         )
-    if time[-1] - time[0] > MAX_GROWTH * median * len(time):
+    duration = time[-1] - time[0]
+    if duration > MAX_GROWTH * median * len(time):
         raise LogError(
-            f"{log.source}: {len(time)} rows lie in bursts over {time[-1] - time[0]:.4g} s: at "
-            f"their median period of {median * 1e3:.3g} ms there would be "
-            f"{(time[-1] - time[0]) / median:.0f}; mend the timestamps, or give the rate of even "
-            "rows (rate in logs.toml, --rate), which replaces the clock"
+            f"{log.source}: {len(time)} rows lie in bursts over {duration:.4g} s: at their median "
+            f"period of {median * 1e3:.3g} ms there would be {duration / median:.0f}; mend the "
+            "timestamps, or give the rate of even rows (rate in logs.toml, --rate), which replaces "
+            "the clock"
         )
     stated = log.meta.get("dt", median)
     if abs(stated - median) > 0.1 * stated:
@@ -478,37 +505,55 @@ def _median_period(log: Log) -> float:
     return median
 
 
-def _loop(time: Array, median: float, usual: float) -> tuple[float | None, float]:
-    """When the loop that wrote uneven rows began, and its period, s: least squares over the rows'
-    numbers, some of them lost; or no beginning and the median period, where rows keep to no period.
+class _Loop(NamedTuple):
+    """A loop that wrote a row in each of its periods, some of them late, some lost."""
+
+    begin: float  # s
+    period: float  # s
+
+
+def _loop(time: Array, median: float, usual: float) -> _Loop | None:
+    """Return the loop that wrote uneven rows, by least squares over the rows' numbers; None where
+    rows keep to no period.
+
+    Args:
+        time: Of the rows, s.
+        median: Of their periods, s.
+        usual: Period of the robot's controller, s, which is taken where it fits.
     """
     begin = float(time[0])
     period = float(np.diff(time).mean())
-    period = period if abs(period - median) < 0.05 * median else median
-    rows = FEW
-    while True:
+    if abs(period - median) >= 0.05 * median:
+        period = median
+    rows = FIRST_LOOP_ROWS
+    while True:  # twice as many rows each time: their numbers are surer with a better period
         some = time[:rows]
-        period, begin = np.polyfit(np.round((some - begin) / period), some - time[0], 1)
+        numbers = np.round((some - begin) / period)
+        period, begin = np.polyfit(numbers, some - time[0], 1)
         begin += time[0]
         if rows >= len(time):
             break
         rows *= 2
     number = (time - begin) / period
-    if (
-        not abs(period - median) < 0.1 * median
-        or np.median(np.abs(number - np.round(number))) > 0.2
-    ):
-        return None, round(median, 5)
-    short = (usual, round(float(period), 5), float(period))
-    return begin, next(p for p in short if abs(p - period) * number[-1] <= 0.1 * period)
+    off = np.median(np.abs(number - np.round(number)))
+    if not abs(period - median) < MAX_LOOP_DIFFERENCE * median or off > MAX_OFF_LOOP:
+        return None
+    for rounder in (usual, round(float(period), 5)):
+        if abs(rounder - period) * number[-1] <= MAX_ADDED_DRIFT * period:
+            return _Loop(begin, rounder)
+    return _Loop(begin, float(period))
 
 
 def _resample(log: Log, dt: float, begin: float | None) -> dict[str, Array]:
-    """On a grid; of a loop that began then, a command belongs to the period that its row is
-    nearest to.
+    """Return the channels' values on a grid, (T, n) each.
+
+    Args:
+        dt: Period of the grid, s.
+        begin: When the loop began that wrote the rows, s: a command then belongs to the period
+            that its row is nearest to. None: no loop is known.
     """
-    start = max(c.time[0] for c in log.channels.values())
-    stop = min(c.time[-1] for c in log.channels.values())
+    start = max(channel.time[0] for channel in log.channels.values())
+    stop = min(channel.time[-1] for channel in log.channels.values())
     if stop - start < 2 * dt:
         raise LogError(
             f"{log.source}: command and state channels overlap for {stop - start:.3f} s only; "
@@ -534,11 +579,16 @@ def _feedforward_position(
     torque: Array, kp: Array, assumed: bool, log: Log, robot: RobotSpec
 ) -> Array:
     """Return the distance of the command, (T, n) rad, that has the effect of a torque on a PD
-    controller: torque / kp, as kp (command − q) − kd q̇ + torque is kp (command + torque / kp − q)
-    − kd q̇. `assumed`: nobody stated kp.
+    controller.
+
+    kp (command − q) − kd q̇ + torque is kp (command + torque / kp − q) − kd q̇.
+
+    Args:
+        torque: That is fed forward, (T, n) N·m.
+        kp: (n) N·m/rad.
+        assumed: Nobody stated kp.
     """
-    without = torque.any(axis=0) & (assumed | (kp == 0))
-    lacking = [name for name, x in zip(robot.joint_names, without, strict=True) if x]
+    lacking = masked_names(robot, torque.any(axis=0) & (assumed | (kp == 0)))
     if lacking:
         raise LogError(
             f"{log.source}: a {FEEDFORWARD} counts as command + torque / kp, and kp of "
@@ -558,8 +608,9 @@ def _led(log: Log, robot: RobotSpec) -> dict[str, Follower]:
 
 
 def _to_robot(channel: str, values: Array, log: Log, robot: RobotSpec) -> Array:
-    """Columns in robot order; joints the log lacks stand where its posture says or at home
-    (positions), or at zero.
+    """Return values (T, n) of a log's joints in robot order.
+
+    Joints that the log lacks stand where its posture says or at home (positions), or at zero.
     """
     out = np.zeros((len(values), len(robot.joint_names)))
     if channel in ("ctrl", "qpos"):
@@ -571,6 +622,6 @@ def _to_robot(channel: str, values: Array, log: Log, robot: RobotSpec) -> Array:
         return out
     for name, follower in _led(log, robot).items():
         leader = out[:, robot.index([follower.joint])]
-        at_zero = follower.at_zero if channel != "qvel" else 0.0
+        at_zero = 0.0 if channel == "qvel" else follower.at_zero
         out[:, robot.index([name])] = follower.ratio * leader + at_zero
     return out

@@ -31,18 +31,15 @@ def write_arrays(
 
     rows = len(next(iter(columns.values())))
     vector = pa.list_(pa.field("element", pa.float32(), nullable=False), len(joint_names))
-    fields = [
-        pa.field("time", pa.float64(), nullable=False),
-        *(pa.field(column, vector, nullable=False) for column in columns),
-    ]
+    fields = [pa.field("time", pa.float64(), nullable=False)]
     arrays = [pa.array(np.arange(rows) * dt, pa.float64())]
-    for values in columns.values():
+    for column, values in columns.items():
+        fields.append(pa.field(column, vector, nullable=False))
         flat = pa.array(np.ascontiguousarray(values, np.float32).ravel())
         arrays.append(pa.FixedSizeListArray.from_arrays(flat, type=vector))
-    units = json.dumps({column: UNITS[column] for column in ["time", *columns]})
-    table = pa.table(
-        arrays, schema=pa.schema(fields, {"joint_names": ",".join(joint_names), "units": units})
-    )
+    units = {column: UNITS[column] for column in ("time", *columns)}
+    metadata = {"joint_names": ",".join(joint_names), "units": json.dumps(units)}
+    table = pa.table(arrays, schema=pa.schema(fields, metadata))
     with atomic_write(path, named=False) as temporary:
         # Against zstd alone: 6 % larger, read in half the time (552 rows of 27 joints, 7 channels:
         # 1.5 ms).

@@ -40,9 +40,8 @@ PROPERTIES: dict[str, Callable[[Entry], str]] = {
 }
 ORDERED = ("repetition", "time")  # properties of which the last values are held out
 MIN_MOTIONS = 3  # one for each split
-# of motions, units or payloads; at least one each
-TEST_SHARE = 0.25
-VAL_SHARE = 0.125
+TEST_SHARE = 0.25  # of motions, units or payloads; at least one
+VAL_SHARE = 0.125  # of motions; at least one
 RATE_TOLERANCE = 0.02  # relative; rates are measured
 
 
@@ -171,24 +170,28 @@ def _require_present(
     dataset: Dataset, units: tuple[str, ...], payloads: tuple[float, ...], rates: tuple[float, ...]
 ) -> None:
     known_units = sorted({entry.meta.unit_id for entry in dataset.entries})
-    if missing_units := [u for u in units if u not in known_units]:
-        raise UsageError(
-            f"unit '{missing_units[0]}' is not in {dataset.path}; it holds {', '.join(known_units)}"
-        )
-    known_payloads = {entry.meta.payload_mass for entry in dataset.entries}
-    known_rates = {round(1 / entry.dt, 2) for entry in dataset.entries}
-    for wanted, known, text, tolerance in (
-        (payloads, known_payloads, "with {:g} kg", 0.0),
-        (rates, known_rates, "at {:g} Hz", RATE_TOLERANCE),
-    ):
-        for value in wanted:
-            if any(abs(value - other) <= tolerance * value for other in known):
-                continue
-            present = ", ".join(f"{other:g}" for other in sorted(known))
-            unit = text[-2:]
+    for unit in units:
+        if unit not in known_units:
             raise UsageError(
-                f"no recording {text.format(value)} in {dataset.path}; it holds {present} {unit}"
+                f"unit '{unit}' is not in {dataset.path}; it holds {', '.join(known_units)}"
             )
+    known_payloads = sorted({entry.meta.payload_mass for entry in dataset.entries})
+    for payload in payloads:
+        if payload not in known_payloads:
+            raise UsageError(
+                f"no recording with {payload:g} kg in {dataset.path}; it holds "
+                f"{_listed(known_payloads)} kg"
+            )
+    known_rates = sorted({round(1 / entry.dt, 2) for entry in dataset.entries})
+    for rate in rates:
+        if not any(abs(rate - known) <= RATE_TOLERANCE * rate for known in known_rates):
+            raise UsageError(
+                f"no recording at {rate:g} Hz in {dataset.path}; it holds {_listed(known_rates)} Hz"
+            )
+
+
+def _listed(numbers: Iterable[float]) -> str:
+    return ", ".join(f"{number:g}" for number in numbers)
 
 
 def split_by_order(dataset: Dataset, by: str) -> Splits:
@@ -206,7 +209,7 @@ def split_by_order(dataset: Dataset, by: str) -> Splits:
     for entry in dataset.entries:
         whole = canonical.get(entry.meta.motion, entry.meta.source)
         groups.setdefault((*entry.meta.repetition_key[1:], whole), []).append(entry)
-    splits: Splits = {s: [] for s in SPLITS}
+    splits: Splits = {split: [] for split in SPLITS}
     for group in groups.values():
         places = sorted({_place(entry, by) for entry in group}, reverse=True)
         held_out = 0
@@ -262,19 +265,23 @@ def make_split(dataset: Dataset, by: str, holdout: tuple[str, ...] = ()) -> Spli
 
     key = motion_of if by == "motion" else PROPERTIES[by]
     held_out = _held_out_values(dataset, by, holdout, key)
-    rest = [entry for entry in dataset.entries if key(entry) not in held_out]
-    if by in ORDERED:
+    splits: Splits = {"train": [], "val": [], "test": []}
+    rest = []
+    for entry in dataset.entries:
+        if key(entry) in held_out:
+            splits["test"].append(entry)
+        else:
+            rest.append(entry)
+    if by in ORDERED:  # the last that is left is for validation
         val_key = key
         val_values = {max(map(key, rest), key=float)} if rest else set()
     else:
-        count = max(1, round(len(set(canonical.values())) * VAL_SHARE))
         val_key = motion_of
+        count = max(1, round(len(set(canonical.values())) * VAL_SHARE))
         val_values = set(hash_order(map(motion_of, rest))[:count])
-    splits = {
-        "train": [entry for entry in rest if val_key(entry) not in val_values],
-        "val": [entry for entry in rest if val_key(entry) in val_values],
-        "test": [entry for entry in dataset.entries if key(entry) in held_out],
-    }
+    for entry in rest:
+        split = "val" if val_key(entry) in val_values else "train"
+        splits[split].append(entry)
     empty = [name for name in SPLITS if not splits[name]]
     if empty:
         left = len(set(map(motion_of, rest)))
@@ -387,14 +394,14 @@ def _split_by_joints(unrecorded: dict[str, frozenset[str]]) -> dict[str, list[st
         groups[joints].append(motion)
     if len(groups) == 1 or max(map(len, groups.values())) < MIN_MOTIONS:
         return split_motions(unrecorded)
-    splits: dict[str, list[str]] = {s: [] for s in SPLITS}
+    splits: dict[str, list[str]] = {split: [] for split in SPLITS}
     for names in map(hash_order, groups.values()):
         parts = {"train": names[-1:], "val": names[:-1], "test": []}
         if len(names) >= MIN_MOTIONS:
             parts = split_motions(names)
         for split, part in parts.items():
             splits[split] += part
-    return {s: hash_order(names) for s, names in splits.items()}
+    return {split: hash_order(motions) for split, motions in splits.items()}
 
 
 def stratified_subset(entries: ListOf[Entry], count: int) -> list[Entry]:
@@ -407,8 +414,10 @@ def stratified_subset(entries: ListOf[Entry], count: int) -> list[Entry]:
         rate = round(1 / entry.dt, 1)
         kind = (meta.payload_mass, meta.payload_side, meta.unit_id, rate)
         groups.setdefault(kind, []).append(entry)
-    # each begins with another motion
-    rotated = [g[i % len(g) :] + g[: i % len(g)] for i, g in enumerate(groups.values())]
+    rotated = []  # groups, each beginning with another motion
+    for i, group in enumerate(groups.values()):
+        start = i % len(group)
+        rotated.append(group[start:] + group[:start])
     in_turn: list[str] = []
     for turn in itertools.zip_longest(*rotated):
         in_turn += [entry.id for entry in turn if entry is not None]
@@ -476,19 +485,20 @@ def read_split(path: str | Path, dataset: Dataset) -> Splits:
     file = read_json(
         _SplitFile, Path(path), DatasetError, "make one with gaponet data split", allow_extra=True
     )
-    splits: Splits = {s: [] for s in SPLITS}
+    splits: Splits = {split: [] for split in SPLITS}
     split_of_hash: dict[str, str] = {}
-    for s in SPLITS:
-        for name, digest in file["parts"][s].items():  # type: ignore[literal-required]
+    for split in SPLITS:
+        part: dict[str, str] = file["parts"][split]  # type: ignore[literal-required]
+        for name, digest in part.items():
             entry = dataset.find(digest)
             if entry is None:
                 raise DatasetError(
                     f"{path}: '{name}' is not in {dataset.path}; split that dataset anew"
                 )
-            if split_of_hash.setdefault(digest, s) != s:
+            other = split_of_hash.setdefault(digest, split)
+            if other != split:
                 raise DatasetError(
-                    f"{path}: '{name}' is in {split_of_hash[digest]} and in {s}; split the "
-                    "dataset anew"
+                    f"{path}: '{name}' is in {other} and in {split}; split the dataset anew"
                 )
-            splits[s].append(entry)
+            splits[split].append(entry)
     return splits

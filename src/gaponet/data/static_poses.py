@@ -22,8 +22,8 @@ WINDOW_S = 0.5  # command and state must stand still for this time
 MAX_CTRL_RANGE_RAD = 1e-3  # of the command in the window
 MAX_DRIFT_RAD = 2e-3  # between the means of the window's halves
 MAX_NOISE_RAD = 3e-3  # standard deviation in the window; two steps of a 12-bit encoder
-MIN_MOTION_RAD = 0.01
-MIN_POSES_PER_SIDE = 3
+MIN_MOTION_RAD = 0.01  # by which a joint is away from where it rests
+MIN_POSES_PER_SIDE = 3  # from which the width of a joint's band is known
 BLOCK_ROWS = 1024  # extremes of blocks are searched before the rows
 
 
@@ -52,29 +52,27 @@ class StaticPoses:
         approach = np.zeros((len(ends), n), int)
         distinct = np.ones((len(ends), n), bool)
         window = _window_rows(sequence)
-        starts = np.arange(0, len(sequence), BLOCK_ROWS)
-        # (2, blocks, n)
-        extremes = np.stack([f.reduceat(sequence.qpos, starts) for f in (np.minimum, np.maximum)])
+        blocks = _Blocks.of(sequence.qpos)
         for i, end in enumerate(ends):
             qpos[i] = sequence.qpos[end + 1 - window : end + 1].mean(axis=0)
             ctrl[i] = sequence.ctrl[end]
-            approach[i] = -_last_side(sequence.qpos[: end + 1], extremes, qpos[i])
+            approach[i] = -_last_side(sequence.qpos[: end + 1], blocks, qpos[i])
             if i:
                 state_moved = np.abs(qpos[i] - qpos[i - 1]) > MIN_MOTION_RAD
                 command_moved = np.abs(ctrl[i] - ctrl[i - 1]) > MIN_MOTION_RAD
                 distinct[i] = state_moved | command_moved
-        distinct[:, [name in sequence.copied for name in sequence.joint_names]] = False
+        copied = [name in sequence.copied for name in sequence.joint_names]
+        distinct[:, copied] = False
         return cls(qpos, ctrl, approach, distinct)
 
     @classmethod
     def joined(cls, parts: list[StaticPoses], n: int) -> StaticPoses:
         """Return the static poses of several sequences of n joints as one."""
-        empty = cls(
-            np.zeros((0, n)), np.zeros((0, n)), np.zeros((0, n), int), np.zeros((0, n), bool)
-        )
+        empty = np.zeros((0, n))
+        none = cls(empty, empty, np.zeros((0, n), int), np.zeros((0, n), bool))
         fields = {}
-        for name in vars(empty):
-            fields[name] = np.concatenate([getattr(part, name) for part in (empty, *parts)])
+        for name in vars(none):
+            fields[name] = np.concatenate([getattr(part, name) for part in (none, *parts)])
         return cls(**fields)
 
     def static_error(self, joint: int, expected: Array | float = 0.0) -> StaticError:
@@ -89,11 +87,10 @@ class StaticPoses:
         side = self.approach[:, joint]
         up = error[distinct & (side > 0)]
         down = error[distinct & (side < 0)]
-        both = error[distinct]
         if min(len(up), len(down)) < MIN_POSES_PER_SIDE:
-            return StaticError(
-                float(np.median(both)) if len(both) else np.nan, np.nan, len(up), len(down)
-            )
+            of_any_side = error[distinct]
+            middle = float(np.median(of_any_side)) if len(of_any_side) else np.nan
+            return StaticError(middle, np.nan, len(up), len(down))
         high = float(np.median(down))
         low = float(np.median(up))
         return StaticError((high + low) / 2, max(high - low, 0.0) / 2, len(up), len(down))
@@ -116,17 +113,42 @@ class StaticError:
         return bool(np.isfinite(self.half_band))
 
 
-def _last_side(qpos: Array, extremes: Array, rest: Array) -> Array:
+@dataclass(frozen=True)
+class _Blocks:
+    """Extremes of positions in blocks of BLOCK_ROWS rows, (blocks, n) rad."""
+
+    least: Array
+    greatest: Array
+
+    @classmethod
+    def of(cls, qpos: Array) -> _Blocks:
+        """Return the extremes of positions (T, n)."""
+        starts = np.arange(0, len(qpos), BLOCK_ROWS)
+        return cls(np.minimum.reduceat(qpos, starts), np.maximum.reduceat(qpos, starts))
+
+    def moved_from(self, rest: Array, count: int) -> Array:
+        """Return where joints were away from `rest` (n) in the first blocks, (count, n) bool."""
+        below = np.abs(self.least[:count] - rest) > MIN_MOTION_RAD
+        above = np.abs(self.greatest[:count] - rest) > MIN_MOTION_RAD
+        return np.asarray(below | above)
+
+
+def _last_side(qpos: Array, blocks: _Blocks, rest: Array) -> Array:
     """Return on which side of `rest` (n) the joints of qpos (T, n) were last, (n): +1, −1, or 0 if
     never away.
+
+    Args:
+        blocks: Of the recording that begins with qpos.
     """
-    full = len(qpos) // BLOCK_ROWS
+    complete = len(qpos) // BLOCK_ROWS
+    moved = blocks.moved_from(rest, complete)
     side = np.zeros(len(rest), int)
-    # complete blocks, (full, n)
-    blocks = (np.abs(extremes[:, :full] - rest) > MIN_MOTION_RAD).any(axis=0)
-    for j, x in enumerate(rest):
-        for start in (full * BLOCK_ROWS, *BLOCK_ROWS * np.flatnonzero(blocks[:, j])[:-2:-1]):
-            offset = qpos[start : start + BLOCK_ROWS, j] - x
+    for j, at_rest in enumerate(rest):
+        # the rows behind the last complete block first, then the last block in which it moved
+        last_moved = np.flatnonzero(moved[:, j])[-1:]
+        for block in (complete, *last_moved):
+            start = block * BLOCK_ROWS
+            offset = qpos[start : start + BLOCK_ROWS, j] - at_rest
             away = np.flatnonzero(np.abs(offset) > MIN_MOTION_RAD)
             if away.size:
                 side[j] = np.sign(offset[away[-1]])
@@ -156,7 +178,10 @@ def _ends_of_rest(sequence: Sequence, joints: Array) -> Array:
     drift = np.abs(halves[window - half :] - halves[: len(halves) - window + half])
     quiet = (ctrl_range < MAX_CTRL_RANGE_RAD) & (noise < MAX_NOISE_RAD) & (drift < MAX_DRIFT_RAD)
     rows = np.flatnonzero(quiet.all(axis=1))
-    return rows[np.append(np.diff(rows) > 1, True)] + window - 1 if rows.size else rows
+    if not rows.size:
+        return rows
+    is_last = np.append(np.diff(rows) > 1, True)
+    return np.asarray(rows[is_last] + window - 1)
 
 
 def _moving_mean(values: Array, window: int) -> Array:

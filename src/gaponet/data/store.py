@@ -1,13 +1,16 @@
 """The dataset folder: Parquet files, one per sequence, and a journal that lists them.
 
-    dataset.json            format version, robot, joint names, units; licence and source if stated
-    robot/                  the nominal robot: robot.toml and a self-contained MJCF
-    (gaponet.robot.folder) sequences.jsonl         one line per sequence: metadata, hash, delays
-    (data.journal) offsets.json            static offsets of each unit as measured at import
-    (data.offsets); not applied sequences/<id>.parquet  columns time, ctrl, qpos, qvel, …
-    (data.sequence_file) replays/<model>/<id>.parquet  qpos, qvel, tau of the simulator with that
-    model hash card.json, CARD.md      counts and ranges (data.card) splits/<name>.json      train,
-    validation and test sets (data.split)
+    dataset.json                     format version, robot, joint names, units; licence and source
+                                     if stated
+    robot/                           the nominal robot: robot.toml and a self-contained MJCF
+                                     (gaponet.robot.folder)
+    sequences.jsonl                  one line per sequence: metadata, hash, delays (data.journal)
+    sequences/<id>.parquet           columns time, ctrl, qpos, qvel, … (data.sequence_file)
+    offsets.json                     static offsets of each unit as measured at import, not applied
+                                     (data.offsets)
+    replays/<model>/<id>.parquet     qpos, qvel, tau of the simulator with that model hash
+    card.json, CARD.md               counts and ranges (data.card)
+    splits/<name>.json               train, validation and test sets (data.split)
 
 A sequence is written to a temporary file, renamed, synced to the disk, and then listed. A file that
 is not listed does not count. One process writes at a time (gaponet.base.files). Reading needs no
@@ -239,14 +242,22 @@ class Dataset:
         Raises:
             DatasetError: The dataset has no such motion or unit, or is empty.
         """
-        for kind, attribute, wanted in (("motion", "motion", motions), ("unit", "unit_id", units)):
-            present = {getattr(entry.meta, attribute) for entry in self.entries if wanted}
-            if missing := sorted(set(wanted) - present):
-                available = ", ".join(sorted(present)) or "nothing"
-                raise DatasetError(f"{self.path}: no {kind} '{missing[0]}'; it holds: {available}")
+        chosen = self.entries
+        if motions:
+            self._require_present("motion", motions, {entry.meta.motion for entry in self.entries})
+            chosen = [entry for entry in chosen if entry.meta.motion in motions]
+        if units:
+            self._require_present("unit", units, {entry.meta.unit_id for entry in self.entries})
+            chosen = [entry for entry in chosen if entry.meta.unit_id in units]
         self.require_sequences()
-        chosen = [entry for entry in self.entries if not motions or entry.meta.motion in motions]
-        return [entry for entry in chosen if not units or entry.meta.unit_id in units]
+        return list(chosen)
+
+    def _require_present(self, kind: str, wanted: tuple[str, ...], present: set[str]) -> None:
+        """Refuse motions or units (kind) that are not present."""
+        missing = sorted(set(wanted) - present)
+        if missing:
+            available = ", ".join(sorted(present)) or "nothing"
+            raise DatasetError(f"{self.path}: no {kind} '{missing[0]}'; it holds: {available}")
 
     # ---- changes
 
@@ -301,13 +312,14 @@ class Dataset:
                         f"{self.path}: no sequence '{pattern}'; {JOURNAL} in it lists the ids"
                     )
             removed = []
+            kept_lines = []
             for entry in self.entries:
                 if any(fnmatchcase(entry.id, pattern) for pattern in patterns):
                     removed.append(entry)
+                else:
+                    kept_lines.append(entry.line + b"\n")
             with atomic_write(self.path / JOURNAL) as temporary:
-                temporary.write_bytes(
-                    b"".join(entry.line + b"\n" for entry in self.entries if entry not in removed)
-                )
+                temporary.write_bytes(b"".join(kept_lines))
             for entry in removed:  # if this is cut short, the files that remain are not listed
                 self._file(entry).unlink(missing_ok=True)
                 for file in self.path.glob(f"{REPLAYS}/*/{entry.id}.*"):
@@ -361,9 +373,11 @@ class Dataset:
         return self.path / "sequences" / f"{entry.id}.parquet"
 
     def _replay_file(self, entry: Entry, model: str) -> Path:
-        folders = (self._replay_root / REPLAYS, self.path / REPLAYS)
-        files = [folder / model / f"{entry.id}.parquet" for folder in folders]
-        return next((file for file in files if file.is_file()), files[0])
+        """Where the replay of a sequence is, or would be written."""
+        place = Path(REPLAYS) / model / f"{entry.id}.parquet"
+        written = self._replay_root / place
+        stored = self.path / place
+        return stored if stored.is_file() and not written.is_file() else written
 
 
 def entry_id(meta: SequenceMeta, content_hash: str) -> str:
