@@ -46,14 +46,12 @@ WHOLE_SECONDS = re.compile(r"(.*?)secs?")
 NANOSECONDS = ("nanosec", "nanosecs", "nsec", "nsecs")
 MIN_ROWS = 20
 MIN_LINEARITY = 0.99  # correlation of a clock with the number of its row
-MAX_RATE_DIFFERENCE = (
-    0.05  # by which two clocks may differ, apart from a factor of thousands between their units
-)
+# By which two clocks may differ, apart from a factor of thousands between their units.
+MAX_RATE_DIFFERENCE = 0.05
+Load = Callable[[list[str]], dict[str, Any]]  # reads signals of these names
 
 
-def clock_periods(
-    signals: Mapping[str, Sequence[str]], load: Callable[[list[str]], dict[str, Any]]
-) -> dict[str, float]:
+def clock_periods(signals: Mapping[str, Sequence[str]], load: Load) -> dict[str, float]:
     """Return the columns that run like clocks → mean distance of their rows, in the column's own
     unit.
 
@@ -65,15 +63,12 @@ def clock_periods(
         if labels or not named_like_a_clock(name):
             continue
         try:
-            values = load([name])[name].values[:ROWS]
+            stamps = load([name])[name].values[:ROWS]
         except LogError:  # text
             continue
-        if len(values) >= MIN_ROWS and np.isfinite(values).all() and _runs(values):
-            periods[name] = float(values[-1] - values[0]) / (len(values) - 1)
+        if len(stamps) >= MIN_ROWS and np.isfinite(stamps).all() and _runs(stamps):
+            periods[name] = float(stamps[-1] - stamps[0]) / (len(stamps) - 1)
     return periods
-
-
-Load = Callable[[list[str]], dict[str, Any]]
 
 
 def with_whole_seconds(
@@ -89,7 +84,10 @@ def with_whole_seconds(
     if not pairs:
         return signals, load
     parts = set[str]().union(*pairs.values())
-    joined = dict.fromkeys(pairs, ()) | {n: x for n, x in signals.items() if n not in parts}
+    joined: dict[str, tuple[str, ...]] = dict.fromkeys(pairs, ())
+    for name, labels in signals.items():
+        if name not in parts:
+            joined[name] = labels
     return joined, partial(_load_stamps, load, pairs)
 
 
@@ -100,9 +98,11 @@ def _stamps(signals: Collection[str]) -> dict[str, tuple[str, str]]:
         match = WHOLE_SECONDS.fullmatch(whole)
         if match is None:
             continue
+        start = match[1]
+        stamp = start.rstrip("._/ ") or "stamp"
         for ending in NANOSECONDS:
-            if match[1] + ending in signals:
-                pairs[match[1].rstrip("._/ ") or "stamp"] = (whole, match[1] + ending)
+            if start + ending in signals:
+                pairs[stamp] = (whole, start + ending)
     return pairs
 
 

@@ -22,7 +22,7 @@ TIME_OF_DAY = re.compile(r"\d\d?:\d\d(:\d\d([.,]\d+)?)?")
 
 def is_date(cell: str) -> bool:
     """Return True for 2026-03-01T12:00:00.125Z, 2026-03-01 12:00:00,125+01:00 and 12:00:00.125."""
-    cell = cell.strip().strip('"')
+    cell = _without_quotes(cell)
     if DATE.match(cell) or TIME_OF_DAY.fullmatch(cell):
         return True
     return DAY_OR_MONTH_FIRST.fullmatch(cell) is not None
@@ -39,7 +39,7 @@ def to_seconds(cells: Sequence[str | None], where: str) -> Array:
     seconds = np.full(len(cells), np.nan)
     days = np.zeros(len(cells))
     for i, cell in enumerate(cells):
-        text = (cell or "").strip().strip('"')
+        text = _without_quotes(cell)
         if not text:
             continue
         try:
@@ -51,7 +51,7 @@ def to_seconds(cells: Sequence[str | None], where: str) -> Array:
             ) from None
         first = first or at
         seconds[i] = (at - first).total_seconds()
-    if TIME_OF_DAY.fullmatch((cells[0] or "").strip().strip('"')):
+    if TIME_OF_DAY.fullmatch(_without_quotes(cells[0])):
         midnight = np.diff(seconds, prepend=seconds[0]) < -DAY_S / 2
         days = np.cumsum(midnight)
     return seconds + DAY_S * days
@@ -61,13 +61,22 @@ def _day_comes_first(cells: Sequence[str | None]) -> bool:
     """Return True if the day stands before the month: behind it there is a dot, a number above 12,
     or the days of a recording would be months apart.
     """
-    matches = [DAY_OR_MONTH_FIRST.fullmatch((cell or "").strip().strip('"')) for cell in cells]
-    fields = [match.groups() for match in matches if match]
-    if any(field[1] == "." for field in fields):
-        return True
-    first = {field[0] for field in fields}
-    second = {field[2] for field in fields}
+    first = set()
+    second = set()
+    for cell in cells:
+        match = DAY_OR_MONTH_FIRST.fullmatch(_without_quotes(cell))
+        if match is None:
+            continue
+        number, separator, other, *_ = match.groups()
+        if separator == ".":
+            return True
+        first.add(number)
+        second.add(other)
     return any(int(number) > 12 for number in first) or len(first) > len(second)
+
+
+def _without_quotes(cell: str | None) -> str:
+    return (cell or "").strip().strip('"')
 
 
 def _iso(text: str, day_first: bool) -> str:
@@ -94,5 +103,7 @@ def _parse(text: str) -> datetime:
     fraction = re.search(r"\.(\d{7,})", text)
     if fraction:  # nanoseconds: datetime keeps microseconds
         text = text.replace(fraction[1], fraction[1][:6])
-    at = datetime.fromisoformat(re.sub(r"\s+(?=[+-]\d\d:?\d\d$)", "", text.replace(" UTC", "Z")))
+    text = text.replace(" UTC", "Z")
+    text = re.sub(r"\s+(?=[+-]\d\d:?\d\d$)", "", text)  # before a zone
+    at = datetime.fromisoformat(text)
     return at if at.tzinfo else at.replace(tzinfo=UTC)

@@ -60,16 +60,18 @@ class Encoder:
         if unit == "signed_percent":
             sign = -1.0 if self.inverted else 1.0
             return sign * values * (self.high - self.low) / 200 * per_tick
-        middle = 0.0 if speed else (self.low + self.high) / 2
+        if speed:
+            return values * per_tick
+        middle = (self.low + self.high) / 2
         return (values - middle) * per_tick
 
     def fractions(self, values: Array, speed: bool = False) -> Array:
         """Return ticks (k,) as shares of the range, 0..1."""
-        zero = 0.0 if speed else self.low
-        shares = (values - zero) / (self.high - self.low)
-        if not self.inverted:
-            return shares
-        return -shares if speed else 1 - shares
+        span = self.high - self.low
+        if speed:
+            return (-values if self.inverted else values) / span
+        shares = (values - self.low) / span
+        return 1 - shares if self.inverted else shares
 
 
 def read_encoders(

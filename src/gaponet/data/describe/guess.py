@@ -47,7 +47,7 @@ UNIT_WORDS = {
     "ticks": ("ticks", "tick", "counts"),
     "turns": ("turns", "turn", "rev", "revs", "revolutions", "rotations"),
 }
-LARGEST_RAD = 7.0  # larger positions are degrees
+LARGEST_RAD = 7.0  # larger positions are degrees, unless they look like ticks or percent
 CLOCKS = (
     "time",
     "t",
@@ -62,12 +62,14 @@ CLOCKS = (
 )
 FILLERS = ("joint", "joints", "data", "log")  # of files' names
 NOT_POSITIONS = ("qvel", "tau", "temperature")
+NOT_TORQUES = ("qpos", "qvel", "temperature")
+USUAL_PERIODS_S = (5e-4, 0.2)  # of logs
 ROWS = 4000  # that are looked at
-# of the positions' own motion by which commands are apart from them; of those, correlation with
-# speed
-NEAR_POSITIONS = 0.8
-MAX_SPEED_CORRELATION = 0.9
-APART = 0.5  # of a command's own motion by which repetitions of it differ at the most
+MAX_APART_SHARE = 0.8  # of the positions' own motion, by which commands are apart from them
+MAX_SPEED_CORRELATION = 0.9  # of commands with the speed; speeds have more
+MAX_REPETITION_SHARE = 0.5  # of a command's own motion, by which repetitions of it differ
+MAX_NAMES_SHOWN = 5  # of recordings, in a comment
+QUESTION = "# Lines with a ? are guesses: look at them."
 
 
 def guess_logs(
@@ -85,13 +87,14 @@ def guess_logs(
     family = _family(list(by_place(recordings)))
     if family:
         by_kind = {kind: _first_of(recordings, pattern) for kind, pattern in family.items()}
-        if "qpos" in _channels(by_kind["qpos"], robot) and "ctrl" in family:
+        names_columns = "qpos" in _channels(by_kind["qpos"], robot)
+        if names_columns and "ctrl" in family:
             return _guess_two_files(by_kind, family, robot, fmt, known)
         return _guess_family(by_kind, family, robot, fmt)
-    topics = _state_and_command(recordings)
-    if topics:
-        files = {kind: Path(recording.source).name for kind, recording in topics.items()}
-        return _guess_two_files(topics, files, robot, fmt, known)
+    pair = _state_and_command(recordings)
+    if pair:
+        files = {kind: Path(recording.source).name for kind, recording in pair.items()}
+        return _guess_two_files(pair, files, robot, fmt, known)
     return _guess_one_file(recordings, robot, fmt, known)
 
 
@@ -111,26 +114,38 @@ def _guess_one_file(
     lines = [
         f"# {fmt}; the first recording: {first.place}",
         f"# its columns: {first.shown(40)}",
-        "# Lines with a ? are guesses: look at them.",
+        QUESTION,
         "",
     ]
     lines += _clock(first, specified)
     lines += _positions(first, channels, robot, specified.get("position_unit"))
     for channel, name in channels.items():
         lines.append(_channel_line(channel, name, lines) + _others_alike(first, channel, name))
-    for need in ("ctrl", "qpos"):
+    lines += _missing_channels(channels)
+    names = _names(channels, joints, robot)
+    commands = _joints(first, channels, "ctrl")
+    in_array = "ctrl" in channels and "{joint}" not in channels["ctrl"]
+    names += _names_of_commands(commands, joints, robot, in_array)
+    tables = []  # the tables of TOML come last
+    for line in names:
+        if line.startswith(("joints =", "ignore =")):
+            lines.append(line)
+        else:
+            tables.append(line)
+    repeated = _repeated(recordings, channels.get("ctrl", ""))
+    lines += _labels([recording.name for recording in recordings], repeated)
+    return "\n".join([*lines, *tables]) + "\n"
+
+
+def _missing_channels(channels: dict[str, str]) -> list[str]:
+    """Lines that ask for command and position where no name looks like them."""
+    lines = []
+    for need in REQUIRED:
         if need not in channels:
             lines.append(f'# {need} = "…"          ? none of the names looks like it')
     if "ctrl" not in channels and {"tau", "qpos"} <= channels.keys():
         lines.append("# driven by torque? then the position's name also for ctrl: docs/logs.md")
-    repeated = _repeated(recordings, channels.get("ctrl", ""))
-    names = _names(channels, joints, robot)
-    array = "{joint}" not in channels.get("ctrl", "{joint}")
-    names += _names_of_commands(_joints(first, channels, "ctrl"), joints, robot, array)
-    top = [line for line in names if line.startswith(("joints =", "ignore ="))]
-    tables = [line for line in names if line not in top]
-    lines += [*top, *_labels([r.name for r in recordings], repeated), *tables]
-    return "\n".join(lines) + "\n"
+    return lines
 
 
 def _refuse_file_per_joint(
@@ -152,19 +167,26 @@ def _tell_desired_from_velocity(recording: RawRecording, channels: dict[str, str
     """Call an array such as qd a command, where no other is one and it is near the positions
     instead of their derivative.
     """
-    if "ctrl" in channels or "qvel" not in channels or "qpos" not in channels:
+    if "ctrl" in channels or not {"qvel", "qpos"} <= channels.keys():
         return
-    near = _values(recording, channels["qvel"])
+    values = _values(recording, channels["qvel"])
     qpos = _values(recording, channels["qpos"])
-    if near is None or qpos is None or near.shape != qpos.shape or len(qpos) < 3:
+    if values is None or qpos is None or values.shape != qpos.shape or len(qpos) < 3:
         return
-    apart = np.abs(near - qpos).mean()
-    moved = np.abs(qpos - qpos.mean(axis=0)).mean()
-    alike = []
-    for angle, other in zip(qpos.T, near.T, strict=True):
-        alike.append(np.corrcoef(np.gradient(angle), other)[0, 1])
-    if apart < NEAR_POSITIONS * moved and np.nanmean(np.abs(alike)) < MAX_SPEED_CORRELATION:
+    if _look_like_targets(values, qpos):
         channels["ctrl"] = channels.pop("qvel")
+
+
+def _look_like_targets(values: Array, qpos: Array) -> bool:
+    """Return True if values (T, n) are near positions (T, n), and unlike their speeds."""
+    apart = np.abs(values - qpos).mean()
+    own_motion = np.abs(qpos - qpos.mean(axis=0)).mean()
+    correlations = []  # with the speed of each joint
+    for angle, of_joint in zip(qpos.T, values.T, strict=True):
+        correlations.append(np.corrcoef(np.gradient(angle), of_joint)[0, 1])
+    near = apart < MAX_APART_SHARE * own_motion
+    unlike_speed = np.nanmean(np.abs(correlations)) < MAX_SPEED_CORRELATION
+    return bool(near and unlike_speed)
 
 
 def _labels(names: list[str], repeated: bool) -> list[str]:
@@ -173,11 +195,11 @@ def _labels(names: list[str], repeated: bool) -> list[str]:
     Args:
         repeated: A final number in the names counts repetitions.
     """
-    more = ", …" if len(names) > 5 else ""
+    more = ", …" if len(names) > MAX_NAMES_SHOWN else ""
     return [
         "",
         "# What the names of the recordings say, or a sheet (file, motion, payload, unit, rep):",
-        f"# names here: {', '.join(names[:5])}{more}",
+        f"# names here: {', '.join(names[:MAX_NAMES_SHOWN])}{more}",
         f"motion = {_text(_pattern(names, repeated))}",
         '# manifest = "sheet.csv"',
         '# unit = "…"',
@@ -202,9 +224,11 @@ def _family(files: list[str]) -> dict[str, str]:
         by_name[name][_kind(stem) or "time"] = f"{pattern}.{suffix}"
     families = list(by_name.values())
     kinds = families[0]
+    if "qpos" not in kinds or len(kinds) < 2:
+        return {}
     # the last may be cut off
     alike = all(family.keys() == kinds.keys() for family in families[:-1])
-    return kinds if alike and "qpos" in kinds and len(kinds) > 1 else {}
+    return kinds if alike else {}
 
 
 def _without_kind(stem: str) -> str | None:
@@ -215,8 +239,9 @@ def _without_kind(stem: str) -> str | None:
     known = [word for word in words if _kind(word) or word.lower() in CLOCKS]
     if not known:
         return None
+    fillers = [word for word in words if word.lower() in FILLERS]
     name = stem
-    for word in [*known, *(w for w in words if w.lower() in FILLERS)]:
+    for word in known + fillers:
         name = re.sub(rf"[-_. ]?{word}", "", name, count=1)
     return name.strip("-_. /")
 
@@ -237,7 +262,7 @@ def _guess_family(
     values = np.concatenate([signal.values[:ROWS].ravel() for signal in loaded.values()])
     lines = [
         f"# {fmt}; files that belong together: {', '.join(family.values())}",
-        "# Lines with a ? are guesses: look at them.",
+        QUESTION,
         "",
         f"state_file = {_text(family['qpos'])}  # ?",
     ]
@@ -280,16 +305,20 @@ def _others_alike(recording: RawRecording, channel: str, name: str) -> str:
     """A question where other arrays could be this channel, as those of a second arm; "" if none."""
     if channel not in REQUIRED:
         return ""
-    arrays = [array for array, labels in recording.signals.items() if labels]
-    alike = [array for array in arrays if array != name and _kind(array) == channel]
-    return f"  # ? also: {', '.join(alike)}" if alike and "{joint}" not in name else ""
+    if "{joint}" in name:
+        return ""
+    alike = []
+    for array, labels in recording.signals.items():
+        if labels and array != name and _kind(array) == channel:
+            alike.append(array)
+    return f"  # ? also: {', '.join(alike)}" if alike else ""
 
 
 def _state_and_command(recordings: list[RawRecording]) -> dict[str, RawRecording] | None:
     """Return state and command where there are two files, called like joint_states.csv and
     command.csv.
     """
-    by_kind = {_kind(Path(r.source).stem) or "": r for r in recordings}
+    by_kind = {_kind(Path(recording.source).stem) or "": recording for recording in recordings}
     if len(recordings) != 2 or by_kind.keys() != {"qpos", "ctrl"}:
         return None
     return by_kind
@@ -318,7 +347,7 @@ def _guess_two_files(
         f"# {fmt}; each recording in two files",
         f"# columns of the state: {state.shown(20)}",
         f"# columns of the command: {command.shown(20)}",
-        "# Lines with a ? are guesses: look at them.",
+        QUESTION,
         "",
         f"state_file = {_text(files['qpos'])}",
         f"command_file = {_text(files['ctrl'])}",
@@ -354,12 +383,16 @@ def _first_of(recordings: list[RawRecording], pattern: str) -> RawRecording:
 def _time_unit(stamps: Array) -> str:
     """The line of time_unit for a clock."""
     low, period, high = np.percentile(np.diff(stamps[:ROWS]), [5, 50, 95])
-    units = [u for u, s in SECONDS.items() if 5e-4 <= period * s <= 0.2]
-    unit = units[0] if units else "s"
+    unit = "s"
+    for name, seconds in SECONDS.items():
+        if USUAL_PERIODS_S[0] <= period * seconds <= USUAL_PERIODS_S[1]:
+            unit = name
+            break
+    in_seconds = SECONDS[unit]
     uneven = ""
     if high - low > 0.2 * period:
-        uneven = f"; uneven: {low * SECONDS[unit]:.3g} to {high * SECONDS[unit]:.3g} s"
-    return f'time_unit = "{unit}"  # the median period is {period * SECONDS[unit]:.6g} s{uneven}'
+        uneven = f"; uneven: {low * in_seconds:.3g} to {high * in_seconds:.3g} s"
+    return f'time_unit = "{unit}"  # the median period is {period * in_seconds:.6g} s{uneven}'
 
 
 def _text(value: str) -> str:
@@ -367,51 +400,58 @@ def _text(value: str) -> str:
 
 
 def _kind(name: str) -> str | None:
-    """Which channel a name speaks of; of a command's, positions only."""
+    """Return which channel a name speaks of; None for none, a commanded velocity or torque, and a
+    feed-forward of something else than a torque.
+    """
     parts = re.split(r"[^a-z0-9]+", re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name).lower())
     parts += [part.rstrip("0123456789") for part in parts]  # q1, cmd2
     matches = [channel for channel, words in WORDS.items() if not set(words).isdisjoint(parts)]
-    excluded = {"ctrl": NOT_POSITIONS, FEEDFORWARD: ("qpos", "qvel", "temperature")}.get(
-        matches[0] if matches else ""
-    )
-    if excluded and any(c in matches for c in excluded):
-        return None  # a commanded velocity or torque; a feed-forward of something else
-    return matches[0] if matches else None
+    if not matches:
+        return None
+    first, *others = matches
+    excluded: tuple[str, ...] = ()
+    if first == "ctrl":
+        excluded = NOT_POSITIONS
+    elif first == FEEDFORWARD:
+        excluded = NOT_TORQUES
+    return first if set(excluded).isdisjoint(others) else None
 
 
 def _channels(recording: RawRecording, robot: RobotSpec) -> dict[str, str]:
     """channel → array, or pattern of columns with {joint}."""
-    matches = _arrays_of_channels(recording)
-    shapes = _patterns_of_channels(recording)
+    channels = _arrays_of_channels(recording)
+    patterns = _patterns_of_channels(recording)
     joints: set[str] = set()
-    for kind in sorted(shapes, key=lambda k: k != "qpos"):  # the others have the joints of qpos
-        pattern = _best_pattern(shapes[kind], joints, robot)
-        joints = joints or shapes[kind][pattern]
-        matches.setdefault(kind, pattern)
-    return matches
+    qpos_first = sorted(patterns, key=lambda channel: channel != "qpos")
+    for channel in qpos_first:  # the others have the joints of qpos
+        pattern = _best_pattern(patterns[channel], joints, robot)
+        joints = joints or patterns[channel][pattern]
+        channels.setdefault(channel, pattern)
+    return channels
 
 
 def _arrays_of_channels(recording: RawRecording) -> dict[str, str]:
     """channel → the widest array that is called like it."""
-    matches: dict[str, str] = {}
+    channels: dict[str, str] = {}
     arrays = [name for name, labels in recording.signals.items() if labels]
-    for name in sorted(arrays, key=lambda n: -len(recording.signals[n])):
-        kind = _kind(name)
-        if kind and not (kind == "qpos" and _is_of_hand(name)):
-            matches.setdefault(kind, name)
-    return matches
+    for name in sorted(arrays, key=lambda array: -len(recording.signals[array])):
+        channel = _kind(name)
+        if channel is None or (channel == "qpos" and _is_of_hand(name)):
+            continue
+        channels.setdefault(channel, name)
+    return channels
 
 
 def _patterns_of_channels(recording: RawRecording) -> dict[str, dict[str, set[str]]]:
     """channel → pattern with {joint} → joints, of the columns that are no arrays."""
-    shapes: dict[str, dict[str, set[str]]] = defaultdict(dict)
+    patterns: dict[str, dict[str, set[str]]] = defaultdict(dict)
     for name, labels in recording.signals.items():
-        kind = _kind(name)
-        if kind is None or labels or name.lower() in CLOCKS:
+        channel = _kind(name)
+        if channel is None or labels or name.lower() in CLOCKS:
             continue
-        for pattern, joint in _patterns(name):
-            shapes[kind].setdefault(pattern, set()).add(joint)
-    return shapes
+        for pattern, joint in _readings(name):
+            patterns[channel].setdefault(pattern, set()).add(joint)
+    return patterns
 
 
 def _is_of_hand(name: str) -> bool:
@@ -444,31 +484,33 @@ def _is_joint(name: str, robot: RobotSpec) -> bool:
     return True
 
 
-def _patterns(name: str) -> list[tuple[str, str]]:
-    """Each way to read a name as joint and words, with the joint.
+def _readings(name: str) -> list[tuple[str, str]]:
+    """Return each way to read a name as a joint and words of a channel: (pattern, joint).
 
     shoulder_pan_des → {joint}_des; q_des_1 → q_des_{joint}; tau_J[0] → tau_J[{joint}]; q1_ref →
     q{joint}_ref.
     """
+    readings = []
     words = list(re.finditer(r"[A-Za-z0-9]+", name))
-    matches = []
-    for known, run in groupby(words, lambda word: _is_word(word[0])):
-        together = list(run)
-        first = together[0]
-        last = together[-1]
-        if known and last.end() < len(name):
+    for is_channel, run in groupby(words, lambda word: _is_word(word[0])):
+        if not is_channel:
+            continue
+        first, *others = run
+        last = others[-1] if others else first
+        if last.end() < len(name):  # the joint stands behind the channel
             start = last.end() + 1
             joint = re.sub(r"[^A-Za-z0-9]*$", "", name[start:])
             closing = name[start + len(joint) :]
             if joint:
-                matches.append((name[:start] + "{joint}" + closing, joint))
-        if known and first.start():
-            matches.append(("{joint}" + name[first.start() - 1 :], name[: first.start() - 1]))
+                readings.append((name[:start] + "{joint}" + closing, joint))
+        if first.start():  # the joint stands before it
+            end = first.start() - 1
+            readings.append(("{joint}" + name[end:], name[:end]))
     numbers = list(re.finditer(r"\d+", name))
     if numbers:
         place = numbers[-1]
-        matches.append((name[: place.start()] + "{joint}" + name[place.end() :], place[0]))
-    return matches or [(name, "0")]
+        readings.append((name[: place.start()] + "{joint}" + name[place.end() :], place[0]))
+    return readings or [(name, "0")]
 
 
 def _is_word(text: str) -> bool:
@@ -482,18 +524,28 @@ def _joints(recording: RawRecording, channels: dict[str, str], channel: str = "q
         return []
     if "{joint}" not in pattern:
         return list(recording.signals.get(pattern) or ("0",))
-    before, after = map(re.escape, pattern.split("{joint}"))
     kind = channel if channel in channels else "ctrl"
     joints = []
-    for column in recording.columns:
-        match = re.fullmatch(f"{before}(.+?){after}", column)
-        if match and _kind(column) == kind:
-            joints.append(match[1])
+    for column, joint in _joint_of_column(recording, pattern).items():
+        if _kind(column) == kind:
+            joints.append(joint)
     return joints
 
 
+def _joint_of_column(recording: RawRecording, pattern: str) -> dict[str, str]:
+    """Return column → joint, of the columns that fit a pattern with {joint}."""
+    before, after = map(re.escape, pattern.split("{joint}"))
+    fits = re.compile(f"{before}(.+?){after}")
+    joint_of = {}
+    for column in recording.columns:
+        match = fits.fullmatch(column)
+        if match:
+            joint_of[column] = match[1]
+    return joint_of
+
+
 def _names(channels: dict[str, str], joints: list[str], robot: RobotSpec) -> list[str]:
-    """joints and [names]."""
+    """Lines that say which joints the columns of the positions are: joints, ignore or [names]."""
     if not joints:
         return []
     pattern = channels.get("qpos") or channels["ctrl"]
@@ -502,18 +554,20 @@ def _names(channels: dict[str, str], joints: list[str], robot: RobotSpec) -> lis
     strange = [joint for joint in joints if not _is_joint(joint, robot)]
     if not strange:
         return []
-    left = [j for j in robot.joint_names if j not in joints]
-    if not left:
+    free = [joint for joint in robot.joint_names if joint not in joints]
+    if not free:
         return [f"ignore = {json.dumps(strange)}  # ? no joints of this robot"]
-    if len(left) == len(strange):
+    if len(free) == len(strange):
         heading = "[names]  # ? the log's = the robot's, in the order of both"
-    else:
-        heading = "[names]  # ? the log's = the robot's"
-        left = ["…"] * len(strange)
-    lines = ["", heading]
-    for theirs, ours in zip(strange, left, strict=True):
-        lines.append(f"{_text(theirs)} = {_text(ours)}")
-    return lines
+        return ["", heading, *_equal_names(strange, free)]
+    unknown = ["…"] * len(strange)
+    return ["", "[names]  # ? the log's = the robot's", *_equal_names(strange, unknown)]
+
+
+def _equal_names(theirs: list[str], ours: list[str]) -> list[str]:
+    """Lines of [names]: the log's joint = the robot's."""
+    pairs = zip(theirs, ours, strict=True)
+    return [f"{_text(in_log)} = {_text(joint)}" for in_log, joint in pairs]
 
 
 def _joints_in_order(n: int, robot: RobotSpec) -> str:
@@ -527,42 +581,63 @@ def _joints_in_order(n: int, robot: RobotSpec) -> str:
 
 
 def _names_of_commands(
-    told: list[str], joints: list[str], robot: RobotSpec, array: bool
+    commands: list[str], joints: list[str], robot: RobotSpec, in_array: bool
 ) -> list[str]:
     """Lines for commands that call their joints otherwise than the positions do.
 
     Args:
-        array: The commands are one array, whose columns a line `joints` names.
+        commands: Names of the joints, as the commands have them.
+        joints: The same of the positions.
+        in_array: The commands are one array, whose columns a line `joints` names.
     """
-    strange = [name for name in told if name not in joints and not _is_joint(name, robot)]
+    strange = [name for name in commands if name not in joints and not _is_joint(name, robot)]
     if not strange or "0" in joints:
         return []
-    if array and all(name.isdigit() for name in strange):
+    if in_array and all(name.isdigit() for name in strange):
         return [f"{_joints_in_order(len(strange), robot)} (of the commands)"]
     ours = ["…"] * len(strange)
     if len(strange) == len(robot.joint_names):
         ours = list(robot.joint_names)
-    lines = ["", "[names]"] if all(_is_joint(joint, robot) for joint in joints) else []
+    lines = []
+    if all(_is_joint(joint, robot) for joint in joints):  # else [names] stands there already
+        lines += ["", "[names]"]
     lines.append("# of the commands  ? in the robot's order: is it theirs?")
-    return lines + [f"{_text(a)} = {_text(b)}" for a, b in zip(strange, ours, strict=True)]
+    return lines + _equal_names(strange, ours)
 
 
 def _clock(recording: RawRecording, specified: dict[str, Any]) -> list[str]:
-    """time or rate, and time_unit."""
+    """Lines of time or rate, and of time_unit."""
     if "rate" in specified:
         return [f"rate = {specified['rate']:g}  # Hz"]
-    named = [n for n, labels in recording.signals.items() if not labels]
     periods = clock_periods(recording.signals, recording.load)
-    known = [n for n in named if n == specified.get("time") or n.lower() in CLOCKS]
-    clock = next(iter([*known, *periods]), None)
+    clock = _likely_clock(recording, specified.get("time"), periods)
     if clock is None:
-        own = [n for n in list(recording.signals)[:1] if recording.load([n])[n].time is not None]
-        return [] if own else ["rate = 50.0  # ? Hz: the log has no clock"]
+        return [] if _has_own_clock(recording) else ["rate = 50.0  # ? Hz: the log has no clock"]
     lines = [] if clock == "time" else [f"time = {_text(clock)}"]
     others = {name: other for name, other in periods.items() if name != clock}
     if others and clock in periods:
         lines = _which_clock(clock, periods[clock], others)
     return [*lines, _time_unit(recording.load([clock])[clock].values)]
+
+
+def _likely_clock(
+    recording: RawRecording, stated: str | None, periods: dict[str, float]
+) -> str | None:
+    """Return the column that is most likely the clock: the first that is stated or called like
+    one, else the first that runs like one (periods).
+    """
+    for name, labels in recording.signals.items():
+        if not labels and (name == stated or name.lower() in CLOCKS):
+            return name
+    return next(iter(periods), None)
+
+
+def _has_own_clock(recording: RawRecording) -> bool:
+    """Return True if the signals of a recording have clocks of their own, as topics of a bag."""
+    first = next(iter(recording.signals), None)
+    if first is None:
+        return False
+    return recording.load([first])[first].time is not None
 
 
 def _which_clock(clock: str, period: float, others: dict[str, float]) -> list[str]:
@@ -589,8 +664,8 @@ def _values(recording: RawRecording, pattern: str, robot: RobotSpec | None = Non
         if values.ndim == 1:
             return values[:, None]
         labels = recording.signals[pattern]
-        joints = [i for i, label in enumerate(labels) if robot and _is_joint(label, robot)]
-        return values[:, joints] if joints else values
+        of_robot = [i for i, label in enumerate(labels) if robot and _is_joint(label, robot)]
+        return values[:, of_robot] if of_robot else values
     names = _columns_of(recording, pattern, robot)
     if not names:
         return None
@@ -602,14 +677,15 @@ def _columns_of(recording: RawRecording, pattern: str, robot: RobotSpec | None) 
     """Return the columns that fit a pattern with {joint}; of a robot, its joints where any are."""
     if "{joint}" not in pattern:
         return []
-    before, after = map(re.escape, pattern.split("{joint}"))
-    joint_of = {}
-    for name in recording.columns:
-        match = re.fullmatch(f"{before}(.+?){after}", name)
-        if match and name in recording.signals:
-            joint_of[name] = match[1]
-    own = [name for name, joint in joint_of.items() if robot and _is_joint(joint, robot)]
-    return own or list(joint_of)
+    columns = []
+    of_robot = []
+    for column, joint in _joint_of_column(recording, pattern).items():
+        if column not in recording.signals:
+            continue
+        columns.append(column)
+        if robot and _is_joint(joint, robot):
+            of_robot.append(column)
+    return of_robot or columns
 
 
 def _positions(
@@ -654,9 +730,9 @@ def _named_unit(recording: RawRecording, pattern: str) -> str | None:
             texts.append(unit)
     for text in texts:
         for word in re.split(r"[^a-z°]+", text.lower()):
-            unit = next((u for u, words in UNIT_WORDS.items() if word in words), None)
-            if unit:
-                return unit
+            for unit, words in UNIT_WORDS.items():
+                if word in words:
+                    return unit
     return None
 
 
@@ -674,15 +750,17 @@ def _repeated(recordings: list[RawRecording], ctrl: str) -> bool:
     first = np.nan_to_num(first[:rows])
     second = np.nan_to_num(second[:rows])
     own_motion = np.abs(first - first.mean(axis=0)).mean()
-    return bool(np.abs(first - second).mean() <= APART * own_motion)
+    return bool(np.abs(first - second).mean() <= MAX_REPETITION_SHARE * own_motion)
 
 
 def _pattern(names: list[str], repeated: bool) -> str:
     """Return the pattern of the names: a payload with its unit, and a final number."""
     pattern = "{motion}"
-    if all(re.search(r"_\d+(?:[.p]\d+)?kg", n) for n in names):
+    if all(re.search(r"_\d+(?:[.p]\d+)?kg", name) for name in names):
         pattern += "_{payload:g}kg"
-    if repeated and all(re.search(r"_(?:rep|r|run|take)?\d+$", n) for n in names):
-        word = re.search(r"_(rep|r|run|take)?\d+$", names[0])
-        pattern += f"_{word[1] or '' if word else ''}" + "{rep}"
-    return pattern
+    numbers = [re.search(r"_(rep|r|run|take)?\d+$", name) for name in names]
+    if not (repeated and all(numbers)):
+        return pattern
+    first = numbers[0] if numbers else None
+    word = first[1] if first and first[1] else ""
+    return f"{pattern}_{word}{{rep}}"

@@ -37,10 +37,10 @@ FIELDS = {
     "kp": ("kp", r"\d+(?:[.p]\d+)?"), "kd": ("kd", r"\d+(?:[.p]\d+)?"),
     "estimated": ("estimated", r".+"), "leave_out": ("leave_out", r"yes|no"), "": ("", r".+?"),
 }  # fmt: skip
-# of a pattern's words that match anything: each more makes a name that does not fit slower to
-# refuse
-MOST_LOOSE = 3
+# Words of a pattern that match any text: each more makes a name that does not fit slower to refuse.
+MAX_LOOSE_WORDS = 3
 NUMBERS = ("payload_mass", "repetition", "kp", "kd")
+MAX_SHEET_BYTES = 16 << 20
 
 
 class LogsFile(TypedDict, total=False):
@@ -112,17 +112,17 @@ class Naming:
 
     def __init__(self, specified: LogsFile, where: Path | None) -> None:
         self.where = str(where or "logs.toml")
-        self.pattern, self.by_path = _pattern(specified.get("motion"), self.where)
+        self.pattern = _pattern(specified["motion"], self.where) if "motion" in specified else None
         self.text = specified.get("motion", "")
-        if Path(specified.get("manifest", "")).name != specified.get("manifest", ""):
-            raise UsageError(
-                f'{self.where}: manifest = "{specified["manifest"]}": it lies beside logs.toml; '
-                "give its name"
-            )
         self.sheet: list[dict[str, str]] | None = None
         if "manifest" in specified:
-            self.sheet = _read_sheet((where or Path()).parent / specified["manifest"])
-        self.unused = set(range(len(self.sheet or ())))
+            name = specified["manifest"]
+            if Path(name).name != name:
+                raise UsageError(
+                    f'{self.where}: manifest = "{name}": it lies beside logs.toml; give its name'
+                )
+            self.sheet = _read_sheet((where or Path()).parent / name)
+        self.unused = set(range(len(self.sheet or ())))  # rows of the sheet
         self.all: dict[str, Any] = {}
         for word in ("unit", "payload", "side", "kp", "kd"):
             value = specified.get(word)
@@ -134,34 +134,41 @@ class Naming:
         """Fields of SequenceMeta for a recording called `name` at a path relative to the logs."""
         facts = dict(self.all)
         path = "#".join(map(_stem, path.split("#")))
-        if self.pattern:
-            match = self.pattern.fullmatch(path if self.by_path else name)
-            if not match:
-                raise LogError(
-                    f'{path}: its name does not look like motion = "{self.text}" of {self.where}; '
-                    "rename it, or list "
-                    "the recordings in a manifest"
-                )
-            facts |= _agreeing(
-                facts, _fields(match.groupdict(), path), path, f"logs.toml and {name}"
-            )
+        if self.pattern is not None:
+            by_name = self._by_name(self.pattern, name, path)
+            facts |= _agreeing(facts, by_name, path, f"logs.toml and {name}")
         if self.sheet is not None:
-            words = (name, path, path.split("#")[0])
-            rows = []
-            for i, row in enumerate(self.sheet):
-                pattern = _stem(row["file"])
-                if any(fnmatchcase(word, pattern) for word in words):
-                    rows.append(i)
-            if len(rows) != 1:
-                raise LogError(
-                    f"{path}: {len(rows) or 'no'} rows of the manifest of {self.where} name it; "
-                    f"one must: write {name} under file"
-                )
-            self.unused -= set(rows)
-            stated = {k: v for k, v in self.sheet[rows[0]].items() if k != "file"}
-            both = "logs.toml (or a name) and the manifest"
-            facts |= _agreeing(facts, _fields(stated, path), path, both)
+            by_sheet = self._by_sheet(self.sheet, name, path)
+            facts |= _agreeing(facts, by_sheet, path, "logs.toml (or a name) and the manifest")
         return facts
+
+    def _by_name(self, pattern: re.Pattern[str], name: str, path: str) -> dict[str, Any]:
+        """Return what the name of a recording says, or its path where the pattern has a slash."""
+        match = pattern.fullmatch(path if "/" in self.text else name)
+        if not match:
+            raise LogError(
+                f'{path}: its name does not look like motion = "{self.text}" of {self.where}; '
+                "rename it, or list the recordings in a manifest"
+            )
+        return _fields(match.groupdict(), path)
+
+    def _by_sheet(self, sheet: list[dict[str, str]], name: str, path: str) -> dict[str, Any]:
+        """Return what the sheet says of a recording, which one row must name."""
+        words = (name, path, path.split("#")[0])
+        rows = []
+        for i, row in enumerate(sheet):
+            pattern = _stem(row["file"])
+            if any(fnmatchcase(word, pattern) for word in words):
+                rows.append(i)
+        if len(rows) != 1:
+            raise LogError(
+                f"{path}: {len(rows) or 'no'} rows of the manifest of {self.where} name it; "
+                f"one must: write {name} under file"
+            )
+        self.unused -= set(rows)
+        stated = dict(sheet[rows[0]])
+        del stated["file"]
+        return _fields(stated, path)
 
     def require_all_used(self) -> None:
         """Refuse rows of the sheet that name no recording: one that is missing, or a name with a
@@ -178,12 +185,15 @@ class Naming:
 def _agreeing(facts: dict[str, Any], more: dict[str, Any], path: str, both: str) -> dict[str, Any]:
     """Return `more`, which may say gains of single joints beside those of all, but contradict no
     other fact.
+
+    Args:
+        both: What says facts, and what says more.
     """
     for field in facts.keys() & more.keys():
         first = facts[field]
         second = more[field]
         if isinstance(second, dict):
-            more[field] = (first if isinstance(first, dict) else {"": first}) | second
+            more[field] = _by_joint(first) | second
         elif second != first:
             raise LogError(
                 f"{path}: {both} contradict: {field} {first} and {second}; delete the wrong one"
@@ -191,10 +201,13 @@ def _agreeing(facts: dict[str, Any], more: dict[str, Any], path: str, both: str)
     return more
 
 
-def _pattern(text: str | None, where: str) -> tuple[re.Pattern[str] | None, bool]:
-    """The regular expression of "{motion}_{payload:g}kg", and whether it is of the path."""
-    if text is None:
-        return None, False
+def _by_joint(gains: Any) -> dict[str, Any]:
+    """Return gains by joint; "" stands for all others."""
+    return gains if isinstance(gains, dict) else {"": gains}
+
+
+def _pattern(text: str, where: str) -> re.Pattern[str]:
+    """Return the regular expression of "{motion}_{payload:g}kg"."""
     parts = []
     seen = set()
     loose = 0
@@ -202,20 +215,21 @@ def _pattern(text: str | None, where: str) -> tuple[re.Pattern[str] | None, bool
         if literal:
             parts.append(re.escape(literal))
             continue
-        if brace or word not in FIELDS or (word and word in seen):
-            known = ", ".join("{" + k + "}" for k in FIELDS)
+        repeated = word in seen and word != ""
+        if brace or word not in FIELDS or repeated:
+            known = ", ".join("{" + field + "}" for field in FIELDS)
             raise UsageError(f'{where}: motion = "{text}": use each of {known} at most once')
         seen.add(word)
         expression = FIELDS[word][1]
         if expression.startswith(".+"):
             loose += 1
         parts.append(f"(?P<{word}>{expression})" if word else expression)
-    if loose > MOST_LOOSE:
+    if loose > MAX_LOOSE_WORDS:
         raise UsageError(
-            f'{where}: motion = "{text}": at most {MOST_LOOSE} words may be of any text; use a '
-            "manifest"
+            f'{where}: motion = "{text}": at most {MAX_LOOSE_WORDS} words may be of any text; use '
+            "a manifest"
         )
-    return re.compile("".join(parts)), "/" in text
+    return re.compile("".join(parts))
 
 
 def _fields(stated: Mapping[str, str | None], where: str) -> dict[str, Any]:
@@ -230,8 +244,7 @@ def _fields(stated: Mapping[str, str | None], where: str) -> dict[str, Any]:
         field = FIELDS[kind][0]
         value: Any = _value(field, text, word, where)
         if joint:
-            gains = facts.get(field, {})
-            value = (gains if isinstance(gains, dict) else {"": gains}) | {joint: value}
+            value = _by_joint(facts.get(field, {})) | {joint: value}
         facts[field] = value
     return facts
 
@@ -267,7 +280,7 @@ def _stem(file: str) -> str:
 
 def _read_sheet(file: Path) -> list[dict[str, str]]:
     """The rows of a manifest; columns that say nothing here are left alone."""
-    if not file.is_file() or file.stat().st_size > 16 << 20:
+    if not file.is_file() or file.stat().st_size > MAX_SHEET_BYTES:
         raise UsageError(f"{file}: the manifest is missing, or no table; a CSV with a column file")
     try:
         content = io.StringIO(file.read_text(encoding="utf-8-sig"))
@@ -280,17 +293,22 @@ def _read_sheet(file: Path) -> list[dict[str, str]]:
         raise UsageError(f"{file}: a manifest has a column file, and a row for each recording")
     columns = ["file", *filter(_is_known, names)]
     _require_clear_names(file, names, columns)
+    _require_no_further_cells(file, rows)
+    sheet = []
     for row in rows:
-        if any(row.get(None, ())):  # cells behind the last column
+        if row.get("file"):
+            sheet.append({column: row[column] for column in columns if row.get(column) is not None})
+    return sheet
+
+
+def _require_no_further_cells(file: Path, rows: list[dict[Any, Any]]) -> None:
+    """Refuse rows with cells behind the last column, which csv keeps under None."""
+    for row in rows:
+        if any(row.get(None, ())):
             raise UsageError(
                 f"{file}: the row of {row['file']} has more cells than the header; is a decimal "
                 "comma in it?"
             )
-    sheet = []
-    for row in rows:
-        if row.get("file"):
-            sheet.append({c: row[c] for c in columns if row.get(c) is not None})
-    return sheet
 
 
 def _require_clear_names(file: Path, names: list[str], columns: list[str]) -> None:

@@ -18,22 +18,26 @@ from gaponet.data.log import FEEDFORWARD, UNITS, Channel, Log
 from gaponet.robot.spec import RobotSpec
 
 # Beyond these nothing was measured: 9,500 turns a minute; what differentiation and inverse dynamics
-# make of noise.
-MOST = {"qpos": 1e3, "qvel": 1e3, "temperature": 400.0, "qacc": 1e6, "tau_eq": 1e6}
-FASTER = 50.0  # rad/s beyond ten times as fast as the positions ever move
-MOSTLY = 0.2  # of a joint's rows: more nonsense than this, and nothing of the channel is believed
-UNASKED = 1.0  # rad that no joint moves of itself while all are told to stand still
+# make of noise. In SI.
+MAX_PLAUSIBLE = {"qpos": 1e3, "qvel": 1e3, "temperature": 400.0, "qacc": 1e6, "tau_eq": 1e6}
+MAX_TORQUE_RATIO = 20.0  # of a reading, over the torque limit of its motor
+MAX_WEAK_TORQUE = 100.0  # N·m, of a reading of a motor with less than a 20th of it
+MAX_SPEED_RATIO = 10.0  # of a reading, over the fastest that the positions ever move
+MAX_SPEED_BEYOND_RAD_S = 50.0  # added to this
+MAX_NONSENSE_SHARE = 0.2  # of a joint's rows: with more, nothing of the channel is believed
+MAX_UNASKED_RAD = 1.0  # that a joint moves of itself while all are told to stand still
 TICKS_PER_TURN = 4096  # of the encoders of Feetech and Dynamixel servos
-# start, span
+# Unit → where it starts, and its span, of a joint's range.
 FRACTIONS = {
     "fraction": (0.0, 1.0),
     "percent": (0.0, 100.0),
     "signed_percent": (-100.0, 200.0),
 }
 FULL_PERCENT = 100.0
-NO_OFFSET_RAD = 3.3  # from zero: more than half a turn
-MIN_KIND = 0.5  # correlation of a command with speed or torque that tells what it is
-SAME_MOTION = 0.8  # correlation of positions in two units
+MAX_OFFSET_RAD = 3.3  # from zero, of a calibration: little more than half a turn
+MAX_BEYOND_RAD = 1.0  # of a joint's range, the same
+MIN_KIND_CORRELATION = 0.5  # of a command with speed or torque that tells what it is
+SAME_MOTION_CORRELATION = 0.8  # of positions in two units
 TURN_RAD = 2 * np.pi
 LARGEST_DEG = 360.0  # larger positions of a limb are no degrees
 
@@ -74,8 +78,9 @@ def _angles(
     """Return one joint's values (k,) in rad or, if they are speeds, in rad/s."""
     if unit in ("rad", "deg", "turns"):
         return _from_angles(values, unit)
-    in_range = robot.log_joints.units[robot.joint_names.index(joint)] == "fraction"  # a gripper
-    if encoder is not None and unit == "ticks" and in_range:
+    place = robot.joint_names.index(joint)
+    is_gripper = robot.log_joints.units[place] == "fraction"
+    if encoder is not None and unit == "ticks" and is_gripper:
         values = encoder.fractions(values, speed)
         unit = "fraction"
     if encoder is not None and unit in ("ticks", "signed_percent"):
@@ -83,18 +88,20 @@ def _angles(
     if unit == "ticks":
         zero = 0.0 if speed else TICKS_PER_TURN / 2
         return (values - zero) * 2 * np.pi / TICKS_PER_TURN
-    low, high = robot.qpos_range[robot.joint_names.index(joint)]
+    low, high = robot.qpos_range[place]
     start, span = FRACTIONS[unit]
-    shares = values / span if speed else (values - start) / span
-    zero = 0.0 if speed else low
-    return np.asarray(shares * (high - low) + zero)
+    if speed:
+        return np.asarray(values / span * (high - low))
+    return np.asarray((values - start) / span * (high - low) + low)
 
 
 def _from_angles(values: Array, unit: str) -> Array:
     """Return angles in rad, degrees or turns in rad."""
     if unit == "deg":
         return np.asarray(np.radians(values))
-    return TURN_RAD * values if unit == "turns" else values
+    if unit == "turns":
+        return TURN_RAD * values
+    return values
 
 
 def require_plausible(log: Log, robot: RobotSpec, strict: bool = False) -> Log:
@@ -106,22 +113,15 @@ def require_plausible(log: Log, robot: RobotSpec, strict: bool = False) -> Log:
     a channel that is mostly nonsense is left out. `strict` refuses it. A sensor may read more
     torque than the motor has, not 20 times as much.
     """
-    commanded = np.ptp(log.channels["ctrl"].values, axis=0).max()
-    moved = np.ptp(log.channels["qpos"].values, axis=0).max()
-    if commanded == 0 and moved > UNASKED:
-        raise LogError(
-            f"{log.source}: every commanded position stands still while the joints move by up to "
-            f"{moved:.3g} rad: a robot driven by torques, by velocities or by hand; such commands "
-            "are no position targets to learn from"
-        )
+    _require_told_to_move(log)
     _require_targets(log, robot)
     channels = dict(log.channels)
     replaced = {}
     for name in UNITS:
         if name not in log.channels:
             continue
-        values = log.channels[name].values
         if name in ("ctrl", "qpos"):
+            values = log.channels[name].values
             require_radians(values, log.joint_names, robot, partial(_place, log, name))
             continue
         wrong = _nonsense(name, log, robot)
@@ -129,7 +129,7 @@ def require_plausible(log: Log, robot: RobotSpec, strict: bool = False) -> Log:
             continue
         if strict or name == FEEDFORWARD:  # commands are never made up
             raise _implausible(name, log, wrong)
-        tolerable = bool(wrong.mean(axis=0).max() <= MOSTLY)
+        tolerable = bool(wrong.mean(axis=0).max() <= MAX_NONSENSE_SHARE)
         replaced[name] = _note(name, log, wrong, tolerable)
         channels.pop(name)
         if tolerable:
@@ -138,6 +138,18 @@ def require_plausible(log: Log, robot: RobotSpec, strict: bool = False) -> Log:
         return log
     notes = log.meta.get("notes", {}) | {"nonsense": replaced}
     return replace(log, channels=channels, meta=log.meta | {"notes": notes})
+
+
+def _require_told_to_move(log: Log) -> None:
+    """Refuse commands that all stand still while the joints move."""
+    commanded = np.ptp(log.channels["ctrl"].values, axis=0).max()
+    moved = np.ptp(log.channels["qpos"].values, axis=0).max()
+    if commanded == 0 and moved > MAX_UNASKED_RAD:
+        raise LogError(
+            f"{log.source}: every commanded position stands still while the joints move by up to "
+            f"{moved:.3g} rad: a robot driven by torques, by velocities or by hand; such commands "
+            "are no position targets to learn from"
+        )
 
 
 def _implausible(name: str, log: Log, wrong: Array) -> LogError:
@@ -176,31 +188,23 @@ def _require_targets(log: Log, robot: RobotSpec) -> None:
     """Refuse commands that no joint reaches beside positions that all do: speeds, torques or
     currents under a name of targets.
     """
+    time, positions = log.channels["qpos"]
+    command_time, commands = log.channels["ctrl"]
     for column, joint in enumerate(log.joint_names):
         low, high = robot.qpos_range[robot.joint_names.index(joint)]
-        told = log.channels["ctrl"].values[:, column]
-        at = log.channels["qpos"].values[:, column]
-        if not _beyond(told, low, high) or _beyond(at, low, high):
+        command = commands[:, column]
+        qpos = positions[:, column]
+        if not _beyond(command, low, high) or _beyond(qpos, low, high):
             continue
-        time = log.channels["qpos"].time
-        command = np.interp(time, log.channels["ctrl"].time, told)
-        if abs(_correlation(command, at)) > SAME_MOTION:
+        correlations = _correlations(np.interp(time, command_time, command), column, log)
+        if correlations.pop("positions") > SAME_MOTION_CORRELATION:
             return  # positions in another unit
-        speed = np.gradient(at, time)
-        acceleration = np.gradient(speed, time)
-        kinds = {
-            "speeds": abs(_correlation(command, speed)),
-            "torques or currents": abs(_correlation(command, acceleration)),
-        }
-        if "tau" in log.channels and len(log.channels["tau"].time) == len(time):
-            torque = abs(_correlation(command, log.channels["tau"].values[:, column]))
-            kinds["torques or currents"] = max(kinds["torques or currents"], torque)
-        likely = max(kinds, key=lambda kind: kinds[kind])
-        if kinds[likely] < MIN_KIND:
+        likely = max(correlations, key=lambda kind: correlations[kind])
+        if correlations[likely] < MIN_KIND_CORRELATION:
             return  # a reading that is wrong in some rows
-        row = int(np.abs(told).argmax())
+        row = int(np.abs(command).argmax())
         raise LogError(
-            f"{_place(log, 'ctrl', row)} of {joint} is {told[row]:.3f}, outside its range "
+            f"{_place(log, 'ctrl', row)} of {joint} is {command[row]:.3f}, outside its range "
             f"[{low:.2f}, {high:.2f}] rad, while its measured positions are inside: these are no "
             f"position targets but, by how the joint moves, {likely}. Log the targets of the "
             "position controller; of a robot that is driven by torque or current see "
@@ -208,12 +212,34 @@ def _require_targets(log: Log, robot: RobotSpec) -> None:
         )
 
 
+def _correlations(command: Array, column: int, log: Log) -> dict[str, float]:
+    """Return what a command (k,) may be → its correlation with that, of either sign.
+
+    Args:
+        command: At the times of the positions.
+        column: Of the joint.
+    """
+    time, positions = log.channels["qpos"]
+    qpos = positions[:, column]
+    speed = np.gradient(qpos, time)
+    acceleration = np.gradient(speed, time)
+    torque = abs(_correlation(command, acceleration))
+    if "tau" in log.channels and len(log.channels["tau"].time) == len(time):
+        recorded = log.channels["tau"].values[:, column]
+        torque = max(torque, abs(_correlation(command, recorded)))
+    return {
+        "positions": abs(_correlation(command, qpos)),
+        "speeds": abs(_correlation(command, speed)),
+        "torques or currents": torque,
+    }
+
+
 def _beyond(values: Array, low: float, high: float) -> bool:
     """Return True if positions (k,), rad, are further from zero and from the joint's range than a
     calibration offset.
     """
-    far = np.abs(values) > NO_OFFSET_RAD
-    outside = (values < low - 1.0) | (values > high + 1.0)
+    far = np.abs(values) > MAX_OFFSET_RAD
+    outside = (values < low - MAX_BEYOND_RAD) | (values > high + MAX_BEYOND_RAD)
     return bool((far & outside).any())
 
 
@@ -228,27 +254,30 @@ def _nonsense(name: str, log: Log, robot: RobotSpec) -> Array:
     """Where a channel holds what no joint does, (k, n)."""
     values = np.abs(log.channels[name].values)
     if name in ("tau", FEEDFORWARD):
-        return np.asarray(
-            values > np.maximum(20 * robot.servo.effort_limit[robot.index(log.joint_names)], 100.0)
-        )
+        limits = robot.servo.effort_limit[robot.index(log.joint_names)]
+        return np.asarray(values > np.maximum(MAX_TORQUE_RATIO * limits, MAX_WEAK_TORQUE))
     if name != "qvel":
-        return np.asarray(values > MOST[name])
+        return np.asarray(values > MAX_PLAUSIBLE[name])
     time, qpos = log.channels["qpos"]
-    fastest = np.abs(np.diff(qpos, axis=0) / np.diff(time)[:, None]).max(axis=0)
-    return np.asarray(values > np.minimum(FASTER + 10 * fastest, MOST[name]))
+    fastest = np.abs(np.diff(qpos, axis=0) / np.diff(time)[:, None]).max(axis=0)  # (n) rad/s
+    most = MAX_SPEED_BEYOND_RAD_S + MAX_SPEED_RATIO * fastest
+    return np.asarray(values > np.minimum(most, MAX_PLAUSIBLE[name]))
 
 
 def _made_up(name: str, log: Log, wrong: Array) -> Array:
-    """A channel whose wrong values, (k, n), come from positions or from the rows around them."""
-    at, qpos = log.channels["qpos"]
+    """Return a channel whose wrong values, (k, n) bool, come from positions or from the rows
+    around them.
+    """
+    position_time, qpos = log.channels["qpos"]
     time, values = log.channels[name]
     out = np.array(values, float)
     for j in np.flatnonzero(wrong.any(axis=0)):
         bad = wrong[:, j]
-        known = (
-            (at, np.gradient(qpos[:, j], at)) if name == "qvel" else (time[~bad], values[~bad, j])
-        )
-        out[bad, j] = np.interp(time[bad], *known)
+        if name == "qvel":
+            speed = np.gradient(qpos[:, j], position_time)
+            out[bad, j] = np.interp(time[bad], position_time, speed)
+        else:
+            out[bad, j] = np.interp(time[bad], time[~bad], values[~bad, j])
     return out
 
 
@@ -265,29 +294,34 @@ def require_radians(
     A real joint may pass its MJCF limit by a calibration offset, not by a radian and half a turn.
     """
     for column, joint in enumerate(joint_names):
-        row = int(abs(values[:, column]).argmax())
-        value = values[row, column]
+        of_joint = values[:, column]
+        row = int(abs(of_joint).argmax())
+        value = of_joint[row]
         low, high = robot.qpos_range[robot.joint_names.index(joint)]
-        if abs(value) > NO_OFFSET_RAD and (
-            not low - 1.0 <= value <= high + 1.0 or abs(value) > MOST["qpos"]
-        ):
-            look_like = "degrees; logs state them with --position-unit deg"
-            stated_as_degrees = np.round(np.degrees(values[:, column]), 6)
-            if look_like_ticks(values[:, column]) or look_like_ticks(stated_as_degrees):
-                look_like = (
-                    "ticks of an encoder, whole numbers from 0 to 4095; logs state them with "
-                    "--position-unit ticks"
-                )
-            elif look_like_percent(values[:, column]):
-                look_like = (
-                    "degrees, or LeRobot's −100..100 of the range; logs state them with "
-                    "--position-unit deg or signed_percent"
-                )
-            raise LogError(
-                f"{where(row)} of {joint} is {value:.3f}, outside its range [{low:.2f}, "
-                f"{high:.2f}] rad; positions must be in radians: these look like {look_like}, or "
-                "for one joint with [joint_units]"
-            )
+        near = low - MAX_BEYOND_RAD <= value <= high + MAX_BEYOND_RAD
+        if abs(value) <= MAX_OFFSET_RAD or (near and abs(value) <= MAX_PLAUSIBLE["qpos"]):
+            continue
+        raise LogError(
+            f"{where(row)} of {joint} is {value:.3f}, outside its range [{low:.2f}, "
+            f"{high:.2f}] rad; positions must be in radians: these look like "
+            f"{_likely_unit(of_joint)}, or for one joint with [joint_units]"
+        )
+
+
+def _likely_unit(values: Array) -> str:
+    """Say what positions (k,) are that are no radians, and how to state it."""
+    stated_as_degrees = np.round(np.degrees(values), 6)
+    if look_like_ticks(values) or look_like_ticks(stated_as_degrees):
+        return (
+            "ticks of an encoder, whole numbers from 0 to 4095; logs state them with "
+            "--position-unit ticks"
+        )
+    if look_like_percent(values):
+        return (
+            "degrees, or LeRobot's −100..100 of the range; logs state them with --position-unit "
+            "deg or signed_percent"
+        )
+    return "degrees; logs state them with --position-unit deg"
 
 
 def look_like_ticks(values: Array) -> bool:

@@ -52,21 +52,27 @@ def within_range(log: Log, robot: RobotSpec) -> Log:
         low, high = robot.qpos_range[robot.joint_names.index(joint)]
         if not (np.isfinite(low) and np.isfinite(high)):
             continue
+        inside: dict[str, Array] = {}  # channel → angles inside the range, (k,)
         wraps = 0
-        inside: dict[str, Array] = {}
         for name, values in positions.items():
-            found = _inside_range(values[:, column], low, high)
-            if found is not None:
-                inside[name] = found
-                wraps += int((np.abs(np.diff(values[:, column])) > TURN_RAD / 2).sum())
+            angles = _inside_range(values[:, column], low, high)
+            if angles is not None:
+                inside[name] = angles
+                wraps += _count_wraps(values[:, column])
         converted = joint in log.meta.get("converted_from", {})
-        if inside and (wraps or converted):  # radians beyond the range may be degrees
-            reference = next(iter(inside.values()))
-            for name, values in positions.items():
-                beside = _of_same_turn(values[:, column], reference)
-                values[:, column] = inside.get(name, beside)
-            turned[joint] = {"wraps": wraps, "turns": 0}
+        if not inside or not (wraps or converted):  # radians beyond the range may be degrees
+            continue
+        reference = next(iter(inside.values()))
+        for name, values in positions.items():
+            beside = _of_same_turn(values[:, column], reference)
+            values[:, column] = inside.get(name, beside)
+        turned[joint] = {"wraps": wraps, "turns": 0}
     return _with_positions(log, positions, turned) if turned else log
+
+
+def _count_wraps(values: Array) -> int:
+    """Return how often angles (k,) jump by more than half a turn."""
+    return int((np.abs(np.diff(values)) > TURN_RAD / 2).sum())
 
 
 def _with_positions(log: Log, positions: dict[str, Array], turned: dict[str, Any]) -> Log:
