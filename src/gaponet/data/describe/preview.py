@@ -21,7 +21,7 @@ NAMED = re.compile(r"^(\[names\]|joints = )", re.MULTILINE)
 
 
 class DescriptionNeededError(LogError):
-    """A person has to look at `text`, a logs.toml: logs cannot be read by it, or it guesses which
+    """A person has to look at a logs.toml (text): logs cannot be read by it, or it guesses which
     joint is which.
     """
 

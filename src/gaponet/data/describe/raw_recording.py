@@ -31,7 +31,9 @@ from gaponet.robot.log_joints import LOG_UNITS
 from gaponet.robot.spec import RobotSpec
 
 WIDEST = 500  # columns of an array that may be joints
-MIN_WIDTHS = 10  # by which an array with a column per sample is wider than high
+MIN_WIDTHS = 10  # times its height: so wide is an array with a column per sample, at least
+MAX_RATE_ERROR = 0.1  # of the rate that is stated beside a clock
+MAX_GAIN_CHANGE = 1e-3  # of a gain, while it is recorded
 SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 SAY_UNITS = "--position-unit rad --time-unit s (or position_unit and time_unit in logs.toml)"
 MOST_ROWS_APART = 2  # of channels without a clock: the state before the first command, and the last
@@ -45,14 +47,23 @@ NO_COMMANDS = (
 
 
 class Signal(NamedTuple):
-    """values (k,) or (k, n); time (k,) s where the signal has a clock of its own.
+    """One signal of a recording."""
 
-    in_seconds: A clock that was written as dates, whose unit nobody has to state.
-    """
+    values: Array  # (k,) or (k, n)
+    time: Array | None = None  # (k,) s, where the signal has a clock of its own
+    in_seconds: bool = False  # a clock that was written as dates: nobody has to state its unit
 
-    values: Array
-    time: Array | None = None
-    in_seconds: bool = False
+
+class Column(NamedTuple):
+    """One column of a recording."""
+
+    signal: str
+    number: int | None  # in the signal; None for a signal of one column
+
+    def of(self, loaded: dict[str, Signal]) -> Array:
+        """Return its values, (k,)."""
+        values = loaded[self.signal].values
+        return values if self.number is None else values[:, self.number]
 
 
 @dataclass(frozen=True)
@@ -79,16 +90,14 @@ class RawRecording:
         return self.where or self.source
 
     @property
-    def columns(self) -> dict[str, tuple[str, int | None]]:
-        """Every column by the name that logs.toml may call it: "signal" or "signal[label]" →
-        (signal, which).
-        """
-        columns: dict[str, tuple[str, int | None]] = {}
+    def columns(self) -> dict[str, Column]:
+        """Every column by the name that logs.toml may call it: "signal" or "signal[label]"."""
+        columns = {}
         for name, labels in self.signals.items():
             if not labels:
-                columns[name] = (name, None)
+                columns[name] = Column(name, None)
             for i, label in enumerate(labels):
-                columns[f"{name}[{label}]"] = (name, i)
+                columns[f"{name}[{label}]"] = Column(name, i)
         return columns
 
     def shown(self, most: int = 12) -> str:
@@ -104,11 +113,21 @@ class RawRecording:
         """
 
         def load(names: list[str]) -> dict[str, Signal]:
-            theirs = [n.removeprefix(prefix) for n in names if n.startswith(prefix)]
-            loaded = {prefix + n: s for n, s in other.load(theirs).items()} if theirs else {}
-            return self.load([n for n in names if not n.startswith(prefix)]) | loaded
+            ours = []
+            theirs = []
+            for name in names:
+                if name.startswith(prefix):
+                    theirs.append(name.removeprefix(prefix))
+                else:
+                    ours.append(name)
+            loaded = self.load(ours)
+            if theirs:
+                loaded |= {prefix + name: signal for name, signal in other.load(theirs).items()}
+            return loaded
 
-        signals = self.signals | {prefix + n: labels for n, labels in other.signals.items()}
+        signals = dict(self.signals)
+        for name, labels in other.signals.items():
+            signals[prefix + name] = labels
         return replace(self, signals=signals, load=load, files=self.files + other.files)
 
     @classmethod
@@ -169,7 +188,8 @@ class RawRecording:
         units = _units(robot, specified, list(chosen["ctrl"]), joint_map)
         joints = tuple(name for name in robot.joint_names if name in chosen["ctrl"])
         encoders = _encoders(robot, specified, joint_map)
-        in_si = _Conversion(robot, joints, [units[j] for j in joints], specified, encoders)
+        units_in_order = [units[joint] for joint in joints]
+        in_si = _Conversion(robot, joints, units_in_order, specified, encoders)
         channels = {}
         for channel, columns in chosen.items():
             time = _time(self, specified, loaded, clocks[channel], channel, columns)
@@ -180,8 +200,8 @@ class RawRecording:
         meta = self._meta(channels, specified)
         meta["notes"] = meta.get("notes", {}) | empty | repeated
         for name, columns in gains.items():
-            meta[name] = [_constant(self, name, _column(loaded, *columns[j])) for j in joints]
-        meta["converted_from"] = {j: units[j] for j in joints if units[j] != "rad"}
+            meta[name] = [_constant(self, name, columns[joint].of(loaded)) for joint in joints]
+        meta["converted_from"] = {joint: units[joint] for joint in joints if units[joint] != "rad"}
         return Log(robot.name, joints, channels, self.source, meta)
 
     def _meta(self, channels: Iterable[str], specified: LogsFile) -> dict[str, Any]:
@@ -199,8 +219,8 @@ class RawRecording:
     ) -> dict[str, Signal]:
         """Load the signals of some columns, and those that are clocks."""
         names = set[str]()
-        for joints in columns:
-            names.update(signal for signal, _ in joints.values())
+        for of_channel in columns:
+            names.update(column.signal for column in of_channel.values())
         of_time = {clock for clock in clocks.values() if clock in self.signals} - names
         return self.load([*names, *of_time])
 
@@ -213,8 +233,7 @@ class RawRecording:
         periods = clock_periods(self.signals, self.load)
         used = [*specified.get("clock", {}).values(), specified.get("time", "")]
         for clock in sorted(filter(None, chosen)):
-            where = self.place
-            require_one_rate(periods, clock, used, specified.get("ignore", ()), where)
+            require_one_rate(periods, clock, used, specified.get("ignore", ()), self.place)
 
 
 def rows_first(arrays: dict[str, Any]) -> tuple[dict[str, Any], list[str]]:
@@ -223,8 +242,14 @@ def rows_first(arrays: dict[str, Any]) -> tuple[dict[str, Any], list[str]]:
     The clock tells the number of samples. Without one, arrays that are all far wider than high are
     taken as transposed.
     """
-    tables = {n: a for n, a in arrays.items() if isinstance(a, np.ndarray) and a.ndim == 2}
-    clocks = {n: a.ravel() for n, a in tables.items() if 1 in a.shape and named_like_a_clock(n)}
+    tables = {}
+    clocks = {}
+    for name, array in arrays.items():
+        if not isinstance(array, np.ndarray) or array.ndim != 2:
+            continue
+        tables[name] = array
+        if 1 in array.shape and named_like_a_clock(name):
+            clocks[name] = array.ravel()
     arrays = arrays | clocks
     samples = _samples(arrays, list(tables.values()))
     if samples < 2:
@@ -241,13 +266,19 @@ def _samples(arrays: dict[str, Any], tables: list[Array]) -> int:
     """Return the number of samples: the length of single columns, else the width of tables that
     are all far wider than high; 0 if one is not.
     """
-    single = [a for a in arrays.values() if isinstance(a, np.ndarray) and a.ndim == 1]
-    samples = max(map(len, single), default=0)
+    samples = 0
+    for array in arrays.values():
+        if isinstance(array, np.ndarray) and array.ndim == 1:
+            samples = max(samples, len(array))
     if samples > 1:
         return samples
-    if any(table.shape[0] * MIN_WIDTHS > table.shape[1] for table in tables):
-        return 0
-    return max((table.shape[1] for table in tables), default=0)
+    widest = 0
+    for table in tables:
+        rows, columns = table.shape
+        if rows * MIN_WIDTHS > columns:
+            return 0
+        widest = max(widest, columns)
+    return widest
 
 
 def _is_signal(array: Any) -> bool:
@@ -299,26 +330,20 @@ def reading(file: Path, what: str) -> Iterator[None]:
         raise
     except Exception as error:
         reason = " ".join(str(error).split())[:200] or type(error).__name__
-        hint = (
-            "it is cut short: copy or record it again"
-            if _cut_short(file, error)
-            else "is it the right file?"
-        )
+        hint = "is it the right file?"
+        if _cut_short(file, error):
+            hint = "it is cut short: copy or record it again"
         raise LogError(f"{file}: not a readable {what} ({reason}); {hint}") from None
 
 
-# how files begin → how those that are whole end
-ENDS = {
-    b"\x89MCAP0\r\n": b"\x89MCAP0\r\n",
-    b"PAR1": b"PAR1",
-}
+# MCAP and Parquet files begin with these bytes, and end with them if they are whole.
+ENDS = (b"\x89MCAP0\r\n", b"PAR1")
+CUT_SHORT = re.compile(r"truncated|unexpected(ly)? end|end.of.file")  # in messages of libraries
 
 
 def _cut_short(file: Path, error: Exception) -> bool:
     """Return True if the end of a file is missing, by the error or by its last bytes."""
-    if isinstance(error, EOFError) or re.search(
-        r"truncated|unexpected(ly)? end|end.of.file", str(error).lower()
-    ):
+    if isinstance(error, EOFError) or CUT_SHORT.search(str(error).lower()):
         return True
     if not file.is_file():
         return False
@@ -328,10 +353,10 @@ def _cut_short(file: Path, error: Exception) -> bool:
         stop = stream.read(8)
     if start.startswith(b"PK\x03\x04"):
         return not zipfile.is_zipfile(file)
-    for begin, end in ENDS.items():
-        if start == begin[: len(start)]:
+    for mark in ENDS:
+        if start == mark[: len(start)]:  # nothing but the beginning is there
             return True
-        if start.startswith(begin) and not stop.endswith(end):
+        if start.startswith(mark) and not stop.endswith(mark):
             return True
     return False
 
@@ -356,7 +381,7 @@ def by_place(recordings: ListOf[RawRecording]) -> dict[str, RawRecording]:
     return dict(zip(places, recordings, strict=True))
 
 
-Columns = dict[str, tuple[str, int | None]]  # joint → (signal, column)
+Columns = dict[str, Column]  # by joint
 Chosen = dict[str, Columns]  # by channel
 
 
@@ -379,7 +404,7 @@ class _Conversion:
 
     def values(self, channel: str, columns: Columns, loaded: dict[str, Signal]) -> Array:
         """Return the values of a channel, (k, n) in SI."""
-        logged = [_column(loaded, *columns[joint]) for joint in self.joints]
+        logged = [columns[joint].of(loaded) for joint in self.joints]
         values = np.stack(logged, axis=1).astype(float)
         if channel == "ctrl" and "action_scale" in self.specified:
             home = self.robot.qpos_home[self.robot.index(self.joints)]
@@ -395,7 +420,7 @@ def _require_one_length(
         return
     rows = {}
     for channel, columns in chosen.items():
-        signal = loaded[next(name for name, _ in columns.values())]
+        signal = _first_signal(columns, loaded)
         if signal.time is None:
             rows[channel] = len(signal.values)
     if max(rows.values(), default=0) - min(rows.values(), default=0) <= MOST_ROWS_APART:
@@ -432,7 +457,8 @@ def _encoders(
 def _clocks(specified: LogsFile, chosen: Chosen) -> dict[str, str | None]:
     """Return channel → column of its clock; None where none is named."""
     own: dict[Any, str] = specified.get("clock", {})
-    return {channel: own.get(channel) or specified.get("time") for channel in chosen}
+    common = specified.get("time")
+    return {channel: own.get(channel) or common for channel in chosen}
 
 
 def _is_in_seconds(clocks: dict[str, str | None], loaded: dict[str, Signal]) -> bool:
@@ -442,52 +468,70 @@ def _is_in_seconds(clocks: dict[str, str | None], loaded: dict[str, Signal]) -> 
 
 def _from_zero(channels: dict[str, Channel]) -> dict[str, Channel]:
     """Return channels whose time starts at 0: nanoseconds since 1970 would lose their digits."""
-    start = min((float(c.time[0]) for c in channels.values() if len(c.time)), default=0.0)
-    shifted = {id(c.time): c.time - start for c in channels.values()}  # a shared clock stays shared
-    return {name: Channel(shifted[id(c.time)], c.values) for name, c in channels.items()}
+    starts = [float(channel.time[0]) for channel in channels.values() if len(channel.time)]
+    start = min(starts, default=0.0)
+    shifted: dict[int, Array] = {}  # a clock that channels share stays shared
+    from_zero = {}
+    for name, (time, values) in channels.items():
+        if id(time) not in shifted:
+            shifted[id(time)] = time - start
+        from_zero[name] = Channel(shifted[id(time)], values)
+    return from_zero
 
 
 def _choose(
     recording: RawRecording, robot: RobotSpec, specified: LogsFile, joint_map: dict[str, str] | None
 ) -> Chosen:
-    """Which column holds what."""
-    where = recording.place
+    """Return the columns of each channel, by joint."""
     columns = recording.columns
     single = specified.get("columns", {})
+    _require_columns(recording, single)
+    clocks = specified.get("clock", {}).values()
+    taken = {*single.values(), specified.get("time", ""), *clocks}  # no pattern finds these columns
+    chosen: Chosen = {}
+    for channel in (*CHANNELS, *DERIVED):
+        found = _matching(recording, specified, channel, taken)
+        for ours, theirs in single.items():
+            kind, _, joint = ours.partition(".")
+            if kind == channel:
+                found.append((joint, theirs))
+        names = []  # of joints in the log
+        chosen_columns = []
+        for name, column in found:
+            if not ignored(name, specified.get("ignore", ())):
+                names.append(name)
+                chosen_columns.append(columns[column])
+        if names:
+            joints = resolve_all(names, robot, recording.place, joint_map)
+            chosen[channel] = dict(zip(joints, chosen_columns, strict=True))
+    _require_complete(chosen, recording, specified)
+    return chosen
+
+
+def _require_columns(recording: RawRecording, single: dict[str, str]) -> None:
+    """Refuse single columns (ours → the log's) that are not there, or whose name is none of ours."""
     for ours, theirs in single.items():
-        if ours.partition(".")[0] not in CHANNELS or "." not in ours:
+        channel, dot, _ = ours.partition(".")
+        if channel not in CHANNELS or not dot:
             raise UsageError(
                 f"logs.toml: '{ours}' is neither time nor {'.<joint>, '.join(CHANNELS)}.<joint>"
             )
-        if theirs not in columns:
+        if theirs not in recording.columns:
             raise LogError(
-                f"{where}: column '{theirs}' (for {ours}) is missing; there are: "
+                f"{recording.place}: column '{theirs}' (for {ours}) is missing; there are: "
                 f"{recording.shown()}"
             )
-    chosen: Chosen = {}
-    clocks = specified.get("clock", {}).values()
-    taken = {*single.values(), specified.get("time", ""), *clocks}  # no pattern finds these columns
-    for channel in (*CHANNELS, *DERIVED):
-        named = _matching(recording, specified, channel, taken)
-        for ours, theirs in single.items():
-            if ours.startswith(f"{channel}."):
-                named.append((ours.partition(".")[2], theirs))
-        ignore = specified.get("ignore", ())
-        named = [(joint, column) for joint, column in named if not ignored(joint, ignore)]
-        if not named:
-            continue
-        joints = resolve_all([joint for joint, _ in named], robot, where, joint_map)
-        chosen[channel] = {
-            joint: columns[column] for joint, (_, column) in zip(joints, named, strict=True)
-        }
-    _require_complete(chosen, recording, specified)
-    return chosen
 
 
 def _matching(
     recording: RawRecording, specified: LogsFile, channel: str, taken: set[str]
 ) -> list[tuple[str, str]]:
-    """(joint, column) of a pattern: "{joint}_des", or an array whose columns are joints."""
+    """Return (joint, column) of a channel: of a pattern such as "{joint}_des", or of an array whose
+    columns are joints.
+
+    Args:
+        taken: Columns that no pattern finds.
+    """
     pattern = specified.get(channel)
     if not isinstance(pattern, str):
         return []
@@ -496,15 +540,19 @@ def _matching(
     if pattern.count("{joint}") != 1:
         return []  # an array that this recording does not have
     fits = _column_pattern(pattern)
-    others = [_column_pattern(longer) for longer in _longer_patterns(specified, pattern)]
+    longer = [_column_pattern(other) for other in _longer_patterns(specified, pattern)]
     found = []
     for column in recording.columns:
-        match = fits.fullmatch(column)
-        if match is None or column in taken or not _may_hold(column, channel):
+        if column in taken or not _may_hold(column, channel):
             continue
-        if not any(other.fullmatch(column) for other in others):
+        match = fits.fullmatch(column)
+        if match and not _fits_any(column, longer):
             found.append((match["joint"], column))
     return found
+
+
+def _fits_any(column: str, patterns: list[re.Pattern[str]]) -> bool:
+    return any(pattern.fullmatch(column) for pattern in patterns)
 
 
 def _may_hold(column: str, channel: str) -> bool:
@@ -554,7 +602,7 @@ def _gain_columns(recording: RawRecording, specified: LogsFile, ctrl: Columns) -
     """kp and kd → joint → column, where logs.toml says that an array holds them; it has the columns
     of the command's.
     """
-    widths = {len(recording.signals[signal]) for signal, _ in ctrl.values()}
+    widths = {len(recording.signals[column.signal]) for column in ctrl.values()}
     gains: Chosen = {}
     for name in ("kp", "kd"):
         array = specified.get(name)
@@ -565,13 +613,13 @@ def _gain_columns(recording: RawRecording, specified: LogsFile, ctrl: Columns) -
                 f'{recording.place}: {name} = "{array}" is no array like the command\'s; there '
                 f"are: {recording.shown()}"
             )
-        gains[name] = {joint: (array, index) for joint, (_, index) in ctrl.items()}
+        gains[name] = {joint: Column(array, column.number) for joint, column in ctrl.items()}
     return gains
 
 
 def _constant(recording: RawRecording, name: str, values: Array) -> float:
     """A gain that stood still."""
-    if np.ptp(values) > 1e-3 * max(abs(float(values[0])), 1e-9):
+    if np.ptp(values) > MAX_GAIN_CHANGE * max(abs(float(values[0])), 1e-9):
         raise LogError(
             f"{recording.source}: {name} changes from {values.min():g} to {values.max():g} while "
             "it is recorded; cut the log where it does"
@@ -579,24 +627,24 @@ def _constant(recording: RawRecording, name: str, values: Array) -> float:
     return float(values[0])
 
 
-def _require_complete(columns: Chosen, recording: RawRecording, specified: LogsFile) -> None:
+def _require_complete(chosen: Chosen, recording: RawRecording, specified: LogsFile) -> None:
+    """Refuse a recording without commands or positions, or with other joints in some channel."""
     where = recording.place
     for need in REQUIRED:
-        if need in columns:
+        if need in chosen:
             continue
         explanation = f' (expected "{specified.get(need)}")' if need in specified else ""
         why = f": {NO_COMMANDS}" if need == "ctrl" else ""
         raise LogError(
             f"{where}: no column holds {need}.<joint>{explanation}; there are: "
-            f'{recording.shown()}. Say {need} = "…" '
-            f"in logs.toml ({HINT}){why}"
+            f'{recording.shown()}. Say {need} = "…" in logs.toml ({HINT}){why}'
         )
-    for kind in columns:
-        odd = sorted(columns["ctrl"].keys() ^ columns[kind].keys())
+    for channel in chosen:
+        odd = sorted(chosen["ctrl"].keys() ^ chosen[channel].keys())
         if odd:
-            other = kind if odd[0] in columns["ctrl"] else "ctrl"
+            lacking = channel if odd[0] in chosen["ctrl"] else "ctrl"
             raise LogError(
-                f"{where}: column '{other}.{odd[0]}' is missing: every channel needs the same "
+                f"{where}: column '{lacking}.{odd[0]}' is missing: every channel needs the same "
                 "joints"
             )
 
@@ -633,7 +681,7 @@ def _time(
 ) -> Array:
     """The time stamps of a channel, s, from any start."""
     where = recording.place
-    own = next(loaded[signal] for signal, _ in columns.values())
+    own = _first_signal(columns, loaded)
     if channel not in specified.get("clock", {}) and own.time is not None:
         return own.time
     if "rate" in specified:
@@ -644,11 +692,10 @@ def _time(
             )
         return np.arange(len(own.values)) / specified["rate"]
     if clock not in recording.signals:
-        explanation = f"'{clock or 'time'}' (the clock of {channel})"
         raise LogError(
-            f"{where}: column {explanation} is missing; there are: {recording.shown()}. Say time "
-            '= "…" in logs.toml, '
-            f"or rate = 50.0 (Hz) where the log has no clock ({HINT})"
+            f"{where}: column '{clock or 'time'}' (the clock of {channel}) is missing; there are: "
+            f'{recording.shown()}. Say time = "…" in logs.toml, or rate = 50.0 (Hz) where the log '
+            f"has no clock ({HINT})"
         )
     time = np.asarray(loaded[clock].values, float)
     if time.shape != (len(own.values),):
@@ -666,9 +713,10 @@ def _has_rate(stamps: Array, rate: float) -> bool:
     periods = rate * float(np.median(np.diff(stamps)))
     if not periods > 0:
         return True
-    return min(abs(periods * unit - 1) for unit in SECONDS.values()) <= 0.1
+    return min(abs(periods * unit - 1) for unit in SECONDS.values()) <= MAX_RATE_ERROR
 
 
-def _column(loaded: dict[str, Signal], signal: str, index: int | None) -> Array:
-    values = loaded[signal].values
-    return values if index is None else values[:, index]
+def _first_signal(columns: Columns, loaded: dict[str, Signal]) -> Signal:
+    """Return the signal of a channel's first column, whose clock and length are the channel's."""
+    first = next(iter(columns.values()))
+    return loaded[first.signal]

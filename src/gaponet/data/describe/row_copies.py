@@ -7,6 +7,8 @@ next one. What was sent to the servos is then not in the log.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from gaponet.base.arrays import Array
@@ -70,10 +72,24 @@ def copied_rows(command: Channel, state: Channel) -> Array:
         if len(changes) > MAX_COMPARED_CHANGES:
             start = (len(changes) - MAX_COMPARED_CHANGES) // 2
             changes = changes[start : start + MAX_COMPARED_CHANGES]
-        usual_change = float(np.median(np.abs(told[changes] - told[changes - 1])))
-        later = reading[nearest[changes][:, None] + shifts]  # (changes, shifts)
-        result[joint] = _shift(told[changes], later, shifts, usual_change)
+        compared = _Changes(
+            told=told[changes],
+            later=reading[nearest[changes][:, None] + shifts],
+            shifts=shifts,
+            usual=float(np.median(np.abs(told[changes] - told[changes - 1]))),
+        )
+        result[joint] = _shift(compared)
     return result
+
+
+@dataclass(frozen=True)
+class _Changes:
+    """Changes of one joint's command, and the states of the rows around each."""
+
+    told: Array  # commands, (changes) rad
+    later: Array  # states, (changes, shifts) rad
+    shifts: Array  # rows from the command to the state, (shifts)
+    usual: float  # size of a change from one row to the next, rad
 
 
 def _pairs(command: Array, state: Array) -> tuple[Array, Array]:
@@ -95,60 +111,53 @@ def _nearest(time: Array, at: Array) -> Array:
     return np.asarray(right - before_is_nearer)
 
 
-def _shift(told: Array, later: Array, shifts: Array, usual_change: float) -> float:
-    """Return the shift of one joint's copy; NaN if it is none.
-
-    Args:
-        told: Commands, (changes) rad.
-        later: States of the rows around each, (changes, shifts) rad.
-        shifts: Rows from the command to the state, (shifts).
-        usual_change: Of the command from one row to the next, rad.
-    """
-    steps = [_step(told), _step(later[:, MAX_COPIED_ROWS])]
+def _shift(changes: _Changes) -> float:
+    """Return the shift of one joint's copy, rows; NaN if it is none."""
+    told = changes.told
+    steps = [_step(told), _step(changes.later[:, MAX_COPIED_ROWS])]
     coarse = max(steps)
+    rounded = min(steps) < 0.9 * coarse  # one of them, to the steps of the other
     tolerance = NO_DIGIT_RAD
-    if min(steps) < 0.9 * coarse:  # one of them was rounded
+    if rounded:
         tolerance = max(0.501 * coarse, NO_DIGIT_RAD)
-    equal = np.abs(later - told[:, None]) <= tolerance
-    if usual_change >= FINE_STEPS * coarse:
+    equal = np.abs(changes.later - told[:, None]) <= tolerance  # (changes, shifts)
+    if changes.usual >= FINE_STEPS * coarse:
         if equal.any(axis=1).mean() < FINE_SHARE:
-            return _noisy_shift(told, later, shifts, usual_change)
-        return float(shifts[equal.sum(axis=0).argmax()])
+            return _noisy_shift(changes)
+        return float(changes.shifts[equal.sum(axis=0).argmax()])
     share = equal.mean(axis=0)
     if tolerance > NO_DIGIT_RAD or share.max() < COARSE_SHARE:
         return np.nan
-    return float(shifts[share.argmax()])
+    return float(changes.shifts[share.argmax()])
 
 
-def _noisy_shift(told: Array, later: Array, shifts: Array, usual_change: float) -> float:
-    """Return the shift of one joint's copy that has noise on it; NaN if it is none.
-
-    Args:
-        told, later, shifts, usual_change: As of _shift.
-    """
-    if len(told) < MIN_NOISE_ROWS:
+def _noisy_shift(changes: _Changes) -> float:
+    """Return the shift of one joint's copy that has noise on it, rows; NaN if it is none."""
+    if len(changes.told) < MIN_NOISE_ROWS:
         return np.nan
-    noise = later - told[:, None]
-    size = np.sqrt((noise**2).mean(axis=0))
+    errors = changes.later - changes.told[:, None]
+    size = np.sqrt((errors**2).mean(axis=0))  # rms at each shift, rad
     best = int(size.argmin())
-    if size[best] > NOISE_SHARE * usual_change or size[best] <= NO_DIGIT_RAD:
+    if size[best] > NOISE_SHARE * changes.usual or size[best] <= NO_DIGIT_RAD:
         return np.nan
-    left = noise[:, best]
-    colour = np.corrcoef(left[1:], left[:-1])[0, 1]
-    motion = np.stack(
-        [
-            np.ones(len(told)),
-            later.mean(axis=1),
-            later[:, -1] - later[:, 0],
-            later[:, -1] + later[:, 0] - 2 * later.mean(axis=1),
-        ],
-        axis=1,
-    )
-    rest = left - motion @ np.linalg.lstsq(motion, left, rcond=None)[0]
-    explained = 1 - (rest**2).sum() / (left**2).sum()
-    if abs(colour) > MAX_COLOUR or explained > MAX_EXPLAINED:
+    noise = errors[:, best]
+    colour = np.corrcoef(noise[1:], noise[:-1])[0, 1]
+    if abs(colour) > MAX_COLOUR or _explained_by_motion(noise, changes.later) > MAX_EXPLAINED:
         return np.nan
-    return float(shifts[best])
+    return float(changes.shifts[best])
+
+
+def _explained_by_motion(noise: Array, later: Array) -> float:
+    """Return the share of noise (changes) that position, velocity and acceleration of the rows
+    around, (changes, shifts), explain.
+    """
+    position = later.mean(axis=1)
+    first = later[:, 0]
+    last = later[:, -1]
+    terms = [np.ones(len(noise)), position, last - first, last + first - 2 * position]
+    motion = np.stack(terms, axis=1)
+    rest = noise - motion @ np.linalg.lstsq(motion, noise, rcond=None)[0]
+    return float(1 - (rest**2).sum() / (noise**2).sum())
 
 
 def _step(values: Array) -> float:

@@ -31,9 +31,10 @@ def sampled_channels(
     absent: dict[str, Any] = {}
     for name, channel in channels.items():
         present = np.isfinite(channel.values)
-        empty = [
-            joint for joint, any_row in zip(joints, present.any(axis=0), strict=True) if not any_row
-        ]
+        empty = []
+        for joint, in_any_row in zip(joints, present.any(axis=0), strict=True):
+            if not in_any_row:
+                empty.append(joint)
         if empty and name in REQUIRED:
             names = ", ".join(f'"{joint}"' for joint in empty)
             raise LogError(
@@ -51,14 +52,14 @@ def sampled_channels(
 
 
 def _sampled(name: str, channel: Channel, present: Array) -> Channel:
-    """Return the rows with samples. present: (k, n) bool."""
-    some = present.any(axis=1)
-    partial = some & ~present.all(axis=1)
+    """Return the rows with samples. present: where a cell holds one, (k, n) bool."""
     if (~present).mean() < MIN_EMPTY_SHARE:
         return channel
+    some = present.any(axis=1)
     time = channel.time[some]
     values = channel.values[some]
-    if partial.mean() < MIN_EMPTY_SHARE:
+    partly = some & ~present.all(axis=1)
+    if partly.mean() < MIN_EMPTY_SHARE:
         return Channel(time, values)
     columns = []
     for column, is_present in zip(values.T, present[some].T, strict=True):

@@ -11,7 +11,7 @@ PACKED = (".zip", ".gz", ".tgz", ".tar", ".bz2", ".xz", ".zst", ".7z", ".rar")
 SPREADSHEETS = (".xlsx", ".xls", ".ods")
 JSON = (".json", ".jsonl", ".ndjson")
 TEXT = (".txt", ".dat")
-MOST_FILES = 2000  # that are looked at
+MAX_FILES = 2000  # that are looked at
 ADDRESS = re.compile(r"(hf|https?|s3|gs):/+(?:datasets/)?(.*)")
 
 
@@ -25,7 +25,7 @@ def why_unread(path: Path, files: list[Path]) -> str:
         LogError: One of them is a Git LFS pointer.
     """
     by_suffix: dict[str, Path] = {}
-    for file in files[:MOST_FILES]:
+    for file in files[:MAX_FILES]:
         require_content(file)
         by_suffix.setdefault(file.suffix.lower(), file)
     for suffix, file in by_suffix.items():
