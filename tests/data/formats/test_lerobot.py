@@ -158,7 +158,7 @@ def test_statistics_are_those_of_all_frames(dataset, tmp_path):
 
 
 def test_many_episodes_are_spread_over_files(dataset, arm, tmp_path, monkeypatch):
-    monkeypatch.setattr(lerobot_export, "FILE_MB", 0.001)
+    monkeypatch.setattr(lerobot_export, "MAX_FILE_MB", 0.001)
     monkeypatch.setattr(lerobot_export, "CHUNK_FILES", 2)
     monkeypatch.setattr(lerobot_export, "BLOCK_EPISODES", 2)
     export_lerobot(dataset, tmp_path / "out")

@@ -42,6 +42,7 @@ from typing import Any, Literal, cast
 import numpy as np
 
 from gaponet.base import plugins
+from gaponet.base.arrays import Array
 from gaponet.base.errors import LogError, UsageError
 from gaponet.base.plugins import attempt
 from gaponet.data.describe.logs_file import LogsFile, Naming, read_logs_file
@@ -58,7 +59,7 @@ FORMATS = {
     for name in ("sage", "table", "npz", "lerobot", "bam", "rosbag", "hdf5", "mat", "pace", "asap")
 }
 FILES = {"state_file", "command_file", "time_file"}
-LOOK = 20  # recordings that are looked at before they are described
+MAX_LOOKED_AT = 20  # recordings, before they are described
 ALWAYS = (
     "names",
     "ignore",
@@ -105,16 +106,18 @@ def extra_of(fmt: str) -> str | None:
 
 
 def _options(reader: ModuleType) -> tuple[str, ...]:
-    return DESCRIBED if hasattr(reader, "recordings") else getattr(reader, "OPTIONS", ())
+    """The fields of logs.toml that a format acts on, beside ALWAYS."""
+    if hasattr(reader, "recordings"):
+        return DESCRIBED
+    return getattr(reader, "OPTIONS", ())
 
 
 def files_under(path: Path, suffixes: Iterable[str]) -> list[Path]:
     """The file, or those with these suffixes in a folder and below it; hidden ones are left
     alone.
     """
-    if path.is_file():
-        return [path] if path.suffix.lower() in suffixes else []
-    return sorted(f for f in files_below(path) if f.suffix.lower() in suffixes)
+    files = [path] if path.is_file() else files_below(path)
+    return sorted(file for file in files if file.suffix.lower() in suffixes)
 
 
 def files_below(folder: Path) -> Iterator[Path]:
@@ -147,34 +150,49 @@ def detect(path: Path) -> str:
         kinds = " and ".join(f"{fmt} ({about(fmt)})" for fmt in matches)
         ways = " or ".join(f"--format {fmt}" for fmt in matches)
         raise LogError(f"{path}: could be {kinds}; say {ways}")
+    raise _no_log(path)
+
+
+def _no_log(path: Path) -> LogError:
+    """Return the error that nothing at a path is a log, with what to do."""
     if (path / "dataset.json").is_file():
-        raise LogError(
+        return LogError(
             f"{path}: is a dataset of gaponet, not logs; go on with gaponet doctor {path}"
         )
-    raise LogError(
+    files = [path] if path.is_file() else list(files_below(path))
+    return LogError(
         f"{path}: no log of {', '.join(formats())} (gaponet import --formats explains "
-        f"them){why_unread(path, [path] if path.is_file() else list(files_below(path)))}"
+        f"them){why_unread(path, files)}"
     )
 
 
-def _tables_belong_to_others(path: Path, formats: list[str]) -> bool:
+def _tables_belong_to_others(path: Path, matches: list[str]) -> bool:
     """Return True if the tables at a path are parts of recordings of another format: each is
     detected by it, or none lies directly in the folder.
+
+    Args:
+        matches: The formats that the path looks like.
     """
-    others = [fmt for fmt in formats if fmt != "table"]
+    others = [fmt for fmt in matches if fmt != "table"]
+    if not others:
+        return False
     tables = module("table").find(path)
-    below = all(file.parent != path for file in tables)
-    alike = all(any(_detects(fmt, file) for fmt in others) for file in tables)
-    return bool(others) and (below or alike)
+    if all(file.parent != path for file in tables):
+        return True
+    return all(any(_detects(fmt, file) for fmt in others) for file in tables)
 
 
 def _detects(fmt: str, path: Path) -> bool:
     reader = module(fmt)
-    return bool(reader.detects(path) if hasattr(reader, "detects") else _find(reader, path))
+    if hasattr(reader, "detects"):
+        return bool(reader.detects(path))
+    return bool(_find(reader, path))
 
 
 def _find(reader: ModuleType, path: Path) -> list[Path]:
-    return reader.find(path) if hasattr(reader, "find") else files_under(path, reader.SUFFIXES)
+    if hasattr(reader, "find"):
+        return cast("list[Path]", reader.find(path))
+    return files_under(path, reader.SUFFIXES)
 
 
 def find_logs(path: Path, fmt: str | None = None) -> list[Path]:
@@ -253,21 +271,31 @@ def read_logs(
     bad = skipped_rows()
     for name, load in _loaders(reader, path, robot, specified, names):
         try:
-            log = within_range(load(), robot)
-            log = require_plausible(log, robot, options.strict)
-            log = _corrected(log, robot, specified, names)
-            log = without_repeated_rows(log)  # after the checks, which name lines of the file
-            log = continued_turns(log, robot)
+            log = _mended(load(), robot, specified, names, options.strict)
         except LogError as error:
             if bad is None:
                 raise
             bad.append(f"left out: {error}")
             continue
-        words = naming.of(name, _place_below(root, log.source))
-        if words.pop("leave_out", False):
+        facts = naming.of(name, _place_below(root, log.source))
+        if facts.pop("leave_out", False):
             continue
-        yield str(words.pop("motion", name)), _named(log, words, robot, names)
+        motion = str(facts.pop("motion", name))
+        yield motion, _labelled(log, facts, robot, names)
     naming.require_all_used()
+
+
+def _mended(
+    log: Log, robot: RobotSpec, specified: LogsFile, names: dict[str, str], strict: bool
+) -> Log:
+    """Return a log with angles of one turn, without nonsense and repeated rows, and corrected as
+    logs.toml says.
+    """
+    log = within_range(log, robot)
+    log = require_plausible(log, robot, strict)
+    log = _corrected(log, robot, specified, names)
+    log = without_repeated_rows(log)  # after the checks, which name lines of the file
+    return continued_turns(log, robot)
 
 
 def _place_below(root: Path, source: str) -> str:
@@ -287,7 +315,7 @@ def look(
     kind = _require_allowed(reader, path, options.allow_pickle)
     if not hasattr(reader, "recordings"):
         raise UsageError(f"{path}: {about(kind)}: the format says itself what its columns are")
-    return kind, specified, list(islice(_recordings(reader, path, specified), LOOK))
+    return kind, specified, list(islice(_recordings(reader, path, specified), MAX_LOOKED_AT))
 
 
 def _require_allowed(reader: ModuleType, path: Path, allow_pickle: bool) -> str:
@@ -312,12 +340,9 @@ def _loaders(
 ) -> Iterator[tuple[str, Callable[[], Log]]]:
     """(name, what reads it) of every recording."""
     if not hasattr(reader, "recordings"):
-        yield from reader.read(
-            path,
-            robot,
-            names or None,
-            **{k: v for k, v in specified.items() if k in getattr(reader, "OPTIONS", ())},
-        )
+        known = getattr(reader, "OPTIONS", ())
+        options = {field: value for field, value in specified.items() if field in known}
+        yield from reader.read(path, robot, names or None, **options)
         return
     recordings = _recordings(reader, path, specified)
     if FILES & specified.keys():
@@ -346,8 +371,8 @@ def _with_prefixes(full: LogsFile, specified: LogsFile) -> LogsFile:
     """
     changes: dict[str, Any] = {}
     if "command_file" in specified:
-        commands = tuple(c for c in COMMANDS if c == "ctrl" or c in specified)
-        changes = {c: COMMAND + str(full.get(c, "")) for c in commands}
+        commands = tuple(name for name in COMMANDS if name == "ctrl" or name in specified)
+        changes = {name: COMMAND + str(full.get(name, "")) for name in commands}
         if "time_file" not in specified:
             changes["clock"] = _beside_clock(full, commands)
     if "time_file" in specified and "time" in specified:
@@ -370,19 +395,25 @@ def _with_files(recordings: list[RawRecording], specified: LogsFile) -> Iterator
         if file in beside:
             continue
         recording = replace(by_file[file], name=name)
-        for what, prefix, others in (
-            ("command_file", COMMAND, commands),
-            ("time_file", TIME, clocks),
-        ):
-            if file not in others:
-                continue
-            if others[file] not in by_file:
-                raise LogError(f'{recording.source}: its {what} "{others[file]}" is not beside it')
-            recording = recording.beside(by_file[others[file]], prefix)
-        if file in clocks and len(columns := by_file[clocks[file]].signals) == 1:
-            only = TIME + next(iter(columns))
-            recording = replace(recording, default=recording.default | {"time": only})
+        if file in commands:
+            command = _beside(recording, "command_file", commands[file], by_file)
+            recording = recording.beside(command, COMMAND)
+        if file in clocks:
+            clock = _beside(recording, "time_file", clocks[file], by_file)
+            recording = recording.beside(clock, TIME)
+            if len(clock.signals) == 1:
+                only = TIME + next(iter(clock.signals))
+                recording = replace(recording, default=recording.default | {"time": only})
         yield recording
+
+
+def _beside(
+    recording: RawRecording, what: str, file: str, by_file: dict[str, RawRecording]
+) -> RawRecording:
+    """Return the command_file or time_file (what) of a recording."""
+    if file not in by_file:
+        raise LogError(f'{recording.source}: its {what} "{file}" is not beside it')
+    return by_file[file]
 
 
 def _files_beside(states: dict[str, str], pattern: str | None) -> dict[str, str]:
@@ -393,9 +424,7 @@ def _files_beside(states: dict[str, str], pattern: str | None) -> dict[str, str]
 
 
 def _named_by(pattern: str, files: Iterable[str]) -> dict[str, str]:
-    """Return file → its {name} in the pattern, or its stem where the pattern has none; files that
-    fit.
-    """
+    """Return the files that fit a pattern → {name} in it, or the file's stem where it has none."""
     before, _, after = pattern.partition("{name}")
     named = {}
     for file in files:
@@ -411,15 +440,17 @@ def _named_by(pattern: str, files: Iterable[str]) -> dict[str, str]:
 
 
 def _beside_clock(specified: LogsFile, commands: tuple[str, ...]) -> dict[str, str]:
-    """Commands in a file of their own have the clock of that file."""
-    clock = specified.get("clock", {})
-    mine = clock.get("ctrl") or specified.get("time")
-    return clock | (dict.fromkeys(commands, COMMAND + mine) if mine else {})
+    """Return the clocks of channels where commands lie in a file of their own, with its clock."""
+    clocks = cast("dict[str, str]", dict(specified.get("clock", {})))
+    of_commands = clocks.get("ctrl") or specified.get("time")
+    if of_commands:
+        clocks |= dict.fromkeys(commands, COMMAND + of_commands)
+    return clocks
 
 
 def _corrected(log: Log, robot: RobotSpec, specified: LogsFile, names: dict[str, str]) -> Log:
-    """Signs and offsets, where logs.toml says some, noted; and where joints stood that the log
-    does not hold.
+    """Return the log with signs and offsets, where logs.toml says some, noted; and where joints
+    stood that it does not hold.
     """
     posture = _by_joint("posture", specified.get("posture", {}), robot, names)
     if posture:
@@ -430,15 +461,11 @@ def _corrected(log: Log, robot: RobotSpec, specified: LogsFile, names: dict[str,
         return log
     if 0 in signs.values():
         raise UsageError("[signs] of logs.toml: a sign is 1 or -1")
-    sign = np.array([signs.get(j, 1) for j in log.joint_names], float)
-    offset = np.array([offsets.get(j, 0.0) for j in log.joint_names])
+    sign = np.array([signs.get(joint, 1) for joint in log.joint_names], float)  # (n)
+    offset = np.array([offsets.get(joint, 0.0) for joint in log.joint_names])  # (n) rad
     channels = {}
     for name, (time, values) in log.channels.items():
-        if name != "temperature":
-            # positions are moved; velocities and torques are only turned
-            shift = offset if name in ("ctrl", "qpos") else 0.0 * offset
-            values = sign * values + shift
-        channels[name] = Channel(time, values)
+        channels[name] = Channel(time, _turned(name, values, sign, offset))
     notes = dict(log.meta.get("notes", {}))
     if signs:
         notes["signs"] = signs
@@ -446,6 +473,15 @@ def _corrected(log: Log, robot: RobotSpec, specified: LogsFile, names: dict[str,
         notes["offsets"] = offsets
     corrected = replace(log, channels=channels, meta=log.meta | {"notes": notes})
     return require_plausible(corrected, robot)
+
+
+def _turned(channel: str, values: Array, sign: Array, offset: Array) -> Array:
+    """Return the values (k, n) of a channel with other signs, and positions with an offset."""
+    if channel == "temperature":
+        return values
+    if channel not in ("ctrl", "qpos"):
+        offset = np.zeros_like(offset)
+    return np.asarray(sign * values + offset)
 
 
 def _by_joint(
@@ -456,40 +492,48 @@ def _by_joint(
     return {robot.resolve(joint, where, names): value for joint, value in stated.items()}
 
 
-def _named(log: Log, option: dict[str, Any], robot: RobotSpec, names: dict[str, str]) -> Log:
-    """The log with what its name and logs.toml say of it; what the format itself says must not
-    contradict.
+def _labelled(log: Log, facts: dict[str, Any], robot: RobotSpec, names: dict[str, str]) -> Log:
+    """Return the log with what its name and logs.toml say of it; what the format itself says must
+    not contradict.
     """
     meta = dict(log.meta)
     stated = dict(log.meta.get("stated", {}))
     for name in ("kp", "kd"):
-        if name in option:
-            meta[name] = _gains(name, option.pop(name), log, robot, names)
-    if "estimated" in option:
-        meta["notes"] = meta.get("notes", {}) | {"estimated": option.pop("estimated")}
-    for name, value in option.items():
+        if name in facts:
+            meta[name] = _gains(name, facts.pop(name), log, robot, names)
+    if "estimated" in facts:
+        meta["notes"] = meta.get("notes", {}) | {"estimated": facts.pop("estimated")}
+    for name, value in facts.items():
         if stated.get(name) not in (None, value):
             raise UsageError(
                 f"{log.source}: {name} is {stated[name]} in the file and {value} in logs.toml; "
                 "mend one"
             )
         stated[name] = value
-    return replace(log, meta=meta | ({"stated": stated} if stated else {}))
+    if stated:
+        meta["stated"] = stated
+    return replace(log, meta=meta)
 
 
 def _gains(
-    name: str, option: Any, log: Log, robot: RobotSpec, names: dict[str, str]
+    name: str, stated: Any, log: Log, robot: RobotSpec, names: dict[str, str]
 ) -> list[float]:
-    """One number for all joints, or {joint: number} with the robot's own for the others ("": for
-    all others).
+    """Return the gains of the log's joints.
+
+    Args:
+        name: kp or kd.
+        stated: One number for all joints, or {joint: number}; "" stands for all others, which
+            else have the robot's own.
     """
-    if not isinstance(option, dict):
-        return [option] * len(log.joint_names)
-    given = {
-        robot.resolve(j, f"{name} of logs.toml", names) if j else "": value
-        for j, value in option.items()
-    }
+    if not isinstance(stated, dict):
+        return [stated] * len(log.joint_names)
+    by_joint: dict[str, float] = {}
+    for joint, gain in stated.items():
+        if joint:
+            by_joint[robot.resolve(joint, f"{name} of logs.toml", names)] = gain
     own = robot.before_identification.servo[name][robot.index(log.joint_names)]
-    return [
-        given.get(j, given.get("", float(o))) for j, o in zip(log.joint_names, own, strict=True)
-    ]
+    gains: list[float] = []
+    for joint, of_robot in zip(log.joint_names, own, strict=True):
+        of_others = stated[""] if "" in stated else float(of_robot)
+        gains.append(by_joint.get(joint, of_others))
+    return gains

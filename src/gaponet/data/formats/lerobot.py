@@ -2,11 +2,11 @@
 
 One folder, many episodes; what gaponet exports, and stock sets of position-controlled arms.
 
-    meta/info.json                          codebase_version "v3.0", fps, features, data_path
-    meta/tasks.parquet                      task, task_index
+    meta/info.json                              codebase_version "v3.0", fps, features, data_path
+    meta/tasks.parquet                          task, task_index
     meta/episodes/chunk-000/file-000.parquet    one row per episode: length, where its rows are
-    data/chunk-000/file-000.parquet         one row per frame: action, observation.state, timestamp,
-    frame_index, …
+    data/chunk-000/file-000.parquet             one row per frame: action, observation.state,
+                                                timestamp, frame_index, …
 
 Of v2.1, one data file an episode and meta/episodes.jsonl, the episodes whose files are there are
 read.
@@ -112,13 +112,13 @@ def read(
         encoders = read_encoders(Path(said["calibration"]), robot, joint_map)
     for part in sets_under(path):
         options = _Options(
-            robot,
-            joint_map,
-            _unit(part, said.get("position_unit")),
-            said.get("joints"),
-            tuple(said.get("ignore", ())),
-            encoders,
-            {channel: said[channel] for channel in ("ctrl", "qpos") if channel in said},
+            robot=robot,
+            joint_map=joint_map,
+            unit=_unit(part, said.get("position_unit")),
+            joints=said.get("joints"),
+            ignore=tuple(said.get("ignore", ())),
+            encoders=encoders,
+            features={channel: said[channel] for channel in ("ctrl", "qpos") if channel in said},
         )
         if part.absent:
             logging.getLogger("gaponet").warning(
@@ -158,11 +158,9 @@ def _unit(part: Set, given: str | None) -> str:
             )
         return "rad"
     if given not in POSITION_UNITS:
-        explanation = (
-            f"'{given}' is not one of {', '.join(POSITION_UNITS)}"
-            if given
-            else "is not written in the set"
-        )
+        explanation = "is not written in the set"
+        if given:
+            explanation = f"'{given}' is not one of {', '.join(POSITION_UNITS)}"
         raise UsageError(
             f"{part.path}: the unit of positions {explanation}; say --position-unit deg (SO-101 "
             "sets), signed_percent (older ones, −100..100) or rad"
@@ -179,33 +177,39 @@ class _Frames:
         self.options = options
         robot = options.robot
         features = self._features()
-        names = {}
+        names = {}  # channel → joints of its columns
         for channel, feature in self.features.items():
             names[channel] = self._joints(channel, feature, features[feature])
-        self.joints = tuple(j for j in robot.joint_names if j in names["ctrl"])
-        for channel, theirs in names.items():
-            odd = sorted(set(theirs) - {""} ^ set(self.joints))
-            if odd:
-                raise JointMismatchError(
-                    f"{part.path}/meta/info.json: joint '{odd[0]}' is not in both "
-                    f"{self.features['ctrl']} and {self.features[channel]}"
-                )
+        self.joints = tuple(joint for joint in robot.joint_names if joint in names["ctrl"])
+        self._require_same_joints(names)
         self.units = [self._unit_of(joint) for joint in self.joints]
         table = read_table(file, (*self.features.values(), *INDEX))
-        self.columns = {}
+        self.columns = {}  # channel → its values, (frames, n)
         for channel, feature in self.features.items():
-            theirs = names[channel]
-            order = [theirs.index(joint) for joint in self.joints]
-            self.columns[channel] = _matrix(file, table, feature, len(theirs))[:, order]
+            of_channel = names[channel]
+            order = [of_channel.index(joint) for joint in self.joints]
+            self.columns[channel] = _matrix(file, table, feature, len(of_channel))[:, order]
         self._require_unit()
         self.timestamp = _matrix(file, table, "timestamp", 1)[:, 0]
         self.frame = _matrix(file, table, "frame_index", 1)[:, 0]
         self.episodes = _matrix(file, table, "episode_index", 1)[:, 0]
 
+    def _require_same_joints(self, names: dict[str, list[str]]) -> None:
+        """Refuse channels with other joints than the command's. names: channel → joints, "" for
+        columns that are none.
+        """
+        for channel, joints in names.items():
+            odd = sorted(set(joints) - {""} ^ set(self.joints))
+            if odd:
+                raise JointMismatchError(
+                    f"{self.part.path}/meta/info.json: joint '{odd[0]}' is not in both "
+                    f"{self.features['ctrl']} and {self.features[channel]}"
+                )
+
     def _features(self) -> dict[str, Feature]:
         """Choose the feature of each channel, and return what info.json says of them."""
         part = self.part
-        known = dict(self.part.features)
+        known = dict(part.features)
         self.features = {ours: theirs for ours, theirs in FEATURES.items() if theirs in known}
         info = f"{part.path}/meta/info.json"
         for channel, name in self.options.features.items():
@@ -234,24 +238,28 @@ class _Frames:
         robot = self.options.robot
         unit = self.options.unit
         in_range = robot.log_joints.units[robot.joint_names.index(joint)] == "fraction"
-        raw = unit == "ticks" and self.options.encoders is not None
-        return "percent" if in_range and unit in NO_SI and not raw else unit
+        calibrated = unit == "ticks" and self.options.encoders is not None
+        if in_range and unit in NO_SI and not calibrated:
+            return "percent"
+        return unit
 
     def _require_unit(self) -> None:
         """Refuse degrees that are called percent, and percent that are called degrees."""
         for column, joint in enumerate(self.joints):
-            if self.units[column] not in ("deg", "signed_percent"):
+            unit = self.units[column]
+            if unit not in ("deg", "signed_percent"):
                 continue
             both = [self.columns["ctrl"][:, column], self.columns["qpos"][:, column]]
             size = np.abs(np.concatenate(both))
+            largest = size.max()
             where = f"{self.file}: {joint}"
-            if self.units[column] == "signed_percent" and size.max() > MAX_PERCENT:
+            if unit == "signed_percent" and largest > MAX_PERCENT:
                 raise LogError(
-                    f"{where} is up to {size.max():.4g}, beyond −100..100 of a range: these are "
+                    f"{where} is up to {largest:.4g}, beyond −100..100 of a range: these are "
                     "degrees or ticks; say --position-unit deg (or ticks)"
                 )
             at_end = int((size == FULL_PERCENT).sum())
-            if self.units[column] == "deg" and at_end >= MIN_AT_END and size.max() == FULL_PERCENT:
+            if unit == "deg" and at_end >= MIN_AT_END and largest == FULL_PERCENT:
                 raise LogError(
                     f"{where} ends at exactly 100 in {at_end} values: these are LeRobot's "
                     "−100..100 of the calibrated range, not degrees; say --position-unit "
@@ -272,8 +280,9 @@ class _Frames:
         kept = [name for name in short if not ignored(name, options.ignore)]
         if channel in ("ctrl", "qpos"):
             self._require_joints(kept, where)
-        ours = iter(resolve_all(kept, options.robot, where, options.joint_map))
-        return ["" if ignored(n, options.ignore) else next(ours) for n in short]
+        joints = resolve_all(kept, options.robot, where, options.joint_map)
+        joint_of = dict(zip(kept, joints, strict=True))
+        return [joint_of.get(name, "") for name in short]
 
     def _require_joints(self, names: list[str], where: str) -> None:
         """Refuse poses of the hand, steps and speeds, where no value is a joint; joints among them
@@ -312,28 +321,31 @@ class _Frames:
                 f"{length} in a row; download or export the set again"
             )
         time = self._time(where)
-        channels = {
-            channel: Channel(time, self._si(channel, values[where]))
-            for channel, values in self.columns.items()
-        }
+        channels = {}
+        for channel, values in self.columns.items():
+            channels[channel] = Channel(time, self._si(channel, values[where]))
+        converted_from = {}
+        for joint, unit in zip(self.joints, self.units, strict=True):
+            if unit != "rad":
+                converted_from[joint] = unit
         meta: dict[str, Any] = {
             "files": dict.fromkeys(channels, str(self.file)),
             "first_line": int(where[0]) + 1,
             "dt": self.part.dt,
-            "converted_from": {
-                j: u for j, u in zip(self.joints, self.units, strict=True) if u != "rad"
-            },
+            "converted_from": converted_from,
         }
         if self.part.ours:
-            explanation = self.part.ours["dataset"]
-            meta |= {
-                "stated": row["stated"],
-                "dataset": {k: v for k, v in explanation.items() if k in Stated.__annotations__},
-            }
+            meta["stated"] = row["stated"]
+            meta["dataset"] = {}
+            for name, text in self.part.ours["dataset"].items():
+                if name in Stated.__annotations__:
+                    meta["dataset"][name] = text
         return Log(self.options.robot.name, self.joints, channels, f"{self.file}#{index}", meta)
 
     def _time(self, where: Array) -> Array:
-        """Frames are a period apart; their timestamps, float32, lose digits and are believed only
+        """Return the times of an episode's rows, s.
+
+        Frames are a period apart; their timestamps, float32, lose digits and are believed only
         where they differ.
         """
         regular = np.arange(len(where)) * self.part.dt
@@ -368,8 +380,8 @@ def _motion(episode: dict[str, Any], tasks: dict[int, str]) -> str:
     """
     if "stated" in episode:
         return str(episode["stated"]["motion"])
-    since_start = episode.get("tasks") or list(tasks.values())[:1] or ["episode"]
-    slug = re.sub(r"[^a-z0-9]+", "_", since_start[0].lower()).strip("_")[:40] or "episode"
+    texts = episode.get("tasks") or list(tasks.values()) or ["episode"]
+    slug = re.sub(r"[^a-z0-9]+", "_", texts[0].lower()).strip("_")[:40] or "episode"
     return f"{slug}-{episode['episode_index']:04d}"
 
 

@@ -6,7 +6,7 @@ import os.path
 import re
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NotRequired, cast
+from typing import Annotated, Any, NotRequired, cast
 
 from annotated_types import Interval, Len
 from typing_extensions import TypedDict
@@ -15,9 +15,6 @@ from gaponet.base.errors import LogError
 from gaponet.base.structure import parse_json, read_json, validated
 from gaponet.data.formats import parquet
 from gaponet.data.sequence import SequenceMeta
-
-if TYPE_CHECKING:
-    pass
 
 VERSION = "v3.0"  # that is written
 VERSIONS = ("v3", "v2")  # that are read
@@ -76,8 +73,9 @@ Episode = TypedDict(
 )
 
 
-# One line of meta/episodes.jsonl, v2.1.
 class Listed(TypedDict):
+    """One line of meta/episodes.jsonl, v2.1."""
+
     episode_index: Count
     length: Annotated[int, Interval(ge=1, le=10**8)]
     tasks: NotRequired[list[str] | None]
@@ -87,7 +85,7 @@ NEEDED = tuple(k for k in Episode.__annotations__ if k != "tasks")
 
 
 class Stated(TypedDict):
-    """Contents of meta/info.json."""
+    """What an export says of its dataset."""
 
     licence: NotRequired[str]
     source: NotRequired[str]
@@ -102,16 +100,14 @@ class Ours(TypedDict):
 
 @dataclass(frozen=True)
 class Set:
-    """One LeRobot folder: its info.json, its features that are read, its episodes and how many
-    more it lists that are not there; ours is None for a stock set.
-    """
+    """One LeRobot folder."""
 
     path: Path
     info: Info
-    features: dict[str, Feature]
-    episodes: list[dict[str, Any]]
-    ours: Ours | None
-    absent: int = 0
+    features: dict[str, Feature]  # those of FEATURES that it has
+    episodes: list[dict[str, Any]]  # by number
+    ours: Ours | None  # None for a stock set
+    absent: int = 0  # episodes that it lists and that are not there
 
     @property
     def dt(self) -> float:
@@ -151,6 +147,7 @@ def sets_under(path: Path) -> list[Set]:
 
 
 def _open(file: Path) -> Set:
+    """Return the set of an info.json."""
     info = read_json(Info, file, LogError, AGAIN, allow_extra=True)
     version = info["codebase_version"]
     if version.split(".")[0] not in VERSIONS:
@@ -159,57 +156,75 @@ def _open(file: Path) -> Set:
             "the set with lerobot's own scripts"
         )
     root = file.parents[1]
-    features = info["features"]
-    ours = file.with_name(OURS)
-    stated: Ours | None = None
-    if ours.is_file():
-        hint = "restore it, or delete it to read the set as a stock one"
-        stated = read_json(Ours, ours, LogError, hint, allow_extra=True)
+    ours = _read_ours(file.with_name(OURS))
     listed = root / "meta" / "episodes.jsonl"
     if listed.is_file():
         episodes = _listed(listed, info.get("chunks_size", 1000))
     else:
         episodes = []
         for table in sorted((root / "meta" / "episodes").glob("*/*.parquet")):
-            episodes += _episodes(table, stated)
+            episodes += _episodes(table, ours)
     if not episodes:
         raise LogError(f"{root}: meta/episodes lists no episode; {AGAIN}")
-    episodes.sort(key=lambda e: e["episode_index"])
+    episodes.sort(key=lambda episode: episode["episode_index"])
+    part = Set(root, info, _known_features(file, info), episodes, ours)
+    # v2: one file an episode, and often only some of them
+    return _without_absent(part) if listed.is_file() else part
+
+
+def _read_ours(file: Path) -> Ours | None:
+    """Return what an export of gaponet says beside info.json; None for a stock set."""
+    if not file.is_file():
+        return None
+    hint = "restore it, or delete it to read the set as a stock one"
+    return read_json(Ours, file, LogError, hint, allow_extra=True)
+
+
+def _known_features(file: Path, info: Info) -> dict[str, Feature]:
+    """Return the features of an info.json that are read."""
     known = {}
     for name in FEATURES.values():
-        if name in features:
+        if name in info["features"]:
             where = f"{file}: features.{name}"
-            spec = features[name]
+            spec = info["features"][name]
             known[name] = validated(Feature, spec, where, LogError, AGAIN, allow_extra=True)
-    part = Set(root, info, known, episodes, stated)
-    if not listed.is_file():
-        return part
-    # v2: one file an episode, and often only some of them
-    here = [e for e in episodes if part.data_file(e).is_file()]
+    return known
+
+
+def _without_absent(part: Set) -> Set:
+    """Return a set without the episodes whose data files are not there."""
+    here = [episode for episode in part.episodes if part.data_file(episode).is_file()]
     if not here:
         raise LogError(
-            f"{root}: none of the {len(episodes)} episodes' data files is there; {AGAIN}"
+            f"{part.path}: none of the {len(part.episodes)} episodes' data files is there; {AGAIN}"
         )
-    return replace(part, episodes=here, absent=len(episodes) - len(here))
+    return replace(part, episodes=here, absent=len(part.episodes) - len(here))
 
 
 def _listed(file: Path, chunk: int) -> list[dict[str, Any]]:
     """Episodes of a v2.1 set, a line of JSON each."""
     lines = file.read_text(encoding="utf-8", errors="replace").splitlines()
-    rows = [
-        parse_json(Listed, line, f"{file}:{i}", LogError, AGAIN, allow_extra=True)
-        for i, line in enumerate(lines, 1)
-    ]
-    return [dict(r) | {"data/chunk_index": r["episode_index"] // chunk} for r in rows]
+    episodes = []
+    for number, line in enumerate(lines, 1):
+        row = parse_json(Listed, line, f"{file}:{number}", LogError, AGAIN, allow_extra=True)
+        episodes.append(dict(row) | {"data/chunk_index": row["episode_index"] // chunk})
+    return episodes
 
 
 def _episodes(file: Path, ours: Ours | None) -> list[dict[str, Any]]:
-    columns = STATED if ours else ()
-    hint = f"restore it, or delete meta/{OURS} to read the set as a stock one" if ours else AGAIN
-    table = read_table(file, (*NEEDED, *columns), ("tasks", "content_hash", "findings"), hint)
+    """Episodes of a v3.0 set, those of one file."""
+    columns: tuple[str, ...] = NEEDED
+    hint = AGAIN
+    if ours:
+        columns = NEEDED + STATED
+        hint = f"restore it, or delete meta/{OURS} to read the set as a stock one"
+    table = read_table(file, columns, ("tasks", "content_hash", "findings"), hint)
     rows = _rows(file, table)
     known = validated(list[Episode], rows, file, LogError, AGAIN, allow_extra=True)
-    return [_state(row, file, hint) if ours else row for row in cast("list[dict[str, Any]]", known)]
+    episodes = cast("list[dict[str, Any]]", known)
+    if ours:
+        return [_state(episode, file, hint) for episode in episodes]
+    return episodes
 
 
 def _state(row: dict[str, Any], file: Path, hint: str) -> dict[str, Any]:

@@ -18,6 +18,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Container, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from functools import partial
 from itertools import islice
 from pathlib import Path
@@ -36,14 +37,22 @@ from gaponet.data.formats import files_under
 SUFFIXES = (".db3", ".mcap", ".bag")
 EXTRA = "ros"
 DEFAULT: LogsFile = {"time_unit": "s", "position_unit": "rad"}
-PEEK = 200  # messages of a topic in which all its joints are named
-# s that a stamp may lie before the recorder's clock, and by which topics may differ in that
-LATENCY = 0.1
-DRIFT = 0.005  # s by which a stamp may run away from the recorder's clock during a recording
+MAX_PEEKED = 200  # messages of a topic in which all its joints are named
+# By which a stamp may lie before the recorder's clock, and by which topics may differ in that.
+MAX_LATENCY_S = 0.1
+MAX_DRIFT_S = 0.005  # by which a stamp may run away from the recorder's clock during a recording
 COMMANDS = ("command", "cmd", "desired", "target", "goal", "reference", "setpoint")
 # words of topics whose numbers without names are no positions
 NO_POSITIONS = {"velocity", "vel", "effort", "torque", "current", "acceleration", "cartesian"}
 COMMAND_FIELDS = (".position", ".point", ".data", ".q")  # that hold commanded positions
+# Ends of signals, those that say most of a command first.
+BEST_COMMANDS = (
+    (".reference.position", ".desired.position"),
+    (".q",),
+    (".position",),
+    (".point",),
+    (".data",),
+)
 # Unitree's hg messages, for bags that do not hold the definitions of their messages; fields as in
 # its public IDL.
 HG = {
@@ -66,7 +75,7 @@ NOT_JOINTS = re.compile(
     r"|rosgraph_msgs|rcl_interfaces|diagnostic_msgs|stereo_msgs|vision_msgs|action_msgs"
     r"|lifecycle_msgs|statistics_msgs|std_msgs/msg/U?Int8).*"
 )
-MOST = 256  # numbers of a field: more is a picture
+MAX_NUMBERS = 256  # of a field: more is a picture
 CONTROLLER = (
     f"std_msgs/Header header\nstring[] joint_names\n{POINT} reference\n{POINT} feedback\n"
     f"{POINT} error\n{POINT} output"
@@ -82,26 +91,29 @@ Wanted = dict[str, dict[str, tuple[str, ...]]]  # topic → field → names of i
 
 def find(path: Path) -> list[Path]:
     """Bags: folders with metadata.yaml, and files that lie in none."""
-    files = files_under(path, SUFFIXES)
-    return sorted(
-        {f.parent if (f.parent / "metadata.yaml").is_file() and path.is_dir() else f for f in files}
-    )
+    bags = set()
+    for file in files_under(path, SUFFIXES):
+        is_part = path.is_dir() and (file.parent / "metadata.yaml").is_file()
+        bags.add(file.parent if is_part else file)
+    return sorted(bags)
 
 
 def recordings(path: Path, specified: LogsFile) -> Iterator[RawRecording]:
     """Every bag."""
     for bag in find(path):
-        topics = _peeked(bag)
-        signals = {
-            f"{topic}.{field}": labels
-            for topic, fields in topics.items()
-            for field, labels in fields.items()
-        }
-        files = tuple(map(str, files_under(bag, SUFFIXES)))
+        signals = {}
+        for topic, fields in _peeked(bag).items():
+            for field, labels in fields.items():
+                signals[f"{topic}.{field}"] = labels
         meta: dict[str, Any] = {}
-        load = partial(_load, bag, meta)
         yield RawRecording(
-            bag.stem, str(bag), signals, load, "", files, meta=meta, default=_usual(signals)
+            bag.stem,
+            str(bag),
+            signals,
+            partial(_load, bag, meta),
+            files=tuple(map(str, files_under(bag, SUFFIXES))),
+            meta=meta,
+            default=_usual(signals),
         )
 
 
@@ -180,16 +192,12 @@ def _best_command(
             if joints & set(columns) or len(columns) == len(joints):
                 fitting.append(command)
         commands = fitting or commands
-    for endings in (
-        (".reference.position", ".desired.position"),
-        (".q",),
-        (".position",),
-        (".point",),
-        (".data",),
-    ):
+    for endings in BEST_COMMANDS:
         alike = [command for command in commands if command.endswith(endings)]
+        if len(alike) == 1:
+            return alike[0]
         if alike:
-            return alike[0] if len(alike) == 1 else None
+            return None
     return None
 
 
@@ -211,26 +219,35 @@ def _opened(bag: Path) -> Iterator[Any]:
         yield reader
 
 
-def _messages(
-    reader: Any, connections: list[Any]
-) -> Iterator[tuple[Any, float, Fields, float | None]]:
-    """(connection, recorder's time, fields, stamp) of each message; times in s."""
-    for connection, time, raw in reader.messages(connections):
+class _Message(NamedTuple):
+    """One message of a bag."""
+
+    connection: Any
+    received: float  # by the recorder's clock, s
+    fields: Fields
+    stamp: float | None  # of its header, s; None where it has none
+
+
+def _messages(reader: Any, connections: list[Any]) -> Iterator[_Message]:
+    """Yield the messages of some connections."""
+    for connection, received_ns, raw in reader.messages(connections):
         message = reader.deserialize(raw, connection.msgtype)
-        stamp = getattr(getattr(message, "header", None), "stamp", None)
-        stamped = None
-        if stamp is not None and (stamp.sec or stamp.nanosec):
-            stamped = stamp.sec + 1e-9 * stamp.nanosec
-        fields = KINDS.get(connection.msgtype, _numbers)(connection.topic, message)
-        yield connection, 1e-9 * time, fields, stamped
+        header = getattr(getattr(message, "header", None), "stamp", None)
+        stamp = None
+        if header is not None and (header.sec or header.nanosec):
+            stamp = header.sec + 1e-9 * header.nanosec
+        fields_of = KINDS.get(connection.msgtype, _numbers)
+        fields = fields_of(connection.topic, message)
+        yield _Message(connection, 1e-9 * received_ns, fields, stamp)
 
 
 def _known(reader: Any) -> list[Any]:
-    known = reader.typestore.types
+    """Return the connections whose messages are defined, and may be about joints."""
+    defined = reader.typestore.types
     connections = []
     for connection in reader.connections:
         kind = connection.msgtype
-        if connection.msgcount and kind in known and not NOT_JOINTS.match(kind):
+        if connection.msgcount and kind in defined and not NOT_JOINTS.match(kind):
             connections.append(connection)
     return connections
 
@@ -250,8 +267,8 @@ def _peek(bag: Path, reader: Any) -> Wanted:
     topics: Wanted = {}
     for connection in _known(reader):
         sets: dict[str, list[tuple[str, ...]]] = {}  # field → names of its columns, by topic
-        for _, _, fields, _ in islice(_messages(reader, [connection]), PEEK + 1):
-            for field, (labels, _) in fields.items():
+        for message in islice(_messages(reader, [connection]), MAX_PEEKED + 1):
+            for field, (labels, _) in message.fields.items():
                 of_field = sets.setdefault(field, [])
                 number = _join(of_field, labels)
                 topic = f"{connection.topic}#{number + 1}" if number else connection.topic
@@ -286,8 +303,13 @@ def _join(sets: list[tuple[str, ...]], labels: tuple[str, ...]) -> int:
 
 def _joined(known: tuple[str, ...], labels: tuple[str, ...]) -> bool:
     """Return True if both name columns of one array: the same numbers, or names of joints."""
-    numbered = [all(label.isdigit() for label in names) for names in (known, labels)]
-    return known == labels if any(numbered) else True
+    if _are_numbers(known) or _are_numbers(labels):
+        return known == labels
+    return True
+
+
+def _are_numbers(labels: tuple[str, ...]) -> bool:
+    return all(label.isdigit() for label in labels)
 
 
 def _load(bag: Path, meta: dict[str, Any], names: list[str]) -> dict[str, Signal]:
@@ -306,25 +328,39 @@ class _Row(NamedTuple):
     values: list[list[float]]
 
 
+@dataclass(frozen=True)
+class _Stamps:
+    """Times of the messages of one topic, (k) s."""
+
+    received: Array
+    stamp: Array
+    all_stamped: bool
+
+    @classmethod
+    def of(cls, rows: list[_Row]) -> _Stamps:
+        return cls(
+            received=np.array([row.received for row in rows], float),
+            stamp=np.array([row.stamp for row in rows], float),
+            all_stamped=all(row.stamped for row in rows),
+        )
+
+
 @sandboxed(LogError, "rosbags.highlevel", 4.0)
 def _read(bag: Path, names: list[str]) -> tuple[dict[str, Signal], dict[str, Any]]:
-    """The same, and notes."""
+    """Return the signals of these names, and notes."""
     with _opened(bag) as reader:
         wanted = _wanted(_peek(bag, reader), names)
-        rows, partial = _collect(reader, wanted)
+        rows, in_parts = _collect(reader, wanted)
     notes: dict[str, Any] = {}
-    stamps = {
-        topic: np.array([row[:3] for row in messages], float).reshape(-1, 3)
-        for topic, messages in rows.items()
-    }
+    stamps = {topic: _Stamps.of(of_topic) for topic, of_topic in rows.items()}
     times = _clocks(stamps, notes)
     loaded: dict[str, Signal] = {}
     for topic, known in wanted.items():
         time = times[topic]
-        columns = [
-            np.array([row.values[i] for row in rows[topic]], float) for i in range(len(known))
-        ]
-        if topic in partial:
+        columns = []  # of each field, (k, columns)
+        for i in range(len(known)):
+            columns.append(np.array([row.values[i] for row in rows[topic]], float))
+        if topic in in_parts:
             time, columns = _together(time, columns)
         fresh = _fresh(time, columns)
         if not fresh.all():
@@ -349,23 +385,28 @@ def _collect(reader: Any, wanted: Wanted) -> tuple[dict[str, list[_Row]], set[st
     each.
     """
     rows: dict[str, list[_Row]] = {topic: [] for topic in wanted}
-    partial = set[str]()
-    used = {topic.split("#")[0] for topic in wanted}
-    connections = [c for c in _known(reader) if c.topic in used]
-    for connection, time, fields, stamp in _messages(reader, connections):
+    in_parts = set[str]()
+    used = {_without_number(topic) for topic in wanted}
+    connections = [connection for connection in _known(reader) if connection.topic in used]
+    for message in _messages(reader, connections):
         for topic, known in wanted.items():
-            if topic.split("#")[0] != connection.topic:
+            if _without_number(topic) != message.connection.topic:
                 continue
-            told = _told(fields, known)
+            told = _told(message.fields, known)
             if not told:
                 continue
             if not _tells_all(told, known):
-                partial.add(topic)
+                in_parts.add(topic)
             values = [_in_order(told.get(field), labels) for field, labels in known.items()]
-            rows[topic].append(
-                _Row(time, time if stamp is None else stamp, stamp is not None, values)
-            )
-    return rows, partial
+            stamped = message.stamp is not None
+            stamp = message.received if message.stamp is None else message.stamp
+            rows[topic].append(_Row(message.received, stamp, stamped, values))
+    return rows, in_parts
+
+
+def _without_number(topic: str) -> str:
+    """Return the name of a topic as the bag has it: /joints#2 → /joints."""
+    return topic.split("#")[0]
 
 
 def _told(fields: Fields, known: dict[str, tuple[str, ...]]) -> Fields:
@@ -418,54 +459,53 @@ def _together(time: Array, columns: list[Array]) -> tuple[Array, list[Array]]:
 
 def _fresh(time: Array, values: list[Array]) -> Array:
     """Rows that are no second copy of the row before, at the same time."""
-    fresh = np.ones(len(time), bool)
     same = np.diff(time) == 0
-    for v in values:
-        same &= (np.diff(v, axis=0) == 0).all(axis=1)
+    for of_field in values:
+        same &= (np.diff(of_field, axis=0) == 0).all(axis=1)
+    fresh = np.ones(len(time), bool)
     fresh[1:] = ~same
     return fresh
 
 
-def _clocks(stamps: dict[str, Array], notes: dict[str, Any]) -> dict[str, Array]:
-    """Time of the rows of each topic, from columns received, stamp, whether stamped; all on one
-    clock.
-    """
-    lines: dict[str, Array] = {}  # of received − stamp over time: slope, s/s, and start, s
-    for topic, table in stamps.items():
-        received, stamp, stamped = table.T
-        if len(stamp) > 1 and stamped.all():
-            lines[topic] = np.polyfit(received - received[0], received - stamp, 1)
+def _clocks(stamps: dict[str, _Stamps], notes: dict[str, Any]) -> dict[str, Array]:
+    """Return the time of the rows of each topic, s, all on one clock; what was done is noted."""
+    # of received − stamp over time since the first: slope, s/s, and start, s
+    lines: dict[str, Array] = {}
+    for topic, times in stamps.items():
+        if len(times.stamp) > 1 and times.all_stamped:
+            since_first = times.received - times.received[0]
+            lines[topic] = np.polyfit(since_first, times.received - times.stamp, 1)
     moved = _must_be_moved(stamps, lines)
-    times = {}
-    for topic, table in stamps.items():
-        received, stamp, _ = table.T
+    clocks = {}
+    for topic, times in stamps.items():
+        clocks[topic] = times.stamp
         if topic not in lines:
-            times[topic] = received
+            clocks[topic] = times.received
             notes.setdefault("clock", {})[topic] = "the recorder's: no stamps"
         elif moved:
             rate, start = lines[topic]
-            times[topic] = stamp + start + rate * (received - received[0])
+            clocks[topic] = times.stamp + start + rate * (times.received - times.received[0])
             notes.setdefault("clock", {})[topic] = (
                 f"stamps moved by {start:.4f} s and {1e6 * rate:.0f} ppm"
             )
-        else:
-            times[topic] = stamp
-    return times
+    return clocks
 
 
-def _must_be_moved(stamps: dict[str, Array], lines: dict[str, Array]) -> bool:
+def _must_be_moved(stamps: dict[str, _Stamps], lines: dict[str, Array]) -> bool:
     """Return True if stamps are of several clocks: topics lie apart, or one runs away.
 
     Args:
-        stamps, lines: As in _clocks.
+        lines: As in _clocks.
     """
-    spans = {topic: float(np.ptp(table[:, 0])) for topic, table in stamps.items()}
     late = [float(start) for _, start in lines.values()]
     if len(lines) < len(stamps):
         late.append(0.0)  # a topic with the recorder's clock
-    if len(stamps) > 1 and max(late) - min(late) > LATENCY:
+    if len(stamps) > 1 and max(late) - min(late) > MAX_LATENCY_S:
         return True
-    return any(abs(rate) * spans[topic] > DRIFT for topic, (rate, _) in lines.items())
+    drifts = []
+    for topic, (rate, _) in lines.items():
+        drifts.append(abs(float(rate)) * float(np.ptp(stamps[topic].received)))
+    return max(drifts, default=0.0) > MAX_DRIFT_S
 
 
 def _numbers(topic: str, message: Any) -> Fields:
@@ -517,13 +557,13 @@ def _names_of_parts(parts: list[Any]) -> list[tuple[str, ...]]:
 
 
 def _labelled(messages: Fields, texts: list[tuple[str, ...]]) -> Fields:
-    """Return the fields of at most MOST numbers; those without names get the first texts of their
+    """Return the fields of at most MAX_NUMBERS numbers; those without names get the first texts of their
     length, or digits.
     """
     labelled: Fields = {}
     for field, (labels, numbers) in messages.items():
         count = len(numbers)
-        if not 0 < count <= MOST:
+        if not 0 < count <= MAX_NUMBERS:
             continue
         digits = tuple(str(i) for i in range(count))
         named = next((names for names in texts if len(names) == count), digits)
@@ -532,20 +572,17 @@ def _labelled(messages: Fields, texts: list[tuple[str, ...]]) -> Fields:
 
 
 def _controller(topic: str, message: Any) -> Fields:
+    """Return the points of a controller's state, as far as they hold a number for each joint."""
     names = tuple(message.joint_names)
-    messages = {}
+    fields: Fields = {}
     for part in ("reference", "desired", "feedback", "actual"):
         point = getattr(message, part, None)
         if point is None:
             continue
-        for ours, values in (
-            ("position", point.positions),
-            ("velocity", point.velocities),
-            ("effort", point.effort),
-        ):
-            if len(values) == len(names):
-                messages[f"{part}.{ours}"] = (names, values)
-    return messages
+        fields[f"{part}.position"] = (names, point.positions)
+        fields[f"{part}.velocity"] = (names, point.velocities)
+        fields[f"{part}.effort"] = (names, point.effort)
+    return {name: field for name, field in fields.items() if len(field[1]) == len(names)}
 
 
 def _dynamic(topic: str, message: Any) -> Fields:
@@ -560,12 +597,13 @@ def _dynamic(topic: str, message: Any) -> Fields:
 
 
 def _trajectory(topic: str, message: Any) -> Fields:
+    """Return the only point of a trajectory; refuse one of several."""
     points = message.points
     if len(points) > 1:
         raise LogError(
-            f"{topic} sends whole trajectories ({len(points)} points); what the controller made "
-            "of them stands in "
-            'its state topic (…/controller_state): record that, and say ctrl = "…" in logs.toml'
+            f"{topic} sends whole trajectories ({len(points)} points); what the controller made of "
+            "them stands in its state topic (…/controller_state): record that, and say "
+            'ctrl = "…" in logs.toml'
         )
     if not points:
         return {}
@@ -573,10 +611,12 @@ def _trajectory(topic: str, message: Any) -> Fields:
 
 
 def _motors(field: str, names: tuple[str, ...]) -> Callable[[str, Any], Fields]:
+    """Return what reads a list of motors (field), and some numbers (names) of each."""
+
     def fields(topic: str, message: Any) -> Fields:
         motors = getattr(message, field)
         labels = tuple(map(str, range(len(motors))))
-        return {n: (labels, [getattr(x, n) for x in motors]) for n in names}
+        return {name: (labels, [getattr(motor, name) for motor in motors]) for name in names}
 
     return fields
 

@@ -15,7 +15,7 @@ import re
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -42,9 +42,9 @@ SUFFIXES = (".csv", ".tsv", ".txt", ".dat", ".parquet")
 NOT_OURS = ("control.csv", "state_motor.csv", "event.csv", "joint_list.txt")  # of SAGE folders
 # metadata of a table that is no data, and why (hw/control/recording.py)
 NOT_OBEYED = "gaponet.not_obeyed"
-MIN_TRANSPOSED_CELLS = (
-    20  # of the first row of a table that can be transposed; times the rows, where nothing is named
-)
+# Cells of the first row of a table that can be transposed; where no row is named, there are also so
+# many times as many cells as rows.
+MIN_TRANSPOSED_CELLS = 20
 DECIMAL_SAMPLE_BYTES = 20_000  # of the first rows, by which decimal commas are told
 DATES = re.compile(rb"\d\d?\.\d\d?\.\d{4}|:\d\d[.,]\d+")  # whose points and commas are no decimals
 THOUSANDS = re.compile(r"[-+]?\d{1,3}([., ']\d{3})+([.,]\d*)?|[-+]?\d+,\d+")  # as 1,234.5
@@ -76,10 +76,13 @@ def find(path: Path) -> list[Path]:
     directly = [file for file in below if file.parent == path and _is_table(file)]
     if directly:
         return directly
-    folders = {folder for file in below for folder in file.parents}
-    inside = [folder for folder in folders if folder.is_relative_to(path)]
-    datasets = {folder for folder in inside if _is_dataset(folder)}
-    return [file for file in below if not datasets & {*file.parents} and _is_table(file)]
+    return [file for file in below if not _is_in_dataset(file, path) and _is_table(file)]
+
+
+def _is_in_dataset(file: Path, root: Path) -> bool:
+    """Return True if a file below a root lies in a dataset of gaponet."""
+    folders = [folder for folder in file.parents if folder.is_relative_to(root)]
+    return any(_is_dataset(folder) for folder in folders)
 
 
 def _is_dataset(folder: Path) -> bool:
@@ -98,39 +101,53 @@ def recordings(path: Path, specified: LogsFile) -> Iterator[RawRecording]:
         name = file.stem
         if stems.count(name) > 1:  # day1/run.csv and day2/run.csv
             name = "-".join(file.relative_to(path).with_suffix("").parts)
-        line = 1
-        meta: dict[str, Any] = {}
-        signals: dict[str, tuple[str, ...]] = {}
-        if file.suffix.lower() == ".parquet":
-            names = _parquet_header(file)
-            load = partial(_read_parquet, file)
-            lists = parquet.list_widths(file).items()
-            signals = {column: tuple(map(str, range(width))) for column, width in lists}
-        else:
-            found = _heading(file, specified.get("header"))
-            names = found.names
-            load = partial(_read_csv, file, found)
-            line = found.first + 1
-            if found.units:
-                meta = {"notes": {"units": dict(zip(names, found.units, strict=False))}}
-        _refuse_twice(file, names, [name for name in names if name.split(".")[0] in DEFAULT])
-        load = partial(_load_once, file, names, load)
-        if joint := joint_rows.joint_column(names, specified):
-            yield joint_rows.recording(file, names, joint, specified)
+        table = _opened(file, specified)
+        ours = [column for column in table.names if column.split(".")[0] in DEFAULT]
+        _refuse_twice(file, table.names, ours)
+        joint = joint_rows.joint_column(table.names, specified)
+        if joint:
+            yield joint_rows.recording(file, table.names, joint, specified)
             continue
-        signals = dict.fromkeys(names, ()) | signals
+        signals = dict.fromkeys(table.names, ()) | table.lists
+        load = partial(_load_once, file, table.names, table.load)
         signals, load_joined = with_whole_seconds(signals, load)
-        whole = RawRecording(
+        recording = RawRecording(
             name,
             str(file),
             signals,
             load_joined,
-            f"{file}:1",
-            (str(file),),
-            line,
-            meta,
+            where=f"{file}:1",
+            files=(str(file),),
+            first_line=table.first_line,
+            meta=table.meta,
         )
-        yield from episodes(whole)
+        yield from episodes(recording)
+
+
+class _Table(NamedTuple):
+    """What the beginning of a file says, and what reads the rest."""
+
+    names: list[str]  # of its columns
+    load: Callable[[list[str]], dict[str, Signal]]
+    lists: dict[str, tuple[str, ...]]  # column whose cells are lists → names of their numbers
+    first_line: int  # where its rows begin
+    meta: dict[str, Any]  # as in RawRecording
+
+
+def _opened(file: Path, specified: LogsFile) -> _Table:
+    """Read the beginning of a file."""
+    if file.suffix.lower() == ".parquet":
+        names = _parquet_header(file)
+        lists = {}
+        for column, width in parquet.list_widths(file).items():
+            lists[column] = tuple(str(i) for i in range(width))
+        return _Table(names, partial(_read_parquet, file), lists, 1, {})
+    heading = _heading(file, specified.get("header"))
+    meta: dict[str, Any] = {}
+    if heading.units:
+        units = dict(zip(heading.names, heading.units, strict=False))
+        meta = {"notes": {"units": units}}
+    return _Table(heading.names, partial(_read_csv, file, heading), {}, heading.first + 1, meta)
 
 
 def _refuse_twice(file: Path, names: list[str], wanted: list[str]) -> None:
@@ -201,65 +218,68 @@ def _refuse_transposed(file: Path, first: list[str]) -> None:
     """Refuse a table with a row per signal, whose first row has these cells."""
     if len(first) < MIN_TRANSPOSED_CELLS or not text.is_numeric(first[1:]):
         return
-    named = not text.is_numeric(first[:1])
     with file.open("rb") as lines:
         rows = sum(1 for _ in lines)
-    if named or rows * MIN_TRANSPOSED_CELLS < len(first):
-        raise LogError(
-            f"{file}:1: the table is transposed: {rows} rows with a signal each, and {len(first)} "
-            "columns with an "
-            'instant each. A row must be an instant. Turn it: python -c "import pandas; '
-            "pandas.read_csv("
-            f"'{file.name}', header=None, "
-            f"index_col={0 if named else None}).T.to_csv('{file.name}', index=False"
-            f'{"" if named else ", header=False"})"'
-        )
+    named = not text.is_numeric(first[:1])  # the first cell of each row
+    if not named and rows * MIN_TRANSPOSED_CELLS >= len(first):
+        return
+    read = f"pandas.read_csv('{file.name}', header=None, index_col={0 if named else None})"
+    header = "" if named else ", header=False"
+    write = f".T.to_csv('{file.name}', index=False{header})"
+    raise LogError(
+        f"{file}:1: the table is transposed: {rows} rows with a signal each, and {len(first)} "
+        "columns with an instant each. A row must be an instant. Turn it: "
+        f'python -c "import pandas; {read}{write}"'
+    )
 
 
-def _read_csv(file: Path, found: text.Heading, wanted: list[str]) -> dict[str, Signal]:
-    """{column: (k,)}; an empty cell is NaN, a short row or an unreadable cell too where rows are
-    cut, else refused.
+def _read_csv(file: Path, heading: text.Heading, wanted: list[str]) -> dict[str, Signal]:
+    """Return columns by name, (k,) each; an empty cell is NaN, a short row or an unreadable cell
+    too where rows are cut, else refused.
     """
     import pyarrow as pa
     import pyarrow.csv as pc
 
     body = read_limited(file, LogError, "cut the log into shorter ones", MAX_ARRAYS_BYTES)
-    names = found.names
-    delimiter = found.delimiter
-    body = _rows(text.decoded(body), found.first)
+    body = _rows(text.decoded(body), heading.first)
     if not body:
         raise LogError(f"{file}: holds a header and no rows; delete it or record again")
+    delimiter = heading.delimiter
     if delimiter == " ":
-        if _has_decimal_commas(body, delimiter):
-            body = body.replace(b",", b".")
-        without_margins = re.sub(rb"(?m)^[ \t]+|[ \t\r]+$", b"", body)
-        body = re.sub(rb"[ \t]+", b",", without_margins)
+        body = _with_commas(body)
         delimiter = ","
-    dates = _date_columns(body, names, wanted, delimiter)
+    dates = _date_columns(body, heading.names, wanted, delimiter)
+    types = dict.fromkeys(wanted, pa.float64()) | dict.fromkeys(dates, pa.string())
+    decimal_point = "," if _has_decimal_commas(body, delimiter) else "."
     try:
         table = pc.read_csv(
             pa.py_buffer(body),
-            read_options=pc.ReadOptions(column_names=names, use_threads=False),
+            read_options=pc.ReadOptions(column_names=heading.names, use_threads=False),
             parse_options=pc.ParseOptions(ignore_empty_lines=False, delimiter=delimiter),
             convert_options=pc.ConvertOptions(
                 include_columns=wanted,
-                column_types=dict.fromkeys(wanted, pa.float64())
-                | dict.fromkeys(dates, pa.string()),
+                column_types=types,
                 null_values=list(text.EMPTY),
-                decimal_point="," if _has_decimal_commas(body, delimiter) else ".",
+                decimal_point=decimal_point,
             ),
         )
         return {name: _signal(file, table.column(name), name in dates) for name in wanted}
     except pa.ArrowInvalid as error:
         reason = str(error)
-    rows = _read_slowly(
-        file, body.decode("utf-8", "replace"), names, wanted, delimiter, found.first
-    )
+    lines = body.decode("utf-8", "replace")
+    rows = _read_slowly(file, lines, heading._replace(delimiter=delimiter), wanted)
     if not rows:
         raise LogError(f"{file}: not a readable CSV file ({reason}); export it again")
-    return {
-        name: Signal(column) for name, column in zip(wanted, np.array(rows, float).T, strict=True)
-    }
+    columns = np.array(rows, float).T  # (columns, k)
+    return {name: Signal(column) for name, column in zip(wanted, columns, strict=True)}
+
+
+def _with_commas(body: bytes) -> bytes:
+    """Return rows whose cells are apart by white space with commas instead, and decimal points."""
+    if _has_decimal_commas(body, " "):
+        body = body.replace(b",", b".")
+    without_margins = re.sub(rb"(?m)^[ \t]+|[ \t\r]+$", b"", body)
+    return re.sub(rb"[ \t]+", b",", without_margins)
 
 
 def _rows(body: bytes, first: int) -> bytes:
@@ -294,51 +314,60 @@ def _signal(file: Path, column: pa.ChunkedArray, dates: bool) -> Signal:
 
 
 def _read_slowly(
-    file: Path, body: str, names: list[str], wanted: list[str], delimiter: str, first: int
+    file: Path, body: str, heading: text.Heading, wanted: list[str]
 ) -> list[list[float]]:
-    """Line by line: raises for the first with too few cells or a cell that is no number; NaN where
-    rows are cut.
+    """Return the wanted cells of each row, read line by line.
+
+    Raises for the first row with too few cells, or with a cell that is no number; where bad rows
+    are cut, it is NaN.
     """
+    names = heading.names
     places = {name: names.index(name) for name in wanted}
     bad = skipped_rows()
     numbers: list[list[float]] = []
-    if _has_decimal_commas(body.encode(), delimiter):
+    if _has_decimal_commas(body.encode(), heading.delimiter):
         body = body.replace(",", ".")
-    rows = csv.reader(body.split("\n"), delimiter=delimiter)
+    rows = csv.reader(body.split("\n"), delimiter=heading.delimiter)
     while True:
-        where = f"{file}:{rows.line_num + first + 1}"
+        where = f"{file}:{rows.line_num + heading.first + 1}"
         try:
             row = next(rows)
-            values = {name: _number(row, place, names, name) for name, place in places.items()}
+            values = [_number(row, place, names, name) for name, place in places.items()]
         except StopIteration:
             return numbers
         except (csv.Error, ValueError) as error:
             if bad is None:
                 raise LogError(f"{where}: {error}; repair or cut the row") from None
-            values = dict.fromkeys(places, np.nan)
-        numbers.append(list(values.values()))
+            values = [np.nan] * len(places)
+        numbers.append(values)
 
 
 def _number(row: list[str], place: int, names: list[str], name: str) -> float:
+    """Return the number in a cell, NaN for an empty one; raise ValueError for what is none."""
     if len(row) != len(names):
         raise ValueError(
             f"{len(row)} cells, the header has {len(names)}; the file may be cut short"
         )
+    if row[place].strip() in text.EMPTY:
+        return np.nan
     try:
-        return np.nan if row[place].strip() in text.EMPTY else float(row[place])
+        return float(row[place])
     except ValueError:
-        cell = row[place].strip()[:60]
-        if THOUSANDS.fullmatch(cell):
-            raise ValueError(
-                f"column '{name}' is '{cell}': a number with separators between thousands; export "
-                "the table without them"
-            ) from None
-        if cell.startswith(("[", "(", "{")):
-            raise ValueError(
-                f"column '{name}' holds lists ({cell}); write a column per joint, or Parquet "
-                "with lists"
-            ) from None
-        raise ValueError(f"column '{name}' is '{cell}', not a number") from None
+        raise ValueError(_no_number(name, row[place].strip()[:60])) from None
+
+
+def _no_number(name: str, cell: str) -> str:
+    """Say why the cell of a column is no number."""
+    if THOUSANDS.fullmatch(cell):
+        return (
+            f"column '{name}' is '{cell}': a number with separators between thousands; export "
+            "the table without them"
+        )
+    if cell.startswith(("[", "(", "{")):
+        return (
+            f"column '{name}' holds lists ({cell}); write a column per joint, or Parquet with lists"
+        )
+    return f"column '{name}' is '{cell}', not a number"
 
 
 def _parquet_header(file: Path) -> list[str]:
@@ -352,35 +381,37 @@ def _parquet_header(file: Path) -> list[str]:
 
 
 def _read_parquet(file: Path, wanted: list[str]) -> dict[str, Signal]:
-    """{column: (k,)}; an empty cell is NaN."""
-    import pyarrow as pa
-
+    """Return columns by name, (k,) each, or (k, width) of lists; an empty cell is NaN."""
     table = parquet.read(file, wanted)
     widths = parquet.list_widths(file)
-    data: dict[str, Signal] = {}
-    for name in wanted:
-        column = table.column(name)
-        if pa.types.is_timestamp(column.type):
-            at_ns = column.cast(pa.timestamp("ns")).cast(pa.int64()).to_numpy()
-            data[name] = Signal(1e-9 * (at_ns - at_ns[0]), in_seconds=True)
-            continue
-        if pa.types.is_string(column.type) and is_date(column[0].as_py() or ""):
-            data[name] = _signal(file, column, dates=True)
-            continue
-        if name in widths:
-            data[name] = Signal(_matrix(file, name, column, widths[name]))
-            continue
-        if pa.types.is_struct(column.type):
-            raise LogError(
-                f"{file}: cells of '{name}' hold named values ({column.type}); make a column of "
-                "each: pyarrow.Table.flatten() does"
-            )
-        if not joint_rows.is_number(column.type):
-            raise LogError(
-                f"{file}: column '{name}' is {column.type}, not numbers; export it as float64"
-            )
-        data[name] = Signal(column.to_numpy().astype(float))
-    return data
+    return {name: _cells(file, name, table.column(name), widths.get(name)) for name in wanted}
+
+
+def _cells(file: Path, name: str, column: pa.ChunkedArray, width: int | None) -> Signal:
+    """Return a column of a Parquet file.
+
+    Args:
+        width: Of the lists in its cells; None where they are none.
+    """
+    import pyarrow as pa
+
+    if pa.types.is_timestamp(column.type):
+        at_ns = column.cast(pa.timestamp("ns")).cast(pa.int64()).to_numpy()
+        return Signal(1e-9 * (at_ns - at_ns[0]), in_seconds=True)
+    if pa.types.is_string(column.type) and is_date(column[0].as_py() or ""):
+        return _signal(file, column, dates=True)
+    if width is not None:
+        return Signal(_matrix(file, name, column, width))
+    if pa.types.is_struct(column.type):
+        raise LogError(
+            f"{file}: cells of '{name}' hold named values ({column.type}); make a column of each: "
+            "pyarrow.Table.flatten() does"
+        )
+    if not joint_rows.is_number(column.type):
+        raise LogError(
+            f"{file}: column '{name}' is {column.type}, not numbers; export it as float64"
+        )
+    return Signal(column.to_numpy().astype(float))
 
 
 def _matrix(file: Path, name: str, column: pa.ChunkedArray, width: int) -> Array:

@@ -8,11 +8,13 @@ a 2,000th of what lies before them where that is more. Some data files share a f
 meta/episodes. No file depends on episodes that come after it, so that a dataset that grew has its
 earlier files again, byte by byte, and a push sends the others only (share/push_pull.py).
 
-    beyond the standard     features observation.velocity, .acceleration, .torque,
-                            .equivalent_torque, .temperature features.<name>.info.unit: SI columns
-                            of meta/episodes: unit_id, payload_mass, level, repetition, virtual,
-                            findings, … meta/gaponet.json: exact period, robot, joint names,
-                            licence, source
+Beyond the standard are
+
+    features                    observation.velocity, .acceleration, .torque, .equivalent_torque,
+                                .temperature
+    features.<name>.info.unit   SI
+    columns of meta/episodes    unit_id, payload_mass, level, repetition, virtual, findings, …
+    meta/gaponet.json           exact period, robot, joint names, licence, source
 
 A reader that knows none of these finds an ordinary set. Simulated replays are not in it.
 """
@@ -43,13 +45,13 @@ Group = tuple[float, tuple[str, ...]]  # dt, channels
 Tell = Callable[[str], None]  # called with the motion of each recording
 FeatureStatistics = dict[str, Statistics]  # feature → of its samples
 
-# LeRobot's own defaults, at most
-FILE_MB = 100
+# LeRobot's own limits:
+MAX_FILE_MB = 100
 CHUNK_FILES = 1000
-# of a file, and of all bytes before it
+# A data file is so large in the mean, and at least so much of all before it.
 USUAL_MB = 2.0
-SHARE = 1 / 2000
-# a block ends with a file, once it holds as much of both together
+USUAL_SHARE = 1 / 2000
+# A block ends with a file, once it holds so much of both together.
 BLOCK_MB = 32.0
 BLOCK_EPISODES = 64
 INDEX = {
@@ -103,14 +105,18 @@ def write(dataset: Dataset, folder: Path, tell: Tell) -> list[Written]:
 
 
 def _folder(dt: float, channels: tuple[str, ...], groups: list[Group]) -> str:
-    """ "50hz"; with the channels behind it where they are what differs."""
-    same_rate = [c for other, c in groups if other == dt]
-    return f"{_fps(dt):.6g}hz" + ("-" + "-".join(channels) if len(same_rate) > 1 else "")
+    """Return a name such as 50hz; with the channels behind it where they are what differs."""
+    rate = f"{_fps(dt):.6g}hz"
+    same_rate = [group for group in groups if group[0] == dt]
+    if len(same_rate) > 1:
+        return "-".join([rate, *channels])
+    return rate
 
 
 def _fps(dt: float) -> float:
     """A whole number where it is one, as LeRobot expects; 49.85 Hz stays 49.85 Hz."""
-    return round(1 / dt) if abs(round(1 / dt) * dt - 1) < 1e-9 else 1 / dt
+    whole = round(1 / dt)
+    return whole if abs(whole * dt - 1) < 1e-9 else 1 / dt
 
 
 class _Set:
@@ -135,46 +141,45 @@ class _Set:
 
     def write(self, tell: Tell) -> None:
         """Write all files."""
-        self._write_meta(
-            _pooled([self._write_block(*block, tell) for block in enumerate(self._blocks())])
-        )
+        stats = []
+        for number, block in enumerate(self._blocks()):
+            stats.append(self._write_block(number, block, tell))
+        self._write_meta(_pooled(stats))
 
     def _blocks(self) -> Iterator[list[_Placed]]:
         """Episodes of whole data files that one file of meta/episodes lists; the journal alone
         decides the ends.
         """
-        row = 4 * self.n * len(self.channels) + sum(
-            np.dtype(kind).itemsize for kind in INDEX.values()
-        )
+        index_bytes = sum(np.dtype(kind).itemsize for kind in INDEX.values())
+        row_bytes = 4 * self.n * len(self.channels) + index_bytes
         block: list[_Placed] = []
-        file = size = total = 0
-        # of the block; whether a file ended with the last episode
-        fill = 0.0
-        ended = False
+        file = 0
+        file_bytes = 0
+        all_bytes = 0
+        fill = 0.0  # of the block
+        ended = False  # a file, with the last episode
         for index, entry in enumerate(self.entries):
-            more = entry.rows * row
-            if ended or (size and size + more > FILE_MB * 1e6):
-                file = file + 1
-                size = 0
+            more = entry.rows * row_bytes
+            if ended or (file_bytes and file_bytes + more > MAX_FILE_MB * 1e6):
+                file += 1
+                file_bytes = 0
                 if fill >= 1:
                     yield block
                     block = []
                     fill = 0.0
             task = self.tasks.setdefault(entry.meta.motion, len(self.tasks))
             block.append(_Placed(entry, index, self.frames, task, file))
-            size = size + more
-            total = total + more
+            file_bytes += more
+            all_bytes += more
             fill = fill + more / (BLOCK_MB * 1e6) + 1 / BLOCK_EPISODES
             self.frames += entry.rows
-            ended = int(entry.hash[:8], 16) / 2**32 < more / max(USUAL_MB * 1e6, SHARE * total)
+            chance = int(entry.hash[:8], 16) / 2**32  # from 0 to 1, the same each time
+            ended = chance < more / max(USUAL_MB * 1e6, USUAL_SHARE * all_bytes)
         yield block
 
     def _place(self, what: str, number: int) -> Path:
-        place = (
-            self.folder
-            / what
-            / PLACE.format(chunk_index=number // CHUNK_FILES, file_index=number % CHUNK_FILES)
-        )
+        chunk, file = divmod(number, CHUNK_FILES)
+        place = self.folder / what / PLACE.format(chunk_index=chunk, file_index=file)
         place.parent.mkdir(parents=True, exist_ok=True)
         return place
 
@@ -229,18 +234,20 @@ class _Set:
 
         # one value is no list in LeRobot
         vector = pa.list_(pa.float32(), self.n) if self.n > 1 else pa.float32()
-        fields = [(FEATURES[c], vector) for c in self.channels]
-        return pa.schema(fields + [(name, pa.type_for_alias(kind)) for name, kind in INDEX.items()])
+        fields = [(FEATURES[channel], vector) for channel in self.channels]
+        for name, kind in INDEX.items():
+            fields.append((name, pa.type_for_alias(kind)))
+        return pa.schema(fields)
 
     def _columns(self, sequence: Sequence, episode: _Placed) -> dict[str, Array]:
+        columns = {FEATURES[channel]: getattr(sequence, channel) for channel in self.channels}
         rows = np.arange(len(sequence))
-        return {FEATURES[c]: getattr(sequence, c) for c in self.channels} | {
-            "timestamp": (rows * self.dt).astype(np.float32),
-            "frame_index": rows,
-            "episode_index": np.full(len(rows), episode.index),
-            "index": episode.first + rows,
-            "task_index": np.full(len(rows), episode.task),
-        }
+        columns["timestamp"] = (rows * self.dt).astype(np.float32)
+        columns["frame_index"] = rows
+        columns["episode_index"] = np.full(len(rows), episode.index)
+        columns["index"] = episode.first + rows
+        columns["task_index"] = np.full(len(rows), episode.task)
+        return columns
 
     def _table(self, columns: dict[str, Array]) -> pa.Table:
         import pyarrow as pa
@@ -298,7 +305,7 @@ class _Set:
             "total_frames": self.frames,
             "total_tasks": len(self.tasks),
             "chunks_size": CHUNK_FILES,
-            "data_files_size_in_mb": FILE_MB,
+            "data_files_size_in_mb": MAX_FILE_MB,
             "video_files_size_in_mb": 200,
             "fps": _fps(self.dt),
             "splits": {"train": f"0:{len(self.entries)}"},
