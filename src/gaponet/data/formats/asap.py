@@ -35,9 +35,12 @@ def recordings(path: Path, specified: LogsFile) -> Iterator[RawRecording]:
     """Every motion of every file."""
     for file in files_under(path, SUFFIXES):
         require_content(file)
-        motions = _read(file)
-        motions = motions if isinstance(motions, dict) else {}
-        motions = {str(k): v for k, v in motions.items() if isinstance(v, dict) and "dof" in v}
+        content = _read(file)
+        motions = {}
+        if isinstance(content, dict):
+            for name, motion in content.items():
+                if isinstance(motion, dict) and "dof" in motion:
+                    motions[str(name)] = motion
         if not motions:
             raise LogError(
                 f"{file}: no motion with dof in it; an ASAP file is {{motion: {{dof, action, "
@@ -59,7 +62,7 @@ def _is_array(value: Any) -> bool:
 
 def _recording(file: Path, name: str, motion: dict[str, Any]) -> RawRecording:
     where = f"{file}#{name}"
-    arrays = {name: value for name, value in motion.items() if _is_array(value)}
+    arrays = {field: value for field, value in motion.items() if _is_array(value)}
     fps = motion.get("fps")
     if not isinstance(fps, (int, float, np.number)) or not 1 <= float(fps) <= 10_000:
         raise LogError(f"{where}: fps is {fps!r:.40}; a number from 1 to 10000 Hz")
@@ -68,7 +71,7 @@ def _recording(file: Path, name: str, motion: dict[str, Any]) -> RawRecording:
             f"{where}: no {'action' if 'dof' in arrays else 'dof'}: a motion to follow, not a log"
         )
     rows = min(len(arrays["action"]), len(arrays["dof"]))
-    arrays = {k: v[:rows] for k, v in arrays.items() if len(v) >= rows}
+    arrays = {field: array[:rows] for field, array in arrays.items() if len(array) >= rows}
     default = LogsFile(rate=float(fps))
     names = motion.get("joint_names")
     labels = tuple(map(str, names)) if isinstance(names, (list, np.ndarray)) else ()

@@ -59,10 +59,9 @@ class BamFile(TypedDict):
 
 def detects(path: Path) -> bool:
     """A file that begins as BAM's do, or a folder with one."""
-    return any(
-        f.suffix.lower() == ".json" and _is_bam(f)
-        for f in ([path] if path.is_file() else path.glob("*.json"))
-    )
+    if path.is_file():
+        return path.suffix.lower() == ".json" and _is_bam(path)
+    return any(_is_bam(file) for file in path.glob("*.json"))
 
 
 def _is_bam(file: Path) -> bool:
@@ -77,7 +76,7 @@ def find(path: Path) -> list[Path]:
     """The recordings at or below a path."""
     if path.is_file():
         return [path]
-    return sorted(f for f in files_below(path) if f.suffix == ".json" and _is_bam(f))
+    return sorted(file for file in files_below(path) if file.suffix == ".json" and _is_bam(file))
 
 
 def read(
@@ -112,18 +111,19 @@ def _log(file: Path, log_data: BamFile, robot: RobotSpec, joint_map: dict[str, s
             f"{file}: torque is off from the start; a log needs commands that the servo follows"
         )
     samples = entries[:end]
-    volts = float(np.median([e.get("input_volts", log_data["vin"]) for e in samples]))
-    if abs(volts - log_data["vin"]) > MAX_VOLTS_RATIO * log_data["vin"]:
+    vin = log_data["vin"]
+    volts = float(np.median([sample.get("input_volts", vin) for sample in samples]))
+    if abs(volts - vin) > MAX_VOLTS_RATIO * vin:
         logging.getLogger("gaponet").warning(
             "%s: vin says %g V, the servo measured %g V: the gain is taken at vin; correct the "
             "file if that is wrong",
             file,
-            log_data["vin"],
+            vin,
             volts,
         )
-    volts_ratio = log_data["vin"] / servo.gain_volts if servo.gain_volts else 1.0
+    volts_ratio = vin / servo.gain_volts if servo.gain_volts else 1.0
     arm_mass = log_data.get("arm_mass", 0.0)
-    notes: dict[str, Any] = {"firmware_kp": log_data["kp"], "volts": log_data["vin"]}
+    notes: dict[str, Any] = {"firmware_kp": log_data["kp"], "volts": vin}
     if end < len(entries):
         notes["cut"] = f"torque is off from {entries[end]['timestamp']:.2f} s on"
     meta = {

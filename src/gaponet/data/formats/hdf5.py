@@ -10,7 +10,7 @@ command. Images are not read.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -34,19 +34,29 @@ ALOHA: LogsFile = {
     "tau": "observations/effort",
     "position_unit": "rad",
 }
-# groups in groups; arrays in a file
-DEEPEST = 6
-MOST = 5000
+MAX_DEPTH = 6  # of groups in groups
+MAX_ARRAYS = 5000  # in a file
 
 
 def recordings(path: Path, specified: LogsFile) -> Iterator[RawRecording]:
     """Every file, or every demonstration in it."""
     for file in files_under(path, SUFFIXES):
         arrays = _listed(file)
-        demos = sorted({"/".join(n.split("/")[:2]) for n in arrays if n.startswith("data/")})
-        demos.sort(key=lambda demo: int(re.sub(r"\D", "", demo)[:9] or 0))
-        for demo in demos or [""]:
+        for demo in _demos(arrays) or [""]:
             yield _recording(file, demo, arrays)
+
+
+def _demos(paths: Iterable[str]) -> list[str]:
+    """Return the demonstrations of a file of robomimic's, such as data/demo_0, by number."""
+    demos = set()
+    for path in paths:
+        if path.startswith("data/"):
+            demos.add("/".join(path.split("/")[:2]))
+
+    def number(demo: str) -> int:
+        return int(re.sub(r"\D", "", demo)[:9] or 0)
+
+    return sorted(sorted(demos), key=number)
 
 
 def _recording(file: Path, demo: str, arrays: dict[str, tuple[str, ...]]) -> RawRecording:
@@ -62,7 +72,10 @@ def _recording(file: Path, demo: str, arrays: dict[str, tuple[str, ...]]) -> Raw
             signals[path.removeprefix(demo).lstrip("/")] = labels
     default = LogsFile()
     if not demo and {"action", "observations/qpos"} <= signals.keys():
-        known = {k: v for k, v in ALOHA.items() if v in signals or k == "position_unit"}
+        known = {}
+        for field, stated in ALOHA.items():
+            if stated in signals or field == "position_unit":
+                known[field] = stated
         default = cast("LogsFile", known)
     name = file.stem
     source = str(file)
@@ -100,13 +113,15 @@ def _listed(file: Path) -> dict[str, tuple[str, ...]]:
                 if not isinstance(group.get(name, getlink=True), h5py.HardLink):
                     continue  # a soft link may make a circle, an external one open another file
                 item = group[name]
-                if isinstance(item, h5py.Group) and depth < DEEPEST:
+                if isinstance(item, h5py.Group) and depth < MAX_DEPTH:
                     groups.append((path, item, depth + 1))
                 elif isinstance(item, h5py.Dataset) and _is_signal(item):
                     width = item.shape[1] if item.ndim == 2 else 0
                     arrays[path] = tuple(str(i) for i in range(width))
-                if len(arrays) > MOST:
-                    raise LogError(f"{file}: more than {MOST} arrays; give one recording per file")
+                if len(arrays) > MAX_ARRAYS:
+                    raise LogError(
+                        f"{file}: more than {MAX_ARRAYS} arrays; give one recording per file"
+                    )
     return dict(sorted(arrays.items()))
 
 

@@ -29,10 +29,11 @@ def joint_column(names: list[str], logs: LogsFile) -> str | None:
     commands per joint.
     """
     before, pattern, after = str(logs.get("ctrl", "ctrl.{joint}")).partition("{joint}")
-    if pattern and any(
-        n.startswith(before) and n.endswith(after) and len(n) > len(before + after) for n in names
-    ):
-        return None
+    if pattern:
+        for name in names:
+            longer = len(name) > len(before + after)
+            if longer and name.startswith(before) and name.endswith(after):
+                return None
     return next((name for name in names if name.lower() in JOINT_COLUMNS), None)
 
 
@@ -54,14 +55,17 @@ def recording(file: Path, names: list[str], joint: str, logs: LogsFile) -> RawRe
         )
     table = _table(file, names)
     of_row = np.array([str(name) for name in table.column(joint).to_pylist()], dtype=object)
-    rows_of = {name: np.flatnonzero(of_row == name) for name in dict.fromkeys(of_row.tolist())}
+    rows_of = {}  # joint → its rows
+    for name in dict.fromkeys(of_row.tolist()):
+        rows_of[name] = np.flatnonzero(of_row == name)
     stamps = _numbers(file, table, time)
-    times = _common_times(file, stamps, rows_of)
-    arrays = {time: times}
+    arrays = {time: _common_times(file, stamps, rows_of)}
     for name in names:
+        if name in (joint, time):
+            continue
         column = table.column(name)
         is_used = name in logs.values() or not column.null_count
-        if name not in (joint, time) and is_used and is_number(column.type):
+        if is_used and is_number(column.type):
             numbers = _numbers(file, table, name)
             arrays[name] = np.stack([numbers[rows] for rows in rows_of.values()], axis=1)
     recording = RawRecording.of_arrays(file, arrays, tuple(rows_of), default={"time": time})

@@ -38,12 +38,14 @@ def _read(file: Path) -> dict[str, Any]:
                 f"{file}: a v7.3 file, which is HDF5: rename it to .h5, or save it with -v7"
             )
     with reading(file, ".mat file"):
-        specified = loadmat(file, simplify_cells=True)
-        members: dict[str, Any] = {}
-        for name, struct in specified.items():
+        variables = loadmat(file, simplify_cells=True)
+        members = {}
+        for name, struct in variables.items():
             if isinstance(struct, dict):
-                members |= {f"{name}.{field}": value for field, value in struct.items()}
-        return {name: value for name, value in (specified | members).items() if _is_array(value)}
+                for field, value in struct.items():
+                    members[f"{name}.{field}"] = value
+        arrays = variables | members
+        return {name: value for name, value in arrays.items() if _is_array(value)}
 
 
 def _is_array(value: Any) -> bool:

@@ -36,36 +36,53 @@ GAPONET: LogsFile = {
     "time_unit": "s",
 }
 NAMES = ("joint_names", "joint_sequence", "dof_names")
+# Version of a .npy file → what reads its header: shape, order and dtype.
+HEADERS = {
+    (1, 0): np.lib.format.read_array_header_1_0,
+    (2, 0): np.lib.format.read_array_header_2_0,
+}
 
 
 def recordings(path: Path, specified: LogsFile) -> Iterator[RawRecording]:
     """Every file, or every motion in it."""
     for file in files_under(path, SUFFIXES):
         arrays = _read(file)
-        names = next((tuple(map(str, arrays[n].ravel())) for n in NAMES if n in arrays), ())
-        if all(k in arrays for k in ("real_dof_positions", "real_dof_positions_cmd")):
+        names = _joint_names(arrays)
+        if {"real_dof_positions", "real_dof_positions_cmd"} <= arrays.keys():
             yield from _motions(file, arrays, names)
         else:
             yield RawRecording.of_arrays(file, arrays, names)
 
 
+def _joint_names(arrays: dict[str, Any]) -> tuple[str, ...]:
+    """Return the names of columns that a file holds; () if it holds none."""
+    for name in NAMES:
+        if name in arrays:
+            return tuple(map(str, arrays[name].ravel()))
+    return ()
+
+
 def _motions(file: Path, arrays: dict[str, Any], names: tuple[str, ...]) -> Iterator[RawRecording]:
     """GAPONet's: the first axis counts motions."""
-    signals = {k: arrays[k] for k in GAPONET.values() if k in arrays}
+    signals = {name: arrays[name] for name in GAPONET.values() if name in arrays}
     count = min(len(array) for array in signals.values())
     single = len(names) == count and all(_is_table(array) for array in signals.values())
     payloads = np.asarray(arrays["payloads"]).ravel() if "payloads" in arrays else ()
-    default = {k: v for k, v in GAPONET.items() if v in signals or k.endswith("_unit")}
+    default = {}
+    for field, stated in GAPONET.items():
+        if stated in signals or field.endswith("_unit"):
+            default[field] = stated
     for i in range(count):
-        motion = _motion(file, signals, i, single)
-        stated = {"payload_mass": float(payloads[i])} if len(payloads) == count else {}
+        labels = {}
+        if len(payloads) == count:
+            labels["payload_mass"] = float(payloads[i])
         yield RawRecording.of_arrays(
             file,
-            motion,
+            _motion(file, signals, i, single),
             names[i : i + 1] if single else names,
             f"{file.stem}-{i:04d}",
             str(i),
-            meta={"stated": stated},
+            meta={"stated": labels},
             default=default,
         )
 
@@ -106,23 +123,25 @@ def _without_padding(motion: dict[str, Array]) -> dict[str, Array]:
 @sandboxed(LogError, "numpy")
 def _read(file: Path) -> dict[str, Any]:
     """Every array; those of objects by a safe unpickler."""
+    arrays = {}
     with pickles.open_zip(file, "npz file") as packed:
-        return {
-            n.removesuffix(".npy"): _array(packed.read(n), f"{file}: {n}")
-            for n in packed.namelist()
-        }
+        for name in packed.namelist():
+            arrays[name.removesuffix(".npy")] = _array(packed.read(name), f"{file}: {name}")
+    return arrays
 
 
 def _array(data: bytes, where: str) -> Any:
+    """Return the array of a .npy file."""
     stream = io.BytesIO(data)
     version = np.lib.format.read_magic(stream)
-    header = {
-        (1, 0): np.lib.format.read_array_header_1_0,
-        (2, 0): np.lib.format.read_array_header_2_0,
-    }.get(version)
-    if header is None or not header(stream)[2].hasobject:
+    read_header = HEADERS.get(version)
+    holds_objects = False
+    if read_header is not None:
+        _, _, kind = read_header(stream)
+        holds_objects = kind.hasobject
+    if not holds_objects:
         return np.lib.format.read_array(io.BytesIO(data), allow_pickle=False)
-    arrays = pickles.load(stream.read(), where)
-    if not isinstance(arrays, np.ndarray):
+    array = pickles.load(stream.read(), where)  # what stands behind the header
+    if not isinstance(array, np.ndarray):
         raise LogError(f"{where}: not an array")
-    return arrays
+    return array

@@ -5,7 +5,7 @@ first.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from gaponet.base.errors import LogError
 from gaponet.base.sandbox import sandboxed
@@ -23,10 +23,10 @@ def header(file: Path) -> tuple[list[str], dict[str, str]]:
 
     with reading(file, "Parquet file"):
         schema = pq.read_schema(file)
-        metadata = (schema.metadata or {}).items()
-        return list(schema.names), {
-            k.decode("utf-8", "replace"): v.decode("utf-8", "replace") for k, v in metadata
-        }
+        metadata = {}
+        for key, value in (schema.metadata or {}).items():
+            metadata[key.decode("utf-8", "replace")] = value.decode("utf-8", "replace")
+        return list(schema.names), metadata
 
 
 @sandboxed(LogError, "pyarrow.parquet")
@@ -68,9 +68,7 @@ def read(file: Path, wanted: list[str]) -> pa.Table:
 
     with reading(file, "Parquet file"):
         source = pq.ParquetFile(file)
-        parts = [source.metadata.row_group(i) for i in range(source.metadata.num_row_groups)]
-        chunks = (part.column(k) for part in parts for k in range(part.num_columns))
-        values = sum(c.num_values for c in chunks if c.path_in_schema.split(".")[0] in wanted)
+        values = _count_values(source, wanted)
         if 8 * values > MAX_ARRAYS_BYTES:
             raise LogError(
                 f"{file}: {source.metadata.num_rows:,} rows of {len(wanted)} columns are "
@@ -78,3 +76,15 @@ def read(file: Path, wanted: list[str]) -> pa.Table:
                 "shorter ones"
             )
         return source.read(columns=wanted, use_threads=False).select(wanted)
+
+
+def _count_values(file: Any, wanted: list[str]) -> int:
+    """Return how many values some columns of a pyarrow.parquet.ParquetFile hold, by its footer."""
+    values = 0
+    for i in range(file.metadata.num_row_groups):
+        group = file.metadata.row_group(i)
+        for k in range(group.num_columns):
+            chunk = group.column(k)
+            if chunk.path_in_schema.split(".")[0] in wanted:
+                values += chunk.num_values
+    return values

@@ -37,7 +37,7 @@ STORAGES = {
     "Byte": "u1",
     "Bool": "b1",
 }
-MOST_STEPS = 1 << 20  # values of a tree that is walked; shared ones count each time
+MAX_STEPS = 1 << 20  # values of a tree that is walked; shared ones count each time
 
 
 @contextmanager
@@ -68,15 +68,16 @@ class _Type:
         self.order = ""
 
     def __setstate__(self, state: Any) -> None:
-        self.order = (
-            state[1]
-            if isinstance(state, tuple) and len(state) > 1 and state[1] in ("<", ">", "|")
-            else ""
-        )
+        self.order = ""
+        if isinstance(state, tuple) and len(state) > 1 and state[1] in ("<", ">", "|"):
+            self.order = state[1]
 
     def real(self) -> np.dtype[Any]:
+        """Return NumPy's dtype."""
         kind = np.dtype(self.text[:20])
-        return np.dtype(self.order + kind.str[1:]) if self.order in ("<", ">") else kind
+        if self.order in ("<", ">"):
+            return np.dtype(self.order + kind.str[1:])
+        return kind
 
 
 class _Array:
@@ -89,20 +90,21 @@ class _Array:
         self.state = state
 
     def real(self, make: Callable[[Any], Any]) -> Any:
-        shape, kind, order, data = self.state[-4:]
-        if (
-            not isinstance(kind, _Type)
-            or not isinstance(shape, tuple)
-            or not all(type(n) is int for n in shape)
-        ):
+        """Return the array; make: what makes the values of an array of objects."""
+        shape, kind, fortran, data = self.state[-4:]
+        if not isinstance(kind, _Type) or not _is_shape(shape):
             raise _RefusedError("an array without type or shape")
         if kind.text.lstrip("|<>=")[:1] == "O":
             out = np.empty(len(data), object)
-            out[:] = [make(x) for x in data]
+            out[:] = [make(value) for value in data]
             return out.reshape(shape)
         if kind.real().kind not in KINDS or not isinstance(data, (bytes, bytearray)):
             raise _RefusedError(f"an array of {kind.text}")
-        return np.frombuffer(bytes(data), kind.real()).reshape(shape, order="F" if order else "C")
+        return np.frombuffer(bytes(data), kind.real()).reshape(shape, order="F" if fortran else "C")
+
+
+def _is_shape(shape: Any) -> bool:
+    return isinstance(shape, tuple) and all(type(n) is int for n in shape)
 
 
 class _Wrapped:
@@ -112,18 +114,16 @@ class _Wrapped:
         self.array: Any = None
 
     def read(self, state: Any, stream: io.BytesIO) -> None:
+        """Read the bytes that stand in the stream now, as the state describes them."""
         kind = state.get("dtype")
         shape = state.get("shape")
-        if (
-            not isinstance(kind, _Type)
-            or kind.real().kind not in KINDS
-            or not isinstance(shape, tuple)
-        ):
+        is_plain = isinstance(kind, _Type) and kind.real().kind in KINDS
+        if not is_plain or not isinstance(shape, tuple):
             raise _RefusedError("an array of objects inside a joblib file")
-        padding = state.get("numpy_array_alignment_bytes")
-        if padding is not None:
-            stream.seek(stream.read(1)[0], io.SEEK_CUR)
-        size = int(np.prod([int(n) for n in shape], dtype=object)) * kind.real().itemsize
+        if state.get("numpy_array_alignment_bytes") is not None:
+            padding = stream.read(1)[0]
+            stream.seek(padding, io.SEEK_CUR)
+        size = math.prod(int(n) for n in shape) * kind.real().itemsize
         if not 0 <= size <= MAX_ARRAYS_BYTES:
             raise _RefusedError(f"an array of {size} bytes")
         data = stream.read(size)
@@ -139,11 +139,14 @@ def _frombuffer(data: Any, kind: Any, shape: Any, order: Any = "C") -> _Array:
 
 
 class _Scalar:
+    """A number of NumPy's that was meant."""
+
     def __init__(self, kind: Any, data: Any = b"") -> None:
         self.kind = kind
         self.data = data
 
     def real(self, make: Callable[[Any], Any]) -> Any:
+        """Return the number."""
         return np.frombuffer(self.data, self.kind.real())[0]
 
 
@@ -212,15 +215,12 @@ class _Unpickler(pickle._Unpickler):
         return MEANT[module, name]
 
     def persistent_load(self, pid: Any) -> Any:
-        known = (
-            isinstance(pid, tuple)
-            and len(pid) == 5
-            and isinstance(pid[1], str)
-            and pid[1] in STORAGES.values()
-        )
-        if self.storage is None or not known:
+        if self.storage is None or not isinstance(pid, tuple) or len(pid) != 5:
             raise _RefusedError("a persistent id that is no storage of tensors")
-        return np.frombuffer(self.storage(str(pid[2])), np.dtype("<" + pid[1]))
+        _, kind, key, _, _ = pid
+        if not isinstance(kind, str) or kind not in STORAGES.values():
+            raise _RefusedError("a persistent id that is no storage of tensors")
+        return np.frombuffer(self.storage(str(key)), np.dtype("<" + kind))
 
     def load_build(self) -> None:
         stack = self.stack  # type: ignore[attr-defined]
@@ -242,21 +242,22 @@ class _Maker:
     def __init__(self) -> None:
         self.steps = 0
 
-    def make(self, x: Any) -> Any:
+    def make(self, meant: Any) -> Any:
+        """Return an array or a plain value; refuse any other."""
         self.steps += 1
-        if self.steps > MOST_STEPS:
+        if self.steps > MAX_STEPS:
             raise _RefusedError("too many values")
-        if isinstance(x, (_Array, _Scalar)):
-            return x.real(self.make)
-        if isinstance(x, (_Wrapped, _Tensor)):
-            return x.array
-        if isinstance(x, dict):
-            return {k: self.make(v) for k, v in x.items()}
-        if isinstance(x, (list, tuple)):
-            return [self.make(v) for v in x]
-        if x is None or isinstance(x, (bool, int, float, str)):
-            return x
-        raise _RefusedError(f"a {type(x).__name__}")
+        if isinstance(meant, (_Array, _Scalar)):
+            return meant.real(self.make)
+        if isinstance(meant, (_Wrapped, _Tensor)):
+            return meant.array
+        if isinstance(meant, dict):
+            return {key: self.make(value) for key, value in meant.items()}
+        if isinstance(meant, (list, tuple)):
+            return [self.make(value) for value in meant]
+        if meant is None or isinstance(meant, (bool, int, float, str)):
+            return meant
+        raise _RefusedError(f"a {type(meant).__name__}")
 
 
 def load(data: bytes, where: str, storage: Callable[[str], bytes] | None = None) -> Any:

@@ -39,8 +39,8 @@ def detects(path: Path) -> bool:
 
 def find(path: Path) -> list[Path]:
     """Real motion folders under path; simulated ones are skipped."""
-    folders = sorted({f.parent for f in files_below(path) if f.name in FILES})
-    return [f for f in folders if f.relative_to(path).parts[:1] != ("sim",)]
+    folders = sorted({file.parent for file in files_below(path) if file.name in FILES})
+    return [folder for folder in folders if folder.relative_to(path).parts[:1] != ("sim",)]
 
 
 def read(
@@ -53,56 +53,79 @@ def read(
             f"{path}: no folder with control.csv and state_motor.csv; point at a SAGE folder"
         )
     for folder in folders:
-        yield (
-            os.path.basename(os.path.abspath(folder)),
-            partial(_read_motion, folder, robot, joint_map),
-        )
+        motion = os.path.basename(os.path.abspath(folder))
+        yield motion, partial(_read_motion, folder, robot, joint_map)
 
 
 def _read_motion(folder: Path, robot: RobotSpec, joint_map: dict[str, str] | None) -> Log:
     list_file = folder / "joint_list.txt"
-    if not list_file.is_file():
-        raise LogError(f"{list_file}: missing; one joint name a line, in the order of the columns")
-    try:
-        lines = read_limited(list_file, LogError).decode().splitlines()
-    except UnicodeDecodeError as error:
-        raise LogError(
-            f"{list_file}: not UTF-8 text ({error.reason} at byte {error.start}); is it this file?"
-        ) from None
-    raw_names = [line.strip() for line in lines if line.strip()]
-    if not raw_names:
-        raise LogError(f"{list_file}: empty; one joint name a line, in the order of the columns")
-    names = tuple(resolve_all(raw_names, robot, str(list_file), joint_map))
+    names = tuple(resolve_all(_joint_names(list_file), robot, str(list_file), joint_map))
     control = folder / "control.csv"
     state = folder / "state_motor.csv"
-    ctrl_time, ctrl = _read_csv(control, len(names), "control")
-    state_time, values = _read_csv(state, len(names), "state_motor")
+    command_time, commands = _read_csv(control, len(names), "control")
+    state_time, states = _read_csv(state, len(names), "state_motor")
     units = [robot.log_joints.units[robot.joint_names.index(name)] for name in names]
-    channels = {COLUMNS[k]: Channel(state_time, v) for k, v in values.items() if k in COLUMNS}
-    channels["ctrl"] = Channel(ctrl_time, ctrl["positions"])
-    return Log(
-        robot.name,
-        names,
-        {
-            k: Channel(c.time, to_radians(k, c.values, names, units, robot))
-            for k, c in channels.items()
-        },
-        str(folder),
-        {
-            "files": dict.fromkeys(channels, str(state)) | {"ctrl": str(control)},
-            "first_line": 2,
-            "converted_from": {n: u for n, u in zip(names, units, strict=True) if u != "rad"},
-        },
-    )
+    channels = {}
+    for column, values in states.items():
+        if column in COLUMNS:
+            channel = COLUMNS[column]
+            in_si = to_radians(channel, values, names, units, robot)
+            channels[channel] = Channel(state_time, in_si)
+    targets = to_radians("ctrl", commands["positions"], names, units, robot)
+    channels["ctrl"] = Channel(command_time, targets)
+    converted_from = {}
+    for name, unit in zip(names, units, strict=True):
+        if unit != "rad":
+            converted_from[name] = unit
+    meta = {
+        "files": dict.fromkeys(channels, str(state)) | {"ctrl": str(control)},
+        "first_line": 2,
+        "converted_from": converted_from,
+    }
+    return Log(robot.name, names, channels, str(folder), meta)
+
+
+def _joint_names(file: Path) -> list[str]:
+    """Return the names in a joint_list.txt."""
+    if not file.is_file():
+        raise LogError(f"{file}: missing; one joint name a line, in the order of the columns")
+    try:
+        lines = read_limited(file, LogError).decode().splitlines()
+    except UnicodeDecodeError as error:
+        raise LogError(
+            f"{file}: not UTF-8 text ({error.reason} at byte {error.start}); is it this file?"
+        ) from None
+    names = [line.strip() for line in lines if line.strip()]
+    if not names:
+        raise LogError(f"{file}: empty; one joint name a line, in the order of the columns")
+    return names
 
 
 def _read_csv(file: Path, n: int, kind: str) -> tuple[Array, dict[str, Array]]:
-    """Time (k,) in seconds and {column: (k, n)}."""
+    """Return the time of each row, (k) s, and the lists of n numbers by name, (k, n) each.
+
+    Args:
+        kind: TYPE of its rows.
+    """
     needed = "a SAGE motion needs control.csv and state_motor.csv, each of one recording"
     first, _, body = read_limited(file, LogError, needed, MAX_ARRAYS_BYTES).partition(b"\n")
+    lists = _lists(file, first)
+    body = body.rstrip()
+    if not body:
+        raise LogError(f"{file}: holds no rows; delete the motion folder or record it again")
+    table = _parse(file, body, n, len(lists), kind)  # (k, 1 + lists · n)
+    stamps = table[:, 0]
+    numbers = table[:, 1:]
+    by_name = {}
+    for i, name in enumerate(lists):
+        by_name[name] = numbers[:, i * n : (i + 1) * n]
+    return stamps * _seconds(file, stamps), by_name
+
+
+def _lists(file: Path, first: bytes) -> list[str]:
+    """Return the names of the lists that the header of a file names."""
     header = first.decode("utf-8", errors="replace").strip().lstrip("\ufeff")
-    columns = [c.strip().lower() for c in header.split(",")]
-    lists = columns[2:]
+    columns = [column.strip().lower() for column in header.split(",")]
     if columns[:2] != ["type", "timestamp"]:
         raise LogError(
             f"{file}:1: header is '{header[:60]}', expected type,timestamp,positions,..."
@@ -112,29 +135,29 @@ def _read_csv(file: Path, n: int, kind: str) -> tuple[Array, dict[str, Array]]:
             f"{file}:1: a column stands twice in the header {', '.join(columns)}; delete or "
             "rename one"
         )
-    if "positions" not in lists:
+    if "positions" not in columns:
         raise LogError(
             f"{file}:1: column 'positions' is missing; the header has: {', '.join(columns)}"
         )
-    body = body.rstrip()
-    if not body:
-        raise LogError(f"{file}: holds no rows; delete the motion folder or record it again")
-    table = _parse(file, body, n, len(lists), kind)
-    time = table[:, 0] * _seconds(file, table[:, 0])
-    return time, {name: table[:, 1 + i * n : 1 + (i + 1) * n] for i, name in enumerate(lists)}
+    return columns[2:]
 
 
 def _parse(file: Path, body: bytes, n: int, k: int, kind: str) -> Array:
-    """Numbers of all rows, (rows, 1 + k n).
+    """Return the numbers of all rows, (rows, 1 + k n).
 
     The whole body is looked at once; lines singly only to name a bad one.
+
+    Args:
+        n: Joints.
+        k: Lists in a row.
+        kind: TYPE of the rows.
     """
     import pyarrow as pa
     import pyarrow.csv as csv
 
-    skeletons = set(body.translate(None, DIGITS).lower().split(b"\n"))
-    numbers = b'"[' + b"," * (n - 1) + b']"'
-    if skeletons != {b",".join([kind.encode().translate(None, DIGITS), b"", *[numbers] * k])}:
+    list_skeleton = b'"[' + b"," * (n - 1) + b']"'
+    skeleton = b",".join([kind.encode().translate(None, DIGITS), b"", *[list_skeleton] * k])
+    if set(body.translate(None, DIGITS).lower().split(b"\n")) != {skeleton}:
         _refuse_row(file, body, n, k, kind)
     names = [str(i) for i in range(2 + n * k)]
     try:
@@ -163,17 +186,18 @@ def _refuse_row(file: Path, body: bytes, n: int, k: int, kind: str) -> None:
     row = re.compile(
         rf'([A-Za-z_]+),{NUMBER}(?:,"\[{NUMBER}(?:,{NUMBER}){{{n - 1}}}\]"){{{k}}}', re.IGNORECASE
     )
-    for i, line in enumerate(body.decode("utf-8", errors="replace").split("\n")):
-        if (match := row.fullmatch(line.rstrip("\r"))) and match[1].lower() != kind:
-            raise LogError(
-                f"{file}:{i + 2}: a row of type '{match[1]}', not {kind.upper()}: are the files "
-                "swapped or mixed?"
-            )
-        if not match:
+    for number, line in enumerate(body.decode("utf-8", errors="replace").split("\n"), 2):
+        match = row.fullmatch(line.rstrip("\r"))
+        if match is None:
             shown = line if len(line) < 60 else line[:57] + "..."
             raise LogError(
-                f"{file}:{i + 2}: expected TYPE,timestamp and {k} list(s) of {n} numbers, got "
+                f"{file}:{number}: expected TYPE,timestamp and {k} list(s) of {n} numbers, got "
                 f"'{shown}'; the file may be cut short: remove the row or record the motion again"
+            )
+        if match[1].lower() != kind:
+            raise LogError(
+                f"{file}:{number}: a row of type '{match[1]}', not {kind.upper()}: are the files "
+                "swapped or mixed?"
             )
 
 

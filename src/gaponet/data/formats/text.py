@@ -68,12 +68,22 @@ def delimiter_of(line: str) -> str:
     semicolons = line.count(";")
     if semicolons and semicolons >= line.count(",") - 1:
         return ";"
-    for delimiter in ("\t", " "):
-        cells = line.split(None if delimiter == " " else delimiter)
-        ends = any(cell.strip().endswith(",") for cell in cells)
-        if "," in line and len(cells) > 1 and not ends and is_numeric(cells):
+    if "," in line:
+        if _are_decimal_commas(line.split("\t")):
+            return "\t"
+        if _are_decimal_commas(line.split()):
+            return " "
+    for delimiter in (",", ";", "\t"):
+        if delimiter in line:
             return delimiter
-    return next((d for d in (",", ";", "\t") if d in line), " ")
+    return " "
+
+
+def _are_decimal_commas(cells: list[str]) -> bool:
+    """Return True if cells are numbers, none of which ends with a comma."""
+    if len(cells) < 2 or any(cell.strip().endswith(",") for cell in cells):
+        return False
+    return is_numeric(cells)
 
 
 def cells_of(line: str) -> list[str]:
@@ -90,11 +100,13 @@ def cells_of(line: str) -> list[str]:
 
 def is_numeric(cells: Sequence[str]) -> bool:
     """Return True if all cells are numbers, with a decimal point or a decimal comma, or dates."""
+    numbers = [cell for cell in cells if cell.strip() and not is_date(cell)]
     try:
-        numbers = [cell for cell in cells if cell.strip() and not is_date(cell)]
-        return bool([float(cell.replace(",", ".")) for cell in numbers])
+        for cell in numbers:
+            float(cell.replace(",", "."))
     except ValueError:
         return False
+    return bool(numbers)
 
 
 def heading(text: str) -> Heading:
@@ -108,15 +120,16 @@ def heading(text: str) -> Heading:
     """
     lines = text.split("\n")
     start = _after_comments(lines)
-    named = start and _names_row_after(lines, start)
-    if named:
-        lines = [*lines[: start - 1], COMMENT.sub("", lines[start - 1], count=1), *lines[start:]]
+    in_comment = start > 0 and _names_row_after(lines, start)
+    if in_comment:
         start -= 1
+        header = COMMENT.sub("", lines[start], count=1)
+        delimiter = delimiter_of(lines[start + 1])
     else:
         start = _after_preamble(lines, start)
-    header = lines[start] if start < len(lines) else ""
+        header = lines[start] if start < len(lines) else ""
+        delimiter = delimiter_of(header)
     names = cells_of(header)
-    delimiter = delimiter_of(lines[start + 1] if named else header)
     if is_numeric(names):
         return Heading([], start, names, delimiter, [])
     units = _units_below(lines, start, len(names))
@@ -163,8 +176,10 @@ def _after_preamble(lines: list[str], start: int) -> int:
     counts = [_count(line) for line in lines[start:] if line.strip()]
     if len(counts) <= MIN_ALIKE_LINES:
         return start
-    usual, alike = Counter(counts).most_common(1)[0]
-    if alike < MIN_ALIKE_LINES or usual < 2 or counts[0] == usual or counts[0] == usual - 1:
+    ((usual, alike),) = Counter(counts).most_common(1)
+    if alike < MIN_ALIKE_LINES or usual < 2:
+        return start
+    if counts[0] in (usual, usual - 1):  # a row may end with a separator
         return start
     for i in range(start, min(len(lines), start + MAX_PREAMBLE_LINES)):
         after = [_count(line) for line in lines[i : i + MIN_ALIKE_LINES]]
