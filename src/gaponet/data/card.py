@@ -30,8 +30,7 @@ from gaponet.data.sequence import ARRAYS
 from gaponet.data.statistics import Statistics, pool, statistics
 from gaponet.data.store import Dataset, Entry, dataset_hash
 
-# about so many rows, evenly taken from the dataset, give the 1 % and 99 % percentiles
-PERCENTILE_ROWS = 100_000
+PERCENTILE_ROWS = 100_000  # about, evenly taken from the dataset, for the 1 % and 99 % percentiles
 NOT_STATED = "not stated"
 # Property → its heading and its value; the card counts sequences by each.
 PROPERTIES: dict[str, tuple[str, Callable[[Entry], str]]] = {
@@ -49,13 +48,10 @@ def make_card(dataset: Dataset, progress: Progress = no_progress) -> dict[str, A
         DatasetError: It is empty, or a file is damaged.
     """
     dataset.require_sequences()
-    stride = max(1, sum(entry.rows for entry in dataset.entries) // PERCENTILE_ROWS)
-    stats: dict[str, list[Statistics]] = defaultdict(list)
-    samples: dict[str, list[Array]] = defaultdict(list)
     groups: dict[tuple[object, ...], list[Entry]] = defaultdict(list)
     for entry in dataset.entries:
         groups[*entry.meta.repetition_key, round(entry.dt, 7)].append(entry)
-    rows_before: Counter[str] = Counter()
+    signals = _Signals(max(1, sum(entry.rows for entry in dataset.entries) // PERCENTILE_ROWS))
     repeated = []
     done = 0
     for group in groups.values():
@@ -63,28 +59,48 @@ def make_card(dataset: Dataset, progress: Progress = no_progress) -> dict[str, A
         for entry in group:
             sequence = dataset.read(entry)
             for name in entry.channels:
-                values = getattr(sequence, name)
-                samples[name].append(values[-rows_before[name] % stride :: stride].copy())
-                rows_before[name] += len(values)
-                stats[name].append(statistics(values))
+                signals.add(name, getattr(sequence, name))
             repetitions.add(sequence)
             done += 1
             progress(done, len(dataset), entry.meta.motion)
         if repetitions.count > 1:
             repeated.append(repetitions.result())
-    signals: dict[str, Any] = {}
-    for name in ARRAYS:
-        if stats[name]:
-            values = np.concatenate(samples[name])
-            signals[name] = {
-                "unit": UNITS[name],
-                "sequences": len(stats[name]),
-                "joints": _by_joint(pool(stats[name]), values, dataset.joint_names),
-            }
     return _counted(dataset) | {
-        "signals": signals,
+        "signals": signals.by_name(dataset.joint_names),
         "repeatability": Repetitions.summary(repeated, dataset.joint_names),
     }
+
+
+class _Signals:
+    """Accumulates the samples of each channel: statistics of all, and every `stride`-th row."""
+
+    def __init__(self, stride: int) -> None:
+        self.stride = stride
+        self.statistics: dict[str, list[Statistics]] = defaultdict(list)  # of each recording
+        self.samples: dict[str, list[Array]] = defaultdict(list)
+        self.rows_before: Counter[str] = Counter()
+
+    def add(self, name: str, values: Array) -> None:
+        """Add a channel of one recording, (T, n)."""
+        start = -self.rows_before[name] % self.stride
+        self.samples[name].append(values[start :: self.stride].copy())
+        self.rows_before[name] += len(values)
+        self.statistics[name].append(statistics(values))
+
+    def by_name(self, joint_names: tuple[str, ...]) -> dict[str, Any]:
+        """Return unit, number of recordings and ranges by joint, of each channel."""
+        signals = {}
+        for name in ARRAYS:
+            of_recordings = self.statistics[name]
+            if not of_recordings:
+                continue
+            samples = np.concatenate(self.samples[name])
+            signals[name] = {
+                "unit": UNITS[name],
+                "sequences": len(of_recordings),
+                "joints": _by_joint(pool(of_recordings), samples, joint_names),
+            }
+        return signals
 
 
 def beside_paper(dataset: Dataset) -> dict[str, Any]:
@@ -103,16 +119,12 @@ def beside_paper(dataset: Dataset) -> dict[str, Any]:
 
 def _counted(dataset: Dataset) -> dict[str, Any]:
     """Return what the journal and dataset.json alone say."""
-    collected = dataset.path / "collect.json"
-    recorded = sorted({entry.meta.recorded_at for entry in dataset.entries} - {""})
-    by_property: dict[str, dict[str, Any]] = {}
-    for name, (_, value_of) in PROPERTIES.items():
-        groups: dict[str, list[Entry]] = defaultdict(list)
-        for entry in dataset.entries:
-            groups[value_of(entry)].append(entry)
-        by_property[name] = {
-            value: count_entries(groups[value]) for value in sorted(groups, key=_number_or_name)
-        }
+    collected = None
+    collect_file = dataset.path / "collect.json"
+    if collect_file.is_file():
+        hint = "restore it or delete it"
+        collected = read_json(dict[str, Any], collect_file, DatasetError, hint)
+    dates = sorted({entry.meta.recorded_at for entry in dataset.entries} - {""})
     return {
         "name": dataset.path.resolve().name,
         "robot": dataset.robot_name,
@@ -120,17 +132,24 @@ def _counted(dataset: Dataset) -> dict[str, Any]:
         "virtual_sequences": sum(entry.meta.virtual for entry in dataset.entries),
         "licence": dataset.header.get("licence", NOT_STATED),
         "source": dataset.header.get("source", NOT_STATED),
-        "recorded": [recorded[0], recorded[-1]] if recorded else NOT_STATED,
-        "collected": read_json(dict[str, Any], collected, DatasetError, "restore it or delete it")
-        if collected.is_file()
-        else None,
+        "recorded": [dates[0], dates[-1]] if dates else NOT_STATED,
+        "collected": collected,
         "dataset_hash": dataset_hash(dataset.entries),
         "format": dataset.header["format"],
-        "bytes": sum(f.stat().st_size for f in (dataset.path / "sequences").iterdir()),
+        "bytes": sum(file.stat().st_size for file in (dataset.path / "sequences").iterdir()),
         "gaponet": __version__,
         "total": count_entries(dataset.entries),
-        "shares": by_property,
+        "shares": {name: _shares(dataset.entries, name) for name in PROPERTIES},
     }
+
+
+def _shares(entries: list[Entry], name: str) -> dict[str, dict[str, float]]:
+    """Return value → counts of the entries that have it, by one of PROPERTIES."""
+    _, value_of = PROPERTIES[name]
+    groups: dict[str, list[Entry]] = defaultdict(list)
+    for entry in entries:
+        groups[value_of(entry)].append(entry)
+    return {value: count_entries(groups[value]) for value in sorted(groups, key=_number_or_name)}
 
 
 def count_entries(entries: list[Entry]) -> dict[str, float]:
@@ -181,8 +200,11 @@ def headline(card: dict[str, Any]) -> str:
     """Return the first line: "demo: 128 sequences, 0.39 h of h1_2, all on VIRTUAL robots"."""
     total = card["total"]
     virtual = card["virtual_sequences"]
-    count = "all" if virtual == total["sequences"] else f"{virtual} of them"
-    kind = f", {count} on VIRTUAL robots" if virtual else ""
+    kind = ""
+    if virtual == total["sequences"]:
+        kind = ", all on VIRTUAL robots"
+    elif virtual:
+        kind = f", {virtual} of them on VIRTUAL robots"
     return (
         f"{card['name']}: {total['sequences']:,} sequences, {total['hours']:.2f} h of "
         f"{card['robot']}{kind}"
@@ -225,7 +247,9 @@ def _facts(card: dict[str, Any]) -> Iterator[str]:
     recorded = card["recorded"]
     collected = card["collected"]
     for name in ("licence", "source"):
-        ask = f"; set with `gaponet data card DIR --{name} …`" if card[name] == NOT_STATED else ""
+        ask = ""
+        if card[name] == NOT_STATED:
+            ask = f"; set with `gaponet data card DIR --{name} …`"
         yield f"- {name}: {escape_markdown(card[name])}{ask}"
     dates = recorded if isinstance(recorded, str) else " to ".join(dict.fromkeys(recorded))
     yield f"- recorded: {escape_markdown(dates)}"
@@ -266,32 +290,34 @@ def _repeatability(card: dict[str, Any]) -> Iterator[str]:
     )
     if excluded := repeated["left_out_other_command"]:
         yield f"{excluded:,} sequences of these groups had another command and were left out."
-    channels = repeated["channels"]
-    joints: dict[str, None] = {}
-    for channel in channels.values():
+    yield "\n" + _repeatability_table(repeated["channels"]).markdown() + "\n"
+
+
+def _repeatability_table(channels: dict[str, Any]) -> ResultTable:
+    """Return a row per joint and a column per channel, and their means."""
+    joints: dict[str, None] = {}  # in the order in which they come
+    headings = ["joint"]
+    mean = ["mean"]
+    for name, channel in channels.items():
         joints |= dict.fromkeys(channel["joints"])
+        headings.append(f"{name}, {channel['unit']}")
+        mean.append(_digits(channel["mean"]))
     rows = []
     for joint in joints:
         values = [channel["joints"].get(joint) for channel in channels.values()]
         rows.append((joint, *map(_digits, values)))
-    mean = ("mean", *(_digits(c["mean"]) for c in channels.values()))
-    headings = ("joint", *(f"{name}, {c['unit']}" for name, c in channels.items()))
-    yield "\n" + ResultTable("repeatability", headings, (*rows, mean)).markdown() + "\n"
+    return ResultTable("repeatability", tuple(headings), (*rows, tuple(mean)))
 
 
 def _signals(card: dict[str, Any]) -> Iterator[str]:
     yield "## Signals\n"
     for name, signal in card["signals"].items():
         yield f"### {name}, {signal['unit']} ({signal['sequences']:,} sequences)\n"
-        rows = tuple(
-            (joint, *map(_digits, values.values())) for joint, values in signal["joints"].items()
-        )
-        yield (
-            ResultTable(
-                name, ("joint", "min", "1 %", "mean", "99 %", "max", "std"), rows
-            ).markdown()
-            + "\n"
-        )
+        rows = []
+        for joint, values in signal["joints"].items():
+            rows.append((joint, *map(_digits, values.values())))
+        headings = ("joint", "min", "1 %", "mean", "99 %", "max", "std")
+        yield ResultTable(name, headings, tuple(rows)).markdown() + "\n"
 
 
 def _digits(value: float | None) -> str:

@@ -139,18 +139,21 @@ class Journal:
         content = self.path.read_bytes()
         self._size = content.rfind(b"\n") + 1
         id_of_hash: dict[str, str] = {}
-        for number, line in enumerate(content[: self._size].split(b"\n")[:-1], 1):
+        lines = content[: self._size].split(b"\n")[:-1]
+        for number, line in enumerate(lines, 1):
             entry = Entry.parse(line, f"{self.path}:{number}")
-            if id_of_hash.setdefault(entry.hash, entry.id) != entry.id or len(id_of_hash) < number:
+            if entry.hash in id_of_hash:
                 raise DatasetError(
                     f"{entry.where}: '{id_of_hash[entry.hash]}' is listed already; delete this line"
                 )
+            id_of_hash[entry.hash] = entry.id
             yield entry
 
     @property
     def changed(self) -> bool:
         """True if another process has written since the last read or append."""
-        return (self.path.stat().st_size if self.path.is_file() else 0) != self._size
+        size = self.path.stat().st_size if self.path.is_file() else 0
+        return size != self._size
 
     def append(self, entry: Entry, at_once: bool = True) -> None:
         """Add an entry whose file is complete; with at_once=False, it is written within

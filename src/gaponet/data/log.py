@@ -61,8 +61,8 @@ class Channel(NamedTuple):
 
 
 RESTART_PERIODS = 3  # by which clocks of recordings in one file may begin apart
-MOSTLY = 0.5  # of the rows that repeat a stamp: a clock that is too coarse
-MIN_PIECE_ROWS = 20  # of each of them
+MIN_PIECE_ROWS = 20  # of each of these recordings
+MAX_REPEATED_STAMPS = 0.5  # of the rows; with more, a clock is too coarse
 
 
 @dataclass(frozen=True)
@@ -103,22 +103,33 @@ class Log:
         for name, (clock, _) in self.channels.items():
             if name in channels:
                 continue
-            same = [
-                n for n, c in self.channels.items() if np.array_equal(c.time, clock, equal_nan=True)
-            ]
+            same = self._channels_of(clock)
             good = np.isfinite(clock)
-            for other in same:
-                good &= np.isfinite(self.channels[other].values).all(axis=1)
+            for values in same.values():
+                good &= np.isfinite(values).all(axis=1)
             latest = np.maximum.accumulate(np.where(good, clock, -np.inf))
             good[1:] &= clock[1:] > latest[:-1]
-            bad += [f"{self.row(name, int(row))}: cut" for row in np.flatnonzero(~good)]
-            channels |= {n: Channel(clock[good], self.channels[n].values[good]) for n in same}
-        cut = max(len(c.time) - len(channels[n].time) for n, c in self.channels.items())
+            for row in np.flatnonzero(~good):
+                bad.append(f"{self.row(name, int(row))}: cut")
+            for other, values in same.items():
+                channels[other] = Channel(clock[good], values[good])
+        cut = 0
+        for name, channel in self.channels.items():
+            cut = max(cut, len(channel.time) - len(channels[name].time))
         if cut:
             self.meta["notes"] = self.meta.get("notes", {}) | {"rows_cut": cut}
             object.__setattr__(self, "channels", channels)
 
+    def _channels_of(self, clock: Array) -> dict[str, Array]:
+        """Return the values of the channels that have a clock."""
+        same = {}
+        for name, (time, values) in self.channels.items():
+            if np.array_equal(time, clock, equal_nan=True):
+                same[name] = values
+        return same
+
     def _check(self, name: str, time: Array, values: Array) -> None:
+        """Refuse a channel that is unknown, has another shape, is not finite, or goes back."""
         if name not in UNITS:
             raise LogError(
                 f"{self.source}: unknown channel '{name}'; known are "
@@ -133,38 +144,48 @@ class Log:
             raise LogError(
                 f"{self.source}: channel {name} has {len(time)} rows; nothing to learn from"
             )
+        self._require_finite(name, time, values)
+        self._require_clock(name, time)
+
+    def _require_finite(self, name: str, time: Array, values: Array) -> None:
         bad = np.flatnonzero(~np.isfinite(values).all(axis=1) | ~np.isfinite(time))
-        if bad.size:
-            row = int(bad[0])
-            what = "time"
-            if np.isfinite(time[row]):
-                joint = int(np.flatnonzero(~np.isfinite(values[row]))[0])
-                what = f"{name} of {self.joint_names[joint]}"
-            raise LogError(
-                f"{self.row(name, row)}: {what} is empty or not finite; repair or cut the row "
-                "(--skip-bad does)"
-            )
+        if not bad.size:
+            return
+        row = int(bad[0])
+        what = "time"
+        if np.isfinite(time[row]):
+            joint = int(np.flatnonzero(~np.isfinite(values[row]))[0])
+            what = f"{name} of {self.joint_names[joint]}"
+        raise LogError(
+            f"{self.row(name, row)}: {what} is empty or not finite; repair or cut the row "
+            "(--skip-bad does)"
+        )
+
+    def _require_clock(self, name: str, time: Array) -> None:
+        """Refuse a clock that does not increase, with the likely cause."""
         back = np.flatnonzero(np.diff(time) <= 0)
-        if back.size and _starts_again(time):
+        if not back.size:
+            return
+        before = time[back[0]]
+        after = time[back[0] + 1]
+        where = self.row(name, int(back[0]) + 1)
+        if _starts_again(time):
             raise LogError(
-                f"{self.row(name, int(back[0]) + 1)}: the clock starts again at "
-                f"{time[back[0] + 1]:.6g} s: several recordings in one file; write each into a "
-                "file of its own, or number them in a column episode_index"
+                f"{where}: the clock starts again at {after:.6g} s: several recordings in one "
+                "file; write each into a file of its own, or number them in a column episode_index"
             )
-        if np.mean(np.diff(time) == 0) > MOSTLY:
+        if np.mean(np.diff(time) == 0) > MAX_REPEATED_STAMPS:
             stamps = np.unique(time)
             step = f"{stamps[1] - stamps[0]:g} s" if len(stamps) > 1 else "nothing"
             raise LogError(
-                f"{self.row(name, int(back[0]) + 1)}: the clock is too coarse: it has "
-                f"{len(stamps)} stamps in {len(time)} rows and advances by {step}; log "
-                "milliseconds, or state the rate of even rows (rate in logs.toml, --rate)"
+                f"{where}: the clock is too coarse: it has {len(stamps)} stamps in {len(time)} "
+                f"rows and advances by {step}; log milliseconds, or state the rate of even rows "
+                "(rate in logs.toml, --rate)"
             )
-        if back.size:
-            raise LogError(
-                f"{self.row(name, int(back[0]) + 1)}: time does not increase in channel {name} "
-                f"({time[back[0]]:.6f} s, then {time[back[0] + 1]:.6f} s); sort the rows or cut "
-                "the log there (--skip-bad does)"
-            )
+        raise LogError(
+            f"{where}: time does not increase in channel {name} ({before:.6f} s, then "
+            f"{after:.6f} s); sort the rows or cut the log there (--skip-bad does)"
+        )
 
     def row(self, name: str, index: int) -> str:
         """File and line of a row of a channel, as the reader noted them."""

@@ -63,23 +63,31 @@ def unit_offsets(
         known: Content hash → static poses of sequences that need not be read again.
     """
     poses = []
-    sags = [np.zeros((0, len(robot.joint_names)))]
+    sags = [np.zeros((0, len(robot.joint_names)))]  # of the nominal model in these poses, rad
     for entry in dataset.entries:
         meta = entry.meta
-        if meta.unit_id == unit_id:
-            own = known.get(entry.hash) or StaticPoses.of(dataset.read(entry), robot.operated_index)
-            kp = robot.with_gains(meta.recorded_gains[0], None).servo.kp
-            torque = gravity(own.qpos, meta.payload_mass, meta.payload_side)
-            poses.append(own)
-            sags.append(-torque / np.where(kp > 0, kp, np.inf))
+        if meta.unit_id != unit_id:
+            continue
+        own = known.get(entry.hash) or StaticPoses.of(dataset.read(entry), robot.operated_index)
+        recorded_kp, _ = meta.recorded_gains
+        kp = robot.with_gains(recorded_kp, None).servo.kp
+        torque = gravity(own.qpos, meta.payload_mass, meta.payload_side)
+        poses.append(own)
+        sags.append(-torque / np.where(kp > 0, kp, np.inf))
     joined = StaticPoses.joined(poses, len(robot.joint_names))
     sag = np.concatenate(sags)
     offsets = {}
     for name, j in zip(robot.operated, robot.operated_index, strict=True):
         error = joined.static_error(j)
-        beyond = joined.static_error(j, sag[:, j])
-        values = (error.middle, beyond.half_band, error.middle - beyond.middle, beyond.middle)
-        offsets[name] = JointOffset(error.up, error.down, *map(_rounded, values))
+        beyond_sag = joined.static_error(j, sag[:, j])
+        offsets[name] = JointOffset(
+            rests_up=error.up,
+            rests_down=error.down,
+            static_error=_rounded(error.middle),
+            stiction_band=_rounded(beyond_sag.half_band),
+            nominal_sag=_rounded(error.middle - beyond_sag.middle),
+            tracking_offset=_rounded(beyond_sag.middle),
+        )
     return offsets
 
 

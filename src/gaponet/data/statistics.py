@@ -11,26 +11,30 @@ Statistics = dict[str, Array]  # min, max, mean, std (n) and count (1)
 
 def statistics(values: Array) -> Statistics:
     """Return the statistics of one recording's samples, (T, n) or (T)."""
-    x = values.reshape(len(values), -1).astype(float)
+    samples = values.reshape(len(values), -1).astype(float)  # (T, n)
     return {
-        "min": x.min(axis=0),
-        "max": x.max(axis=0),
-        "mean": x.mean(axis=0),
-        "std": x.std(axis=0),
-        "count": np.array([len(x)]),
+        "min": samples.min(axis=0),
+        "max": samples.max(axis=0),
+        "mean": samples.mean(axis=0),
+        "std": samples.std(axis=0),
+        "count": np.array([len(samples)]),
     }
 
 
 def pool(parts: list[Statistics]) -> Statistics:
     """Return the statistics of all samples together, from those of the recordings."""
-    s = {k: np.stack([part[k] for part in parts]) for k in parts[0]}
-    weight = s["count"] / s["count"].sum()  # (recordings, 1)
-    mean = (weight * s["mean"]).sum(axis=0)
-    variance = (weight * (s["std"] ** 2 + (s["mean"] - mean) ** 2)).sum(axis=0)
+    least = np.stack([part["min"] for part in parts])  # (recordings, n), as the others
+    greatest = np.stack([part["max"] for part in parts])
+    means = np.stack([part["mean"] for part in parts])
+    stds = np.stack([part["std"] for part in parts])
+    counts = np.stack([part["count"] for part in parts])  # (recordings, 1)
+    weight = counts / counts.sum()
+    mean = (weight * means).sum(axis=0)
+    variance = (weight * (stds**2 + (means - mean) ** 2)).sum(axis=0)
     return {
-        "min": s["min"].min(axis=0),
-        "max": s["max"].max(axis=0),
+        "min": least.min(axis=0),
+        "max": greatest.max(axis=0),
         "mean": mean,
         "std": np.sqrt(variance),
-        "count": s["count"].sum(axis=0).astype(int),
+        "count": counts.sum(axis=0).astype(int),
     }
