@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gaponet.motion.files import SAGE_DT
+from gaponet.motion.files import SAGE_PERIOD_S
 from gaponet.motion.motion import Motion
 from gaponet.robot.spec import RobotSpec
 
@@ -19,7 +19,7 @@ def write_motion(path: str | Path, motion: Motion, robot: RobotSpec) -> None:
         return
     names, ctrl = list(robot.joint_names), motion.ctrl
     if path.suffix == ".txt":
-        ctrl = motion.sample(SAGE_DT)
+        ctrl = motion.sample(SAGE_PERIOD_S)
     else:
         names, ctrl = ["time", *names], np.column_stack([np.arange(len(ctrl)) * motion.dt, ctrl])
     lines = [",".join(names), *(",".join(f"{v:.9g}" for v in row) for row in ctrl)]

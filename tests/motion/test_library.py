@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from gaponet.base.errors import UsageError
-from gaponet.motion.feasible import MAX_PAYLOAD
+from gaponet.motion.feasible import MAX_PAYLOAD_KG
 from gaponet.motion.library import SIGNALS, Library, short
 from gaponet.robot.spec import load_robot
 
@@ -25,7 +25,7 @@ def library():
 def test_a_motion_is_within_all_limits_at_every_payload(library, name):
     motion = library.make(name)
     need = library.limits.demand(motion.ctrl, motion.dt)
-    assert library.limits.max_payload == MAX_PAYLOAD
+    assert library.limits.max_payload == MAX_PAYLOAD_KG
     assert need.met, need
     assert np.abs(np.diff(motion.ctrl, axis=0)[[0, -1]]).max() < 1e-3  # from rest to rest
 

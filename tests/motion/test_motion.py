@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from gaponet.base.errors import UsageError
-from gaponet.motion.feasible import MAX_SPEED, TORQUE_SHARE, Feasibility
+from gaponet.motion.feasible import MAX_SPEED_RAD_S, TORQUE_SHARE, Feasibility
 from gaponet.motion.motion import GRID, PEAK_SPEED, Motion, blend, move_time, through
 
 
@@ -53,7 +53,7 @@ def test_torque_demand_of_a_level_arm_is_its_weight(arm):
 def test_speed_and_range_are_limits(arm):
     limits = Feasibility(arm, 0.0)
     fast = still(arm, 0.0)
-    fast[:, 1] = np.linspace(0, 2 * MAX_SPEED * GRID * 49, 50)
+    fast[:, 1] = np.linspace(0, 2 * MAX_SPEED_RAD_S * GRID * 49, 50)
     assert limits.demand(fast, GRID).speed == pytest.approx(2.0)
     assert not limits.demand(still(arm, 1.5), GRID).met  # on the stop
 

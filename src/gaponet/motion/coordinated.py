@@ -28,8 +28,12 @@ Sides = tuple[str, ...]
 MAX_IK_ITERATIONS = 80
 MAX_IK_STEP_RAD = 0.3  # of a joint in one iteration
 IK_TOLERANCE_M = 1e-4
+IK_DAMPING = 1e-3  # m²
+IK_PULL = 0.1  # of the way back to the start, in the null space of one iteration
 DURATION_S = 8.0  # of most whole-body motions
 BOX_SHARE = 0.3  # of a joint's range, half the width of a box of targets
+MAX_BOX_RAD = 0.8  # the same
+ENDLESS_RAD = 2.0  # that counts as the range of a joint without one
 # Rows between postures that are computed on a path of the hands; a spline goes through them.
 KNOT_ROWS = 10
 ROLES = ("shoulder_pitch", "shoulder_roll", "shoulder_yaw", "elbow", "wrist_roll")
@@ -43,6 +47,14 @@ class Arm:
     sign: float  # +1 left, −1 right: multiplies every sideways (y) quantity
     columns: Array  # positions of ROLES in robot.joint_names, (5,)
     hand: str  # MuJoCo body at the palm
+
+    def column(self, role: str) -> int:
+        """Return the position of a joint of ROLES in robot.joint_names."""
+        return int(self.columns[ROLES.index(role)])
+
+    def mirrored(self, point: Array | list[float]) -> Array:
+        """Return points (…, 3) m of the left hand for this one."""
+        return np.asarray(point) * [1.0, self.sign, 1.0]
 
 
 def arms(robot: RobotSpec) -> dict[str, Arm]:
@@ -106,10 +118,12 @@ class HandIK:
                 break
             mujoco.mj_comPos(self.model, self.data)
             mujoco.mj_jacBody(self.model, self.data, jacobian, None, self.body)
-            J = jacobian[:, columns]
-            inverse = J.T @ np.linalg.inv(J @ J.T + 1e-3 * np.eye(3))
-            pull = (np.eye(len(rest)) - inverse @ J) @ (rest - q[columns])
-            step = np.clip(inverse @ error + 0.1 * pull, -MAX_IK_STEP_RAD, MAX_IK_STEP_RAD)
+            J = jacobian[:, columns]  # (3, ROLES)
+            inverse = J.T @ np.linalg.inv(J @ J.T + IK_DAMPING * np.eye(3))
+            null_space = np.eye(len(rest)) - inverse @ J
+            pull = null_space @ (rest - q[columns])
+            step = inverse @ error + IK_PULL * pull
+            step = np.clip(step, -MAX_IK_STEP_RAD, MAX_IK_STEP_RAD)
             q[columns] = np.clip(q[columns] + step, self.low, self.high)
         return q
 
@@ -162,8 +176,8 @@ class Kit:
         """
         for side in sides:
             arm = self.arms[side]
-            q = self.ik[side].solve(q, np.asarray(point) * [1.0, arm.sign, 1.0])
-            q[arm.columns[4]] = arm.sign * roll
+            q = self.ik[side].solve(q, arm.mirrored(point))
+            q[arm.column("wrist_roll")] = arm.sign * roll
         return q
 
 
@@ -241,9 +255,9 @@ def wave(kit: Kit, sides: Sides, rng: np.random.Generator) -> Array:
     swing = np.repeat(raised[None], steps, axis=0)
     window = fade(steps, GRID, 1.0)
     for side in sides:
-        columns = kit.arms[side].columns
-        swing[:, columns[2]] += 0.4 * np.sin(phase) * window
-        swing[:, columns[3]] += 0.25 * np.sin(phase + 1.0) * window
+        arm = kit.arms[side]
+        swing[:, arm.column("shoulder_yaw")] += 0.4 * np.sin(phase) * window
+        swing[:, arm.column("elbow")] += 0.25 * np.sin(phase + 1.0) * window
     return np.concatenate([ctrl, swing, _stops([raised, kit.ready], 1.6, 0.4)])
 
 
@@ -267,8 +281,8 @@ def mirror(kit: Kit, sides: Sides, rng: np.random.Generator) -> Array:
     lag = rng.choice([0.0, np.pi])
     paths = {}
     for i, side in enumerate(sides):
-        own = phase + i * lag
-        oval = np.stack([0.5 * np.cos(own), 0.6 * np.sin(own), np.cos(own)], axis=1)
+        of_side = phase + i * lag
+        oval = np.stack([0.5 * np.cos(of_side), 0.6 * np.sin(of_side), np.cos(of_side)], axis=1)
         paths[side] = centre + size[:, None] * oval
     return _along(kit, paths)
 
@@ -282,13 +296,12 @@ def carry(kit: Kit, sides: Sides, rng: np.random.Generator) -> Array:
     time = np.arange(steps) * GRID
     window = fade(steps, GRID, 1.5)
     ctrl = np.repeat(held[None], steps, axis=0)
-    torso = [i for i, n in enumerate(kit.robot.joint_names) if n.startswith("torso")]
-    ctrl[:, torso] += (rng.uniform(0.2, 0.4) * np.sin(2 * np.pi * 0.25 * time) * window)[:, None]
+    _add(ctrl, kit, "torso", rng.uniform(0.2, 0.4) * np.sin(2 * np.pi * 0.25 * time) * window)
     bounce = 0.05 * np.sin(2 * np.pi * rng.uniform(0.8, 1.2) * time) * window
     for side in sides:
-        columns = kit.arms[side].columns
-        ctrl[:, columns[0]] += bounce
-        ctrl[:, columns[3]] -= 0.7 * bounce
+        arm = kit.arms[side]
+        ctrl[:, arm.column("shoulder_pitch")] += bounce
+        ctrl[:, arm.column("elbow")] -= 0.7 * bounce
     before = _stops([kit.ready, held], 1.2, 0.3)
     after = _stops([held, kit.ready], 1.2, 0.3)
     return np.concatenate([before, ctrl, after])
@@ -337,8 +350,7 @@ def _along(kit: Kit, paths: dict[str, Array]) -> Array:
     q = np.repeat(kit.ready[None], len(knots), axis=0)
     for side, path in paths.items():
         arm = kit.arms[side]
-        targets = path[knots] * [1.0, arm.sign, 1.0]
-        postures = kit.ik[side].path(kit.ready, targets)
+        postures = kit.ik[side].path(kit.ready, arm.mirrored(path[knots]))
         q[:, arm.columns] = postures[:, arm.columns]
     before = _stops([kit.ready, q[0]], 1.2, 0.3)
     middle = CubicSpline(knots, q)(np.arange(rows))
@@ -355,7 +367,7 @@ def squat(kit: Kit, rng: np.random.Generator) -> Array:
         _add(down, kit, f"{side}_knee", 2 * depth)
         _add(down, kit, f"{side}_ankle_pitch", -depth * 0.9)
     for arm in kit.arms.values():
-        down[arm.columns[0]] -= rng.uniform(0.3, 0.6)
+        down[arm.column("shoulder_pitch")] -= rng.uniform(0.3, 0.6)
     return _stops([kit.ready, down, kit.ready, down, kit.ready], rng.uniform(1.3, 1.7), 0.4)
 
 
@@ -364,15 +376,16 @@ def march(kit: Kit, rng: np.random.Generator) -> Array:
     time, ctrl, window = _start(kit)
     phase = 2 * np.pi * rng.uniform(0.5, 0.8) * time
     size = rng.uniform(0.25, 0.4)
-    for side, p in (("left", phase), ("right", phase + np.pi)):
-        swing = np.sin(p) * window
-        lift = np.maximum(np.sin(p), 0.0) ** 2 * window
+    for side, of_leg in (("left", phase), ("right", phase + np.pi)):
+        swing = np.sin(of_leg) * window
+        lift = np.maximum(np.sin(of_leg), 0.0) ** 2 * window
         _add(ctrl, kit, f"{side}_hip_pitch", -size * swing)
         _add(ctrl, kit, f"{side}_knee", 2.0 * size * lift)
         _add(ctrl, kit, f"{side}_ankle_pitch", -0.6 * size * lift)
         if side in kit.arms:
-            ctrl[:, kit.arms[side].columns[0]] += 0.8 * size * swing
-            ctrl[:, kit.arms[side].columns[3]] -= 0.4 * size * swing
+            arm = kit.arms[side]
+            ctrl[:, arm.column("shoulder_pitch")] += 0.8 * size * swing
+            ctrl[:, arm.column("elbow")] -= 0.4 * size * swing
     _add(ctrl, kit, "torso", 0.3 * size * np.sin(phase) * window)
     return ctrl
 
@@ -389,7 +402,8 @@ def sway(kit: Kit, rng: np.random.Generator) -> Array:
         _add(ctrl, kit, f"{side}_hip_yaw", 0.15 * wave)
     _add(ctrl, kit, "torso", rng.uniform(0.2, 0.5) * wave)
     for arm in kit.arms.values():
-        ctrl[:, arm.columns[1]] += arm.sign * rng.uniform(0.3, 0.6) * opening
+        shoulder_roll = arm.column("shoulder_roll")
+        ctrl[:, shoulder_roll] += arm.sign * rng.uniform(0.3, 0.6) * opening
     return ctrl
 
 
@@ -456,9 +470,9 @@ def _start(kit: Kit) -> tuple[Array, Array, Array]:
 
 
 def _box(kit: Kit) -> tuple[Array, Array]:
-    """BOX_SHARE of every joint's range around the ready posture, at most 0.8 rad to either side."""
+    """Return the lowest and highest targets of every joint around the ready posture, (n) rad."""
     low = kit.limits.low
     high = kit.limits.high
-    width = np.where(np.isfinite(high - low), high - low, 2.0)
-    half = np.minimum(BOX_SHARE * width, 0.8)
+    width = np.where(np.isfinite(high - low), high - low, ENDLESS_RAD)
+    half = np.minimum(BOX_SHARE * width, MAX_BOX_RAD)
     return np.maximum(kit.ready - half, low), np.minimum(kit.ready + half, high)

@@ -21,24 +21,26 @@ from gaponet.robot.spec import RobotSpec
 from gaponet.sim.dynamics import inverse_dynamics, static_torque
 from gaponet.sim.model import build_model
 
-MAX_PAYLOAD = 3.0  # kg per hand: the heaviest of the SimLifter recipe, and the default
-# rad/s: under half of the 9 of the slowest H1-2 arm joint (unitreerobotics/unitree_ros, h1_2.urdf)
-MAX_SPEED = 4.0
+MAX_PAYLOAD_KG = 3.0  # per hand: the heaviest of the SimLifter recipe, and the default
+# Under half of the 9 of the slowest H1-2 arm joint (unitreerobotics/unitree_ros, h1_2.urdf).
+MAX_SPEED_RAD_S = 4.0
 MAX_CHANGES = 40  # of a motion until it fits
 NEARER = 0.93  # of the distance to a posture that is fine, after one change
-RANGE_MARGIN = 0.02  # rad kept from a hard stop
+MIN_SLOWER = 1.03  # factor by which one change slows a motion down, at least
+MAX_SLOWER = 1.5  # and at most
+RANGE_MARGIN_RAD = 0.02  # kept from a hard stop
 MAX_STATIC_SHARE = 0.95  # of the usable torque, to hold a posture: slower motion does not reduce it
 TORQUE_SHARE = 0.85  # of the effort limit, for commands; the rest is for feedback, heavier links
 
 
 @dataclass(frozen=True)
 class Demand:
-    """The worst that a command demands of any joint; 1.0 is the limit."""
+    """The worst that a command demands of any joint, and the free space that it leaves."""
 
-    position: float
-    speed: float
-    torque: float
-    gravity: float  # torque at rest
+    position: float  # distance from the middle of a joint's range, over half of it
+    speed: float  # over MAX_SPEED_RAD_S
+    torque: float  # over the usable torque
+    gravity: float  # the same at rest
     worst_joint: str  # by torque
     clearance: float  # least free space, m
     nearest: str  # bodies between which it is
@@ -56,7 +58,7 @@ class Feasibility:
     def __init__(
         self,
         robot: RobotSpec,
-        max_payload: float = MAX_PAYLOAD,
+        max_payload: float = MAX_PAYLOAD_KG,
         height: float | None = None,
         unchecked: bool = False,
     ) -> None:
@@ -69,8 +71,8 @@ class Feasibility:
             unchecked: Ignore all shapes.
         """
         self.robot = robot
-        self.low = robot.qpos_range[:, 0] + RANGE_MARGIN
-        self.high = robot.qpos_range[:, 1] - RANGE_MARGIN
+        self.low = robot.qpos_range[:, 0] + RANGE_MARGIN_RAD
+        self.high = robot.qpos_range[:, 1] - RANGE_MARGIN_RAD
         self.max_payload = max_payload if robot.payload_mounts else 0.0
         self.models: list[mujoco.MjModel] = []
         for payload in sorted({0.0, self.max_payload}):
@@ -113,7 +115,7 @@ class Feasibility:
         required = self.collision.clearance if need is None else need
         return Demand(
             position=float(position[:, named].max()),
-            speed=float(np.abs(qvel).max() / MAX_SPEED),
+            speed=float(np.abs(qvel).max() / MAX_SPEED_RAD_S),
             torque=float(share.max()),
             gravity=float(still.max()),
             worst_joint=self.robot.joint_names[int(share.max(axis=0).argmax())],
@@ -155,13 +157,14 @@ class Feasibility:
             if demand.gravity > MAX_STATIC_SHARE or not demand.clear:
                 ctrl = anchor + NEARER * (ctrl - anchor)
             else:
-                slower = max(demand.speed, demand.torque**0.5, 1.03)
-                ctrl = stretch(ctrl, min(slower, 1.5))
+                # torque of acceleration falls with the square of the duration
+                slower = max(demand.speed, demand.torque**0.5, MIN_SLOWER)
+                ctrl = stretch(ctrl, min(slower, MAX_SLOWER))
             ctrl = np.clip(ctrl, low, high)
         raise UsageError(
             f"motion '{motion.name}' does not fit {self.robot.name} after {MAX_CHANGES} changes: "
             f"{demand.worst_joint} needs {demand.torque:.2f} of its usable torque at "
-            f"{self.max_payload:g} kg, speed is {demand.speed:.2f} of {MAX_SPEED:g} rad/s, "
+            f"{self.max_payload:g} kg, speed is {demand.speed:.2f} of {MAX_SPEED_RAD_S:g} rad/s, "
             f"{demand.nearest or 'limbs'} come as near as {demand.clearance * 100:.1f} cm (at "
             f"least {self.collision.clearance * 100:g}). Start it from a posture that is easier to "
             "hold, or collect with a lighter payload"
@@ -224,13 +227,13 @@ def find_excitation_range(limits: Feasibility, joint: str, seed: int = 0) -> Exc
         if best.share >= ENOUGH_RANGE_SHARE:
             break
         posture = home.copy()
-        near_home_first = min(1.0, 1.5 * i / MAX_POSTURES)
-        reach = near_home_first * rng.uniform(0, 1, len(columns))
+        furthest = min(1.0, 1.5 * i / MAX_POSTURES)  # share of the way; near home first
+        share = furthest * rng.uniform(0, 1, len(columns))
         anywhere = rng.uniform(low[columns], high[columns])
-        posture[columns] += reach * (anywhere - home[columns])
-        stage = _span(limits, posture, int(j))
-        if stage.share > best.share:
-            best = stage
+        posture[columns] += share * (anywhere - home[columns])
+        candidate = _span(limits, posture, int(j))
+        if candidate.share > best.share:
+            best = candidate
     return best
 
 
@@ -242,7 +245,8 @@ def _span(limits: Feasibility, posture: Array, j: int) -> ExcitationRange:
     rows[:, j] = grid
     empty = ExcitationRange(posture, grid[0], grid[0], 0.0)
     fits = limits.collision.distance(rows) >= limits.collision.clearance
-    if np.diff(_longest_run(fits))[0] < GRID_POINTS // 2:
+    start, stop = _longest_run(fits)
+    if stop - start < GRID_POINTS // 2:
         return empty
     torques = [np.abs(static_torque(model, rows)) for model in limits.models]
     share = np.max(torques, axis=0) / limits.limit
@@ -252,7 +256,7 @@ def _span(limits: Feasibility, posture: Array, j: int) -> ExcitationRange:
         return empty
     low = float(grid[start])
     high = float(grid[stop - 1])
-    full = float(reach_high[j] - reach_low[j]) + 2 * RANGE_MARGIN
+    full = float(reach_high[j] - reach_low[j]) + 2 * RANGE_MARGIN_RAD  # of the joint, rad
     return ExcitationRange(posture, low, high, (high - low) / full)
 
 
@@ -270,11 +274,11 @@ def _limb(model: mujoco.MjModel, operated: tuple[str, ...], joint: str) -> list[
     """Return the operated joints on the chain of `joint`: those that it carries and those that
     carry it.
     """
-    body = {name: int(model.joint(name).bodyid[0]) for name in operated}
-    mine = body[joint]
+    body_of = {name: int(model.joint(name).bodyid[0]) for name in operated}
+    body = body_of[joint]
     limb = []
-    for name, other in body.items():
-        if other in carriers(model, mine) or mine in carriers(model, other):
+    for name, other in body_of.items():
+        if other in carriers(model, body) or body in carriers(model, other):
             limb.append(name)
     return limb
 

@@ -20,9 +20,12 @@ from gaponet.data.sequence import MAX_PERIOD_S, MIN_PERIOD_S
 from gaponet.motion.motion import Motion
 from gaponet.robot.spec import RobotSpec
 
-SAGE_DT = 0.02  # s: the format has no time column, its files are at 50 Hz
-LARGEST = 64 << 20  # bytes of a file, unpacked: 10 hours of 27 joints at 10 Hz
+SAGE_PERIOD_S = 0.02  # the format has no time column, its files are at 50 Hz
+MAX_BYTES = 64 << 20  # of a file, unpacked: 10 hours of 27 joints at 10 Hz
 SUFFIXES = (".txt", ".csv", ".npz")
+# Kinds of dtypes in npz files:
+TEXT = "U"
+NUMBERS = "fiu"
 
 
 def read_motion(path: str | Path, robot: RobotSpec) -> Motion:
@@ -38,9 +41,10 @@ def read_motion(path: str | Path, robot: RobotSpec) -> Motion:
         raise LogError(f"{path}: motion files end in {', '.join(SUFFIXES)}")
     if not path.is_file():
         raise LogError(f"{path}: no such file")
-    if path.stat().st_size > LARGEST:
-        raise LogError(f"{path}: has more than {LARGEST >> 20} MiB; cut it into shorter motions")
-    names, rows, period = _npz(path) if path.suffix == ".npz" else _text(path)
+    if path.stat().st_size > MAX_BYTES:
+        raise LogError(f"{path}: has more than {MAX_BYTES >> 20} MiB; cut it into shorter motions")
+    read = _npz if path.suffix == ".npz" else _text
+    names, rows, period = read(path)
     if not MIN_PERIOD_S <= period <= MAX_PERIOD_S:
         raise LogError(
             f"{path}: its period is {period:g} s; expected {MIN_PERIOD_S} to {MAX_PERIOD_S:g}"
@@ -72,9 +76,9 @@ def write_motion(path: Path, motion: Motion, robot: RobotSpec, rate: float) -> N
         with atomic_write(path) as temporary, temporary.open("wb") as file:
             np.savez(file, joint_names=np.array(names), ctrl=rows, dt=1 / rate)
         return
-    if path.suffix == ".txt" and abs(rate * SAGE_DT - 1) > 1e-9:
+    if path.suffix == ".txt" and abs(rate * SAGE_PERIOD_S - 1) > 1e-9:
         raise UsageError(
-            f"{path}: SAGE motion files are at {1 / SAGE_DT:g} Hz; write csv or npz at {rate:g} Hz"
+            f"{path}: SAGE motion files are at {1 / SAGE_PERIOD_S:g} Hz; write csv or npz at {rate:g} Hz"
         )
     if path.suffix == ".csv":
         rows = np.column_stack([np.arange(len(rows)) / rate, rows])
@@ -101,6 +105,7 @@ def _level_of(ctrl: Array, robot: RobotSpec) -> str:
 
 
 def _text(path: Path) -> tuple[list[str], Array, float]:
+    """Return names, targets (T, k) rad and period, s, of a txt or csv file."""
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except UnicodeDecodeError:
@@ -113,7 +118,7 @@ def _text(path: Path) -> tuple[list[str], Array, float]:
         return names[:at] + names[at + 1 :], np.delete(table, at, axis=1), dt
     if path.suffix == ".csv":
         raise LogError(f"{path}:1: no column time, s, so its pace is not known; add one")
-    return names, table, SAGE_DT
+    return names, table, SAGE_PERIOD_S
 
 
 def _table(lines: list[str], columns: int, path: Path) -> Array:
@@ -150,24 +155,29 @@ def _even_period(time: Array, path: Path) -> float:
 
 
 def _npz(path: Path) -> tuple[list[str], Array, float]:
-    arrays = read_npz(
-        path, LogError, "give a motion of at most 10 hours, as gaponet excite writes it", LARGEST
-    )
-    for name, kind, dimensions in (("joint_names", "U", 1), ("ctrl", "fiu", 2), ("dt", "fiu", 0)):
-        if name not in arrays:
-            raise LogError(
-                f"{path}: array '{name}' is missing; it holds {', '.join(arrays) or 'nothing'}"
-            )
-        if arrays[name].dtype.kind not in kind or arrays[name].ndim != dimensions:
-            what = "text" if kind == "U" else "numbers"
-            raise LogError(
-                f"{path}: array '{name}' must hold {what} in {dimensions} dimensions; write it "
-                "again"
-            )
-    names = arrays["joint_names"].tolist()
-    rows = arrays["ctrl"].astype(float)
+    """Return names, targets (T, k) rad and period, s, of an npz file."""
+    hint = "give a motion of at most 10 hours, as gaponet excite writes it"
+    arrays = read_npz(path, LogError, hint, MAX_BYTES)
+    names = _array(path, arrays, "joint_names", TEXT, 1).tolist()
+    rows = _array(path, arrays, "ctrl", NUMBERS, 2).astype(float)
+    period = float(_array(path, arrays, "dt", NUMBERS, 0))
     if rows.shape[1] != len(names) or len(rows) < 2 or not np.isfinite(rows).all():
         raise LogError(
             f"{path}: ctrl has shape {rows.shape} or holds NaN; {len(names)} joint names"
         )
-    return names, rows, float(arrays["dt"])
+    return names, rows, period
+
+
+def _array(path: Path, arrays: dict[str, Array], name: str, kinds: str, dimensions: int) -> Array:
+    """Return an array of a file; refuse one of another kind (of its dtype) or shape."""
+    if name not in arrays:
+        raise LogError(
+            f"{path}: array '{name}' is missing; it holds {', '.join(arrays) or 'nothing'}"
+        )
+    array = arrays[name]
+    if array.dtype.kind not in kinds or array.ndim != dimensions:
+        what = "text" if kinds == TEXT else "numbers"
+        raise LogError(
+            f"{path}: array '{name}' must hold {what} in {dimensions} dimensions; write it again"
+        )
+    return array

@@ -12,7 +12,7 @@ from gaponet.base.arrays import Array
 from gaponet.base.errors import UsageError
 from gaponet.motion.coordinated import BUILDERS, WHOLE_BODY, Kit, available
 from gaponet.motion.feasible import (
-    MAX_PAYLOAD,
+    MAX_PAYLOAD_KG,
     ExcitationRange,
     Feasibility,
     find_excitation_range,
@@ -37,10 +37,10 @@ def creep(low: float, high: float, rng: np.random.Generator, dt: float) -> Array
     Stribeck dip.
     """
     half = min(0.15, (high - low) / 2)
-    mid = (low + high) / 2
+    middle = (low + high) / 2
     if high - low > 2 * half:
-        mid = rng.uniform(low + half, high - half)
-    levels = [mid - half, mid + half, mid - half]
+        middle = rng.uniform(low + half, high - half)
+    levels = [middle - half, middle + half, middle - half]
     return _ramps(levels, [0.1, 0.1], dt)
 
 
@@ -106,20 +106,22 @@ SIGNALS: dict[str, Signal] = {
 def _line(
     levels: Array | list[float], moves: Array | list[float], rests: list[float], dt: float
 ) -> Array:
-    return through(np.asarray(levels)[:, None], np.asarray(moves), np.asarray(rests), dt)[:, 0]
+    """Move one joint from level to level (rad), resting at each; moves and rests in s."""
+    points = np.asarray(levels)[:, None]
+    return through(points, np.asarray(moves), np.asarray(rests), dt)[:, 0]
 
 
 def _ramps(levels: Array | list[float], speeds: Array | list[float], dt: float) -> Array:
     """Go from level to level at constant speeds (rad/s), corners rounded over 0.3 s."""
     kernel = np.hanning(max(3, round(0.3 / dt)))
-    out = [np.full(round(0.5 / dt), levels[0])]
-    for a, b, speed in zip(levels[:-1], levels[1:], speeds, strict=True):
-        before = np.full(len(kernel), a)
-        line = np.linspace(a, b, max(2, round(abs(b - a) / speed / dt)))
-        after = np.full(len(kernel) + round(0.2 / dt), b)
+    parts = [np.full(round(0.5 / dt), levels[0])]
+    for start, stop, speed in zip(levels[:-1], levels[1:], speeds, strict=True):
+        before = np.full(len(kernel), start)
+        line = np.linspace(start, stop, max(2, round(abs(stop - start) / speed / dt)))
+        after = np.full(len(kernel) + round(0.2 / dt), stop)
         ramp = np.concatenate([before, line, after])
-        out.append(np.convolve(ramp, kernel / kernel.sum(), "valid"))
-    return np.concatenate(out)
+        parts.append(np.convolve(ramp, kernel / kernel.sum(), "valid"))
+    return np.concatenate(parts)
 
 
 def _about(low: float, high: float, wave: Array, rng: np.random.Generator, dt: float) -> Array:
@@ -139,7 +141,7 @@ class Library:
         self,
         robot: RobotSpec,
         seed: int = 0,
-        max_payload: float = MAX_PAYLOAD,
+        max_payload: float = MAX_PAYLOAD_KG,
         height: float | None = None,
         unchecked: bool = False,
     ) -> None:
@@ -200,7 +202,7 @@ class Library:
 
     def _forms(self) -> str:
         """Say how motions are named."""
-        joints = ", ".join(short(joint) for joint in self.robot.operated)
+        joints = _short_names(self.robot)
         sides = "none (this robot has no arms by name)"
         if self.kit.arms:
             sides = ", ".join([*self.kit.arms, "both"])
@@ -221,24 +223,30 @@ class Library:
         if full is None:
             raise UsageError(
                 f"motion '{name}': {self.robot.name} has no operated joint '{joint}'; it has "
-                f"{', '.join(short(j) for j in self.robot.operated)}"
+                f"{_short_names(self.robot)}"
             )
-        there = self.excitation_range(full)
-        column = SIGNALS[signal](there.low, there.high, rng, GRID)
-        ctrl = np.repeat(there.posture[None], len(column), axis=0)
-        ctrl[:, self.robot.index([full])[0]] = column
+        interval = self.excitation_range(full)
+        of_joint = SIGNALS[signal](interval.low, interval.high, rng, GRID)  # (T,) rad
+        ctrl = np.repeat(interval.posture[None], len(of_joint), axis=0)
+        ctrl[:, self.robot.index([full])[0]] = of_joint
         return self._fitted(name, "joint", ctrl)
 
     def _fitted(self, name: str, level: str, ctrl: Array) -> Motion:
         """Make commands feasible; the motion names the operated joints and those that move."""
         fitted = self.limits.fit(Motion(name, level, GRID, ctrl))
         about = {*self.robot.operated, *fitted.moved(self.robot)}
-        return replace(fitted, joints=tuple(n for n in self.robot.joint_names if n in about))
+        joints = tuple(joint for joint in self.robot.joint_names if joint in about)
+        return replace(fitted, joints=joints)
 
 
 def _number(name: str) -> int:
     """Return a number that a name stands for, the same on every machine."""
     return int(hashlib.sha256(name.encode()).hexdigest()[:8], 16)
+
+
+def _short_names(robot: RobotSpec) -> str:
+    """Return the names of the operated joints, as motions have them."""
+    return ", ".join(short(joint) for joint in robot.operated)
 
 
 def short(joint: str) -> str:

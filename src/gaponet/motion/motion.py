@@ -9,6 +9,7 @@ import numpy as np
 from gaponet.base.arrays import Array
 from gaponet.base.errors import UsageError
 from gaponet.data.sequence import LEVELS
+from gaponet.robot.finding import masked_names
 from gaponet.robot.spec import RobotSpec
 
 GRID = 0.01  # s: motions are made at 100 Hz; 50 Hz plays every second row
@@ -77,7 +78,7 @@ class Motion:
     def moved(self, robot: RobotSpec) -> tuple[str, ...]:
         """Names of the joints that are asked to move."""
         span = np.ptp(self.ctrl, axis=0)
-        return tuple(name for name, s in zip(robot.joint_names, span, strict=True) if s > 1e-9)
+        return masked_names(robot, span > 1e-9)
 
 
 PEAK_SPEED = 1.875  # of a minimum-jerk move, over its mean speed
@@ -105,10 +106,11 @@ def through(points: Array, moves: Array, holds: Array, dt: float) -> Array:
     """
     points = np.atleast_2d(np.asarray(points, float))
     rows = [np.repeat(points[:1], max(1, round(holds[0] / dt)), axis=0)]
-    for a, b, move, hold in zip(points[:-1], points[1:], moves, holds[1:], strict=True):
+    for start, stop, move, hold in zip(points[:-1], points[1:], moves, holds[1:], strict=True):
         steps = max(1, round(move / dt))
-        rows.append(a + (b - a) * blend(np.arange(1, steps + 1) / steps)[:, None])
-        rows.append(np.repeat(b[None], round(hold / dt), axis=0))
+        share = blend(np.arange(1, steps + 1) / steps)  # of the way
+        rows.append(start + (stop - start) * share[:, None])
+        rows.append(np.repeat(stop[None], round(hold / dt), axis=0))
     return np.concatenate(rows)
 
 

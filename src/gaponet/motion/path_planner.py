@@ -39,9 +39,11 @@ class Trajectory:
             acceleration: Peak acceleration, rad/s².
             least: Least duration, s.
         """
-        far = np.abs(np.diff(points, axis=0)).max(axis=1)
-        legs = move_time(far, speed, least if len(points) == 2 else MIN_LEG_S)
-        legs = np.maximum(legs, np.sqrt(PEAK_ACCELERATION * far / acceleration))
+        far = np.abs(np.diff(points, axis=0)).max(axis=1)  # of the joint that goes furthest, rad
+        shortest = least if len(points) == 2 else MIN_LEG_S
+        by_speed = move_time(far, speed, shortest)
+        by_acceleration = np.sqrt(PEAK_ACCELERATION * far / acceleration)
+        legs = np.maximum(by_speed, by_acceleration)  # s
         times = np.concatenate([[0.0], legs.cumsum()])
         return cls(points, times * max(1.0, least / times[-1]))
 
@@ -52,11 +54,13 @@ class Trajectory:
 
     def at(self, time: float) -> Array:
         """Return the posture at a time, (n,) rad."""
-        leg = min(max(int(np.searchsorted(self.times, time)) - 1, 0), len(self.times) - 2)
-        a, b = self.points[leg : leg + 2]
+        last_leg = len(self.times) - 2
+        leg = int(np.searchsorted(self.times, time)) - 1
+        leg = min(max(leg, 0), last_leg)
+        start, stop = self.points[leg : leg + 2]
         since, until = self.times[leg : leg + 2]
         share = np.array((time - since) / (until - since))
-        result: Array = a + float(blend(share)) * (b - a)
+        result: Array = start + float(blend(share)) * (stop - start)
         return result
 
     def rows(self, dt: float) -> Array:

@@ -15,17 +15,9 @@ from gaponet.motion.library import Library, short
 from gaponet.motion.motion import Motion
 from gaponet.robot.spec import RobotSpec
 
-# most informative first
-SIGNAL_ORDER = (
-    "multisine",
-    "steps",
-    "holds",
-    "chirp",
-    "sweep",
-    "trapezoids",
-    "creep",
-)
-MAX_ROUNDS = 50
+# Of motions of one joint, the most informative first.
+SIGNAL_ORDER = ("multisine", "steps", "holds", "chirp", "sweep", "trapezoids", "creep")
+MAX_ROUNDS = 50  # of motions of many joints
 RECOMMENDED_MINUTES = 41.0
 MIN_TRAINING_MINUTES = 9.0
 
@@ -105,12 +97,14 @@ def _names(robot: RobotSpec, library: Library) -> Iterator[str]:
     joint.
     """
     kinds = ["tour-all", "limber-all", *(f"wander-{side}" for side in library.kit.arms)]
-    for k in range(MAX_ROUNDS):
+    for number in range(MAX_ROUNDS):
         for kind in kinds:
-            yield f"{kind}-{2 * k}"
-            yield f"{kind}-{2 * k + 1}"
-        if k + 1 < len(SIGNAL_ORDER):
-            yield from (f"{SIGNAL_ORDER[k + 1]}-{short(joint)}" for joint in robot.operated)
+            yield f"{kind}-{2 * number}"
+            yield f"{kind}-{2 * number + 1}"
+        following = number + 1  # the first signal is played before all
+        if following < len(SIGNAL_ORDER):
+            for joint in robot.operated:
+                yield f"{SIGNAL_ORDER[following]}-{short(joint)}"
 
 
 def sheet(
@@ -120,32 +114,27 @@ def sheet(
 
     Args:
         files: Motion → file.
+        rate: Of the commands, Hz.
         known: Folder of a robot of which there are logs already.
     """
-    gains = []
-    for i, joint in enumerate(robot.joint_names):
-        if joint in robot.operated:
-            gains.append(f"{short(joint)} {robot.servo.kp[i]:g}/{robot.servo.kd[i]:g}")
     masses = ", ".join(f"{mass:g}" for mass in plan.payloads)
-    size = (
-        f"On virtual H1-2 robots {MIN_TRAINING_MINUTES:g} minutes left a third of the simulator's "
-        f"error, {RECOMMENDED_MINUTES:g} came within a tenth of the best."
-    )
-    if plan.minutes < MIN_TRAINING_MINUTES:
-        size += " Enough to identify gains, friction and delay; little to train on."
+    minutes = f"{plan.minutes:.0f}"
+    purpose = _size(plan)
+    if known:
+        minutes = f"{plan.minutes:.1f}"
+        purpose = "Chosen for what they tell of this robot beside its logs."
     lines = [
         f"# Recording sheet: {robot.name}",
         "",
-        f"{plan.minutes:.{1 if known else 0}f} minutes of motion: {len(plan.motions)} motions at "
-        f"{masses} kg, commands at {rate:g} Hz. "
-        f"{'Chosen for what they tell of this robot beside its logs.' if known else size}",
+        f"{minutes} minutes of motion: {len(plan.motions)} motions at {masses} kg, commands at "
+        f"{rate:g} Hz. {purpose}",
         "",
         "Robot: ____________  unit: ____________  date: ____________  by: ____________",
         "",
         "1. Warm up for ten minutes with any of these motions: cold joints rub more.",
         "2. Note kp and kd of the controller and leave them: one setting for all motions, or a "
         "folder for each.",
-        f"   The simulator has (N·m/rad, N·m·s/rad): {'; '.join(gains)}.",
+        f"   The simulator has (N·m/rad, N·m·s/rad): {_gains(robot)}.",
         "3. Log the command as it is sent, the measured position and, if there are, velocity and "
         "signed torque: with",
         "   one clock, at the commands' rate or above, with all digits, from before the motion to "
@@ -155,21 +144,57 @@ def sheet(
         "   was stopped.",
         "5. Weigh payloads to 10 g and mount them where robot.toml says.",
         "",
+        *_table(plan, files),
+        "",
+        "Then, for each payload:",
+        "",
+        *_commands(plan, known),
+    ]
+    return "\n".join([*lines, ""])
+
+
+def _size(plan: Plan) -> str:
+    """Say what so many minutes are good for."""
+    size = (
+        f"On virtual H1-2 robots {MIN_TRAINING_MINUTES:g} minutes left a third of the simulator's "
+        f"error, {RECOMMENDED_MINUTES:g} came within a tenth of the best."
+    )
+    if plan.minutes < MIN_TRAINING_MINUTES:
+        size += " Enough to identify gains, friction and delay; little to train on."
+    return size
+
+
+def _gains(robot: RobotSpec) -> str:
+    """Return kp/kd of the operated joints."""
+    gains = []
+    for i, joint in enumerate(robot.joint_names):
+        if joint in robot.operated:
+            gains.append(f"{short(joint)} {robot.servo.kp[i]:g}/{robot.servo.kd[i]:g}")
+    return "; ".join(gains)
+
+
+def _table(plan: Plan, files: dict[str, str]) -> list[str]:
+    """Return a row to fill in for each motion that is played."""
+    rows = [
         "| nr | file | kg | s | time | temperature | remarks |",
         "| ---: | --- | ---: | ---: | --- | --- | --- |",
     ]
     for number, (mass, motion) in enumerate(plan.played, 1):
-        lines.append(
-            f"| {number} | {files[motion.name]} | {mass:g} | {motion.duration:.0f} | | | |"
-        )
-    lines += ["", "Then, for each payload:", ""]
+        file = files[motion.name]
+        rows.append(f"| {number} | {file} | {mass:g} | {motion.duration:.0f} | | | |")
+    return rows
+
+
+def _commands(plan: Plan, known: Path | None) -> list[str]:
+    """Return what to type when all is recorded. known: as of sheet."""
+    commands = []
     for mass in plan.payloads:
-        lines.append(
+        commands.append(
             f"    gaponet import LOGS/{mass:g}kg --robot ROBOT --unit-id UNIT --payload-mass "
             f"{mass:g} --out data"
         )
-    lines.append("    gaponet doctor data")
+    commands.append("    gaponet doctor data")
     if known:
-        lines.append(f"    gaponet check {known} data")
-        lines.append(f"    gaponet adapt {known} data --out ROBOT_2")
-    return "\n".join([*lines, ""])
+        commands.append(f"    gaponet check {known} data")
+        commands.append(f"    gaponet adapt {known} data --out ROBOT_2")
+    return commands

@@ -17,7 +17,7 @@ from gaponet.base.errors import UsageError
 from gaponet.base.structure import load_toml, validated
 
 RECIPES = Path(__file__).parent / "recipes"
-MOST_TAKES = 1_000_000
+MAX_TAKES = 1_000_000
 
 Name = Annotated[str, Len(1, 200)]
 Count = Annotated[int, Interval(ge=1, le=10_000)]
@@ -99,9 +99,9 @@ def takes(recipe: Recipe, names: list[str]) -> list[Take]:
         * len(recipe.units)
         * recipe.repetitions
     )
-    if count > MOST_TAKES:
+    if count > MAX_TAKES:
         raise UsageError(
-            f"recipe '{recipe.name}': {count} sequences; at most {MOST_TAKES} in one recipe"
+            f"recipe '{recipe.name}': {count} sequences; at most {MAX_TAKES} in one recipe"
         )
     repetitions = range(recipe.repetitions)
     every = product(motions, recipe.rates, recipe.payloads, recipe.units, repetitions)
