@@ -78,7 +78,8 @@ def write_motion(path: Path, motion: Motion, robot: RobotSpec, rate: float) -> N
         return
     if path.suffix == ".txt" and abs(rate * SAGE_PERIOD_S - 1) > 1e-9:
         raise UsageError(
-            f"{path}: SAGE motion files are at {1 / SAGE_PERIOD_S:g} Hz; write csv or npz at {rate:g} Hz"
+            f"{path}: SAGE motion files are at {1 / SAGE_PERIOD_S:g} Hz; write csv or npz at "
+            f"{rate:g} Hz"
         )
     if path.suffix == ".csv":
         rows = np.column_stack([np.arange(len(rows)) / rate, rows])

@@ -243,13 +243,10 @@ def rows_first(arrays: dict[str, Any]) -> tuple[dict[str, Any], list[str]]:
     taken as transposed.
     """
     tables = {}
-    clocks = {}
     for name, array in arrays.items():
-        if not isinstance(array, np.ndarray) or array.ndim != 2:
-            continue
-        tables[name] = array
-        if 1 in array.shape and named_like_a_clock(name):
-            clocks[name] = array.ravel()
+        if isinstance(array, np.ndarray) and array.ndim == 2:
+            tables[name] = array
+    clocks = {name: table.ravel() for name, table in tables.items() if _is_clock(name, table)}
     arrays = arrays | clocks
     samples = _samples(arrays, list(tables.values()))
     if samples < 2:
@@ -260,6 +257,11 @@ def rows_first(arrays: dict[str, Any]) -> tuple[dict[str, Any], list[str]]:
         if name not in clocks and columns == samples and rows != samples:
             turned.append(name)
     return arrays | {name: tables[name].T for name in turned}, turned
+
+
+def _is_clock(name: str, table: Array) -> bool:
+    """Return True for a single row or column that is called like a clock."""
+    return 1 in table.shape and named_like_a_clock(name)
 
 
 def _samples(arrays: dict[str, Any], tables: list[Array]) -> int:
@@ -509,7 +511,9 @@ def _choose(
 
 
 def _require_columns(recording: RawRecording, single: dict[str, str]) -> None:
-    """Refuse single columns (ours → the log's) that are not there, or whose name is none of ours."""
+    """Refuse single columns that are not there, or that stand for nothing. single: ours → the
+    log's.
+    """
     for ours, theirs in single.items():
         channel, dot, _ = ours.partition(".")
         if channel not in CHANNELS or not dot:

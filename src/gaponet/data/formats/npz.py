@@ -14,7 +14,7 @@ from __future__ import annotations
 import io
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -68,10 +68,6 @@ def _motions(file: Path, arrays: dict[str, Any], names: tuple[str, ...]) -> Iter
     count = min(len(array) for array in signals.values())
     single = len(names) == count and all(_is_table(array) for array in signals.values())
     payloads = np.asarray(arrays["payloads"]).ravel() if "payloads" in arrays else ()
-    default = {}
-    for field, stated in GAPONET.items():
-        if stated in signals or field.endswith("_unit"):
-            default[field] = stated
     for i in range(count):
         labels = {}
         if len(payloads) == count:
@@ -83,8 +79,17 @@ def _motions(file: Path, arrays: dict[str, Any], names: tuple[str, ...]) -> Iter
             f"{file.stem}-{i:04d}",
             str(i),
             meta={"stated": labels},
-            default=default,
+            default=_described(signals),
         )
+
+
+def _described(signals: dict[str, Any]) -> LogsFile:
+    """Return what logs.toml would say of the signals that a file holds."""
+    described = {}
+    for field, stated in GAPONET.items():
+        if stated in signals or field.endswith("_unit"):
+            described[field] = stated
+    return cast("LogsFile", described)
 
 
 def _motion(file: Path, signals: dict[str, Array], i: int, single: bool) -> dict[str, Array]:

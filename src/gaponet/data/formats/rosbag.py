@@ -557,8 +557,8 @@ def _names_of_parts(parts: list[Any]) -> list[tuple[str, ...]]:
 
 
 def _labelled(messages: Fields, texts: list[tuple[str, ...]]) -> Fields:
-    """Return the fields of at most MAX_NUMBERS numbers; those without names get the first texts of their
-    length, or digits.
+    """Return the fields of at most MAX_NUMBERS numbers; those without names get the first texts of
+    their length, or digits.
     """
     labelled: Fields = {}
     for field, (labels, numbers) in messages.items():
