@@ -96,7 +96,7 @@ def test_a_pull_into_a_dataset_brings_what_it_lacks_and_touches_nothing_else(
 def many_files(monkeypatch):
     """A data file holds one recording."""
     monkeypatch.setattr("gaponet.data.writers.lerobot.USUAL_MB", 1e-9)
-    monkeypatch.setattr("gaponet.data.writers.lerobot.SHARE", 0.0)
+    monkeypatch.setattr("gaponet.data.writers.lerobot.USUAL_SHARE", 0.0)
 
 
 def test_on_the_hub_a_push_is_a_set_that_lerobot_reads_with_a_card_and_its_tag(hub, dataset, arm):
