@@ -105,12 +105,10 @@ def short_motions(monkeypatch):
     monkeypatch.setattr(plain_servos, "OWN_MOTION_S", 3.0)
 
 
-@pytest.fixture
-def mine(tmp_path):
-    """A user's scene: includes, degrees, defaults, a mesh, a tendon, sensors, a keyframe, a servo
-    and a body before.
+def write_scene(folder):
+    """Write a user's scene: includes, degrees, defaults, a mesh, a tendon, sensors, a keyframe, a
+    servo and a body before.
     """
-    folder = tmp_path / "mine"
     for name, text in {
         "scene.xml": MAIN.format(step=0.005),
         "parts/defaults.xml": DEFAULTS,
@@ -123,55 +121,77 @@ def mine(tmp_path):
 
 
 @pytest.fixture
-def quick(monkeypatch, robot):
+def mine(tmp_path):
+    """A user's scene."""
+    return write_scene(tmp_path / "mine")
+
+
+def without_terms(robot, *args, **options):
     """The form without the law is not searched for: that is identification's, and tried below."""
-    monkeypatch.setattr(
-        exporting,
-        "fit_plain_servos",
-        lambda r, *a, **k: r.with_identified({j: dict.fromkeys(SERVO_TERMS, 0.0) for j in FOUND}),
-    )
+    return robot.with_identified({joint: dict.fromkeys(SERVO_TERMS, 0.0) for joint in FOUND})
 
 
-def test_a_users_file_moves_as_gaponet_does_and_keeps_all_that_is_the_users(
-    lawful, mine, tmp_path, quick
-):
-    made = export_robot(lawful, "mjcf", tmp_path / "out", source=Source(mine))
-    assert made.virtual
-    assert made.errors["in gaponet"] == pytest.approx(0.0, abs=1e-9)
-    assert made.errors["scene.xml with mujoco_servos.py"] < 2e-5
-    assert made.errors["scene.xml alone"] == pytest.approx(
-        made.errors["in gaponet, without the servo model"], rel=0.02
+@pytest.fixture
+def quick(monkeypatch):
+    monkeypatch.setattr(exporting, "fit_plain_servos", without_terms)
+
+
+@pytest.fixture(scope="module")
+def edited(lawful, tmp_path_factory):
+    """A user's scene that took the robot's servos: the export, and the model before and now."""
+    folder = tmp_path_factory.mktemp("edited")
+    scene = write_scene(folder / "mine")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(plain_servos, "OWN_MOTION_S", 3.0)
+        patch.setattr(exporting, "fit_plain_servos", without_terms)
+        made = export_robot(lawful, "mjcf", folder / "out", source=Source(scene))
+    before, now = (mujoco.MjModel.from_xml_path(str(file)) for file in (scene, made.file))
+    return SimpleNamespace(made=made, scene=scene, out=folder / "out", before=before, now=now)
+
+
+def test_a_users_file_moves_as_gaponet_does(edited):
+    errors = edited.made.errors
+    assert edited.made.virtual
+    assert errors["in gaponet"] == pytest.approx(0.0, abs=1e-9)
+    assert errors["scene.xml with mujoco_servos.py"] < 2e-5
+    assert errors["scene.xml alone"] == pytest.approx(
+        errors["in gaponet, without the servo model"], rel=0.02
     )
-    assert made.errors["scene.xml alone"] > 0.003
-    assert any("elbow met something at -1.20 rad" in note for note in made.notes)
-    before, now = (mujoco.MjModel.from_xml_path(str(f)) for f in (mine, made.file))
+    assert errors["scene.xml alone"] > 0.003
+    assert any("elbow met something at -1.20 rad" in note for note in edited.made.notes)
+
+
+def test_a_users_file_keeps_all_that_is_the_users(edited):
+    before = edited.before
+    now = edited.now
     assert np.array_equal(before.key_qpos, now.key_qpos)
     assert [now.actuator(i).name for i in range(3)] == ["first", "thumb", "second"]
-    assert np.degrees(now.actuator_ctrlrange[0]) == pytest.approx(
-        [-80 * 180 / np.pi, 80 * 180 / np.pi]
-    )
     assert now.actuator_gear[1, 0] == 2
     assert now.sensor_type.tolist() == before.sensor_type.tolist()
     assert now.site("tip").pos.tolist() == before.site("tip").pos.tolist()
-    assert (
-        (now.nsite, now.ntendon, now.nmesh)
-        == (before.nsite, before.ntendon, before.nmesh)
-        == (1, 1, 1)
-    )
+    assert (before.nsite, before.ntendon, before.nmesh) == (1, 1, 1)
+    assert (now.nsite, now.ntendon, now.nmesh) == (1, 1, 1)
+
+
+def test_a_users_file_in_degrees_gets_ranges_in_degrees_and_zeros_of_its_joints(edited):
+    now = edited.now
+    low_and_high = [-80 * 180 / np.pi, 80 * 180 / np.pi]
+    assert np.degrees(now.actuator_ctrlrange[0]) == pytest.approx(low_and_high)
     assert now.qpos0[now.joint("shoulder").qposadr[0]] == pytest.approx(-0.01)
-    text = made.file.read_text() + (tmp_path / "out/parts/arm.xml").read_text()
+
+
+def test_only_what_had_to_change_is_changed_in_a_copy_of_a_users_file(edited):
+    text = edited.made.file.read_text() + (edited.out / "parts/arm.xml").read_text()
     assert "<!-- mine -->" in text
     assert "<!-- turned by hand -->" in text
-    assert (tmp_path / "out/parts/defaults.xml").read_text() == DEFAULTS
-    changed = [
-        x
-        for x in (tmp_path / "out/changes.diff").read_text().splitlines()
-        if x[:1] in "+-" and x[:3] not in ("+++", "---")
-    ]
-    assert (
-        len(changed) == 9
-    )  # two joints, of which one is of two lines, two servos, and the solver's tolerance
-    assert mine.read_text() == MAIN.format(step=0.005)
+    assert (edited.out / "parts/defaults.xml").read_text() == DEFAULTS
+    assert edited.scene.read_text() == MAIN.format(step=0.005)
+    changed = []
+    for line in (edited.out / "changes.diff").read_text().splitlines():
+        if line[:1] in "+-" and line[:3] not in ("+++", "---"):
+            changed.append(line)
+    # Two joints, of which one is of two lines, two servos, and the solver's tolerance.
+    assert len(changed) == 9
 
 
 def test_the_check_travels(robot, mine, tmp_path):

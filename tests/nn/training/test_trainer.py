@@ -94,10 +94,8 @@ def test_a_plain_network_trains_and_is_evaluated_beside_the_operator(trained, ro
     data, run, _ = trained
     config = replace(SMALL, model=replace(SMALL.model, kind="mlp", mlp_hidden=(64,)))
     model = Trainer(data, robot, tmp_path / "run", config, STEPS).run()
-    lines = [
-        json.loads(line) for line in (tmp_path / "run" / "progress.jsonl").read_text().splitlines()
-    ]
-    assert {line["stage"] for line in lines} - {"gain"} == {"start", "pretraining", "ppo"}
+    stages = {line["stage"] for line in progress(tmp_path / "run")}
+    assert stages - {"gain"} == {"start", "pretraining", "ppo"}
     assert model.card["val_mpjae"]["model"] < 0.95 * model.card["val_mpjae"]["nominal"]
     result = evaluate([run, tmp_path / "run"], data, robot).result
     assert [m for m in result["methods"] if m in LEARNED] == ["mlp", "gaponet"]
@@ -117,20 +115,33 @@ def test_trees_train_without_ppo_and_are_exported_like_networks(
     assert export_network(tmp_path / "run", to="torch").parity < 1e-5
 
 
-def test_card_and_progress_state_inputs_errors_and_label_fits(trained):
-    card = trained[2].card
-    lines = [json.loads(line) for line in (trained[1] / "progress.jsonl").read_text().splitlines()]
-    assert {line["stage"] for line in lines} - {"gain"} == {"start", "pretraining", "ppo"}
-    # The best is exported.
-    assert card["val_mpjae"]["model"] == min(line["val_mpjae"] for line in lines)
-    fitted = [line for line in lines if line["stage"] == "pretraining"]
-    assert all(0 < line["label_rmse"] < 0.1 and line["label_rmse_before"] > 0 for line in fitted)
+def progress(run):
+    """Validations of a run, in their order."""
+    lines = (run / "progress.jsonl").read_text().splitlines()
+    return [json.loads(line) for line in lines]
+
+
+def test_the_best_network_of_all_stages_is_exported(trained):
+    _, run, model = trained
+    error = model.card["val_mpjae"]
+    assert {line["stage"] for line in progress(run)} - {"gain"} == {"start", "pretraining", "ppo"}
+    assert error["model"] == min(line["val_mpjae"] for line in progress(run))
+    assert error["model"] < error["nominal"]
+
+
+def test_progress_states_how_labels_were_fitted(trained):
+    fitted = [line for line in progress(trained[1]) if line["stage"] == "pretraining"]
+    assert all(0 < line["label_rmse"] < 0.1 for line in fitted)
+    assert all(line["label_rmse_before"] > 0 for line in fitted)
     assert fitted[0]["label_rmse"] < fitted[0]["label_rmse_before"]
+
+
+def test_the_card_states_what_a_network_was_trained_on(trained):
+    card = trained[2].card
     assert card["joint_names"] == ["shoulder", "elbow"]
     assert card["payload_seen"] == [0.0, 0.2]
     assert card["virtual"] is True
     assert card["parity_rad"] <= 1e-5
-    assert card["val_mpjae"]["model"] < card["val_mpjae"]["nominal"]
 
 
 def test_threads_reach_every_simulation(robot, tmp_path, monkeypatch):
