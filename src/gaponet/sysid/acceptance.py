@@ -55,7 +55,11 @@ class Judged(Protocol):
     def links(self) -> list[Links]: ...
 
 
-Split = tuple[list[Sequence], list[Sequence]]  # recordings to fit, recordings that judge
+class Split(NamedTuple):
+    """Recordings to fit, and recordings that judge the fit."""
+
+    fitted: list[Sequence]
+    held_out: list[Sequence]
 
 
 def cross_validation(
@@ -74,7 +78,7 @@ def cross_validation(
     most_motions = max(len(names) for names in motions.values())
     folds = min(folds, most_motions)
     if not validation or folds < 2 or not _needs_cross_validation(motions, _motions(validation)):
-        return [(list(sequences), list(validation))]
+        return [Split(list(sequences), list(validation))]
     return [_split(every, motions, number, folds) for number in range(folds)]
 
 
@@ -123,7 +127,7 @@ def _split(
             held_out.append(s)
         else:
             fitted.append(s)
-    return fitted, held_out
+    return Split(fitted, held_out)
 
 
 @dataclass(frozen=True)

@@ -81,7 +81,7 @@ class Recordings:
         """What is fitted: the recordings of each fold, and all of them last if there are several
         folds.
         """
-        sets = [train for train, _ in self.splits]
+        sets = [split.fitted for split in self.splits]
         if len(self.splits) > 1:
             sets.append([*self.fitted, *self.validation])
         return sets
@@ -210,7 +210,7 @@ def _fits(
         rollouts = JointRollouts(windows, robot, contact, options.nthread)
         joints.append(JointFit(rollouts, robot, Bounds(robot, train)))
     fitted_windows = joints[0].rollouts.parts
-    judging = [held_out or fitted_windows for _, held_out in recordings.splits]
+    judging = [split.held_out or fitted_windows for split in recordings.splits]
     judge = Judge(judging, robot, contact, options.nthread)
     return Fits(sets, given, joints, judge, shown, options.nthread)
 
@@ -384,12 +384,12 @@ def _held_out(
     if len(recordings.splits) == 1:
         return [HeldOut(recordings.validation, fitted)]
     folds = []
-    for i, (_, held_out) in enumerate(recordings.splits):
+    for i, split in enumerate(recordings.splits):
         with_table = robots[i].with_table(fitted.scene.table)
         own = with_table.with_servo(
             stop_low=fitted.servo.stop_low, stop_high=fitted.servo.stop_high
         )
-        folds.append(HeldOut(held_out, own))
+        folds.append(HeldOut(split.held_out, own))
     return folds
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 
@@ -21,6 +22,13 @@ STEPS_TIME_SHARE = 0.3
 TABLE_ITERATIONS = 20  # of all starts together; only the bar depends on it
 # Of a time budget, for standard errors and comparisons after the searches.
 END_TIME_SHARE = 0.15
+
+
+class _PlannedSearch(NamedTuple):
+    """A search of an identification: iterations at most, and its share of a time budget."""
+
+    iterations: int
+    time_share: float
 
 
 class SearchProgress:
@@ -41,21 +49,19 @@ class SearchProgress:
             fits: Sets of recordings that are fitted.
             progress: Called with iterations done, in all, and what is fitted with its error.
         """
-        joints = sum(SEARCH_ITERATIONS)
-        robot = FIRST_ROBOT_ITERATIONS + ROBOT_ITERATIONS + MAX_CHAIN_ITERATIONS
-        iterations = [joints] * fits
-        iterations += [robot * fits]
-        iterations += [joints + POLISH_ITERATIONS] * (fits * steps)
-        step_share = STEPS_TIME_SHARE / (steps + 1)
-        shares = [JOINTS_TIME_SHARE] * fits
-        shares += [ROBOT_TIME_SHARE * fits]
-        shares += [step_share] * (fits * steps)
-        # Of the time that is left when a search begins: as much as of one more step stays for the
-        # table.
-        self._shares = []
-        for i, share in enumerate(shares):
-            left = sum(shares[i:]) + fits * step_share
-            self._shares.append(share / left)
+        of_joints = sum(SEARCH_ITERATIONS)
+        of_robot = FIRST_ROBOT_ITERATIONS + ROBOT_ITERATIONS + MAX_CHAIN_ITERATIONS
+        joints = _PlannedSearch(of_joints, JOINTS_TIME_SHARE)
+        robot = _PlannedSearch(of_robot * fits, ROBOT_TIME_SHARE * fits)
+        step = _PlannedSearch(of_joints + POLISH_ITERATIONS, STEPS_TIME_SHARE / (steps + 1))
+        searches = [joints] * fits + [robot] + [step] * (fits * steps)
+        # As much time as of one more step stays for the table.
+        for_table = fits * step.time_share
+        self._shares = []  # of the time that is left when a search begins
+        for i, search in enumerate(searches):
+            left = sum(later.time_share for later in searches[i:]) + for_table
+            self._shares.append(search.time_share / left)
+        iterations = [search.iterations for search in searches]
         self._last_of = np.cumsum(iterations).tolist()  # number of each search's last iteration
         self._total = self._last_of[-1] + TABLE_ITERATIONS
         self._began = time.monotonic()
@@ -128,11 +134,10 @@ class SearchProgress:
         """
 
         def report(cost: Array) -> bool:
-            each = 1e3 * ERROR_SCALE_RAD * np.sqrt(2 * cost / np.maximum(rows, 1))
-            worst = int(each.argmax())
+            rms = 1e3 * ERROR_SCALE_RAD * np.sqrt(2 * cost / np.maximum(rows, 1))  # (n,) mrad
+            worst = int(rms.argmax())
             self.show_iteration(
-                f"{what}: {each.mean():.2f} mrad on fitted windows, {joints[worst]} "
-                f"{each[worst]:.2f}"
+                f"{what}: {rms.mean():.2f} mrad on fitted windows, {joints[worst]} {rms[worst]:.2f}"
             )
             return self.search_is_over()
 

@@ -98,10 +98,14 @@ class JointUncertainty:
 
 @dataclass(frozen=True)
 class LinkUncertainty:
-    """Uncertainty of fitted links in Q coordinates (sim/links.py), and slopes (P, Q) of each
-    joint's values over them.
+    """Uncertainty of fitted links in Q coordinates (sim/links.py).
 
     The covariances of the joints are for the links as fitted.
+
+    Attributes:
+        values: Fitted coordinates, (Q,).
+        covariance: (Q, Q).
+        servo_slopes: Joint → slopes of its values over the coordinates, (P, Q).
     """
 
     values: tuple[float, ...]

@@ -244,7 +244,7 @@ def _gradients_to_explain(
     uncertainty: ParameterUncertainty,
     joints: ListOf[str],
     repeatability: Mapping[str, float],
-) -> tuple[list[_Joint], float]:
+) -> tuple[list[_JointGradient], float]:
     """Return the gradients of the joints, and the number of standard errors from which a change is
     significant.
 
@@ -262,44 +262,45 @@ def _gradients_to_explain(
     information = seen.information.sum(axis=1)  # (n, Q, Q)
     expected = trusted * widened(information, overdispersion)
     scatter = expected + (clusters - 1) * gradient_covariance(seen.gradients)
-    gradients = seen.gradients.sum(axis=1)  # (n, Q)
-    each = []
+    total = seen.gradients.sum(axis=1)  # (n, Q)
+    gradients = []
     for i, joint in enumerate(joints):
-        one = _Joint(
+        of_joint = _JointGradient(
             joint,
             uncertainty,
             information=information[i],
-            gradient=gradients[i],
+            gradient=total[i],
             scatter=scatter[i] / freedom,
             rows=int(seen.rows[i]),
             repeatability=repeatability[joint],
         )
-        each.append(one)
-    return each, threshold
+        gradients.append(of_joint)
+    return gradients, threshold
 
 
 def _changes(
-    each: ListOf[_Joint], threshold: float
+    joints: ListOf[_JointGradient], threshold: float
 ) -> tuple[list[ParameterChange], dict[str, ParameterChange]]:
     """Return the significant changes, and joint → its largest change: first those that all joints
     share.
     """
     moved: list[ParameterChange] = []
-    if len(each) > 1:
+    if len(joints) > 1:
         for field in COMMON_FIELDS:
-            together = _together(each, each[0].fields.index(field), threshold)
+            number = joints[0].fields.index(field)
+            together = _together(joints, number, threshold)
             if together is not None:
                 moved.append(together)
     largest = {change.joint: change for change in moved}
-    for one in each:
-        changes, first = one.explained(threshold)
+    for joint in joints:
+        changes, first = joint.explained(threshold)
         moved += changes
         if first is not None:
-            largest[one.name] = first
+            largest[joint.name] = first
     return moved, largest
 
 
-class _Joint:
+class _JointGradient:
     """Gradient of one joint that changes are to explain, beyond that of the identification.
 
     Attributes:
@@ -330,8 +331,8 @@ class _Joint:
         """
         self.name = name
         self.fields = (*uncertainty.fields, PLAY)
-        # Change of the axes and play by a change of one parameter in SI units, column by column: a
-        # softer motor has the friction that it had, so its friction over kp is larger.
+        # Change of the axes and play by a change of one parameter in SI units, column by column,
+        # (Q, Q): a softer motor has the friction that it had, so its friction over kp is larger.
         by_field = np.eye(len(self.fields))
         over_kp = [SERVO_FIELDS[field].axis == "over kp" for field in uncertainty.fields]
         by_field[:-1, self.fields.index("kp")] -= uncertainty.array(name, "values") * over_kp
@@ -395,7 +396,7 @@ class _Joint:
 
 
 def _together(
-    joints: ListOf[_Joint],
+    joints: ListOf[_JointGradient],
     number: int,
     threshold: float,
 ) -> ParameterChange | None:
@@ -417,7 +418,7 @@ def _together(
     return change
 
 
-def _common_change(joints: ListOf[_Joint], number: int) -> ParameterChange:
+def _common_change(joints: ListOf[_JointGradient], number: int) -> ParameterChange:
     """Return the one change of a parameter in every joint that explains all gradients best."""
     information = []
     pulls = []

@@ -185,16 +185,17 @@ def _slopes_over_play(rollouts: JointRollouts, bounds: Bounds) -> Array:
     The link is half the width behind the motor, on the side on which the servo's error presses it.
     """
     windows = rollouts.windows
-    late = np.round(bounds.first["delay"][:, None] / windows.periods).astype(int)  # (n, windows)
-    command = np.empty_like(windows.ctrl)
+    delay = bounds.first["delay"][:, None]  # (n, 1) s
+    delay_rows = np.round(delay / windows.periods).astype(int)  # (n, windows)
+    command = np.empty_like(windows.ctrl)  # (n, windows, rows) rad
     for j, of_joint in enumerate(windows.ctrl):
         for window, ctrl in enumerate(of_joint):
-            command[j, window] = np.roll(ctrl, late[j, window])
+            command[j, window] = np.roll(ctrl, delay_rows[j, window])
     offset = bounds.first["offset"][:, None, None].astype(np.float32)
     servo_error = command + offset - windows.qpos
-    side = np.tanh(servo_error / PLAY_TURN_RAD)[..., :: windows.thin]
+    side = np.tanh(servo_error / PLAY_TURN_RAD)  # −1 to 1
     is_counted = rollouts.counted & rollouts.recorded[..., None]
-    return np.asarray(0.5 / ERROR_SCALE_RAD * side * is_counted)
+    return np.asarray(0.5 / ERROR_SCALE_RAD * side[..., :: windows.thin] * is_counted)
 
 
 def _window_name(part: Sequence) -> str:

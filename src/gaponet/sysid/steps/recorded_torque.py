@@ -29,7 +29,7 @@ def with_torque(
     An accepted fit is repeated with all recordings. Without cross-validation it is kept only if the
     validation motions are followed no worse. `given` is the robot that both fits start from.
     """
-    torques = [TorqueFit(train, given) for train, _ in splits]
+    torques = [TorqueFit(split.fitted, given) for split in splits]
     if not all(torque.known for torque in torques):
         return fitted
     options, folds = _best_options(torques, splits)
@@ -42,8 +42,8 @@ def with_torque(
     comparisons = (*fitted.comparisons, comparison)
     if not comparison.accepted:
         return replace(fitted, comparisons=comparisons)
-    train, validation = splits[0]
-    every = [*train, *validation]
+    validation = splits[0].held_out
+    every = [*splits[0].fitted, *validation]
     after = float(comparison.after.mean())
     robot = TorqueFit(every, given).fit(options)
     if len(splits) == 1 and motion_errors(validation, robot).mean() > after:
@@ -78,8 +78,8 @@ def _best_options(
         if options.place and not has_payloads:
             continue
         folds = []
-        for torque, (_, held_out) in zip(torques, splits, strict=True):
-            folds.append(HeldOut(held_out, torque.fit(options)))
+        for torque, split in zip(torques, splits, strict=True):
+            folds.append(HeldOut(split.held_out, torque.fit(options)))
         tried[options] = tuple(folds)
 
     def error(options: TorqueOptions) -> float:
