@@ -1,8 +1,9 @@
-"""Contacts of a posture as MuJoCo's own collision finds them: a judge written apart from what the package checks with.
+"""Contacts of a posture as MuJoCo's own collision finds them: a judge written apart from what the
+package checks with.
 
-Every capsule of a robot's collision.toml becomes a geom, so do the shapes of robot.xml of bodies that have none, and
-the floor or table becomes a plane. Left out are pairs of bodies of one group of collision.toml, and of a body, the one
-that carries it and the one that carries that.
+Every capsule of a robot's collision.toml becomes a geom, so do the shapes of robot.xml of bodies
+that have none, and the floor or table becomes a plane. Left out are pairs of bodies of one group of
+collision.toml, and of a body, the one that carries it and the one that carries that.
 """
 
 from __future__ import annotations

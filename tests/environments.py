@@ -13,7 +13,8 @@ import pytest
 
 
 def environment(name: str, version: str, *installs: tuple[str, ...]) -> str:
-    """The Python of an environment; skips the test where it cannot be made, and fails it where CI asked for it.
+    """The Python of an environment; skips the test where it cannot be made, and fails it where CI
+    asked for it.
 
     Args:
         name: Of the folder.

@@ -1,4 +1,6 @@
-"""Good logs of a virtual arm, and faults to put into them, one at a time, before they are imported."""
+"""Good logs of a virtual arm, and faults to put into them, one at a time, before they are
+imported.
+"""
 
 from __future__ import annotations
 
@@ -103,7 +105,9 @@ def examine(
     gain: float | None = None,
     logs_toml: str = "",
 ) -> DoctorResult | GAPONetError:
-    """Write the logs, import them and call the doctor; an import that refuses is an answer as well."""
+    """Write the logs, import them and call the doctor; an import that refuses is an answer as
+    well.
+    """
     for log in logs:
         place = folder / f"{log.payload:g}" / "real" / robot.name / "tests" / log.motion
         write_sage(place, log.ctrl, log.qpos, log.tau, robot.joint_names, 1e6 * log.time, log.qvel)

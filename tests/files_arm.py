@@ -1,4 +1,6 @@
-"""A two-joint arm as robots come from vendors: includes, meshes that give inertia, frames, degrees."""
+"""A two-joint arm as robots come from vendors: includes, meshes that give inertia, frames,
+degrees.
+"""
 
 from __future__ import annotations
 

@@ -1,6 +1,8 @@
-"""A stand-in of the Hugging Face Hub: the endpoints that huggingface_hub asks for push and pull, over real HTTP.
+"""A stand-in of the Hugging Face Hub: the endpoints that huggingface_hub asks for push and pull,
+over real HTTP.
 
-Repositories are lists of commits, each a table path → bytes. Large files go through the LFS batch endpoint.
+Repositories are lists of commits, each a table path → bytes. Large files go through the LFS batch
+endpoint.
 """
 
 from __future__ import annotations

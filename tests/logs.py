@@ -86,7 +86,9 @@ def stock(
     names: tuple[str, ...] = SO101,
     **changes: object,
 ) -> Path:
-    """A set as lerobot 0.4 writes it for an SO-101: degrees, gripper 0..100, no metadata of ours."""
+    """A set as lerobot 0.4 writes it for an SO-101: degrees, gripper 0..100, no metadata of
+    ours.
+    """
     import pyarrow as pa
     import pyarrow.parquet as pq
 

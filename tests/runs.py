@@ -84,7 +84,9 @@ def untrained(
 
 
 def corrects_by(delta: float, robot: RobotSpec, folder: Path) -> GapModel:
-    """A run whose operator adds the same to every target, rad: what it is told makes no difference."""
+    """A run whose operator adds the same to every target, rad: what it is told makes no
+    difference.
+    """
     config = ModelConfig(
         history=2, num_probes=2, branch_hidden=(8,), trunk_hidden=(8,), sensor_hidden=(8,)
     )

@@ -1,7 +1,8 @@
-"""Six servos as Feetech's public documents describe them, written apart from the package: the outside of the bus.
+"""Six servos as Feetech's public documents describe them, written apart from the package: the
+outside of the bus.
 
-`Servos` answers bytes with bytes; `Wire` is a serial port with them at its other end, without any time: a reply is
-there as soon as a request was written. `adversary` may change what a servo says.
+`Servos` answers bytes with bytes; `Wire` is a serial port with them at its other end, without any
+time: a reply is there as soon as a request was written. `adversary` may change what a servo says.
 """
 
 from __future__ import annotations

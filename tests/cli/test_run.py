@@ -125,7 +125,9 @@ def test_a_refused_plan_leaves_nothing_behind(tmp_path, capsys):
 
 
 def test_the_plan_says_the_payload_that_it_is_for_and_how_a_stop_ends(capsys):
-    """And a motion of the library is for that payload, not for the 3 kg that an SO-101 cannot hold."""
+    """And a motion of the library is for that payload, not for the 3 kg that an SO-101 cannot
+    hold.
+    """
     command = [
         "run",
         "--robot",

@@ -364,7 +364,9 @@ def test_steps_from_and_to_zero_are_no_rows_of_zeros(arm, tmp_path):
 
 
 def hanging(arm, payload: float = 0.0) -> Sequence:
-    """The arm of tests/arm.py moved slowly, with the torques that hold it up and a little friction."""
+    """The arm of tests/arm.py moved slowly, with the torques that hold it up and a little
+    friction.
+    """
     ctrl = wave(ROWS, 2, 0.02, amplitude=0.8, hertz=0.05)
     qpos = late(ctrl, 3)
     friction = 0.05 * np.sign(np.gradient(qpos, axis=0))
@@ -417,7 +419,8 @@ def test_a_sign_wrong_in_command_and_state_alike_shows_in_the_torque(arm, tmp_pa
 
 
 def standing(arm, seed: int, share: float, behind_gears: bool = False) -> Sequence:
-    """The simulated arm moved from hold to hold, with a share of its weight fed forward, and the motors' torque.
+    """The simulated arm moved from hold to hold, with a share of its weight fed forward, and the
+    motors' torque.
 
     Args:
         behind_gears: The torque is measured behind the friction.
@@ -464,7 +467,9 @@ def test_a_few_rests_do_not_tell_what_holds_the_arm(arm, tmp_path):
 
 
 def test_a_motor_too_weak_for_its_load_is_no_error_of_the_commands(arm, tmp_path):
-    """Servos that move with their commands, far from them: those of four pendulums on an XL330 did."""
+    """Servos that move with their commands, far from them: those of four pendulums on an XL330
+    did.
+    """
     ctrl, _ = good()
     weak = late(0.3 * ctrl, 3) - 0.5
     finding = found(examine(arm, tmp_path, arm_sequence(arm, ctrl, weak)), "command", "warning")

@@ -1,4 +1,6 @@
-"""Recordings in which the doctor finds an error are refused before anything is learned from them."""
+"""Recordings in which the doctor finds an error are refused before anything is learned from
+them.
+"""
 
 from dataclasses import replace
 

@@ -213,7 +213,9 @@ GOAL = np.array([0.3, -0.2])
 
 
 def largest_step_at_the_end(known, robot, observe):
-    """Return by how much a joint still moves in a period after 8 s of a proportional policy, rad."""
+    """Return by how much a joint still moves in a period after 8 s of a proportional policy,
+    rad.
+    """
     sim = BatchSim(robot, [(0.0, "both", robot.dt)], 1)
     sim.reset(slice(None), GOAL[None], np.zeros((1, 2)), past=GOAL[None, None])
     follower = Compensator(known, config=NOW, follow="nominal")

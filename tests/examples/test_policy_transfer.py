@@ -1,4 +1,6 @@
-"""The tutorial on policies: recorded, identified, learnt three times and played on a VIRTUAL robot."""
+"""The tutorial on policies: recorded, identified, learnt three times and played on a VIRTUAL
+robot.
+"""
 
 import re
 import subprocess

@@ -1,6 +1,8 @@
-"""In an environment with mjlab: play targets on an export under its servos and its action term; hand back the motion.
+"""In an environment with mjlab: play targets on an export under its servos and its action term;
+hand back the motion.
 
-Two of the robot stand in one scene; the other one is told the targets of another world, its joints in another order.
+Two of the robot stand in one scene; the other one is told the targets of another world, its joints
+in another order.
 
 python mjlab_peer.py EXPORT IN.npz OUT.npz     # IN: test_mjlab.py writes it
 """

@@ -1,4 +1,6 @@
-"""Servos in somebody else's scene: by joint name, as our own replay, refused where they contradict."""
+"""Servos in somebody else's scene: by joint name, as our own replay, refused where they
+contradict.
+"""
 
 import mujoco
 import numpy as np

@@ -1,4 +1,6 @@
-"""Whole units in the worlds of mjlab and Isaac Lab, in stand-ins with the methods of these engines."""
+"""Whole units in the worlds of mjlab and Isaac Lab, in stand-ins with the methods of these
+engines.
+"""
 
 import json
 import sys

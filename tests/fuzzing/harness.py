@@ -1,9 +1,11 @@
-"""Fuzzing: files that gaponet reads, changed at random, and what may never happen to whoever opens them.
+"""Fuzzing: files that gaponet reads, changed at random, and what may never happen to whoever opens
+them.
 
-A target says which files there are and what is done with them. A mutant is one of these file sets with one to three
-changes; its number and the seed make it again. It fails when anything but a GAPONetError comes out, when it takes
-longer than HANG_S, wants more than MEMORY beyond what the process had, writes a file outside the folder meant for it,
-or leaves something absurd stored (the target looks). Workers are processes; one that hangs or dies costs its mutant.
+A target says which files there are and what is done with them. A mutant is one of these file sets
+with one to three changes; its number and the seed make it again. It fails when anything but a
+GAPONetError comes out, when it takes longer than HANG_S, wants more than MEMORY beyond what the
+process had, writes a file outside the folder meant for it, or leaves something absurd stored (the
+target looks). Workers are processes; one that hangs or dies costs its mutant.
 """
 
 from __future__ import annotations
@@ -59,7 +61,9 @@ class Target:
 
 @dataclass(frozen=True)
 class Failure:
-    """A mutant that did what may not happen; kind: traceback, hang, memory, died, outside, absurd."""
+    """A mutant that did what may not happen; kind: traceback, hang, memory, died, outside,
+    absurd.
+    """
 
     target: str
     number: int
@@ -132,7 +136,9 @@ Outcome = tuple[str, Failure | None]  # "refused", "taken" or "failed", and what
 
 
 class _Worker:
-    """A process that tries the mutants of a plan; it is replaced when it is used up, hangs or dies."""
+    """A process that tries the mutants of a plan; it is replaced when it is used up, hangs or
+    dies.
+    """
 
     def __init__(self, plan: list[tuple[Target, int]], seed: int, keep: Path | None) -> None:
         self.plan, self.seed, self.keep = deque(plan), seed, keep

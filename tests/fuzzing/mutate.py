@@ -141,7 +141,9 @@ def mutate(files: Files, rng: random.Random, only: tuple[str, ...] = ("",)) -> F
 
 
 def change(name: str, content: bytes, rng: random.Random) -> bytes:
-    """One change of a kind that suits the file; where it holds something else by now, of its bytes."""
+    """One change of a kind that suits the file; where it holds something else by now, of its
+    bytes.
+    """
     of = [c for suffix, c in BY_SUFFIX.items() if name.endswith(suffix)]
     kinds = [*of[0] * 3, _bytes] if of else [_text, _bytes]
     try:
@@ -277,7 +279,9 @@ def _structure(value: Any, rng: random.Random) -> Any:
 
 
 def _parquet(content: bytes, rng: random.Random) -> bytes:
-    """One column gone, renamed, twice, of other values or of another type; or rows gone or twice."""
+    """One column gone, renamed, twice, of other values or of another type; or rows gone or
+    twice.
+    """
     table = pq.read_table(io.BytesIO(content))
     rows, at, kind = table.num_rows, rng.randrange(table.num_columns), rng.randrange(9)
     name, values = table.column_names[at], table.column(at).to_pylist()

@@ -1,4 +1,6 @@
-"""Models by name: found on this disk, in the folders where their collections lie; never downloaded."""
+"""Models by name: found on this disk, in the folders where their collections lie; never
+downloaded.
+"""
 
 import pytest
 from vendors import MJCF, URDF

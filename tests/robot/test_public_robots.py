@@ -1,4 +1,6 @@
-"""Packaged robots have the masses of their published models and the joint order of their vendors."""
+"""Packaged robots have the masses of their published models and the joint order of their
+vendors.
+"""
 
 import mujoco
 import numpy as np

@@ -66,7 +66,8 @@ def place(hub):
 
 @pytest.fixture
 def forge(hub):
-    """Change what was pushed as somebody does who knows how an index is made: hashes and sizes are right.
+    """Change what was pushed as somebody does who knows how an index is made: hashes and sizes are
+    right.
 
     The function that is given gets the index, and put(name, content) and read(name) of its files.
     """

@@ -1,4 +1,6 @@
-"""Backlash: the servo model beside a MuJoCo model with a hinge of its own between motor and link."""
+"""Backlash: the servo model beside a MuJoCo model with a hinge of its own between motor and
+link.
+"""
 
 import mujoco
 import numpy as np

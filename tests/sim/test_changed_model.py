@@ -25,7 +25,9 @@ CHANGE = SimulatorChange(
 
 
 def rebuilt(robot: RobotSpec, change: SimulatorChange) -> RobotSpec:
-    """Return the robot with the values of the change, as somebody would write them into its files."""
+    """Return the robot with the values of the change, as somebody would write them into its
+    files.
+    """
     model = build_model(robot)
     mounts = tuple(
         replace(mount, pos=tuple(np.add(mount.pos, change.mount))) for mount in robot.payload_mounts

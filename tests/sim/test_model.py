@@ -1,4 +1,6 @@
-"""The nominal simulator: joints that hold still, payloads that weigh, robots a user brings along."""
+"""The nominal simulator: joints that hold still, payloads that weigh, robots a user brings
+along.
+"""
 
 import re
 from dataclasses import replace
@@ -246,7 +248,9 @@ def test_a_model_in_degrees_moves_as_the_same_one_in_radians(tmp_path):
 
 @pytest.mark.parametrize("payload", [0.0, 3.0])
 def test_h1_2_agrees_with_pinocchio(payload):
-    """An independent rigid-body library reads the same MJCF and gets the payload as an extra body."""
+    """An independent rigid-body library reads the same MJCF and gets the payload as an extra
+    body.
+    """
     pin = pytest.importorskip("pinocchio", reason="pinocchio (package pin) is not installed")
     robot = load_robot("h1_2")
     other = pin.buildModelFromMJCF(str(robot.mjcf))

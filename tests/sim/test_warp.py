@@ -1,4 +1,6 @@
-"""Simulations by mujoco_warp, on CUDA or else on Warp's CPU device, are MuJoCo's but for rounding."""
+"""Simulations by mujoco_warp, on CUDA or else on Warp's CPU device, are MuJoCo's but for
+rounding.
+"""
 
 from dataclasses import replace
 

@@ -1,4 +1,6 @@
-"""Axes of a search: units in which torques are multiples of kp, bounds, and what is said at them."""
+"""Axes of a search: units in which torques are multiples of kp, bounds, and what is said at
+them.
+"""
 
 from dataclasses import replace
 

@@ -49,7 +49,9 @@ def test_a_bounded_step_solves_the_free_parameters_again():
 
 
 def test_agreed_slopes_are_zero_where_the_two_sides_differ_in_sign():
-    """A joint at the edge of breaking loose goes far to one side: it does not tell the parameter."""
+    """A joint at the edge of breaking loose goes far to one side: it does not tell the
+    parameter.
+    """
     errors = lambda x: np.concatenate([3 * x, 50 * np.maximum(x, 0), -np.abs(x)], axis=-1)  # noqa: E731
     at, low, high = np.zeros((1, 1, 1)), np.full((1, 1), -9.0), np.full((1, 1), 9.0)
     _, slopes = agreed_slopes(at, low, high, errors)

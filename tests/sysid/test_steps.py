@@ -1,4 +1,6 @@
-"""The loop of steps: what is proposed, what the judge does with it, and what no time is left for."""
+"""The loop of steps: what is proposed, what the judge does with it, and what no time is left
+for.
+"""
 
 from types import SimpleNamespace
 

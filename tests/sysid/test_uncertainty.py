@@ -297,7 +297,9 @@ def test_another_arm_that_no_parameter_explains_has_drifted(arm, folder, monkeyp
 def test_a_change_smaller_than_the_difference_between_repetitions_is_no_drift(
     arm, folder, tmp_path
 ):
-    """A robot that stands 4 mrad elsewhere each time it plays a command: 3 mrad today are nothing."""
+    """A robot that stands 4 mrad elsewhere each time it plays a command: 3 mrad today are
+    nothing.
+    """
     robot, rng = load_robot(folder), np.random.default_rng(0)
     today = [replace(s, qpos=s.qpos + np.float32([0.003, 0.0])) for s in played(arm, 50, 6)]
     seen = {}

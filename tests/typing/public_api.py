@@ -1,4 +1,5 @@
-"""Types of every public name, as a user's type checker sees them: `make check` runs mypy on this file.
+"""Types of every public name, as a user's type checker sees them: `make check` runs mypy on this
+file.
 
 It is not a test of pytest, and is never executed.
 """

@@ -1,4 +1,6 @@
-"""gaponet data card, split, figures, export, and import of what was exported, as a user runs them."""
+"""gaponet data card, split, figures, export, and import of what was exported, as a user runs
+them.
+"""
 
 import json
 
@@ -11,7 +13,9 @@ from gaponet.data.store import Dataset
 
 @pytest.fixture(scope="module")
 def place(tmp_path_factory):
-    """A user's robot folder and a dataset of six motions, alternately empty-handed and with 0.2 kg."""
+    """A user's robot folder and a dataset of six motions, alternately empty-handed and with 0.2
+    kg.
+    """
     folder = tmp_path_factory.mktemp("data")
     robot = write_arm(folder / "arm")
     dataset = Dataset.create(folder / "set", robot)

@@ -1,4 +1,5 @@
-"""Layouts of logs that people publish or ask about: the guess reads them, or the refusal names the cause.
+"""Layouts of logs that people publish or ask about: the guess reads them, or the refusal names the
+cause.
 
 Values are the tests' own; column names and files are those of the source that each layout names.
 """

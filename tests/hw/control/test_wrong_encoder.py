@@ -29,7 +29,9 @@ KINDS = {  # way in which the robot is wrong → faults that may end the run
 
 
 class Swaying:
-    """Plays each fault once: both elbows go up and sway, and the left one's reading becomes wrong."""
+    """Plays each fault once: both elbows go up and sway, and the left one's reading becomes
+    wrong.
+    """
 
     def __init__(self, robot: RobotSpec, monkeypatch: pytest.MonkeyPatch) -> None:
         self.robot = robot
