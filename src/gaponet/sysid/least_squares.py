@@ -151,7 +151,7 @@ def _normal_equations(errors: Array, jac: Array) -> tuple[Array, Array]:
     """Return curvature (S, n, P, P) and gradient (S, n, P) of soft L1 costs, from errors (S, n, m)
     and their slopes (S, n, m, P).
     """
-    weight = 1 / np.sqrt(1 + errors**2)  # (S, n, m)
+    weight = soft_l1_weight(errors)  # (S, n, m)
     transposed = np.swapaxes(jac, -1, -2)  # (S, n, P, m)
     normal = transposed @ (weight[..., None] * jac)
     gradient = transposed @ (weight * errors)[..., None]  # (S, n, P, 1)
@@ -226,6 +226,11 @@ def better_half(x: Array, cost: Array) -> Array:
 def soft_l1(errors: Array) -> Array:
     """Return the soft L1 cost, √(1 + e²) − 1, summed over the last axis."""
     return np.asarray((np.sqrt(1 + errors**2) - 1).sum(axis=-1, dtype=float))
+
+
+def soft_l1_weight(errors: Array) -> Array:
+    """Return the weights with which errors enter the gradient of the soft L1 cost."""
+    return np.asarray(1 / np.sqrt(1 + errors**2))
 
 
 def _evaluated(errors: Errors, tried: Array) -> Array:

@@ -15,7 +15,7 @@ from gaponet.base.text import format_uncertainty
 from gaponet.robot.servo_fields import SERVO_FIELDS
 from gaponet.sysid.acceptance import Covariance, Std
 from gaponet.sysid.axes import MIN_EXCITATION_RAD, Axes, Bounds, Values
-from gaponet.sysid.least_squares import agreed_slopes
+from gaponet.sysid.least_squares import agreed_slopes, soft_l1_weight
 from gaponet.sysid.problem import MIN_GAIN_OVER_FILE, PRIORS, FitProblem, fitted_fields
 
 # Parts of the recordings that count as independent of each other.
@@ -99,7 +99,7 @@ def _covariance(problem: FitProblem, axes: Axes, x: Array) -> tuple[Array, Array
     errors_of_start, slopes_of_start = agreed_slopes(x[None], axes.low, axes.high, of_axes)
     errors = errors_of_start[0]  # (n, rows + PRIORS)
     slopes = slopes_of_start[0]  # (n, rows + PRIORS, P)
-    weight = 1 / np.sqrt(1 + errors**2)  # of soft L1
+    weight = soft_l1_weight(errors)
     gradient = slopes * (weight * errors)[..., None]
     curvature = (np.swapaxes(slopes, -1, -2) @ (weight[..., None] * slopes)).astype(float)
     size = np.sqrt(np.einsum("...ii->...i", curvature))  # (n, P)

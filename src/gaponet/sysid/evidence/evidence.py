@@ -19,7 +19,7 @@ from gaponet.sim.replay import replay
 from gaponet.sysid.acceptance import HeldOut
 from gaponet.sysid.axes import CLASSIC, Axes, Bounds, first_values
 from gaponet.sysid.joint_rollouts import ERROR_SCALE_RAD, JointRollouts
-from gaponet.sysid.least_squares import slopes
+from gaponet.sysid.least_squares import slopes, soft_l1_weight
 from gaponet.sysid.robot_rollouts import cut
 from gaponet.sysid.standard_errors import cluster_sums
 from gaponet.sysid.table_contact import contact_height, tip_heights
@@ -117,7 +117,7 @@ def evidence(
     parts = cut(sequences, windows)
     rollouts = JointRollouts(parts, robot, contact, nthread)
     errors, jac = _slopes_of_joints(rollouts, Bounds(robot, sequences), fields)
-    weight = 1 / np.sqrt(1 + errors**2)  # of soft L1
+    weight = soft_l1_weight(errors)  # (n, rows)
     gradient_of_rows = jac * (weight * errors)[..., None]  # (n, rows, Q)
     gradients, window_of_cluster = cluster_sums(gradient_of_rows, rollouts.window)
     name_of_window = [_window_name(part) for part in parts]

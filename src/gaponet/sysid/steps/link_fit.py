@@ -37,7 +37,8 @@ MIN_INFORMATION = 1.0  # of a direction that is fitted, over the prior's
 MAX_DIRECTIONS = 12
 # Of a kp from recorded torque, whose scale is a motor constant.
 MIN_KP_LOG_STD = 0.05
-ITERATIONS = (1, 2)  # with the first residual, and with what that leaves
+FIRST_ITERATIONS = 1  # with the first residual
+LATER_ITERATIONS = 2  # with the residual that these leave
 # Of the servos' residual, which wrong links may have caused.
 FIRST_RESIDUAL_SHARE = 0.25
 # Of a joint's errors, over those of a joint of mean residual.
@@ -214,8 +215,9 @@ class LinkFit:
         torque = inverse_dynamics(model, *motion)[:, op]
         changed = []
         for x in DIFFERENCE_STEP * np.eye(self.axes.scale.size):
-            other = with_links(model, replace(robot, links=self.axes.links(x)))
-            changed.append(inverse_dynamics(other, *motion)[:, op])
+            other_robot = replace(robot, links=self.axes.links(x))
+            other_model = with_links(model, other_robot)
+            changed.append(inverse_dynamics(other_model, *motion)[:, op])
         return torque, np.array(changed) - torque
 
     def _servo_values(self, x: Array) -> Values:
@@ -267,11 +269,10 @@ class LinkFit:
         low = np.concatenate([self._servos.low.ravel(), -most])
         high = np.concatenate([self._servos.high.ravel(), most])
         problems = Problems(self.errors, low[None], high[None])
-        first, second = ITERATIONS
         start = np.concatenate([servos, no_change])[None, None]
-        x, _ = descend(problems, start, first, report, MIN_COST_DECREASE)
+        x, _ = descend(problems, start, FIRST_ITERATIONS, report, MIN_COST_DECREASE)
         self._update_residual(x)
-        x, _ = descend(problems, x, second, report, MIN_COST_DECREASE)
+        x, _ = descend(problems, x, LATER_ITERATIONS, report, MIN_COST_DECREASE)
         return np.asarray(x)
 
     def _update_residual(self, x: Array) -> None:
