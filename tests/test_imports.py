@@ -176,6 +176,7 @@ def test_what_may_run_on_a_robot_never_imports_training():
             assert "gaponet.nn.training" not in file.read_text(encoding="utf-8"), file
 
 
+@functools.cache
 def names(file: Path) -> set[str]:
     """Names that a module binds at any depth, and its submodules."""
     bound = {inner.stem for inner in file.parent.iterdir()} if file.name == "__init__.py" else set()
