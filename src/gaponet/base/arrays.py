@@ -4,12 +4,14 @@ numpy and torch.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from importlib import import_module
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
 Array = np.ndarray
+_T = TypeVar("_T")
 
 
 def array_module(x: Any) -> Any:
@@ -48,3 +50,11 @@ def to_numpy(x: Any) -> Array:
 def float32(x: Any) -> Any:
     """Return a numpy or torch array as float32."""
     return x.astype(np.float32) if isinstance(x, np.ndarray) else x.float()
+
+
+def joined(parts: Sequence[_T]) -> _T:
+    """Return dataclasses of arrays as one: each field of all parts, one behind the other."""
+    fields = {}
+    for name in vars(parts[0]):
+        fields[name] = np.concatenate([getattr(part, name) for part in parts])
+    return type(parts[0])(**fields)

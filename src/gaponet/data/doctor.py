@@ -149,7 +149,7 @@ def _sequence_row(survey: Survey, robot: RobotSpec) -> dict[str, Any]:
     lags = {}  # joint → its lag, s
     for name, (lag,) in fast_lags([survey], robot).items():
         lags[name] = round(lag, 4)
-    meta = survey.entry.meta
+    meta = survey.meta
     return {
         "motion": meta.motion,
         "unit": meta.unit_id,

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gaponet.base.arrays import Array
+from gaponet.base.arrays import Array, joined
 from gaponet.data.sequence import Sequence
 from gaponet.data.signals import range_before
 
@@ -70,10 +70,7 @@ class StaticPoses:
         """Return the static poses of several sequences of n joints as one."""
         empty = np.zeros((0, n))
         none = cls(empty, empty, np.zeros((0, n), int), np.zeros((0, n), bool))
-        fields = {}
-        for name in vars(none):
-            fields[name] = np.concatenate([getattr(part, name) for part in (none, *parts)])
-        return cls(**fields)
+        return joined([none, *parts])
 
     def static_error(self, joint: int, expected: Array | float = 0.0) -> StaticError:
         """Return the static error of a joint over its distinct poses, both approaches weighed

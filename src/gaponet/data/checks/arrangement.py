@@ -13,7 +13,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from gaponet.base.arrays import Array
+from gaponet.base.arrays import Array, joined
 from gaponet.data.checks.exchanges import Exchange, exchange, mirrored_joints, pairs, shifts
 from gaponet.data.checks.gravity import JOINT_FAULTS, Payload
 from gaponet.data.checks.survey import Movement, Survey
@@ -57,10 +57,9 @@ class _Motion:
             movement = survey.samples.movement
             if movement is not None:
                 parts.append(movement)
-                payload = (survey.entry.meta.payload_mass, survey.entry.meta.payload_side)
-                payloads += [payload] * len(movement.qpos)
+                payloads += [survey.payload] * len(movement.qpos)
         step = -(-len(payloads) // MAX_ROWS)  # rounded up
-        self.rows = Movement.joined(parts).at(slice(None, None, step))
+        self.rows = joined(parts).in_double().at(slice(None, None, step))
         self.payloads = payloads[::step]
         self.model = model
         torque = self.rows.torque

@@ -13,7 +13,7 @@ import numpy as np
 
 from gaponet.base.arrays import Array
 from gaponet.data.checks.check import Check
-from gaponet.data.checks.survey import Survey, Torque
+from gaponet.data.checks.survey import Recorded, Survey, with_torque
 from gaponet.data.log import COMMANDS
 from gaponet.robot.finding import Finding, abbreviate, masked_names
 from gaponet.robot.spec import RobotSpec
@@ -82,7 +82,7 @@ def _same_rate(survey: Survey, rates: Iterable[float]) -> float:
 
 
 def _is_resampled(survey: Survey) -> bool:
-    return "resampled" in str(survey.entry.meta.notes.get("rows", ""))
+    return "resampled" in str(survey.meta.notes.get("rows", ""))
 
 
 def _regularity(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
@@ -152,7 +152,7 @@ def _jumps(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
 def _nonsense(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     """Were impossible values of a channel replaced at import?"""
     for channel, hit in _with_note(surveys, "nonsense").items():
-        notes = [survey.entry.meta.notes["nonsense"][channel] for survey in hit]
+        notes = [survey.meta.notes["nonsense"][channel] for survey in hit]
         rows = sum(note["rows"] for note in notes)
         done = ", ".join(dict.fromkeys(note["done"] for note in notes))
         joints = _joined([note["joints"] for note in notes])
@@ -166,10 +166,10 @@ def _nonsense(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
 
 def _repeated_rows(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     """Were rows that the logger wrote twice left out at import?"""
-    hit = [survey for survey in surveys if "repeated" in survey.entry.meta.notes]
+    hit = [survey for survey in surveys if "repeated" in survey.meta.notes]
     if not hit:
         return
-    rows = sum(survey.entry.meta.notes["repeated"]["rows"] for survey in hit)
+    rows = sum(survey.meta.notes["repeated"]["rows"] for survey in hit)
     text = (
         f"{rows} rows of {_motions(hit)} repeat the row before within a fraction of a period: the "
         "logger wrote them twice, and they were left out at import"
@@ -200,17 +200,17 @@ def _with_note(surveys: list[Survey], note: str) -> dict[str, list[Survey]]:
     """Return channel or joint → recordings that had this note on it at import."""
     by_name: dict[str, list[Survey]] = defaultdict(list)
     for survey in surveys:
-        for name in survey.entry.meta.notes.get(note, ()):
+        for name in survey.meta.notes.get(note, ()):
             by_name[name].append(survey)
     return by_name
 
 
 def _rows_cut(survey: Survey) -> int:
-    return int(survey.entry.meta.notes.get("rows_cut", 0))
+    return int(survey.meta.notes.get("rows_cut", 0))
 
 
 def _slower(channel: str, hit: list[Survey]) -> Finding:
-    notes = [survey.entry.meta.notes["slower"][channel] for survey in hit]
+    notes = [survey.meta.notes["slower"][channel] for survey in hit]
     filled = "held" if channel in COMMANDS else "interpolated"
     rows = sum(note["rows"] for note in notes)
     of_rows = sum(note["of"] for note in notes)
@@ -222,7 +222,7 @@ def _slower(channel: str, hit: list[Survey]) -> Finding:
 
 
 def _absent(channel: str, hit: list[Survey]) -> Finding:
-    joints = _joined([survey.entry.meta.notes["absent"][channel] for survey in hit])
+    joints = _joined([survey.meta.notes["absent"][channel] for survey in hit])
     text = (
         f"{channel} of {abbreviate(list(joints))} is empty in all rows of {_motions(hit)}: "
         f"{channel} is left out"
@@ -231,7 +231,7 @@ def _absent(channel: str, hit: list[Survey]) -> Finding:
 
 
 def _turns(joint: str, hit: list[Survey]) -> Finding:
-    notes = [survey.entry.meta.notes["turns"][joint] for survey in hit]
+    notes = [survey.meta.notes["turns"][joint] for survey in hit]
     wraps = sum(note["wraps"] for note in notes)
     moved = any(note["turns"] for note in notes)
     if not wraps and not moved:
@@ -274,7 +274,7 @@ def _blocked(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
         yield Finding(level, "blocked", text, (name,), values)
 
 
-def unsigned_torque(recorded: list[tuple[Survey, Torque]], robot: RobotSpec) -> tuple[str, ...]:
+def unsigned_torque(recorded: Recorded, robot: RobotSpec) -> tuple[str, ...]:
     """Return the joints with a changing torque if none of these torques is ever negative:
     magnitudes, no torques.
     """
@@ -295,7 +295,7 @@ class TorqueLimits(NamedTuple):
     moved: Array  # whether the joint moves, bool
 
 
-def torque_limits(recorded: list[tuple[Survey, Torque]]) -> TorqueLimits:
+def torque_limits(recorded: Recorded) -> TorqueLimits:
     """Return the least and greatest torque of each joint, and whether it moves."""
     ranges = np.max([survey.qpos_range for survey, _ in recorded], axis=0)  # (n) rad
     return TorqueLimits(
@@ -307,7 +307,7 @@ def torque_limits(recorded: list[tuple[Survey, Torque]]) -> TorqueLimits:
 
 def _saturation(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     """Did a motor reach its torque limit?"""
-    recorded = [(survey, survey.torque) for survey in surveys if survey.torque is not None]
+    recorded = with_torque(surveys)
     if unsigned_torque(recorded, robot):  # the torque check warns of it
         yield Finding("ok", "saturation", "no signed torque recorded")
         return
@@ -332,7 +332,7 @@ def _saturation(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     yield Finding("warning", "saturation", text, (name,), values)
 
 
-def _flat_torque(recorded: list[tuple[Survey, Torque]], robot: RobotSpec) -> Iterator[Finding]:
+def _flat_torque(recorded: Recorded, robot: RobotSpec) -> Iterator[Finding]:
     """Find torques that are cut off at one value below the limit of robot.toml."""
     for i, name in enumerate(robot.joint_names):
         top = max((float(torque.largest[i]) for _, torque in recorded), default=0.0)

@@ -208,9 +208,9 @@ def _servo_torques(surveys: list[Survey], robot: RobotSpec) -> Loads:
     """Return the torques of the servos at rest, from their distance to the command."""
     samples = []
     for survey in surveys:
-        kp = robot.with_gains(*survey.entry.meta.recorded_gains).servo.kp
         poses = survey.samples.static_poses
-        samples.append((survey, poses.qpos, kp * (poses.ctrl - poses.qpos)))
+        torque = survey.kp(robot) * (poses.ctrl - poses.qpos)
+        samples.append((survey, poses.qpos, torque))
     return _by_payload(samples)
 
 
@@ -218,8 +218,7 @@ def _by_payload(samples: Iterable[tuple[Survey, Array, Array]]) -> Loads:
     """Join the angles and torques, (k, n) each, of recordings with equal payloads."""
     parts: dict[Payload, list[tuple[Array, Array]]] = defaultdict(list)
     for survey, qpos, torque in samples:
-        meta = survey.entry.meta
-        parts[meta.payload_mass, meta.payload_side].append((qpos, torque))
+        parts[survey.payload].append((qpos, torque))
     loads = {}
     for payload, of_payload in parts.items():
         qpos_of_parts, torque_of_parts = zip(*of_payload, strict=True)

@@ -10,7 +10,7 @@ import numpy as np
 from gaponet.base.arrays import Array
 from gaponet.data.checks.check import Check
 from gaponet.data.checks.completeness import torque_limits, unsigned_torque
-from gaponet.data.checks.survey import Survey, Torque
+from gaponet.data.checks.survey import Recorded, Survey, with_torque
 from gaponet.data.checks.timing import MAX_EXTRA_LAG_S, WHY_LATE, verdict_on
 from gaponet.data.signals import FAST_COMMAND_RAD_S, Response
 from gaponet.data.static_poses import StaticError, StaticPoses
@@ -143,10 +143,10 @@ def _expected_lag(robot: RobotSpec) -> dict[str, _ExpectedLag]:
 
 def _sag(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     """How far from its command does each joint rest, with the lightest and the heaviest payload?"""
-    payloads = sorted({survey.entry.meta.payload_mass for survey in surveys})
+    payloads = sorted({survey.meta.payload_mass for survey in surveys})
     errors: dict[float, dict[str, StaticError]] = {}  # payload → joint → error
     for payload in (payloads[0], payloads[-1]):
-        same = [survey for survey in surveys if survey.entry.meta.payload_mass == payload]
+        same = [survey for survey in surveys if survey.meta.payload_mass == payload]
         errors[payload] = static_errors(same, robot)
     largest = {}  # joint → static error, rad
     for name in robot.operated:
@@ -198,7 +198,7 @@ def _sag_finding(sagging: list[str], errors: dict[float, dict[str, StaticError]]
 
 def _torque(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     """Can the torque signal be trusted?"""
-    recorded = [(survey, survey.torque) for survey in surveys if survey.torque is not None]
+    recorded = with_torque(surveys)
     if not recorded:
         yield Finding(
             "note", "torque", "no torque recorded; equivalent torque comes from inverse dynamics"
@@ -220,7 +220,7 @@ def _torque(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     yield from _spikes(spiky, robot)
 
 
-def _spikes(spiky: list[tuple[Survey, Torque]], robot: RobotSpec) -> Iterator[Finding]:
+def _spikes(spiky: Recorded, robot: RobotSpec) -> Iterator[Finding]:
     """Report recordings with torque spikes, and the worst of these."""
     if not spiky:
         return

@@ -21,9 +21,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gaponet.base.arrays import Array
+from gaponet.base.arrays import Array, joined
 from gaponet.data.checks.completeness import unsigned_torque
-from gaponet.data.checks.survey import Survey
+from gaponet.data.checks.survey import Survey, with_torque
 from gaponet.data.offsets import Gravity
 from gaponet.robot.finding import Finding, abbreviate
 from gaponet.robot.spec import RobotSpec
@@ -180,22 +180,19 @@ def _collect_poses(surveys: list[Survey], robot: RobotSpec, model: Gravity) -> _
     for number, survey in enumerate(surveys):
         if len(survey.samples.static_poses):
             parts.append(_poses_of(number, survey, robot, model))
-    joined = {}
-    for name in vars(parts[0]):
-        joined[name] = np.concatenate([getattr(part, name) for part in parts])
-    return _Poses(**joined)
+    return joined(parts)
 
 
 def _poses_of(number: int, survey: Survey, robot: RobotSpec, model: Gravity) -> _Poses:
     """Return the poses of the operated joints of one sequence, which has this number."""
-    meta = survey.entry.meta
+    mass, side = survey.payload
     poses = survey.samples.static_poses
-    kp = np.where(robot.servo.kp > 0, robot.with_gains(*meta.recorded_gains).servo.kp, np.inf)
+    kp = np.where(robot.servo.kp > 0, survey.kp(robot), np.inf)
     # weight over kp, and its change with 1 kg more; (poses, n) rad
-    load = model(poses.qpos, meta.payload_mass, meta.payload_side) / kp
+    load = model(poses.qpos, mass, side) / kp
     heavier = np.zeros_like(load)
     if robot.payload_mounts:
-        heavier = model(poses.qpos, meta.payload_mass + 1.0, meta.payload_side) / kp - load
+        heavier = model(poses.qpos, mass + 1.0, side) / kp - load
     judged = poses.distinct & (poses.approach != 0)  # (poses, n)
     nth, pose = np.nonzero(judged[:, robot.operated_index].T)
     joint = robot.operated_index[nth]
@@ -292,7 +289,7 @@ def _offset_and_scale(name: str, fit: _Fit) -> Iterator[Finding]:
 
 def _swapped_labels(surveys: list[Survey], poses: _Poses, judged: list[int]) -> list[Finding]:
     """Would the labels' masses in another order explain the poses better?"""
-    mass = np.array([survey.entry.meta.payload_mass for survey in surveys])[poses.sequence]
+    mass = np.array([survey.meta.payload_mass for survey in surveys])[poses.sequence]
     labels = sorted(set(mass.tolist()))
     if not 1 < len(labels) <= 3:
         return []
@@ -443,7 +440,7 @@ def _odd_sequence(
     """
     by_joint = {j: poses.of_joint(j) for j in judged}
     fits = {j: _fit(own) for j, own in by_joint.items() if len(own) >= MIN_POSES}
-    heaviest = max(survey.entry.meta.payload_mass for survey in surveys) or 1.0
+    heaviest = max(survey.meta.payload_mass for survey in surveys) or 1.0
     furthest = 0.0  # mean square of its residuals
     odd: tuple[int, Finding] | None = None
     for number in sorted(set(poses.sequence.tolist())):
@@ -503,7 +500,7 @@ def _judge_sequence(survey: Survey, heaviest: float, rests: _Rests) -> Finding |
     Args:
         heaviest: Of the labels, kg.
     """
-    meta = survey.entry.meta
+    meta = survey.meta
     more = _mass_that_explains(rests)
     if abs(more) > MIN_MASS_ERROR * heaviest:
         text = (
@@ -543,7 +540,7 @@ def _mass_that_explains(rests: _Rests) -> float:
 
 def feedforward(surveys: list[Survey], robot: RobotSpec, model: Gravity) -> Iterator[Finding]:
     """Is a torque fed forward beside the position command?"""
-    recorded = [(survey, survey.torque) for survey in surveys if survey.torque is not None]
+    recorded = with_torque(surveys)
     if not recorded or unsigned_torque(recorded, robot):
         return
     shares: dict[str, _FedForward] = {}
@@ -623,10 +620,9 @@ def _joint_holds(
         own = holds.joint == joint
         if not own.any():
             continue
-        meta = survey.entry.meta
-        kp = max(float(robot.with_gains(*meta.recorded_gains).servo.kp[joint]), MIN_KP)
+        kp = max(float(survey.kp(robot)[joint]), MIN_KP)
         qpos = holds.qpos[own]
-        weight = model(qpos, meta.payload_mass, meta.payload_side)[:, joint]
+        weight = model(qpos, *survey.payload)[:, joint]
         part = _JointHolds(
             recording=np.full(len(qpos), number),
             torque=holds.torque[own] / kp,
@@ -635,10 +631,7 @@ def _joint_holds(
             qpos=qpos[:, joint],
         )
         parts.append(part)
-    joined = {}
-    for name in vars(parts[0]):
-        joined[name] = np.concatenate([getattr(part, name) for part in parts])
-    return _JointHolds(**joined)
+    return joined(parts)
 
 
 def _explained(values: Array, fold: Array, *columns: Array) -> tuple[float, float, float]:

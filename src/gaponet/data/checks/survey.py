@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterator
 from concurrent.futures import Executor
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -20,7 +20,7 @@ from gaponet.base.executor import LOCAL, open_pool
 from gaponet.base.progress import Progress
 from gaponet.data.describe.row_copies import copied_rows
 from gaponet.data.log import Channel
-from gaponet.data.sequence import Sequence
+from gaponet.data.sequence import Sequence, SequenceMeta
 from gaponet.data.signals import (
     FAST_COMMAND_RAD_S,
     Response,
@@ -238,14 +238,9 @@ class Movement:
     command_velocity: Array  # rad/s
     command_acceleration: Array  # rad/s²
 
-    @classmethod
-    def joined(cls, parts: list[Movement]) -> Movement:
-        """Return the rows of several recordings, in double precision."""
-        channels = {}
-        for field in fields(cls):
-            of_parts = [getattr(part, field.name) for part in parts]
-            channels[field.name] = np.concatenate(of_parts).astype(float)
-        return cls(**channels)
+    def in_double(self) -> Movement:
+        """Return the rows in double precision."""
+        return Movement(**{name: values.astype(float) for name, values in vars(self).items()})
 
     def at(self, rows: Array | slice) -> Movement:
         """Return some of the rows."""
@@ -290,9 +285,23 @@ class Survey:
     spectra: Array  # log power of command and state at SPECTRUM_HZ, (2, H)
 
     @property
+    def meta(self) -> SequenceMeta:
+        """Provenance and labels."""
+        return self.entry.meta
+
+    @property
     def motion(self) -> str:
         """Name of the motion."""
-        return self.entry.meta.motion
+        return self.meta.motion
+
+    @property
+    def payload(self) -> tuple[float, str]:
+        """Mass, kg, and the hand that carries it."""
+        return self.meta.payload_mass, self.meta.payload_side
+
+    def kp(self, robot: RobotSpec) -> Array:
+        """Return the stiffness while recording, (n) N·m/rad; the robot's where none was said."""
+        return robot.with_gains(*self.meta.recorded_gains).servo.kp
 
     @property
     def ctrl_range(self) -> Array:
@@ -332,6 +341,14 @@ class Survey:
             samples=samples,
             spectra=np.stack([_spectrum(ctrl, dt), _spectrum(qpos, dt)]).astype(np.float32),
         )
+
+
+Recorded = list[tuple[Survey, Torque]]
+
+
+def with_torque(surveys: list[Survey]) -> Recorded:
+    """Return the recordings of torque, each with it."""
+    return [(survey, survey.torque) for survey in surveys if survey.torque is not None]
 
 
 def survey_all(

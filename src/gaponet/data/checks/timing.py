@@ -233,7 +233,7 @@ def _shifted(word: str, group: list[tuple[Survey, float]]) -> Iterator[Finding]:
 def _shift_finding(word: str, group: list[tuple[Survey, float]]) -> Finding:
     labels = []
     for survey, _ in group:
-        meta = survey.entry.meta
+        meta = survey.meta
         labels.append(f"{meta.motion} ({meta.unit_id}, {meta.payload_mass:g} kg)")
     ms = sorted(abs(late) * 1e3 for _, late in group)
     follow = "follow their"

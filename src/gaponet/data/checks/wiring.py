@@ -465,7 +465,7 @@ def _beyond_range(
 
 def _labels(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     """Is one recording filed under two payloads or units, and were all made with the same gains?"""
-    gains = {(survey.entry.meta.kp, survey.entry.meta.kd) for survey in surveys}
+    gains = {(survey.meta.kp, survey.meta.kd) for survey in surveys}
     if len(gains) > 1:
         text = (
             f"{len(gains)} sets of kp and kd while recording: each recording is simulated with "
