@@ -4,7 +4,7 @@ refused.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -70,6 +70,15 @@ def to_radians(
         encoder = (encoders or {}).get(joint)
         out[:, column] = _angles(out[:, column], joint, unit, robot, encoder, name == "qvel")
     return out
+
+
+def not_in_radians(joint_names: Iterable[str], units: Iterable[str]) -> dict[str, str]:
+    """Return joint → unit, of the joints whose positions have to be converted."""
+    converted = {}
+    for joint, unit in zip(joint_names, units, strict=True):
+        if unit != "rad":
+            converted[joint] = unit
+    return converted
 
 
 def _angles(

@@ -23,7 +23,7 @@ from gaponet.data.describe.clocks import clock_periods, named_like_a_clock, requ
 from gaponet.data.describe.encoders import Encoder, read_encoders
 from gaponet.data.describe.joints import ignored, resolve_all
 from gaponet.data.describe.logs_file import HINT, LogsFile
-from gaponet.data.describe.plausibility import to_radians
+from gaponet.data.describe.plausibility import not_in_radians, to_radians
 from gaponet.data.describe.repeats import without_equal_rows
 from gaponet.data.describe.slow_channels import sampled_channels
 from gaponet.data.log import CHANNELS, COMMANDS, DERIVED, FEEDFORWARD, REQUIRED, Channel, Log
@@ -201,7 +201,7 @@ class RawRecording:
         meta["notes"] = meta.get("notes", {}) | empty | repeated
         for name, columns in gains.items():
             meta[name] = [_constant(self, name, columns[joint].of(loaded)) for joint in joints]
-        meta["converted_from"] = {joint: units[joint] for joint in joints if units[joint] != "rad"}
+        meta["converted_from"] = not_in_radians(joints, units_in_order)
         return Log(robot.name, joints, channels, self.source, meta)
 
     def _meta(self, channels: Iterable[str], specified: LogsFile) -> dict[str, Any]:

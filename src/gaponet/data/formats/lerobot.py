@@ -37,7 +37,7 @@ from gaponet.base.structure import validated
 from gaponet.data.describe.actions import NO_TARGETS, what_it_holds
 from gaponet.data.describe.encoders import Encoder, read_encoders
 from gaponet.data.describe.joints import ignored, resolve_all
-from gaponet.data.describe.plausibility import FULL_PERCENT, to_radians
+from gaponet.data.describe.plausibility import FULL_PERCENT, not_in_radians, to_radians
 from gaponet.data.formats.lerobot_set import (
     AGAIN,
     FEATURES,
@@ -324,15 +324,11 @@ class _Frames:
         channels = {}
         for channel, values in self.columns.items():
             channels[channel] = Channel(time, self._si(channel, values[where]))
-        converted_from = {}
-        for joint, unit in zip(self.joints, self.units, strict=True):
-            if unit != "rad":
-                converted_from[joint] = unit
         meta: dict[str, Any] = {
             "files": dict.fromkeys(channels, str(self.file)),
             "first_line": int(where[0]) + 1,
             "dt": self.part.dt,
-            "converted_from": converted_from,
+            "converted_from": not_in_radians(self.joints, self.units),
         }
         if self.part.ours:
             meta["stated"] = row["stated"]

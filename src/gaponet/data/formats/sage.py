@@ -21,7 +21,7 @@ from gaponet.base.arrays import Array
 from gaponet.base.errors import LogError
 from gaponet.base.structure import MAX_ARRAYS_BYTES, read_limited
 from gaponet.data.describe.joints import resolve_all
-from gaponet.data.describe.plausibility import to_radians
+from gaponet.data.describe.plausibility import not_in_radians, to_radians
 from gaponet.data.formats import files_below
 from gaponet.data.log import Channel, Log
 from gaponet.robot.spec import RobotSpec
@@ -73,14 +73,10 @@ def _read_motion(folder: Path, robot: RobotSpec, joint_map: dict[str, str] | Non
             channels[channel] = Channel(state_time, in_si)
     targets = to_radians("ctrl", commands["positions"], names, units, robot)
     channels["ctrl"] = Channel(command_time, targets)
-    converted_from = {}
-    for name, unit in zip(names, units, strict=True):
-        if unit != "rad":
-            converted_from[name] = unit
     meta = {
         "files": dict.fromkeys(channels, str(state)) | {"ctrl": str(control)},
         "first_line": 2,
-        "converted_from": converted_from,
+        "converted_from": not_in_radians(names, units),
     }
     return Log(robot.name, names, channels, str(folder), meta)
 
