@@ -126,7 +126,7 @@ def _examine_loads(
     if errors:
         text = (
             "zeros, offsets, gains and payloads are judged by gravity once this is mended: "
-            f"{', '.join(set(errors))}"
+            f"{', '.join(dict.fromkeys(errors))}"
         )
         return [*result, Finding("ok", "gravity", text)]
     by_commands = () if driven_by_torque(surveys) else (feedforward, static_checks)
