@@ -126,3 +126,11 @@ def test_logs_without_torque_are_refused(robot, tmp_path, capsys):
     assert main(["identify", data, "--out", str(tmp_path / "found")]) == 2
     assert "has no torque of every operated joint" in capsys.readouterr().err
     assert not (tmp_path / "found").exists()
+
+
+def test_recordings_that_are_too_short_to_judge_by_are_refused(robot, tmp_path, capsys):
+    logs = {f"m{k}": drive(robot, k, rows=180) for k in range(8)}
+    data = imported(tmp_path, robot, logs)
+    assert main(["identify", data, "--out", str(tmp_path / "found")]) == 2
+    assert "longer" in capsys.readouterr().err
+    assert not (tmp_path / "found").exists()

@@ -99,11 +99,17 @@ def fit_torque_driven(
         constant: Fit N·m per unit of the torque, as of a current.
 
     Raises:
-        UsageError: A recording has no torque.
+        UsageError: A recording has no torque, or none of those that judge is long enough.
     """
     _require_torque([*train, *judging], robot)
     if train is judging:
         train, judging = _parts_in_turn(judging)
+    windows = sum(len(_starts(s)) for s in judging)
+    if windows == 0:
+        raise UsageError(
+            f"a fit from torque is judged on motions of more than {HORIZONS_S[-1]:g} s, and none of "
+            "the validation recordings is that long; record longer motions"
+        )
     joints = _fit_joints([_rows(s, robot) for s in train], robot.operated, constant)
     fitted = robot.with_identified(joints.servos)
     op = robot.operated_index
@@ -130,7 +136,7 @@ def fit_torque_driven(
         std=joints.std,
         torque=(torque_before, torque_after),
         angle=angle,
-        windows=sum(len(_starts(s)) for s in judging),
+        windows=windows,
     )
 
 

@@ -187,10 +187,9 @@ def _slopes_over_play(rollouts: JointRollouts, bounds: Bounds) -> Array:
     windows = rollouts.windows
     delay = bounds.first["delay"][:, None]  # (n, 1) s
     delay_rows = np.round(delay / windows.periods).astype(int)  # (n, windows)
-    command = np.empty_like(windows.ctrl)  # (n, windows, rows) rad
-    for j, of_joint in enumerate(windows.ctrl):
-        for window, ctrl in enumerate(of_joint):
-            command[j, window] = np.roll(ctrl, delay_rows[j, window])
+    row = np.arange(windows.ctrl.shape[-1])
+    sent = np.maximum(row - delay_rows[..., None], 0)  # row of the command that acts
+    command = np.take_along_axis(windows.ctrl, sent, axis=-1)  # (n, windows, rows) rad
     offset = bounds.first["offset"][:, None, None].astype(np.float32)
     servo_error = command + offset - windows.qpos
     side = np.tanh(servo_error / PLAY_TURN_RAD)  # −1 to 1
