@@ -500,6 +500,12 @@ def world(tmp_path_factory):
     return data, robot
 
 
+@pytest.fixture(scope="module")
+def shared():
+    """Results of trainings that do not depend on the network, such as baselines."""
+    return {}
+
+
 @pytest.mark.parametrize(
     "how",
     [
@@ -518,23 +524,23 @@ def world(tmp_path_factory):
     ],
 )
 def test_it_trains_by_ppo_alone_and_a_resumed_run_equals_one_that_was_not_stopped(
-    world, tmp_path, how
+    world, shared, tmp_path, how
 ):
     config = replace(TRAINING, model=replace(PAPER, **how)).paper_recipe()
     update = 8 * 8 * config.model.delta_hold
     run = tmp_path / "whole"
-    model = Trainer(*world, run, config, Budget(steps=4 * update)).run()
+    model = Trainer(*world, run, config, Budget(steps=4 * update), shared=shared).run()
     assert (
         GapModel.how_trained(model.card)
         == "4 updates of PPO from the untrained network, no supervised pre-training"
     )
     assert model.card["steps"] == 4 * update
-    Trainer(*world, tmp_path / "parts", config, Budget(steps=2 * update)).run()
-    Trainer(*world, tmp_path / "parts", config, Budget(steps=4 * update), resume=True).run()
-    whole, parts = (
-        torch.load(r / "checkpoint.pt", weights_only=True)["net"] for r in (run, tmp_path / "parts")
-    )
-    assert all(torch.equal(x, parts[name]) for name, x in whole.items())
+    parts = tmp_path / "parts"
+    Trainer(*world, parts, config, Budget(steps=2 * update), shared=shared).run()
+    Trainer(*world, parts, config, Budget(steps=4 * update), resume=True, shared=shared).run()
+    whole = torch.load(run / "checkpoint.pt", weights_only=True)["net"]
+    resumed = torch.load(parts / "checkpoint.pt", weights_only=True)["net"]
+    assert all(torch.equal(x, resumed[name]) for name, x in whole.items())
     untrained = build_network(config.model, 2)
     assert whole.keys() == untrained.state_dict().keys()
 

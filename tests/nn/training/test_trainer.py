@@ -51,10 +51,17 @@ def robot(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def trained(robot, tmp_path_factory):
+def shared():
+    """Results of trainings on `trained`'s recordings that do not depend on the network."""
+    return {}
+
+
+@pytest.fixture(scope="module")
+def trained(robot, shared, tmp_path_factory):
     place = tmp_path_factory.mktemp("trained")
     data = dataset(place / "data", robot, kp=0.5, delay=2)
-    return data, place / "run", Trainer(data, robot, place / "run", SMALL, STEPS).run()
+    run = place / "run"
+    return data, run, Trainer(data, robot, run, SMALL, STEPS, shared=shared).run()
 
 
 def test_a_trained_operator_beats_the_nominal_simulator_on_unseen_motions(trained, robot):
@@ -90,10 +97,12 @@ def test_a_run_takes_its_parts_from_a_split_file(trained, robot, tmp_path):
         Trainer(data, robot, tmp_path / "other", replace(config, train_share=0.5), STEPS)
 
 
-def test_a_plain_network_trains_and_is_evaluated_beside_the_operator(trained, robot, tmp_path):
+def test_a_plain_network_trains_and_is_evaluated_beside_the_operator(
+    trained, shared, robot, tmp_path
+):
     data, run, _ = trained
     config = replace(SMALL, model=replace(SMALL.model, kind="mlp", mlp_hidden=(64,)))
-    model = Trainer(data, robot, tmp_path / "run", config, STEPS).run()
+    model = Trainer(data, robot, tmp_path / "run", config, STEPS, shared=shared).run()
     stages = {line["stage"] for line in progress(tmp_path / "run")}
     assert stages - {"gain"} == {"start", "pretraining", "ppo"}
     assert model.card["val_mpjae"]["model"] < 0.95 * model.card["val_mpjae"]["nominal"]
@@ -103,12 +112,12 @@ def test_a_plain_network_trains_and_is_evaluated_beside_the_operator(trained, ro
 
 
 def test_trees_train_without_ppo_and_are_exported_like_networks(
-    trained, robot, tmp_path, monkeypatch
+    trained, shared, robot, tmp_path, monkeypatch
 ):
     pytest.importorskip("sklearn")
     monkeypatch.setattr("gaponet.nn.trees.TREES", 4)
     config = replace(SMALL, model=replace(SMALL.model, kind="trees"))
-    model = Trainer(trained[0], robot, tmp_path / "run", config, STEPS).run()
+    model = Trainer(trained[0], robot, tmp_path / "run", config, STEPS, shared=shared).run()
     assert GapModel.how_trained(model.card) == "supervised pre-training (3 rounds), no PPO"
     assert model.card["val_mpjae"]["model"] < 0.95 * model.card["val_mpjae"]["nominal"]
     assert "trees" in evaluate([tmp_path / "run"], trained[0], robot).result["methods"]
@@ -162,14 +171,15 @@ def test_threads_reach_every_simulation(robot, tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("sensors", ["predicted", "off"])
 def test_ppo_alone_has_statistics_of_its_inputs_and_a_fitted_predictor(
-    sensors, trained, robot, tmp_path
+    sensors, trained, shared, robot, tmp_path
 ):
     config = replace(
         SMALL,
         pretraining=replace(SMALL.pretraining, rounds=0),
         model=replace(SMALL.model, sensors=sensors),
     )
-    trainer = Trainer(trained[0], robot, tmp_path / "run", config, Budget(steps=16 * 16))
+    budget = Budget(steps=16 * 16)
+    trainer = Trainer(trained[0], robot, tmp_path / "run", config, budget, shared=shared)
     model = trainer.run()
     assert trainer.net.features.standardise.std.min() < 0.9
     assert (trainer.progress.state.sensor_r2 is None) == (sensors == "off")
@@ -178,7 +188,7 @@ def test_ppo_alone_has_statistics_of_its_inputs_and_a_fitted_predictor(
 
 
 def test_the_gain_is_halved_if_that_reduces_the_validation_error(
-    tmp_path, robot, trained, monkeypatch
+    tmp_path, robot, trained, shared, monkeypatch
 ):
     # Nominal 0.5; the fitted network 0.6 as it is and 0.4 at half.
     def error(validator, net, robot=None):
@@ -187,13 +197,13 @@ def test_the_gain_is_halved_if_that_reduces_the_validation_error(
         return np.full(len(validator.sequences), mean)
 
     monkeypatch.setattr(Validator, "errors", error)
-    model = Trainer(trained[0], robot, tmp_path / "run", SMALL, STEPS).run()
+    model = Trainer(trained[0], robot, tmp_path / "run", SMALL, STEPS, shared=shared).run()
     assert model.card["gain"] == 0.5
     assert model.card["val_mpjae"]["model"] == pytest.approx(0.4)
 
 
 def test_ppo_starts_untrained_if_pretraining_increases_the_error(
-    tmp_path, robot, trained, monkeypatch
+    tmp_path, robot, trained, shared, monkeypatch
 ):
     seen = []
 
@@ -210,7 +220,7 @@ def test_ppo_starts_untrained_if_pretraining_increases_the_error(
         validate_every=1,
         ppo=replace(SMALL.ppo, critic_warmup=3),
     )
-    trainer = Trainer(trained[0], robot, tmp_path / "run", config, STEPS)
+    trainer = Trainer(trained[0], robot, tmp_path / "run", config, STEPS, shared=shared)
     model = trainer.run()
     rounds = [s for s in seen if s[0] == "pretraining"]
     updates = [s for s in seen if s[0] == "ppo"]
