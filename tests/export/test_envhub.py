@@ -65,7 +65,7 @@ def test_robots_are_stepped_by_targets_in_degrees_and_come_near(hub):
 def test_an_episode_ends_in_success_at_the_goal_and_without_it_after_its_time(hub):
     env = hub.RobotEnv()
     env.reset(seed=3)
-    env._goal = env.robot.home
+    env.goal = env.robot.home
     outcomes = [env.step(env.values.of(env.robot.home)) for _ in range(hub.HELD_PERIODS)]
     assert [terminated for _, _, terminated, _, _ in outcomes].count(True) == 1
     assert outcomes[-1][-1]["is_success"]

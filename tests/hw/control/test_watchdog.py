@@ -185,7 +185,7 @@ class LooseRobot:
 
 def test_what_fails_is_tried_again_until_the_robot_is_damped(monkeypatch, capsys):
     robot = LooseRobot(monkeypatch, damp=(2, 3), confirm=(1, 2))
-    watchdog._damp(robot, 0.1, 0.5)
+    watchdog.damp_robot(robot, 0.1, 0.5)
     assert (robot.counts["confirm"], robot.counts["close"]) == (3, 1)
     weights = [values[0] for name, *values in robot.calls if name == "damp"]
     assert weights[0] == 0.5
@@ -198,7 +198,7 @@ def test_what_fails_is_tried_again_until_the_robot_is_damped(monkeypatch, capsys
 
 def test_a_watchdog_gives_up_after_ten_minutes_and_not_before(monkeypatch, capsys):
     robot = LooseRobot(monkeypatch, confirm=None)
-    watchdog._damp(robot, 2.0, 1.0)
+    watchdog.damp_robot(robot, 2.0, 1.0)
     assert 600 < robot.now < 601
     assert robot.counts["close"] == 1
     assert "gave up after 600 s; switch the supply off" in capsys.readouterr().err

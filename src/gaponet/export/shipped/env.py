@@ -175,7 +175,7 @@ class RobotEnv(gymnasium.Env[Any, Any]):
         self._max_episode_steps = round(EPISODE_S / facts["dt"])
         names = list(facts["joints"])
         self._operated = [names.index(name) for name in facts["corrected"]]
-        self._goal = self.robot.home
+        self.goal = self.robot.home
         self._periods = 0
         self._held = 0
         box = partial(gymnasium.spaces.Box, dtype=np.float32)
@@ -201,14 +201,14 @@ class RobotEnv(gymnasium.Env[Any, Any]):
         goal = self.robot.home.copy()
         away = self.np_random.uniform(-MAX_GOAL_RAD, MAX_GOAL_RAD, len(self._operated))
         goal[self._operated] += away
-        self._goal = np.clip(goal, self.values.low, self.values.high)
+        self.goal = np.clip(goal, self.values.low, self.values.high)
         self._periods = 0
         self._held = 0
         return self._observation(), {"is_success": False}
 
     def step(self, action: np.ndarray) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
         self.robot.step(self.values.in_rad(action))
-        away = np.abs(self.robot.qpos - self._goal)[self._operated]
+        away = np.abs(self.robot.qpos - self.goal)[self._operated]
         self._held = self._held + 1 if away.max() < NEAR_RAD else 0
         self._periods += 1
         reached = self._held >= HELD_PERIODS
@@ -226,7 +226,7 @@ class RobotEnv(gymnasium.Env[Any, Any]):
     def _observation(self) -> dict[str, Any]:
         seen = {
             "agent_pos": self.values.of(self.robot.qpos),
-            "environment_state": self.values.of(self._goal),
+            "environment_state": self.values.of(self.goal),
         }
         if self.pixels:
             seen["pixels"] = self.render()

@@ -168,7 +168,7 @@ def main(spec: dict[str, Any]) -> None:
     _send(FIRED)
     why = "ended" if readable else f"was silent for {timeout * 1e3:.0f} ms"
     print(f"watchdog: the controller {why}; damping {driver.address}", file=sys.stderr, flush=True)
-    _damp(driver, damp, weight)
+    damp_robot(driver, damp, weight)
 
 
 def _send(word: bytes) -> None:
@@ -176,7 +176,7 @@ def _send(word: bytes) -> None:
         os.write(1, word)
 
 
-def _damp(driver: Driver, seconds: float, weight: float) -> None:
+def damp_robot(driver: Driver, seconds: float, weight: float) -> None:
     """Damp for some seconds from the first success on, and until the robot confirms it.
 
     Retry what fails.
