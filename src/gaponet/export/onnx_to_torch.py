@@ -5,6 +5,7 @@ It knows the operators that nn/onnx_export.py writes, and no others.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -60,7 +61,7 @@ def _slice(inputs: list[Any], attributes: Attributes) -> Tensor:
 
 def _flatten(inputs: list[Any], attributes: Attributes) -> Tensor:
     axis = attributes.get("axis", 1)
-    width = int(np.prod(inputs[0].shape[axis:]))
+    width = math.prod(inputs[0].shape[axis:])
     result: Tensor = inputs[0].reshape(-1, width)
     return result
 
