@@ -107,8 +107,8 @@ def fit_torque_driven(
     windows = sum(len(_starts(s)) for s in judging)
     if windows == 0:
         raise UsageError(
-            f"a fit from torque is judged on motions of more than {HORIZONS_S[-1]:g} s, and none of "
-            "the validation recordings is that long; record longer motions"
+            f"a fit from torque is judged on motions of more than {HORIZONS_S[-1]:g} s, and no "
+            "validation recording is that long; record longer motions"
         )
     joints = _fit_joints([_rows(s, robot) for s in train], robot.operated, constant)
     fitted = robot.with_identified(joints.servos)
