@@ -9,6 +9,7 @@ import os
 import signal
 import time
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -104,6 +105,15 @@ def test_its_recording_can_be_imported_and_trained_on(arm, tmp_path):
     np.testing.assert_allclose(
         [stored.ctrl, stored.qpos], [sequence.ctrl, sequence.qpos], atol=1e-6
     )
+
+
+def test_a_second_recording_of_a_name_does_not_replace_the_first(arm, tmp_path):
+    recording = run(NotedArm(arm))
+    first = recording.save(tmp_path / "logs", "sway")
+    second = recording.save(tmp_path / "logs", "sway")
+    third = recording.save(tmp_path / "logs", "sway")
+    names = [Path(file).stem for file in (first, second, third)]
+    assert names == ["sway", "sway-2", "sway-3"]
 
 
 @pytest.mark.parametrize(

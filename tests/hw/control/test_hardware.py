@@ -166,6 +166,24 @@ def test_a_driver_writes_no_command_outside_its_robots_range(h1_2):
             driver.write(ctrl)
 
 
+def test_a_robot_with_other_joints_than_the_known_one_is_refused(h1_2):
+    with pytest.raises(RobotError, match="joints"):
+        hardware_robot(load_robot("so101"), h1_2)
+
+
+@pytest.mark.parametrize("name", ["kp", "kd"])
+def test_a_driver_refuses_gains_above_those_of_the_known_robot(h1_2, name):
+    stiffer = h1_2.with_servo(**{name: h1_2.servo[name] * 1.5})
+    with pytest.raises(RobotError, match=name):
+        UnitreeDriver(stiffer)
+
+
+def test_a_driver_refuses_a_wider_range_than_that_of_the_known_robot(h1_2, tmp_path):
+    folder = tampered(h1_2, tmp_path / "sent", "robot.xml", r'range="[^"]*"', 'range="-9 9"')
+    with pytest.raises(RobotError, match="range"):
+        UnitreeDriver(load_robot(folder))
+
+
 def shifted(robot: RobotSpec, joint: str, by: float) -> SimpleNamespace:
     """A compensator that commands a joint away from its target."""
     shift = np.where(np.array(robot.joint_names) == joint, by, 0.0)

@@ -16,6 +16,7 @@ from gaponet.hw.control.phases import (
     TRANSITIONS,
     Action,
     Phase,
+    PhaseMachine,
     Trigger,
 )
 
@@ -64,6 +65,20 @@ def test_a_fault_in_any_phase_ends_damped_or_in_silence_and_sends_no_position(ph
         )
     else:
         assert (following, action) == (Phase.DAMP, Action.DAMP)
+
+
+def test_an_event_that_cannot_happen_in_a_phase_is_an_error_and_changes_nothing():
+    impossible = [
+        trigger
+        for trigger in Trigger
+        if TRANSITION_TABLE[Phase.CONNECT, trigger][1] is Action.RAISE
+    ]
+    machine = PhaseMachine()
+    for trigger in impossible:
+        with pytest.raises(AssertionError, match=trigger.name):
+            machine.fire(trigger, period=3)
+    assert impossible
+    assert machine.phase is Phase.CONNECT
 
 
 def test_the_page_has_the_same_table():

@@ -21,7 +21,7 @@ from gaponet.hw.control.driver import DriverError
 from gaponet.hw.drivers import feetech as reg
 from gaponet.hw.drivers.so101 import FULL_TORQUE, SO101Driver
 from gaponet.hw.drivers.so101_calibration import JOINTS, STEP_RAD, read_calibration
-from gaponet.robot.spec import RobotSpec
+from gaponet.robot.spec import RobotSpec, load_robot
 from gaponet.virtual.fleet import load_fleet
 from gaponet.virtual.so101_virtual import PERIOD, VirtualSO101
 
@@ -115,6 +115,11 @@ def test_servos_that_it_cannot_command_are_refused_and_nothing_is_written(
     with pytest.raises(DriverError, match=complaint):
         SO101Driver(so101, timeout=SILENCE).connect()
     assert set(instructions(servos)) == {reg.SYNC_READ}
+
+
+def test_a_robot_with_other_joints_is_refused():
+    with pytest.raises(UsageError, match="gripper"):
+        SO101Driver(load_robot("h1_2"))
 
 
 def test_a_port_that_is_not_there_is_said(so101):
