@@ -15,7 +15,6 @@ from gaponet.api.opening import test_motions
 from gaponet.api.options import CollectOptions
 from gaponet.api.paper import DEMO, paper_experiment
 from gaponet.api.results import GapResult
-from gaponet.api.share import public_recordings
 from gaponet.api.start import Step, measure_error, steps_from_logs
 from gaponet.base.errors import UsageError
 from gaponet.base.installation import install_command
@@ -62,6 +61,8 @@ def demo(out: Path = Path("demo_run"), real: Flag = False, json: Json = False) -
 
 def identify_real_arm(screen: Out, out: Path) -> dict[str, object]:
     """Identify the SO-101 of the public recordings; return errors and places for --json."""
+    from gaponet.api.share import public_recordings  # it imports MuJoCo, which is too early above
+
     began = time.monotonic()
     with progress_bar("fetching") as update:
         logs, origin = public_recordings(update)
