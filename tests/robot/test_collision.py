@@ -26,7 +26,8 @@ def test_segment_distance_is_the_minimum_over_pairs_of_points():
     s = np.linspace(0, 1, 201)[:, None]
     for _ in range(20):
         a0, a1, b0, b1 = rng.normal(size=(4, 3))
-        a, b = a0 + s * (a1 - a0), b0 + s * (b1 - b0)
+        a = a0 + s * (a1 - a0)
+        b = b0 + s * (b1 - b0)
         brute = np.linalg.norm(a[:, None] - b[None], axis=-1).min()
         assert brute - 0.02 <= distance((a0, a1), (b0, b1)) <= brute + 1e-9
 
@@ -51,7 +52,8 @@ def test_hanging_arms_are_free_and_folded_ones_collide(h1):
 
 def test_left_and_right_shapes_are_mirrored(h1):
     robot, collision = h1
-    left, right = robot.qpos_home.copy(), robot.qpos_home.copy()
+    left = robot.qpos_home.copy()
+    right = robot.qpos_home.copy()
     left[robot.index(["left_shoulder_roll_joint"])] = -0.3
     right[robot.index(["right_shoulder_roll_joint"])] = 0.3
     a, b = collision.distance(np.stack([left, right]))
@@ -92,7 +94,8 @@ def test_packaged_robots_are_free_at_home_and_have_a_plane(name):
 
 
 def test_distances_agree_with_contacts_of_mujoco(so101):
-    collision, judge = Collision(so101, build_model(so101)), Contacts(so101)
+    collision = Collision(so101, build_model(so101))
+    judge = Contacts(so101)
     postures = np.random.default_rng(0).uniform(*so101.qpos_range.T, (300, 6))
     touching = np.array([judge.deepest(q)[0] > 0 for q in postures])
     free = collision.distance(postures)

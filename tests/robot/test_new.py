@@ -44,11 +44,14 @@ def furthest(made: NewRobot) -> tuple[float, float]:
     """Largest difference of gravity (N·m) and inertia (kg·m²) at kept joints over 50 postures,
     other joints at home.
     """
-    ours, theirs = build_model(made.robot), made.vendor
-    a, b = mujoco.MjData(ours), mujoco.MjData(theirs)
+    ours = build_model(made.robot)
+    theirs = made.vendor
+    a = mujoco.MjData(ours)
+    b = mujoco.MjData(theirs)
     places = np.array([theirs.joint(name).qposadr[0] for name in made.robot.joint_names])
     dofs = np.array([theirs.joint(name).dofadr[0] for name in made.robot.joint_names])
-    rng, worst = np.random.default_rng(0), np.zeros(2)
+    rng = np.random.default_rng(0)
+    worst = np.zeros(2)
     for _ in range(50):
         a.qpos[:] = rng.uniform(*np.clip(made.robot.qpos_range.T, -3, 3))
         b.qpos[:] = made.pose
@@ -74,11 +77,15 @@ def test_unlogged_joints_are_fixed_and_gravity_and_inertia_are_unchanged(tmp_pat
 
 
 def test_notes_name_coupled_joints_and_a_free_base(tmp_path):
-    body = '<body><joint name="{0}" axis="1 0 0" range="-1 1"/><geom type="sphere" size=".02" pos="0 0 .1"/>{1}</body>'
+    body = (
+        '<body><joint name="{0}" axis="1 0 0" range="-1 1"/>'
+        '<geom type="sphere" size=".02" pos="0 0 .1"/>{1}</body>'
+    )
+    thumb = body.format("thumb", body.format("tip", ""))
     file = tmp_path / "fingers.xml"
     file.write_text(
-        f'<mujoco><worldbody><body><freejoint/><geom size=".1"/>{body.format("thumb", body.format("tip", ""))}</body>'
-        '</worldbody><equality><joint joint1="tip" joint2="thumb" polycoef="0 1 0.3 0 0"/></equality>'
+        f'<mujoco><worldbody><body><freejoint/><geom size=".1"/>{thumb}</body></worldbody>'
+        '<equality><joint joint1="tip" joint2="thumb" polycoef="0 1 0.3 0 0"/></equality>'
         '<actuator><position joint="thumb" kp="2"/></actuator></mujoco>'
     )
     notes = make(tmp_path, file).notes
@@ -102,28 +109,36 @@ def test_the_folder_names_no_file_and_no_dropped_element(tmp_path):
     assert not any(g.contype or g.conaffinity for g in spec.geoms)
 
 
-def test_gains_and_limits_come_from_actuators_with_their_gears_and_sources(tmp_path):
-    made = make(tmp_path, kp=("hip=200", "roll=3"), kd=("hip=9", "roll=0.2"))
-    joints = written(made)
+OF_TWO_JOINTS = {"kp": ("hip=200", "roll=3"), "kd": ("hip=9", "roll=0.2")}
+
+
+def test_gains_and_limits_come_from_actuators_with_their_gears(tmp_path):
+    joints = written(make(tmp_path, **OF_TWO_JOINTS))
     assert joints["shoulder"]["kp"] == 60.0
     assert joints["shoulder"]["kd"] > 1.0  # dampratio
     assert joints["shoulder"]["effort_limit"] == 9.0
-    assert (joints["elbow"]["kp"], joints["elbow"]["kd"]) == (40.0, 2.0)  # gear 2, twice
-    assert (
-        joints["elbow"]["effort_limit"] == 6.0
-    )  # actuatorfrcrange, before forcerange times gear, 8
+    assert joints["elbow"]["kp"] == 40.0  # gear 2, twice
+    assert joints["elbow"]["kd"] == 2.0
+    # actuatorfrcrange, before forcerange times gear, 8
+    assert joints["elbow"]["effort_limit"] == 6.0
     assert joints["roll"]["effort_limit"] == 1.5  # ctrlrange of a motor, times gear
     assert joints["shoulder"]["aliases"] == ["shoulder_servo"]
-    text = (made.robot.folder / "robot.toml").read_text(encoding="utf-8")
-    for source in (
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
         "its actuator in vendor.xml",
         "actuatorfrcrange (in a URDF, effort) in vendor.xml",
         "# N·m/rad: --kp",
         'keyframe "home"',
         "a guess: tcp",
         "vendor.xml has 0.004",
-    ):
-        assert source in text
+    ],
+)
+def test_robot_toml_names_the_source_of_a_number(tmp_path, source):
+    made = make(tmp_path, **OF_TWO_JOINTS)
+    assert source in (made.robot.folder / "robot.toml").read_text(encoding="utf-8")
 
 
 def test_made_robots_pass_the_check_at_the_model_s_own_step(tmp_path):
@@ -184,9 +199,11 @@ def test_a_urdf_in_its_package_becomes_a_robot(tmp_path):
     )
 
 
-LINK = """<link name="{0}"><inertial><mass value="{1}"/><inertia ixx="{2}" iyy="{2}" izz="{2}" ixy="0" ixz="0" iyz="0"/>
+LINK = """<link name="{0}"><inertial><mass value="{1}"/>
+<inertia ixx="{2}" iyy="{2}" izz="{2}" ixy="0" ixz="0" iyz="0"/>
 </inertial>{3}</link>"""
-TURN = """<joint name="{0}" type="revolute"><parent link="{1}"/><child link="{2}"/><axis xyz="0 1 0"/>
+TURN = """<joint name="{0}" type="revolute"><parent link="{1}"/><child link="{2}"/>
+<axis xyz="0 1 0"/>
 <limit lower="-1" upper="1" effort="5" velocity="1"/></joint>"""
 
 
@@ -318,7 +335,8 @@ def test_a_named_servo_type_fills_damping_friction_armature_and_torque_limit(tmp
         tmp_path, joints=ARM, servo=("STS3215", "roll=XL330-M288-T"), effort_limit=("elbow=1",)
     )
     for joint, name in (("shoulder", "STS3215"), ("elbow", "STS3215"), ("roll", "XL330-M288-T")):
-        servo, spec = servo_type(name, ""), read_mjcf(made.robot.mjcf).joint(joint)
+        servo = servo_type(name, "")
+        spec = read_mjcf(made.robot.mjcf).joint(joint)
         for field in ("damping", "frictionloss", "armature"):
             assert np.ravel(getattr(spec, field))[0] == pytest.approx(servo.measured[field].value)
         assert written(made)[joint]["servo"] == name
@@ -333,10 +351,12 @@ def test_a_named_servo_type_fills_damping_friction_armature_and_torque_limit(tmp
 
 
 MIMIC = """<robot name="hand"><link name="base"><inertial><mass value="1"/>
-<inertia ixx="0.01" iyy="0.01" izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial></link>{joints}</robot>"""
+<inertia ixx="0.01" iyy="0.01" izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial></link>
+{joints}</robot>"""
 FINGER = """<link name="{name}_link"><inertial><origin xyz="0.05 0 0"/><mass value="0.05"/>
 <inertia ixx="1e-4" iyy="1e-4" izz="1e-4" ixy="0" ixz="0" iyz="0"/></inertial></link>
-<joint name="{name}" type="revolute"><parent link="base"/><child link="{name}_link"/><axis xyz="0 0 1"/>
+<joint name="{name}" type="revolute"><parent link="base"/><child link="{name}_link"/>
+<axis xyz="0 0 1"/>
 <limit lower="-1.5" upper="1.5" effort="5" velocity="2"/>{mimic}</joint>"""
 
 
@@ -347,7 +367,8 @@ def test_a_mimic_joint_follows_without_a_motor(tmp_path, ratio, at_zero):
     (tmp_path / "hand.urdf").write_text(MIMIC.format(joints=joints))
     robot = make(tmp_path, tmp_path / "hand.urdf").robot
     assert robot.operated == ("drive",)
-    led, drive = robot.index(["led"])[0], robot.index(["drive"])[0]
+    led = robot.index(["led"])[0]
+    drive = robot.index(["drive"])[0]
     assert robot.servo.kp[led] == 0
     model = build_model(robot)
     data = mujoco.MjData(model)

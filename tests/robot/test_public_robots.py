@@ -10,18 +10,18 @@ from gaponet.robot.spec import load_robot
 from gaponet.sim.model import build_model
 
 # Root mean square of gravity's torque (N·m) and mean inertia without armature (kg·m²) at each joint
-# over 100 postures
-# drawn by numpy's default_rng(0) within the ranges: MuJoCo on Unitree's URDF g1_29dof_rev_1_0, as
-# example-robot-data
-# 6.0.0 has it. robot.xml was written from the MJCF of that name.
+# over 100 postures drawn by numpy's default_rng(0) within the ranges: MuJoCo on Unitree's URDF
+# g1_29dof_rev_1_0, as example-robot-data 6.0.0 has it. robot.xml was written from the MJCF of that
+# name.
 G1_GRAVITY = [
-    9.406, 6.286, 3.734, 2.505, 0.1215, 0.05997, 9.738, 6.314, 4.048, 2.416, 0.1315, 0.06246, 0.0, 9.927, 9.94, 2.569,
-    3.057, 0.9575, 0.9767, 0.1686, 0.1925, 0.1029, 2.471, 2.758, 0.877, 0.9925, 0.1584, 0.2108, 0.09575,
+    9.406, 6.286, 3.734, 2.505, 0.1215, 0.05997, 9.738, 6.314, 4.048, 2.416, 0.1315, 0.06246, 0.0,
+    9.927, 9.94, 2.569, 3.057, 0.9575, 0.9767, 0.1686, 0.1925, 0.1029, 2.471, 2.758, 0.877, 0.9925,
+    0.1584, 0.2108, 0.09575,
 ]  # fmt: skip
 G1_INERTIA = [
-    0.4017, 0.5549, 0.124, 0.1125, 0.002771, 0.0003871, 0.3786, 0.5407, 0.1377, 0.1125, 0.00277, 0.0003871, 0.5091,
-    1.134, 0.9802, 0.066, 0.1212, 0.02031, 0.02647, 0.00286, 0.003131, 0.001837, 0.07104, 0.1189, 0.01997, 0.0277,
-    0.002657, 0.003438, 0.001837,
+    0.4017, 0.5549, 0.124, 0.1125, 0.002771, 0.0003871, 0.3786, 0.5407, 0.1377, 0.1125, 0.00277,
+    0.0003871, 0.5091, 1.134, 0.9802, 0.066, 0.1212, 0.02031, 0.02647, 0.00286, 0.003131, 0.001837,
+    0.07104, 0.1189, 0.01997, 0.0277, 0.002657, 0.003438, 0.001837,
 ]  # fmt: skip
 # Of the moving links, kg: google-deepmind/mujoco_menagerie, franka_fr3/fr3.xml and
 # universal_robots_ur10e/ur10e.xml.
@@ -46,8 +46,10 @@ def test_g1_has_the_gravity_and_inertia_of_unitrees_urdf():
     robot = load_robot("g1_29")
     model = build_model(robot)
     model.dof_armature[:] = 0
-    data, rng = mujoco.MjData(model), np.random.default_rng(0)
-    gravity, inertia = [], []
+    data = mujoco.MjData(model)
+    rng = np.random.default_rng(0)
+    gravity = []
+    inertia = []
     for _ in range(100):
         data.qpos[:] = rng.uniform(*robot.qpos_range.T)
         mujoco.mj_forward(model, data)
@@ -83,13 +85,35 @@ def test_gravity_of_a_stretched_ur10e_follows_from_its_links():
     np.testing.assert_allclose(np.abs(data.qfrc_bias[1:3]), [shoulder, elbow], rtol=0.01)
 
 
+WAIST = ("WaistYaw", "WaistRoll", "WaistPitch")
+ONLY_LARGE = (
+    "waist_roll_joint",
+    "waist_pitch_joint",
+    "left_wrist_pitch_joint",
+    "left_wrist_yaw_joint",
+    "right_wrist_pitch_joint",
+    "right_wrist_yaw_joint",
+)
+
+
+def of_side(side, names):
+    return [f"{side}{name}" for name in names]
+
+
 def test_joints_of_g1_have_the_order_of_the_sdk():
-    names = [*(f"Left{x}" for x in LEG), *(f"Right{x}" for x in LEG), "WaistYaw", "WaistRoll", "WaistPitch",
-             *(f"Left{x}" for x in ARM), *(f"Right{x}" for x in ARM)]  # fmt: skip
-    large, small = load_robot("g1_29"), load_robot("g1_23")
-    assert [large.resolve(name, "sdk") for name in names] == list(large.joint_names)
-    gone = {"waist_roll_joint", "waist_pitch_joint", *(f"{side}_wrist_{axis}_joint" for side in ("left", "right")
-                                                     for axis in ("pitch", "yaw"))}  # fmt: skip
-    assert small.joint_names == tuple(name for name in large.joint_names if name not in gone)
-    assert len(large.operated) == 17
-    assert len(small.operated) == 11
+    legs = of_side("Left", LEG) + of_side("Right", LEG)
+    arms = of_side("Left", ARM) + of_side("Right", ARM)
+    large = load_robot("g1_29")
+    names = [large.resolve(name, "sdk") for name in (*legs, *WAIST, *arms)]
+    assert names == list(large.joint_names)
+
+
+def test_the_small_g1_has_the_joints_of_the_large_one_but_six():
+    small = load_robot("g1_23").joint_names
+    large = load_robot("g1_29").joint_names
+    assert small == tuple(name for name in large if name not in ONLY_LARGE)
+
+
+@pytest.mark.parametrize(("name", "count"), [("g1_29", 17), ("g1_23", 11)])
+def test_all_joints_of_g1_above_the_legs_are_operated(name, count):
+    assert len(load_robot(name).operated) == count

@@ -51,7 +51,10 @@ def test_a_copy_of_the_copy_is_identical(tmp_path):
 
 
 def test_numbers_beyond_the_precision_of_one_file_are_refused(tmp_path):
-    tendon = '<tendon><fixed name="t" stiffness="1.23456789"><joint joint="elbow" coef="1"/></fixed></tendon></mujoco>'
+    tendon = (
+        '<tendon><fixed name="t" stiffness="1.23456789">'
+        '<joint joint="elbow" coef="1"/></fixed></tendon></mujoco>'
+    )
     robot = write_files_arm(tmp_path / "arm", xml=XML.replace("</mujoco>", tendon))
     with pytest.raises(RobotError, match="fit"):
         save_robot(robot, tmp_path / "kept")
