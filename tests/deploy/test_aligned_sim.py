@@ -26,19 +26,23 @@ def model(robot, tmp_path_factory):
     return small_model(robot, run / "model")
 
 
+def stacked(sequences, name, t):
+    """A field of all sequences at one time, (sequences, joints)."""
+    return np.stack([getattr(s, name)[t] for s in sequences])
+
+
 def test_it_is_the_replay_with_the_corrector(robot, model):
     sequences = recordings(robot, 3, rows=40, kp=0.7)
     replays = replay(sequences, robot, model.corrector(robot))
-    sim = AlignedSim(robot, model, np.array([s.meta.payload_mass for s in sequences]), num_envs=3)
-    sim.reset(*(np.stack([getattr(s, name)[0] for s in sequences]) for name in ("qpos", "qvel")))
+    payloads = np.array([s.meta.payload_mass for s in sequences])
+    sim = AlignedSim(robot, model, payloads, num_envs=3)
+    sim.reset(stacked(sequences, "qpos", 0), stacked(sequences, "qvel", 0))
     for t in range(39):
-        sim.step(np.stack([s.ctrl[t] for s in sequences]))
-        np.testing.assert_allclose(
-            sim.delta,
-            np.stack([w.ctrl[t] - s.ctrl[t] for w, s in zip(replays, sequences, strict=True)]),
-            atol=1e-6,
-        )
-        np.testing.assert_allclose(sim.qpos, np.stack([w.qpos[t + 1] for w in replays]), atol=1e-6)
+        target = stacked(sequences, "ctrl", t)
+        sim.step(target)
+        corrected = stacked(replays, "ctrl", t)
+        np.testing.assert_allclose(sim.delta, corrected - target, atol=1e-6)
+        np.testing.assert_allclose(sim.qpos, stacked(replays, "qpos", t + 1), atol=1e-6)
     assert np.abs(sim.delta).max() > 1e-3
 
 
@@ -53,7 +57,8 @@ def test_without_a_model_it_is_the_nominal_simulator(robot):
 
 
 def test_one_simulation_takes_flat_arrays(robot, model):
-    one, two = AlignedSim(robot, model, 0.2), AlignedSim(robot, model, 0.2, num_envs=2)
+    one = AlignedSim(robot, model, 0.2)
+    two = AlignedSim(robot, model, 0.2, num_envs=2)
     for target in commands(20, 0):
         one.step(target)
         two.step(np.stack([target, target]))
@@ -62,7 +67,8 @@ def test_one_simulation_takes_flat_arrays(robot, model):
 
 
 def test_one_of_several_simulations_can_be_reset(robot, model):
-    sim, fresh = AlignedSim(robot, model, num_envs=2), AlignedSim(robot, model)
+    sim = AlignedSim(robot, model, num_envs=2)
+    fresh = AlignedSim(robot, model)
     for target in commands(15, 0):
         sim.step(target)
     sim.reset(np.array([[0.1, -0.1]]), ids=np.array([1]))
@@ -87,11 +93,9 @@ def test_late_servos_follow_the_target_in_force_at_the_start(robot, tmp_path):
 
 def test_a_users_mujoco_loop_is_aligned_by_one_call_per_period(robot, model):
     mj_model = build_model(robot, 0.2)
-    data, align, sim = (
-        mujoco.MjData(mj_model),
-        MujocoAligner(model, mj_model, dt=0.02, payload_mass=0.2),
-        AlignedSim(robot, model, 0.2),
-    )
+    data = mujoco.MjData(mj_model)
+    align = MujocoAligner(model, mj_model, dt=0.02, payload_mass=0.2)
+    sim = AlignedSim(robot, model, 0.2)
     for _ in range(2):
         mujoco.mj_resetData(mj_model, data)
         align.reset()
@@ -106,10 +110,8 @@ def test_a_users_mujoco_loop_is_aligned_by_one_call_per_period(robot, model):
 def test_other_rates_simulators_and_locked_joints_are_refused(robot, model, tmp_path):
     with pytest.raises(ModelError, match=r"40\.0"):
         AlignedSim(robot, model, dt=0.025)
-    bare, other = (
-        small_model(robot, tmp_path / "model"),
-        write_arm(tmp_path, TOML.replace("kp = 20.0", "kp = 21.0")),
-    )
+    bare = small_model(robot, tmp_path / "model")
+    other = write_arm(tmp_path, TOML.replace("kp = 20.0", "kp = 21.0"))
     with pytest.raises(ModelError, match="beside"):
         AlignedSim(other, bare)
     with pytest.raises(UsageError, match="locked"):
@@ -136,12 +138,11 @@ def test_a_scene_moves_like_an_identified_robot_without_a_model(robot):
     law = {"kp": 15.0, "frictionloss": 0.05, "stribeck": 0.05, "stribeck_speed": 0.1}
     known = robot.with_identified(dict.fromkeys(robot.joint_names, law))
     mj_model = build_model(robot, 0.2)
-    data, align, sim = (
-        mujoco.MjData(mj_model),
-        MujocoAligner(known, mj_model, dt=0.02, payload_mass=0.2),
-        AlignedSim(known, None, 0.2),
-    )
-    plain, apart = AlignedSim(robot, None, 0.2), []
+    data = mujoco.MjData(mj_model)
+    align = MujocoAligner(known, mj_model, dt=0.02, payload_mass=0.2)
+    sim = AlignedSim(known, None, 0.2)
+    plain = AlignedSim(robot, None, 0.2)
+    apart = []
     for target in commands(60, 3):
         data.ctrl[:] = align(data, target)
         mujoco.mj_step(mj_model, data, robot.decimation)

@@ -28,7 +28,9 @@ class WeakArm:
     def __init__(self, robot, payload=0.0, late=0, lost=0.0, seed=0):
         weak = robot.with_servo(kp=WEAK * robot.servo.kp)
         self.sim = BatchSim(weak, [(m, "both", robot.dt) for m in (payload, *self.masses)], 1)
-        self.late, self.lost, self.rng = late, lost, np.random.default_rng(seed)
+        self.late = late
+        self.lost = lost
+        self.rng = np.random.default_rng(seed)
 
     def start(self, qpos):
         self.sim.reset(slice(None), np.tile(qpos, (3, 1)), 0.0)
@@ -65,7 +67,8 @@ def play(arm, targets, compensator=None, payload=0.0, events=None):
     arm.start(targets[0])
     if compensator is not None:
         compensator.reset(targets[0], payload)
-    q, u = [], []
+    q = []
+    u = []
     for t, target in enumerate(targets):
         (events or {}).get(t, lambda: None)()
         q.append(arm.qpos)
@@ -149,15 +152,15 @@ def test_by_default_half_of_the_compensation_is_there_after_half_a_second_and_al
 @pytest.mark.parametrize(("late", "lost"), [(0, 0.0), (4, 0.2)])
 def test_steps_of_command_and_payload_die_out(robot, model, late, lost):
     targets = np.repeat([[0.3, -0.2], [-0.4, 0.5], [0.2, 0.2]], 150, axis=0)
-    arm, compensator = WeakArm(robot, 0.0, late, lost), Compensator(robot, model, config=NOW)
+    arm = WeakArm(robot, 0.0, late, lost)
+    compensator = Compensator(robot, model, config=NOW)
 
     def load(heavy, mass):
         arm.load(heavy)
         compensator.set_payload(mass)
 
-    q, u = play(
-        arm, targets, compensator, 0.0, {200: lambda: load(1, 0.4), 350: lambda: load(0, 0.0)}
-    )
+    events = {200: lambda: load(1, 0.4), 350: lambda: load(0, 0.0)}
+    q, u = play(arm, targets, compensator, 0.0, events)
     assert np.abs(u - targets).max() <= NOW.limit + 1e-12
     for end in (150, 300, 450):
         assert np.abs(np.diff(u[end - 20 : end], axis=0)).max() < 1e-3
@@ -174,23 +177,19 @@ def test_the_default_feedback_is_stable_on_a_weakly_damped_arm(tmp_path):
     targets = np.repeat([[0.3, -0.2], [-0.4, 0.5]], 400, axis=0)
     calm = {}
     for name, config in (("default", NOW), ("fast", replace(NOW, feedback=5.0, feedback_time=0.0))):
-        q, _ = play(
-            WeakArm(swinging, 0.4, late=4),
-            targets,
-            Compensator(swinging, model, config=config),
-            0.4,
-        )
+        arm = WeakArm(swinging, 0.4, late=4)
+        q, _ = play(arm, targets, Compensator(swinging, model, config=config), 0.4)
         calm[name] = float(np.abs(np.diff(q[-100:], axis=0)).max())
     assert calm["default"] < 1e-3 < calm["fast"]
 
 
 def test_a_payload_that_is_not_stated_is_estimated(robot, model):
     targets = np.repeat([[0.3, -0.2]], 500, axis=0)
-    arm, compensator = WeakArm(robot), Compensator(robot, model, config=NOW, payload_step=0.1)
+    arm = WeakArm(robot)
+    compensator = Compensator(robot, model, config=NOW, payload_step=0.1)
     q, _ = play(arm, targets, compensator, None, {100: lambda: arm.load(1)})
-    assert compensator.payload.mass[0] == pytest.approx(
-        0.4, abs=0.12
-    )  # the servo law overrates torque by 1 / 0.8
+    # the servo law overrates torque by 1 / 0.8
+    assert compensator.payload.mass[0] == pytest.approx(0.4, abs=0.12)
     assert np.abs(q[-20:] - targets[-20:]).max() < 0.02
     assert np.abs(np.diff(q[-50:], axis=0)).max() < 1e-3
 
@@ -231,10 +230,8 @@ def test_torques_contradict_a_payload_that_is_wrong_by_more_than_half_of_the_lar
     ("held", "told", "doubted"), [(0, 0.4, True), (1, 0.0, True), (0, 0.0, False), (1, 0.4, False)]
 )
 def test_a_stated_payload_is_compared_with_the_servo_torques(robot, model, held, told, doubted):
-    arm, compensator = (
-        WeakArm(robot, WeakArm.masses[held]),
-        Compensator(robot, model, config=NOW, payload_step=0.1),
-    )
+    arm = WeakArm(robot, WeakArm.masses[held])
+    compensator = Compensator(robot, model, config=NOW, payload_step=0.1)
     play(arm, np.repeat([[0.3, -0.2]], 200, axis=0), compensator, told)
     assert (
         f"{told:g} kg were stated, but the torques are those of about" in compensator.doubt
@@ -248,10 +245,9 @@ def test_torques_unlike_a_payload_give_mass_zero(robot, model):
     compensator.reset(target, None)
     per_kg = np.subtract(*compensator.payload.estimate.gravity(target)[::-1])
     across = 6.0 * np.array([-per_kg[1], per_kg[0]]) + 2.0 * per_kg  # mostly what no payload does
+    torque = compensator.payload.estimate.gravity(target)[0] + across
     for _ in range(200):
-        compensator.step(
-            target, target, np.zeros(2), compensator.payload.estimate.gravity(target)[0] + across
-        )
+        compensator.step(target, target, np.zeros(2), torque)
     assert compensator.payload.mass[0] == 0.0
 
 
@@ -290,9 +286,8 @@ def test_several_robots_are_compensated_as_each_alone(robot, model):
         c.reset(targets[0, i], (0.0, 0.3)[i])
     for target in targets:
         u = both.step(target, 0.9 * target)
-        np.testing.assert_allclose(
-            u, [c.step(a, 0.9 * a) for c, a in zip(alone, target, strict=True)], atol=1e-9
-        )
+        each = [c.step(a, 0.9 * a) for c, a in zip(alone, target, strict=True)]
+        np.testing.assert_allclose(u, each, atol=1e-9)
 
 
 def test_a_step_before_a_start_is_refused(robot):
@@ -334,10 +329,8 @@ def test_dynamic_feed_forward_reduces_the_error_of_a_moving_arm(robot, model):
 def test_without_a_model_what_was_identified_is_fed_forward(robot):
     """Weak servos with friction at rest: known, they follow."""
     law = {"kp": 16.0, "offset": 0.03, "frictionloss": 0.1, "stribeck": 0.1, "stribeck_speed": 0.05}
-    identified, targets = (
-        robot.with_identified(dict.fromkeys(robot.joint_names, law)),
-        commands(150, 1),
-    )
+    identified = robot.with_identified(dict.fromkeys(robot.joint_names, law))
+    targets = commands(150, 1)
     missed = {}
     for name, known in (("raw", None), ("nominal", robot), ("identified", identified)):
         arm = BatchSim(identified, [(0.2, "both", 0.02)], 1)
@@ -357,10 +350,10 @@ def test_without_a_model_servos_with_other_gains_and_absurd_payloads_are_refused
     compensator = Compensator(
         robot.with_identified({"elbow": {"kp": 12.0}}), config=CompensatorConfig(payload_max=0.5)
     )
-    joints, kd = robot.joint_names, np.zeros(2)
-    compensator.require_gains(
-        joints, np.array([20.0, 20.1]), kd
-    )  # as robot.toml says, not as identified
+    joints = robot.joint_names
+    kd = np.zeros(2)
+    # as robot.toml says, not as identified
+    compensator.require_gains(joints, np.array([20.0, 20.1]), kd)
     with pytest.raises(RobotError, match="12"):
         compensator.require_gains(joints, np.array([20.0, 12.0]), kd)
     for mass in (np.nan, -1.0, 0.6):
@@ -377,7 +370,8 @@ def test_payloads_beyond_the_training_data_are_refused_without_extrapolate(robot
             Operator(1.0),
         )
 
-    light, loaded = Compensator(robot, trained(0.0, 0.2)), Compensator(robot, trained(0.1, 0.2))
+    light = Compensator(robot, trained(0.0, 0.2))
+    loaded = Compensator(robot, trained(0.1, 0.2))
     light.reset(np.zeros(2), 0.2)
     assert light.payload.masses.max() == 0.2
     for compensator, mass in ((light, 0.3), (loaded, 0.0), (loaded, 0.3)):
@@ -405,9 +399,12 @@ def test_values_that_are_not_finite_have_no_lasting_effect(robot, model, payload
         compensator.reset(np.tile(targets[0], (2, 1)), payload)
     q = np.tile(targets[0], (2, 1))
     for k, target in enumerate(np.repeat(targets[:, None], 2, axis=1)):
-        spoilt, state, force = target.copy(), q.copy(), np.zeros((2, 2))
+        spoilt = target.copy()
+        state = q.copy()
+        force = np.zeros((2, 2))
         if k == 20:
-            spoilt[0, 0], state[0, 1] = bad, bad
+            spoilt[0, 0] = bad
+            state[0, 1] = bad
         if k == 25:
             force[0, 0] = bad
         whole = two.step(target, q, np.zeros((2, 2)), np.zeros((2, 2)))
@@ -423,19 +420,14 @@ def test_an_adapted_unit_follows_where_the_model_alone_does_not(robot):
     ignorant = GapModel(Path("exact"), make_card(CONFIG, robot, dt=[0.02]), CONFIG, Operator(0.0))
     targets = np.tile([0.4, 0.8], (200, 1))
     still = replace(NOW, feedback=0.0)
-    servos = {
-        j: {"kp": WEAK * float(k), "delay": 0.0}
-        for j, k in zip(robot.joint_names, robot.servo.kp, strict=True)
-    }
+    servos = {}
+    for joint, kp in zip(robot.joint_names, robot.servo.kp, strict=True):
+        servos[joint] = {"kp": WEAK * float(kp), "delay": 0.0}
     unit = Adaptation("a", "weights", servos, (), 30.0, 0.0, 0.0)
     error = {}
     for name, adaptation in (("common", None), ("unit", unit)):
-        q, _ = play(
-            WeakArm(robot, 0.4),
-            targets,
-            Compensator(robot, ignorant, config=still, adaptation=adaptation),
-            0.4,
-        )
+        compensator = Compensator(robot, ignorant, config=still, adaptation=adaptation)
+        q, _ = play(WeakArm(robot, 0.4), targets, compensator, 0.4)
         error[name] = np.abs(q[1:] - targets[:-1])[100:].mean()
     assert error["unit"] < 0.2 * error["common"]
 
@@ -443,7 +435,8 @@ def test_an_adapted_unit_follows_where_the_model_alone_does_not(robot):
 def test_servos_with_other_gains_than_the_data_are_refused_without_extrapolate(robot):
     card = make_card(CONFIG, robot, dt=[0.02], recorded={"kp": [20.0, 20.0], "kd": None})
     model = GapModel(Path("exact"), card, CONFIG, Operator(1.0))
-    joints, kd = robot.joint_names, np.zeros(2)
+    joints = robot.joint_names
+    kd = np.zeros(2)
     Compensator(robot, model).require_gains(joints, np.array([20.0, 20.1]), kd)
     with pytest.raises(ModelError, match="elbow"):
         Compensator(robot, model).require_gains(joints, np.array([20.0, 10.0]), kd)

@@ -53,10 +53,12 @@ def test_action_zero_follows_the_reference(robot, model):
     from gaponet.deploy.gym import TrackingEnv
 
     reference = commands(30, 0)
-    env, sim = TrackingEnv(AlignedSim(robot, model), [reference]), AlignedSim(robot, model)
+    env = TrackingEnv(AlignedSim(robot, model), [reference])
+    sim = AlignedSim(robot, model)
     env.reset()
     sim.reset(reference[0])
-    truncated, t = False, 0
+    truncated = False
+    t = 0
     while not truncated:
         t += 1
         _, reward, terminated, truncated, info = env.step(np.zeros(2))
@@ -82,7 +84,8 @@ def test_a_wrapped_environment_moves_as_the_aligned_simulator(robot, model, stif
     class Plain(gymnasium.Env):
         """A MuJoCo environment as users write them."""
 
-        model, dt = build_model(robot.with_servo(kp=stiffer * robot.servo.kp)), 0.02
+        model = build_model(robot.with_servo(kp=stiffer * robot.servo.kp))
+        dt = 0.02
         data = mujoco.MjData(model)
         action_space = observation_space = gymnasium.spaces.Box(-2, 2, (2,))
         spec = SimpleNamespace(id="plain")
@@ -96,7 +99,8 @@ def test_a_wrapped_environment_moves_as_the_aligned_simulator(robot, model, stif
             mujoco.mj_step(self.model, self.data, robot.decimation)
             return self.data.qpos.copy(), 0.0, False, False, {}
 
-    env, sim = AlignedActions(Plain(), model, payload_mass=0.0), AlignedSim(robot, model)
+    env = AlignedActions(Plain(), model, payload_mass=0.0)
+    sim = AlignedSim(robot, model)
     for _ in range(2):
         env.reset()
         sim.reset()

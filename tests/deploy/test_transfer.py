@@ -48,7 +48,8 @@ def follow(sim, targets=TARGETS, push=0.0, repeat=1):
     while.
     """
     sim.reset(targets[0], ctrl=targets[0])
-    applied, out = sim.sim.batch.bind("qfrc_applied"), []
+    applied = sim.sim.batch.bind("qfrc_applied")
+    out = []
     for t, target in enumerate(targets):
         applied[:] = push * (PUSHED.start <= t < PUSHED.stop)
         for _ in range(repeat):
@@ -59,7 +60,8 @@ def follow(sim, targets=TARGETS, push=0.0, repeat=1):
 
 def test_twice_the_gain_follows_the_reference_to_a_microradian(tmp_path):
     reference = write_arm(tmp_path / "arm", ONE_STEP, HEAVY)
-    target, there = other(reference, kp=2.0), follow(AlignedSim(reference, None))
+    target = other(reference, kp=2.0)
+    there = follow(AlignedSim(reference, None))
     assert np.abs(follow(AlignedSim(target, None)) - there).max() > 0.05
     np.testing.assert_allclose(
         follow(AlignedSim(target, reference, extrapolate=True)), there, atol=1e-6
@@ -76,7 +78,8 @@ def test_twice_the_gain_follows_the_reference_to_a_microradian(tmp_path):
     ],
 )
 def test_the_target_moves_like_the_reference_with_its_model(robot, model, factors):
-    there, target = follow(AlignedSim(robot, model)), other(robot, **factors)
+    there = follow(AlignedSim(robot, model))
+    target = other(robot, **factors)
     apart = np.abs(follow(AlignedSim(target, model)) - there).mean()
     assert apart < 0.002 < 0.1 * np.abs(follow(AlignedSim(target, None)) - there).mean()
 
@@ -86,7 +89,8 @@ def test_transfer_follows_saturated_motors(tmp_path):
         write_arm(tmp_path / limit, TOML.replace("effort_limit = 5.0", f"effort_limit = {limit}"))
         for limit in ("1.0", "5.0")
     )
-    there, target = follow(AlignedSim(weak, None, 0.2)), other(weak, kp=3.0)
+    there = follow(AlignedSim(weak, None, 0.2))
+    target = other(weak, kp=3.0)
     assert np.abs(follow(AlignedSim(strong, None, 0.2)) - there).max() > 0.05
     alone, given = (
         np.abs(follow(AlignedSim(target, like, 0.2)) - there).mean() for like in (None, weak)
@@ -94,27 +98,32 @@ def test_transfer_follows_saturated_motors(tmp_path):
     assert given < 0.1 * alone
 
 
+def mean_distance(motion, other):
+    """Of all joints and periods, rad."""
+    return np.abs(motion - other).mean()
+
+
 def test_jumps_that_saturate_motors_cause_no_windup(tmp_path):
     weak = write_arm(tmp_path, TOML.replace("effort_limit = 5.0", "effort_limit = 0.7"), HEAVY)
     jumps = np.repeat([[-0.6, -0.6], [0.6, 0.6], [-0.6, -0.6]], [20, 60, 60], axis=0)
-    there, target = follow(AlignedSim(weak, None), jumps), other(weak, kp=0.5)
-    alone, given = (
-        np.abs(follow(AlignedSim(target, like), jumps) - there).mean() for like in (None, weak)
-    )
+    there = follow(AlignedSim(weak, None), jumps)
+    target = other(weak, kp=0.5)
+    alone = mean_distance(follow(AlignedSim(target, None), jumps), there)
+    given = mean_distance(follow(AlignedSim(target, weak), jumps), there)
     assert given < 0.1 * alone
 
 
 def test_a_payload_that_the_simulator_does_not_know_of(robot, model):
     there = follow(AlignedSim(robot, model, 0.2))
     sim = AlignedSim(robot, model, 0.2, options=AlignedSimOptions(simulator_payload=0.0))
-    assert np.abs(follow(sim) - there).mean() < 0.001
-    assert np.abs(follow(AlignedSim(robot, model, 0.0)) - there).mean() > 0.01
+    assert mean_distance(follow(sim), there) < 0.001
+    assert mean_distance(follow(AlignedSim(robot, model, 0.0)), there) > 0.01
 
 
 def test_at_twice_the_control_rate_the_model_keeps_its_own_rate(robot, model):
     there = follow(AlignedSim(robot, model))
     quick = AlignedSim(other(robot, kp=2.0), model, dt=robot.dt / 2)
-    assert np.abs(follow(quick, repeat=2) - there).mean() < 0.001
+    assert mean_distance(follow(quick, repeat=2), there) < 0.001
     with pytest.raises(ModelError, match=r"40\.0"):
         AlignedSim(robot, model, dt=0.025)
 
@@ -123,27 +132,33 @@ def test_another_integrator_and_offsets(robot, model, tmp_path):
     there = follow(AlignedSim(robot, model))
     euler = write_arm(tmp_path, STRONG, HEAVY.replace("implicitfast", "Euler"))
     for target in (euler, robot.with_servo(offset=np.array([0.05, -0.03]))):
-        assert np.abs(follow(AlignedSim(target, model)) - there).mean() < 0.001
+        assert mean_distance(follow(AlignedSim(target, model)), there) < 0.001
 
 
-def test_servos_that_are_late_like_the_reference_and_those_that_are_later(robot):
-    reference = robot.with_servo(delay=np.array([0.03, 0.02]))
-    there = follow(AlignedSim(reference, None))
-    same = follow(
-        AlignedSim(other(robot, kp=1.5).with_servo(delay=reference.servo.delay), reference)
-    )
-    assert (
-        np.abs(same - there).mean() < 0.2 * np.abs(follow(AlignedSim(robot, None)) - there).mean()
-    )
-    later = robot.with_servo(delay=np.array([0.03, 0.06]))
+@pytest.fixture
+def late(robot):
+    """A reference whose servos are late."""
+    return robot.with_servo(delay=np.array([0.03, 0.02]))
+
+
+def test_servos_that_are_late_like_the_reference_follow_it(robot, late):
+    there = follow(AlignedSim(late, None))
+    equally_late = other(robot, kp=1.5).with_servo(delay=late.servo.delay)
+    same = mean_distance(follow(AlignedSim(equally_late, late)), there)
+    without = mean_distance(follow(AlignedSim(robot, None)), there)
+    assert same < 0.2 * without
+
+
+def test_servos_that_are_later_than_the_reference_are_refused_or_at_least_not_made_worse(
+    robot, late
+):
+    there = follow(AlignedSim(late, None))
     with pytest.raises(ModelError, match="40 ms"):
-        AlignedSim(later, reference)
-    late = robot.with_servo(
-        delay=np.array([0.06, 0.06])
-    )  # whoever wants it so all the same is not made worse
-    sims = (AlignedSim(late, given, extrapolate=True) for given in (reference, None))
-    apart = [np.abs(follow(sim) - there).mean() for sim in sims]
-    assert apart[0] <= apart[1]
+        AlignedSim(robot.with_servo(delay=np.array([0.03, 0.06])), late)
+    later = robot.with_servo(delay=np.array([0.06, 0.06]))
+    given = follow(AlignedSim(later, late, extrapolate=True))
+    alone = follow(AlignedSim(later, None, extrapolate=True))
+    assert mean_distance(given, there) <= mean_distance(alone, there)
 
 
 def test_transfer_is_causal(robot, model):
@@ -158,13 +173,13 @@ def test_transfer_is_causal(robot, model):
 @pytest.mark.parametrize("factors", [{"kp": 2.0}, {"damping": 0.5}, {"frictionloss": 3.0}])
 def test_transfer_reduces_the_difference_in_contact_and_under_a_push(robot, factors):
     tipped = replace(robot, scene=Scene(tips=(Tip("fore", (0.2, 0.0, 0.0), 0.01),)))
-    reference, target = other(tipped, kp=0.8, damping=1.5), other(tipped, **factors)
+    reference = other(tipped, kp=0.8, damping=1.5)
+    target = other(tipped, **factors)
     for plane, push in ((Table(-0.1, 0.3, 2e3), 0.0), (None, 1.0)):
         there = follow(AlignedSim(reference.with_table(plane), None), push=push)
-        given, alone = (
-            np.abs(follow(AlignedSim(target.with_table(plane), like), push=push) - there).mean()
-            for like in (reference, None)
-        )
+        here = target.with_table(plane)
+        given = mean_distance(follow(AlignedSim(here, reference), push=push), there)
+        alone = mean_distance(follow(AlignedSim(here, None), push=push), there)
         assert given < 0.2 * alone
 
 
@@ -175,10 +190,7 @@ def test_in_the_simulator_of_training_nothing_is_transferred(robot, model):
 
 def test_a_simulator_outside_the_measured_range_is_refused(robot, model):
     far = other(robot, kp=9.0)
-    with pytest.raises(
-        ModelError,
-        match=r"shoulder.* kp",
-    ):
+    with pytest.raises(ModelError, match=r"shoulder.* kp"):
         AlignedSim(far, model)
     AlignedSim(far, model, extrapolate=True)
 
@@ -197,8 +209,10 @@ def scene(robot):
 
 
 def test_a_users_scene_moves_like_the_reference_with_its_model(robot, model):
-    there, mj_model = follow(AlignedSim(robot, model, 0.2)), scene(robot)
-    align, apart = MujocoAligner(model, mj_model, dt=0.02, payload_mass=0.2), []
+    there = follow(AlignedSim(robot, model, 0.2))
+    mj_model = scene(robot)
+    align = MujocoAligner(model, mj_model, dt=0.02, payload_mass=0.2)
+    apart = []
     for correct in (align, lambda data, target: target):
         data = mujoco.MjData(mj_model)
         data.qpos[:2] = TARGETS[0]
