@@ -24,37 +24,43 @@ SERVO = {
     "offset": 0.0,
     "delay": 0.0,
 }
-TOML = 'name = "disc"\ndt = 0.01\ntimestep = 0.0025\n[[joint]]\nname = "turn"\nkp = 3.0\neffort_limit = 50.0\n'
-XML = """<mujoco><compiler angle="radian"/><worldbody><body><joint name="turn" axis="0 0 1" armature="0.002"
-  damping="0.08" frictionloss="0.015"/><geom type="capsule" fromto="0 0 0 0.2 0 0" size="0.01" mass="0.15"
-  contype="0" conaffinity="0"/></body></worldbody></mujoco>"""
+TOML = """name = "disc"
+dt = 0.01
+timestep = 0.0025
+[[joint]]
+name = "turn"
+kp = 3.0
+effort_limit = 50.0
+"""
+XML = """<mujoco><compiler angle="radian"/><worldbody><body>
+  <joint name="turn" axis="0 0 1" armature="0.002" damping="0.08" frictionloss="0.015"/>
+  <geom type="capsule" fromto="0 0 0 0.2 0 0" size="0.01" mass="0.15" contype="0" conaffinity="0"/>
+</body></worldbody></mujoco>"""
 
 
 def fitted(folder, width):
     """The fit of a VIRTUAL joint with this gap, and values without a gap and with it, of the same
     search.
     """
-    robot, t = write_arm(folder, TOML, XML), np.arange(200)[:, None] * 0.01
-    meta, rng = SequenceMeta(robot.name, "a", "m", 0.0, virtual=True), np.random.default_rng(0)
+    robot = write_arm(folder, TOML, XML)
+    t = np.arange(200)[:, None] * 0.01
+    meta = SequenceMeta(robot.name, "a", "m", 0.0, virtual=True)
+    rng = np.random.default_rng(0)
     parts = []
     for number in range(3):
-        ctrl = sum(
-            0.12 * np.sin(2 * np.pi * f * t + p) for f, p in rng.uniform((0.3, 0), (2.0, 6), (3, 2))
-        )
-        asked = Sequence(
-            replace(meta, motion=f"m{number}"), robot.joint_names, 0.01, ctrl, ctrl, 0.0 * ctrl
-        )
+        ctrl = 0.0
+        for hertz, phase in rng.uniform((0.3, 0), (2.0, 6), (3, 2)):
+            ctrl = ctrl + 0.12 * np.sin(2 * np.pi * hertz * t + phase)
+        here = replace(meta, motion=f"m{number}")
+        asked = Sequence(here, robot.joint_names, 0.01, ctrl, ctrl, 0.0 * ctrl)
         (moved,) = replay([asked], robot.with_identified({"turn": SERVO | {"backlash": width}}))
         noisy = moved.qpos + 2e-4 * rng.standard_normal(moved.qpos.shape)
         parts.append(replace(asked, qpos=noisy, qvel=moved.qvel))
     fit = JointFit(JointRollouts(parts, robot, nthread=1), robot, Bounds(robot, parts))
     without = fit.search({f: np.full(1, v) for f, v in SERVO.items()})
     fit.prior.update_correlation_time(fit.rollouts, without)
-    return (
-        fit,
-        without,
-        fit.search(without | {"backlash": fit.bounds.guess["backlash"]}),
-    )
+    values = fit.search(without | {"backlash": fit.bounds.guess["backlash"]})
+    return fit, without, values
 
 
 def test_a_gap_is_found_and_probable(tmp_path):

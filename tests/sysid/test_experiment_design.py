@@ -1,5 +1,7 @@
 """gaponet excite --for: the motions that tell most of a robot that is known in part."""
 
+import contextlib
+import io
 import json
 from dataclasses import replace
 
@@ -29,16 +31,14 @@ HELD = 0.3  # kg
 def identified(place, xml=XML):
     """As if two short motions had identified it."""
     robot = write_arm(place / "arm", TOML, xml)
-    logs = [record(robot, commands(400, seed), f"m{seed}", kp=0.8, delay=1) for seed in range(2)]
     rng = np.random.default_rng(0)
-    logs = [
-        replace(s, qpos=s.qpos + 4e-4 * rng.standard_normal(s.qpos.shape).astype(np.float32))
-        for s in logs
-    ]
-    save_robot(
-        robot.with_identified({j: {"kp": 16.0, "delay": 0.02} for j in robot.operated}),
-        place / "known",
-    )
+    logs = []
+    for seed in range(2):
+        s = record(robot, commands(400, seed), f"m{seed}", kp=0.8, delay=1)
+        noise = 4e-4 * rng.standard_normal(s.qpos.shape).astype(np.float32)
+        logs.append(replace(s, qpos=s.qpos + noise))
+    servos = {joint: {"kp": 16.0, "delay": 0.02} for joint in robot.operated}
+    save_robot(robot.with_identified(servos), place / "known")
     estimate_uncertainty(load_robot(place / "known"), logs, [], nthread=1).save(place / "known")
     return load_robot(place / "known")
 
@@ -57,9 +57,8 @@ def pool(robot):
 
 @pytest.fixture(scope="module")
 def told(robot, pool):
-    return ExperimentDesign.from_recordings(
-        robot, ParameterUncertainty.load(robot), simulated_recordings(robot, pool, 0.0)
-    )
+    expected = simulated_recordings(robot, pool, 0.0)
+    return ExperimentDesign.from_recordings(robot, ParameterUncertainty.load(robot), expected)
 
 
 def errors(covariance):
@@ -75,14 +74,12 @@ def test_expected_information_is_that_of_a_recording(robot, pool, told):
     """Played on another arm than the identified one."""
     mine = ParameterUncertainty.load(robot)
     nominal = load_robot(robot.folder.parent / "arm")
-    played = [
-        record(nominal, m.sample(nominal.dt), f"n{k}", kp=0.84, delay=1)
-        for k, m in enumerate(pool[:4])
-    ]
+    played = []
+    for k, motion in enumerate(pool[:4]):
+        played.append(record(nominal, motion.sample(nominal.dt), f"n{k}", kp=0.84, delay=1))
     there = ExperimentDesign.from_recordings(robot, mine, played)
-    np.testing.assert_allclose(
-        errors(told.after(range(4))), errors(there.after(range(4))), rtol=0.5
-    )
+    expected = errors(told.after(range(4)))
+    np.testing.assert_allclose(expected, errors(there.after(range(4))), rtol=0.5)
 
 
 def test_more_recordings_never_increase_standard_errors(told):
@@ -97,7 +94,8 @@ def test_the_design_fits_the_time_and_beats_nine_of_ten_random_sets(told):
     picks = told.choose(24.0)
     assert len(set(picks)) == len(picks)
     assert told.seconds[picks].sum() <= 24.0
-    rng, random = np.random.default_rng(1), []
+    rng = np.random.default_rng(1)
+    random = []
     for _ in range(40):
         order = rng.permutation(len(told.seconds))
         fits = order[np.cumsum(told.seconds[order]) <= 24.0]
@@ -120,28 +118,40 @@ def test_kp_of_unloaded_joints_is_reported_as_undetermined(tmp_path, robot, pool
     mine = ParameterUncertainty.load(free)
     motions = [m for m in candidate_motions(Library(free, 3, HELD)) if m.name.startswith("creep")]
     slow = ExperimentDesign.from_recordings(free, mine, simulated_recordings(free, motions, 0.0))
-    unsure = replace(
-        slow,
-        covariance=slow.covariance + 0.25 * np.eye(len(mine.fields))[0][:, None] * np.eye(6)[0],
-    )
-    said = undetermined_gains(mine, unsure)
+    added = np.zeros((6, 6))
+    added[0, 0] = 0.25
+    said = undetermined_gains(mine, replace(slow, covariance=slow.covariance + added))
     assert set(said) == {"shoulder", "elbow"}
-    assert all(
-        "so no motion separates kp from friction and damping" in why for why in said.values()
-    )
+    sentence = "so no motion separates kp from friction and damping"
+    assert all(sentence in why for why in said.values())
 
 
-def test_excite_writes_motions_and_expected_errors(robot, tmp_path, capsys):
-    out = tmp_path / "next"
-    assert (
-        main(["excite", "--for", str(robot.folder), "--out", str(out), "--seed", "3", "--json"])
-        == 0
-    )
-    said = json.loads(capsys.readouterr().out)
+@pytest.fixture(scope="module")
+def excited(robot, tmp_path_factory):
+    """Where excite has written motions for the robot, and what it said."""
+    out = tmp_path_factory.mktemp("excite") / "next"
+    words = ["excite", "--for", str(robot.folder), "--out", str(out), "--seed", "3", "--json"]
+    said = io.StringIO()
+    with contextlib.redirect_stdout(said):
+        assert main(words) == 0
+    return out, json.loads(said.getvalue())
+
+
+def test_excite_says_how_long_motions_take_and_whether_they_are_worth_it(excited):
+    _, said = excited
     assert 60 * said["minutes"] <= 30
     assert said["worth_seconds"] >= 0
+
+
+def test_excite_expects_smaller_errors_than_before(excited):
+    _, said = excited
     for joint, before in said["errors"].items():
-        assert all(said["errors_then"][joint][f] <= e for f, e in before.items())
+        for field, error in before.items():
+            assert said["errors_then"][joint][field] <= error
+
+
+def test_excite_writes_motions_and_a_sheet(robot, excited):
+    out, said = excited
     for file in said["motions"]:
         assert read_motion(out / file, robot).duration > 1
     assert f"gaponet adapt {robot.folder} data --out ROBOT_2" in (out / "sheet.md").read_text()
@@ -151,7 +161,6 @@ def test_a_robot_without_uncertainty_and_two_robots_are_refused(robot, tmp_path,
     plain = robot.folder.parent / "arm"
     assert main(["excite", "--for", str(plain), "--out", str(tmp_path / "a")]) == 2
     assert "keeps only values" in capsys.readouterr().err
-    assert (
-        main(["excite", "--for", str(plain), "--robot", "so101", "--out", str(tmp_path / "b")]) == 2
-    )
+    two = ["excite", "--for", str(plain), "--robot", "so101", "--out", str(tmp_path / "b")]
+    assert main(two) == 2
     assert "--robot NAME" in capsys.readouterr().err

@@ -66,26 +66,17 @@ def test_a_joint_that_never_moves_is_reported_as_undetermined(tmp_path):
     robot = write_arm(tmp_path)
     still = [replace(s, ctrl=np.zeros_like(s.ctrl)) for s in recordings(robot, 2, rows=100)]
     still = [replace(s, qpos=np.zeros_like(s.qpos), qvel=np.zeros_like(s.qvel)) for s in still]
-    assert any(
-        "not determined" in w
-        for w in identify(still, robot, options=IdentifyOptions(windows=2)).warnings
-    )
+    fit = identify(still, robot, options=IdentifyOptions(windows=2))
+    assert any("not determined" in text for text in fit.warnings)
 
 
 def test_terms_of_the_robot_are_part_of_the_start(tmp_path):
     robot = write_arm(tmp_path)
     logs = recordings(robot, 3, rows=100)
-    begun = robot.with_identified(
-        {j: {"stribeck": 0.05, "stribeck_speed": 0.1} for j in robot.operated}
-    )
-    warm = robot.with_identified({j: {"friction_per_kelvin": -0.01} for j in robot.operated})
-    for start in (begun, warm):
-        assert (
-            identify(
-                logs, start, options=IdentifyOptions(windows=2, terms=(), seconds=1e-6)
-            ).robot.joint_names
-            == robot.joint_names
-        )
+    options = IdentifyOptions(windows=2, terms=(), seconds=1e-6)
+    for terms in ({"stribeck": 0.05, "stribeck_speed": 0.1}, {"friction_per_kelvin": -0.01}):
+        start = robot.with_identified(dict.fromkeys(robot.operated, terms))
+        assert identify(logs, start, options=options).robot.joint_names == robot.joint_names
 
 
 def test_no_term_is_tried_after_the_time_limit(tmp_path):
@@ -129,16 +120,13 @@ def test_a_soft_joint_that_sticks_has_no_stop(tmp_path):
     ctrl = np.zeros_like(s.ctrl)
     ctrl[:, 0] = 0.9 * np.sin(np.linspace(0, 6 * np.pi, len(ctrl)))
     qpos = np.zeros_like(ctrl)
-    for t in range(
-        1, len(ctrl)
-    ):  # a spring to the command that is as soft as friction is strong: 0.4 rad of play
+    # A spring to the command that is as soft as friction is strong: 0.4 rad of play.
+    for t in range(1, len(ctrl)):
         qpos[t, 0] = np.clip(qpos[t - 1, 0], ctrl[t, 0] - 0.4, ctrl[t, 0] + 0.4)
     pressed = (ctrl[:, 0] > qpos[:, 0].max() + 0.1) & (qpos[:, 0] > qpos[:, 0].max() - 0.005)
     assert pressed.sum() >= 50  # as long as against a stop
-    assert (
-        with_stops(robot, [replace(s, ctrl=ctrl, qpos=qpos.astype(s.qpos.dtype))]).qpos_range[0, 1]
-        == 1.5
-    )
+    found = with_stops(robot, [replace(s, ctrl=ctrl, qpos=qpos.astype(s.qpos.dtype))])
+    assert found.qpos_range[0, 1] == 1.5
 
 
 def test_packing_by_kinematic_chain_is_undone():
@@ -152,38 +140,45 @@ def test_packing_by_kinematic_chain_is_undone():
 
 def test_cross_validation_ignores_one_short_motion_without_information(tmp_path):
     robot = write_arm(tmp_path)
-    logs, still = (
-        recordings(robot, 4, rows=100, kp=0.6),
-        [record(robot, commands(10, 4), "still", kp=1.0)],
-    )
-    alone, folds = (
-        identify(
-            logs,
-            robot,
-            still,
-            options=IdentifyOptions(
-                windows=4, terms=(), table=False, joints_alone=True, folds=count
-            ),
-        ).chosen
-        for count in (1, 2)
-    )
-    assert alone == "given"
-    assert folds != "given"
+    logs = recordings(robot, 4, rows=100, kp=0.6)
+    still = [record(robot, commands(10, 4), "still", kp=1.0)]
+    options = IdentifyOptions(windows=4, terms=(), table=False, joints_alone=True, folds=1)
+    alone = identify(logs, robot, still, options=options)
+    folds = identify(logs, robot, still, options=replace(options, folds=2))
+    assert alone.chosen == "given"
+    assert folds.chosen != "given"
 
 
-def test_folds_share_no_motion_and_a_set_of_joints_with_one_motion_is_always_fitted(arm):
-    logs = recordings(arm, 5)
-    logs[4] = replace(logs[4], meta=replace(logs[4].meta, notes={"held_at_home": ("elbow",)}))
+def motions(sequences):
+    """The motion of each sequence."""
+    return [s.meta.motion for s in sequences]
+
+
+@pytest.fixture
+def logs(arm):
+    """Of five motions; the last one moves the shoulder alone."""
+    made = recordings(arm, 5)
+    meta = replace(made[4].meta, notes={"held_at_home": ("elbow",)})
+    made[4] = replace(made[4], meta=meta)
+    return made
+
+
+def test_folds_share_no_motion(logs):
     folds = cross_validation(logs[:3], logs[3:], 3)
-    assert sorted(s.meta.motion for _, out in folds for s in out) == sorted(
-        s.meta.motion for s in logs[:4]
-    )
+    held_out = []
     for train, out in folds:
-        assert not {s.meta.motion for s in train} & {s.meta.motion for s in out}
+        assert not set(motions(train)) & set(motions(out))
+        held_out += motions(out)
+    assert sorted(held_out) == sorted(motions(logs[:4]))
+
+
+def test_a_set_of_joints_with_one_motion_is_always_fitted(logs):
+    for train, _ in cross_validation(logs[:3], logs[3:], 3):
         assert logs[4] in train
-    assert cross_validation(logs[:1], logs[1:4], 3) == [
-        (logs[:1], logs[1:4])
-    ]  # three motions validate
+
+
+def test_three_validation_motions_need_no_folds(logs):
+    assert cross_validation(logs[:1], logs[1:4], 3) == [(logs[:1], logs[1:4])]
 
 
 @pytest.mark.parametrize(
@@ -205,27 +200,27 @@ def test_a_candidate_is_accepted_if_the_gain_is_significant_and_large_enough(fal
 
 
 def test_repetitions_and_gains_of_one_motion_judge_as_one(tmp_path):
-    robot, logs = write_arm(tmp_path), recordings(load_robot(tmp_path))[:3]
+    robot = write_arm(tmp_path)
+    logs = recordings(load_robot(tmp_path))[:3]
     again = [*logs, replace(logs[0], meta=replace(logs[0].meta, repetition=1, kp=(18.0, 18.0)))]
     values = Bounds(robot, logs).first
-    once, twice = (Judge([x], robot, -np.inf, 1).errors([values]) for x in (logs, again))
+    once = Judge([logs], robot, -np.inf, 1).errors([values])
+    twice = Judge([again], robot, -np.inf, 1).errors([values])
     assert len(once) == len(twice) == 3
     np.testing.assert_allclose(twice[1:], once[1:])
 
 
 def test_pieces_of_one_recording_are_one_motion(arm):
-    logs = [
-        replace(
-            s,
-            meta=replace(
-                s.meta, motion=f"m{i // 2}@{4 * (i % 2)}s", notes={"from_s": 4.0 * (i % 2)}
-            ),
-        )
-        for i, s in enumerate(recordings(arm, 10, rows=40))
-    ]
-    for train, held_out in cross_validation(logs[:8], logs[8:], 3):
-        assert not {s.meta.motion[:2] for s in train} & {s.meta.motion[:2] for s in held_out}
-    assert len(motion_errors(logs, arm)) == 5
+    pieces = []
+    for i, s in enumerate(recordings(arm, 10, rows=40)):
+        start = 4 * (i % 2)
+        notes = {"from_s": float(start)}
+        meta = replace(s.meta, motion=f"m{i // 2}@{start}s", notes=notes)
+        pieces.append(replace(s, meta=meta))
+    for train, held_out in cross_validation(pieces[:8], pieces[8:], 3):
+        recorded = {motion[:2] for motion in motions(train)}
+        assert not recorded & {motion[:2] for motion in motions(held_out)}
+    assert len(motion_errors(pieces, arm)) == 5
 
 
 def test_a_joint_takes_a_fit_only_if_its_own_motions_accept_it():
@@ -246,7 +241,8 @@ def test_a_joint_takes_a_fit_only_if_its_own_motions_accept_it():
         def _sums(self, candidate):
             return errors[candidate[0]["kp"][0]], np.ones((4, 2))
 
-    given, fit = ({"kp": np.full(2, kp)} for kp in errors)
+    given = {"kp": np.full(2, 1.0)}
+    fit = {"kp": np.full(2, 2.0)}
     name, (chosen,) = Payloads().best_by_joint({"given": [given], "limbs": [fit]})
     assert (name, chosen["kp"].tolist()) == ("mixed", [1.0, 2.0])
     worse = {"kp": np.full(2, 3.0)}
@@ -295,8 +291,10 @@ def test_all_joints_are_fitted_together_unless_the_first_iterations_lose_much(er
     progress = SearchProgress(None, 0, 1, no_progress)
     fits = Fits([], None, [], judge, progress, 1)
     assert set(robot_candidates(fits, [robot], alone)) == kept
-    first, rest = FIRST_ROBOT_ITERATIONS, ROBOT_ITERATIONS
-    assert asked == ([first, rest] if kept else [first])
+    iterations = [FIRST_ROBOT_ITERATIONS]
+    if kept:
+        iterations.append(ROBOT_ITERATIONS)
+    assert asked == iterations
 
 
 def test_all_joints_are_not_fitted_together_where_the_time_is_too_short(monkeypatch):

@@ -22,7 +22,8 @@ ENDS = np.array([[0.3, 1.2, 0.5], [1.5, 0.2, 2.0]])
 def test_problems_that_share_candidates_have_separate_minima():
     tried = []
     starts = np.random.default_rng(0).uniform(0, 2, (4, 2, 3))
-    low, high = np.full((2, 3), -3.0), np.full((2, 3), 3.0)
+    low = np.full((2, 3), -3.0)
+    high = np.full((2, 3), 3.0)
     problems = Problems(lambda x: tried.append(x.shape) or valley(x), low, high)
     x, cost = descend(problems, starts, 40)
     best = better_half(x, cost)
@@ -52,8 +53,13 @@ def test_agreed_slopes_are_zero_where_the_two_sides_differ_in_sign():
     """A joint at the edge of breaking loose goes far to one side: it does not tell the
     parameter.
     """
-    errors = lambda x: np.concatenate([3 * x, 50 * np.maximum(x, 0), -np.abs(x)], axis=-1)  # noqa: E731
-    at, low, high = np.zeros((1, 1, 1)), np.full((1, 1), -9.0), np.full((1, 1), 9.0)
+
+    def errors(x):
+        return np.concatenate([3 * x, 50 * np.maximum(x, 0), -np.abs(x)], axis=-1)
+
+    at = np.zeros((1, 1, 1))
+    low = np.full((1, 1), -9.0)
+    high = np.full((1, 1), 9.0)
     _, slopes = agreed_slopes(at, low, high, errors)
     np.testing.assert_allclose(slopes[0, 0, :, 0], [3, 0, 0], atol=1e-6)
     for edge in ((np.zeros((1, 1)), high), (low, np.zeros((1, 1)))):  # at a bound there is one side

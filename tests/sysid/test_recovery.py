@@ -29,12 +29,36 @@ SERVO = {
 }
 
 
+def answered(asked, acting):
+    """The recordings with what this robot does on their commands."""
+    made = []
+    for s, t in zip(asked, replay(asked, acting), strict=True):
+        made.append(replace(s, qpos=t.qpos, qvel=t.qvel))
+    return made
+
+
 def played(robot, acting, count, rows):
     """Recordings of an arm of known servos."""
     template = recordings(robot, 1, rows=rows)[0]
     asked = [replace(template, ctrl=commands(rows, seed)) for seed in range(count)]
-    replays = replay(asked, acting)
-    return [replace(s, qpos=t.qpos, qvel=t.qvel) for s, t in zip(asked, replays, strict=True)]
+    return answered(asked, acting)
+
+
+def jumps(count):
+    """Targets that jump four times each, (count, 80, 2) rad."""
+    return np.random.default_rng(0).uniform(-1, 1, (count, 4, 2)).repeat(20, axis=1)
+
+
+def joint_fit(parts, robot):
+    return JointFit(JointRollouts(parts, robot), robot, Bounds(robot, parts))
+
+
+def start_of(fit, terms=()):
+    """Values from which a search starts: those of SERVO, and what is guessed of the terms."""
+    values = {field: np.full(2, value) for field, value in SERVO.items()}
+    for field in terms:
+        values[field] = fit.bounds.guess[field]
+    return values
 
 
 @pytest.mark.parametrize(
@@ -47,14 +71,10 @@ def played(robot, acting, count, rows):
 )
 def test_a_term_of_the_servo_model_is_recovered(tmp_path, law):
     robot = write_arm(tmp_path / "arm")
-    parts = played(
-        robot, robot.with_identified(dict.fromkeys(robot.joint_names, SERVO | law)), 3, 120
-    )
-    fit = JointFit(JointRollouts(parts, robot), robot, Bounds(robot, parts))
-    start = {f: np.full(2, v) for f, v in SERVO.items()} | {
-        f: fit.bounds.guess[f] for f in SERVO_TERMS if f in law
-    }
-    found = fit.search(start)
+    acting = robot.with_identified(dict.fromkeys(robot.joint_names, SERVO | law))
+    fit = joint_fit(played(robot, acting, 3, 120), robot)
+    terms = [term for term in SERVO_TERMS if term in law]
+    found = fit.search(start_of(fit, terms))
     assert set(CLASSIC) < set(found)
     std = standard_errors(fit, found).std
     for field, value in law.items():
@@ -66,41 +86,28 @@ def test_a_term_of_the_servo_model_is_recovered(tmp_path, law):
 @pytest.mark.parametrize("no_load", [1.5, 0.0])
 def test_a_torque_speed_line_is_recovered_and_none_is_seen_where_none_is(tmp_path, no_load):
     robot = write_arm(tmp_path / "arm").with_servo(effort_limit=np.full(2, 2.5), kd=np.full(2, 0.5))
-    template, true = recordings(robot, 1, rows=80)[0], SERVO | {"no_load_speed": no_load}
-    jumps = np.random.default_rng(0).uniform(-1, 1, (2, 4, 2)).repeat(20, axis=1)
-    asked = [replace(template, ctrl=c) for c in jumps]
-    replays = replay(asked, robot.with_identified(dict.fromkeys(robot.joint_names, true)))
-    parts = [replace(s, qpos=t.qpos, qvel=t.qvel) for s, t in zip(asked, replays, strict=True)]
+    template = recordings(robot, 1, rows=80)[0]
+    true = SERVO | {"no_load_speed": no_load}
+    asked = [replace(template, ctrl=ctrl) for ctrl in jumps(2)]
+    acting = robot.with_identified(dict.fromkeys(robot.joint_names, true))
+    parts = answered(asked, acting)
     assert "speed" in default_terms(parts, robot)
-    fit = JointFit(JointRollouts(parts, robot), robot, Bounds(robot, parts))
-    start = {f: np.full(2, v) for f, v in SERVO.items()} | {
-        "no_load_speed": fit.bounds.guess["no_load_speed"]
-    }
-    found = fit.search(start)
+    fit = joint_fit(parts, robot)
+    found = fit.search(start_of(fit, ["no_load_speed"]))
     np.testing.assert_allclose(fit.bounds.visible("no_load_speed", found), no_load, rtol=0.1)
 
 
 def test_a_torque_limit_of_half_the_files_is_recovered(tmp_path):
-    robot, template = (
-        write_arm(tmp_path / "arm"),
-        recordings(write_arm(tmp_path / "arm"), 1, rows=80)[0],
-    )
-    jumps = np.random.default_rng(0).uniform(-1, 1, (5, 4, 2)).repeat(20, axis=1)
-    asked = [
-        replace(template, ctrl=c, meta=replace(template.meta, motion=f"m{i}"))
-        for i, c in enumerate(jumps)
-    ]
+    robot = write_arm(tmp_path / "arm")
+    template = recordings(robot, 1, rows=80)[0]
+    asked = []
+    for i, ctrl in enumerate(jumps(5)):
+        meta = replace(template.meta, motion=f"m{i}")
+        asked.append(replace(template, ctrl=ctrl, meta=meta))
     weak = robot.with_identified({joint: {"effort_limit": 2.5} for joint in robot.joint_names})
-    parts = [
-        replace(s, qpos=t.qpos, qvel=t.qvel)
-        for s, t in zip(asked, replay(asked, weak), strict=True)
-    ]
-    found = identify(
-        parts[:4],
-        robot,
-        parts[4:],
-        options=IdentifyOptions(windows=4, terms=("limit",), table=False, folds=1),
-    )
+    parts = answered(asked, weak)
+    options = IdentifyOptions(windows=4, terms=("limit",), table=False, folds=1)
+    found = identify(parts[:4], robot, parts[4:], options=options)
     assert [c.name for c in found.comparisons if c.accepted] == ["limit"]
     np.testing.assert_allclose(found.robot.servo.effort_limit, 2.5, rtol=0.05)
     assert found.after < 0.1 * found.before
@@ -110,19 +117,11 @@ def test_damping_of_an_unmoved_joint_is_recovered_from_the_motion_of_another(tmp
     """The file's damping of the shoulder, which no command moves, is ten times too much."""
     robot = write_arm(tmp_path / "arm")
     swung = [replace(s, ctrl=s.ctrl * [0, 1]) for s in played(robot, robot, 3, 200)]
-    true, told = (
-        robot.with_identified({"shoulder": {"damping": d, "kp": 20.0}}) for d in (0.2, 2.0)
-    )
-    parts = [
-        replace(s, qpos=t.qpos, qvel=t.qvel)
-        for s, t in zip(swung, replay(swung, true), strict=True)
-    ]
-    found = identify(
-        parts[:2],
-        told,
-        parts[2:],
-        options=IdentifyOptions(windows=2, terms=(), table=False, folds=1),
-    )
+    true = robot.with_identified({"shoulder": {"damping": 0.2, "kp": 20.0}})
+    told = robot.with_identified({"shoulder": {"damping": 2.0, "kp": 20.0}})
+    parts = answered(swung, true)
+    options = IdentifyOptions(windows=2, terms=(), table=False, folds=1)
+    found = identify(parts[:2], told, parts[2:], options=options)
     assert found.improved
     assert found.after < 0.1 * found.before
     assert any("shoulder: not determined" in text for text in found.warnings)
@@ -135,9 +134,8 @@ def test_a_table_is_recovered(tmp_path):
     robot = write_arm(tmp_path / "arm", toml=TOML + TIP)
     parts = played(robot, robot.with_table(Table(-0.02, 0.3, 2000.0)), 3, 100)
     heights = table_contact.tip_heights(parts, robot)
-    found = table_contact.fit_table(
-        parts, robot, min(h.min() for h in heights), 1, lambda error: None
-    )
+    lowest = min(height.min() for height in heights)
+    found = table_contact.fit_table(parts, robot, lowest, 1, lambda error: None)
     assert found.accepted
     assert found.after.mean() < 0.2 * found.before.mean()
     assert found.robot.scene.table.height == pytest.approx(-0.02, abs=0.004)
@@ -151,10 +149,8 @@ def test_half_of_the_rows_remain_for_motions_close_to_the_table(tmp_path):
     heights = [np.linspace(0.30, 0.33, 50), np.full(40, 0.32)]
     below = table_contact.contact_height(robot, heights)
     assert np.mean(np.concatenate(heights) >= below) >= 0.5
-    assert (
-        table_contact.contact_height(robot, [np.r_[0.0, np.full(50, 0.4)]])
-        == table_contact.CONTACT_CLEARANCE_M
-    )
+    far = [np.r_[0.0, np.full(50, 0.4)]]
+    assert table_contact.contact_height(robot, far) == table_contact.CONTACT_CLEARANCE_M
 
 
 def test_a_kd_of_the_file_that_is_eight_times_too_low_is_overruled_and_named(tmp_path):
@@ -177,7 +173,8 @@ def test_a_kd_of_the_file_that_is_eight_times_too_low_is_overruled_and_named(tmp
         fit = JointFit(rollouts, given, bounds)
         found = fit.search(bounds.start, fit.regressed())
         np.testing.assert_allclose((found["damping"] + kd) / found["kp"], 4.0 / 20.0, rtol=0.05)
-        errors.append(np.abs(rollouts.errors({f: v[None] for f, v in found.items()})).mean())
+        candidate = {field: value[None] for field, value in found.items()}
+        errors.append(np.abs(rollouts.errors(candidate)).mean())
         doubts.append(contradicted_gains(bounds, found, standard_errors(fit, found).std))
     assert errors[1] < 1.02 * errors[0]
     assert doubts[0] == []

@@ -26,8 +26,10 @@ def own(robot, parts):
 
 
 def test_robot_rollouts_agree_with_replays(robot, parts):
-    runs, values = RobotRollouts(parts, robot), own(robot, parts)
-    both = {f: np.concatenate([x, x * (1.3 if f == "kp" else 1.0)]) for f, x in values.items()}
+    runs = RobotRollouts(parts, robot)
+    values = own(robot, parts)
+    both = {field: np.concatenate([value, value]) for field, value in values.items()}
+    both["kp"][1] *= 1.3
     errors = runs.flat_errors(both)
     assert np.abs(errors[1] - errors[0]).max() > 1e-3
     for window, (part, simulated) in enumerate(zip(parts, replay(parts, robot), strict=True)):
@@ -36,11 +38,11 @@ def test_robot_rollouts_agree_with_replays(robot, parts):
 
 
 def test_a_joints_error_depends_mostly_on_its_own_parameters(robot, parts):
-    runs, values = RobotRollouts(parts, robot), own(robot, parts)
-    stiffer = np.array([[1.0, 1.0], [1.02, 1.02], [1.02, 1.0], [1.0, 1.02]])
-    errors = runs.flat_errors(
-        {f: x * stiffer if f == "kp" else np.repeat(x, 4, axis=0) for f, x in values.items()}
-    )
+    runs = RobotRollouts(parts, robot)
+    values = own(robot, parts)
+    candidates = {field: np.repeat(value, 4, axis=0) for field, value in values.items()}
+    candidates["kp"] *= [[1.0, 1.0], [1.02, 1.02], [1.02, 1.0], [1.0, 1.02]]
+    errors = runs.flat_errors(candidates)
     together = errors[1] - errors[0]
     for joint in range(2):
         alone = errors[2 + joint, joint] - errors[0, joint]
@@ -50,25 +52,24 @@ def test_a_joints_error_depends_mostly_on_its_own_parameters(robot, parts):
 def test_a_rollout_restarts_from_the_recording_after_a_possible_contact(robot, parts):
     touch = np.zeros((2, 60), bool)
     touch[0, 30] = True
-    free, held, values = (
-        RobotRollouts(parts, robot),
-        RobotRollouts(parts, robot, touch=touch),
-        own(robot, parts),
-    )
+    free = RobotRollouts(parts, robot)
+    held = RobotRollouts(parts, robot, touch=touch)
+    values = own(robot, parts)
     assert free.counted[29, 0]
     assert not held.counted[29, 0]
     assert held.counted[29, 1]
-    one, other = (
-        [runs.flat_errors(values)[0][:, runs.window == w] for w in (0, 1)] for runs in (free, held)
-    )
-    np.testing.assert_array_equal(one[1], other[1])
+    untouched = free.flat_errors(values)[0]
+    touched = held.flat_errors(values)[0]
+    np.testing.assert_array_equal(untouched[:, free.window == 1], touched[:, held.window == 1])
     late = RobotRollouts([parts[0].rows(slice(30, 60))], robot)
     afresh = late.flat_errors(values)[0][:, 1:]  # the first rows after it do not count
-    np.testing.assert_allclose(other[0][:, -afresh.shape[1] :], afresh, atol=1e-6)
+    restarted = touched[:, held.window == 0][:, -afresh.shape[1] :]
+    np.testing.assert_allclose(restarted, afresh, atol=1e-6)
 
 
 def test_damping_below_zero_is_taken_from_the_servo(robot, parts):
-    less, softer = (robot.with_servo(kd=np.array([kd, kd])) for kd in (0.4, 0.1))
+    less = robot.with_servo(kd=np.full(2, 0.4))
+    softer = robot.with_servo(kd=np.full(2, 0.1))
     values = own(less, parts)
     np.testing.assert_allclose(
         RobotRollouts(parts, less).flat_errors(values | {"damping": np.full((1, 2), -0.3)}),

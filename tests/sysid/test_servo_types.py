@@ -33,64 +33,75 @@ def test_a_value_an_order_of_magnitude_off_is_named(tmp_path):
     ]
 
 
-def test_every_type_of_the_table_has_source_licence_and_ordered_values():
-    table = servo_table()
-    assert len({servo.name for servo in table.servo}) == len(table.servo)
-    for servo in table.servo:
-        assert servo.source
-        assert servo.licence
-        assert servo.measured or servo.effort_limit
-        for spread in servo.measured.values():
-            assert spread.low <= spread.value <= spread.high
+def test_every_type_of_the_table_has_a_name_of_its_own():
+    names = [servo.name for servo in servo_table().servo]
+    assert len(set(names)) == len(names)
+
+
+@pytest.mark.parametrize("servo", servo_table().servo, ids=lambda servo: servo.name)
+def test_every_type_of_the_table_has_source_licence_and_ordered_values(servo):
+    assert servo.source
+    assert servo.licence
+    assert servo.measured or servo.effort_limit
+    for spread in servo.measured.values():
+        assert spread.low <= spread.value <= spread.high
+
+
+def test_a_value_outside_its_spread_is_refused():
     with pytest.raises(RobotError, match="value"):
         Spread(3.0, 1.0, 2.0)
 
 
-def test_an_entry_from_an_identified_folder_has_the_values_of_its_joints_and_loads(
-    tmp_path, capsys
-):
+@pytest.fixture
+def command(tmp_path):
+    """gaponet robot servos of an identified folder, with source and licence."""
+    values = {
+        "shoulder": {"damping": 0.8, "frictionloss": 0.1, "armature": 0.03},
+        "elbow": {"damping": 1.2, "frictionloss": 0.3, "armature": 0.05},
+    }
     robot = write_arm(tmp_path / "nominal", TWO)
-    values = {"shoulder": (0.8, 0.1, 0.03), "elbow": (1.2, 0.3, 0.05)}
-    fields = ("damping", "frictionloss", "armature")
-    save_robot(
-        robot.with_identified({j: dict(zip(fields, v, strict=True)) for j, v in values.items()}),
-        tmp_path / "id",
-    )
-    command = ["robot", "servos", "--from", str(tmp_path / "id")]
-    assert main(command) == 2  # without a licence
-    capsys.readouterr()
-    command += ["--source", "my logs", "--licence", "CC0-1.0"]
+    save_robot(robot.with_identified(values), tmp_path / "id")
+    words = ["robot", "servos", "--from", str(tmp_path / "id")]
+    return [*words, "--source", "my logs", "--licence", "CC0-1.0"]
+
+
+def test_an_entry_needs_a_licence(command):
+    assert main(command[:4]) == 2
+
+
+def test_an_entry_from_an_identified_folder_has_the_values_of_its_joints_and_loads(
+    command, tmp_path, capsys
+):
     assert main(command) == 0
     entry = capsys.readouterr().out
     (servo, _) = write_arm(tmp_path / "used", TWO.replace(SERVO, entry)).servo.types
-    assert (servo.name, servo.source, servo.licence, servo.joints, servo.robots) == (
-        "S1",
-        "my logs",
-        "CC0-1.0",
-        2,
-        1,
-    )
-    for field, low, high in zip(fields, *values.values(), strict=True):
-        assert vars(servo.measured[field]) == pytest.approx(
-            {"value": (low + high) / 2, "low": low, "high": high}
-        )
-    assert main([*command, "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["servos"][0]["damping"] == {
-        "value": 1.0,
-        "low": 0.8,
-        "high": 1.2,
+    assert servo.name == "S1"
+    assert (servo.source, servo.licence) == ("my logs", "CC0-1.0")
+    assert (servo.joints, servo.robots) == (2, 1)
+    found = {
+        field: vars(servo.measured[field]) for field in ("damping", "frictionloss", "armature")
     }
+    assert found["damping"] == pytest.approx({"value": 1.0, "low": 0.8, "high": 1.2})
+    assert found["frictionloss"] == pytest.approx({"value": 0.2, "low": 0.1, "high": 0.3})
+    assert found["armature"] == pytest.approx({"value": 0.04, "low": 0.03, "high": 0.05})
+
+
+def test_an_entry_is_printed_as_json(command, capsys):
+    assert main([*command, "--json"]) == 0
+    (servo,) = json.loads(capsys.readouterr().out)["servos"]
+    assert servo["damping"] == {"value": 1.0, "low": 0.8, "high": 1.2}
 
 
 def test_the_interval_of_a_single_joint_is_that_of_its_standard_error(tmp_path):
     robot = write_arm(tmp_path / "nominal", TWO).with_identified({"elbow": {"frictionloss": 0.2}})
     save_robot(robot, tmp_path / "id")
-    fields, std = ("kp", "frictionloss"), 0.02 / 20.0  # on the axis: friction over kp
+    fields = ("kp", "frictionloss")
+    std = 0.02 / 20.0  # on the axis: friction over kp
     rest = ((0.0,) * 3, ((0.0,) * 3,) * 3, (1.0,) * 3, 0.0, 0.0, 0.0)
-    joints = {
-        joint: JointUncertainty(tuple(x), ((0.0, 0.0), (0.0, std**2)), *rest)
-        for joint, x in to_axes(robot, fields).items()
-    }
+    covariance = ((0.0, 0.0), (0.0, std**2))
+    joints = {}
+    for joint, x in to_axes(robot, fields).items():
+        joints[joint] = JointUncertainty(tuple(x), covariance, *rest)
     ParameterUncertainty(fields, joints, (), 24, True).save(tmp_path / "id")
     (servo,) = measured_types([load_robot(tmp_path / "id")], "my logs", "CC0-1.0")
     assert servo.measured == {"frictionloss": Spread(0.2, 0.167, 0.233)}  # 1.645 of them
@@ -98,9 +109,8 @@ def test_the_interval_of_a_single_joint_is_that_of_its_standard_error(tmp_path):
 
 def test_a_robot_s_own_servo_type_comes_before_the_table_s(tmp_path):
     used = TWO.replace('"S1"', '"STS3215"')
-    own, packaged = (
-        write_arm(tmp_path, toml).servo.types[0] for toml in (used, used.split("[[servo]]")[0])
-    )
+    own = write_arm(tmp_path, used).servo.types[0]
+    packaged = write_arm(tmp_path, used.split("[[servo]]")[0]).servo.types[0]
     assert (own.source, own.measured["armature"].value) == ("a bench", 0.02)
     assert packaged == load_robot("so101").servo.types[0]
 
@@ -125,21 +135,20 @@ def test_a_mirrored_joint_has_the_other_side_in_its_name(joint, other):
     assert (mirrored(joint), mirrored(other)) == (other, joint)
 
 
-def test_a_joint_starts_from_the_identified_servo_of_its_type_or_mirror_image_and_keeps_its_mounting(
-    tmp_path,
-):
+def test_a_joint_starts_from_the_identified_servo_of_its_type_and_keeps_its_mounting(tmp_path):
     robot = write_arm(tmp_path / "a", TWO)
-    identified = robot.with_identified(
-        {"elbow": {"kp": 15.0, "frictionloss": 0.2, "offset": 0.03, "delay": 0.01}}
-    )
+    elbow = {"kp": 15.0, "frictionloss": 0.2, "offset": 0.03, "delay": 0.01}
+    identified = robot.with_identified({"elbow": elbow})
     stiff = write_arm(tmp_path / "b", TWO.replace("kp = 20.0", "kp = 40.0"))
     started, sources = servos_like(stiff, identified)
     assert sources == {"shoulder": "elbow", "elbow": "elbow"}  # the shoulder was not identified
     assert started.servo.kp.tolist() == [30.0, 30.0]  # the ratio to the nominal gain
-    assert (started.servo.frictionloss.tolist(), started.servo.delay.tolist()) == (
-        [0.2, 0.2],
-        [0.01, 0.01],
-    )
+    assert started.servo.frictionloss.tolist() == [0.2, 0.2]
+    assert started.servo.delay.tolist() == [0.01, 0.01]
     assert started.servo.offset.tolist() == [0.0, 0.0]
+
+
+def test_a_robot_that_is_not_identified_gives_no_servos(tmp_path):
+    robot = write_arm(tmp_path, TWO)
     with pytest.raises(UsageError, match="identified"):
-        servos_like(stiff, robot)
+        servos_like(robot, robot)

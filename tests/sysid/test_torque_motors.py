@@ -12,7 +12,8 @@ from gaponet.robot.spec import load_robot
 from gaponet.sim.model import build_model
 
 TRUE = {"armature": (0.05, 0.03), "damping": (0.8, 0.3), "frictionloss": (0.12, 0.06)}
-DT, LATE = 0.005, 0.01  # s
+DT = 0.005  # s
+LATE = 0.01  # s
 LOGS_TOML = """time_unit = "s"
 position_unit = "rad"
 ctrl = "q_{joint}"
@@ -30,13 +31,13 @@ def drive(robot, seed, unit=1.0, rows=1200):
     for name, values in TRUE.items():
         getattr(model, f"dof_{name}").reshape(model.nv, -1)[:, 0] = values
     model.opt.timestep = DT / 2
-    data, wanted, rng = (
-        mujoco.MjData(model),
-        1.6 * commands(rows, seed, DT),
-        np.random.default_rng(seed),
-    )
-    data.qpos[:], pitch = wanted[0], rng.uniform(2.5, 3.5)
-    told, seen = [], []
+    data = mujoco.MjData(model)
+    wanted = 1.6 * commands(rows, seed, DT)
+    rng = np.random.default_rng(seed)
+    data.qpos[:] = wanted[0]
+    pitch = rng.uniform(2.5, 3.5)
+    told = []
+    seen = []
     for t in range(rows):
         seen.append(data.qpos + rng.normal(0, 1e-4, 2))
         probe = 0.8 * np.sin(2 * np.pi * pitch * t * DT)
@@ -48,32 +49,34 @@ def drive(robot, seed, unit=1.0, rows=1200):
 
 def imported(folder, robot, logs, torque=True):
     (folder / "logs").mkdir(parents=True)
-    head = "time,q_shoulder,q_elbow" + ",tau_shoulder,tau_elbow" * torque
+    head = "time,q_shoulder,q_elbow,tau_shoulder,tau_elbow"
+    layout = LOGS_TOML
+    columns = 5
+    if not torque:
+        head = "time,q_shoulder,q_elbow"
+        layout = LOGS_TOML.replace('tau = "tau_{joint}"\n', "")
+        columns = 3
     for name, table in logs.items():
-        columns = table if torque else table[:, :3]
-        np.savetxt(
-            folder / "logs" / f"{name}.csv", columns, delimiter=",", header=head, comments=""
-        )
-    (folder / "logs" / "logs.toml").write_text(
-        LOGS_TOML if torque else LOGS_TOML.replace('tau = "tau_{joint}"\n', "")
-    )
-    words = [
-        "--robot",
-        str(robot.folder),
-        "--unit-id",
-        "a",
-        "--payload-mass",
-        "0",
-        "--out",
-        str(folder / "data"),
-    ]
-    assert main(["import", str(folder / "logs"), *words]) == 0
+        file = folder / "logs" / f"{name}.csv"
+        np.savetxt(file, table[:, :columns], delimiter=",", header=head, comments="")
+    (folder / "logs" / "logs.toml").write_text(layout)
+    words = ["import", str(folder / "logs"), "--robot", str(robot.folder), "--unit-id", "a"]
+    words += ["--payload-mass", "0", "--out", str(folder / "data")]
+    assert main(words) == 0
     return str(folder / "data")
 
 
 @pytest.fixture(scope="module")
 def robot(tmp_path_factory):
     return write_arm(tmp_path_factory.mktemp("arm") / "arm")
+
+
+def expected(joint, unit):
+    """What identify says of a joint of this number: each field within its tolerance."""
+    fields = {name: pytest.approx(values[joint], rel=0.06) for name, values in TRUE.items()}
+    fields["constant"] = pytest.approx(unit, rel=0.03)
+    fields["delay"] = pytest.approx(LATE, abs=0.003)
+    return fields
 
 
 @pytest.mark.parametrize(("unit", "words"), [(1.0, []), (0.08, ["--current"])])
@@ -83,17 +86,14 @@ def test_a_torque_driven_arm_is_identified(robot, tmp_path, capsys, unit, words)
     assert main(["identify", data, "--out", str(tmp_path / "found"), "--json", *words]) == 0
     said = json.loads(capsys.readouterr().out)
     for i, found in enumerate(said["joints"].values()):
-        assert found["constant"] == pytest.approx(unit, rel=0.03)
-        assert found["delay"] == pytest.approx(LATE, abs=0.003)
-        for name, values in TRUE.items():
-            assert found[name] == pytest.approx(values[i], rel=0.06)
+        wanted = expected(i, unit)
+        assert {field: found[field] for field in wanted} == wanted
     before, after = said["angle"]["0.5"]
     assert np.mean(after) < 0.05 * np.mean(before)
     again = load_robot(tmp_path / "found")
     assert again.servo.damping[0] == said["joints"]["shoulder"]["damping"]
-    assert (
-        main(["export", str(tmp_path / "found"), "--to", "json"]) == 0
-    )  # judged by what the robot itself answers
+    # Judged by what the robot itself answers.
+    assert main(["export", str(tmp_path / "found"), "--to", "json"]) == 0
 
 
 def test_a_push_by_hand_is_not_taken_for_friction(robot, tmp_path, capsys):

@@ -37,14 +37,25 @@ def played(robot, first=0, count=6, seconds=8, noise=4e-4, **how):
     found = []
     for seed in range(first, first + count):
         rows = round(seconds / robot.dt)
-        one = record(robot, commands(rows, seed), f"m{seed}", **({"kp": 0.8, "delay": 1} | how))
-        found.append(
-            replace(
-                one,
-                qpos=one.qpos + noise * np.random.default_rng(seed).standard_normal(one.qpos.shape),
-            )
-        )
+        servo = {"kp": 0.8, "delay": 1} | how
+        one = record(robot, commands(rows, seed), f"m{seed}", **servo)
+        spread = noise * np.random.default_rng(seed).standard_normal(one.qpos.shape)
+        found.append(replace(one, qpos=one.qpos + spread))
     return found
+
+
+def shifted(sequences, by):
+    """The recordings read elsewhere, by (n,) rad."""
+    return [replace(s, qpos=s.qpos + by) for s in sequences]
+
+
+def held(sequences, *joints):
+    """The recordings, said to hold these joints at home."""
+    made = []
+    for s in sequences:
+        meta = replace(s.meta, notes={"held_at_home": joints})
+        made.append(replace(s, meta=meta))
+    return made
 
 
 @pytest.fixture(scope="module")
@@ -78,22 +89,33 @@ def checked(capsys, *words):
     return code, json.loads(capsys.readouterr().out)
 
 
-def test_uncertainty_has_sources_values_and_a_consistent_covariance(arm, folder):
-    mine = ParameterUncertainty.load(load_robot(folder))
+@pytest.fixture
+def mine(folder):
+    return ParameterUncertainty.load(load_robot(folder))
+
+
+def test_uncertainty_lists_its_sources(mine):
     (source,) = mine.sources
     assert source["logs"].keys() == {f"m{seed}" for seed in range(6)}
     assert source["seconds"] == pytest.approx(48.0)
-    for joint in arm.operated:
-        values, covariance = mine.si(joint)
-        np.testing.assert_allclose(
-            [values[f] for f in mine.fields], [TRUE[f] for f in mine.fields], atol=1e-5
-        )
-        drawn = np.random.default_rng(0).multivariate_normal(
-            mine.array(joint, "values"), mine.array(joint, "covariance"), 20_000
-        )
-        spread = np.std([from_axes(mine.fields, drawn)[f] for f in mine.fields], axis=1)
-        np.testing.assert_allclose(spread, np.sqrt(np.diag(covariance)), rtol=0.1)
-        assert mine.joints[joint].residual_rms < 2e-3
+
+
+@pytest.mark.parametrize("joint", ["shoulder", "elbow"])
+def test_uncertainty_has_the_values_of_the_robot(mine, joint):
+    values, _ = mine.si(joint)
+    assert values == pytest.approx({field: TRUE[field] for field in mine.fields}, abs=1e-5)
+    assert mine.joints[joint].residual_rms < 2e-3
+
+
+@pytest.mark.parametrize("joint", ["shoulder", "elbow"])
+def test_a_covariance_is_that_of_draws_on_the_axes(mine, joint):
+    _, covariance = mine.si(joint)
+    centre = mine.array(joint, "values")
+    rng = np.random.default_rng(0)
+    drawn = rng.multivariate_normal(centre, mine.array(joint, "covariance"), 20_000)
+    found = from_axes(mine.fields, drawn)
+    spread = [found[field].std() for field in mine.fields]
+    np.testing.assert_allclose(spread, np.sqrt(np.diag(covariance)), rtol=0.1)
 
 
 def test_a_value_is_shown_without_its_error_where_no_log_shows_it():
@@ -118,48 +140,66 @@ def test_a_parameter_without_information_keeps_its_prior_std(arm):
     """A joint that nothing loads and that hardly moves shows no gain: kp is believed to a factor,
     not to the moon.
     """
-    still = [
-        replace(s, ctrl=s.ctrl * [0.02, 1], qpos=s.qpos * [0.02, 1]) for s in played(arm, 0, 3)
-    ]
+    share = np.array([0.02, 1])
+    still = [replace(s, ctrl=s.ctrl * share, qpos=s.qpos * share) for s in played(arm, 0, 3)]
     mine = estimate_uncertainty(arm, still, [], nthread=1)
     assert np.sqrt(np.diag(mine.array("shoulder", "covariance"))[0]) <= 0.5
 
 
-def test_residuals_use_recordings_that_hold_the_joint_and_the_robot_that_was_judged(arm, folder):
-    robot, judges = load_robot(folder), played(arm, 20, 2)
-    alone = [replace(s, meta=replace(s.meta, notes={"held_at_home": ["elbow"]})) for s in judges]
-    both, one, none = (
-        estimate_uncertainty(robot, judges, some, nthread=1).joints
-        for some in (judges, [judges[0], alone[1]], alone)
-    )
-    assert one["elbow"].residual_rms == pytest.approx(
-        estimate_uncertainty(robot, judges, judges[:1], nthread=1).joints["elbow"].residual_rms,
-        rel=0.2,
-    )
-    assert (
-        one["elbow"].residual_rms > 0.5 * both["elbow"].residual_rms
-    )  # rows that do not hold it are no zeros
+@pytest.fixture(scope="module")
+def judges(arm):
+    """Two recordings that judge."""
+    return played(arm, 20, 2)
+
+
+@pytest.fixture(scope="module")
+def both(folder, judges):
+    """The uncertainty of each joint where both recordings judge it."""
+    return estimate_uncertainty(load_robot(folder), judges, judges, nthread=1).joints
+
+
+def test_residuals_use_recordings_that_hold_the_joint(folder, judges, both):
+    robot = load_robot(folder)
+    some = [judges[0], *held(judges[1:], "elbow")]
+    one = estimate_uncertainty(robot, judges, some, nthread=1).joints["elbow"]
+    first = estimate_uncertainty(robot, judges, judges[:1], nthread=1).joints["elbow"]
+    assert one.residual_rms == pytest.approx(first.residual_rms, rel=0.2)
+    # Rows that do not hold it are no zeros.
+    assert one.residual_rms > 0.5 * both["elbow"].residual_rms
+
+
+def test_a_joint_that_no_recording_holds_has_the_residual_of_the_others(folder, judges):
+    alone = held(judges, "elbow")
+    none = estimate_uncertainty(load_robot(folder), judges, alone, nthread=1).joints
     assert none["elbow"].residual_p90 == none["shoulder"].residual_p90 > 0.0
-    off = robot.with_identified({"elbow": {"offset": 0.05}})
-    judged = estimate_uncertainty(
-        robot, judges, judges, held_out=[HeldOut(judges, off)], nthread=1
-    ).joints["elbow"]
+
+
+def test_residuals_are_those_of_the_robot_that_was_judged(folder, judges, both):
+    robot = load_robot(folder)
+    off = HeldOut(judges, robot.with_identified({"elbow": {"offset": 0.05}}))
+    found = estimate_uncertainty(robot, judges, judges, held_out=[off], nthread=1)
+    judged = found.joints["elbow"]
     assert judged.residual_rms > 10 * both["elbow"].residual_rms
     assert judged.values == both["elbow"].values
 
 
 def test_the_error_bound_is_wider_if_few_motions_differ(arm, folder):
-    robot, judges = load_robot(folder), played(arm, 20, 4)
-    alike = estimate_uncertainty(robot, judges, judges, nthread=1).joints["elbow"]
-    apart = [replace(s, qpos=s.qpos + np.float32(0.05 * (i == 0))) for i, s in enumerate(judges)]
-    replays = replay(apart, robot, nthread=1, lock_idle=True)
-    pooled = np.concatenate(
-        [np.abs(t.qpos - s.qpos)[1:] for s, t in zip(apart, replays, strict=True)]
-    )
+    robot = load_robot(folder)
+    judges = played(arm, 20, 4)
+    apart = [*shifted(judges[:1], np.float32(0.05)), *judges[1:]]
+    errors = []
+    for s, t in zip(apart, replay(apart, robot, nthread=1, lock_idle=True), strict=True):
+        errors.append(np.abs(t.qpos - s.qpos)[1:, robot.index(["elbow"])])
+    pooled = np.quantile(np.concatenate(errors), 0.9)
+    alike = estimate_uncertainty(robot, judges, judges, nthread=1).joints["elbow"].residual_p90
     wide = estimate_uncertainty(robot, judges, apart, nthread=1).joints["elbow"].residual_p90
-    assert wide > 1.5 * np.quantile(pooled[:, robot.index(["elbow"])], 0.9) > alike.residual_p90
-    one = estimate_uncertainty(robot, judges, judges[:1], nthread=1).joints["elbow"].residual_p90
-    assert np.isfinite(one)
+    assert wide > 1.5 * pooled > alike
+
+
+def test_the_error_bound_of_one_motion_is_finite(folder, judges):
+    robot = load_robot(folder)
+    one = estimate_uncertainty(robot, judges, judges[:1], nthread=1).joints["elbow"]
+    assert np.isfinite(one.residual_p90)
 
 
 def test_more_recordings_reduce_the_variance_and_are_listed(arm, folder):
@@ -168,22 +208,22 @@ def test_more_recordings_reduce_the_variance_and_are_listed(arm, folder):
     more = estimate_uncertainty(robot, played(arm, 40, 4), [], before=mine, nthread=1)
     assert len(more.sources) == 2
     for joint in arm.operated:
-        before, after = (np.diag(k.array(joint, "covariance")) for k in (mine, more))
+        before = np.diag(mine.array(joint, "covariance"))
+        after = np.diag(more.array(joint, "covariance"))
         assert (after < before).all()
 
 
 def test_a_change_by_adaptation_increases_the_variance(arm, folder):
     robot = load_robot(folder)
-    mine, found = ParameterUncertainty.load(robot), []
+    mine = ParameterUncertainty.load(robot)
+    column = mine.fields.index("offset")
+    variances = []
     for by in (0.0, -0.05):
         there = robot.with_identified({"elbow": {"offset": by}})
-        seen = [replace(s, qpos=s.qpos + np.array([0.0, by])) for s in played(arm, 40, 2)]
-        found.append(
-            estimate_uncertainty(there, seen, [], before=mine, nthread=1).array(
-                "elbow", "covariance"
-            )
-        )
-    same, moved = (np.diag(covariance)[mine.fields.index("offset")] for covariance in found)
+        seen = shifted(played(arm, 40, 2), np.array([0.0, by]))
+        found = estimate_uncertainty(there, seen, [], before=mine, nthread=1)
+        variances.append(found.array("elbow", "covariance")[column, column])
+    same, moved = variances
     assert moved > 1.1 * same
 
 
@@ -202,9 +242,8 @@ def test_a_folder_of_an_older_version_loads(folder, tmp_path):
         text = text.replace(f'"{key}"', f'"{old}"')
     (tmp_path / "old" / "known.json").write_text(text)
     new.unlink()
-    assert ParameterUncertainty.load(load_robot(tmp_path / "old")) == ParameterUncertainty.load(
-        load_robot(folder)
-    )
+    today = ParameterUncertainty.load(load_robot(folder))
+    assert ParameterUncertainty.load(load_robot(tmp_path / "old")) == today
 
 
 def test_a_folder_without_uncertainty_loads_and_show_refuses_it(arm, capsys):
@@ -243,11 +282,10 @@ def test_show_prints_and_draws(folder, tmp_path, capsys):
 
 
 def test_check_reports_a_changed_kp(arm, folder, tmp_path, capsys):
-    code, said = checked(
-        capsys, folder, dataset(arm, tmp_path / "data", played(arm, 70, 6, kp=0.7))
-    )
+    data = dataset(arm, tmp_path / "data", played(arm, 70, 6, kp=0.7))
+    code, said = checked(capsys, folder, data)
     assert (code, said["verdict"]) == (1, "drifted")
-    assert "kp" in {m["field"] for m in said["moved"]}
+    assert "kp" in {change["field"] for change in said["moved"]}
 
 
 @pytest.mark.parametrize(
@@ -261,15 +299,20 @@ def test_check_reports_a_changed_kp(arm, folder, tmp_path, capsys):
 )
 def test_drift_names_what_changed_and_by_how_much(arm, folder, how, shift, changes):
     robot = load_robot(folder)
-    logs = [replace(s, qpos=s.qpos + np.array([0.0, shift])) for s in played(arm, 70, 6, **how)]
+    logs = shifted(played(arm, 70, 6, **how), np.array([0.0, shift]))
     found = drift(robot, ParameterUncertainty.load(robot), logs, nthread=1)
-    moved = {(m.joint, m.field): m.by for m in found.moved if not how or m.field in ("kp", "delay")}
+    moved = {}
+    for change in found.moved:
+        if not how or change.field in ("kp", "delay"):
+            moved[change.joint, change.field] = change.by
     assert moved == pytest.approx(changes, rel=0.35)
     assert found.verdict == ("drifted" if changes else "same")
 
 
 def test_a_contradicting_recording_is_set_aside_and_half_of_them_are_a_contradiction(arm, folder):
-    robot, logs, verdicts = load_robot(folder), played(arm, 70, 6), []
+    robot = load_robot(folder)
+    logs = played(arm, 70, 6)
+    verdicts = []
     for odd in (2, 3, 4):
         logs[odd] = replace(logs[odd], qpos=logs[odd].qpos + np.array([0.03, 0.0]))
         found = drift(robot, ParameterUncertainty.load(robot), logs, nthread=1)
@@ -283,7 +326,8 @@ def test_another_arm_that_no_parameter_explains_has_drifted(arm, folder, monkeyp
     same.
     """
     xml = XML.replace('mass="0.3"', 'mass="0.6"').replace('mass="0.2"', 'mass="0.4"')
-    heavy, robot = write_arm(tmp_path / "heavy", TOML, xml), load_robot(folder)
+    heavy = write_arm(tmp_path / "heavy", TOML, xml)
+    robot = load_robot(folder)
     mine = ParameterUncertainty.load(robot)
     fresh = drift(robot, mine, played(arm, 70, 6), 1)
     assert (fresh.verdict, fresh.far) == ("same", {})
@@ -300,31 +344,32 @@ def test_a_change_smaller_than_the_difference_between_repetitions_is_no_drift(
     """A robot that stands 4 mrad elsewhere each time it plays a command: 3 mrad today are
     nothing.
     """
-    robot, rng = load_robot(folder), np.random.default_rng(0)
-    today = [replace(s, qpos=s.qpos + np.float32([0.003, 0.0])) for s in played(arm, 50, 6)]
-    seen = {}
-    for repeats in (1, 3):
-        logs = [
-            replace(s, qpos=s.qpos + np.float32(0.004 * (repeats > 1) * rng.standard_normal(2)))
-            for s in played(arm)
-            for _ in range(repeats)
-        ]
-        mine = estimate_uncertainty(robot, logs, played(arm, 20, 3), nthread=1)
-        seen[repeats] = drift(robot, mine, today, 1), mine.joints["shoulder"].repeatability
-    (precise, none), (loose, difference) = seen.values()
-    assert (precise.verdict, loose.verdict, none) == ("drifted", "same", 0.0)
+    robot = load_robot(folder)
+    rng = np.random.default_rng(0)
+    today = shifted(played(arm, 50, 6), np.float32([0.003, 0.0]))
+    judges = played(arm, 20, 3)
+    once = played(arm)
+    thrice = []
+    for s in once:
+        for _ in range(3):
+            thrice.append(replace(s, qpos=s.qpos + np.float32(0.004 * rng.standard_normal(2))))
+    precise = estimate_uncertainty(robot, once, judges, nthread=1)
+    assert precise.joints["shoulder"].repeatability == 0.0
+    assert drift(robot, precise, today, 1).verdict == "drifted"
+    loose = estimate_uncertainty(robot, thrice, judges, nthread=1)
+    difference = loose.joints["shoulder"].repeatability
     assert difference == pytest.approx(0.004 * 2**0.5, rel=0.5)
-    assert loose.min_effect["shoulder"] == difference > loose.largest["shoulder"].moves
+    found = drift(robot, loose, today, 1)
+    assert found.verdict == "same"
+    assert found.min_effect["shoulder"] == difference > found.largest["shoulder"].moves
 
 
 def test_recordings_of_joints_that_were_never_identified_are_not_called_the_same(arm, folder):
     robot = load_robot(folder)
-    half = robot.with_servo(
-        **{f: np.where([True, False], robot.servo[f], arm.servo[f]) for f in TRUE}
-    )
-    logs = [
-        replace(s, meta=replace(s.meta, notes={"held_at_home": ("shoulder",)}))
-        for s in played(arm, 70, 2)
-    ]
+    servo = {}
+    for field in TRUE:
+        servo[field] = np.where([True, False], robot.servo[field], arm.servo[field])
+    half = robot.with_servo(**servo)
+    logs = held(played(arm, 70, 2), "shoulder")
     with pytest.raises(UsageError, match="elbow"):
         drift(half, ParameterUncertainty.load(robot), logs, 1)
