@@ -40,23 +40,30 @@ def fitted(arm, data, tmp_path):
     return tmp_path / "fitted"
 
 
-def test_an_identified_folder_is_accepted_like_a_run(fitted, data, arm, capsys):
+def test_an_identified_folder_is_evaluated_like_a_run(fitted, data):
     found = gp.evaluate(fitted, data).to_dict()
-    assert (list(found["methods"]), found["motions"], found["unseen"]) == (
-        ["nominal", "identified"],
-        ["motion2"],
-        True,
-    )
+    assert list(found["methods"]) == ["nominal", "identified"]
+    assert found["motions"] == ["motion2"]
+    assert found["unseen"] is True
     assert found["ratio_to_nominal"]["identified"] < 0.5
-    by_cause = gp.gap(data, robot=fitted).to_dict()  # no training for the picture
+
+
+def test_an_identified_folder_has_a_gap_and_its_picture_without_training(fitted, data):
+    by_cause = gp.gap(data, robot=fitted).to_dict()
     assert list(by_cause["left"]) == ["nominal", "gain", "friction", "creep"]
-    assert by_cause["methods"]["identified"]["mpjae"] == pytest.approx(
-        found["methods"]["identified"]["mpjae"]
-    )
+    error = gp.evaluate(fitted, data).to_dict()["methods"]["identified"]["mpjae"]
+    assert by_cause["methods"]["identified"]["mpjae"] == pytest.approx(error)
     assert (fitted / "gap.png").is_file()
+
+
+def test_an_identified_folder_is_seen_beside_its_recordings(fitted, data):
     shown = side_by_side(data, select_entry(data, (fitted,)), gp.load_robot(fitted))
-    assert [m.method for m in shown.motions] == ["target", "nominal", "identified", "recorded"]
+    methods = [motion.method for motion in shown.motions]
+    assert methods == ["target", "nominal", "identified", "recorded"]
     assert shown.seen is False
+
+
+def test_eval_of_an_identified_folder_names_the_next_command(fitted, data, capsys):
     assert main(["eval", str(fitted), str(data.path)]) == 0
     said = " ".join(capsys.readouterr().out.split())
     assert "After identification the error is" in said
@@ -92,31 +99,39 @@ def test_a_robot_that_is_not_identified_is_refused(arm, data, tmp_path):
 
 def scores(**errors):
     """Metrics of methods from their errors in two motions, mrad."""
-    joint = lambda e: {"elbow": {"mpjae": e / 1e3}}  # noqa: E731
-    return {
-        name.replace("_", "+"): {
-            "mpjae": sum(e) / 2e3,
-            "by_joint": joint(sum(e) / 2),
-            "by_independent_motion": {f"m{i}": {"mpjae": x / 1e3} for i, x in enumerate(e)},
-        }
-        for name, e in errors.items()
-    }
+    found = {}
+    for name, (first, second) in errors.items():
+        mean = {"mpjae": (first + second) / 2e3}
+        motions = {"m0": {"mpjae": first / 1e3}, "m1": {"mpjae": second / 1e3}}
+        metrics = {"by_joint": {"elbow": mean}, "by_independent_motion": motions}
+        found[name.replace("_", "+")] = mean | metrics
+    return found
+
+
+NOMINAL = (20.0, 18.0)
+IDENTIFIED = (3.0, 3.2)
 
 
 def test_the_verdict_states_the_gain_of_a_network_even_if_it_is_zero(tmp_path):
-    useless = scores(nominal=(20.0, 18.0), identified=(3.0, 3.2), identified_gaponet=(3.0, 3.2))
-    said = verdict(useless)
-    assert (
-        said[1]
-        == "After identification the error is 3.10 mrad, 84 % less, on 2 independent motions."
-    )
-    assert (
-        "reduces the error of identification by 0.00 ± 0.00 mrad: leave the network out" in said[2]
-    )
+    useless = scores(nominal=NOMINAL, identified=IDENTIFIED, identified_gaponet=IDENTIFIED)
+    _, identification, network, *_ = verdict(useless)
+    error = "After identification the error is 3.10 mrad, 84 % less, on 2 independent motions."
+    assert identification == error
+    gain = "reduces the error of identification by 0.00 ± 0.00 mrad: leave the network out"
+    assert gain in network
     assert next_step(useless, "data", tmp_path) == f"gaponet export {tmp_path / 'robot'} --to mjcf"
-    useful = scores(nominal=(20.0, 18.0), identified=(3.0, 3.2), identified_gaponet=(2.0, 2.1))
+
+
+def test_the_verdict_states_the_gain_of_a_useful_network(tmp_path):
+    useful = scores(nominal=NOMINAL, identified=IDENTIFIED, identified_gaponet=(2.0, 2.1))
     assert "reduces the error of identification by 1.05 ± 0.05 mrad, 34 %." in verdict(useful)[2]
     assert next_step(useful, "data", tmp_path) == f"gaponet report {tmp_path}"
-    alone = scores(nominal=(20.0, 18.0), mlp=(9.0, 8.0))
+
+
+def test_the_gain_of_a_network_on_its_own_is_over_the_nominal_simulator():
+    alone = scores(nominal=NOMINAL, mlp=(9.0, 8.0))
     assert network_gain(alone, "mlp").base == "nominal"
-    assert next_step(scores(nominal=(20.0, 18.0)), "data") == "gaponet identify data --out my_robot"
+
+
+def test_after_the_nominal_simulator_the_next_step_is_identification():
+    assert next_step(scores(nominal=NOMINAL), "data") == "gaponet identify data --out my_robot"

@@ -27,9 +27,8 @@ def test_the_encoder_step_is_estimated_from_recordings():
     rng = np.random.default_rng(0)
     angle = np.cumsum(rng.normal(0, 0.01, 4000))
     step = 2 * np.pi / 4096
-    assert encoder_step([(np.round(angle / step) * step).astype(np.float32)]) == pytest.approx(
-        step, rel=1e-3
-    )
+    read = np.round(angle / step) * step
+    assert encoder_step([read.astype(np.float32)]) == pytest.approx(step, rel=1e-3)
     assert encoder_step([angle.astype(np.float32)]) == 0.0
 
 
@@ -63,26 +62,33 @@ def test_every_kind_of_model_has_its_bar(kind):
     assert ax.patches[4].get_width() == pytest.approx(2.0)  # what the model removes, mrad
 
 
-def test_a_run_has_its_steps_and_its_figure(arm, tmp_path):
-    kind = "gaponet"
+@pytest.fixture
+def run(arm, tmp_path):
+    """A run that corrects nothing yet, and its steps."""
     data = Dataset.create(tmp_path / "data", arm)
     for sequence in recordings(arm, 3, rows=60, kp=0.5):
         data.append(sequence)
-    motions = sorted({e.meta.motion for e in data.entries})
-    run = untrained(
-        tmp_path / "run", arm, data, kind, train=motions[:1], val=motions[1:2], test=motions[2:]
+    train, val, test = sorted({entry.meta.motion for entry in data.entries})
+    made = untrained(
+        tmp_path / "run", arm, data, "gaponet", train=(train,), val=(val,), test=(test,)
     )
-    found = gap_by_step(Candidate.load(run, arm), data)
-    assert list(found["left"]) == ["nominal", "delay", "offset", kind]
-    assert found["left"][kind] == pytest.approx(
-        found["left"]["nominal"], rel=0.2
-    )  # it corrects nothing yet
+    return made, gap_by_step(Candidate.load(made, arm), data)
+
+
+def test_a_run_has_its_steps(run):
+    _, found = run
+    left = found["left"]
+    assert list(left) == ["nominal", "delay", "offset", "gaponet"]
+    assert left["gaponet"] == pytest.approx(left["nominal"], rel=0.2)
     assert found["floor"] == {"encoder": None, "repeatability": None, "both": None}
-    (run / "gap.json").write_text(json.dumps(found))
-    for shown in (found, read_gap(run)):
-        assert [ax.get_title("right") for ax in waterfall(shown).axes if ax.get_visible()] == [
-            "floor –"
-        ] * 3
+
+
+def test_a_run_has_its_figure(run):
+    folder, found = run
+    (folder / "gap.json").write_text(json.dumps(found))
+    for shown in (found, read_gap(folder)):
+        panels = [ax for ax in waterfall(shown).axes if ax.get_visible()]
+        assert [ax.get_title("right") for ax in panels] == ["floor –"] * 3
 
 
 def test_bars_and_floor_carry_their_values():
@@ -101,9 +107,8 @@ def test_bars_and_floor_carry_their_values():
 
 def test_causes_lead_from_the_nominal_simulator_to_the_identified_one(tmp_path):
     robot = write_arm(tmp_path / "arm")
-    found = robot.with_identified(
-        {"elbow": {"kp": 15.0, "frictionloss": 0.1, "stribeck": 0.05, "stribeck_speed": 0.1}}
-    )
+    elbow = {"kp": 15.0, "frictionloss": 0.1, "stribeck": 0.05, "stribeck_speed": 0.1}
+    found = robot.with_identified({"elbow": elbow})
     steps = cause_steps(found)
     assert [step.name for step in steps] == ["gain", "friction", "creep", "stribeck"]
     assert model_hash(steps[-1].simulator) == model_hash(found)
@@ -122,37 +127,44 @@ def test_a_servo_with_less_damping_than_its_files_kd_is_the_last_step_too(tmp_pa
 def test_the_reduction_by_a_step_has_a_standard_error_over_motions(tmp_path):
     robot = write_arm(tmp_path / "arm")
     sequences = recordings(robot, 3, rows=50)
-    off = lambda sizes: [  # noqa: E731
-        Run.of(s, s.qpos + x, robot) for s, x in zip(sequences, sizes, strict=True)
-    ]
-    done = {"nominal": off([0.03, 0.02, 0.01]), "gain": off([0.02, 0.01, 0.0])}
-    assert reductions(done)["gain"] == pytest.approx([0.01, 0.0], abs=1e-6)
-    less, error = reductions({"nominal": off([0.03, 0.03, 0.03]), "gain": off([0.0, 0.01, 0.02])})[
-        "gain"
-    ]
-    assert (less, error) == pytest.approx((0.02, 0.01 / np.sqrt(3)), abs=1e-6)
+
+    def off(*sizes):
+        made = []
+        for s, size in zip(sequences, sizes, strict=True):
+            made.append(Run.of(s, s.qpos + size, robot))
+        return made
+
+    alike = {"nominal": off(0.03, 0.02, 0.01), "gain": off(0.02, 0.01, 0.0)}
+    assert reductions(alike)["gain"] == pytest.approx((0.01, 0.0), abs=1e-6)
+    apart = {"nominal": off(0.03, 0.03, 0.03), "gain": off(0.0, 0.01, 0.02)}
+    assert reductions(apart)["gain"] == pytest.approx((0.02, 0.01 / np.sqrt(3)), abs=1e-6)
 
 
-def test_a_motion_that_repeats_itself_tells_repeatability(tmp_path):
-    robot = write_arm(tmp_path / "arm")
-    once = recordings(robot, 1, rows=60)[0]
-    start, noise = once.ctrl[:1] + 0.3, np.random.default_rng(1).normal(0, 0.002, (270, 2))
-    qpos = np.concatenate([np.tile(once.qpos, (5, 1))[:270] + noise, once.qpos[:1]])
-    thrice = replace(
-        once,
-        ctrl=np.tile(once.ctrl, (5, 1))[:270],
-        qpos=qpos[:270].astype(np.float32),
-        qvel=np.zeros((270, 2), np.float32),
-    )
-    assert [len(p) for p in Repetitions.periods(thrice)] == [
-        60,
-        60,
-        60,
-    ]  # without the first, and the last is not whole
-    for joint in error_floor([thrice], robot).values():
+@pytest.fixture
+def repeated(arm):
+    """A motion of 60 rows, four and a half times, read with noise."""
+    once = recordings(arm, 1, rows=60)[0]
+    noise = np.random.default_rng(1).normal(0, 0.002, (270, 2))
+    qpos = np.tile(once.qpos, (5, 1))[:270] + noise
+    ctrl = np.tile(once.ctrl, (5, 1))[:270]
+    qvel = np.zeros((270, 2), np.float32)
+    return replace(once, ctrl=ctrl, qpos=qpos.astype(np.float32), qvel=qvel)
+
+
+def test_periods_are_whole_and_without_the_first(repeated):
+    assert [len(period) for period in Repetitions.periods(repeated)] == [60, 60, 60]
+
+
+def test_a_motion_that_repeats_itself_tells_repeatability(arm, repeated):
+    for joint in error_floor([repeated], arm).values():
         assert joint["repeatability"] == pytest.approx(0.002 * np.sqrt(2 / np.pi), rel=0.1)
-    assert not Repetitions.periods(once)
-    assert not Repetitions.periods(replace(thrice, ctrl=np.concatenate([thrice.ctrl[:-1], start])))
+
+
+def test_a_motion_that_does_not_repeat_itself_has_no_periods(repeated):
+    other_end = repeated.ctrl.copy()
+    other_end[-1] = repeated.ctrl[0] + 0.3
+    assert not Repetitions.periods(repeated.rows(slice(60)))
+    assert not Repetitions.periods(replace(repeated, ctrl=other_end))
 
 
 def test_friction_creeps_only_with_the_option(tmp_path):
@@ -160,22 +172,16 @@ def test_friction_creeps_only_with_the_option(tmp_path):
     stiff = {"kp": 20.0, "frictionloss": 2.0, "armature": 0.002}
     heavy = robot.with_identified(dict.fromkeys(robot.joint_names, stiff))
     still = recordings(robot, 1, rows=100)[0]
-    held = replace(
-        still, ctrl=np.repeat(still.qpos[:1] + 0.05, 100, axis=0), qvel=np.zeros_like(still.qvel)
-    )
-    moved = [
-        np.abs(np.ptp(replay([held], heavy, creeps=c)[0].qpos, axis=0)).max() for c in (False, True)
-    ]
-    assert moved[1] > 5 * moved[0]
+    ctrl = np.repeat(still.qpos[:1] + 0.05, 100, axis=0)
+    held = replace(still, ctrl=ctrl, qvel=np.zeros_like(still.qvel))
+    (stuck,) = replay([held], heavy, creeps=False)
+    (creeping,) = replay([held], heavy, creeps=True)
+    assert np.ptp(creeping.qpos, axis=0).max() > 5 * np.ptp(stuck.qpos, axis=0).max()
 
 
 def test_the_steps_of_an_identified_simulator_are_those_that_a_report_reads(tmp_path):
-    panel = {
-        "left": dict.fromkeys(
-            ["nominal", "delay", "offset", *CAUSES, "creep", "identified+gaponet"], 0.01
-        )
-    }
-    panel |= {"floor": {"both": 0.001}}
+    steps = ["nominal", "delay", "offset", *CAUSES, "creep", "identified+gaponet"]
+    panel = {"left": dict.fromkeys(steps, 0.01), "floor": {"both": 0.001}}
     gap = panel | {
         "by_joint": {"elbow": panel},
         "virtual": True,
@@ -195,13 +201,11 @@ def test_a_joint_that_nobody_recorded_has_no_bar_and_dilutes_nothing(tmp_path):
     stiffer = robot.with_identified({"shoulder": {"kp": 30.0}})
     found = gap_by_step(Candidate(stiffer.folder, stiffer, None), data)
     assert list(found["by_joint"]) == ["shoulder"]
-    assert found["removed"]["gain"] == pytest.approx(
-        found["by_joint"]["shoulder"]["removed"]["gain"]
-    )
+    shoulder = found["by_joint"]["shoulder"]
+    assert found["removed"]["gain"] == pytest.approx(shoulder["removed"]["gain"])
     both = rollout_errors(data.sequences(data.entries), robot)
-    assert both.mean() == pytest.approx(
-        found["methods"]["nominal"]["by_joint"]["shoulder"]["mpjae"], rel=1e-3
-    )
+    nominal = found["methods"]["nominal"]["by_joint"]["shoulder"]["mpjae"]
+    assert both.mean() == pytest.approx(nominal, rel=1e-3)
 
 
 def test_a_gap_that_is_measured_again_simulates_nothing(tmp_path, monkeypatch):

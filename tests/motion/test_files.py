@@ -9,9 +9,8 @@ from gaponet.robot.spec import load_robot
 def test_sage_names_may_be_paths_and_missing_joints_stay_at_home(tmp_path):
     robot = load_robot("h1_2")
     file = tmp_path / "stir.txt"
-    file.write_text(
-        " /h1_2/torso_link/left_shoulder_pitch_joint, /h1_2/x/left_elbow_joint\n0.1, 0.2\n0.3, 0.4\n"
-    )
+    head = " /h1_2/torso_link/left_shoulder_pitch_joint, /h1_2/x/left_elbow_joint\n"
+    file.write_text(head + "0.1, 0.2\n0.3, 0.4\n")
     motion = read_motion(file, robot)
     columns = robot.index(["left_shoulder_pitch_joint", "left_elbow_joint"])
     assert motion.ctrl[:, columns].tolist() == [[0.1, 0.2], [0.3, 0.4]]
@@ -71,9 +70,8 @@ def test_a_bad_file_is_an_error_that_says_what_is_wrong(arm, tmp_path, name, tex
 )
 def test_arrays_that_are_no_motion_are_refused(arm, tmp_path, arrays, message):
     good = {"joint_names": np.array(["shoulder"]), "ctrl": np.zeros((3, 1)), "dt": 0.02}
-    np.savez(
-        tmp_path / "bad.npz", **{name: x for name, x in (good | arrays).items() if x is not None}
-    )
+    stored = {name: array for name, array in (good | arrays).items() if array is not None}
+    np.savez(tmp_path / "bad.npz", **stored)
     with pytest.raises(LogError, match=rf"bad\.npz: {message}"):
         read_motion(tmp_path / "bad.npz", arm)
 

@@ -92,19 +92,17 @@ def test_the_paper_s_numbers_stand_beside_its_own_claims_alone():
 
 
 def test_no_method_of_a_block_is_missing_from_its_table():
-    found = claims(
-        make_results(*(training(n, 0.9) for n in ("MLP", "shared MLP", "literal", "GAPONet")))
-    )
+    networks = ("MLP", "shared MLP", "literal", "GAPONet")
+    found = claims(make_results(*[training(network, 0.9) for network in networks]))
     table = claim_table(found, "labels")
-    assert table.columns[2:-1] == ("identification", "MLP", "shared MLP", "literal", "GAPONet")
+    assert table.columns[2:-1] == ("identification", *networks)
 
 
 def test_the_gain_of_a_network_on_the_robot_is_over_the_same_way_without_it():
     table = commands_table(make_results(training("GAPONet", 0.5)), "labels")
     both = next(row for row in table.rows if row[0].startswith("GAPONet: feed-forward and"))
-    assert both[2].mean == pytest.approx(
-        75.0
-    )  # against raw: half by the feed-forward, half of the rest
+    # Against raw: half by the feed-forward, half of the rest.
+    assert both[2].mean == pytest.approx(75.0)
     assert both[3].mean == pytest.approx(50.0)
 
 
@@ -119,8 +117,8 @@ def test_table_1_has_every_payload_way_and_method_beside_the_paper_s():
 
 
 def test_a_row_of_table_2_above_half_of_nominal_is_not_converged():
-    rows = table_2(
-        make_results(training("payload out", 0.4, "table2"), training("history 2", 0.6, "table2"))
-    ).rows
+    good = training("payload out", 0.4, "table2")
+    bad = training("history 2", 0.6, "table2")
+    rows = table_2(make_results(good, bad)).rows
     assert [row[-2] for row in rows] == ["", "not converged"]
     assert rows[0][2].mean == pytest.approx(40.0)  # mrad: 0.4 · 0.2 rad·s in 2 s

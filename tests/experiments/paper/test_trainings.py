@@ -18,33 +18,52 @@ def trainings():
     return all_trainings(OPTIONS, (50.0, 100.0), PAYLOADS)
 
 
+def of_block(trainings, block, seed=None):
+    """The trainings of a block, of one seed or of all, in their order."""
+    found = []
+    for training in trainings:
+        if training.block == block and seed in (None, training.seed):
+            found.append(training)
+    assert found
+    return found
+
+
 @pytest.mark.parametrize("block", ["labels", "ppo"])
-def test_networks_of_a_block_differ_in_their_kind_alone(trainings, block):
-    for seed in range(3):
-        configs = [t.config for t in trainings if (t.block, t.seed) == (block, seed)]
-        kinds = [config.model.kind for config in configs]
-        assert kinds == list(NETWORKS.values())
-        alike = {replace(c, model=replace(c.model, kind="gaponet")) for c in configs}
-        assert len(alike) == 1
+@pytest.mark.parametrize("seed", range(3))
+def test_networks_of_a_block_differ_in_their_kind_alone(trainings, block, seed):
+    kinds = []
+    alike = set()
+    for training in of_block(trainings, block, seed):
+        kinds.append(training.config.model.kind)
+        model = replace(training.config.model, kind="gaponet")
+        alike.add(replace(training.config, model=model))
+    assert kinds == list(NETWORKS.values())
+    assert len(alike) == 1
 
 
 def test_every_network_of_the_claims_knows_the_payload(trainings):
-    assert all(t.config.model.payload_input for t in trainings if t.block != "table2")
+    for training in trainings:
+        assert training.config.model.payload_input or training.block == "table2"
 
 
 def test_the_paper_s_recipe_has_no_labels_and_ours_has(trainings):
-    assert all(t.config.pretraining.rounds == 0 for t in trainings if t.block == "ppo")
-    assert all(t.config.pretraining.rounds > 0 for t in trainings if t.block == "labels")
+    for training in of_block(trainings, "ppo"):
+        assert training.config.pretraining.rounds == 0
+    for training in of_block(trainings, "labels"):
+        assert training.config.pretraining.rounds > 0
 
 
 def test_all_trainings_of_a_block_are_equally_long(trainings):
-    assert {t.steps for t in trainings} == {100_000}
+    assert {training.steps for training in trainings} == {100_000}
 
 
-def test_no_two_trainings_share_a_folder_or_a_configuration(trainings):
-    assert len({t.folder for t in trainings}) == len(trainings)
-    rows = [t for t in trainings if t.block == "table2" and t.seed == 0]
-    assert len({t.config for t in rows}) == len(rows) == len(TABLE_2_CHANGES)
+def test_no_two_trainings_share_a_folder(trainings):
+    assert len({training.folder for training in trainings}) == len(trainings)
+
+
+def test_no_two_rows_of_table_2_share_a_configuration(trainings):
+    rows = of_block(trainings, "table2", seed=0)
+    assert len({row.config for row in rows}) == len(rows) == len(TABLE_2_CHANGES)
 
 
 def test_each_row_of_table_2_observes_as_many_values_as_the_paper_prints(trainings):
