@@ -1,7 +1,7 @@
 """make fuzz: mutants over all targets, their counts as JSON; exit code 1 where one failed.
 
 python -m fuzzing [--mutants 100000] [--only sage,table] [--seed 0] [--workers 2] [--keep FOLDER]
-python -m fuzzing --replay FOLDER/KIND-TARGET-NUMBER     # the files that --keep stored there, read again
+python -m fuzzing --replay FOLDER/KIND-TARGET-NUMBER     # reads again what --keep stored there
 """
 
 from __future__ import annotations
@@ -44,11 +44,11 @@ class Counted:
 
 def grouped(failures: list[Failure]) -> list[tuple[str, int, Failure]]:
     """(what, how often, the first of them), most frequent first."""
-    what = (  # noqa: E731
-        lambda f: (
-            f"{f.target} {f.kind}: {f.text.strip().splitlines()[-1][:150] if f.text.strip() else ''}"
-        )
-    )
+
+    def what(failure: Failure) -> str:
+        lines = failure.text.strip().splitlines() or [""]
+        return f"{failure.target} {failure.kind}: {lines[-1][:150]}"
+
     counts = Counter(map(what, failures))
     first = {what(f): f for f in reversed(failures)}
     return [(text, count, first[text]) for text, count in counts.most_common()]

@@ -47,16 +47,13 @@ class Target:
     """One kind of input."""
 
     name: str
-    files: Callable[
-        [], Files
-    ]  # the untouched files: path below the folder → content; called once in each worker
-    use: Callable[
-        [Path, Path], None
-    ]  # reads the first folder, writes below the second only; raises AbsurdError
+    # the untouched files: path below the folder → content; called once in each worker
+    files: Callable[[], Files]
+    # reads the first folder, writes below the second only; raises AbsurdError
+    use: Callable[[Path, Path], None]
     share: float = 1.0  # of a run's mutants, beside the others' shares
-    only: tuple[str, ...] = (
-        "",
-    )  # suffixes of the files that are changed; the others stand beside them
+    # suffixes of the files that are changed; the others stand beside them
+    only: tuple[str, ...] = ("",)
 
 
 @dataclass(frozen=True)
@@ -107,14 +104,15 @@ def run(
     plan = [(t, k) for t in chosen for k in range(round(mutants * t.share / total))]
     random.Random(seed).shuffle(plan)
     crew = [_Worker(plan[w::workers], seed, keep) for w in range(workers)]
-    start, counts, failures = time.monotonic(), Counter[str](), list[Failure]()
+    start = time.monotonic()
+    counts = Counter[str]()
+    failures: list[Failure] = []
     try:
-        while busy := [worker for worker in crew if worker.plan]:
-            wait([worker.pipe for worker in busy], 0.2)
-            for worker in busy:
-                for outcome, failure in worker.outcomes():
-                    counts[outcome] += 1
-                    failures += [failure] if failure else []
+        while any(worker.plan for worker in crew):
+            for outcome, failure in _next_outcomes(crew):
+                counts[outcome] += 1
+                if failure:
+                    failures.append(failure)
             progress(counts.total(), len(failures))
     except KeyboardInterrupt:
         pass  # the counts so far are true
@@ -133,6 +131,15 @@ def run(
 
 
 Outcome = tuple[str, Failure | None]  # "refused", "taken" or "failed", and what went wrong
+Problem = tuple[str, str]  # kind and text of a failure
+
+
+def _next_outcomes(crew: list[_Worker]) -> Iterator[Outcome]:
+    """Yield what the workers have tried since the last call, after a wait of at most 0.2 s."""
+    busy = [worker for worker in crew if worker.plan]
+    wait([worker.pipe for worker in busy], 0.2)
+    for worker in busy:
+        yield from worker.outcomes()
 
 
 class _Worker:
@@ -141,47 +148,60 @@ class _Worker:
     """
 
     def __init__(self, plan: list[tuple[Target, int]], seed: int, keep: Path | None) -> None:
-        self.plan, self.seed, self.keep = deque(plan), seed, keep
+        self.plan = deque(plan)
+        self.seed = seed
+        self.keep = keep
         self._start()
 
     def _start(self) -> None:
-        context, memory = mp.get_context("fork"), Path("/dev/shm")
+        context = mp.get_context("fork")
+        memory = Path("/dev/shm")
         self.room = Path(
             tempfile.mkdtemp(prefix="fuzz-", dir=memory if os.access(memory, os.W_OK) else None)
         )
         self.pipe, theirs = context.Pipe(duplex=False)
         what = (list(islice(self.plan, RENEW)), self.seed, self.keep, self.room, theirs)
         self.process = context.Process(target=_work, args=what, daemon=True)
-        self.begun, self.since = False, time.monotonic()
+        self.begun = False
+        self.since = time.monotonic()
         self.process.start()
         theirs.close()
 
     def outcomes(self) -> Iterator[Outcome]:
         """Yield the outcomes since the last call, without waiting for more."""
-        kind, text, ended = "", "", False
+        ended = False
         try:
-            while self.plan and self.pipe.poll(0):
-                outcome = self.pipe.recv()
-                self.since = time.monotonic()
-                if self.begun:
-                    self.plan.popleft()
-                    yield outcome
-                self.begun = True
+            yield from self._received()
         except (EOFError, OSError):
             self.process.join()
             if not self.begun:
                 raise RuntimeError("a fuzzing worker died before its first mutant") from None
             ended = True
-            if self.process.exitcode:
-                kind, text = "died", f"exit code {self.process.exitcode}"
-        if self.begun and time.monotonic() - self.since > PATIENCE * HANG_S:
-            kind, text = "hang", f"no answer after {PATIENCE * HANG_S:g} s"
-        if kind and self.plan:
+        problem = self._problem(ended)
+        if problem and self.plan:
             target, number = self.plan.popleft()
-            yield "failed", Failure(target.name, number, kind, text)
-        if (kind or ended) and self.plan:
+            yield "failed", Failure(target.name, number, *problem)
+        if (problem or ended) and self.plan:
             self.close()
             self._start()
+
+    def _received(self) -> Iterator[Outcome]:
+        """Yield what the process has sent; its first message only says that it begins."""
+        while self.plan and self.pipe.poll(0):
+            outcome = self.pipe.recv()
+            self.since = time.monotonic()
+            if self.begun:
+                self.plan.popleft()
+                yield outcome
+            self.begun = True
+
+    def _problem(self, ended: bool) -> Problem | None:
+        """What went wrong with the process itself, if anything."""
+        if self.begun and time.monotonic() - self.since > PATIENCE * HANG_S:
+            return "hang", f"no answer after {PATIENCE * HANG_S:g} s"
+        if ended and self.process.exitcode:
+            return "died", f"exit code {self.process.exitcode}"
+        return None
 
     def close(self) -> None:
         """End the process."""
@@ -206,7 +226,8 @@ def _work(
     quiet = os.open(os.devnull, os.O_WRONLY)
     os.dup2(quiet, 1)
     os.dup2(quiet, 2)
-    sys.stdout, sys.stderr = open(1, "w", closefd=False), open(2, "w", closefd=False)  # noqa: SIM115
+    sys.stdout = open(1, "w", closefd=False)  # noqa: SIM115
+    sys.stderr = open(2, "w", closefd=False)  # noqa: SIM115
     sys.addaudithook(_watch)
     _limit_memory()
     parent = os.getppid()
@@ -226,30 +247,39 @@ def _attempt(target: Target, files: Files, number: int, seed: int, room: Path) -
     mutant = mutate(files, random.Random(f"{seed} {target.name} {number}"), target.only)
     _lay(mutant, room)
     _WATCHED[:] = [str(room / "out")]
-    start, outcome, kind, text = time.process_time(), "taken", "", ""
-    try:
-        target.use(room / "in", room / "out")
-    except GAPONetError as error:
-        outcome = "refused"
-        if "\n" in str(error).strip() or len(str(error)) > 2000:
-            kind, text = "traceback", f"not one line: {str(error)[:2500]!r}"
-    except AbsurdError as error:
-        kind, text = "absurd", str(error)
-    except MemoryError:
-        kind, text = "memory", traceback.format_exc()
-    except BaseException:
-        kind, text = "traceback", traceback.format_exc()
-    if not kind and time.process_time() - start > HANG_S:
-        kind, text = "hang", f"{time.process_time() - start:.1f} s of computing"
+    start = time.process_time()
+    outcome, problem = _use(target, room)
+    seconds = time.process_time() - start
+    if problem is None and seconds > HANG_S:
+        problem = ("hang", f"{seconds:.1f} s of computing")
     outside = [
         *_WATCHED[1:],
         *(p.name for p in room.iterdir() if p.name not in ("in", "out")),
         *_changed(mutant, room),
     ]
     _WATCHED.clear()
-    if not kind and outside:
-        kind, text = "outside", f"written outside the target: {', '.join(outside)}"
-    return ("failed", Failure(target.name, number, kind, text)) if kind else (outcome, None)
+    if problem is None and outside:
+        problem = ("outside", f"written outside the target: {', '.join(outside)}")
+    if problem is None:
+        return outcome, None
+    return "failed", Failure(target.name, number, *problem)
+
+
+def _use(target: Target, room: Path) -> tuple[str, Problem | None]:
+    """Read the mutant in room/in: "refused" or "taken", and what may not happen, if it did."""
+    try:
+        target.use(room / "in", room / "out")
+    except GAPONetError as error:
+        if "\n" in str(error).strip() or len(str(error)) > 2000:
+            return "refused", ("traceback", f"not one line: {str(error)[:2500]!r}")
+        return "refused", None
+    except AbsurdError as error:
+        return "taken", ("absurd", str(error))
+    except MemoryError:
+        return "taken", ("memory", traceback.format_exc())
+    except BaseException:
+        return "taken", ("traceback", traceback.format_exc())
+    return "taken", None
 
 
 def _lay(files: Files, room: Path) -> None:
@@ -277,9 +307,8 @@ def _changed(files: Files, room: Path) -> list[str]:
     ]
 
 
-_WATCHED: list[
-    str
-] = []  # the folder that may be written while a mutant is tried, then what was written elsewhere
+# the folder that may be written while a mutant is tried, then what was written elsewhere
+_WATCHED: list[str] = []
 
 
 def _watch(event: str, args: tuple[Any, ...]) -> None:

@@ -15,9 +15,8 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-Files = dict[
-    str, bytes | None
-]  # path below a folder → content; None is a folder where a file is expected
+# path below a folder → content; None is a folder where a file is expected
+Files = dict[str, bytes | None]
 Change = Callable[[bytes, random.Random], bytes]
 UNREADABLE = (
     ValueError,
@@ -162,9 +161,8 @@ def _of_folder(files: Files, name: str, names: list[str], rng: random.Random) ->
     elif kind == 2:
         files[name] = b""
     else:
-        files[name] = files.get(
-            rng.choice(names)
-        )  # None where an earlier change took the only file
+        # None where an earlier change took the only file
+        files[name] = files.get(rng.choice(names))
 
 
 def _bytes(content: bytes, rng: random.Random) -> bytes:
@@ -205,7 +203,8 @@ def _text(content: bytes, rng: random.Random) -> bytes:
 
 def _lines(text: str, rng: random.Random) -> str:
     lines = text.split("\n")
-    a, b = rng.randrange(len(lines)), rng.randrange(len(lines))
+    a = rng.randrange(len(lines))
+    b = rng.randrange(len(lines))
     kind = rng.randrange(7)
     if kind == 0:
         del lines[a]
@@ -217,7 +216,8 @@ def _lines(text: str, rng: random.Random) -> str:
         lines[a] = rng.choice(("", " ", ",", "#", "﻿", "\x00", "1,2,3"))
     elif kind == 4:  # a column twice, gone, or one number in all rows
         at = rng.randrange(lines[0].count(",") + 1)
-        number, how = rng.choice(NUMBERS), rng.randrange(3)
+        number = rng.choice(NUMBERS)
+        how = rng.randrange(3)
         do = lambda cell: (cell * 2, [], [number])[how]  # noqa: E731
         cells = [line.split(",") for line in lines]
         lines = [",".join(c[:at] + do(c[at : at + 1]) + c[at + 1 :]) for c in cells]
@@ -251,16 +251,7 @@ def _structure(value: Any, rng: random.Random) -> Any:
     """A parsed structure with one place changed: another value, a key gone, renamed or added, a
     list longer.
     """
-    places: list[tuple[Any, Any]] = []
-
-    def walk(node: Any) -> None:
-        for key in node if isinstance(node, dict) else range(len(node)):
-            places.append((node, key))
-            if isinstance(node[key], (dict, list)):
-                walk(node[key])
-
-    if isinstance(value, (dict, list)):
-        walk(value)
+    places = _places(value)
     if not places or rng.random() < 0.01:
         return rng.choice(VALUES)
     node, key = rng.choice(places)
@@ -278,51 +269,69 @@ def _structure(value: Any, rng: random.Random) -> Any:
     return value
 
 
+def _places(node: Any) -> list[tuple[Any, Any]]:
+    """(dict or list, key or index) of every value below a node, a container before its content."""
+    if not isinstance(node, (dict, list)):
+        return []
+    places: list[tuple[Any, Any]] = []
+    for key in node if isinstance(node, dict) else range(len(node)):
+        places.append((node, key))
+        places += _places(node[key])
+    return places
+
+
 def _parquet(content: bytes, rng: random.Random) -> bytes:
     """One column gone, renamed, twice, of other values or of another type; or rows gone or
     twice.
     """
     table = pq.read_table(io.BytesIO(content))
-    rows, at, kind = table.num_rows, rng.randrange(table.num_columns), rng.randrange(9)
-    name, values = table.column_names[at], table.column(at).to_pylist()
-    if kind == 0:
-        table = table.remove_column(at)
-    elif kind == 1:
-        new = rng.choice((*WORDS, *table.column_names))
-        table = table.rename_columns(
-            [new if i == at else n for i, n in enumerate(table.column_names)]
-        )
-    elif kind == 2:
-        table = table.append_column(rng.choice((name, "x")), table.column(at))
-    elif kind == 3:
-        cut = rng.randrange(rows + 1)
-        table = rng.choice(
-            (table.slice(0, cut), table.slice(cut), pa.concat_tables([table, table]))
-        )
-    elif kind == 4:
-        table = table.set_column(
-            at, name, pa.array([rng.choice((None, True, False, 1, "x"))] * rows)
-        )
-    elif kind == 5:
-        table = table.set_column(
-            at,
-            name,
-            _column([v if rng.random() < 0.5 else None for v in values], rng.choice(TYPES)),
-        )
-    elif values:
-        i = rng.randrange(rows)
-        number = rng.choice((None, float("nan"), float("inf"), 1e30, -1, 0, 10**9, 2**62, 0.5))
-        if isinstance(values[i], list):
-            cut = rng.randrange(len(values[i]) + 1)
-            values[i] = rng.choice(
-                (values[i][:cut], [*values[i], 1.0], [number] * len(values[i]), None)
-            )
-        else:
-            values[i] = rng.choice(WORDS) if isinstance(values[i], str) else number
-        table = table.set_column(at, name, _column(values, None))
+    at = rng.randrange(table.num_columns)
+    kind = rng.randrange(9)
+    values = table.column(at).to_pylist()
+    if kind <= 3:
+        table = _of_table(table, at, kind, rng)
+    elif kind <= 5 or values:
+        table = table.set_column(at, table.column_names[at], _of_column(values, kind, rng))
     out = io.BytesIO()
     pq.write_table(table, out)
     return out.getvalue()
+
+
+def _of_table(table: pa.Table, at: int, kind: int, rng: random.Random) -> pa.Table:
+    """A column gone (kind 0), renamed (1) or twice (2), or rows gone or twice (3)."""
+    names = table.column_names
+    if kind == 0:
+        return table.remove_column(at)
+    if kind == 1:
+        names[at] = rng.choice((*WORDS, *names))
+        return table.rename_columns(names)
+    if kind == 2:
+        return table.append_column(rng.choice((names[at], "x")), table.column(at))
+    cut = rng.randrange(table.num_rows + 1)
+    twice = pa.concat_tables([table, table])
+    return rng.choice((table.slice(0, cut), table.slice(cut), twice))
+
+
+def _of_column(values: list[Any], kind: int, rng: random.Random) -> pa.Array:
+    """One value in all rows (kind 4), half of the values and another type (5), or one value
+    changed.
+    """
+    if kind == 4:
+        return pa.array([rng.choice((None, True, False, 1, "x"))] * len(values))
+    if kind == 5:
+        half = [v if rng.random() < 0.5 else None for v in values]
+        return _column(half, rng.choice(TYPES))
+    row = rng.randrange(len(values))
+    values[row] = _of_value(values[row], rng)
+    return _column(values, None)
+
+
+def _of_value(value: Any, rng: random.Random) -> Any:
+    number = rng.choice((None, float("nan"), float("inf"), 1e30, -1, 0, 10**9, 2**62, 0.5))
+    if isinstance(value, list):
+        cut = rng.randrange(len(value) + 1)
+        return rng.choice((value[:cut], [*value, 1.0], [number] * len(value), None))
+    return rng.choice(WORDS) if isinstance(value, str) else number
 
 
 TYPES = (
@@ -355,7 +364,8 @@ def _npz(content: bytes, rng: random.Random) -> bytes:
     with np.load(io.BytesIO(content), allow_pickle=False) as file:
         arrays = dict(file)
     name = rng.choice(sorted(arrays))
-    array, kind = arrays.pop(name), rng.randrange(6)
+    array = arrays.pop(name)
+    kind = rng.randrange(6)
     if kind == 0:
         name = rng.choice(WORDS[:8])
     elif kind == 1:

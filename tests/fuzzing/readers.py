@@ -110,7 +110,8 @@ def importing(
         given = options | (
             {"logs": str(source / str(options["logs"]))} if "logs" in options else {}
         )
-        unit, payload = None if stated == "all" else "lab", None if stated else 0.0
+        unit = None if stated == "all" else "lab"
+        payload = None if stated else 0.0
         report = import_logs(
             source / at, robot(), out, ImportRequest(unit_id=unit, payload_mass=payload, **given)
         )
@@ -148,7 +149,8 @@ def _mapped(folder: Path) -> None:
     (folder / "logs" / "a.csv").write_text(table_text(theirs))
     (folder / "map.toml").write_text(
         'time = "t"\ntime_unit = "s"\nposition_unit = "rad"\n[columns]\n"ctrl.shoulder" = "cmd_1"\n'
-        '"ctrl.elbow" = "cmd_2"\n"qpos.shoulder" = "pos_1"\n"qpos.elbow" = "pos_2"\n[joint_units]\nelbow = "rad"\n'
+        '"ctrl.elbow" = "cmd_2"\n"qpos.shoulder" = "pos_1"\n"qpos.elbow" = "pos_2"\n'
+        '[joint_units]\nelbow = "rad"\n'
     )
 
 
@@ -161,8 +163,10 @@ def _described(folder: Path) -> None:
     )
     (folder / "sheet.csv").write_text("file,motion,payload,rep,kp.b\nx,wave,0.1,0,20\n")
     (folder / "logs.toml").write_text(
-        'time = "t"\ntime_unit = "s"\nposition_unit = "rad"\nctrl = "{joint}_des"\nqpos = "{joint}"\n'
-        'ignore = ["t"]\ncommand_file = "{name}_cmd.csv"\nmanifest = "sheet.csv"\n[names]\na = "shoulder"\n'
+        'time = "t"\ntime_unit = "s"\nposition_unit = "rad"\n'
+        'ctrl = "{joint}_des"\nqpos = "{joint}"\n'
+        'ignore = ["t"]\ncommand_file = "{name}_cmd.csv"\nmanifest = "sheet.csv"\n'
+        '[names]\na = "shoulder"\n'
         'b = "elbow"\n[signs]\nshoulder = -1\n'
     )
 
