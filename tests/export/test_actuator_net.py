@@ -52,8 +52,10 @@ def run(tmp_path_factory):
 
 def test_the_torque_of_a_late_servo_follows_from_the_past_of_error_and_speed():
     joint = {"kp": 20.0, "kd": 0.5, "delay": 0.007, "offset": 0.1, "effort_limit": 3.0}
-    net, rng = ActuatorNet(joint, 0.005, 4), np.random.default_rng(0)
-    v, target = 0.1 * rng.normal(size=4), 0.01 * rng.normal(size=4)  # newest first
+    net = ActuatorNet(joint, 0.005, 4)
+    rng = np.random.default_rng(0)
+    v = 0.1 * rng.normal(size=4)  # newest first, as the targets
+    target = 0.01 * rng.normal(size=4)
     q = 0.005 * (np.cumsum(v[::-1])[::-1])
     late = 0.6 * target[1] + 0.4 * target[2]  # 7 ms are 1.4 steps
     torque = 20.0 * (late + 0.1 - q[0]) - 0.5 * v[0]
@@ -99,7 +101,8 @@ def test_networks_play_the_run_in_plain_mujoco_and_say_what_they_leave(exported)
     told = {"metadata.json": ""}
     program = torch.export.load(exported / "elbow.pt2", extra_files=told).module()(x)
     torch.testing.assert_close(program, script)
-    onnx, onnxruntime = pytest.importorskip("onnx"), pytest.importorskip("onnxruntime")
+    onnx = pytest.importorskip("onnx")
+    onnxruntime = pytest.importorskip("onnxruntime")
     session = onnxruntime.InferenceSession(str(exported / "elbow.onnx"))
     np.testing.assert_allclose(session.run(None, {"past": x.numpy()})[0], script.numpy(), atol=1e-4)
     props = {p.key: p.value for p in onnx.load(exported / "elbow.onnx").metadata_props}

@@ -98,7 +98,8 @@ def test_nothing_of_the_program_stays_on_the_device_that_it_was_written_on(place
 
 
 def test_a_past_made_in_inference_mode_is_begun_anew_outside_it(place):
-    aligner, state = Aligner(place / "torch", ["shoulder", "elbow"], 3, "cpu"), drawn(3)
+    aligner = Aligner(place / "torch", ["shoulder", "elbow"], 3, "cpu")
+    state = drawn(3)
     with torch.inference_mode():
         first = aligner(*state).clone()
         aligner(*drawn(3, seed=1))
@@ -108,36 +109,55 @@ def test_a_past_made_in_inference_mode_is_begun_anew_outside_it(place):
     assert not torch.equal(now[1], first[1])
 
 
-@pytest.mark.parametrize(("bad", "when"), [(float("nan"), 0), (float("inf"), 2)])
-def test_one_target_that_is_no_number_touches_one_world_and_no_later_period(
-    place, model, bad, when
-):
-    aligners = [Aligner(place / "torch", ["shoulder", "elbow"], 3, "cpu") for _ in range(2)]
-    step = program(delta_step(model, place / "run")).module()
-    frames, fresh = [torch.zeros(3, 3, 6)] * 2, torch.ones(3, dtype=torch.bool)
+NO_NUMBER = [(float("nan"), 0), (float("inf"), 2)]
+
+
+@pytest.mark.parametrize(("bad", "when"), NO_NUMBER)
+def test_one_target_that_is_no_number_touches_one_world_and_no_later_period(place, bad, when):
+    """The last sent target is repeated; in the first period, the position."""
+    spoilt = Aligner(place / "torch", ["shoulder", "elbow"], 3, "cpu")
+    held = Aligner(place / "torch", ["shoulder", "elbow"], 3, "cpu")
     for t in range(6):
         q, v, a = drawn(3, seed=t)
-        targets, held = [a.clone(), a.clone()], a.clone()
+        spoilt_target = a.clone()
+        held_target = a.clone()
         if t == when:
-            targets[0][1, 0] = bad
-            targets[1][1, 0] = aligners[1].sent[1, 0] if t else q[1, 0]
-            held[1, 0] = frames[1][1, 0, 4] if t else q[1, 0]
-        sent = [aligner(q, v, target) for aligner, target in zip(aligners, targets, strict=True)]
-        assert torch.equal(*sent)
-        assert sent[0].isfinite().all()
-        made = [
-            step(q, v, b, torch.zeros(3), f, fresh)
-            for b, f in zip((targets[0], held), frames, strict=True)
-        ]
-        frames, fresh = [f for _, f in made], torch.zeros_like(fresh)
-        assert torch.equal(made[0][0], made[1][0])
-        assert torch.equal(*frames)
-        assert frames[0].isfinite().all()
+            spoilt_target[1, 0] = bad
+            held_target[1, 0] = held.sent[1, 0] if t else q[1, 0]
+        sent = spoilt(q, v, spoilt_target)
+        assert torch.equal(sent, held(q, v, held_target))
+        assert sent.isfinite().all()
+
+
+@pytest.mark.parametrize(("bad", "when"), NO_NUMBER)
+def test_the_exported_step_holds_the_last_target_in_place_of_one_that_is_no_number(
+    place, model, bad, when
+):
+    step = program(delta_step(model, place / "run")).module()
+    payload = torch.zeros(3)
+    spoilt_frames = torch.zeros(3, 3, 6)
+    held_frames = torch.zeros(3, 3, 6)
+    fresh = torch.ones(3, dtype=torch.bool)
+    for t in range(6):
+        q, v, a = drawn(3, seed=t)
+        spoilt_target = a.clone()
+        held_target = a.clone()
+        if t == when:
+            spoilt_target[1, 0] = bad
+            held_target[1, 0] = held_frames[1, 0, 4] if t else q[1, 0]
+        spoilt_delta, spoilt_frames = step(q, v, spoilt_target, payload, spoilt_frames, fresh)
+        held_delta, held_frames = step(q, v, held_target, payload, held_frames, fresh)
+        fresh = torch.zeros_like(fresh)
+        assert torch.equal(spoilt_delta, held_delta)
+        assert torch.equal(spoilt_frames, held_frames)
+        assert spoilt_frames.isfinite().all()
 
 
 def test_gradients_reach_the_present_command_and_no_earlier_one(model, place):
     step = program(delta_step(model, place / "run")).module()
-    frames, fresh, payload = torch.zeros(2, 3, 6), torch.ones(2, dtype=torch.bool), torch.zeros(2)
+    frames = torch.zeros(2, 3, 6)
+    fresh = torch.ones(2, dtype=torch.bool)
+    payload = torch.zeros(2)
     commands = [x.requires_grad_() for t in range(3) for x in drawn(2, seed=t)[2:]]
     for a in commands:
         q, v, _ = drawn(2)
@@ -150,7 +170,8 @@ def test_gradients_reach_the_present_command_and_no_earlier_one(model, place):
 
 
 def test_facts_are_the_compiled_simulators(place, model):
-    robot, facts = model.simulator(), read_facts(place / "torch")
+    robot = model.simulator()
+    facts = read_facts(place / "torch")
     compiled = build_model(robot, 0.1)
     assert facts["simulator"] == model_hash(robot) == model.card["simulator"]
     assert facts["corrected"] == ["shoulder", "elbow"]
@@ -275,7 +296,9 @@ class JointPositionAction:
     """
 
     def __init__(self, dt=0.02):
-        self._env, self.num_envs, self.device = SimpleNamespace(step_dt=dt), 2, "cpu"
+        self._env = SimpleNamespace(step_dt=dt)
+        self.num_envs = 2
+        self.device = "cpu"
         self._raw_actions = torch.zeros(2, 2)
 
     def process_actions(self, actions):
@@ -291,7 +314,8 @@ class Term(AlignedAction, JointPositionAction):
 
 
 def test_an_action_term_corrects_what_was_processed_in_the_present_state(place):
-    term, (q, v, a) = Term(), drawn(2)
+    term = Term()
+    q, v, a = drawn(2)
     term.folder = place / "torch"
     robot = SimpleNamespace(data=SimpleNamespace(joint_pos=Wrapped(q), joint_vel=Wrapped(v)))
     term.align(robot, slice(None), ["shoulder", "elbow"])
@@ -310,7 +334,8 @@ def test_an_action_term_corrects_what_was_processed_in_the_present_state(place):
 
 
 def test_a_servos_law_in_torch_is_the_simulators(tmp_path):
-    rng, values = np.random.default_rng(0), (0.1, 0.2, 0.05, 0.08, 0.3, 0.02, 3.0, 0.0)
+    rng = np.random.default_rng(0)
+    values = (0.1, 0.2, 0.05, 0.08, 0.3, 0.02, 3.0, 0.0)
     law = dict(zip(SERVO_TERMS, values, strict=True))
     robot = write_arm(tmp_path / "arm").with_identified(
         {"elbow": law | {"offset": 0.1}, "shoulder": {"kp": 11.0}}
@@ -321,7 +346,8 @@ def test_a_servos_law_in_torch_is_the_simulators(tmp_path):
     vars(data).update({name: torch.tensor(x).float() for name, x in seen.items()})
     found.after_step(data)
     found.before_step(model, data, torch.tensor(ctrl).float())
-    terms, kp = {name: robot.servo[name] for name in SERVO_TERMS}, robot.servo.kp
+    terms = {name: robot.servo[name] for name in SERVO_TERMS}
+    kp = robot.servo.kp
     friction = friction_limit(terms, np.full(2, 0.05), v, torque, load)
     np.testing.assert_allclose(model.dof_frictionloss, friction, atol=1e-6)
     asked = servo_torque(terms, kp, ctrl + robot.servo.offset, q)
@@ -409,12 +435,10 @@ def test_a_joint_with_a_no_load_speed_is_isaac_labs_dc_motor(tmp_path, monkeypat
 
 def test_targets_under_way_in_the_term_are_late_by_parts_of_a_step_and_begin_at_rest():
     class Engine:
-        num_envs, device, servo_offset, _env = (
-            2,
-            "cpu",
-            torch.tensor([0.1, 0.0]),
-            SimpleNamespace(physics_dt=0.005),
-        )
+        num_envs = 2
+        device = "cpu"
+        servo_offset = torch.tensor([0.1, 0.0])
+        _env = SimpleNamespace(physics_dt=0.005)
         aligner = SimpleNamespace(past=SimpleNamespace(fresh=torch.tensor([True, True])))
 
         def apply_actions(self):

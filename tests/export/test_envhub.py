@@ -108,7 +108,8 @@ def test_the_gripper_has_0_to_100_and_other_joints_have_degrees(hub, folder):
 def test_the_folder_needs_no_gaponet(folder):
     blocked = (
         "import sys; sys.modules['gaponet'] = None; sys.path.insert(0, '.'); import env; "
-        "envs = env.make_env(1)['so101'][0]; envs.reset(seed=0); envs.step(envs.action_space.sample())"
+        "envs = env.make_env(1)['so101'][0]; envs.reset(seed=0); "
+        "envs.step(envs.action_space.sample())"
     )
     subprocess.run([sys.executable, "-c", blocked], cwd=folder, check=True)
 

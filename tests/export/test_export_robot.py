@@ -55,7 +55,8 @@ MAIN = """<mujoco model="my scene">
     <body name="ball" pos="1 0 0"><freejoint/><geom size="0.1" mass="1"/></body>
     <include file="parts/arm.xml"/>
   </worldbody>
-  <tendon><fixed name="both"><joint joint="shoulder" coef="1"/><joint joint="elbow" coef="1"/></fixed></tendon>
+  <tendon><fixed name="both"><joint joint="shoulder" coef="1"/>
+    <joint joint="elbow" coef="1"/></fixed></tendon>
   <actuator>
     <!-- mine -->
     <position class="servo" name='first' joint="shoulder" ctrlrange="-80 80"/>
@@ -67,7 +68,8 @@ MAIN = """<mujoco model="my scene">
 </mujoco>
 """
 DEFAULTS = """<mujocoinclude><default>
-  <joint damping="0.5" armature="0.02" frictionloss="0.05"/><general gear="3" dyntype="integrator" biastype="none"/>
+  <joint damping="0.5" armature="0.02" frictionloss="0.05"/>
+  <general gear="3" dyntype="integrator" biastype="none"/>
   <default class="servo"><position kp="99" forcerange="-1 1" gear="1"/></default>
 </default></mujocoinclude>
 """
@@ -78,10 +80,12 @@ ARM = """<mujocoinclude>
     <geom type="capsule" fromto="0 0 0 0.2 0 0" size="0.02" mass="0.3" contype="0" conaffinity="0"/>
     <body name="fore" pos="0.2 0 0">
       <joint armature='7' name="elbow" axis="0 1 0" range="-85.94366926962348 85.94366926962348"/>
-      <geom type="capsule" fromto="0 0 0 0.2 0 0" size="0.02" mass="0.2" contype="0" conaffinity="0"/>
+      <geom type="capsule" fromto="0 0 0 0.2 0 0" size="0.02" mass="0.2"
+            contype="0" conaffinity="0"/>
       <geom type="mesh" mesh="wedge" mass="0" contype="0" conaffinity="0"/>
       <site name="tip" pos="0.2 0 0"/>
-      <body name="thumb" pos="0.2 0 0"><joint name="thumb" axis="0 0 1"/><geom size="0.01" mass="1e-6"/></body>
+      <body name="thumb" pos="0.2 0 0"><joint name="thumb" axis="0 0 1"/>
+        <geom size="0.01" mass="1e-6"/></body>
     </body>
   </body>
 </mujocoinclude>
@@ -248,8 +252,10 @@ def test_a_joint_that_turns_without_end_leaves_beside_one_that_does_not(tmp_path
 def test_two_robots_in_one_scene_are_told_apart_by_what_stands_before_their_names(
     robot, lawful, tmp_path, quick
 ):
-    body = """<body name="{0}upper"><joint name="{0}shoulder" axis="0 1 0"/><geom size=".1" mass=".3"/>
-        <body pos=".2 0 0"><joint name="{0}elbow" axis="0 1 0"/><geom size=".1" mass=".2"/></body></body>"""
+    body = """<body name="{0}upper">
+        <joint name="{0}shoulder" axis="0 1 0"/><geom size=".1" mass=".3"/>
+        <body pos=".2 0 0">
+        <joint name="{0}elbow" axis="0 1 0"/><geom size=".1" mass=".2"/></body></body>"""
     scene = tmp_path / "scene.xml"
     scene.write_text(
         f"<mujoco><worldbody>{body.format('left_')}{body.format('right_')}</worldbody></mujoco>"
@@ -274,7 +280,8 @@ def test_a_file_in_one_line_takes_a_payload_right_before_a_joint(robot, tmp_path
     scene.write_text(text.replace("<option ", '<option timestep="0.005" '))
     made = export_robot(robot, "mjcf", tmp_path / "out", source=Source(scene), payload_mass=0.2)
     assert '"/></body><joint' in made.file.read_text().replace("\n", "")
-    model, own = mujoco.MjModel.from_xml_path(str(made.file)), build_model(robot, 0.2)
+    model = mujoco.MjModel.from_xml_path(str(made.file))
+    own = build_model(robot, 0.2)
     assert model.body_mass.sum() == pytest.approx(own.body_mass.sum())
     assert model.dof_armature.tolist() == own.dof_armature.tolist()
     assert made.errors["scene.xml alone"] < 2e-5
@@ -325,12 +332,11 @@ def test_a_delay_buffer_of_five_lines_is_mujocos_own_delay(robot, tmp_path):
         {"ctrl": motion.ctrl, "qpos": motion.qpos, "qvel": motion.qvel, "dt": 0.02},
         form="plain",
     )
-    weights, data = delay_weights([0.013, 0.006], 0.005), mujoco.MjData(model)
-    data.qpos[:], past, found = (
-        motion.qpos[0],
-        np.tile(motion.ctrl[0], (len(weights), 1)),
-        [motion.qpos[0]],
-    )
+    weights = delay_weights([0.013, 0.006], 0.005)
+    data = mujoco.MjData(model)
+    data.qpos[:] = motion.qpos[0]
+    past = np.tile(motion.ctrl[0], (len(weights), 1))
+    found = [motion.qpos[0]]
     for ctrl in motion.ctrl[:-1]:
         for _ in range(4):
             past = np.concatenate([ctrl[None], past[:-1]])
@@ -349,38 +355,60 @@ def test_the_nearest_servos_without_a_law_are_nearer_than_those_with_the_law_str
     assert fit_plain_servos(struck, motions) is struck
 
 
-def test_an_export_of_an_unchanged_robot_does_not_fit_again(lawful, tmp_path, monkeypatch):
-    save_robot(lawful, tmp_path / "identified")
-    fits, motions = [], own_motions(lawful, count=2)
-    fitted = lambda sequences, start, **_: SimpleNamespace(  # noqa: E731
-        robot=start.with_identified({"elbow": {"kp": 23.0}})
-    )
-    monkeypatch.setattr(
-        plain_servos, "identify", lambda *given, **how: fits.append(given) or fitted(*given, **how)
-    )
-    first, again = (
-        fit_plain_servos(load_robot(tmp_path / "identified"), motions) for _ in range(2)
-    )
-    assert len(fits) == 1
-    assert not first.servo.has_terms
-    assert all(np.array_equal(first.servo[f], again.servo[f], equal_nan=True) for f in SERVO_FIELDS)
-    assert model_hash(first) == model_hash(again)
+@pytest.fixture(scope="module")
+def two_motions(lawful):
+    return own_motions(lawful, count=2)
+
+
+@pytest.fixture
+def fitted(lawful, two_motions, tmp_path, monkeypatch):
+    """A stored robot that was fitted once: its folder, the fits made, and the first fit's robot."""
+    fits = []
+
+    def identify(sequences, start, **_):
+        fits.append(sequences)
+        return SimpleNamespace(robot=start.with_identified({"elbow": {"kp": 23.0}}))
+
+    monkeypatch.setattr(plain_servos, "identify", identify)
+    folder = tmp_path / "identified"
+    save_robot(lawful, folder)
+    first = fit_plain_servos(load_robot(folder), two_motions)
+    return SimpleNamespace(folder=folder, fits=fits, first=first)
+
+
+def test_an_export_of_an_unchanged_robot_does_not_fit_again(fitted, two_motions):
+    again = fit_plain_servos(load_robot(fitted.folder), two_motions)
+    assert len(fitted.fits) == 1
+    for field in SERVO_FIELDS:
+        assert np.array_equal(fitted.first.servo[field], again.servo[field], equal_nan=True)
+    assert model_hash(fitted.first) == model_hash(again)
+    assert not fitted.first.servo.has_terms
     assert again.nominal is not None
-    fit_plain_servos(
-        load_robot(tmp_path / "identified"), [replace(s, qvel=s.qvel + 1.0) for s in motions]
-    )
-    assert len(fits) == 2
-    (tmp_path / "identified" / "plain_servos.json").write_text("damaged")
-    fit_plain_servos(load_robot(tmp_path / "identified"), motions)
-    assert len(fits) == 3
-    fit_plain_servos(lawful, motions)
-    assert not (lawful.folder / "plain_servos.json").exists()  # a folder that the user made
+
+
+def test_an_export_with_other_recordings_fits_again(fitted, two_motions):
+    others = [replace(s, qvel=s.qvel + 1.0) for s in two_motions]
+    fit_plain_servos(load_robot(fitted.folder), others)
+    assert len(fitted.fits) == 2
+
+
+def test_an_export_whose_stored_fit_is_damaged_fits_again(fitted, two_motions):
+    (fitted.folder / "plain_servos.json").write_text("damaged")
+    fit_plain_servos(load_robot(fitted.folder), two_motions)
+    assert len(fitted.fits) == 2
+
+
+def test_an_export_stores_no_fit_in_a_folder_that_the_user_made(fitted, lawful, two_motions):
+    fit_plain_servos(lawful, two_motions)
+    assert len(fitted.fits) == 2
+    assert not (lawful.folder / "plain_servos.json").exists()
 
 
 def test_check_motions_run_in_worlds_that_restart(robot, tmp_path, capsys):
     motions = [s.rows(slice(0, 20 + 7 * i)) for i, s in enumerate(own_motions(robot, count=5))]
     export_robot(robot, "newton", tmp_path, (motions, motions))
-    check, recorded = Check(tmp_path), {}
+    check = Check(tmp_path)
+    recorded = {}
 
     def start(begun, ctrl):
         for world, motion in begun.items():

@@ -41,6 +41,7 @@ SERVO_FIELDS = {
     "delay": 0.02,
 }
 ERRORS = np.array([0.05, 0.001, 1e-4, 1e-4, 2e-3, 1e-3])
+LARGE_ERRORS = np.array([0.3, 0.01, 1e-3, 1e-4, 1e-2, 5e-3])
 
 
 def source(values, unit="a", days=()):
@@ -135,7 +136,8 @@ def test_drawn_links_are_physical_and_servos_follow_them(arm, tmp_path):
         np.testing.assert_array_equal(alone.units[field], values)
     links = np.array([together.links.inertials(row) for row in together.units["links"]])
     file = LinkAxes(arm).inertials(np.zeros(2 * COORDINATES))
-    mass, moments = np.log(links[..., 0] / file[:, 0]), np.sort(links[..., 4:7])
+    mass = np.log(links[..., 0] / file[:, 0])
+    moments = np.sort(links[..., 4:7])
     assert (moments[..., 0] + moments[..., 1] >= moments[..., 2]).all()
     scale = 2 * LinkAxes(arm).scale[:, 0]  # of log mass
     np.testing.assert_allclose(mass.mean(axis=0) / scale, 0.5, atol=0.05)
@@ -149,14 +151,10 @@ def test_an_exported_unit_has_its_links_in_mujoco_and_isaac_lab_says_that_it_has
 ):
     folder = written(arm, tmp_path / "known", links=heavy_links())
     assert exported(capsys, folder, "--engine", "mujoco", "--out", tmp_path / "out")[0] == 0
-    functions, model = (
-        runpy.run_path(str(tmp_path / "out" / "mujoco_randomization.py")),
-        mujoco.MjModel,
-    )
-    moved, drawn = (
-        model.from_xml_path(str(arm.mjcf)),
-        functions["units"](tmp_path / "out" / "randomization.json"),
-    )
+    functions = runpy.run_path(str(tmp_path / "out" / "mujoco_randomization.py"))
+    model = mujoco.MjModel
+    moved = model.from_xml_path(str(arm.mjcf))
+    drawn = functions["units"](tmp_path / "out" / "randomization.json")
     functions["apply"](moved, drawn, 7)
     unit = sample_units(folder)
     robot = drawn_robots.robots_of(load_robot(folder), unit.units)[7]
@@ -186,7 +184,8 @@ def test_what_no_log_determines_is_said(arm, tmp_path, capsys):
 
 
 def test_any_day_needs_two_days_and_any_robot_three(arm, tmp_path, capsys):
-    one, two = written(arm, tmp_path / "one"), written(arm, tmp_path / "two", sources=2)
+    one = written(arm, tmp_path / "one")
+    two = written(arm, tmp_path / "two", sources=2)
     code, said = exported(capsys, one, "--scope", "any-day")
     assert code == 2
     assert "known from one day; adapt it with logs of another one" in said
@@ -217,7 +216,8 @@ def test_a_model_takes_a_unit_without_gaponet(arm, tmp_path, capsys):
         "assert abs(m.actuator_gainprm[0, 0] - u['units']['kp'][7][1]) < 1e-6\n"
         "assert abs(m.actuator_forcerange[0, 1] - u['units']['effort_limit'][7][1]) < 1e-6\n"
         "assert abs(m.dof_frictionloss[1] - u['units']['frictionloss'][7][1]) < 1e-6\n"
-        "assert abs(m.actuator_biasprm[0, 0] - u['units']['kp'][7][1] * u['units']['offset'][7][1]) < 1e-6\n"
+        "bias = u['units']['kp'][7][1] * u['units']['offset'][7][1]\n"
+        "assert abs(m.actuator_biasprm[0, 0] - bias) < 1e-6\n"
         "assert 'gaponet' not in sys.modules\n"
     )
     subprocess.run(
@@ -234,7 +234,8 @@ def test_the_file_of_an_engine_needs_no_gaponet_and_reads_whole_units(
     assert exported(capsys, folder, "--engine", engine)[0] == 0
     file = folder / "randomization" / f"{engine}_randomization.py"
     assert not re.search(r"^(from|import) gaponet", file.read_text(), re.M)
-    events, env = runpy.run_path(str(file)), SimpleNamespace(num_envs=9, device="cpu")
+    events = runpy.run_path(str(file))
+    env = SimpleNamespace(num_envs=9, device="cpu")
     ids, joints, units = events["draw_units"](
         file.parent / "randomization.json", "plain_units", env, None, None
     )
@@ -245,52 +246,72 @@ def test_the_file_of_an_engine_needs_no_gaponet_and_reads_whole_units(
         np.testing.assert_allclose(values[4], stored[field][row], rtol=1e-6)
 
 
-def test_units_that_follow_the_recordings_are_retained_and_stored_and_worse_ones_refused(
-    arm, tmp_path, monkeypatch
-):
-    monkeypatch.setattr(drawn_robots, "DRAWN", 32)
-    monkeypatch.setattr(drawn_robots, "JUDGED", 4)
-    folder = written(arm, tmp_path / "known", errors=np.array([0.3, 0.01, 1e-3, 1e-4, 1e-2, 5e-3]))
-    robot = load_robot(folder)
+def few_units(patch):
+    patch.setattr(drawn_robots, "DRAWN", 32)
+    patch.setattr(drawn_robots, "JUDGED", 4)
+
+
+@pytest.fixture(scope="module")
+def judged(tmp_path_factory):
+    """Few units, drawn of a robot that is known badly and compared with its own motions."""
+    folder = tmp_path_factory.mktemp("judged")
+    robot = load_robot(written(write_arm(folder / "arm"), folder / "known", errors=LARGE_ERRORS))
     motions = [s.rows(slice(0, 200)) for s in own_motions(robot, count=4)]
-    recordings, drawn = (motions[::2], motions[1::2]), sample_units(robot)
-    made = drawn_robots.draw_robots(robot, drawn.units, recordings)
-    assert made.errors["exported"] < 1e-4  # the motions are the robot's own
-    first = np.mean(
-        [rollout_error(motions[1::2], r) for r in drawn_robots.robots_of(robot, drawn.units)[:8]]
-    )
-    assert made.errors["units"] < 0.5 * first
-    assert len(made.units["kp"]) == 8
-    other_gains = [replace(s, meta=replace(s.meta, kp=(5.0, 5.0))) for s in motions]
-    assert (
-        "were not compared with recordings"
-        in judge_units(drawn, robot, (other_gains, other_gains)).notes[-1]
-    )
+    recordings = (motions[::2], motions[1::2])
+    drawn = sample_units(robot)
+    with pytest.MonkeyPatch.context() as patch:
+        few_units(patch)
+        made = drawn_robots.draw_robots(robot, drawn.units, recordings)
+    return SimpleNamespace(robot=robot, recordings=recordings, drawn=drawn, made=made)
+
+
+def test_units_that_follow_the_recordings_are_retained(judged):
+    _, held_out = judged.recordings
+    drawn = drawn_robots.robots_of(judged.robot, judged.drawn.units)[:8]
+    error_as_drawn = np.mean([rollout_error(held_out, robot) for robot in drawn])
+    assert judged.made.errors["exported"] < 1e-4  # the motions are the robot's own
+    assert judged.made.errors["units"] < 0.5 * error_as_drawn
+    assert len(judged.made.units["kp"]) == 8
+
+
+def test_units_are_not_compared_with_recordings_at_other_gains(judged, monkeypatch):
+    few_units(monkeypatch)
+    others = []
+    for motions in judged.recordings:
+        others.append([replace(s, meta=replace(s.meta, kp=(5.0, 5.0))) for s in motions])
+    notes = judge_units(judged.drawn, judged.robot, tuple(others)).notes
+    assert "were not compared with recordings" in notes[-1]
+
+
+def test_units_worse_than_ranges_by_hand_are_refused(judged):
+    errors = judged.made.errors | {"by hand": judged.made.errors["units"] / 2}
     with pytest.raises(NoGainError, match=r"units are \d"):
-        replace(
-            made, errors=made.errors | {"by hand": made.errors["units"] / 2}
-        ).require_better_than_by_hand()
+        replace(judged.made, errors=errors).require_better_than_by_hand()
+
+
+def test_retained_units_are_stored_and_compared_again_only_if_others_are_drawn(judged, monkeypatch):
+    few_units(monkeypatch)
     rollouts = []
-    monkeypatch.setattr(
-        drawn_robots,
-        "rollout_error",
-        lambda *given: rollouts.append(given) or rollout_error(*given),
-    )
-    again = judge_units(drawn, robot, recordings)
+
+    def counted(*given):
+        rollouts.append(given)
+        return rollout_error(*given)
+
+    monkeypatch.setattr(drawn_robots, "rollout_error", counted)
+    again = judge_units(judged.drawn, judged.robot, judged.recordings)
     assert not rollouts
-    np.testing.assert_array_equal(again.units["kp"], made.units["kp"])
+    np.testing.assert_array_equal(again.units["kp"], judged.made.units["kp"])
     low, value, high = again.ranges["elbow"]["kp"]
-    assert low < value == drawn.ranges["elbow"]["kp"][1] < high
-    drawn_robots.draw_robots(robot, sample_units(robot, seed=1).units, recordings)
+    assert low < value == judged.drawn.ranges["elbow"]["kp"][1] < high
+    others = sample_units(judged.robot, seed=1).units
+    drawn_robots.draw_robots(judged.robot, others, judged.recordings)
     assert rollouts
 
 
 def test_units_for_an_engine_with_a_torque_speed_line_have_one_each(arm, tmp_path, monkeypatch):
     monkeypatch.setattr(drawn_robots, "DRAWN", 8)
     monkeypatch.setattr(drawn_robots, "JUDGED", 2)
-    robot = load_robot(
-        written(arm, tmp_path / "known", errors=np.array([0.3, 0.01, 1e-3, 1e-4, 1e-2, 5e-3]))
-    )
+    robot = load_robot(written(arm, tmp_path / "known", errors=LARGE_ERRORS))
     drawn = {field: values[:8] for field, values in sample_units(robot).units.items()}
     plain = robot.with_servo(no_load_speed=np.array([3.0, 0.0]))
     robot = plain.with_servo(stribeck=np.full(2, 0.01), stribeck_speed=np.full(2, 0.05))

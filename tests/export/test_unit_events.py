@@ -17,7 +17,8 @@ from gaponet.export.shipped.unit_events import apply_units, mjlab_units
 
 FIELDS = ("kp", "effort_limit", "damping", "frictionloss", "armature", "offset", "delay")
 STEP = 0.005
-WORLDS, UNITS = 6, 4
+WORLDS = 6
+UNITS = 4
 
 
 @pytest.fixture
@@ -128,7 +129,9 @@ class Robot3(Robot):
 class Action(DelayedAction):
     """Action term of isaaclab_action, with joints in an order of its own."""
 
-    num_envs, device, _joint_names = WORLDS, "cpu", ("elbow", "head", "shoulder")
+    num_envs = WORLDS
+    device = "cpu"
+    _joint_names = ("elbow", "head", "shoulder")
     servo_offset = torch.tensor([0.5, 0.5, 0.5])
     _env = SimpleNamespace(physics_dt=STEP)
 
@@ -156,52 +159,98 @@ def stored(file, joint):
 ROBOT = SimpleNamespace(name="robot")
 
 
-@pytest.mark.parametrize(
-    ("kind", "limit"), [(Robot2, "effort_limit"), (Robot3, "actuator_effort_limit")]
-)
-def test_every_world_of_isaac_lab_gets_all_numbers_of_one_unit_by_joint_name(file, kind, limit):
+RESET = (0, 1, 2, 3, 5)  # world 4 goes on
+COLUMNS = {"elbow": 1, "shoulder": 2}  # in the articulation
+PLACES = {"elbow": 0, "shoulder": 2}  # in the action term
+
+
+@pytest.fixture(params=[(Robot2, "effort_limit"), (Robot3, "actuator_effort_limit")])
+def drawn(request, file):
+    """Units were drawn for the worlds RESET: the shoulder's actuator is implicit, the elbow's
+    explicit, in the second column of its group.
+    """
     torch.manual_seed(0)
-    robot, term = (
-        kind(group("shoulder", implicit=True), group("head", "elbow", limit=limit)),
-        Action(),
+    kind, limit = request.param
+    implicit = group("shoulder", implicit=True)
+    explicit = group("head", "elbow", limit=limit)
+    robot = kind(implicit, explicit)
+    term = Action()
+    apply_units(environment(robot, term), torch.tensor(RESET), ROBOT, file)
+    return SimpleNamespace(
+        file=file,
+        robot=robot,
+        term=term,
+        implicit=implicit,
+        explicit=explicit,
+        explicit_limit=getattr(explicit, limit),
     )
-    implicit, explicit = robot.actuators.values()
-    apply_units(environment(robot, term), torch.tensor([0, 1, 2, 3, 5]), ROBOT, file)
-    rows = set()
-    for world in (0, 1, 2, 3, 5):
-        (row,) = {
-            int(
-                (stored(file, "elbow")["armature"] - robot.sim["armature"][world, 1]).abs().argmin()
-            )
-        }
-        rows.add(row)
-        for joint, column, place in (("elbow", 1, 0), ("shoulder", 2, 2)):
-            unit = {field: float(x[row]) for field, x in stored(file, joint).items()}
-            for field in ("armature", "frictionloss", "damping"):
-                assert float(robot.sim[field][world, column]) == pytest.approx(unit[field])
-            assert float(term.servo_offset[world, place]) == pytest.approx(unit["offset"])
-            assert float(term.delay[world, place]) == pytest.approx(unit["delay"])
-            in_engine = (
-                robot.sim["kp"][world, 2] if joint == "shoulder" else explicit.stiffness[world, 1]
-            )
-            assert float(in_engine) == pytest.approx(unit["kp"])
-            of_actuator = (
-                implicit.effort_limit[world, 0]
-                if joint == "shoulder"
-                else getattr(explicit, limit)[world, 1]
-            )
-            assert float(of_actuator) == pytest.approx(unit["effort_limit"])
-    assert len(rows) > 1
-    untouched = (
-        [x[4] for x in robot.sim.values()]
-        + [x[:, 0] for x in robot.sim.values()]
-        + [explicit.stiffness[:, 0]]
-    )
-    assert all((x == 7.0).all() for x in untouched)
-    assert (robot.sim["kp"][:, 1] == 7.0).all()  # the simulation has no gain of explicit actuators
-    assert (term.servo_offset[4] == 0.5).all()
-    if kind is Robot2:
-        assert torch.equal(robot.sim["dynamic"], robot.sim["frictionloss"])
+
+
+def row_of(drawn, world):
+    """The row of the unit that a world has, by the armature of its elbow."""
+    armature = stored(drawn.file, "elbow")["armature"]
+    return int((armature - drawn.robot.sim["armature"][world, COLUMNS["elbow"]]).abs().argmin())
+
+
+def unit_of(drawn, world, joint):
+    """Numbers of a joint of the unit that a world has."""
+    row = row_of(drawn, world)
+    return {field: float(x[row]) for field, x in stored(drawn.file, joint).items()}
+
+
+@pytest.mark.parametrize("joint", COLUMNS)
+def test_every_world_of_isaac_lab_gets_the_passive_numbers_of_its_unit_by_joint_name(drawn, joint):
+    for world in RESET:
+        unit = unit_of(drawn, world, joint)
+        for field in ("armature", "frictionloss", "damping"):
+            simulated = float(drawn.robot.sim[field][world, COLUMNS[joint]])
+            assert simulated == pytest.approx(unit[field])
+
+
+@pytest.mark.parametrize("joint", COLUMNS)
+def test_the_action_term_of_isaac_lab_gets_offsets_and_delays_of_the_unit(drawn, joint):
+    for world in RESET:
+        unit = unit_of(drawn, world, joint)
+        offset = float(drawn.term.servo_offset[world, PLACES[joint]])
+        delay = float(drawn.term.delay[world, PLACES[joint]])
+        assert offset == pytest.approx(unit["offset"])
+        assert delay == pytest.approx(unit["delay"])
+
+
+def test_implicit_actuators_get_the_gain_in_the_simulation_and_the_limit_as_well(drawn):
+    for world in RESET:
+        unit = unit_of(drawn, world, "shoulder")
+        assert float(drawn.robot.sim["kp"][world, 2]) == pytest.approx(unit["kp"])
+        assert float(drawn.implicit.effort_limit[world, 0]) == pytest.approx(unit["effort_limit"])
+
+
+def test_explicit_actuators_get_gain_and_limit_and_the_simulation_has_no_gain_of_them(drawn):
+    for world in RESET:
+        unit = unit_of(drawn, world, "elbow")
+        assert float(drawn.explicit.stiffness[world, 1]) == pytest.approx(unit["kp"])
+        assert float(drawn.explicit_limit[world, 1]) == pytest.approx(unit["effort_limit"])
+    assert (drawn.robot.sim["kp"][:, COLUMNS["elbow"]] == 7.0).all()
+
+
+def test_worlds_of_isaac_lab_get_different_units(drawn):
+    assert len({row_of(drawn, world) for world in RESET}) > 1
+
+
+def test_a_world_that_was_not_reset_keeps_its_numbers(drawn):
+    for values in drawn.robot.sim.values():
+        assert (values[4] == 7.0).all()
+    assert (drawn.term.servo_offset[4] == 0.5).all()
+
+
+def test_a_joint_that_no_unit_has_keeps_its_numbers(drawn):
+    for values in drawn.robot.sim.values():
+        assert (values[:, 0] == 7.0).all()
+    assert (drawn.explicit.stiffness[:, 0] == 7.0).all()
+
+
+@pytest.mark.parametrize("drawn", [(Robot2, "effort_limit")], indirect=True)
+def test_isaac_lab_2_gets_dynamic_friction_equal_to_the_static_one(drawn):
+    assert torch.equal(drawn.robot.sim["dynamic"], drawn.robot.sim["frictionloss"])
 
 
 def test_rows_may_be_given_and_commands_are_then_late_by_the_delay_of_each_world(file):
@@ -212,7 +261,8 @@ def test_rows_may_be_given_and_commands_are_then_late_by_the_delay_of_each_world
     class Term(Action, Engine):
         pass
 
-    robot, term = Robot3(group("shoulder", "elbow", "head")), Term()
+    robot = Robot3(group("shoulder", "elbow", "head"))
+    term = Term()
     apply_units(environment(robot, term), None, ROBOT, file, rows=[0, 1, 2, 3, 3, 0])
     torch.testing.assert_close(
         robot.sim["armature"][:, 2], stored(file, "shoulder")["armature"][[0, 1, 2, 3, 3, 0]]
@@ -253,11 +303,13 @@ def test_dc_motors_of_isaac_lab_get_the_torque_speed_line_of_a_unit(file, execut
 
     def motor(*names):
         made = group(*names)
-        made._saturation_effort, made.velocity_limit = 7.0, torch.full((WORLDS, len(names)), 9.0)
+        made._saturation_effort = 7.0
+        made.velocity_limit = torch.full((WORLDS, len(names)), 9.0)
         made._vel_at_effort_lim = 2 * made.velocity_limit
         return made
 
-    own, whole = motor("shoulder"), motor("elbow", "shoulder")
+    own = motor("shoulder")
+    whole = motor("elbow", "shoulder")
     robot = Robot3(own, group("elbow", "head"))
     if executors:
         robot.actuators = type(

@@ -22,12 +22,14 @@ LINK = (
 )
 URDF = f"""<robot name="arm"><!-- by hand -->
   {LINK.format("base")}{LINK.format("upper")}{LINK.format("fore")}
-  <joint name="shoulder" type="revolute"><parent link="base"/><child link="upper"/><axis xyz="0 1 0"/>
+  <joint name="shoulder" type="revolute"><parent link="base"/><child link="upper"/>
+    <axis xyz="0 1 0"/>
     <limit effort="9" velocity="3" lower="-1.5" upper="1.5"/>
     <dynamics friction="0.5"/></joint>
   <joint name="elbow" type="revolute"><parent link="upper"/><child link="fore"/><axis xyz="0 1 0"/>
     <limit effort="9" velocity="3" lower="-1.5" upper="1.5"/></joint>
-  <transmission name="t"><type>t</type><joint name="elbow"><hardwareInterface>e</hardwareInterface></joint>
+  <transmission name="t"><type>t</type>
+    <joint name="elbow"><hardwareInterface>e</hardwareInterface></joint>
   </transmission>
 </robot>
 """
@@ -38,32 +40,53 @@ def robot(tmp_path_factory):
     return write_arm(tmp_path_factory.mktemp("arm") / "arm").with_identified(FOUND)
 
 
-def test_a_urdf_keeps_all_but_its_dynamics_and_efforts_and_the_loss_has_its_price(robot, tmp_path):
-    file = tmp_path / "mine.urdf"
+@pytest.fixture(scope="module")
+def made(robot, tmp_path_factory):
+    """What was exported into the user's URDF."""
+    folder = tmp_path_factory.mktemp("urdf")
+    file = folder / "mine.urdf"
     file.write_text(URDF)
-    made = export_robot(robot, "urdf", tmp_path / "out", source=Source(file))
-    root = ET.parse(made.file).getroot()
-    told = {j.attrib["name"]: j.find("dynamics").attrib for j in root.findall("joint")}
-    assert {j: (float(d["damping"]), float(d["friction"])) for j, d in told.items()} == {
-        "shoulder": (0.8, 0.1),
-        "elbow": (0.6, 0.07),
-    }
-    assert [j.find("limit").attrib["effort"] for j in root.findall("joint")] == ["5", "5"]
+    return export_robot(robot, "urdf", folder / "out", source=Source(file))
+
+
+def test_a_urdf_gets_the_damping_friction_and_effort_that_were_found(made):
+    damping = {}
+    friction = {}
+    efforts = []
+    for joint in ET.parse(made.file).getroot().findall("joint"):
+        name = joint.attrib["name"]
+        dynamics = joint.find("dynamics").attrib
+        damping[name] = float(dynamics["damping"])
+        friction[name] = float(dynamics["friction"])
+        efforts.append(joint.find("limit").attrib["effort"])
+    assert damping == {"shoulder": 0.8, "elbow": 0.6}
+    assert friction == {"shoulder": 0.1, "elbow": 0.07}
+    assert efforts == ["5", "5"]
+
+
+def test_mujoco_reads_the_damping_of_a_urdf(made):
+    model = mujoco.MjModel.from_xml_path(str(made.file))
+    assert model.dof_damping.ravel().tolist() == [0.8, 0.6]
+
+
+def test_a_urdf_keeps_all_but_its_dynamics_and_efforts(made):
     assert "<!-- by hand -->" in made.file.read_text()
-    assert mujoco.MjModel.from_xml_path(str(made.file)).dof_damping.ravel().tolist() == [0.8, 0.6]
+    changes = (made.file.parent / "changes.diff").read_text().splitlines()
+    changed = [line for line in changes if line.startswith(("+", "-"))]
+    headers = [line for line in changes if line.startswith(("+++", "---"))]
+    assert len(changed) - len(headers) == 9
+
+
+def test_what_a_urdf_cannot_hold_is_named_and_has_its_price(made):
     lost = next(note for note in made.notes if "no place" in note)
     assert "kp, armature, delay" in lost
     alone = made.errors["mine.urdf alone, all else as before"]
     assert alone > 100 * made.errors["in gaponet"] + 0.002
-    changed = (tmp_path / "out/changes.diff").read_text().splitlines()
-    assert sum(line[:1] in "+-" and line[:3] not in ("+++", "---") for line in changed) == 9
 
 
 def test_links_are_written_where_the_file_has_the_mass_that_was_corrected(robot, tmp_path):
-    file, link = (
-        tmp_path / "mine.urdf",
-        Link(0.4, (0.12, 0.0, 0.01), (1e-4, 2e-3, 2e-3, 0.0, 0.0, 0.0)),
-    )
+    file = tmp_path / "mine.urdf"
+    link = Link(0.4, (0.12, 0.0, 0.01), (1e-4, 2e-3, 2e-3, 0.0, 0.0, 0.0))
     file.write_text(URDF)
     made = export_robot(
         replace(robot, links={"upper": link, "fore": link}),
