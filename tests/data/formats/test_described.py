@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 import pytest
 from logs import arm_columns, table_text, wave
+from strange_logs import motion, write_gaponet
 
 from gaponet.base.errors import JointMismatchError, LogError, UsageError
 from gaponet.cli.main import main
@@ -463,3 +464,146 @@ def test_a_second_clock_at_the_same_rate_and_a_counter_of_rows_are_no_question(t
     columns |= {"stamp_ms": 7e9 + 1e3 * columns["t"], "frame": np.arange(60.0)}
     ((_, log),) = read_logs(write(tmp_path / "logs", NAMES, columns=columns), arm)
     assert log.channels["qpos"].time[-1] == pytest.approx(59 * 0.02)
+
+
+SHEET = NAMES + 'manifest = "sheet.csv"\n'
+
+
+def sheeted(folder, *lines):
+    """A folder of one recording, run_7, with a manifest of these lines."""
+    write(folder, SHEET, "run_7.csv")
+    (folder / "sheet.csv").write_text("\n".join(lines) + "\n")
+    return folder
+
+
+def test_a_sheet_says_which_recordings_are_virtual_which_to_leave_out_and_what_is_estimated(
+    tmp_path, arm
+):
+    folder = sheeted(
+        tmp_path / "logs",
+        "file,virtual,estimated,leave_out",
+        "run_7,yes,kp,no",
+        ",,,",
+        "run_8,no,,yes",
+    )
+    (folder / "run_8.csv").write_text(table_text(theirs()))
+    ((name, log),) = read_logs(folder, arm)
+    assert (name, log.meta["stated"]) == ("run_7", {"virtual": True})
+    assert log.meta["notes"] == {"estimated": "kp"}
+
+
+@pytest.mark.parametrize(
+    ("lines", "word"),
+    [
+        (("file,virtual", "run_7,maybe"), "'maybe'"),
+        (("name,motion", "run_7,lift"), "file"),
+        (("file,motion",), "row"),
+    ],
+    ids=["neither yes nor no", "no column file", "no row"],
+)
+def test_a_sheet_that_says_nothing_clear_is_refused(tmp_path, arm, lines, word):
+    with pytest.raises((UsageError, LogError), match=word):
+        list(read_logs(sheeted(tmp_path / "logs", *lines), arm))
+
+
+def test_a_name_and_a_sheet_may_say_the_same(tmp_path, arm):
+    told = 'motion = "{motion}_{rep}"\n' + SHEET
+    folder = write(tmp_path / "logs", told, "run_7.csv")
+    (folder / "sheet.csv").write_text("file,rep\nrun_7,7\n")
+    ((name, log),) = read_logs(folder, arm)
+    assert (name, log.meta["stated"]) == ("run", {"repetition": 7})
+
+
+def test_a_payload_that_a_file_contradicts_is_refused(tmp_path, arm):
+    write_gaponet(tmp_path, objects=False)
+    with (tmp_path / "logs.toml").open("a") as toml:
+        toml.write('motion = "{motion}"\nmanifest = "sheet.csv"\n')
+    (tmp_path / "sheet.csv").write_text("file,payload\na-0000,0\na-0001,0.3\n")
+    with pytest.raises(UsageError, match="payload_mass"):
+        list(read_logs(tmp_path, arm))
+
+
+def test_gains_may_stand_in_a_column_as_long_as_they_stand_still(tmp_path, arm):
+    kp = np.full(60, 12.0)
+    folder = write(tmp_path / "logs", NAMES + 'kp = "gain"\n', columns=theirs() | {"gain": kp})
+    ((_, log),) = read_logs(folder, arm)
+    assert log.meta["kp"] == [12.0, 12.0]
+    kp[30:] = 13.0
+    (folder / "wave.csv").write_text(table_text(theirs() | {"gain": kp}))
+    with pytest.raises(LogError, match="changes"):
+        list(read_logs(folder, arm))
+    (folder / "wave.csv").write_text(table_text(theirs()))
+    with pytest.raises(LogError, match='"gain"'):
+        list(read_logs(folder, arm))
+
+
+def test_a_rate_stands_in_for_a_clock_that_stands_still(tmp_path, arm):
+    columns = theirs() | {"t": np.full(60, 7.0)}
+    folder = write(tmp_path / "logs", "rate = 50.0\n" + NAMES, columns=columns)
+    ((_, log),) = read_logs(folder, arm)
+    assert log.channels["qpos"].time[-1] == pytest.approx(59 * 0.02)
+
+
+def test_a_clock_with_fewer_rows_than_the_state_is_refused(tmp_path, arm):
+    ctrl, qpos = motion()
+    np.savez(tmp_path / "a.npz", target=ctrl, q=qpos, clock=0.02 * np.arange(len(qpos) - 1))
+    told = 'ctrl = "target"\nqpos = "q"\ntime = "clock"\njoints = ["shoulder", "elbow"]\n'
+    (tmp_path / "logs.toml").write_text(UNITS + told)
+    with pytest.raises(LogError, match="clock"):
+        list(read_logs(tmp_path, arm))
+
+
+@pytest.mark.parametrize("further", [{}, {"count": np.arange(60.0)}], ids=["alone", "beside"])
+def test_the_clock_may_lie_in_a_file_of_its_own(tmp_path, arm, further):
+    columns = theirs()
+    clock = {"stamp": columns.pop("t") + 5.0} | further
+    told = 'ctrl = "{joint}_des"\nqpos = "{joint}_pos"\ntime_file = "{name}-times.csv"\n'
+    if further:
+        told += 'time = "stamp"\n'
+    folder = write(tmp_path / "logs", told, columns=columns)
+    (folder / "wave-times.csv").write_text(table_text(clock))
+    ((_, log),) = read_logs(folder, arm)
+    assert np.allclose(log.channels["ctrl"].time, arm_columns()["time"])
+
+
+def test_clocks_in_a_file_of_their_own_that_contradict_each_other_are_asked_about(tmp_path, arm):
+    columns = theirs()
+    clocks = {"stamp": columns["t"], "host_time": 2 * columns.pop("t")}
+    told = NAMES.replace('"t"', '"stamp"') + 'state_file = "wave.csv"\ntime_file = "times.csv"\n'
+    folder = write(tmp_path / "logs", told, columns=columns)
+    (folder / "times.csv").write_text(table_text(clocks))
+    with pytest.raises(LogError, match=r'time = "stamp" and ignore'):
+        list(read_logs(folder, arm))
+    (folder / "logs.toml").write_text(UNITS + told + 'ignore = ["time:host_time"]\n')
+    ((_, log),) = read_logs(folder, arm)
+    assert np.allclose(log.channels["qpos"].time, clocks["stamp"])
+
+
+def test_commands_in_a_file_of_their_own_need_no_clock_beside_a_rate(tmp_path, arm):
+    columns = theirs()
+    state = {name: columns[name] for name in ("shoulder_pos", "elbow_pos")}
+    told = NAMES.replace('time = "t"', "rate = 50.0") + 'command_file = "{name}_cmd.csv"\n'
+    folder = write(tmp_path / "logs", told, columns=state)
+    (folder / "wave_cmd.csv").write_text(
+        table_text({name: columns[name] for name in ("shoulder_des", "elbow_des")})
+    )
+    ((_, log),) = read_logs(folder, arm)
+    assert np.array_equal(log.channels["ctrl"].values[:, 0], columns["shoulder_des"])
+
+
+def test_a_pattern_of_states_that_no_file_fits_is_refused(tmp_path, arm):
+    folder = write(tmp_path / "logs", NAMES + 'state_file = "{name}_state.csv"\n')
+    with pytest.raises(LogError, match="state_file"):
+        list(read_logs(folder, arm))
+
+
+def test_signs_turn_no_temperature(tmp_path, arm):
+    warmth = {f"{joint}_warmth": np.full(60, 40.0) for joint in arm.joint_names}
+    told = NAMES + 'temperature = "{joint}_warmth"\n[signs]\nelbow = -1\n'
+    ((_, log),) = read_logs(write(tmp_path / "logs", told, columns=theirs() | warmth), arm)
+    assert (log.channels["temperature"].values == 40.0).all()
+
+
+def test_names_unlike_any_joint_are_told_which_joints_are_left(arm):
+    with pytest.raises(JointMismatchError, match="one of elbow"):
+        resolve_all(("shoulder", "xxxx", "zzzz"), arm, "a.csv", None)

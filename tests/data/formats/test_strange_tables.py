@@ -72,7 +72,13 @@ def test_a_torque_that_is_never_there_is_left_out(tmp_path, arm):
 
 @pytest.mark.parametrize(
     "form",
-    ["%Y-%m-%dT%H:%M:%S.%fZ", "%Y-%m-%d %H:%M:%S.%f+02:00", "%Y-%m-%d %H:%M:%S.%f", "%H:%M:%S.%f"],
+    [
+        "%Y-%m-%dT%H:%M:%S.%fZ",
+        "%Y-%m-%dT%H:%M:%S.%f789Z",
+        "%Y-%m-%d %H:%M:%S.%f+02:00",
+        "%Y-%m-%d %H:%M:%S.%f",
+        "%H:%M:%S.%f",
+    ],
 )
 @pytest.mark.parametrize("kind", ["csv", "parquet"])
 def test_a_clock_of_dates_needs_no_unit(tmp_path, arm, form, kind):

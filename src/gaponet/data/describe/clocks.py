@@ -12,6 +12,8 @@ import numpy as np
 from gaponet.base.errors import LogError
 from gaponet.data.describe.joints import ignored
 
+COMMAND = "command:"  # before the names of signals that lie in a command_file
+TIME = "time:"  # and in a time_file
 CLOCK_WORDS = {
     "t",
     "ts",
@@ -135,9 +137,14 @@ def _load_stamps(load: Load, pairs: dict[str, tuple[str, str]], names: list[str]
 
 def named_like_a_clock(name: str) -> bool:
     """Return True for timestamp, t_ms, header.stamp, realTime."""
-    apart = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name).lower()
+    apart = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name_in_file(name)).lower()
     words = [word for word in re.split(r"[^a-z]+", apart) if word]
     return any(word in CLOCK_WORDS or word.endswith(CLOCK_ENDS) for word in words)
+
+
+def name_in_file(signal: str) -> str:
+    """Return the name that a signal has in its own file."""
+    return signal.removeprefix(COMMAND).removeprefix(TIME)
 
 
 def _runs(values: np.ndarray) -> bool:
@@ -185,6 +192,6 @@ def require_one_rate(
                 f"{clock}, {periods[clock]:.4g} a row, and {other}, {period:.4g} a row, "
                 f"{ratio:.3g} times as much. A lag measured with the wrong one is wrong by this "
                 "factor. Say which is right in logs.toml: "
-                f'time = "{clock}" and ignore = ["{other}"], or time = "{other}" and ignore = '
-                f'["{clock}"]'
+                f'time = "{name_in_file(clock)}" and ignore = ["{other}"], or time = '
+                f'"{name_in_file(other)}" and ignore = ["{clock}"]'
             )

@@ -100,9 +100,6 @@ def _parse(text: str) -> datetime:
     if TIME_OF_DAY.fullmatch(text):
         hours, _, rest = text.partition(":")
         text = f"2000-01-01 {hours:>02}:{rest}"
-    fraction = re.search(r"\.(\d{7,})", text)
-    if fraction:  # nanoseconds: datetime keeps microseconds
-        text = text.replace(fraction[1], fraction[1][:6])
     text = text.replace(" UTC", "Z")
     text = re.sub(r"\s+(?=[+-]\d\d:?\d\d$)", "", text)  # before a zone
     at = datetime.fromisoformat(text)

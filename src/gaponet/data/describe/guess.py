@@ -85,17 +85,17 @@ def guess_logs(
     if not recordings:
         raise LogError("no recording found")
     family = _family(list(by_place(recordings)))
-    if family:
-        by_kind = {kind: _first_of(recordings, pattern) for kind, pattern in family.items()}
-        names_columns = "qpos" in _channels(by_kind["qpos"], robot)
-        if names_columns and "ctrl" in family:
-            return _guess_two_files(by_kind, family, robot, fmt, known)
-        return _guess_family(by_kind, family, robot, fmt)
+    by_kind = {kind: _first_of(recordings, pattern) for kind, pattern in family.items()}
     pair = _state_and_command(recordings)
-    if pair:
-        files = {kind: Path(recording.source).name for kind, recording in pair.items()}
-        return _guess_two_files(pair, files, robot, fmt, known)
-    return _guess_one_file(recordings, robot, fmt, known)
+    if pair and not family:
+        family = {kind: Path(recording.source).name for kind, recording in pair.items()}
+        by_kind = pair
+    if not family:
+        return _guess_one_file(recordings, robot, fmt, known)
+    names_columns = "qpos" in _channels(by_kind["qpos"], robot)
+    if names_columns and "ctrl" in family:
+        return _guess_two_files(by_kind, family, robot, fmt, known)
+    return _guess_family(by_kind, family, robot, fmt)
 
 
 def _guess_one_file(
@@ -372,16 +372,16 @@ def _numbered(recording: RawRecording) -> str:
 
 
 def _first_of(recordings: list[RawRecording], pattern: str) -> RawRecording:
-    """Return the first recording whose file fits a pattern with {name}."""
+    """Return the first recording whose file fits a pattern of _family for these recordings."""
     before, _, after = pattern.partition("{name}")
-    for file, recording in by_place(recordings).items():
-        if file.startswith(before) and file.endswith(after):
-            return recording
-    raise LogError(f"no file looks like {pattern}")
+    files = by_place(recordings)
+    return next(files[file] for file in files if file.startswith(before) and file.endswith(after))
 
 
 def _time_unit(stamps: Array) -> str:
     """The line of time_unit for a clock."""
+    if len(stamps) < 2:
+        return 'time_unit = "s"  # ? a single row has no period'
     low, period, high = np.percentile(np.diff(stamps[:ROWS]), [5, 50, 95])
     unit = "s"
     for name, seconds in SECONDS.items():

@@ -19,7 +19,13 @@ import numpy as np
 
 from gaponet.base.arrays import Array
 from gaponet.base.errors import LogError, UsageError
-from gaponet.data.describe.clocks import clock_periods, named_like_a_clock, require_one_rate
+from gaponet.data.describe.clocks import (
+    COMMAND,
+    TIME,
+    clock_periods,
+    named_like_a_clock,
+    require_one_rate,
+)
 from gaponet.data.describe.encoders import Encoder, read_encoders
 from gaponet.data.describe.joints import ignored, resolve_all
 from gaponet.data.describe.logs_file import HINT, LogsFile
@@ -37,8 +43,6 @@ MAX_GAIN_CHANGE = 1e-3  # of a gain, while it is recorded
 SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 SAY_UNITS = "--position-unit rad --time-unit s (or position_unit and time_unit in logs.toml)"
 MOST_ROWS_APART = 2  # of channels without a clock: the state before the first command, and the last
-COMMAND = "command:"  # before the names of signals that lie in a command_file
-TIME = "time:"  # and in a time_file
 NO_COMMANDS = (
     "without commanded positions there is no gap to measure. Record the position controller's "
     "targets beside the state, or play the recorded positions again (gaponet run) and record "

@@ -45,9 +45,10 @@ from gaponet.base import plugins
 from gaponet.base.arrays import Array
 from gaponet.base.errors import LogError, UsageError
 from gaponet.base.plugins import attempt
+from gaponet.data.describe.clocks import COMMAND, TIME
 from gaponet.data.describe.logs_file import LogsFile, Naming, read_logs_file
 from gaponet.data.describe.plausibility import require_plausible
-from gaponet.data.describe.raw_recording import COMMAND, TIME, RawRecording, by_place
+from gaponet.data.describe.raw_recording import RawRecording, by_place
 from gaponet.data.describe.repeats import without_repeated_rows
 from gaponet.data.describe.turns import continued_turns, within_range
 from gaponet.data.describe.unread import what_address, why_unread
