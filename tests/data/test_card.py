@@ -156,3 +156,25 @@ def test_the_card_beside_the_paper_has_both_counts_and_says_that_the_paper_s_do_
 
 def test_a_card_that_was_not_asked_for_the_paper_does_not_name_it(dataset):
     assert "paper" not in card_markdown(make_card(dataset))
+
+
+def test_spread_over_repetitions_stands_on_the_page_joint_by_joint(arm, tmp_path):
+    """States 2 mrad apart: their standard deviation is 2 mrad."""
+    data = repeated_motions(tmp_path / "data", arm)
+    ctrl = wave(120, 2, hertz=0.9)
+    data.append(arm_sequence(arm, ctrl, ctrl, "m0"))
+    text = card_markdown(make_card(data))
+    assert "| shoulder | 0.002 |" in text
+    assert "| elbow | 0.002 |" in text
+    assert "1 sequences of these groups had another command" in text
+
+
+def test_a_fleet_and_its_seed_stand_on_the_page(dataset):
+    (dataset.path / "collect.json").write_text('{"fleet": "small", "seed": 7}')
+    assert "fleet small, seed 7" in card_markdown(make_card(dataset))
+
+
+def test_a_licence_that_was_stated_asks_for_nothing(dataset):
+    dataset.set_provenance(licence="CC-BY-4.0", source="a laboratory")
+    text = card_markdown(make_card(Dataset(dataset.path)))
+    assert "- licence: CC-BY-4.0\n" in text

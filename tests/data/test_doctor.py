@@ -13,8 +13,8 @@ from types import SimpleNamespace
 import mujoco
 import numpy as np
 import pytest
-from arm import recordings, write_dataset
-from logs import arm_sequence, late, table_text, wave
+from arm import TOML, XML, recordings, write_arm, write_dataset
+from logs import arm_columns, arm_sequence, late, table_text, wave
 
 from gaponet.base.errors import DatasetError, WorkerError
 from gaponet.data.checks.timing import MIN_EARLY_RATIO, clock_drift
@@ -623,3 +623,129 @@ def test_real_so101_logs_show_their_lag_sag_torque_gripper_and_rate(real_dataset
     assert torque[1].startswith("torque spikes")
     assert {row["rate_hz"] for row in diagnosis.sequences} == {49.85}
     assert found(diagnosis, "blocked", "warning").joints == ("wrist_roll",)
+
+
+def read(arm, tmp_path, columns, **more) -> DoctorResult:
+    """The diagnosis of one recording that is imported from a table."""
+    logs = tmp_path / "m.csv"
+    logs.write_text(table_text(columns).replace("nan", ""))
+    units = {"position_unit": "rad", "time_unit": "s"} | more
+    request = ImportRequest(unit_id="a", payload_mass=0.0, **units)
+    return DoctorResult.of(import_logs(logs, arm, tmp_path / "data", request).dataset, arm)
+
+
+TORQUES = {"tau.shoulder": wave(ROWS, 2)[:, 0], "tau.elbow": wave(ROWS, 2)[:, 1]}
+
+
+def test_a_channel_that_was_empty_is_noted(arm, tmp_path):
+    empty = {name: np.full(ROWS, np.nan) for name in TORQUES}
+    finding = found(read(arm, tmp_path, arm_columns(ROWS) | empty), "absent", "note")
+    assert finding.joints == arm.joint_names
+
+
+def test_a_command_slower_than_the_state_is_noted_as_held(arm, tmp_path):
+    columns = arm_columns(ROWS)
+    for joint in arm.joint_names:
+        columns[f"ctrl.{joint}"][1::2] = np.nan
+    assert "held" in found(read(arm, tmp_path, columns), "slower", "note").message
+
+
+def test_rows_that_the_logger_wrote_twice_are_noted(arm, tmp_path):
+    twice = {name: np.repeat(values, 2) for name, values in arm_columns(ROWS).items()}
+    twice["time"][1::2] += 4e-4
+    assert found(read(arm, tmp_path, twice), "repeated", "note").values == {"rows": ROWS}
+
+
+def test_a_torque_that_no_motor_has_is_a_warning(arm, tmp_path):
+    torques = {name: values.copy() for name, values in TORQUES.items()}
+    torques["tau.elbow"][100:103] = 1e9
+    finding = found(read(arm, tmp_path, arm_columns(ROWS) | torques), "nonsense", "warning")
+    assert (finding.joints, finding.values) == (("elbow",), {"rows": 3})
+
+
+def test_many_rows_that_were_cut_are_a_warning(arm, tmp_path):
+    columns = arm_columns(ROWS)
+    columns["qpos.elbow"][100:130] = np.nan
+    diagnosis = read(arm, tmp_path, columns, skip_bad=True)
+    assert found(diagnosis, "cut", "warning").values == {"rows": 30}
+
+
+@pytest.mark.parametrize(
+    ("state", "word"),
+    [
+        (lambda q: q + 2 * np.pi, "moved"),
+        (lambda q: (q + np.pi) % (2 * np.pi) - np.pi, "continued"),
+    ],
+    ids=["a turn away", "wrapped"],
+)
+def test_angles_that_import_turned_are_noted(tmp_path, state, word):
+    free = 'name="shoulder" axis="0 1 0"'
+    arm = write_arm(tmp_path / "arm", TOML, XML.replace(f'{free} range="-1.5 1.5"', free))
+    columns = arm_columns(ROWS)
+    for name in ("ctrl.shoulder", "qpos.shoulder"):  # on and on, by 2 rad/s
+        columns[name] = columns[name] + 2 * columns["time"]
+    columns["qpos.shoulder"] = state(columns["qpos.shoulder"])
+    finding = found(read(arm, tmp_path, columns), "turns", "note")
+    assert finding.joints == ("shoulder",)
+    assert word in finding.message
+
+
+def test_angles_that_were_counted_from_zero_are_noted(arm, tmp_path):
+    """−0.9 to −0.3 rad are 308° to 343°."""
+    columns = arm_columns(ROWS)
+    for name in columns.keys() - {"time"}:
+        columns[name] = np.degrees(columns[name])
+        if "shoulder" in name:
+            columns[name] = (columns[name] - np.degrees(0.6)) % 360
+    finding = found(read(arm, tmp_path, columns, position_unit="deg"), "turns", "note")
+    assert finding.joints == ("shoulder",)
+    assert "range" in finding.message
+
+
+@pytest.mark.parametrize(
+    ("jitter_ms", "level"), [(1.0, "ok"), (5.0, "note"), (11.0, "warning")], ids=str
+)
+def test_jitter_is_judged_against_the_period_of_20_ms(arm, tmp_path, jitter_ms, level):
+    notes = {"rate_hz": 50.0, "jitter_ms": jitter_ms}
+    diagnosis = examine(arm, tmp_path, arm_sequence(arm, *good(), notes=notes))
+    assert found(diagnosis, "jitter", level).values == {"jitter_ms": jitter_ms}
+
+
+def test_a_robot_that_stands_while_all_its_commands_move_on_was_stopped(arm, tmp_path):
+    ctrl, qpos = good()
+    stood = 100  # rows, 2 s
+    qpos[300 : 300 + stood] = qpos[300]
+    qpos += 1e-5 * np.random.default_rng(0).standard_normal(qpos.shape)
+    finding = found(examine(arm, tmp_path, arm_sequence(arm, ctrl, qpos)), "stop", "warning")
+    assert finding.values["seconds"] == pytest.approx(2.0, abs=0.3)
+
+
+def test_one_joint_in_steps_57_times_as_coarse_as_the_others_is_in_degrees(so101, tmp_path):
+    step = np.full(6, 1e-3)
+    step[2] = np.degrees(1e-3)
+    ctrl = np.where(step > 0.01, 0.5, 0.05) * wave(ROWS, 6, 0.02, amplitude=1.0)
+    qpos = np.round(late(ctrl, 3) / step) * step
+    diagnosis = examine(so101, tmp_path, arm_sequence(so101, ctrl, qpos))
+    units = [f.joints for f in diagnosis.findings if (f.check, f.level) == ("unit", "warning")]
+    assert ("elbow_flex",) in units
+
+
+def test_gains_that_differ_between_recordings_are_noted(arm, tmp_path):
+    first = arm_sequence(arm, *good())
+    second = arm_sequence(arm, *good(lag=2), motion="n")
+    stiff = replace(second, meta=replace(second.meta, kp=(40.0, 40.0)))
+    assert "kp" in found(examine(arm, tmp_path, first, stiff), "labels", "note").message
+
+
+def test_commands_of_less_than_two_degrees_were_radians(arm, tmp_path):
+    ctrl, qpos = (np.radians(values) for values in good())
+    notes = {"converted_from": dict.fromkeys(arm.joint_names, "deg")}
+    diagnosis = examine(arm, tmp_path, arm_sequence(arm, ctrl, qpos, notes=notes))
+    assert "radians" in found(diagnosis, "unit", "warning").message
+    assert "degrees" in found(diagnosis, "order", "warning").message
+
+
+def test_an_error_and_warnings_are_both_counted(arm, tmp_path):
+    ctrl, qpos = good()
+    wrong = arm_sequence(arm, ctrl, qpos * ELBOW, tau=np.zeros((ROWS, 2)))
+    assert "1 error and 1 warning" in examine(arm, tmp_path, wrong).verdict

@@ -307,3 +307,46 @@ def test_a_motion_with_a_name_of_many_letters_is_stored(arm, tmp_path):
     ).dataset
     assert len(data.read(data.entries[0])) == 60
     assert data.entries[0].meta.motion == "a" * 240
+
+
+@pytest.mark.parametrize("cut", [0.0, 0.5, float("nan")])
+def test_pieces_that_are_too_short_are_refused(logs, so101, tmp_path, cut):
+    with pytest.raises(UsageError, match="--cut"):
+        import_logs(
+            logs, so101, tmp_path / "data", ImportRequest(unit_id="lab", payload_mass=0.0, cut=cut)
+        )
+
+
+@pytest.mark.parametrize(
+    ("labels", "word"), [({"payload_mass": 0.0}, "--unit-id"), ({"unit_id": "a"}, "--payload-mass")]
+)
+def test_a_label_that_nobody_stated_is_asked_for(logs, so101, tmp_path, labels, word):
+    with pytest.raises(UsageError, match=word):
+        import_logs(logs, so101, tmp_path / "data", ImportRequest(**labels))
+    assert not (tmp_path / "data").exists()
+
+
+def test_logs_of_which_all_are_left_out_are_refused_with_the_first_reason(logs, so101, tmp_path):
+    for state in logs.rglob("state_motor.csv"):
+        state.unlink()
+    with pytest.raises(LogError, match="down"):
+        import_logs(
+            logs,
+            so101,
+            tmp_path / "data",
+            ImportRequest(unit_id="lab", payload_mass=0.0, skip_bad=True),
+        )
+
+
+def test_logs_of_which_a_sheet_leaves_all_out_are_refused(arm, tmp_path):
+    (tmp_path / "logs").mkdir()
+    (tmp_path / "logs" / "m.csv").write_text(table_text(arm_columns()))
+    (tmp_path / "logs" / "logs.toml").write_text('manifest = "sheet.csv"\n')
+    (tmp_path / "logs" / "sheet.csv").write_text("file,leave_out\nm,yes\n")
+    with pytest.raises(LogError, match="recording"):
+        import_logs(
+            tmp_path / "logs",
+            arm,
+            tmp_path / "data",
+            ImportRequest(unit_id="lab", payload_mass=0.0, **SI),
+        )

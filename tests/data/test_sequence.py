@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from arm import TOML, write_arm
 
 from gaponet.base.errors import LogError, UsageError
 from gaponet.data.log import Channel, Log
@@ -221,3 +222,48 @@ def test_rows_without_a_period_begin_where_they_begin(arm):
     time = np.cumsum(np.random.default_rng(0).exponential(0.02, 400))
     sequence = to_sequence(arm_log(time), arm, META)
     assert sequence.qpos[0, 0] == pytest.approx(time[0], rel=1e-6)
+
+
+@pytest.mark.parametrize("field", ["unit_id", "motion"])
+def test_a_recording_without_a_name_of_its_unit_or_motion_is_refused(field):
+    with pytest.raises(LogError, match="named"):
+        replace(META, **{field: ""})
+
+
+@pytest.mark.parametrize("dt", [5e-5, 1.5, np.nan])
+def test_a_period_that_no_controller_has_is_refused(arm, dt):
+    zeros = np.zeros((5, 2))
+    with pytest.raises(LogError, match="dt"):
+        Sequence(META, arm.joint_names, dt, zeros, zeros, zeros)
+
+
+def test_even_rows_that_drift_off_their_stated_period_are_put_on_a_grid(arm):
+    """200 rows of 20.2 ms, said to be 20 ms apart: the last is two periods off."""
+    time = 0.0202 * np.arange(200)
+    sequence = to_sequence(arm_log(time, dt=0.02), arm, META)
+    assert "fits" in sequence.meta.notes["why_resampled"]
+    assert sequence.dt * (len(sequence) - 1) == pytest.approx(time[-1], abs=sequence.dt)
+    assert sequence.qpos[-1, 0] == pytest.approx(time[-1], abs=sequence.dt)
+
+
+def test_a_loop_whose_period_has_no_few_digits_keeps_all_of_them(arm):
+    """5000 rows of a 30th of a second, unevenly stamped: at 33.33 ms the last would be half a
+    period late.
+    """
+    rng = np.random.default_rng(0)
+    time = (np.arange(5000) + np.clip(rng.normal(0, 0.15, 5000), -0.3, 0.3)) / 30
+    sequence = to_sequence(arm_log(time), arm, META)
+    assert sequence.dt == pytest.approx(1 / 30, rel=1e-5)
+    assert sequence.dt != round(sequence.dt, 5)
+
+
+def test_a_mimic_joint_that_a_log_lacks_follows_its_leader(tmp_path):
+    """The elbow turns by −½ of the shoulder, from 0.3 rad."""
+    led = 'name = "elbow"\nfollows = "shoulder"\nratio = -0.5\nat_zero = 0.3\noperated = false\n'
+    arm = write_arm(tmp_path / "arm", TOML.replace('name = "elbow"\n', led))
+    log = arm_log(0.02 * np.arange(ROWS))
+    channels = {name: Channel(c.time, c.values[:, :1]) for name, c in log.channels.items()}
+    sequence = to_sequence(Log("arm", ("shoulder",), channels, "wave.csv"), arm, META)
+    assert np.allclose(sequence.qpos[:, 1], 0.3 - 0.5 * sequence.qpos[:, 0])
+    assert np.allclose(sequence.qvel[:, 1], -0.5 * sequence.qvel[:, 0])
+    assert "held_at_home" not in sequence.meta.notes

@@ -5,6 +5,7 @@ import pytest
 
 from gaponet.data.signals import (
     Response,
+    busiest_window,
     differentiate,
     estimate_delay,
     fast_speed,
@@ -109,3 +110,10 @@ def test_a_response_that_is_not_late_stays_as_it_is():
     assert found.later(0.0) is found
     assert found.later(float("nan")) is found
     assert not np.array_equal(found.later(0.02).cross, found.cross)
+
+
+def test_the_busiest_window_is_where_joints_move_most():
+    qpos = np.zeros((100, 2))
+    qpos[60:70, 1] = np.linspace(0, 1, 10)
+    assert 50 <= busiest_window(qpos, 20) <= 60
+    assert busiest_window(qpos, 100) == 0

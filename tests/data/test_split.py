@@ -18,6 +18,7 @@ from gaponet.data.split import (
     make_split,
     read_split,
     require_distinct_samples,
+    resolve_splits,
     split_entries,
     split_motions,
     stratified_subset,
@@ -385,3 +386,29 @@ def test_a_held_out_payload_is_in_the_test_split_alone(arm, tmp_path):
     assert {e.meta.payload_mass for e in parts["test"]} == {0.0, 0.2}
     with pytest.raises(UsageError, match="3 kg"):
         split_entries(data, holdout_payloads=(3.0,))
+
+
+def test_a_split_file_and_a_rule_of_ones_own_exclude_each_other(dataset):
+    parts = make_split(dataset, "unit", ("two",))
+    file = str(write_split(dataset, parts, "unit", ("two",)))
+    nothing_else = ((), (), (), 1.0)
+    assert resolve_splits(dataset, file, *nothing_else) == parts
+    assert resolve_splits(dataset, "", *nothing_else) == split_entries(dataset)
+    with pytest.raises(UsageError, match="--holdout-units"):
+        resolve_splits(dataset, file, ("two",), (), (), 1.0)
+
+
+@pytest.mark.parametrize(
+    ("units", "word"), [(("four",), "'four'"), (("one", "two", "three"), "train")]
+)
+def test_units_that_cannot_be_held_out_of_training_are_refused(dataset, units, word):
+    with pytest.raises(UsageError, match=word):
+        split_entries(dataset, holdout_units=units)
+
+
+def test_two_repetitions_cannot_be_split_by_repetition(arm, tmp_path):
+    data = Dataset.create(tmp_path / "data", arm)
+    for lag in (2, 3):
+        data.append(arm_sequence(arm, wave(60, 2), late(wave(60, 2), lag)))
+    with pytest.raises(UsageError, match="repetitions"):
+        make_split(data, "repetition")

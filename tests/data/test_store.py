@@ -314,3 +314,22 @@ def test_a_robot_with_other_joints_and_the_same_name_is_another_robot(dataset, t
     object.__setattr__(swapped, "joint_names", ("elbow", "shoulder"))
     with pytest.raises(DatasetError, match=r"\(elbow, shoulder\)"):
         dataset.require_robot(swapped)
+
+
+def test_a_unit_that_is_not_there_names_those_that_are(dataset):
+    assert len(dataset.select(units=("a",))) == 1
+    with pytest.raises(DatasetError, match="holds: a"):
+        dataset.select(units=("b",))
+
+
+def test_replays_of_a_dataset_that_cannot_be_written_lie_elsewhere(dataset, sequence, monkeypatch):
+    monkeypatch.setattr(os, "access", lambda *_: False)
+    (entry,) = dataset.entries
+    before = sorted(dataset.path.rglob("*"))
+    for digest in ("abc", "xyz"):
+        simulated = SimulatedReplay(digest, sequence.qpos, sequence.qvel, sequence.tau)
+        with dataset.writing_replays():
+            dataset.write_replay(entry, simulated)
+    assert np.array_equal(dataset.pair(entry, "abc").sim.qpos, sequence.qpos)
+    assert np.array_equal(dataset.pair(entry, "xyz").sim.qpos, sequence.qpos)
+    assert sorted(dataset.path.rglob("*")) == before

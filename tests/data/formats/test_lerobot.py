@@ -11,9 +11,9 @@ import pyarrow.parquet as pq
 import pytest
 from logs import SO101, arm_sequence, late, stock, wave
 
-from gaponet.base.errors import LogError, UsageError
+from gaponet.base.errors import DatasetError, LogError, UsageError
 from gaponet.base.progress import no_progress
-from gaponet.data.formats import detect, read_logs
+from gaponet.data.formats import ReadOptions, detect, read_logs
 from gaponet.data.importer import ImportRequest, import_logs
 from gaponet.data.store import Dataset
 from gaponet.data.writers import export
@@ -467,3 +467,47 @@ def test_a_unit_that_is_no_text_is_no_unit(dataset, arm, tmp_path):
     file.write_text(json.dumps(info))
     with pytest.raises(UsageError, match="unit"):
         back(tmp_path / "out", arm, tmp_path / "again")
+
+
+def test_a_folder_without_a_set_and_a_set_without_episodes_are_refused(so101, tmp_path):
+    with pytest.raises(LogError, match=r"info\.json"):
+        list(read_logs(tmp_path, so101, ReadOptions("lerobot")))
+    folder = stock(tmp_path / "set")
+    next((folder / "meta" / "episodes").rglob("*.parquet")).unlink()
+    with pytest.raises(LogError, match="episode"):
+        read_stock(folder, so101, tmp_path / "data")
+
+
+def test_a_set_of_which_nothing_was_downloaded_is_refused(so101, tmp_path):
+    """Version 2.1, which has a file for each episode."""
+    folder = stock(
+        tmp_path / "set", codebase_version="v2.1", data_path="data/{episode_index:06d}.parquet"
+    )
+    listed = {"episode_index": 0, "tasks": ["Pick up!"], "length": 40}
+    (folder / "meta" / "episodes.jsonl").write_text(json.dumps(listed) + "\n")
+    with pytest.raises(LogError, match="none"):
+        read_stock(folder, so101, tmp_path / "data")
+
+
+def test_tasks_without_a_text_are_refused(so101, tmp_path):
+    folder = stock(tmp_path / "set")
+    pq.write_table(pa.table({"task_index": [0]}), folder / "meta" / "tasks.parquet")
+    with pytest.raises(LogError, match=r"tasks\.parquet"):
+        read_stock(folder, so101, tmp_path / "data")
+
+
+def test_a_sequence_that_changed_since_it_was_listed_is_not_exported(dataset, tmp_path):
+    file = dataset.path / "sequences" / f"{dataset.entries[0].id}.parquet"
+    table = pq.read_table(file)
+    changed = pa.FixedSizeListArray.from_arrays(pa.array(np.zeros(100, np.float32)), 2)
+    column = table.schema.get_field_index("qpos")
+    pq.write_table(table.set_column(column, "qpos", changed), file)
+    with pytest.raises(DatasetError, match="restore"):
+        export_lerobot(dataset, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_an_empty_folder_may_be_exported_into(dataset, tmp_path):
+    (tmp_path / "out").mkdir()
+    (written,) = export_lerobot(dataset, tmp_path / "out")
+    assert written.episodes == 3

@@ -10,7 +10,8 @@ import pyarrow.parquet as pq
 import pytest
 from logs import SO101, stock, wave
 
-from gaponet.base.errors import LogError, UsageError
+from gaponet.base.errors import JointMismatchError, LogError, UsageError
+from gaponet.data.describe.encoders import Encoder
 from gaponet.data.doctor import DoctorResult
 from gaponet.data.importer import ImportRequest, import_logs
 
@@ -165,3 +166,58 @@ def test_a_calibration_may_lie_in_the_home_folder(so101, tmp_path, monkeypatch):
     dataset = read(folder, so101, tmp_path / "data")
     ctrl = dataset.read(dataset.entries[0]).ctrl
     assert ctrl[0, 0] == pytest.approx((ticks[0, 0] - 2000) * PER_TICK, abs=1e-6)
+
+
+@pytest.mark.parametrize(("inverted", "sign"), [(False, 1), (True, -1)])
+def test_speeds_of_an_encoder_have_no_zero(inverted, sign):
+    """2400 of 4095 ticks a turn are its range."""
+    encoder = Encoder(800, 3200, inverted)
+    still, fast = np.array([0.0]), np.array([240.0])
+    assert encoder.angles(still, "ticks", speed=True) == 0
+    assert encoder.angles(fast, "ticks", speed=True) == pytest.approx(240 * PER_TICK)
+    assert encoder.fractions(still, speed=True) == 0
+    assert encoder.fractions(fast, speed=True) == pytest.approx(sign * 0.1)
+
+
+def test_an_inverted_gripper_is_open_where_its_reading_is_low():
+    assert Encoder(800, 3200, True).fractions(np.array([800.0, 2600.0])).tolist() == [1, 0.25]
+
+
+def test_a_range_that_ends_before_it_starts_is_refused(so101, tmp_path):
+    folder, _ = of_ticks(tmp_path)
+    turned = CALIBRATION["gripper"] | {"range_min": 3200, "range_max": 800}
+    (folder / "arm.json").write_text(json.dumps(CALIBRATION | {"gripper": turned}))
+    with pytest.raises(UsageError, match="gripper"):
+        read(folder, so101, tmp_path / "data")
+
+
+def test_a_feature_that_is_not_there_names_those_that_are(so101, tmp_path):
+    folder = stock(tmp_path / "set")
+    (folder / "logs.toml").write_text('ctrl = "goal.joints"\n')
+    with pytest.raises(LogError, match=r"goal\.joints"):
+        read(folder, so101, tmp_path / "data", position_unit="deg")
+
+
+def test_names_of_values_may_lie_in_a_dictionary(so101, tmp_path):
+    plain = read(stock(tmp_path / "plain"), so101, tmp_path / "a", position_unit="deg")
+    folder = stock(tmp_path / "set")
+    for feature in ("action", "observation.state"):
+        file = folder / "meta" / "info.json"
+        info = json.loads(file.read_text())
+        info["features"][feature]["names"] = {"motors": list(SO101)}
+        file.write_text(json.dumps(info))
+    named = read(folder, so101, tmp_path / "b", position_unit="deg")
+    assert {e.hash for e in named.entries} == {e.hash for e in plain.entries}
+
+
+def test_a_joint_that_is_only_in_the_state_is_refused_by_name(so101, tmp_path):
+    folder = renamed(stock(tmp_path / "set"), "action", (*SO101[:5], "lamp"))
+    (folder / "logs.toml").write_text('ignore = ["lamp"]\n')
+    with pytest.raises(JointMismatchError, match="gripper"):
+        read(folder, so101, tmp_path / "data", position_unit="deg")
+
+
+def test_a_unit_that_no_position_has_is_refused(so101, tmp_path):
+    folder = stock(tmp_path / "set")
+    with pytest.raises(UsageError, match="'inch'"):
+        read(folder, so101, tmp_path / "data", position_unit="inch")

@@ -7,7 +7,7 @@ import pytest
 from logs import SERVO_NAMES, late, wave, write_sage, write_so101
 
 from gaponet.base.errors import JointMismatchError, LogError, UsageError
-from gaponet.data.formats import ReadOptions, detect, find_logs, read_logs
+from gaponet.data.formats import ReadOptions, detect, find_logs, look, read_logs
 
 
 def edit(file, line: int, old: str, new: str) -> None:
@@ -156,3 +156,29 @@ def test_what_no_joint_does_costs_that_channel_there_and_is_said(tmp_path, so101
     told = log.meta["notes"]["nonsense"][channel]
     assert (told["rows"], told["joints"], told["worst"]) == (1, ["shoulder_pan"], 1e30)
     assert abs(log.channels[channel].values[7, 0]) < 20.0
+
+
+def test_a_folder_without_a_motion_is_refused(tmp_path, so101):
+    with pytest.raises(LogError, match="SAGE"):
+        list(read_logs(tmp_path, so101, ReadOptions("sage")))
+
+
+def test_a_list_that_no_channel_holds_is_left_alone(motion, so101):
+    before = next(read_logs(motion, so101))[1]
+    state = motion / "state_motor.csv"
+    state.write_text(state.read_text().replace("torques", "currents", 1))
+    log = next(read_logs(motion, so101))[1]
+    assert log.channels.keys() == before.channels.keys() - {"tau"}
+    assert np.array_equal(log.channels["qpos"].values, before.channels["qpos"].values)
+
+
+def test_a_clock_that_stands_still_is_refused_by_line(tmp_path, so101):
+    ctrl = wave(20, 6)
+    write_sage(tmp_path / "wave", ctrl, ctrl, time=np.full(20, 7.0))
+    with pytest.raises(LogError, match=r"\.csv:3:"):
+        list(read_logs(tmp_path, so101))
+
+
+def test_what_a_sage_folder_holds_needs_no_guess(motion):
+    with pytest.raises(UsageError, match="itself"):
+        look(motion)

@@ -314,3 +314,109 @@ def test_a_semicolon_in_a_name_does_not_separate_columns(tmp_path, arm):
     log = only(write(tmp_path / "wave.csv", columns), arm)
 
     assert log.joint_names == ("shoulder", "elbow")
+
+
+def test_cells_of_named_values_are_refused(tmp_path, arm):
+    columns = {name: pa.array(values) for name, values in arm_columns().items()}
+    columns["ctrl.elbow"] = pa.array([{"goal": 0.1}] * 60)
+    pq.write_table(pa.table(columns), tmp_path / "wave.parquet")
+    with pytest.raises(LogError, match="flatten"):
+        only(tmp_path / "wave.parquet", arm)
+
+
+def test_lists_of_different_lengths_are_refused(tmp_path, arm):
+    lists = [[0.1, 0.2]] * 59 + [[0.1]]
+    columns = {"time": pa.array(arm_columns()["time"]), "u": pa.array(lists), "q": pa.array(lists)}
+    pq.write_table(pa.table(columns), tmp_path / "wave.parquet")
+    (tmp_path / "logs.toml").write_text(
+        'ctrl = "u"\nqpos = "q"\njoints = ["shoulder", "elbow"]\n'
+        'time_unit = "s"\nposition_unit = "rad"\n'
+    )
+    with pytest.raises(LogError, match="long"):
+        list(read_logs(tmp_path, arm))
+
+
+def test_lists_in_cells_of_text_are_named(tmp_path, arm):
+    text = table_text(arm_columns()).splitlines()
+    time, _, *others = text[3].split(",")
+    text[3] = ",".join([time, '"[0.1; 0.2]"', *others])
+    (tmp_path / "wave.csv").write_text("\n".join(text) + "\n")
+    with pytest.raises(LogError, match="lists"):
+        only(tmp_path / "wave.csv", arm)
+
+
+def test_a_long_table_of_many_columns_without_a_header_is_not_called_transposed(tmp_path, arm):
+    columns = arm_columns() | {f"further_{i}": np.zeros(60) for i in range(20)}
+    (tmp_path / "wave.csv").write_text(table_text(columns).split("\n", 1)[1])
+    (tmp_path / "logs.toml").write_text(
+        f'header = {list(columns)}\ntime_unit = "s"\nposition_unit = "rad"\n'
+    )
+    ((_, log),) = read_logs(tmp_path, arm)
+    assert np.array_equal(log.channels["ctrl"].values[:, 0], columns["ctrl.shoulder"])
+
+
+def test_a_first_row_of_dates_that_is_cut_short_is_refused_by_line(tmp_path, arm):
+    header, first, *rows = table_text(arm_columns()).splitlines()
+    short = "2026-03-01T12:00:00," + ",".join(first.split(",")[2:])
+    (tmp_path / "wave.csv").write_text("\n".join([header, short, *rows]) + "\n")
+    with pytest.raises(LogError, match=r"wave\.csv:2:"):
+        only(tmp_path / "wave.csv", arm)
+
+
+def test_a_folder_without_tables_that_is_said_to_hold_some_is_refused(tmp_path, arm):
+    with pytest.raises(LogError, match="table"):
+        list(read_logs(tmp_path, arm, ReadOptions("table")))
+
+
+def test_rows_per_joint_may_lie_in_parquet_and_need_a_time_and_numbers(tmp_path, arm):
+    columns = arm_columns()
+    long = {"t": np.repeat(columns["time"], 2), "joint": ["shoulder", "elbow"] * 60}
+    for name, channel in (("command", "ctrl"), ("position", "qpos")):
+        both = [columns[f"{channel}.{joint}"] for joint in ("shoulder", "elbow")]
+        long[name] = np.stack(both, axis=1).ravel()
+    file = write_parquet(tmp_path / "long.parquet", long)
+    (tmp_path / "logs.toml").write_text(
+        'ctrl = "command"\nqpos = "position"\ntime_unit = "s"\nposition_unit = "rad"\n'
+    )
+    ((_, log),) = read_logs(tmp_path, arm)
+    assert np.array_equal(log.channels["qpos"].values[:, 1], columns["qpos.elbow"])
+
+    write_parquet(file, {("stamped" if name == "t" else name): long[name] for name in long})
+    with pytest.raises(LogError, match="times"):
+        list(read_logs(tmp_path, arm))
+    write_parquet(file, long | {"command": [None, *long["command"][1:].tolist()]})
+    with pytest.raises(LogError, match="'command'"):
+        list(read_logs(tmp_path, arm))
+
+
+def test_percent_that_are_called_degrees_or_radians_are_named(tmp_path, arm):
+    columns = {name: 500 * values for name, values in arm_columns().items()}
+    for name in columns.keys() - {"time"}:
+        columns[name] = columns[name].clip(-100, 100)
+    file = write(tmp_path / "wave.csv", columns | {"time": arm_columns()["time"]})
+    with pytest.raises(LogError, match="signed_percent"):
+        only(file, arm)
+
+
+def test_commands_beyond_all_ranges_that_follow_the_recorded_torque_are_torques(tmp_path, arm):
+    columns = arm_columns()
+    for joint in arm.joint_names:
+        torque = np.random.default_rng(0).normal(size=60)
+        columns |= {f"tau.{joint}": torque, f"ctrl.{joint}": 20 * torque}
+    with pytest.raises(LogError, match="torques"):
+        only(write(tmp_path / "wave.csv", columns), arm)
+
+
+def test_noise_beyond_all_ranges_is_refused_as_no_position(tmp_path, arm):
+    columns = arm_columns()
+    for joint in arm.joint_names:
+        columns[f"ctrl.{joint}"] = 20 * np.random.default_rng(0).normal(size=60)
+    with pytest.raises(LogError, match="range"):
+        only(write(tmp_path / "wave.csv", columns), arm)
+
+
+def test_a_torque_that_is_mostly_nonsense_is_left_out(tmp_path, arm):
+    columns = arm_columns() | {f"tau.{joint}": np.full(60, 1e9) for joint in arm.joint_names}
+    log = only(write(tmp_path / "wave.csv", columns), arm)
+    assert "tau" not in log.channels
+    assert log.meta["notes"]["nonsense"]["tau"]["done"] == "left out"

@@ -132,3 +132,14 @@ def test_arrays_in_files_of_commands_and_states_are_guessed_as_families(tmp_path
         np.savez(tmp_path / f"{name}.npz", positions)
     kind, known, found = look(tmp_path)
     assert 'command_file = "{name}_cmd.npz"' in guess_logs(found, arm, kind, dict(known))
+
+
+def test_an_address_of_another_store_is_to_be_downloaded(arm):
+    with pytest.raises(LogError, match="download"):
+        list(read_logs(Path("s3://bucket/logs"), arm, SI))
+
+
+def test_a_folder_of_nothing_that_could_be_a_log_names_the_formats(tmp_path):
+    (tmp_path / "robot.stl").write_bytes(b"solid")
+    with pytest.raises(LogError, match="--formats"):
+        detect(tmp_path)
