@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from arm import TOML, XML, commands, record, write_arm, write_dataset
+from logs import arm_sequence, late
 
 from gaponet.data.checks.exchanges import mirrored_joints
 from gaponet.data.doctor import DoctorResult
@@ -84,3 +85,26 @@ def test_positions_that_fit_another_joints_range_only_show_other_names(tmp_path)
 def test_counterparts_are_found_by_their_names():
     sides = mirrored_joints(("left_hip", "right_hip", "waist", "FL_calf", "RL_calf"))
     assert sides == {"left and right": {0: 1, 1: 0}, "front and rear": {3: 4, 4: 3}}
+
+
+def exchanged_legs(tmp_path, left, right):
+    """Warnings of a recording of two legs that swing alike, each within its own range."""
+    named = XML.replace('name="shoulder"', 'name="left_hip"').replace('"elbow"', '"right_hip"')
+    toml = TOML.replace('"shoulder"', '"left_hip"').replace('"elbow"', '"right_hip"')
+    ranges = named.replace("-1.5 1.5", left, 1).replace("-1.5 1.5", right, 1)
+    robot = write_arm(tmp_path / "legs", toml, ranges)
+    swing = 0.2 * np.sin(0.5 * np.arange(30))
+    ctrl = np.stack([1.7 + swing, swing], axis=1)
+    return warnings(tmp_path / "data", robot, [arm_sequence(robot, ctrl, late(ctrl, 1))])
+
+
+def test_ranges_alone_tell_legs_exchanged_where_few_rows_were_recorded(tmp_path):
+    """30 rows are too few for torques. Left and right name the same exchange as the pair does."""
+    (finding,) = exchanged_legs(tmp_path, "-0.8 0.8", "1.0 2.5")
+    assert finding.mend == {"names": {"left_hip": "right_hip", "right_hip": "left_hip"}}
+    assert "left and right" in finding.message
+    assert "other" in finding.message
+
+
+def test_positions_outside_of_every_range_are_no_exchange(tmp_path):
+    assert exchanged_legs(tmp_path, "-0.8 0.8", "-0.8 0.8") == []

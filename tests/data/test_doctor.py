@@ -749,3 +749,102 @@ def test_an_error_and_warnings_are_both_counted(arm, tmp_path):
     ctrl, qpos = good()
     wrong = arm_sequence(arm, ctrl, qpos * ELBOW, tau=np.zeros((ROWS, 2)))
     assert "1 error and 1 warning" in examine(arm, tmp_path, wrong).verdict
+
+
+def held(qpos: np.ndarray, mass: float, side: str) -> np.ndarray:
+    """The torques that hold two links of 0.2 m up, of 0.3 and 0.2 kg, and a payload, (k, 2) N·m."""
+    fore = 9.81 * (0.2 * 0.1 + mass * 0.2) * np.cos(qpos.sum(axis=1))
+    upper = 9.81 * (0.3 * 0.1 + (0.2 + mass) * 0.2) * np.cos(qpos[:, 0])
+    return np.stack([upper + fore, fore], axis=1)
+
+
+def resting(arm, seed: int, payload: float = 0.0, label: float | None = None, soft: float = 1.0):
+    """The arm going from hold to hold, sagging as its servos do under a payload that the label may
+    not say.
+
+    Args:
+        soft: How many times as far as kp says.
+    """
+    rng = np.random.default_rng(seed)
+    levels = rng.uniform(-1.2, 1.2, (8, 2))
+    knots = 80 * np.arange(8)[:, None] + [0, 60]  # a rest of 60 rows, and 20 to the next
+    rows = np.arange(knots.max())
+    ctrl = np.stack([np.interp(rows, knots.ravel(), np.repeat(x, 2)) for x in levels.T], axis=1)
+    told = late(ctrl, 3)
+    qpos = told
+    for _ in range(20):
+        qpos = told - soft * held(qpos, payload, "hand") / arm.servo.kp
+    noise = 3e-4 * rng.standard_normal(ctrl.shape)
+    said = payload if label is None else label
+    return arm_sequence(arm, ctrl, qpos + noise, f"m{seed}", said)
+
+
+def at_rest(arm, tmp_path, logs) -> DoctorResult:
+    data = write_dataset(tmp_path / "data", arm, logs)
+    return DoctorResult.of(data, arm, gravity_model=held)
+
+
+@pytest.mark.parametrize(("labels", "level"), [((0.0, 0.5), "ok"), ((0.5, 0.0), "warning")])
+def test_payload_labels_in_each_others_place_are_found(arm, tmp_path, labels, level):
+    logs = []
+    for seed in range(6):
+        payload = (0.0, 0.5)[seed % 2]
+        logs.append(resting(arm, seed, payload, labels[seed % 2]))
+    diagnosis = at_rest(arm, tmp_path, logs)
+    if level == "ok":
+        assert found(diagnosis, "rests", "ok")
+        return
+    finding = found(diagnosis, "payload", "warning")
+    assert finding.values == {"labels": [0.0, 0.5], "rests_as": [0.5, 0.0]}
+
+
+@pytest.mark.parametrize(("soft", "fed"), [(0.2, True), (3.0, False)])
+def test_joints_that_do_not_sag_as_kp_says_are_found(arm, tmp_path, soft, fed):
+    logs = [resting(arm, seed, 0.2, soft=soft) for seed in range(4)]
+    finding = found(at_rest(arm, tmp_path, logs), "gains", "warning")
+    assert finding.values["softness"]["shoulder"] == pytest.approx(soft, rel=0.1)
+    assert ("feedforward" in finding.message) is fed
+
+
+def test_recordings_of_two_robots_under_one_name_are_found(arm, tmp_path):
+    """Zeros of three recordings lie 20 and −30 mrad apart from those of the others."""
+    logs = []
+    for seed in range(6):
+        one = resting(arm, seed)
+        shift = np.array([0.02, -0.03]) * (seed % 2)
+        logs.append(replace(one, qpos=one.qpos + shift))
+    finding = found(at_rest(arm, tmp_path, logs), "unit_id", "warning")
+    assert finding.joints == arm.joint_names
+    assert finding.values["apart"] == pytest.approx(0.03, abs=2e-3)
+    assert finding.values["motions"] in (["m0", "m2", "m4"], ["m1", "m3", "m5"])
+
+
+def test_a_robot_without_a_place_for_payloads_is_judged_by_its_own_weight(tmp_path):
+    arm = write_arm(tmp_path / "arm", TOML.split("[[payload_mount]]")[0])
+    logs = [resting(arm, seed, soft=3.0) for seed in range(4)]
+    finding = found(at_rest(arm, tmp_path, logs), "gains", "warning")
+    assert finding.joints == ("shoulder",)  # the elbow sags by 10 mrad, too little to tell
+
+
+def test_a_joint_that_follows_later_than_the_others_is_named(so101, tmp_path):
+    logs = []
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        ctrl = np.repeat(rng.uniform(-0.5, 0.5, (30, 6)), 30, axis=0)
+        qpos = late(lowpass(ctrl, 0.02, 4.0), 4)
+        qpos[:, 2] = late(qpos[:, 2:3], 6)[:, 0]  # 120 ms more
+        logs.append(arm_sequence(so101, ctrl, qpos, f"m{seed}"))
+    finding = found(examine(so101, tmp_path, *logs), "lag", "warning")
+    assert finding.joints == ("elbow_flex",)
+    assert finding.values["extra_s"] == pytest.approx(0.12, abs=0.02)
+
+
+def test_several_late_recordings_are_one_finding(arm, tmp_path):
+    logs = []
+    for seed in range(10):
+        ctrl, qpos = lively(seed)
+        if seed in (1, 4, 6, 8):
+            qpos = late(qpos, 3)
+        logs.append(arm_sequence(arm, ctrl, qpos, f"m{seed}"))
+    finding = found(examine(arm, tmp_path, *logs), "lag", "warning")
+    assert finding.values["late_s"] == pytest.approx([0.06] * 4, abs=0.02)
