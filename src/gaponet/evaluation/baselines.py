@@ -47,8 +47,13 @@ def _later_and_shifted(runs: ListOf[Run]) -> list[Run]:
     """Return runs with delays and offsets that were fitted to the other half of the motions."""
     motions = list(dict.fromkeys(run.meta.independent_motion for run in runs))
     first_half = set(motions[::2])
-    first = [run for run in runs if run.meta.independent_motion in first_half]
-    second = [run for run in runs if run.meta.independent_motion not in first_half]
+    first = []
+    second = []
+    for run in runs:
+        if run.meta.independent_motion in first_half:
+            first.append(run)
+        else:
+            second.append(run)
     of_first = fit_delay_offset(first)
     of_second = fit_delay_offset(second or first)  # a single motion is fitted to itself
     moved = []

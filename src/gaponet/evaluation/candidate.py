@@ -122,7 +122,10 @@ def select_entries(
             return dataset.select(motions, units), False
         fitted.append(data)
     available = dataset.select(units=units)
-    unused = [entry for entry in available if not any(entry in data for data in fitted)]
+    unused = []
+    for entry in available:
+        if not any(entry in data for data in fitted):
+            unused.append(entry)
     if motions:
         entries = dataset.select(motions, units)
     else:
@@ -151,7 +154,9 @@ def _unseen_entries(
         return test
     if unused:
         return unused
-    used = frozenset[str]().union(*(data.hashes for data in fitted))
+    used = set[str]()
+    for data in fitted:
+        used |= data.hashes
     return [entry for entry in available if entry.hash not in used]
 
 

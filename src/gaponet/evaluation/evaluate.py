@@ -254,7 +254,9 @@ class _Rollouts:
         """Return everything that is measured, in the form of Evaluation.result."""
         methods = {name: summary(part, self._robot) for name, part in self.runs.items()}
         nominal_error = methods["nominal"]["mpjae"]
-        ratios = {name: metrics["mpjae"] / nominal_error for name, metrics in methods.items()}
+        ratios = {}
+        for name, metrics in methods.items():
+            ratios[name] = metrics["mpjae"] / nominal_error
         delta = {}
         for name, parts in self.deltas.items():
             model = self._candidates[name].model
@@ -292,7 +294,7 @@ class _Rollouts:
         """Return joint → number of recordings in which it is commanded to move."""
         moved = [np.ptp(ctrl, axis=0) > MIN_MOTION_RAD for ctrl in self.ctrl]
         counts = np.sum(moved, axis=0)  # (n operated)
-        return {name: int(n) for name, n in zip(self._robot.operated, counts, strict=True)}
+        return dict(zip(self._robot.operated, counts.tolist(), strict=True))
 
     def _artifacts(self) -> dict[str, dict[str, Any]]:
         """Return method → weights and seed of its network."""
@@ -395,9 +397,11 @@ def _by_unit(
     progress: Callable[[int, int], None],
 ) -> list[SimulatedReplay]:
     """Roll out the model in each unit's adapted simulator, or in the common one for other units."""
+    numbers_of: dict[str, list[int]] = {}  # unit → numbers of its recordings
+    for number, sequence in enumerate(sequences):
+        numbers_of.setdefault(sequence.meta.unit_id, []).append(number)
     replays: dict[int, SimulatedReplay] = {}  # number of the recording → its simulation
-    for unit in dict.fromkeys(s.meta.unit_id for s in sequences):
-        numbers = [i for i, s in enumerate(sequences) if s.meta.unit_id == unit]
+    for unit, numbers in numbers_of.items():
         simulator = candidate.robot
         if unit in adapted:
             simulator = adapted[unit].robot(candidate.robot)
@@ -413,9 +417,19 @@ def _delta_summary(parts: list[Array], sequences: list[Sequence], limit: float) 
     (rad).
     """
     dt = float(np.median([sequence.dt for sequence in sequences]))
+    means = []
+    largest = []
+    shares_at_limit = []
+    steps = []  # mean |difference| of a row and the next one, rad
+    for delta in parts:
+        size = np.abs(delta)
+        means.append(size.mean())
+        largest.append(size.max())
+        shares_at_limit.append((size >= limit - 1e-6).mean())
+        steps.append(np.abs(np.diff(delta, axis=0)).mean())
     return {
-        "mean": float(np.mean([np.abs(delta).mean() for delta in parts])),
-        "max": float(max(np.abs(delta).max() for delta in parts)),
-        "at_limit": float(np.mean([(np.abs(delta) >= limit - 1e-6).mean() for delta in parts])),
-        "rate": float(np.mean([np.abs(np.diff(delta, axis=0)).mean() for delta in parts]) / dt),
+        "mean": float(np.mean(means)),
+        "max": float(max(largest)),
+        "at_limit": float(np.mean(shares_at_limit)),
+        "rate": float(np.mean(steps) / dt),
     }

@@ -150,7 +150,10 @@ def _methods(
         step_of["identified"] = causes[-1].name
     if candidate.model is not None:
         step_of[candidate.method] = list(runs_after)[-1]
-    return {name: errors_of(runs_after[step], candidate.robot) for name, step in step_of.items()}
+    errors = {}
+    for name, step in step_of.items():
+        errors[name] = errors_of(runs_after[step], candidate.robot)
+    return errors
 
 
 def _floors(
@@ -222,7 +225,9 @@ def _sources(
     Args:
         columns: Only these operated joints, by number; default: all.
     """
-    left = {step: metrics(part, columns)["mpjae"] for step, part in runs_after.items()}
+    left = {}
+    for step, part in runs_after.items():
+        left[step] = metrics(part, columns)["mpjae"]
     least = floor["both"]
     unexplained = None
     if least is not None:
@@ -270,8 +275,7 @@ def _with_cause(
     """Return a robot that takes what a cause changes from the identified one."""
     servos: dict[str, dict[str, float]] = {}
     for row, joint in enumerate(identified.joint_names):
-        values = identified.servo.of_joint(row, fields)
-        servos[joint] = {field: value for field, value in values.items() if np.isfinite(value)}
+        servos[joint] = identified.servo.finite_of_joint(row, fields)
     changed = robot.with_identified(servos)
     if cause == "contact":
         return changed.with_table(identified.scene.table)
@@ -370,7 +374,6 @@ def _std_of_equal_commands(sequences: list[Sequence], robot: RobotSpec) -> dict[
 
 def _mean(values: ListOf[float | None]) -> float | None:
     """Return the mean of numbers; None if one is unknown."""
-    numbers = [value for value in values if value is not None]
-    if len(numbers) < len(values):
+    if None in values:
         return None
-    return float(np.mean(numbers))
+    return float(np.mean(np.asarray(values, float)))

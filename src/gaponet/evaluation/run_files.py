@@ -170,8 +170,9 @@ def read_trajectories(run: Path, metrics: dict[str, Any], joints: int) -> dict[s
                 f"{file}: sequence {row} has arrays of {joints} joints missing or of other sizes; "
                 f"{REPAIR_HINT}"
             )
-    if not all(a.dtype == np.float32 and np.isfinite(a).all() for a in arrays.values()):
-        raise ModelError(f"{file}: holds NaN or other types than float32; {REPAIR_HINT}")
+    for array in arrays.values():
+        if array.dtype != np.float32 or not np.isfinite(array).all():
+            raise ModelError(f"{file}: holds NaN or other types than float32; {REPAIR_HINT}")
     return arrays
 
 

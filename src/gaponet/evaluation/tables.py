@@ -92,5 +92,8 @@ def by_group(
     parts = [errors[f"by_{group}"] for errors in methods.values()]
     rows = []
     for key in parts[0]:
-        rows.append((key, *(angle(part[key]["mpjae"]) for part in parts)))
+        row = [key]
+        for part in parts:
+            row.append(angle(part[key]["mpjae"]))
+        rows.append(tuple(row))
     return ResultTable(group, ("mean |error|, mrad", *map(title, methods)), tuple(rows))

@@ -74,7 +74,8 @@ def verdict(methods: Scores, baselines: Mapping[str, float] | None = None) -> li
     sentences = [_about_nominal(methods["nominal"])]
     if "identified" in methods:
         sentences.append(_about_identified(methods))
-    sentences += [_about_network(methods, own) for own in _networks(methods)]
+    for own in _networks(methods):
+        sentences.append(_about_network(methods, own))
     best = min(scores["mpjae"] for scores in methods.values())
     if baselines is not None and baselines["command"] <= best:
         sentences.append(
@@ -92,11 +93,11 @@ def _networks(methods: Scores) -> list[str]:
 
 def _about_nominal(nominal: Scores) -> str:
     error = nominal["mpjae"]
-    by_joint = {joint: errors["mpjae"] for joint, errors in nominal["by_joint"].items()}
-    worst = max(by_joint, key=lambda joint: by_joint[joint])
+    by_joint = nominal["by_joint"]
+    worst = max(by_joint, key=lambda joint: by_joint[joint]["mpjae"])
     return (
         f"The nominal simulator is {mrad(error)} mrad ({np.degrees(error):.2f}°) from the robot, "
-        f"most at {worst} ({mrad(by_joint[worst])})."
+        f"most at {worst} ({mrad(by_joint[worst]['mpjae'])})."
     )
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from itertools import compress
 from typing import Any
 
 from gaponet.base.arrays import Array
@@ -71,4 +72,4 @@ def abbreviate(names: list[str]) -> str:
 
 def masked_names(robot: RobotSpec, mask: Array) -> tuple[str, ...]:
     """Return the joint names where mask (n) is true."""
-    return tuple(name for name, selected in zip(robot.joint_names, mask, strict=True) if selected)
+    return tuple(compress(robot.joint_names, mask))

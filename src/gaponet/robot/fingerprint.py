@@ -138,9 +138,11 @@ def _options(model: mujoco.MjModel) -> Iterator[str]:
         (mujoco.mjtDisableBit, "disableflags"),
         (mujoco.mjtEnableBit, "enableflags"),
     ):
-        # not the count of flags
-        bits = [bit for bit in kind.__members__.values() if "BL_" in bit.name]
-        names = {bit.name for bit in bits if getattr(model.opt, flags) & bit.value}
+        names = set()
+        for bit in kind.__members__.values():
+            is_flag = "BL_" in bit.name  # not the count of flags
+            if is_flag and getattr(model.opt, flags) & bit.value:
+                names.add(bit.name)
         yield f"{flags} {' '.join(sorted(names - IGNORED_FLAGS))}"
     if model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_OVERRIDE:
         fields = ("o_margin", "o_solref", "o_solimp", "o_friction")

@@ -108,13 +108,14 @@ def save_robot(robot: RobotSpec, folder: Path) -> None:
     xml = robot.mjcf.read_text(encoding="utf-8")
     if FILE_REFERENCES.search(xml):
         xml = self_contained_mjcf(robot.mjcf)
-    copied = {name: robot.folder / name for name in COPIED_FILES if (robot.folder / name).is_file()}
     with lock_folder(folder, "robot"):
         # its presence marks a complete folder: it is written last
         (folder / "robot.toml").unlink(missing_ok=True)
         write_text(folder / "robot.xml", xml)
-        for name, file in copied.items():
-            write_text(folder / name, file.read_text(encoding="utf-8"))
+        for name in COPIED_FILES:
+            file = robot.folder / name
+            if file.is_file():
+                write_text(folder / name, file.read_text(encoding="utf-8"))
         write_text(folder / "robot.toml", text)
     written = load_robot(folder).before_identification
     if not np.allclose(written.servo.kd, robot.before_identification.servo.kd, rtol=1e-4):

@@ -254,10 +254,12 @@ def _require_files(
 ) -> None:
     places = {folder}
     for tag in root.iter("compiler"):
-        places.update(folder / tag.get(key, "") for key in ("meshdir", "texturedir", "assetdir"))
+        for key in ("meshdir", "texturedir", "assetdir"):
+            places.add(folder / tag.get(key, ""))
     names = {path.name}
     for tag in root.iter():
-        names.update(tag.get(key, "") for key in ("file", "filename"))
+        names.add(tag.get("file", ""))
+        names.add(tag.get("filename", ""))
     for name in names:
         for place in places:
             file = place / name
@@ -280,8 +282,12 @@ def _copies(tag: ElementTree.Element) -> float:
 
 def _extent(tag: ElementTree.Element, *names: str) -> float:
     """Return the product of the first numbers of some attributes, without signs."""
-    first = [_numbers(tag.get(name, "0"))[:1] for name in names]
-    return math.prod(abs(numbers[0]) for numbers in first if numbers)
+    extent = 1.0
+    for name in names:
+        numbers = _numbers(tag.get(name, "0"))
+        if numbers:
+            extent *= abs(numbers[0])
+    return extent
 
 
 def _bytes(text: str) -> float:

@@ -62,8 +62,7 @@ def new_robot(
         RobotError: The model is damaged, or has no joint to log.
         UsageError: An option does not fit the model, or a gain is stated nowhere.
     """
-    packages = {name: Path(folder) for name, folder in map(_pair, options.packages)}
-    spec, notes = read_vendor(path, packages)
+    spec, notes = read_vendor(path, _package_folders(options.packages))
     model = compile_spec(spec, path)
     recorded = _logged_joints(model, options.joints, path)
     pose, source = _home(model, options.keyframe, path)
@@ -122,6 +121,15 @@ def _holds_another_robot(folder: Path, xml: str, toml: str) -> bool:
     return False
 
 
+def _package_folders(texts: tuple[str, ...]) -> dict[str, Path]:
+    """Return package → folder, from texts NAME=FOLDER."""
+    folders = {}
+    for text in texts:
+        name, folder = _pair(text)
+        folders[name] = Path(folder)
+    return folders
+
+
 def _pair(text: str) -> tuple[str, str]:
     name, equals, value = text.partition("=")
     if not equals or not name or not value:
@@ -173,8 +181,12 @@ def _followers(
         zero = _reference(model, name)
         leader_zero = _reference(model, leader)
         followers[name] = Follower(leader, ratio, zero + constant - ratio * leader_zero)
-    driven = {name: _behind_motor(name, followers) for name in followers}
-    return {name: follower for name, follower in driven.items() if follower is not None}
+    behind_motors = {}
+    for name in followers:
+        follower = _behind_motor(name, followers)
+        if follower is not None:
+            behind_motors[name] = follower
+    return behind_motors
 
 
 def _behind_motor(name: str, followers: dict[str, Follower]) -> Follower | None:
@@ -316,7 +328,10 @@ def _robot_xml(
 
 def _delete_references(spec: mujoco.MjSpec, model: mujoco.MjModel, removed: set[str]) -> None:
     """Delete actuators, sensors and keyframes, and what refers to removed joints."""
-    tendons = {model.tendon(t).name for t in range(model.ntendon) if _wraps(model, t) & removed}
+    tendons = set()
+    for t in range(model.ntendon):
+        if _wraps(model, t) & removed:
+            tendons.add(model.tendon(t).name)
     for kind in (spec.actuators, spec.sensors, spec.keys):
         for element in list(kind):
             spec.delete(element)
@@ -471,7 +486,10 @@ def _mount(model: mujoco.MjModel, end: int, *, is_tip: bool) -> tuple[int, np.nd
         name = model.site(site).name
         if model.site_bodyid[site] in beyond and _hand(name):
             return int(model.site_bodyid[site]), model.site_pos[site], name
-    bodies = [body for body in beyond if body != end and _hand(model.body(body).name)]
+    bodies = []
+    for body in beyond:
+        if body != end and _hand(model.body(body).name):
+            bodies.append(body)
     if is_tip and bodies:
         return bodies[-1], np.zeros(3), model.body(bodies[-1]).name
     return end, model.body_ipos[end], "the last link's centre of mass"
@@ -498,7 +516,10 @@ def _palms(model: mujoco.MjModel, ends: list[int]) -> list[int]:
         sides.setdefault(_side(model, end), []).append(end)
     palms = []
     for side_ends in sides.values():
-        palm = max(set.intersection(*(set(_chain(model, end)) for end in side_ends)))
+        common = set(_chain(model, side_ends[0]))  # ancestors of all ends of this side
+        for end in side_ends[1:]:
+            common.intersection_update(_chain(model, end))
+        palm = max(common)
         palms += [palm] if model.body_parentid[palm] else side_ends
     return sorted(palms)
 

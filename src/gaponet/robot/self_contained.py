@@ -61,8 +61,9 @@ def self_contained_text(spec: mujoco.MjSpec, path: Path) -> str:
     spec.compiler.discardvisual = spec.compiler.fusestatic = False
     model = compile_spec(spec, path)
     root = ET.fromstring(spec.to_xml())
-    for child in [part for part in root if part.tag in (*DROPPED_SECTIONS, "compiler")]:
-        root.remove(child)
+    for child in list(root):
+        if child.tag in (*DROPPED_SECTIONS, "compiler"):
+            root.remove(child)
     for element in root.iter("geom"):  # a default class may name a material that was dropped
         element.attrib.pop("material", None)
     root.insert(0, ET.Element("compiler", COMPILER_ATTRIBUTES))
@@ -96,8 +97,9 @@ def _fill(
     order.
     """
     _unwrap(element)
-    for child in [part for part in element if part.tag not in ("joint", "geom", "site", "body")]:
-        element.remove(child)
+    for child in list(element):
+        if child.tag not in ("joint", "geom", "site", "body"):
+            element.remove(child)
     if body:
         set_attributes(element, pos=model.body_pos[body], quat=model.body_quat[body])
         if model.body_mass[body]:
@@ -119,13 +121,13 @@ def _fill(
             site = next(counters["site"])
             child.attrib.pop("material", None)
             set_attributes(child, pos=model.site_pos[site], quat=model.site_quat[site])
-    for child in [part for part in element if part.tag == "body"]:
+    for child in element.findall("body"):
         _fill(child, next(bodies), model, asset, counters, bodies)
 
 
 def _unwrap(element: ET.Element) -> None:
     """Replace frames by their children: the model states positions relative to the body."""
-    while any(child.tag == "frame" for child in element):
+    while element.find("frame") is not None:
         children: list[ET.Element] = []
         for child in element:
             children += child if child.tag == "frame" else [child]

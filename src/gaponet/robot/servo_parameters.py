@@ -131,6 +131,16 @@ class ServoParameters:
         """Return the values of joint i, by field."""
         return {name: float(self[name][i]) for name in names}
 
+    def finite_of_joint(
+        self, i: int, names: Iterable[str] = tuple(SERVO_FIELDS)
+    ) -> dict[str, float]:
+        """Return the values of joint i that are known and no infinite limits, by field."""
+        values = {}
+        for name, value in self.of_joint(i, names).items():
+            if np.isfinite(value):
+                values[name] = value
+        return values
+
     def with_joints(self, joints: Mapping[int, Mapping[str, float]]) -> ServoParameters:
         """Return the servos with values of some joints: index → field → value.
 

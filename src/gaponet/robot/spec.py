@@ -138,14 +138,13 @@ class RobotSpec:
     def __getstate__(self) -> dict[str, Any]:
         """Include the files: another process may run on a machine without this folder."""
         files = [self.mjcf, *self.folder.glob("*.toml")]
-        contents = {file.name: file.read_bytes() for file in files if file.is_file()}
-        return vars(self) | {"files": contents}
+        return vars(self) | {"files": _contents(files)}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         files: dict[str, bytes] = state.pop("files")
         vars(self).update(state)
         here = [self.mjcf.parent / name for name in files]
-        if {file.name: file.read_bytes() for file in here if file.is_file()} != files:
+        if _contents(here) != files:
             folder = _unpacked(tuple(sorted(files.items())))
             vars(self).update(folder=folder, mjcf=folder / self.mjcf.name)
 
@@ -186,7 +185,9 @@ class RobotSpec:
 
         Negative damping reduces kd instead.
         """
-        joints = {int(self.index([joint])[0]): values for joint, values in servos.items()}
+        joints = {}
+        for joint, values in servos.items():
+            joints[int(self.index([joint])[0])] = values
         servo = self.servo.with_joints(joints)
         return dataclasses.replace(self, servo=servo, nominal=self.before_identification)
 
@@ -373,6 +374,15 @@ def _folder(name_or_path: str | Path) -> Path:
     return packaged
 
 
+def _contents(files: list[Path]) -> dict[str, bytes]:
+    """Return file name → content of those files that exist."""
+    contents = {}
+    for file in files:
+        if file.is_file():
+            contents[file.name] = file.read_bytes()
+    return contents
+
+
 @functools.cache
 def servo_table() -> ServoTable:
     """Return the package's servo types."""
@@ -491,9 +501,12 @@ def _require_known_names(table: RobotTable) -> None:
 
 def _identified_servos(table: RobotTable) -> dict[str, dict[str, float]]:
     """Return joint → field → identified value, SI."""
-    servos = {}
+    servos: dict[str, dict[str, float]] = {}
     for joint, servo in table.identified.items():
-        servos[joint] = {name: value for name, value in vars(servo).items() if value is not None}
+        servos[joint] = {}
+        for name, value in vars(servo).items():
+            if value is not None:
+                servos[joint][name] = value
     return servos
 
 

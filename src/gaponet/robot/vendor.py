@@ -9,6 +9,7 @@ import os
 import re
 import sys
 import xml.etree.ElementTree as ET
+from collections.abc import Container
 from pathlib import Path
 from typing import Any
 
@@ -104,7 +105,10 @@ def _of_menagerie(name: str) -> Path:
 
 def _main_model(folder: Path, name: str) -> Path:
     """Return the robot's own file in a folder of Menagerie: franka_fr3/fr3.xml, not its scenes."""
-    models = sorted(f for f in folder.glob("*.xml") if not re.search(r"scene|keyframe|mjx", f.stem))
+    models = []
+    for file in sorted(folder.glob("*.xml")):
+        if not re.search(r"scene|keyframe|mjx", file.stem):
+            models.append(file)
     named = [f for f in models if folder.name.endswith(f.stem)]
     if len(models) == 1 or named:
         return max(named or models, key=lambda f: len(f.stem))
@@ -243,8 +247,7 @@ def _mjcf(path: Path) -> tuple[mujoco.MjSpec, list[str]]:
     for mesh in spec.meshes:
         if mesh.file and not (place / mesh.file).is_file():
             missing[mesh.name or Path(mesh.file).stem] = mesh
-    for geom in [one for one in spec.geoms if one.meshname in missing]:
-        spec.delete(geom)
+    _delete_geoms(spec, missing)
     for mesh in missing.values():
         spec.delete(mesh)
     return spec, _left_out(sorted(missing), f"are not in {place}") + _drop_unreadable_meshes(spec)
@@ -255,9 +258,9 @@ def _urdf(
 ) -> tuple[mujoco.MjSpec, list[str]]:
     missing: list[str] = []
     unread: list[str] = []
-    foreign = [child for child in root if child.tag in ("transmission", "gazebo", "ros2_control")]
-    for element in foreign:
-        root.remove(element)
+    for element in list(root):
+        if element.tag in ("transmission", "gazebo", "ros2_control"):
+            root.remove(element)
     for link in root.iter("link"):
         for shape in [part for part in link if part.tag in ("visual", "collision")]:
             mesh = shape.find("geometry/mesh")
@@ -398,10 +401,16 @@ def _drop_unreadable_meshes(spec: mujoco.MjSpec) -> list[str]:
             if bad is None:
                 break
             omitted.append(f"mesh left out: {why}")
-            for geom in [one for one in spec.geoms if one.meshname == bad.name]:
-                spec.delete(geom)
+            _delete_geoms(spec, [bad.name])
             spec.delete(bad)
     return omitted
+
+
+def _delete_geoms(spec: mujoco.MjSpec, meshes: Container[str]) -> None:
+    """Delete the geoms of these meshes, by name."""
+    for geom in list(spec.geoms):
+        if geom.meshname in meshes:
+            spec.delete(geom)
 
 
 def _named_mesh(spec: mujoco.MjSpec, message: str) -> mujoco.MjsMesh | None:
