@@ -8,6 +8,7 @@ compare with the MLP.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import compress
 
 import numpy as np
 
@@ -78,11 +79,16 @@ def _alignment_claims(results: Results, block: Block) -> list[Claim]:
         kept = _with_payload(results, payload)
         reductions = {"identification": _reduction(results, [identified], nominal, kept)}
         for name in results.networks(block):
-            errors = [results.over_joints(q_dis) for q_dis in results.q_dis(block, name)]
+            errors = _over_joints(results, results.q_dis(block, name))
             reductions[name] = _reduction(results, errors, nominal, kept)
         text = f"simulator + Δa to robot, {label}: less Q_dis than the nominal simulator"
         found.append(Claim(block, text, printed, reductions))
     return found
+
+
+def _over_joints(results: Results, by_seed: list[Array]) -> list[Array]:
+    """Return Q_dis of each recording for each seed, (recordings,) rad·s each."""
+    return [results.over_joints(q_dis) for q_dis in by_seed]
 
 
 def _command_claims(results: Results, block: Block) -> list[Claim]:
@@ -95,7 +101,7 @@ def _command_claims(results: Results, block: Block) -> list[Claim]:
             reductions = {}
             for name in results.networks(block):
                 measured = results.command_q_dis(block, name, way)
-                errors = [results.over_joints(q_dis) for q_dis in measured]
+                errors = _over_joints(results, measured)
                 reductions[name] = _reduction(results, errors, baseline, kept)
             printed = None
             if way == "delta":
@@ -149,7 +155,10 @@ def _offset_reductions(
     offsets: dict[str, list[Array]], baseline: Array, axis: int
 ) -> dict[str, Reduction]:
     """Return method → reduction along an axis; arguments as of `_offset_reduction`."""
-    return {name: _offset_reduction(seeds, baseline, axis) for name, seeds in offsets.items()}
+    reductions = {}
+    for name, seeds in offsets.items():
+        reductions[name] = _offset_reduction(seeds, baseline, axis)
+    return reductions
 
 
 def _offset_reduction(seeds: list[Array], baseline: Array, axis: int) -> Reduction:
@@ -159,7 +168,7 @@ def _offset_reduction(seeds: list[Array], baseline: Array, axis: int) -> Reducti
         seeds: (goals, 3) m for each seed.
         baseline: (goals, 3) m.
     """
-    goals = [str(goal) for goal in range(len(baseline))]
+    goals = list(map(str, range(len(baseline))))
     return reduction([offsets[:, axis] for offsets in seeds], baseline[:, axis], goals)
 
 
@@ -171,7 +180,7 @@ def _with_payload(results: Results, payload: float | None) -> Array:
 
 
 def _reduction(results: Results, errors: list[Array], baseline: Array, kept: Array) -> Reduction:
-    motions = [motion for motion, keep in zip(results.motions, kept, strict=True) if keep]
+    motions = list(compress(results.motions, kept))
     return reduction([error[kept] for error in errors], baseline[kept], motions)
 
 
@@ -188,7 +197,8 @@ def claim_table(found: list[Claim], block: Block) -> ResultTable:
         rows.append((claim.text, printed, *cells, claim.verdict))
     seeds = 0
     for claim in of_block:
-        seeds = max([seeds, *(reduction.seeds for reduction in claim.reductions.values())])
+        for reduction_of_method in claim.reductions.values():
+            seeds = max(seeds, reduction_of_method.seeds)
     over = f"over {seeds} seeds and over motions or goals"
     if seeds == 1:
         over = "over motions or goals; of one seed the spread over seeds is not known"

@@ -30,7 +30,7 @@ from gaponet.experiments.paper.measure import record_unit
 from gaponet.experiments.paper.options import Block, PaperOptions
 from gaponet.experiments.paper.page import Section, write_page
 from gaponet.experiments.paper.results import Results
-from gaponet.experiments.paper.study import Study, quick_dataset
+from gaponet.experiments.paper.study import Study, entries_at, quick_dataset
 from gaponet.experiments.paper.tables import (
     commands_table,
     large_gaps_table,
@@ -145,7 +145,7 @@ def record_unseen(study: Study, rate: float, progress: ShareDone) -> None:
     """
     unseen = Dataset.create(study.out / "unseen", study.robot)
     unit = study.virtual_unit(1.0 / rate)
-    present = [entry for entry in unseen.entries if round(1 / entry.dt) == rate]
+    present = entries_at(rate, unseen.entries)
     if len(present) == len(unit.motion_runs()):
         return
     for sequence in record_unit(unit, progress).sequences:
@@ -173,7 +173,10 @@ def summarise(study: Study, jobs: list[Job], failures: list[str]) -> PaperResult
         title = "What the Sensor Predictor saves"
         sections.append(Section("", title, tables=[sensor_table(results)]))
     sections.append(Section("", "Methods", tables=[method_table(results)]))
-    gaps = [large_gaps_table(results, block) for block in BLOCKS if results.networks(block)]
+    gaps = []
+    for block in BLOCKS:
+        if results.networks(block):
+            gaps.append(large_gaps_table(results, block))
     sections.append(Section("", "Large gaps by payload", tables=gaps))
     page = write_page(study, sections, failures)
     sentences = [*_conclusions(found), *failures]

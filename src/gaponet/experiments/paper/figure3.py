@@ -78,10 +78,15 @@ def _draw_curve(
 ) -> None:
     """Draw the means of a curve of CURVES with their standard errors."""
     line, marker, colour = CURVES[name]
+    means = []
+    errors = []
+    for value in values:
+        means.append(value.mean)
+        errors.append(value.standard_error)
     ax.errorbar(
         x,
-        [value.mean for value in values],
-        yerr=[value.standard_error for value in values],
+        means,
+        yerr=errors,
         linestyle=line,
         marker=marker,
         color=colour,
@@ -116,8 +121,10 @@ def figure_3_table(results: Results, block: Block) -> ResultTable:
         for name in ("nominal", "identified"):
             cells.append(float(results.over_joints(results.baseline_q_dis(name))[kept].mean()))
         for name in methods:
-            seeds = [results.over_joints(q)[kept].mean() for q in results.q_dis(block, name)]
-            cells.append(MeanStd.from_values([float(seed) for seed in seeds]))
+            seeds = []
+            for q_dis in results.q_dis(block, name):
+                seeds.append(float(results.over_joints(q_dis)[kept].mean()))
+            cells.append(MeanStd.from_values(seeds))
         rows.append((f"{mass:g} kg", *cells))
     caption = (
         "Q_dis between simulator and robot, mean over joints without wrists and over motions; ± "

@@ -139,6 +139,13 @@ class GoalPlanner:
         result: Array = positions[chosen]
         return result
 
+    def _random_goal(self) -> Array:
+        """Return a reachable position for each hand, (hands, 3) m."""
+        positions = []
+        for reachable in self.reachable:
+            positions.append(reachable[self.rng.integers(len(reachable))])
+        return np.array(positions)
+
     def _plan(self) -> Plan | None:
         """Return a random trajectory; None if a goal is too near, cannot be held, or the move to
         it meets the body.
@@ -146,7 +153,7 @@ class GoalPlanner:
         postures = [self.ready]
         goals = []
         for _ in range(GOALS_PER_TRAJECTORY):
-            goal = np.array([places[self.rng.integers(len(places))] for places in self.reachable])
+            goal = self._random_goal()
             q = postures[-1]
             if np.linalg.norm(goal - self.hand_positions(q), axis=1).min() < MIN_DISTANCE_M:
                 return None
@@ -166,6 +173,6 @@ class GoalPlanner:
             return None
         ctrl = through(points, moves, holds, self.robot.dt)
         rows = [round(x / self.robot.dt) for x in (REST_S, *moves, self.hold)]
-        start = rows[0] + np.cumsum([0, *(m + rows[-1] for m in rows[1:-2])])
+        start = rows[0] + np.cumsum([0, *(np.array(rows[1:-2]) + rows[-1])])
         arrive = start + np.array(rows[1:-1])
         return Plan(ctrl, np.array(goals), start, arrive, arrive + rows[-1])

@@ -7,6 +7,7 @@ every payload. Of a real robot: the test motions of the dataset; nothing can be 
 from __future__ import annotations
 
 import time
+from collections import defaultdict
 from collections.abc import Sequence as ListOf
 from dataclasses import dataclass
 from itertools import product
@@ -95,12 +96,17 @@ class Recorded:
         return [(len(sequence) - 1) * sequence.dt for sequence in self.sequences]
 
 
+def _payloads(runs: ListOf[tuple[object, float]]) -> list[float]:
+    """Return the payload of each run, kg."""
+    return [payload for _, payload in runs]
+
+
 def record_unit(unit: VirtualUnit, progress: ShareDone = lambda share: None) -> Recorded:
     """Play the motions of Figure 3 on the unit, targets as they are, and return the recordings."""
     rest = round(REST_S / unit.dt)
     targets = unit.motion_targets()
     runs = unit.motion_runs()
-    payloads = [payload for _, payload in runs]
+    payloads = _payloads(runs)
     played = play(unit.robot, unit.physics, targets, payloads, unit.dt, progress=progress)
     sequences = []
     for i, (motion, payload) in enumerate(runs):
@@ -157,7 +163,7 @@ def measure_commands(
     """
     rest = round(REST_S / unit.dt)
     targets = unit.motion_targets()
-    payloads = [payload for _, payload in unit.motion_runs()]
+    payloads = _payloads(unit.motion_runs())
     operated = unit.robot.operated_index
     ways = PLAIN_WAYS if model is None else NETWORK_WAYS
     measured = {}
@@ -206,21 +212,23 @@ def measure_delivery(
     ways = PLAIN_WAYS if model is None else NETWORK_WAYS
     runs = list(product(delivery.plans, unit.payloads))
     targets = [plan.ctrl for plan, _ in runs]
-    payloads = [payload for _, payload in runs]
+    payloads = _payloads(runs)
     measured = {}
     for way, config in ways.items():
         compensator = None
         if config is not None:
             compensator = make_compensator(unit.robot, model, config, payloads)
         played = play(unit.robot, unit.physics, targets, payloads, unit.dt, compensator)
-        held: dict[float, list[Array]] = {payload: [] for payload in unit.payloads}
+        held: dict[float, list[Array]] = defaultdict(list)  # payload → offsets of each hold
         for i, (plan, payload) in enumerate(runs):
             hands = delivery.planner.hand_positions(played.true_qpos[: len(plan.ctrl), i])
             held[payload] += held_offsets(hands, plan, unit.dt)
-        measured[way] = {
-            "offset": [_mean_offsets(held[payload]) for payload in unit.payloads],
-            "near": [_near_share(held[payload]) for payload in unit.payloads],
-        }
+        offsets = []
+        near = []
+        for payload in unit.payloads:
+            offsets.append(_mean_offsets(held[payload]))
+            near.append(_near_share(held[payload]))
+        measured[way] = {"offset": offsets, "near": near}
     return measured
 
 

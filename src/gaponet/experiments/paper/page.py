@@ -101,12 +101,20 @@ def write_page(study: Study, sections: list[Section], failures: list[str]) -> Pa
     return page
 
 
+def _command() -> str:
+    """Return the command of this process, without the folders of its paths."""
+    words = ["gaponet"]
+    for word in sys.argv[1:]:
+        words.append(Path(word).name if "/" in word else word)
+    return " ".join(words)
+
+
 def _facts(study: Study) -> dict[str, Any]:
     """Return what is needed to repeat the experiment."""
     options = study.options
     hours = sum(entry.rows * entry.dt for entry in study.data.entries) / 3600
     facts: dict[str, Any] = {
-        "command": " ".join(["gaponet", *(Path(w).name if "/" in w else w for w in sys.argv[1:])]),
+        "command": _command(),
         "date": date.today().isoformat(),
         "dataset": f"{study.data.path.name} ({dataset_hash(study.data.entries)}), {hours:.2f} h",
         "training_units": ", ".join(study.training_units),

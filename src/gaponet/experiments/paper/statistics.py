@@ -61,9 +61,10 @@ def reduction(errors: ListOf[Array], baseline: Array, motions: ListOf[str]) -> R
     by_seed = np.array([_percent_less(error, baseline) for error in errors])
     mean_error = np.mean(errors, axis=0)  # (recordings,)
     names = list(dict.fromkeys(motions))
+    motion_of = np.array(motions)  # (recordings,)
     left_out = []
     for name in names:
-        kept = np.array([motion != name for motion in motions])
+        kept = motion_of != name
         left_out.append(_percent_less(mean_error[kept], baseline[kept]))
     count = len(names)
     motion_error = 0.0

@@ -104,7 +104,7 @@ class Study:
     @cached_property
     def training_units(self) -> tuple[str, ...]:
         """Units that networks are trained on: all recorded ones but the unseen one."""
-        units = sorted({entry.meta.unit_id for entry in self.data.entries})
+        units = self._recorded_units()
         if self.virtual:
             units = [unit for unit in units if unit != self.unit_name]
         if not units:
@@ -117,8 +117,11 @@ class Study:
     @cached_property
     def holdout_units(self) -> tuple[str, ...]:
         """Recorded units that are left out of training."""
-        units = sorted({entry.meta.unit_id for entry in self.data.entries})
+        units = self._recorded_units()
         return tuple(unit for unit in units if unit not in self.training_units)
+
+    def _recorded_units(self) -> list[str]:
+        return sorted({entry.meta.unit_id for entry in self.data.entries})
 
     def splits(self) -> Splits:
         """Return the recordings for training, validation and test."""
@@ -144,10 +147,10 @@ class Study:
         """
         rate = rate or self.rates[0]
         if not self.virtual:
-            entries = [entry for entry in self.splits()["test"] if round(1 / entry.dt) == rate]
+            entries = entries_at(rate, self.splits()["test"])
             return Recorded(self.data.sequences(entries))
         unseen = Dataset(self.out / "unseen")
-        entries = [entry for entry in unseen.entries if round(1 / entry.dt) == rate]
+        entries = entries_at(rate, unseen.entries)
         return Recorded(unseen.sequences(entries))
 
     @property
@@ -178,11 +181,19 @@ class Study:
             write_json(file, setup)
             return
         stored = read_json(dict[str, Any], file, DatasetError, SETUP_HINT)
-        changed = [name for name, value in setup.items() if stored.get(name) != value]
+        changed = []
+        for name, value in setup.items():
+            if stored.get(name) != value:
+                changed.append(name)
         if changed:
             raise UsageError(
                 f"{self.out}: holds results with another {', '.join(changed)}; choose another --out"
             )
+
+
+def entries_at(rate: float, entries: list[Entry]) -> list[Entry]:
+    """Return the recordings with a control rate, Hz."""
+    return [entry for entry in entries if round(1 / entry.dt) == rate]
 
 
 def quick_dataset(

@@ -51,16 +51,12 @@ def table_1(results: Results, block: Block) -> ResultTable:
         label = f"{mass:g} kg"
         for way in PLAIN_WAYS:
             offsets = results.plain_offsets(way)[index]
-            cells = [MeanStd.from_values([100 * offsets[:, axis].mean()]) for axis in range(3)]
+            cells = _offset_cells([offsets])
             rows.append((f"{label}, {PLAIN_TITLES[way]}", *cells))
         for name in results.networks(block):
             for way in NETWORK_WAYS:
                 seeds = [seed[index] for seed in results.offsets(block, name, way)]
-                cells = []
-                for axis in range(3):
-                    cells.append(
-                        MeanStd.from_values([100 * seed[:, axis].mean() for seed in seeds])
-                    )
+                cells = _offset_cells(seeds)
                 rows.append((f"{label}, {name}: {WAY_TITLES[way]}", *cells))
         for method, printed in TABLE_1.items():
             if mass in printed:
@@ -73,6 +69,19 @@ def table_1(results: Results, block: Block) -> ResultTable:
     )
     columns = ("payload in each hand, method", *(f"{axis}, cm" for axis in AXES))
     return ResultTable(f"table1_{block}", columns, tuple(rows), caption)
+
+
+def _offset_cells(offsets: list[Array]) -> list[MeanStd]:
+    """Return the mean offsets along X, Y and Z, cm.
+
+    Args:
+        offsets: (goals, 3) m for each training seed.
+    """
+    cells = []
+    for axis in range(3):
+        means = [of_seed[:, axis].mean() for of_seed in offsets]
+        cells.append(MeanStd.from_values(means, scale=100))
+    return cells
 
 
 def commands_table(results: Results, block: Block) -> ResultTable:
@@ -94,14 +103,19 @@ def commands_table(results: Results, block: Block) -> ResultTable:
     for name in results.networks(block):
         for way in NETWORK_WAYS:
             without = results.mean_over_joints(results.plain_command_q_dis(REFERENCE_WAY[way]))
-            seeds = []
+            errors = []  # rad·s, of each seed
+            less_than_raw = []
+            gains = []
             for q_dis in results.command_q_dis(block, name, way):
-                seeds.append(results.mean_over_joints(q_dis))
+                error = results.mean_over_joints(q_dis)
+                errors.append(error)
+                less_than_raw.append(_less(error, raw))
+                gains.append(_less(error, without))
             row = (
                 f"{name}: {WAY_TITLES[way]}",
-                MeanStd.from_values([1e3 * error for error in seeds]),
-                MeanStd.from_values([_less(error, raw) for error in seeds]),
-                MeanStd.from_values([_less(error, without) for error in seeds]),
+                MeanStd.from_values(errors, scale=1e3),
+                MeanStd.from_values(less_than_raw),
+                MeanStd.from_values(gains),
             )
             rows.append(row)
     caption = (
@@ -161,14 +175,18 @@ def table_2(results: Results) -> ResultTable:
         if name == "100 Hz":
             baseline = "nominal_fastest"
         nominal = results.over_joints(results.baseline_q_dis(baseline)) / results.durations
-        # (recordings,) rad each: MPJAE is Q_dis by the duration
-        measured = results.q_dis("table2", name)
-        errors = [results.over_joints(q_dis) / results.durations for q_dis in measured]
+        errors = []  # MPJAE of each seed, which is Q_dis by the duration, (recordings,) rad
+        ratios = []
+        for q_dis in results.q_dis("table2", name):
+            error = results.over_joints(q_dis) / results.durations
+            errors.append(error)
+            ratios.append(float(error.mean() / nominal.mean()))
         cells = []
         for mass in results.masses:
             kept = results.payloads == mass
-            cells.append(MeanStd.from_values([1e3 * float(e[kept].mean()) for e in errors]))
-        ratio = MeanStd.from_values([float(e.mean() / nominal.mean()) for e in errors])
+            means = [float(error[kept].mean()) for error in errors]
+            cells.append(MeanStd.from_values(means, scale=1e3))
+        ratio = MeanStd.from_values(ratios)
         note = "" if ratio.mean <= CONVERGED_SHARE else "not converged"
         label = OWN_LABEL if name == "payload out" else name
         printed = _printed(PRINTED_ROW.get(name))
@@ -188,7 +206,8 @@ def _printed(row: str | None) -> str:
     if row is None:
         return ""
     printed: PrintedRow = TABLE_2[row]
-    return f"{printed.obs_dim}: {' '.join(f'{1e3 * error:.0f}' for error in printed.mpjae)}"
+    errors = [f"{1e3 * error:.0f}" for error in printed.mpjae]
+    return f"{printed.obs_dim}: {' '.join(errors)}"
 
 
 def sensor_table(results: Results) -> ResultTable:
@@ -202,13 +221,18 @@ def sensor_table(results: Results) -> ResultTable:
         runs = results.runs("table2", name)
         if not runs:
             continue
-        timed = [run for run in runs if run["cpu_s"] is not None]
+        speeds = []  # steps per processor second
+        errors = []  # rad
+        for run in runs:
+            errors.append(run["val_mpjae"]["model"])
+            if run["cpu_s"] is not None:
+                speeds.append(run["steps"] / run["cpu_s"])
         rows.append(
             (
                 label,
-                MeanStd.from_values([run["steps"] / run["cpu_s"] for run in timed]),
-                MeanStd.from_values([run["cpu_s"] for run in timed]),
-                MeanStd.from_values([run["val_mpjae"]["model"] * 1e3 for run in runs]),
+                MeanStd.from_values(speeds),
+                MeanStd.from_values(_seconds(runs)),
+                MeanStd.from_values(errors, scale=1e3),
             )
         )
     caption = (
@@ -225,6 +249,11 @@ def _seconds(runs: list[dict[str, Any]]) -> list[float]:
     return [run["cpu_s"] for run in runs if run["cpu_s"] is not None]
 
 
+def _latency(runs: list[dict[str, Any]], percentile: str) -> MeanStd:
+    """Return a percentile of the latency over trainings, µs."""
+    return MeanStd.from_values([run["latency"][percentile] for run in runs])
+
+
 def method_table(results: Results) -> ResultTable:
     """Return size, training time and latency of each method."""
     rows = []
@@ -238,8 +267,8 @@ def method_table(results: Results) -> ResultTable:
                     runs[0]["parameters"],
                     runs[0]["steps"],
                     MeanStd.from_values(_seconds(runs)),
-                    MeanStd.from_values([run["latency"]["p50_us"] for run in runs]),
-                    MeanStd.from_values([run["latency"]["p99_us"] for run in runs]),
+                    _latency(runs, "p50_us"),
+                    _latency(runs, "p99_us"),
                 )
             )
     caption = (
