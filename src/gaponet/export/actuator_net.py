@@ -165,9 +165,11 @@ def write_networks(
         net.gain = gain
         _write(net, folder, name, info | {"joint": name, "robot": robot.name})
     facts["actuator_net"] = info
-    run = float(np.mean([mean_error(s.qpos[:, op], r.qpos[:, op]) for s, r in aligned]))
+    errors_of_run = []
+    for motion, played in aligned:
+        errors_of_run.append(mean_error(motion.qpos[:, op], played.qpos[:, op]))
     return {
-        "the run, in gaponet": run,
+        "the run, in gaponet": float(np.mean(errors_of_run)),
         "actuator networks": errors[gain],
         "of these the servo alone": errors[0.0],
     }

@@ -178,10 +178,12 @@ def _moved(robot: RobotSpec, base: RobotSpec, drawn: Units) -> Units:
 
     Every second one deviates half as far.
     """
-    fields = [field for field in drawn if field not in ("effort_limit", "links")]
+    left_out = {"effort_limit", "links"}
     if base is not robot:
-        lacking = [term for term in SERVO_TERMS if not base.servo[term].any()]
-        fields = [field for field in fields if field not in lacking]
+        for term in SERVO_TERMS:
+            if not base.servo[term].any():
+                left_out.add(term)
+    fields = [field for field in drawn if field not in left_out]
     own = _on_axes(robot, fields)
     axes = np.stack([_on_axes(unit, fields) for unit in robots_of(robot, drawn)])
     share = np.where(np.arange(len(axes)) % 2, NEAR, 1.0)[:, None]  # (units, 1)
@@ -208,9 +210,12 @@ def _one_by_one(
 ) -> list[RobotSpec]:
     """Return robots with each number drawn by itself from the range that the units have."""
     servos = {field: values for field, values in units.items() if field != "links"}
-    low = np.array([np.percentile(values, RANGE_PERCENT[0], axis=0) for values in servos.values()])
-    high = np.array([np.percentile(values, RANGE_PERCENT[1], axis=0) for values in servos.values()])
-    alone = rng.uniform(low, high, (JUDGED, *low.shape)).swapaxes(0, 1)
+    low = []
+    high = []
+    for values in servos.values():
+        low.append(np.percentile(values, RANGE_PERCENT[0], axis=0))
+        high.append(np.percentile(values, RANGE_PERCENT[1], axis=0))
+    alone = rng.uniform(low, high, (JUDGED, *np.shape(low))).swapaxes(0, 1)
     return robots_of(base, dict(zip(servos, alone, strict=True)))
 
 

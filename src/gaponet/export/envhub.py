@@ -60,7 +60,10 @@ OF_VIRTUAL = (
 def lerobot_units(robot: RobotSpec) -> dict[str, str]:
     """Return the unit of each joint in LeRobot: deg, or percent of its range."""
     named = zip(robot.joint_names, robot.log_joints.units, strict=True)
-    return {name: "percent" if unit == "fraction" else "deg" for name, unit in named}
+    units = {}
+    for name, unit in named:
+        units[name] = "percent" if unit == "fraction" else "deg"
+    return units
 
 
 def write_units(

@@ -139,7 +139,9 @@ class _RobotExport:
                 f"inertias of {', '.join(other)} were not written: their masses in the file are "
                 "others"
             )
-            links = {name: link for name, link in plain.links.items() if name not in other}
+            links = dict(plain.links)
+            for name in other:
+                links.pop(name, None)
             plain = replace(plain, links=links)
         error = rollout_error(self.validation, with_urdf_fields(plain))
         self.errors[f"{file.name} alone, all else as before"] = error
@@ -298,8 +300,8 @@ def _stop_notes(robot: RobotSpec) -> list[str]:
     """Return a question for each joint with stops, which the MJCF of the user does not get."""
     notes = []
     for i, name in enumerate(robot.joint_names):
-        both = robot.servo.of_joint(i, STOP_FIELDS).values()
-        stops = " and ".join(f"{stop:.2f}" for stop in both if np.isfinite(stop))
+        known = robot.servo.finite_of_joint(i, STOP_FIELDS).values()
+        stops = " and ".join(f"{stop:.2f}" for stop in known)
         if stops:
             notes.append(
                 f"{name} met something at {stops} rad in the recordings; the file keeps its range: "
@@ -326,7 +328,11 @@ def _law_notes(law: ListOf[str], to: str) -> list[str]:
 def _ramp_note(robot: RobotSpec, to: str) -> str:
     """Return where the servos' own limits of the speed of targets are."""
     named = zip(robot.joint_names, robot.servo.target_speed, strict=True)
-    ramps = ", ".join(f"{name} {speed:.3g}" for name, speed in named if speed)
+    limits = []
+    for name, speed in named:
+        if speed:
+            limits.append(f"{name} {speed:.3g}")
+    ramps = ", ".join(limits)
     if TARGETS[to].edits_mjcf and MUJOCO_HAS_RAMPS:
         return (
             f"servos' own ramps ({ramps} rad/s) are <pid slewmax> of MuJoCo 4: call fill_delays of "

@@ -123,8 +123,9 @@ class Source:
             parser.Parse(text, True)
         except expat.ExpatError as error:
             raise RobotError(f"{file}: not valid MJCF: {error}") from None
-        for tag in [t for t in self.tags if t.file == file and t.name == "include"]:
-            self._read(self.main.parent / tag.attributes["file"])
+        for tag in list(self.tags):  # the included files add theirs
+            if tag.file == file and tag.name == "include":
+                self._read(self.main.parent / tag.attributes["file"])
 
     def set(self, tag: Tag, **values: object) -> None:
         """Change attributes of a start tag, and add missing ones."""
@@ -184,8 +185,10 @@ class Source:
 
     def child(self, parent: Tag, name: str) -> Tag | None:
         """Return the first element of a name in another one, which is in no body in between."""
-        tags = [tag for tag in self.tags if tag.file == parent.file]
-        inside = [tag for tag in tags if parent.open_end <= tag.start < parent.end]
+        inside = []
+        for tag in self.tags:
+            if tag.file == parent.file and parent.open_end <= tag.start < parent.end:
+                inside.append(tag)
         bodies = [tag for tag in inside if tag.name == "body"]
         for tag in inside:
             in_body = any(body.start < tag.start < body.end for body in bodies)
@@ -362,7 +365,11 @@ def _servo_attributes(tag: Tag, model: mujoco.MjModel, joint: str) -> dict[str, 
 
     Name, class, and the range of its targets if it is a position servo.
     """
-    own = {k: tag.attributes[k] for k in SERVO_ATTRIBUTES if k in tag.attributes} | {"joint": joint}
+    own = {}
+    for name in SERVO_ATTRIBUTES:
+        if name in tag.attributes:
+            own[name] = tag.attributes[name]
+    own["joint"] = joint
     i = _actuator(model, joint)
     if model.actuator_ctrllimited[i] and model.actuator_biasprm[i, 1]:
         limits = sorted(_radians_per_unit(model, joint) * model.actuator_ctrlrange[i])
@@ -510,16 +517,22 @@ def _require(
     path: Path,
 ) -> None:
     """Refuse a copy that lacks the wanted servos, or another element of the original."""
-    counts = {f: (getattr(before, f), getattr(now, f)) for f in UNCHANGED_COUNTS}
-    wrong = [f"{f} {old} → {new}" for f, (old, new) in counts.items() if old != new]
+    wrong = []
+    for count in UNCHANGED_COUNTS:
+        old = getattr(before, count)
+        new = getattr(now, count)
+        if old != new:
+            wrong.append(f"{count} {old} → {new}")
     for name in robot.operated:
         servo = joints[name]
         dof = now.joint(prefix + name).dofadr[0]
         i = _actuator(now, prefix + name)
         passive = []
+        wanted_passive = []
         for attribute in JOINT_ATTRIBUTES:
             values = np.ravel(getattr(now, f"dof_{attribute}")[dof])  # of newer MuJoCo a polynomial
             passive.append(float(values[0]))
+            wanted_passive.append(servo[attribute])
         actual = [
             *passive,
             now.actuator_gainprm[i, 0],
@@ -528,7 +541,7 @@ def _require(
         ]
         kp = servo["kp"]
         wanted = [
-            *(servo[f] for f in JOINT_ATTRIBUTES),
+            *wanted_passive,
             0.0 if _is_ramped(servo) else kp,
             kp * servo["offset"],
             -kp,

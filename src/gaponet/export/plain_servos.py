@@ -144,8 +144,7 @@ def _servos(robot: RobotSpec) -> PlainServos:
     """Return the parameters of all servos that have a value."""
     servos: PlainServos = {}
     for i, joint in enumerate(robot.joint_names):
-        values = robot.servo.of_joint(i)
-        servos[joint] = {name: value for name, value in values.items() if np.isfinite(value)}
+        servos[joint] = robot.servo.finite_of_joint(i)
     return servos
 
 
@@ -233,7 +232,10 @@ def own_motions(robot: RobotSpec, payload_mass: float = 0.0, count: int = 24) ->
         rest = np.tile(robot.qpos_home, (len(t), 1))
         motions.append(Sequence(meta, robot.joint_names, robot.dt, ctrl, rest, 0 * ctrl))
     rollouts = replay(motions, robot, lock_idle=True)
-    return [replace(s, qpos=r.qpos, qvel=r.qvel) for s, r in zip(motions, rollouts, strict=True)]
+    played = []
+    for motion, rollout in zip(motions, rollouts, strict=True):
+        played.append(replace(motion, qpos=rollout.qpos, qvel=rollout.qvel))
+    return played
 
 
 def comparable(

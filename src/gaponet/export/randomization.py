@@ -284,7 +284,10 @@ def _days(uncertainty: ParameterUncertainty, joints: tuple[str, ...]) -> Array:
             f"any-day: these sessions are of units {', '.join(sorted(units))}; days of one unit "
             "are needed, or --scope any-robot with --units"
         )
-    days = {s["days"] or (f"session {i}",): s for i, s in enumerate(uncertainty.sources)}
+    days = {}
+    for number, source in enumerate(uncertainty.sources):
+        day = source["days"] or (f"session {number}",)
+        days[day] = source  # replaces an earlier one of that day
     if len(days) < 2:
         raise UsageError(
             "any-day: this robot is known from one day; adapt it with logs of another one "
@@ -381,9 +384,10 @@ def write_randomization(made: Randomization, engine: Engine, folder: Path) -> Pa
 
 def _written_ranges(ranges: dict[str, tuple[float, float, float]]) -> dict[str, Any]:
     """Return field → low, value and high by name."""
-    return {
-        field: dict(zip(("low", "value", "high"), r, strict=True)) for field, r in ranges.items()
-    }
+    written = {}
+    for field, (low, value, high) in ranges.items():
+        written[field] = {"low": low, "value": value, "high": high}
+    return written
 
 
 def _in_mrad(errors: dict[str, float]) -> dict[str, float]:
@@ -392,7 +396,10 @@ def _in_mrad(errors: dict[str, float]) -> dict[str, float]:
 
 def _written(units: Mapping[str, Any], axes: LinkAxes | None) -> dict[str, Any]:
     """Return units with links as MuJoCo has them, (units, bodies, 11)."""
-    written: dict[str, Any] = {f: np.round(v, 9) for f, v in units.items() if f != "links"}
+    written: dict[str, Any] = {}
+    for field, values in units.items():
+        if field != "links":
+            written[field] = np.round(values, 9)
     if axes:
         written["links"] = [axes.inertials(np.array(row)) for row in units["links"]]
     return written

@@ -56,8 +56,11 @@ def validation_error(robot: RobotSpec, recordings: ListOf[Sequence]) -> Array:
     """
     op = robot.operated_index
     rollouts = replay(recordings, robot, lock_idle=True)
-    errors = [np.abs(s.qpos - r.qpos)[1:, op] for s, r in zip(recordings, rollouts, strict=True)]
-    return np.asarray(np.max([np.quantile(e, BAND_SHARE, axis=0) for e in errors], axis=0))
+    quantiles = []
+    for recording, rollout in zip(recordings, rollouts, strict=True):
+        error = np.abs(recording.qpos - rollout.qpos)[1:, op]
+        quantiles.append(np.quantile(error, BAND_SHARE, axis=0))
+    return np.asarray(np.max(quantiles, axis=0))
 
 
 def predict(
@@ -109,10 +112,16 @@ def summary(
     band = rows(lambda p: p.half_width)
     rollout_behind = rows(lambda p: np.abs(p.rollout - p.target))
     robot_behind = rows(lambda p: np.abs(p.robot - p.target))
-    apart = [np.abs(p.rollout - p.robot) for p in predictions]  # (T, n) rad each
-    seconds = [round(1 / p.dt) for p in predictions]  # rows of the first second
-    first = np.concatenate([a[1 : 1 + n] for a, n in zip(apart, seconds, strict=True)])
-    largest = np.array([a.max(axis=0) for a in apart])
+    apart = []  # (T, n) rad each
+    first_seconds = []  # the rows of it that are in the first second
+    maxima = []  # (n,) rad each
+    for prediction in predictions:
+        distance = np.abs(prediction.rollout - prediction.robot)
+        apart.append(distance)
+        first_seconds.append(distance[1 : 1 + round(1 / prediction.dt)])
+        maxima.append(distance.max(axis=0))
+    first = np.concatenate(first_seconds)
+    largest = np.array(maxima)
     worst = largest.argmax(axis=0)  # prediction with the largest difference of each joint
     by_joint = {}
     for j, joint in enumerate(joints):

@@ -165,8 +165,12 @@ def _takes_positions(actuator: mujoco.MjsActuator) -> bool:
 def _body_problems(robot: RobotSpec, spec: mujoco.MjSpec, prefix: str) -> list[str]:
     """Return which bodies with identified inertias are missing."""
     have = {body.name for body in spec.bodies}
-    missing = [prefix + name for name in robot.links if prefix + name not in have]
-    return [f"there is no body '{name}', whose inertia was identified" for name in missing]
+    problems = []
+    for name in robot.links:
+        full = prefix + name
+        if full not in have:
+            problems.append(f"there is no body '{full}', whose inertia was identified")
+    return problems
 
 
 def _geometry_problems(robot: RobotSpec, spec: mujoco.MjSpec, prefix: str) -> list[str]:

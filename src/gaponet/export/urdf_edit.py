@@ -29,6 +29,7 @@ MISSING_FIELDS = (
     "offset",
     "zero",
 )
+INERTIA_AXES = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")  # in the order of robot.toml
 
 
 def edit_urdf(
@@ -96,13 +97,12 @@ def _set_links(source: Source, robot: RobotSpec, prefix: str) -> list[str]:
         if inertial is None or not np.isclose(own, before.body(name).mass[0], rtol=1e-2):
             other.append(name)
             continue
-        axes = zip(
-            ("ixx", "iyy", "izz", "ixy", "ixz", "iyz"), map(text_of, link.inertia), strict=True
-        )
-        numbers = " ".join(f'{axis}="{value}"' for axis, value in axes)
+        numbers = ""
+        for axes, value in zip(INERTIA_AXES, link.inertia, strict=True):
+            numbers += f' {axes}="{text_of(value)}"'
         origin = f'<origin xyz="{text_of(*link.pos)}"/>'
         weight = f'<mass value="{text_of(link.mass)}"/>'
-        source.replace(inertial, f"<inertial>{origin}{weight}<inertia {numbers}/></inertial>")
+        source.replace(inertial, f"<inertial>{origin}{weight}<inertia{numbers}/></inertial>")
     return other
 
 
