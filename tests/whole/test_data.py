@@ -104,7 +104,8 @@ def test_export_and_import_give_the_same_recordings(place, capsys):
     told = run(place, capsys, "import", "{}/lerobot", "--robot", "{}/arm", "--out", "{}/again").out
     assert "6 recordings" in told
     assert "VIRTUAL robot arm, unit a, payload 0, 0.2 kg" in told
-    one, other = Dataset(place / "set"), Dataset(place / "again")
+    one = Dataset(place / "set")
+    other = Dataset(place / "again")
     assert [e.hash for e in one.entries] == [e.hash for e in other.entries]
 
 

@@ -82,34 +82,41 @@ def play(page, heading, capsys):
     return " ".join(capsys.readouterr().out.split())
 
 
-SECTIONS = {  # each goes on where the last ended
-    "tutorial.md": "One command",
-    "export.md": "A policy that fails on the robot",
-    "benchmark.md": "Your method on your recordings",
-}
-
-
-@pytest.mark.parametrize("page", SECTIONS)
-def test_a_section_does_what_it_says(place, monkeypatch, capsys, page):
+@pytest.fixture
+def said(request, place, monkeypatch, capsys):
+    """What a page's section printed; each goes on in the folder where the last ended."""
     monkeypatch.chdir(place)
-    said = play(page, SECTIONS[page], capsys)
-    if page == "tutorial.md":
-        assert (place / "started/identified/report.html").is_file()
-        assert (place / "today/robot.toml").is_file()
-        found = load_robot(place / "started/identified")
-        assert found.servo.kp[found.operated_index] == pytest.approx([14.0, 14.0], rel=0.1)
-        assert found.servo.delay[found.operated_index] == pytest.approx([0.04, 0.04], abs=0.008)
-        here, there = map(
-            float, re.search(r"the MJCF alone: ([\d.]+) mrad; in gaponet ([\d.]+)", said).groups()
-        )
-        assert abs(here - there) <= 0.02 * there + 0.01
-    if page == "export.md":
-        assert "The robot would not do what the simulator did: " in said
-        assert (place / "mine/arm.xml").is_file()
-        assert len(np.load(place / "answer.npz")["joints"]) == 2
-    if page == "benchmark.md":
-        nominal, mine, found = (
-            float(re.search(rf"{n}: ([\d.]+) mrad", said)[1])
-            for n in ("nominal", "mine", "identified")
-        )
-        assert found < mine < nominal
+    return play(*request.param, capsys)
+
+
+def of_section(page, heading):
+    return pytest.mark.parametrize("said", [(page, heading)], indirect=True, ids=[page])
+
+
+@of_section("tutorial.md", "One command")
+def test_one_command_identifies_the_servos_and_writes_reports_and_exports(place, said):
+    assert (place / "started/identified/report.html").is_file()
+    assert (place / "today/robot.toml").is_file()
+    found = load_robot(place / "started/identified")
+    assert found.servo.kp[found.operated_index] == pytest.approx([14.0, 14.0], rel=0.1)
+    assert found.servo.delay[found.operated_index] == pytest.approx([0.04, 0.04], abs=0.008)
+    errors = re.search(r"the MJCF alone: ([\d.]+) mrad; in gaponet ([\d.]+)", said)
+    alone = float(errors[1])
+    in_gaponet = float(errors[2])
+    assert abs(alone - in_gaponet) <= 0.02 * in_gaponet + 0.01
+
+
+@of_section("export.md", "A policy that fails on the robot")
+def test_a_policy_that_fails_on_the_robot_is_explained_and_answered(place, said):
+    assert "The robot would not do what the simulator did: " in said
+    assert (place / "mine/arm.xml").is_file()
+    assert len(np.load(place / "answer.npz")["joints"]) == 2
+
+
+def error_of(method, said):
+    return float(re.search(rf"{method}: ([\d.]+) mrad", said)[1])
+
+
+@of_section("benchmark.md", "Your method on your recordings")
+def test_your_own_method_stands_between_nominal_and_identified(said):
+    assert error_of("identified", said) < error_of("mine", said) < error_of("nominal", said)

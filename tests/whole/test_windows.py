@@ -15,7 +15,8 @@ pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="there it is so"
 SOURCE = Path(gaponet.__file__).parent
 POSIX = ("fcntl", "resource", "termios", "tty", "pty", "pwd", "grp", "syslog", "readline")
 WITHOUT = f"""
-import fcntl, os, signal, subprocess, sys, types  # subprocess takes a Python that has msvcrt for Windows
+# subprocess takes a Python that has msvcrt for Windows
+import fcntl, os, signal, subprocess, sys, types
 
 real, sys.modules["msvcrt"] = fcntl, types.ModuleType("msvcrt")
 
@@ -36,7 +37,8 @@ for name in {POSIX!r}:
     sys.modules.pop(name, None)
 sys.meta_path.insert(0, Hidden())
 for module, names in (
-    (os, "pread pwrite fchmod O_NOFOLLOW getuid geteuid openpty killpg"), (signal, "SIGHUP SIGPIPE SIGALRM setitimer")
+    (os, "pread pwrite fchmod O_NOFOLLOW getuid geteuid openpty killpg"),
+    (signal, "SIGHUP SIGPIPE SIGALRM setitimer"),
 ):
     for name in names.split():
         delattr(module, name)
@@ -52,7 +54,9 @@ from gaponet.nn.training.config import TrainConfig, PretrainingConfig
 
 work = Path(sys.argv[1])
 gp.import_logs(work / "logs", robot=work / "arm", out=work / "data", unit_id="a", payload_mass=0.0)
-small = PretrainingConfig(rounds=1, num_envs=4, steps=20, gradient_steps=5, batch_size=64, sensor_states=16)
+small = PretrainingConfig(
+    rounds=1, num_envs=4, steps=20, gradient_steps=5, batch_size=64, sensor_states=16
+)
 gp.train(work / "data", out=work / "run", budget="120", config=TrainConfig(pretraining=small))
 for words in ("doctor data", "eval run data", "report run", "report . --list"):
     name, *rest = words.split()
