@@ -51,7 +51,12 @@ class Case:
 def mjcf(old: str, new: str) -> Callable[[Path], None]:
     """Write the test arm with a replacement in its MJCF."""
     assert old in XML
-    return lambda folder: str(write_arm(folder / "arm", xml=XML.replace(old, new, 1)))  # type: ignore[return-value]
+    xml = XML.replace(old, new, 1)
+
+    def make(folder: Path) -> None:
+        write_arm(folder / "arm", xml=xml)
+
+    return make
 
 
 def asset(text: str) -> Callable[[Path], None]:

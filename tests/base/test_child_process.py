@@ -52,7 +52,8 @@ if __name__ == "__main__":
     print(len(import_logs("logs", robot, "set", lab).entries), "imported")
     lock = os.open("lock", os.O_CREAT | os.O_RDWR)
     port = os.ttyname(os.openpty()[1])
-    watchdog = Watchdog({"kind": "so101", "robot": "so101", "port": port, "silent": True}, lock, 1, 1)
+    arm = {"kind": "so101", "robot": "so101", "port": port, "silent": True}
+    watchdog = Watchdog(arm, lock, 1, 1)
     watchdog.wait_ready()
     watchdog.release()
     print("watched")

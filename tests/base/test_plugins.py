@@ -99,7 +99,8 @@ def test_a_built_in_name_is_not_replaced_and_one_line_says_so(installed, caplog)
 def test_an_extension_adds_a_format_and_a_driver(installed, tmp_path, capsys, caplog):
     installed(
         "[gaponet.formats]\nwav = HERE_wav\n[gaponet.drivers]\ntoy = HERE_toy:Toy\n",
-        wav='"""Sound."""\nEXTRA = ""\ndef detects(path): return path.is_file() and b"acme" in path.read_bytes()',
+        wav='"""Sound."""\nEXTRA = ""\n'
+        'def detects(path): return path.is_file() and b"acme" in path.read_bytes()',
         toy="class Toy:\n    def __init__(self, robot, port): self.robot, self.port = robot, port\n"
         "    def __getattr__(self, name): return None",
     )

@@ -157,7 +157,10 @@ def test_a_command_ends_with_one_line_within_the_limits(tmp_path, name):
         "gaponet",
         *(word.format(tmp_path) for word in hostile.CASES[name].words),
     ]
-    limit = lambda: resource.setrlimit(resource.RLIMIT_AS, (MAX_ADDRESSES, MAX_ADDRESSES))  # noqa: E731
+
+    def limit() -> None:
+        resource.setrlimit(resource.RLIMIT_AS, (MAX_ADDRESSES, MAX_ADDRESSES))
+
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     done = subprocess.run(
         words, capture_output=True, text=True, errors="replace", preexec_fn=limit, timeout=300
