@@ -35,7 +35,10 @@ def test_the_history_equals_a_list_of_past_frames_under_random_pushes_and_resets
     num = 4
     config = ModelConfig(history=int(rng.integers(1, 5)), stride=stride)
     x = make((num, config.input_dim(n)))
-    own = lambda values: values if make is np.zeros else torch.from_numpy(values).float()  # noqa: E731
+
+    def own(values):
+        return values if make is np.zeros else torch.from_numpy(values).float()
+
     history = History(config, n, x)
     past = [[np.zeros(3 * n, np.float32)] * history.depth for _ in range(num)]
     for _ in range(30):
