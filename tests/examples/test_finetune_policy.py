@@ -39,7 +39,8 @@ class Reader:
 
 def test_the_feed_forward_it_is_told_is_right_for_the_nominal_simulator(robot, task):
     sim = AlignedSim(robot, None, np.array([0.0, 0.4]), num_envs=2, options=ONE_THREAD)
-    alone, fed = example.follow(task, sim, None), example.follow(task, sim, Reader(task))
+    alone = example.follow(task, sim, None)
+    fed = example.follow(task, sim, Reader(task))
     assert (fed < 0.35 * alone).all()
 
 

@@ -30,7 +30,8 @@ from pathlib import Path
 from arm import recordings, write_arm
 from gaponet.sysid import joint_rollouts
 robot = write_arm(Path(sys.argv[2]))
-values = {"kp": 20, "damping": 0.5, "frictionloss": 0.05, "armature": 0.02, "stribeck": 0.3, "stribeck_speed": 0.1}
+values = {"kp": 20, "damping": 0.5, "frictionloss": 0.05, "armature": 0.02}
+values |= {"stribeck": 0.3, "stribeck_speed": 0.1}
 runs = joint_rollouts.JointRollouts(recordings(robot, 1, rows=100), robot)
 values = {f: np.full((1, 2), float(values.get(f, 0))) for f in (*values, "offset", "delay")}
 from gaponet.sim.servo import resting_friction
