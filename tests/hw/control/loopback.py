@@ -85,31 +85,49 @@ class Disobedient(VirtualH12):
 
     def _apply(self, topic: str, data: np.ndarray, now: float) -> None:
         wrong = now - (self.first_command or now) >= self.at
-        left, right = (MOTOR_NAMES.index(f"{side}_elbow_joint") for side in ("left", "right"))
-        if (self.way == "ignores" and wrong) or (self.way == "listens midway" and not wrong):
+        if wrong and self.way == "ignores":
+            return
+        if not wrong and self.way == "listens midway":
             return
         if wrong and self.way in ("limp", "all limp", "crossed", "mirrored"):
-            q, kp = (hg.LowCmd.motors(data, name) for name in ("q", "kp"))
-            if self.way == "crossed":
-                q[[left, right]] = q[[right, left]]
-            elif self.way == "mirrored":
-                q[left] = -q[left]
-            else:
-                kp[slice(left, left + 1) if self.way == "limp" else slice(12, 27)] = 0.0
-            data = data.copy()
-            hg.LowCmd.set_motors(data, "q", q)
-            hg.LowCmd.set_motors(data, "kp", kp)
+            data = self._mistaken(data)
         super()._apply(topic, data, now)
-        if wrong and self.way == "blocked":  # something holds the forearm: it creeps
-            unit = self.live.unit
-            elbow = unit.batch.model.joint("left_elbow_joint").dofadr[0]
-            unit.batch.expand("dof_damping")[:, elbow] = 1000.0
-            unit.motors.cold_damping[:, elbow] = 1000.0
+        if wrong and self.way == "blocked":
+            self._block_elbow()
         if wrong and self.way == "weak":
-            kp, kd, effort, torque = self.live._gains
-            self.live.set_gains(
-                kp, kd, np.where(np.arange(len(kp)) == self._order[left], 0.5, effort), torque
-            )
+            self._weaken_elbow()
+
+    def _mistaken(self, data: np.ndarray) -> np.ndarray:
+        """The command that it follows instead."""
+        left = MOTOR_NAMES.index("left_elbow_joint")
+        right = MOTOR_NAMES.index("right_elbow_joint")
+        q = hg.LowCmd.motors(data, "q")
+        kp = hg.LowCmd.motors(data, "kp")
+        if self.way == "crossed":
+            q[[left, right]] = q[[right, left]]
+        elif self.way == "mirrored":
+            q[left] = -q[left]
+        elif self.way == "limp":
+            kp[left] = 0.0
+        else:
+            kp[12:27] = 0.0
+        data = data.copy()
+        hg.LowCmd.set_motors(data, "q", q)
+        hg.LowCmd.set_motors(data, "kp", kp)
+        return data
+
+    def _block_elbow(self) -> None:
+        """Something holds the forearm: it creeps."""
+        unit = self.live.unit
+        elbow = unit.batch.model.joint("left_elbow_joint").dofadr[0]
+        unit.batch.expand("dof_damping")[:, elbow] = 1000.0
+        unit.motors.cold_damping[:, elbow] = 1000.0
+
+    def _weaken_elbow(self) -> None:
+        kp, kd, effort, torque = self.live._gains
+        elbow = self._order[MOTOR_NAMES.index("left_elbow_joint")]
+        weak = np.arange(len(kp)) == elbow
+        self.live.set_gains(kp, kd, np.where(weak, 0.5, effort), torque)
 
     def _readings(self) -> tuple[np.ndarray, ...]:
         qpos, *more = super()._readings()
@@ -197,7 +215,8 @@ def judge(
     """
     joints = robot.index(recording.commanded)
     torso = robot.index(["torso_joint"])[0]
-    ctrl, kp = (np.array(received[name]) for name in ("ctrl", "kp"))
+    ctrl = np.array(received["ctrl"])
+    kp = np.array(received["kp"])
     limits = Limits.from_robot(robot, recording.commanded, safety)
     stiff = (kp[:, joints] > 0).all(axis=1)
     assert (stiff | (kp[:, joints] == 0).all(axis=1)).all()
@@ -210,9 +229,14 @@ def judge(
     np.testing.assert_array_equal(kp[:, :12], 0.0)  # legs are never commanded
     assert (kp[:, torso] == robot.servo.kp[torso]).all(), "the torso is held"
     assert np.ptp(ctrl[:, torso]) == 0, "where it was found"
+    judge_torques(recording, limits, joints)
+
+
+def judge_torques(recording: Recording, limits: Limits, joints: np.ndarray) -> None:
+    """Assert that no command asks for more torque than the limit."""
     for row in recording.rows:
-        if row.ctrl is not None:
-            torque = (
-                limits.kp * (row.ctrl - row.state.qpos)[joints] - limits.kd * row.state.qvel[joints]
-            )
-            assert (np.abs(torque) <= limits.effort + 1e-6).all()
+        if row.ctrl is None:
+            continue
+        spring = limits.kp * (row.ctrl - row.state.qpos)[joints]
+        torque = spring - limits.kd * row.state.qvel[joints]
+        assert (np.abs(torque) <= limits.effort + 1e-6).all()

@@ -24,8 +24,10 @@ from cyclonedds.pub import DataWriter
 from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
 
-CONFIG = """<?xml version="1.0" encoding="UTF-8" ?><CycloneDDS><Domain Id="any"><General><Interfaces>
-<NetworkInterface name="lo" priority="default" multicast="default" /></Interfaces></General></Domain></CycloneDDS>"""
+CONFIG = """<?xml version="1.0" encoding="UTF-8" ?>
+<CycloneDDS><Domain Id="any"><General><Interfaces>
+<NetworkInterface name="lo" priority="default" multicast="default" />
+</Interfaces></General></Domain></CycloneDDS>"""
 ELBOW = 16
 WEIGHT = 27
 MOTORS = 27
@@ -144,7 +146,8 @@ def robot(part: DomainParticipant, seconds: float) -> dict:
     last = None
     stiff = 0.0
     start = time.monotonic()
-    q[13], q[20] = 0.2, 0.2
+    q[13] = 0.2
+    q[20] = 0.2
     state = LowState(
         [1, 0],
         0,

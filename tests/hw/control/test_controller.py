@@ -387,6 +387,10 @@ def test_the_wall_clock_may_be_set_while_it_runs(arm, monkeypatch):
     assert run(NotedArm(arm)).fault is None
 
 
+def sent_since(driver: NotedArm, time: float) -> list[np.ndarray | None]:
+    return [ctrl for sent, ctrl in driver.sent if sent >= time]
+
+
 @pytest.mark.parametrize("during", ["read", "policy"])
 @pytest.mark.parametrize(("at", "slept"), [(0.06, 600.0), (0.9, 600.0), (0.9, 0.06)])
 def test_a_computer_that_was_suspended_sends_no_command_afterwards(arm, at, slept, during):
@@ -403,7 +407,7 @@ def test_a_computer_that_was_suspended_sends_no_command_afterwards(arm, at, slep
     recording = control(driver).run(lambda k, state: suspend("policy", motion(k, state)))
     assert recording.fault.kind == "suspend"
     assert f"the computer was suspended for {slept:.1f} s" in recording.fault.text
-    after = [ctrl for t, ctrl in driver.sent if t >= suspended[0]]
+    after = sent_since(driver, suspended[0])
     assert all(ctrl is None for ctrl in after)
     assert bool(after) == bool(driver.commands), "damped, or nothing was ever commanded"
     assert ("nothing was commanded" in recording.fault.text) == (not driver.commands)

@@ -89,27 +89,51 @@ class Bus(Wire):
         now = self.clock.now()
         while self.arm.live.steps * PERIOD <= now:
             self.arm.live.step()
-        goes = data[4] == reg.SYNC_WRITE and data[5] == reg.GOAL_POSITION.address
-        if data[4] in (reg.WRITE, reg.SYNC_WRITE):
-            self.written.append((now, data[5], data[6:-1]))
-        self.first = min(self.first, now) if goes else self.first
+        self.note(data, now)
         wrong = now - self.first >= self.at
         if wrong and not self.done:
             self.done = True
-            (WAYS.get(self.way) or (ERRORS.get(self.way, lambda bus: None),))[0](self)
-            self.arm._apply()
-        self.writes += data[4] == reg.SYNC_WRITE
-        # The first among them.
-        dropped = self.way == "ignores" or (self.way == "drops" and self.writes % 7 in (1, 2))
-        out = self.arm.receive(b"" if wrong and dropped and data[4] != reg.SYNC_READ else data)
-        if wrong and self.way == "crossed" and goes:
-            goals = self.get(reg.GOAL_POSITION)
-            self.put(reg.GOAL_POSITION, goals[ROLL - 1], (ELBOW,))
-            self.put(reg.GOAL_POSITION, goals[ELBOW - 1], (ROLL,))
-            self.arm._apply()
-        return (data if self.way == "echo" else b"") + (
-            SPOILT[self.way](out) if wrong and self.way in SPOILT else out
-        )
+            self.go_wrong()
+        said = self.arm.receive(b"" if wrong and self.drops(data) else data)
+        if wrong and self.way == "crossed" and self.is_goal(data):
+            self.cross()
+        if wrong and self.way in SPOILT:
+            said = SPOILT[self.way](said)
+        return data + said if self.way == "echo" else said
+
+    def is_goal(self, data: bytes) -> bool:
+        return data[4] == reg.SYNC_WRITE and data[5] == reg.GOAL_POSITION.address
+
+    def note(self, data: bytes, now: float) -> None:
+        if data[4] in (reg.WRITE, reg.SYNC_WRITE):
+            self.written.append((now, data[5], data[6:-1]))
+        if data[4] == reg.SYNC_WRITE:
+            self.writes += 1
+        if self.is_goal(data):
+            self.first = min(self.first, now)
+
+    def go_wrong(self) -> None:
+        """What goes wrong once."""
+        if self.way in WAYS:
+            happens, _ = WAYS[self.way]
+            happens(self)
+        elif self.way in ERRORS:
+            ERRORS[self.way](self)
+        self.arm._apply()
+
+    def drops(self, data: bytes) -> bool:
+        """Whether what is written does not arrive."""
+        if data[4] == reg.SYNC_READ:
+            return False
+        # Two of seven, the first among them.
+        return self.way == "ignores" or (self.way == "drops" and self.writes % 7 in (1, 2))
+
+    def cross(self) -> None:
+        """Exchange the goals of elbow and roll."""
+        goals = self.get(reg.GOAL_POSITION)
+        self.put(reg.GOAL_POSITION, goals[ROLL - 1], (ELBOW,))
+        self.put(reg.GOAL_POSITION, goals[ELBOW - 1], (ROLL,))
+        self.arm._apply()
 
     def lose(self) -> None:
         self.lost = True
@@ -199,6 +223,19 @@ def play(
     return controller.run(policy)
 
 
+def assert_no_data(recording: Recording, robot: RobotSpec, folder: Path, saved: bool) -> None:
+    """It is no log, and if its rows are saved at all, they say so and are not imported."""
+    with pytest.raises(LogError, match="servo"):
+        recording.log()
+    path = recording.save(folder / "logs", "sway")
+    assert path.exists() == saved
+    if saved:
+        request = ImportRequest(unit_id="a", payload_mass=0.0, position_unit="rad", time_unit="s")
+        with pytest.raises(LogError, match="servo"):
+            import_logs(path, robot, folder / "set", request)
+    assert not json.loads((folder / "logs" / "sway.json").read_text())["obeyed"]
+
+
 @pytest.mark.parametrize(
     ("way", "at"),
     [*((way, 1.0) for way in WAYS), ("ignores", 0.05), ("gain", 2.35), ("zero", 2.35)],
@@ -213,12 +250,7 @@ def test_servos_that_do_not_as_told_are_named_and_their_run_is_no_data(
     assert recording.fault.kind == "obedience", recording.fault
     assert re.search(WAYS[way][1], recording.fault.text)
     # Each state tells; three in a row count.
-    if at == 1.0 and way in (
-        "ignores",
-        "resets",
-        "brown-out",
-        "crossed",
-    ):
+    if at == 1.0 and way in ("ignores", "resets", "brown-out", "crossed"):
         assert recording.fault.time - bus.first - at <= 5 * 0.02
     # else it was noticed at the very end, where the arm is held
     if recording.fault.phase == "damp":
@@ -226,19 +258,7 @@ def test_servos_that_do_not_as_told_are_named_and_their_run_is_no_data(
         assert off != recording.events[-1].text.startswith(
             "could NOT be damped: switch the supply off"
         )
-    with pytest.raises(LogError, match="servo"):
-        recording.log()
-    path = recording.save(tmp_path / "logs", "sway")
-    assert path.exists() == (at > 0.5)
-    if path.exists():
-        with pytest.raises(LogError, match="servo"):
-            import_logs(
-                path,
-                so101,
-                tmp_path / "set",
-                ImportRequest(unit_id="a", payload_mass=0.0, position_unit="rad", time_unit="s"),
-            )
-    assert not json.loads((tmp_path / "logs" / "sway.json").read_text())["obeyed"]
+    assert_no_data(recording, so101, tmp_path, saved=at > 0.5)
 
 
 def test_a_setting_that_changes_is_noticed_within_a_second(so101, clock, bus):
@@ -274,18 +294,28 @@ def told(bus: Bus, register: reg.Register) -> list[tuple[float, bytes]]:
     return [(time, words) for time, address, words in bus.written if address == register.address]
 
 
+def torque_limits(bus: Bus, until: float) -> list[int]:
+    """The torque limits that servos were told before that time."""
+    limits = []
+    for time, words in told(bus, reg.TORQUE_LIMIT):
+        if time < until:
+            limits.append(int.from_bytes(words[2:4], "little"))
+    return limits
+
+
+def torque_off(bus: Bus) -> float:
+    """When servos were first told to let go."""
+    return next(time for time, words in told(bus, reg.TORQUE_ENABLE) if words == b"\0")
+
+
 def test_a_stop_lowers_the_arm_and_only_then_takes_its_torque(so101, clock, bus):
     recording = play(so101, clock, stop=1.0, config=replace(QUICK, damp=LOWERING_S))
     assert [e.kind for e in recording.events if e.phase == "damp"] == ["stop"]
     assert recording.events[-1].text == "let go: all servos say that their torque is off"
-    off = next(time for time, words in told(bus, reg.TORQUE_ENABLE) if words == b"\0")
+    off = torque_off(bus)
     began = recording.events[-2].time
     assert off == pytest.approx(began + LOWERING_S, abs=0.05)
-    limits = [
-        int.from_bytes(words[2:4], "little")
-        for time, words in told(bus, reg.TORQUE_LIMIT)
-        if time < off
-    ]
+    limits = torque_limits(bus, off)
     assert limits == sorted(limits, reverse=True)
     assert limits[0] > 900
     assert limits[-1] <= 10
@@ -426,6 +456,16 @@ def test_a_step_of_the_robots_clock_is_no_fault_and_hides_none(monkeypatch):
     judge(recording, received(robot), robot.robot, SafetyConfig())
 
 
+def assert_damped(recording: Recording, way: str) -> None:
+    """What is limp or weak falls away from where it is asked to be; the rest does not obey."""
+    if recording.fault.kind == "obedience":
+        assert phases(recording)[-2:] == ["damp", "stopped"]
+        assert recording.events[-1].text.startswith("let go; the robot did not obey")
+    else:
+        assert recording.fault.kind == KIND_OF_WAY[way]
+        assert recording.fault.phase == "damp"
+
+
 @pytest.mark.parametrize(
     ("way", "at"),
     [
@@ -447,12 +487,7 @@ def test_a_robot_whose_joints_do_not_follow_is_damped_and_its_run_is_no_data(mon
     recording, _ = swing(monkeypatch, way, at)
     assert recording.fault is not None
     assert "elbow" in recording.fault.text
-    if recording.fault.kind == "obedience":
-        assert phases(recording)[-2:] == ["damp", "stopped"]
-        assert recording.events[-1].text.startswith("let go; the robot did not obey")
-    else:
-        assert recording.fault.kind == KIND_OF_WAY[way]
-        assert recording.fault.phase == "damp"
+    assert_damped(recording, way)
     with pytest.raises(LogError, match="told"):
         recording.log()
     steps = np.abs(np.diff([row.state.qpos for row in recording.rows], axis=0))
@@ -460,10 +495,8 @@ def test_a_robot_whose_joints_do_not_follow_is_damped_and_its_run_is_no_data(mon
         "nothing jumps when a robot listens again, and what is limp falls"
     )
     if at == 0.0 and way == "ignores":
-        assert (
-            max(row.time for row in recording.rows if row.phase == "blend_in")
-            < recording.rows[0].time + 3.0
-        )
+        blended_in = max(row.time for row in recording.rows if row.phase == "blend_in")
+        assert blended_in < recording.rows[0].time + 3.0
 
 
 def test_the_weight_waits_until_a_joint_has_followed(monkeypatch):

@@ -5,7 +5,6 @@ collision.
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import re
 
 import numpy as np
@@ -20,6 +19,7 @@ from gaponet.hw.control.controller import Controller
 from gaponet.hw.control.driver import Fault, State
 from gaponet.hw.control.phases import ControlConfig
 from gaponet.hw.control.plan import GOAL_SHARES, CollisionGuard, Planner
+from gaponet.hw.control.recording import Recording
 from gaponet.hw.control.safety import SafetyConfig
 from gaponet.motion.files import read_motion
 from gaponet.motion.motion import Motion
@@ -264,83 +264,125 @@ def test_a_plan_is_judged_as_a_whole_whatever_was_found_on_the_way(so101, monkey
         Planner(so101, so101.joint_names, *hasty).plan(motion(so101, OVER), so101.qpos_home)
 
 
-@pytest.mark.parametrize(
-    ("found_way", "obeys"),
-    [(True, True), (False, True), (False, False)],
-    ids=["by way of home", "none", "ignores"],
-)
-def test_when_targets_end_it_stands_until_a_clear_way_back_is_found_or_ends_there(
-    monkeypatch, found_way, obeys
-):
-    robot = load_robot("h1_2")
-    judge = Contacts(robot)
-    found = robot.qpos_home.copy()
-    far = robot.qpos_home.copy()
-    at = robot.index(robot.operated)
-    found[at] = HERE
-    far[at] = ACROSS
-    controller, sent = virtual(robot, found)
-    driver = controller.context.driver
-    driver.at_end = "hold" if obeys else "hand_over"
+@pytest.fixture(scope="module")
+def h1_2() -> RobotSpec:
+    return load_robot("h1_2")
 
-    def read():
-        fault = (
-            None
-            if obeys or controller.phase != "blend_out"
-            else Fault("obedience", "it ignores goals")
-        )
-        return State(
-            driver.clock.now(), sent[-1] if sent else found, *np.zeros((3, len(found))), fault=fault
-        )
 
-    driver.read = read
-    controller.output.monitor.frozen.noisy = False
-    assert judge.along(np.stack([far, found]), 0.02)[0] > 0.1
-    legs = itertools.pairwise([found, robot.qpos_home, far])
-    rows = np.concatenate(
-        [Trajectory.minimum_jerk(np.stack(leg), 2.0, 50.0, 0.3).rows(0.02) for leg in legs]
-    )
+@pytest.fixture(scope="module")
+def h1_2_judge(h1_2: RobotSpec) -> Contacts:
+    return Contacts(h1_2)
 
-    # Each step takes a millisecond, and where there is no way it takes a few to find that out.
-    def search(
-        *given,
-    ):
-        for _ in find_points(*given) if found_way else range(50):
-            controller.context.clock.advance(0.001)
-            yield
-        return finish_search(find_points(*given)) if found_way else None
 
-    def policy(k, state):
-        if k:
-            monkeypatch.setattr("gaponet.hw.control.plan.find_points", search)
-        return rows[k] if k < len(rows) else None
+def posture(robot: RobotSpec, operated: np.ndarray) -> np.ndarray:
+    """Home, with the operated joints elsewhere."""
+    qpos = robot.qpos_home.copy()
+    qpos[robot.index(robot.operated)] = operated
+    return qpos
 
-    recording = controller.run(policy)
-    last = recording.events[-1].text
-    assert (recording.fault is None) == obeys, recording.fault
-    if not obeys:
-        assert phases(recording)[-3:] == ["blend_out", "damp", "stopped"]
-        assert recording.fault.kind == "obedience"
-        return
-    assert (
-        judge.along(np.array([row.ctrl for row in recording.rows if row.ctrl is not None]), 0.02)[0]
-        == 0
-    )
-    np.testing.assert_allclose(sent[-1][at], HERE if found_way else ACROSS, atol=0.02)
-    if not found_way:
-        text = "where it is: no clear way back to where it was found: straight it brings .*; hold"
-        assert re.fullmatch(text, last)
-        return
-    assert last == "back where it was found; hold"
-    back = np.array(
-        [
-            row.target
-            for row in recording.rows
-            if row.phase == "blend_out" and row.target is not None
+
+class Outing:
+    """A robot that does as told is led from HERE through home to ACROSS, where its targets end.
+
+    Attributes:
+        found_way: Whether the search for a way back finds one.
+        obeys: Whether it still does as told on the way back.
+        sent: Its commands.
+    """
+
+    def __init__(
+        self,
+        monkeypatch: pytest.MonkeyPatch,
+        robot: RobotSpec,
+        found_way: bool = True,
+        obeys: bool = True,
+    ) -> None:
+        self.monkeypatch = monkeypatch
+        self.found_way = found_way
+        self.obeys = obeys
+        self.found = posture(robot, HERE)
+        self.controller, self.sent = virtual(robot, self.found)
+        self.clock = self.controller.context.clock
+        self.controller.context.driver.at_end = "hold" if obeys else "hand_over"
+        self.controller.context.driver.read = self.read
+        self.controller.output.monitor.frozen.noisy = False
+        legs = [
+            np.stack([self.found, robot.qpos_home]),
+            np.stack([robot.qpos_home, posture(robot, ACROSS)]),
         ]
-    )
+        self.rows = np.concatenate(
+            [Trajectory.minimum_jerk(leg, 2.0, 50.0, 0.3).rows(0.02) for leg in legs]
+        )
+
+    def run(self) -> Recording:
+        return self.controller.run(self.policy)
+
+    def read(self) -> State:
+        fault = None
+        if not self.obeys and self.controller.phase == "blend_out":
+            fault = Fault("obedience", "it ignores goals")
+        qpos = self.sent[-1] if self.sent else self.found
+        return State(self.clock.now(), qpos, *np.zeros((3, len(qpos))), fault=fault)
+
+    def policy(self, k: int, state: State) -> np.ndarray | None:
+        if k:
+            self.monkeypatch.setattr("gaponet.hw.control.plan.find_points", self.search)
+        return self.rows[k] if k < len(self.rows) else None
+
+    def search(self, *given):
+        """Each step takes a millisecond, and where there is no way it takes a few to find that
+        out.
+        """
+        for _ in find_points(*given) if self.found_way else range(50):
+            self.clock.advance(0.001)
+            yield
+        return finish_search(find_points(*given)) if self.found_way else None
+
+
+def commanded(recording: Recording) -> np.ndarray:
+    """All commands that were sent, (T, n) rad."""
+    return np.array([row.ctrl for row in recording.rows if row.ctrl is not None])
+
+
+def test_straight_back_from_there_its_arms_go_into_each_other(h1_2, h1_2_judge):
+    straight_back = np.stack([posture(h1_2, ACROSS), posture(h1_2, HERE)])
+    assert h1_2_judge.along(straight_back, 0.02)[0] > 0.1
+
+
+def test_when_targets_end_it_stands_until_a_clear_way_back_is_found(monkeypatch, h1_2, h1_2_judge):
+    outing = Outing(monkeypatch, h1_2)
+
+    recording = outing.run()
+
+    assert recording.fault is None
+    assert recording.events[-1].text == "back where it was found; hold"
+    np.testing.assert_allclose(outing.sent[-1], outing.found, atol=0.02)
+    assert h1_2_judge.along(commanded(recording), 0.02)[0] == 0
+    ending = [row.target for row in recording.rows if row.phase == "blend_out"]
+    back = np.array([target for target in ending if target is not None])
     standing = int(np.argmax(np.abs(back - back[0]).max(axis=1) > 0))
     assert 2 < standing < 100, "it looks for a share of each period"
+
+
+def test_when_targets_end_and_no_clear_way_back_is_found_it_ends_there(
+    monkeypatch, h1_2, h1_2_judge
+):
+    outing = Outing(monkeypatch, h1_2, found_way=False)
+
+    recording = outing.run()
+
+    assert recording.fault is None
+    text = "where it is: no clear way back to where it was found: straight it brings .*; hold"
+    assert re.fullmatch(text, recording.events[-1].text)
+    np.testing.assert_allclose(outing.sent[-1], posture(h1_2, ACROSS), atol=0.02)
+    assert h1_2_judge.along(commanded(recording), 0.02)[0] == 0
+
+
+def test_when_targets_end_a_robot_that_ignores_goals_is_damped(monkeypatch, h1_2):
+    recording = Outing(monkeypatch, h1_2, found_way=False, obeys=False).run()
+
+    assert recording.fault.kind == "obedience"
+    assert phases(recording)[-3:] == ["blend_out", "damp", "stopped"]
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,7 @@
 """hg messages: layout and checksum against other implementations."""
 
+import itertools
+
 import numpy as np
 import pytest
 
@@ -52,50 +54,66 @@ def test_a_changed_bit_anywhere_is_noticed(message):
         assert not message.intact(broken)
 
 
-def test_the_wire_layout_is_that_of_cyclonedds():
+def count_up(cls, fields, inner, counter):
+    """A message of CycloneDDS whose numbers count up in the order of its fields, and after 99
+    again.
+    """
+
+    def value(kind):
+        if isinstance(kind, str):
+            return next(counter) % 100
+        return count_up(inner[id(kind)], kind, inner, counter)
+
+    values = []
+    for _, kind, count in fields:
+        values.append(value(kind) if count == 1 else [value(kind) for _ in range(count)])
+    return cls(*values)
+
+
+@pytest.fixture
+def on_the_wire():
+    """A function: message of CycloneDDS by its name, and its bytes as CycloneDDS sends them."""
     pytest.importorskip("cyclonedds", reason="pip install 'gaponet[dds]'")
     from cyclonedds.idl import IdlStruct
 
     from gaponet.hw.drivers import dds
-
-    counter = iter(range(10**6))
-
-    def build(cls, fields):
-        values = []
-        for _, kind, count in fields:
-            one = (
-                (lambda k=kind: next(counter) % 100)
-                if isinstance(kind, str)
-                else (lambda k=kind: build(inner[id(k)], k))
-            )
-            values.append(one() if count == 1 else [one() for _ in range(count)])
-        return cls(*values)
 
     inner = {
         id(hg.IMU): dds.IMUState,
         id(hg.MOTOR_STATE): dds.MotorState,
         id(hg.MOTOR_CMD): dds.MotorCmd,
     }
-    for cls, message, fields in (
-        (dds.LowState, hg.LowState, hg.LOW_STATE),
-        (dds.LowCmd, hg.LowCmd, hg.LOW_CMD),
-    ):
-        sample = build(cls, fields)
-        wire = IdlStruct.serialize(sample)
-        assert wire[:4] == hg.HEADER
-        data = np.frombuffer(wire[4:], np.uint8)
-        assert len(data) == message.wire_size
-        motors = sample.motor_state if cls is dds.LowState else sample.motor_cmd
-        for name in ("mode", "q", "dq"):
-            np.testing.assert_array_equal(
-                message.motors(data, name), [getattr(m, name) for m in motors]
-            )
-        assert message.view(data, "crc")[0] == sample.crc
-        assert message.view(data, "mode_machine")[0] == sample.mode_machine
-        again = message.new()
-        for name in message.columns:
-            message.set_motors(again, name, message.motors(data, name))
-        for path in message._at:
-            if "[" not in path:
-                message.view(again, path)[:] = message.view(data, path)
-        np.testing.assert_array_equal(again, data)
+
+    def send(name):
+        fields = {"LowState": hg.LOW_STATE, "LowCmd": hg.LOW_CMD}[name]
+        sample = count_up(getattr(dds, name), fields, inner, itertools.count())
+        return sample, IdlStruct.serialize(sample)
+
+    return send
+
+
+@pytest.mark.parametrize(("name", "part"), [("LowState", "motor_state"), ("LowCmd", "motor_cmd")])
+def test_the_wire_layout_is_that_of_cyclonedds(on_the_wire, name, part):
+    message = getattr(hg, name)
+    sample, wire = on_the_wire(name)
+    assert wire[:4] == hg.HEADER
+    data = np.frombuffer(wire[4:], np.uint8)
+    assert len(data) == message.wire_size
+    for field in ("mode", "q", "dq"):
+        expected = [getattr(motor, field) for motor in getattr(sample, part)]
+        np.testing.assert_array_equal(message.motors(data, field), expected)
+    assert message.view(data, "crc")[0] == sample.crc
+    assert message.view(data, "mode_machine")[0] == sample.mode_machine
+
+
+@pytest.mark.parametrize("name", ["LowState", "LowCmd"])
+def test_a_message_that_is_written_field_by_field_is_that_of_cyclonedds(on_the_wire, name):
+    message = getattr(hg, name)
+    data = np.frombuffer(on_the_wire(name)[1][4:], np.uint8)
+    again = message.new()
+    for column in message.columns:
+        message.set_motors(again, column, message.motors(data, column))
+    for path in message._at:
+        if "[" not in path:
+            message.view(again, path)[:] = message.view(data, path)
+    np.testing.assert_array_equal(again, data)

@@ -202,7 +202,7 @@ def test_what_cannot_be_taken_is_held_and_then_damped(arm, what):
     assert recording.fault.kind == "silence"
     assert set(targets.counts["refused"]) == ({kind} if kind else set())
     judge(arm, recording)
-    damped = next(t for t, ctrl in driver.sent if ctrl is None)
+    damped = driver.damped
     assert all(ctrl is None for t, ctrl in driver.sent if t >= damped)
     held = [r for r in recording.rows if r.target is not None][-10:]
     # The last good one, until then.

@@ -175,7 +175,7 @@ def trajectory(names, positions, stamp=(5, 7), due=20_000_000, points=1):
     return bytes(store.serialize_cdr(message, "trajectory_msgs/msg/JointTrajectory"))
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def ros2():
     pytest.importorskip("rosbags", reason="pip install 'gaponet[ros]'")
     return pytest.importorskip("gaponet.hw.targets.ros2", reason="pip install 'gaponet[dds]'")
@@ -261,14 +261,16 @@ def test_a_second_publisher_of_targets_on_the_bus_is_seen_before_it_says_anythin
     transport.close("over")
 
 
-@pytest.mark.peers
-@pytest.mark.parametrize("version", ["jazzy", "kilted"])
-def test_ros_2_itself_is_heard_and_hears_us(ros2, version):
-    """rclpy on Fast DDS, whose descriptions of types Cyclone DDS does not take: make peers."""
-    packages = (
-        f"ros-{version}-{name}"
-        for name in ("rclpy", "rmw-fastrtps-cpp", "sensor-msgs", "trajectory-msgs")
-    )
+ROS_PACKAGES = ("rclpy", "rmw-fastrtps-cpp", "sensor-msgs", "trajectory-msgs")
+
+
+@pytest.fixture(scope="module", params=["jazzy", "kilted"])
+def talk(ros2, request):
+    """What a node of rclpy has heard of us, and our messages of it: on Fast DDS, whose descriptions
+    of types Cyclone DDS does not take.
+    """
+    version = request.param
+    packages = [f"ros-{version}-{name}" for name in ROS_PACKAGES]
     python = environment(f"ros-{version}", "3.12", tuple(packages))
     domain = 30 + os.getpid() % 150
     there = {"ROS_DOMAIN_ID": str(domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
@@ -283,11 +285,16 @@ def test_ros_2_itself_is_heard_and_hears_us(ros2, version):
             found += transport.receive()
             time.sleep(0.01)
         assert peer.stdout
-        said = json.loads(peer.stdout.read())
+        return json.loads(peer.stdout.read()), found
     finally:
         peer.kill()
         peer.wait()
         transport.close("over")
+
+
+@pytest.mark.peers
+def test_ros_2_itself_hears_us(talk):
+    said, _ = talk
     expected = {
         "name": ["a", "b"],
         "position": [0.1, 0.2],
@@ -295,12 +302,22 @@ def test_ros_2_itself_is_heard_and_hears_us(ros2, version):
         "effort": [1.0, 2.0],
     }
     assert said.items() >= expected.items()
+    assert said["targets"] > 5
+
+
+@pytest.mark.peers
+def test_ros_2_itself_is_heard(talk):
+    _, found = talk
     assert [m.error for m in found if m.error] == []
     assert len({m.sender for m in found}) == 1
     assert [m.time for m in found] == sorted(m.time for m in found)
-    assert said["targets"] > 5
+    assert found[-1].end
+
+
+@pytest.mark.peers
+def test_targets_from_ros_2_itself_are_those_of_its_node(talk):
+    _, found = talk
     targets = [m.target["b"] for m in found if m.target]
     assert len(targets) > 5
     assert 0.2 <= min(targets) < 0.25
     assert 0.35 < max(targets) <= 0.4
-    assert found[-1].end
