@@ -77,7 +77,8 @@ def test_a_chunk_is_corrected_as_its_rows_would_be_and_the_next_goes_on_where_it
     rows = torch.from_numpy(
         np.degrees(0.3 * np.sin(2 * np.pi * np.array([0.4, 0.6]) * time))
     ).float()
-    one, many = plugin.GaponetCorrect(known=str(known)), plugin.GaponetCorrect(known=str(known))
+    one = plugin.GaponetCorrect(known=str(known))
+    many = plugin.GaponetCorrect(known=str(known))
     single = torch.stack([one({"action": row[None]})["action"][0] for row in rows])
     first = many({"action": rows[None, :50]})["action"]
     assert first.shape == (1, 50, 2)

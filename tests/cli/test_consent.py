@@ -31,7 +31,8 @@ class Person(io.StringIO):
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         super().__init__()
-        self.monkeypatch, self.answer = monkeypatch, ""
+        self.monkeypatch = monkeypatch
+        self.answer = ""
         self.master, self.slave = os.openpty()
         monkeypatch.setattr("sys.stdin", open(self.slave))  # noqa: SIM115
 
@@ -142,7 +143,8 @@ def test_without_yes_no_servo_is_written_to(command, person, bus, first, tmp_pat
 
 def test_after_yes_servos_are_written_to_and_a_key_lets_them_go(person, bus, first, monkeypatch):
     port, servos = bus
-    obey, typed = servos.obey, []
+    obey = servos.obey
+    typed = []
 
     def obeyed(who: int, instruction: int, words: bytes) -> bytes:
         if instruction in WRITES and not typed:

@@ -134,12 +134,12 @@ def half_a_parquet(folder: Path) -> Path:
 BROKEN = {
     "missing column": (
         sage_with("positions", "angles", "state_motor.csv"),
-        r"state_motor.csv:1: column 'positions' is missing; the header has: type, timestamp, angles",
+        "state_motor.csv:1: column 'positions' is missing; the header has: type, timestamp, angles",
     ),
     "wrong joint name": (
         sage_with("Elbow", "Ellbow", "joint_list.txt"),
-        "joint_list.txt names joint 'Ellbow', which robot 'so101' does not have; nearest: elbow_flex, wrist_roll, "
-        "wrist_flex. Map it with --map Ellbow=elbow_flex",
+        "joint_list.txt names joint 'Ellbow', which robot 'so101' does not have; "
+        "nearest: elbow_flex, wrist_roll, wrist_flex. Map it with --map Ellbow=elbow_flex",
     ),
     "half-written Parquet": (half_a_parquet, "b.parquet: not a readable Parquet file"),
 }
@@ -151,7 +151,8 @@ def test_a_broken_input_is_one_line_that_says_what_where_and_what_to_do(
 ):
     """And leaves no dataset; the readers' own tests have every message."""
     make, message = BROKEN[what]
-    logs, out = make(tmp_path / "logs"), tmp_path / "data"
+    logs = make(tmp_path / "logs")
+    out = tmp_path / "data"
     code = (
         import_arm(logs, arm, out, *SI)
         if what == "half-written Parquet"
@@ -194,23 +195,33 @@ def test_a_table_asks_for_its_units(arm, tmp_path, capsys):
     )
 
 
-def test_doctor_ends_with_a_verdict_and_what_comes_next_or_prints_one_json_object(
-    logs, tmp_path, capsys
-):
+@pytest.fixture
+def imported(logs, tmp_path, capsys):
+    """A dataset of an SO-101."""
     import_so101(logs, tmp_path / "data")
     capsys.readouterr()
-    assert main(["doctor", str(tmp_path / "data")]) == 0
+    return tmp_path / "data"
+
+
+def test_doctor_ends_with_a_verdict_and_what_comes_next(imported, capsys):
+    assert main(["doctor", str(imported)]) == 0
     told = capsys.readouterr().out
     assert "so101, 1 recordings, 1 motions" in told
     verdict, next_ = told.strip().split("\n")[-2:]
     assert verdict.startswith("Usable. Read the")
-    assert next_ == f"next: gaponet gap {tmp_path / 'data'}"
-    assert main(["doctor", str(tmp_path / "data"), "--json"]) == 0
+    assert next_ == f"next: gaponet gap {imported}"
+
+
+def test_doctor_prints_one_json_object(imported, capsys):
+    assert main(["doctor", str(imported), "--json"]) == 0
     result = json.loads(capsys.readouterr().out)
     assert result["sequences"][0]["rate_hz"] == 49.85
     assert {f["level"] for f in result["findings"]} <= {"ok", "note", "warning", "error"}
     assert [j["joint"] for j in result["joints"]][-1] == "gripper"
-    assert main(["doctor", str(tmp_path / "data"), "--robot", "h1_2"]) == 2
+
+
+def test_doctor_refuses_another_robot_than_the_datasets(imported, capsys):
+    assert main(["doctor", str(imported), "--robot", "h1_2"]) == 2
     assert "holds robot 'so101'" in capsys.readouterr().err
 
 

@@ -109,7 +109,8 @@ def test_a_band_holds_nine_tenths_of_what_a_robot_does_that_was_identified_a_lit
 
 def test_what_is_not_known_widens_a_band_where_motion_shows_it(arm):
     still, moving = (record(arm, ctrl, "x") for ctrl in (np.zeros((100, 2)), commands(100, 1)))
-    known, robot = 1e-3, arm.with_identified({"elbow": {"delay": 0.02}})
+    known = 1e-3
+    robot = arm.with_identified({"elbow": {"delay": 0.02}})
     drawn = [robot.with_identified({"elbow": {"delay": delay}}) for delay in (0.01, 0.03)]
     first, second = predict(robot, [still, moving], np.full(2, known), drawn)
     assert first.half_width.max() < 1.5 * known

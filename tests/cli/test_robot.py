@@ -100,7 +100,8 @@ def test_new_makes_checks_and_shows_a_robot_from_a_vendor_s_model(tmp_path, caps
 
 
 def test_new_may_be_given_again_but_replaces_no_robot_that_a_person_changed(tmp_path, capsys):
-    model, mine = write_mjcf(tmp_path / "repo"), tmp_path / "mine"
+    model = write_mjcf(tmp_path / "repo")
+    mine = tmp_path / "mine"
     told = ["robot", "new", str(model), "--out", str(mine), "--joints", "shoulder", "elbow"]
     assert main(told) == 0
     (mine / "picture.png").unlink(missing_ok=True)  # as a command leaves it that was killed early
@@ -118,7 +119,8 @@ def test_new_that_ends_before_its_picture_leaves_no_robot(tmp_path, monkeypatch)
         raise KeyboardInterrupt
 
     monkeypatch.setattr("gaponet.report.view.picture.still", stop)
-    model, mine = write_mjcf(tmp_path / "repo"), tmp_path / "mine"
+    model = write_mjcf(tmp_path / "repo")
+    mine = tmp_path / "mine"
     told = ["robot", "new", str(model), "--out", str(mine), "--joints", "shoulder", "elbow"]
     assert main(told) == 130
     assert not mine.exists()

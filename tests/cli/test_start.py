@@ -107,54 +107,94 @@ def test_an_interrupted_start_goes_on_and_keeps_the_commands_that_ran(place, mon
     ]
 
 
-def test_other_logs_need_another_folder_and_more_logs_run_again_what_followed_from_them(
-    place, monkeypatch, capsys
-):
-    ran, look = [], start.api.doctor
-    monkeypatch.setattr(start, "main", lambda words: ran.append(words[0]) or main(words))
+@pytest.fixture
+def started(place, monkeypatch, capsys):
+    """The commands that ran after robot, import and doctor of four logs; the fifth lies beside."""
+    ran = []
     every = Start.steps
-    monkeypatch.setattr(
-        Start, "steps", lambda *args: [s for s in every(*args) if s.words[0] in ORDER[:3]]
-    )
-    monkeypatch.setattr(
-        start.api, "doctor", lambda data, **how: ran.append("doctor") or look(data, **how)
-    )
-    last = Path("logs/swing_4.csv").rename("swing_4.csv")
+    look = start.api.doctor
+
+    def run(words):
+        ran.append(words[0])
+        return main(words)
+
+    def doctor(data, **how):
+        ran.append("doctor")
+        return look(data, **how)
+
+    def first_steps(*args):
+        return [step for step in every(*args) if step.words[0] in ORDER[:3]]
+
+    monkeypatch.setattr(start, "main", run)
+    monkeypatch.setattr(start.api, "doctor", doctor)
+    monkeypatch.setattr(Start, "steps", first_steps)
+    Path("logs/swing_4.csv").rename("swing_4.csv")
     assert main(["start", "arm.xml", "logs"]) == 0
+    assert ran == ORDER[:3]
+    ran.clear()
+    capsys.readouterr()
+    return ran
+
+
+def contents():
+    """The files of the started folder."""
+    return {file: file.read_bytes() for file in Path("started").rglob("*") if file.is_file()}
+
+
+def count_sequences():
+    return len(Path("started/data/sequences.jsonl").read_text().splitlines())
+
+
+def test_the_same_logs_elsewhere_are_the_same_data(started):
     shutil.copytree("logs", "other")
-    assert main(["start", "arm.xml", "other"]) == 0  # the same logs elsewhere are the same data
-    assert ran == ["robot", "import", "doctor", "import"]
+    assert main(["start", "arm.xml", "other"]) == 0
+    assert started == ["import"]
+
+
+def test_more_logs_run_again_what_followed_from_them(started):
     Path("logs/swing_4.csv").write_text("no log\n")
     assert main(["start", "arm.xml", "logs"]) == 2  # a new log that cannot be read may be mended
-    assert ran.pop() == "import"
-    last.rename("logs/swing_4.csv")
+    assert started == ["import"]
+    Path("swing_4.csv").rename("logs/swing_4.csv")
     assert main(["start", "arm.xml", "logs"]) == 0
-    assert ran[4:] == ["import", "doctor"]
-    assert len(Path("started/data/sequences.jsonl").read_text().splitlines()) == 5
+    assert started[1:] == ["import", "doctor"]
+    assert count_sequences() == 5
     assert main(["start", "arm.xml", "logs"]) == 0
-    assert ran[6:] == []
-    capsys.readouterr()
-    before = {file: file.read_bytes() for file in Path("started").rglob("*") if file.is_file()}
+    assert started[3:] == []
+
+
+def test_another_cut_of_the_logs_needs_another_folder(started, capsys):
+    before = contents()
     assert main(["start", "arm.xml", "logs", "--cut", "3"]) == 2
     assert "started/data was imported with --robot started/robot" in capsys.readouterr().err
-    Path("other/swing_3.csv").write_text(Path("logs/swing_4.csv").read_text())
+    assert contents() == before
+
+
+def test_other_logs_need_another_folder(started, capsys):
+    before = contents()
+    shutil.copytree("logs", "other")
+    Path("other/swing_2.csv").unlink()
+    Path("other/swing_3.csv").write_text(Path("swing_4.csv").read_text())
     Path("logs/swing_3.csv").unlink()
-    for logs, more in (("other", []), ("other", ["--dry-run"]), ("logs", [])):
-        assert main(["start", "arm.xml", logs, *more]) == 2
-        gone = (
-            "swing_3.csv, swing_4.csv are missing or changed in other"
-            if logs == "other"
-            else "swing_3.csv is"
-        )
-        assert gone in (said := capsys.readouterr().err)
-        assert (
-            "Give another --out for these logs, or the same logs again; or delete started/data"
-            in said
-        )
-    assert {file: file.read_bytes() for file in before} == before
+    gone = "swing_2.csv, swing_3.csv are missing or changed in other"
+    for words, why in (
+        (["other"], gone),
+        (["other", "--dry-run"], gone),
+        (["logs"], "swing_3.csv is"),
+    ):
+        assert main(["start", "arm.xml", *words]) == 2
+        said = capsys.readouterr().err
+        assert why in said
+        assert "Give another --out for these logs, or the same logs again" in said
+        assert "or delete started/data" in said
+    assert contents() == before
+
+
+def test_where_the_dataset_was_deleted_other_logs_are_imported(started):
+    Path("logs/swing_3.csv").unlink()
     shutil.rmtree("started/data")
     assert main(["start", "arm.xml", "logs"]) == 0
-    assert len(Path("started/data/sequences.jsonl").read_text().splitlines()) == 4
+    assert count_sequences() == 3
 
 
 def test_what_is_said_of_the_logs_reaches_their_import(place, capsys):
@@ -195,35 +235,51 @@ def test_what_is_said_of_the_logs_reaches_their_import(place, capsys):
     assert found["commands"][4].endswith("--budget 4m")
 
 
-@pytest.mark.parametrize("name", ["a1", "x"])
-def test_logs_that_do_not_explain_themselves_stop_with_a_file_to_correct(
-    place, monkeypatch, capsys, name
-):
+def rename_in_logs(old, new):
     for file in Path("logs").iterdir():
-        text = file.read_text()
-        file.write_text(
-            text.replace("shoulder", name) if name == "a1" else text.replace("meas", name)
-        )
-    assert main(["start", "arm.xml", "logs", "--dry-run"]) == (0 if name == "a1" else 2)
-    said = capsys.readouterr()
-    assert "\\n" not in said.err
-    assert re.search(
-        '^ *"a1" = "shoulder"' if name == "a1" else '^ *# qpos = "…"', said.out, re.MULTILINE
-    )
+        file.write_text(file.read_text().replace(old, new))
+
+
+def assert_stops_with_a_file_to_correct(capsys):
+    """Return what is printed, and the file."""
     assert main(["start", "arm.xml", "logs"]) == 2
     said = capsys.readouterr()
     assert "they are in started/logs.toml: check those with a ?" in said.err
-    assert (name == "a1") == ('"a1" = "shoulder"' in said.out)
-    told = Path("started/logs.toml")
-    text = told.read_text()
-    assert ('"a1" = "shoulder"' if name == "a1" else '# qpos = "…"') in text
-    told.write_text(text if name == "a1" else re.sub("# qpos.*", 'qpos = "{joint}_x"', text))
-    assert main(["start", "arm.xml", "logs", "--dry-run"]) == 0, text
+    return said.out, Path("started/logs.toml")
+
+
+def assert_goes_on(monkeypatch, capsys):
+    """The folder that holds the guess is its own: the first command begins."""
+    assert main(["start", "arm.xml", "logs", "--dry-run"]) == 0
     monkeypatch.setattr(start, "main", lambda words: 2)
     assert main(["start", "arm.xml", "logs"]) == 2
-    assert (
-        "stopped at: gaponet robot new" in capsys.readouterr().err
-    )  # the folder that holds the guess is its own
+    assert "stopped at: gaponet robot new" in capsys.readouterr().err
+
+
+def test_a_guessed_joint_stops_with_a_file_to_check(place, monkeypatch, capsys):
+    rename_in_logs("shoulder", "a1")
+    assert main(["start", "arm.xml", "logs", "--dry-run"]) == 0
+    said = capsys.readouterr()
+    assert "\\n" not in said.err
+    assert re.search('^ *"a1" = "shoulder"', said.out, re.MULTILINE)
+    printed, told = assert_stops_with_a_file_to_correct(capsys)
+    assert '"a1" = "shoulder"' in printed
+    assert '"a1" = "shoulder"' in told.read_text()
+    assert_goes_on(monkeypatch, capsys)
+
+
+def test_a_signal_that_is_not_found_stops_with_a_file_to_correct(place, monkeypatch, capsys):
+    rename_in_logs("meas", "x")
+    assert main(["start", "arm.xml", "logs", "--dry-run"]) == 2
+    said = capsys.readouterr()
+    assert "\\n" not in said.err
+    assert re.search('^ *# qpos = "…"', said.out, re.MULTILINE)
+    printed, told = assert_stops_with_a_file_to_correct(capsys)
+    assert '"a1" = "shoulder"' not in printed
+    text = told.read_text()
+    assert '# qpos = "…"' in text
+    told.write_text(re.sub("# qpos.*", 'qpos = "{joint}_x"', text))
+    assert_goes_on(monkeypatch, capsys)
 
 
 def test_logs_with_an_error_are_not_fitted(place, monkeypatch, capsys):
