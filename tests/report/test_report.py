@@ -114,7 +114,9 @@ def test_an_incomplete_evaluation_is_refused_with_what_to_do(run, absent):
         write_report(run)
 
 
-def test_trajectories_show_the_command_and_errors_of_a_motion_on_one_scale_moving_joints_first():
+@pytest.fixture(scope="module")
+def trajectories():
+    """Figures of two motions, in which a hardly moves, b swings, c stands, and d goes and stops."""
     n = 1500
     dt = 0.02
     time = np.arange(n) * dt
@@ -127,16 +129,32 @@ def test_trajectories_show_the_command_and_errors_of_a_motion_on_one_scale_movin
         "0/nominal": command + np.array([0.9, 0.01, 0.5, 0.02]),
     }
     arrays |= {f"1/{k[2:]}": v if k != "0/nominal" else command + 0.2 for k, v in arrays.items()}
-    drawn = figures.trajectories(arrays, [{"dt": dt}] * 2, ("a", "b", "c", "d"), ["nominal"])
-    axes = [ax for fig in drawn.values() for ax in fig.axes]
-    titles = [ax.get_title("left") for ax in drawn[0].axes if ax.get_title("left")]
-    assert titles == ["a (stands still)", "b", "d"]
+    return figures.trajectories(arrays, [{"dt": dt}] * 2, ("a", "b", "c", "d"), ["nominal"])
+
+
+@pytest.fixture
+def axes(trajectories):
+    return [ax for fig in trajectories.values() for ax in fig.axes]
+
+
+def test_trajectories_show_moving_joints_and_a_resting_one_that_errs_most(trajectories):
+    titles = [ax.get_title("left") for ax in trajectories[0].axes]
+    assert [title for title in titles if title] == ["a (stands still)", "b", "d"]
+
+
+def test_the_errors_of_a_motion_are_shown_on_one_scale(axes):
     tops = np.array([ax.get_ylim()[1] for ax in axes[6:9] + axes[15:18]]).reshape(2, 3)
     assert np.ptp(tops, axis=1).max() < 1e-6
     assert tops[0, 0] > 900 > 300 > tops[1, 0]
+
+
+def test_trajectories_show_the_command_and_where_it_stops_in_detail(axes):
     assert "command" in [line.get_label() for line in axes[1].lines]
     zoom = axes[5].lines[0].get_xdata()
     assert zoom[0] < 10.0 < zoom[-1]  # where the command of d stops
+
+
+def test_a_joint_that_hardly_moves_is_not_blown_up(axes):
     assert np.ptp(axes[0].get_ylim()) >= 0.06
 
 
