@@ -24,7 +24,8 @@ def same(one, other):
     bare = lambda data: {e.id: (e, e.meta) for e in data.entries}  # noqa: E731
     assert bare(one) == bare(other)
     for entry in one.entries:
-        a, b = one.read(entry), other.read(other.find(entry.hash))
+        a = one.read(entry)
+        b = other.read(other.find(entry.hash))
         assert a.meta == b.meta
         assert a.content_hash() == b.content_hash() == entry.hash
         assert all((getattr(a, name) == getattr(b, name)).all() for name in entry.channels)

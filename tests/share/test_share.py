@@ -77,7 +77,8 @@ def test_what_would_be_lost_is_replaced_only_when_asked(dataset, arm, run, place
 def test_a_pull_into_a_dataset_brings_what_it_lacks_and_touches_nothing_else(
     dataset, arm, place, tmp_path, capsys
 ):
-    back, split = tmp_path / "back", tmp_path / "back" / "splits" / "motion.json"
+    back = tmp_path / "back"
+    split = back / "splits" / "motion.json"
     push(dataset.path, place)
     pull(place, back)
     add(Dataset(back), arm, ["mine"], unit_id="mine")
@@ -401,41 +402,74 @@ def test_samples_that_were_changed_are_refused(dataset, place, forge, tmp_path):
     assert not (tmp_path / "back").exists()
 
 
-@pytest.mark.parametrize(
-    "what", ["contents", "shard", "robot", "no robot", "own", "cut", "kind", "half", "another file"]
-)
-def test_a_place_with_other_content_than_its_index_says_is_one_line(
-    dataset, place, hub, forge, tmp_path, capsys, what
-):
-    push(dataset.path, place)
+def file_with(index, part):
+    return next(name for name in index["files"] if part in name)
 
-    def change(index, put, read):
-        data = next(name for name in index["files"] if "/data/" in name)
-        if what == "contents":
-            index["contents"][0] = "0" * 64
-        if what == "shard":
-            del index["files"][data]
-        if what == "robot":
-            put("gaponet/robot/robot.xml", b'<mujoco><include file="/etc/passwd"/></mujoco>')
-        if what == "no robot":
-            put("gaponet/robot/robot.xml", b"<mujoco>")
-        if what == "own":
-            del index["files"][
-                next(name for name in index["files"] if name.endswith("meta/gaponet.json"))
-            ]
-        if what == "cut":
-            put(data, read(data)[:-100])
-        if what == "kind":
-            index["kind"] = "run"
-        if what == "another file":
-            index["files"][data]["sha256"] = "0" * 64
 
-    forge(change)
-    if what == "half":
-        files = hub.files("datasets/me/arm")
-        hub.commit("datasets/me/arm", files | {"gaponet.json": files["gaponet.json"][:300]})
-    assert main(["pull", place, str(tmp_path / "back")]) == 2
+def another_content(index, put, read):
+    index["contents"][0] = "0" * 64
+
+
+def no_shard(index, put, read):
+    del index["files"][file_with(index, "/data/")]
+
+
+def a_robot_that_includes(index, put, read):
+    put("gaponet/robot/robot.xml", b'<mujoco><include file="/etc/passwd"/></mujoco>')
+
+
+def no_robot(index, put, read):
+    put("gaponet/robot/robot.xml", b"<mujoco>")
+
+
+def no_file_of_ours(index, put, read):
+    del index["files"][file_with(index, "meta/gaponet.json")]
+
+
+def a_cut_file(index, put, read):
+    data = file_with(index, "/data/")
+    put(data, read(data)[:-100])
+
+
+def another_kind(index, put, read):
+    index["kind"] = "run"
+
+
+def another_file(index, put, read):
+    index["files"][file_with(index, "/data/")]["sha256"] = "0" * 64
+
+
+CHANGES = [
+    another_content,
+    no_shard,
+    a_robot_that_includes,
+    no_robot,
+    no_file_of_ours,
+    a_cut_file,
+    another_kind,
+    another_file,
+]
+
+
+def assert_pull_refuses_in_one_line(place, back, capsys):
+    assert main(["pull", place, str(back)]) == 2
     line = capsys.readouterr().err.splitlines()[-1]
     assert line.startswith(f"Remote: {place}: ")
     assert ".gaponet-" not in line
-    assert not (tmp_path / "back").exists()
+    assert not back.exists()
+
+
+@pytest.mark.parametrize("change", CHANGES)
+def test_a_place_with_other_content_than_its_index_says_is_one_line(
+    dataset, place, forge, tmp_path, capsys, change
+):
+    push(dataset.path, place)
+    forge(change)
+    assert_pull_refuses_in_one_line(place, tmp_path / "back", capsys)
+
+
+def test_a_place_with_half_an_index_is_one_line(dataset, place, hub, tmp_path, capsys):
+    push(dataset.path, place)
+    files = hub.files("datasets/me/arm")
+    hub.commit("datasets/me/arm", files | {"gaponet.json": files["gaponet.json"][:300]})
+    assert_pull_refuses_in_one_line(place, tmp_path / "back", capsys)
