@@ -5,6 +5,7 @@ like it.
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -22,10 +23,12 @@ XML = """
   <worldbody>
     <body name="upper">
       <joint name="shoulder" axis="0 1 0" range="-1.5 1.5"/>
-      <geom type="capsule" fromto="0 0 0 0.2 0 0" size="0.02" mass="0.3" contype="0" conaffinity="0"/>
+      <geom type="capsule" fromto="0 0 0 0.2 0 0" size="0.02" mass="0.3"
+            contype="0" conaffinity="0"/>
       <body name="fore" pos="0.2 0 0">
         <joint name="elbow" axis="0 1 0" range="-1.5 1.5"/>
-        <geom type="capsule" fromto="0 0 0 0.2 0 0" size="0.02" mass="0.2" contype="0" conaffinity="0"/>
+        <geom type="capsule" fromto="0 0 0 0.2 0 0" size="0.02" mass="0.2"
+              contype="0" conaffinity="0"/>
       </body>
     </body>
   </worldbody>
@@ -84,7 +87,8 @@ def record(
     model.actuator_biasprm[:, 1] *= kp
     data = mujoco.MjData(model)
     data.qpos[:] = ctrl[0]
-    qpos, qvel = [], []
+    qpos = []
+    qvel = []
     for t in range(len(ctrl)):
         qpos.append(data.qpos.copy())
         qvel.append(data.qvel.copy())
@@ -102,9 +106,10 @@ def write_dataset(folder: Path, robot: RobotSpec, sequences: list[Sequence]) -> 
     return data
 
 
-def recordings(robot: RobotSpec, count: int = 6, rows: int = 150, **how: float) -> list[Sequence]:
+def recordings(robot: RobotSpec, count: int = 6, rows: int = 150, **how: Any) -> list[Sequence]:
     """Several motions, alternately empty-handed and with 0.2 kg."""
-    return [
-        record(robot, commands(rows, seed), f"motion{seed}", payload=0.2 * (seed % 2), **how)  # type: ignore[arg-type]
-        for seed in range(count)
-    ]
+    found = []
+    for seed in range(count):
+        ctrl = commands(rows, seed)
+        found.append(record(robot, ctrl, f"motion{seed}", payload=0.2 * (seed % 2), **how))
+    return found

@@ -67,7 +67,8 @@ class Browser:
         port, path = wait(lambda: (place / "DevToolsActivePort").read_text().split()[:2])
         self.socket = connect(f"ws://127.0.0.1:{port}{path}", max_size=None, open_timeout=PATIENCE)
         self.events: list[dict[str, Any]] = []
-        self.count, self.session = 0, ""
+        self.count = 0
+        self.session = ""
         targets = self.ask("Target.getTargets")["targetInfos"]
         page = next(t["targetId"] for t in targets if t["type"] == "page")
         self.session = self.ask("Target.attachToTarget", targetId=page, flatten=True)["sessionId"]

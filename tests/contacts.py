@@ -10,11 +10,52 @@ from __future__ import annotations
 
 import itertools
 import tomllib
+from typing import Any
 
 import mujoco
 import numpy as np
 
 from gaponet.robot.spec import RobotSpec
+
+
+def add_shapes(spec: mujoco.MjSpec, table: dict[str, Any]) -> None:
+    """Capsules in place of the shapes of their bodies, and the plane."""
+    shelled = {c["body"] for c in table["capsule"]}
+    for body in spec.bodies:
+        for geom in body.geoms:
+            geom.contype = geom.conaffinity = int(body.name not in shelled)
+    for c in table["capsule"]:
+        spec.body(c["body"]).add_geom(
+            type=mujoco.mjtGeom.mjGEOM_CAPSULE,
+            fromto=[*c["from"], *c["to"]],
+            size=[c["radius"], 0, 0],
+            mass=0,
+        )
+    spec.worldbody.add_geom(
+        name="plane",
+        type=mujoco.mjtGeom.mjGEOM_PLANE,
+        pos=[0, 0, table["plane"]["height"]],
+        size=[5, 5, 1],
+    )
+
+
+def exclude_limbs(spec: mujoco.MjSpec, table: dict[str, Any]) -> None:
+    """Leave out pairs of one group, and of bodies that carry each other."""
+    groups = [tuple(group.split()) for group in table["same_limb"]]
+    bodies = [body.name for body in spec.bodies if body.name != "world"]
+    for a, b in itertools.combinations(bodies, 2):
+        parent = spec.body(b).parent
+        carried_by = [parent.name, getattr(parent.parent, "name", "")]
+        if any(a.startswith(g) and b.startswith(g) for g in groups) or a in carried_by:
+            spec.add_exclude(bodyname1=a, bodyname2=b)
+
+
+def exclude_feet(spec: mujoco.MjSpec, table: dict[str, Any]) -> None:
+    """Leave out what stands on the plane."""
+    standing = tuple(table["plane"]["stands"].split())
+    for body in spec.bodies:
+        if body.name.startswith(standing) or "ankle" in body.name:
+            spec.add_exclude(bodyname1="world", bodyname2=body.name)
 
 
 class Contacts:
@@ -28,33 +69,9 @@ class Contacts:
         table = tomllib.loads((robot.folder / "collision.toml").read_text())
         spec = mujoco.MjSpec.from_file(str(robot.mjcf))
         spec.option.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
-        shelled = {c["body"] for c in table["capsule"]}
-        for body in spec.bodies:
-            for geom in body.geoms:
-                geom.contype = geom.conaffinity = int(body.name not in shelled)
-        for c in table["capsule"]:
-            spec.body(c["body"]).add_geom(
-                type=mujoco.mjtGeom.mjGEOM_CAPSULE,
-                fromto=[*c["from"], *c["to"]],
-                size=[c["radius"], 0, 0],
-                mass=0,
-            )
-        spec.worldbody.add_geom(
-            name="plane",
-            type=mujoco.mjtGeom.mjGEOM_PLANE,
-            pos=[0, 0, table["plane"]["height"]],
-            size=[5, 5, 1],
-        )
-        groups = [tuple(group.split()) for group in table["same_limb"]]
-        bodies = [body.name for body in spec.bodies if body.name != "world"]
-        for a, b in itertools.combinations(bodies, 2):
-            carried_by = [spec.body(b).parent.name, getattr(spec.body(b).parent.parent, "name", "")]
-            if any(a.startswith(g) and b.startswith(g) for g in groups) or a in carried_by:
-                spec.add_exclude(bodyname1=a, bodyname2=b)
-        for body in spec.bodies:
-            stands = body.name.startswith(tuple(table["plane"]["stands"].split()))
-            if stands or "ankle" in body.name:  # feet are on the floor
-                spec.add_exclude(bodyname1="world", bodyname2=body.name)
+        add_shapes(spec, table)
+        exclude_limbs(spec, table)
+        exclude_feet(spec, table)
         self.model = spec.compile()
         self.data = mujoco.MjData(self.model)
         self.model.geom_margin[:] = 0.0

@@ -12,6 +12,10 @@ from pathlib import Path
 import pytest
 
 
+def runs(python: str) -> bool:
+    return subprocess.run([python, "-c", ""], capture_output=True).returncode == 0
+
+
 def environment(name: str, version: str, *installs: tuple[str, ...]) -> str:
     """The Python of an environment; skips the test where it cannot be made, and fails it where CI
     asked for it.
@@ -30,7 +34,6 @@ def environment(name: str, version: str, *installs: tuple[str, ...]) -> str:
             shutil.which(f"python{version}"),
             *map(str, pyenv.glob(f"versions/{version}.*/bin/python")),
         ]
-        runs = lambda path: subprocess.run([path, "-c", ""], capture_output=True).returncode == 0  # noqa: E731
         found = next((path for path in named if path and runs(path)), None)
         if found is None:
             give_up(f"no Python {version} here")

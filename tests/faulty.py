@@ -19,7 +19,8 @@ from gaponet.robot.spec import RobotSpec
 from gaponet.sim.dynamics import dynamics_of, gravity_of
 from gaponet.sim.model import build_model
 
-SECONDS, DELAY = 24.0, 2  # of a motion; periods until a command arrives
+SECONDS = 24.0  # of a motion
+DELAY = 2  # periods until a command arrives
 MASSES = (0.0, 0.0, 0.0, 0.2, 0.2, 0.2)
 
 
@@ -47,9 +48,11 @@ class Recording:
 
 def commands(robot: RobotSpec, seed: int) -> np.ndarray:
     """From posture to posture with rests of a second, and a faster sine at the end, (T, n) rad."""
-    rng, dt = np.random.default_rng(seed), robot.dt
+    rng = np.random.default_rng(seed)
+    dt = robot.dt
     low, high = np.clip(robot.qpos_range.T, -1.2, 1.2) * 0.8
-    at, parts = robot.qpos_home.copy(), []
+    at = robot.qpos_home.copy()
+    parts = []
     while sum(map(len, parts)) * dt < SECONDS - 6:
         goal = np.where(
             np.isin(robot.joint_names, robot.operated), rng.uniform(low, high), robot.qpos_home
@@ -77,7 +80,8 @@ def recordings(robot: RobotSpec, kp: float = 0.9) -> list[Recording]:
         model.actuator_gainprm[:, 0] *= kp
         model.actuator_biasprm[:, 1] *= kp
         model.dof_frictionloss *= 1.3
-        data, rng = mujoco.MjData(model), np.random.default_rng(seed + 100)
+        data = mujoco.MjData(model)
+        rng = np.random.default_rng(seed + 100)
         ctrl = commands(robot, seed)
         data.qpos[:] = ctrl[0]
         state = []
@@ -186,7 +190,8 @@ def at(
     return change
 
 
-ARM, J = [0, 1, 2, 3, 4], 2  # of an SO-101; a joint that carries weight
+ARM = [0, 1, 2, 3, 4]  # of an SO-101
+J = 2  # a joint that carries weight
 EVERY = slice(None)
 FAULTS: dict[str, tuple[Callable[[list[Recording]], list[Recording]], dict[str, object]]] = {
     "sign of command and state": (

@@ -13,7 +13,9 @@ from gaponet.robot.spec import RobotSpec, load_robot
 COMMON = """<mujocoinclude>
   <default>
     <joint damping="0.51234567891" armature="0.02" frictionloss="0.05"/>
-    <default class="look"><geom contype="0" conaffinity="0" group="2" type="mesh" mesh="link" mass="0"/></default>
+    <default class="look">
+      <geom contype="0" conaffinity="0" group="2" type="mesh" mesh="link" mass="0"/>
+    </default>
   </default>
 </mujocoinclude>
 """
@@ -21,19 +23,25 @@ XML = """<mujoco model="vendor">
   <compiler angle="degree" eulerseq="zyx" meshdir="meshes" autolimits="true"/>
   <include file="common.xml"/>
   <option integrator="implicitfast" gravity="0 0.1 -9.80665"><flag contact="CONTACT"/></option>
-  <asset><mesh name="link" file="link.obj" scale="1 1.1 1"/><material name="grey" rgba="0.5 0.5 0.5 1"/></asset>
+  <asset>
+    <mesh name="link" file="link.obj" scale="1 1.1 1"/>
+    <material name="grey" rgba="0.5 0.5 0.5 1"/>
+  </asset>
   <worldbody>
     <light pos="0 0 1"/>
     <geom type="plane" size="1 1 0.1" pos="0 0 -0.05"/>
     <frame pos="0 0 0.21234567" euler="0 20 30">
       <body name="upper" euler="5 0 0">
         <joint name="shoulder" axis="0 1 0.1" range="-80 85" ref="3"/>
-        <geom type="mesh" mesh="link" density="1500" contype="0" conaffinity="0" material="grey" euler="1 2 3"/>
+        <geom type="mesh" mesh="link" density="1500" contype="0" conaffinity="0"
+              material="grey" euler="1 2 3"/>
         <body name="fore" pos="0.2 0 0">
           <joint name="elbow" axis="0 1 0" range="-80 80" stiffness="0.3" springref="4"/>
           <geom class="look"/>
           <geom type="capsule" fromto="0 0 0 0.2 0 0" size="0.02" mass="0.2"/>
-          <body name="tool" pos="0.2 0 0" quat="1 0.1 0.2 0.3"><geom type="mesh" mesh="link" mass="0.05"/></body>
+          <body name="tool" pos="0.2 0 0" quat="1 0.1 0.2 0.3">
+            <geom type="mesh" mesh="link" mass="0.05"/>
+          </body>
         </body>
       </body>
     </frame>
@@ -43,8 +51,10 @@ XML = """<mujoco model="vendor">
 </mujoco>
 """
 CORNERS = [(x, y + 0.01 * z, z) for x in (0.0, 0.2) for y in (0.0, 0.05) for z in (0.0, 0.031)]
-FACES = [(1, 2, 4), (1, 4, 3), (5, 8, 6), (5, 7, 8), (1, 6, 2), (1, 5, 6), (3, 4, 8), (3, 8, 7), (1, 3, 7), (1, 7, 5),
-         (2, 6, 8), (2, 8, 4)]  # fmt: skip
+FACES = [
+    (1, 2, 4), (1, 4, 3), (5, 8, 6), (5, 7, 8), (1, 6, 2), (1, 5, 6),
+    (3, 4, 8), (3, 8, 7), (1, 3, 7), (1, 7, 5), (2, 6, 8), (2, 8, 4),
+]  # fmt: skip
 
 
 def write_files_arm(

@@ -45,6 +45,12 @@ class FakeHub(ThreadingHTTPServer):
         return oid
 
 
+def upload_mode(path: str) -> dict[str, object]:
+    """How the Hub wants to have a file."""
+    mode = "lfs" if path.endswith(LARGE) else "regular"
+    return {"path": path, "uploadMode": mode, "shouldIgnore": False}
+
+
 class Handler(BaseHTTPRequestHandler):
     protocol_version = "HTTP/1.1"
     server: FakeHub
@@ -130,42 +136,25 @@ class Handler(BaseHTTPRequestHandler):
             self.refuse(404, "RevisionNotFound")
 
     def do_PUT(self) -> None:
-        oid, data = self.path.rpartition("/")[2], self.body()
+        oid = self.path.rpartition("/")[2]
+        data = self.body()
         assert hashlib.sha256(data).hexdigest() == oid
         self.server.blobs[oid] = data
         self.server.sent[oid] += 1
         self.answer({})
 
     def do_POST(self) -> None:
-        path, data = unquote(urlsplit(self.path).path), self.body()
+        path = unquote(urlsplit(self.path).path)
+        data = self.body()
         if path == "/api/repos/create":
-            asked = json.loads(data)
-            repo = f"{asked.get('type', 'model')}s/{asked['organization']}/{asked['name']}"
-            there = repo in self.server.repos
-            if not there:
-                self.server.commit(repo, {".gitattributes": b"*.parquet filter=lfs\n"})
-            self.answer(
-                {"url": f"{self.server.url}/{repo.removeprefix('models/')}"}, 409 if there else 200
-            )
+            self.create(json.loads(data))
         elif path == "/api/validate-yaml":
             self.answer({"errors": [], "warnings": []})
         elif re.fullmatch(rf"{REPO}/preupload/[^/]+", path):
-            mode = lambda name: "lfs" if name.endswith(LARGE) else "regular"  # noqa: E731
-            self.answer(
-                {
-                    "files": [
-                        {"path": f["path"], "uploadMode": mode(f["path"]), "shouldIgnore": False}
-                        for f in json.loads(data)["files"]
-                    ]
-                }
-            )
+            self.answer({"files": [upload_mode(f["path"]) for f in json.loads(data)["files"]]})
         elif re.fullmatch(r"/(datasets/)?([^/]+/[^/]+)\.git/info/lfs/objects/batch", path):
-            self.answer(
-                {
-                    "transfer": "basic",
-                    "objects": [self.batch(o) for o in json.loads(data)["objects"]],
-                }
-            )
+            objects = [self.batch(o) for o in json.loads(data)["objects"]]
+            self.answer({"transfer": "basic", "objects": objects})
         elif m := re.fullmatch(rf"{REPO}/tag/([^/]+)", path):
             if found := self.at(m[1], m[2]):
                 self.server.tags.setdefault(m[1], {})[json.loads(data)["tag"]] = found[0]
@@ -176,6 +165,14 @@ class Handler(BaseHTTPRequestHandler):
         else:
             self.refuse(404, "NotFound")
 
+    def create(self, asked: dict[str, str]) -> None:
+        repo = f"{asked.get('type', 'model')}s/{asked['organization']}/{asked['name']}"
+        there = repo in self.server.repos
+        if not there:
+            self.server.commit(repo, {".gitattributes": b"*.parquet filter=lfs\n"})
+        url = f"{self.server.url}/{repo.removeprefix('models/')}"
+        self.answer({"url": url}, 409 if there else 200)
+
     def batch(self, asked: dict[str, object]) -> dict[str, object]:
         upload = {"upload": {"href": f"{self.server.url}/lfs/{asked['oid']}"}}
         return asked if asked["oid"] in self.server.blobs else asked | {"actions": upload}
@@ -185,7 +182,8 @@ class Handler(BaseHTTPRequestHandler):
     ) -> None:
         files = dict(parent[1])
         for line in lines:
-            key, value = line["key"], line["value"]
+            key = line["key"]
+            value = line["value"]
             if key == "header" and value.get("parentCommit", parent[0]) != parent[0]:
                 self.refuse(412, "ParentCommitChanged")
                 return

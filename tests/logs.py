@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -177,13 +178,14 @@ def arm_sequence(
     qpos: np.ndarray,
     motion: str = "m",
     payload: float = 0.0,
-    **fields: object,
+    **fields: Any,
 ) -> Sequence:
     """A sequence of any robot at its own rate; qvel is the derivative unless given."""
     notes = fields.pop("notes", {})
-    meta = SequenceMeta(robot.name, str(fields.pop("unit", "a")), motion, payload, notes=notes)  # type: ignore[arg-type]
+    unit = str(fields.pop("unit", "a"))
+    meta = SequenceMeta(robot.name, unit, motion, payload, notes=notes)
     qvel = fields.pop("qvel", np.gradient(qpos, robot.dt, axis=0))
-    return Sequence(meta, robot.joint_names, robot.dt, ctrl, qpos, qvel, **fields)  # type: ignore[arg-type]
+    return Sequence(meta, robot.joint_names, robot.dt, ctrl, qpos, qvel, **fields)
 
 
 def repeated_motions(folder: Path, robot: RobotSpec) -> Dataset:
@@ -203,7 +205,8 @@ def repeated_motions(folder: Path, robot: RobotSpec) -> Dataset:
 
 def write_bam(file: Path, rows: int = 60, off: int | None = None, **changes: object) -> Path:
     """One recording of BAM's test bench at firmware gain 400; torque off from row `off` on."""
-    ctrl, qpos = wave(rows, 1, 0.0053)[:, 0], late(wave(rows, 1, 0.0053), 3)[:, 0]
+    ctrl = wave(rows, 1, 0.0053)[:, 0]
+    qpos = late(wave(rows, 1, 0.0053), 3)[:, 0]
     entries = [
         {
             "timestamp": 0.0035 + 0.0053 * i,

@@ -17,10 +17,13 @@ def write_motion(path: str | Path, motion: Motion, robot: RobotSpec) -> None:
     if path.suffix == ".npz":
         np.savez(path, joint_names=np.array(robot.joint_names), ctrl=motion.ctrl, dt=motion.dt)
         return
-    names, ctrl = list(robot.joint_names), motion.ctrl
     if path.suffix == ".txt":
-        ctrl = motion.sample(SAGE_PERIOD_S)
+        names = list(robot.joint_names)
+        table = motion.sample(SAGE_PERIOD_S)
     else:
-        names, ctrl = ["time", *names], np.column_stack([np.arange(len(ctrl)) * motion.dt, ctrl])
-    lines = [",".join(names), *(",".join(f"{v:.9g}" for v in row) for row in ctrl)]
+        names = ["time", *robot.joint_names]
+        table = np.column_stack([np.arange(len(motion.ctrl)) * motion.dt, motion.ctrl])
+    lines = [",".join(names)]
+    for row in table:
+        lines.append(",".join(f"{value:.9g}" for value in row))
     path.write_text("\n".join(lines) + "\n")

@@ -42,17 +42,24 @@ def read_checkpoint(run: Path) -> dict[str, Any]:
 
 def differences(a: Any, b: Any, where: str = "") -> list[str]:
     """Paths at which two nested states differ, times in seconds aside."""
-    if isinstance(a, dict):
-        assert a.keys() == b.keys()
-        return [d for k in a for d in differences(a[k], b[k], f"{where}/{k}")]
     if isinstance(a, (list, tuple)):
-        return [
-            d
-            for i, (x, y) in enumerate(zip(a, b, strict=True))
-            for d in differences(x, y, f"{where}/{i}")
-        ]
-    same = torch.equal(a, b) if isinstance(a, torch.Tensor) else a == b or (a != a and b != b)
-    return [] if same or where.endswith("/seconds") else [where]
+        assert len(a) == len(b)
+        a = dict(enumerate(a))
+        b = dict(enumerate(b))
+    if not isinstance(a, dict):
+        return [] if where.endswith("/seconds") or same(a, b) else [where]
+    assert a.keys() == b.keys()
+    found = []
+    for key in a:
+        found += differences(a[key], b[key], f"{where}/{key}")
+    return found
+
+
+def same(a: Any, b: Any) -> bool:
+    """Whether two values are equal, or both NaN."""
+    if isinstance(a, torch.Tensor):
+        return torch.equal(a, b)
+    return a == b or (a != a and b != b)
 
 
 def untrained(
@@ -105,15 +112,15 @@ def corrects_by(delta: float, robot: RobotSpec, folder: Path) -> GapModel:
 
 
 def random_run(
-    folder: Path, robot: RobotSpec, payload_seen: tuple[float, ...] = (0.0, 0.2), **how: object
+    folder: Path, robot: RobotSpec, payload_seen: tuple[float, ...] = (0.0, 0.2), **how: Any
 ) -> GapModel:
     """A run whose operator answers anything, up to some 0.1 rad: whatever it is told makes a
     difference.
     """
-    small = {"history": 2, "stride": 2, "num_probes": 4}
+    small: dict[str, Any] = {"history": 2, "stride": 2, "num_probes": 4}
     small |= dict.fromkeys(("branch_hidden", "trunk_hidden", "sensor_hidden"), (8,))
     torch.manual_seed(0)
-    net = build_network(ModelConfig(**small | how), len(robot.operated)).eval()  # type: ignore[arg-type]
+    net = build_network(ModelConfig(**small | how), len(robot.operated)).eval()
     with torch.no_grad():
         for p in net.parameters():
             p.add_(0.1 * torch.randn_like(p))

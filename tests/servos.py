@@ -16,9 +16,14 @@ from contextlib import contextmanager
 
 # address, bytes: from Feetech's memory table
 REGISTERS = {
-    "model": (3, 2), "id": (5, 1), "low": (9, 2), "high": (11, 2), "max_torque": (16, 2), "p": (21, 1), "d": (22, 1),
-    "i": (23, 1), "homing": (31, 2), "mode": (33, 1), "torque": (40, 1), "acceleration": (41, 1), "goal": (42, 2),
-    "speed": (46, 2), "torque_limit": (48, 2), "position": (56, 2), "voltage": (62, 1), "celsius": (63, 1),
+    "model": (3, 2), "id": (5, 1), "low": (9, 2), "high": (11, 2), "max_torque": (16, 2),
+    "p": (21, 1), "d": (22, 1), "i": (23, 1), "homing": (31, 2), "mode": (33, 1),
+    "torque": (40, 1), "acceleration": (41, 1), "goal": (42, 2), "speed": (46, 2),
+    "torque_limit": (48, 2), "position": (56, 2), "voltage": (62, 1), "celsius": (63, 1),
+}  # fmt: skip
+FACTS = {  # of each servo
+    "model": 777, "low": 1000, "high": 3000, "max_torque": 1000, "p": 16, "d": 32,
+    "torque_limit": 1000, "position": 2000, "voltage": 120, "celsius": 30,
 }  # fmt: skip
 Adversary = Callable[[int, bytes], bytes]  # servo, its reply → what reaches the driver
 
@@ -33,9 +38,8 @@ class Servos:
         self.adversary: Adversary = lambda servo, reply: reply
         self._pending = b""
         for number in range(1, 7):
-            facts = {"model": 777, "id": number, "low": 1000, "high": 3000, "max_torque": 1000, "p": 16, "d": 32,
-                     "torque_limit": 1000, "position": 2000, "voltage": 120, "celsius": 30}  # fmt: skip
-            for name, value in facts.items():
+            self.set(number, "id", number)
+            for name, value in FACTS.items():
                 self.set(number, name, value)
 
     def get(self, servo: int, name: str) -> int:
@@ -63,7 +67,8 @@ class Servos:
             ):
                 return said
             end = at + 4 + self._pending[at + 3]
-            request, self._pending = self._pending[at:end], self._pending[end:]
+            request = self._pending[at:end]
+            self._pending = self._pending[end:]
             assert sum(request[2:]) % 256 == 255, "the request's checksum is wrong"
             self.heard.append(request)
             said += self.obey(request[2], request[4], request[5:-1])
@@ -106,7 +111,9 @@ class Wire:
     """A serial port at whose other end servos answer at once."""
 
     def __init__(self, servos: Servos) -> None:
-        self.servos, self.buffer, self.lost = servos, b"", False
+        self.servos = servos
+        self.buffer = b""
+        self.lost = False
 
     def _there(self) -> None:
         if self.lost:
@@ -119,7 +126,8 @@ class Wire:
 
     def read(self, size: int = 1) -> bytes:
         self._there()
-        out, self.buffer = self.buffer[:size], self.buffer[size:]
+        out = self.buffer[:size]
+        self.buffer = self.buffer[size:]
         return out
 
     def write(self, data: bytes) -> int:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import pickle
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from logs import late, wave
@@ -64,7 +65,9 @@ def write_aloha(folder: Path, rows: int = ROWS) -> None:
 
     ctrl, qpos = motion(rows)
     with h5py.File(folder / "episode_0.hdf5", "w") as file:
-        file["action"], file["observations/qpos"], file["observations/qvel"] = ctrl, qpos, 0 * qpos
+        file["action"] = ctrl
+        file["observations/qpos"] = qpos
+        file["observations/qvel"] = 0 * qpos
         file["observations/images/top"] = np.zeros((rows, 2, 2, 3), np.uint8)
     (folder / "logs.toml").write_text("rate = 50.0\n" + TOML)
 
@@ -108,6 +111,157 @@ def write_asap(folder: Path, rows: int = ROWS) -> None:
 CUSTOM = "std_msgs/Header header\nstring[] joints\nfloat64[] position\nfloat32[3] gains\nuint8 mode"
 
 
+class Messages:
+    """Messages of ROS 2.
+
+    Attributes:
+        store: The types.
+        tau: Torque that Unitree's command feeds forward, N·m.
+    """
+
+    def __init__(self, tau: float) -> None:
+        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+        from gaponet.data.formats.rosbag import CONTROLLER, HG
+
+        texts = {f"unitree_hg/msg/{name}": text for name, text in HG.items()}
+        texts["my_robot_msgs/msg/JointCommand"] = CUSTOM
+        texts["control_msgs/msg/JointTrajectoryControllerState"] = CONTROLLER
+        self.store = get_typestore(Stores.ROS2_HUMBLE)
+        for kind, text in texts.items():
+            self.store.register(get_types_from_msg(text, kind))
+        self.tau = tau
+
+    def make(self, kind: str, **fields: object) -> Any:
+        return self.store.types[kind](**fields)
+
+    def command(self, kind: str, t: float, x: np.ndarray) -> Any:
+        """A message of one of the kinds of write_bag."""
+        if kind == "trajectory":
+            return self.trajectory(t, x)
+        if kind == "custom":
+            return self.custom(t, x)
+        if kind == "array":
+            return self.array(x)
+        if kind == "controller":
+            return self.controller(t, x)
+        if kind == "unitree":
+            return self.low_command(x)
+        return self.state(t, x)
+
+    def header(self, t: float) -> Any:
+        stamp = self.make("builtin_interfaces/msg/Time", sec=int(t), nanosec=round(t % 1 * 1e9))
+        return self.make("std_msgs/msg/Header", stamp=stamp, frame_id="")
+
+    def state(self, t: float, x: np.ndarray) -> Any:
+        none = np.array([])
+        return self.make(
+            "sensor_msgs/msg/JointState",
+            header=self.header(t),
+            name=list(JOINTS),
+            position=x,
+            velocity=none,
+            effort=none,
+        )
+
+    def point(self, x: np.ndarray) -> Any:
+        zero = self.make("builtin_interfaces/msg/Duration", sec=0, nanosec=0)
+        none = np.array([])
+        return self.make(
+            "trajectory_msgs/msg/JointTrajectoryPoint",
+            positions=x,
+            velocities=none,
+            accelerations=none,
+            effort=none,
+            time_from_start=zero,
+        )
+
+    def trajectory(self, t: float, x: np.ndarray) -> Any:
+        return self.make(
+            "trajectory_msgs/msg/JointTrajectory",
+            header=self.header(t),
+            joint_names=list(JOINTS),
+            points=[self.point(x)],
+        )
+
+    def custom(self, t: float, x: np.ndarray) -> Any:
+        return self.make(
+            "my_robot_msgs/msg/JointCommand",
+            header=self.header(t),
+            joints=list(JOINTS),
+            position=x,
+            gains=np.ones(3, np.float32),
+            mode=2,
+        )
+
+    def array(self, x: np.ndarray) -> Any:
+        layout = self.make("std_msgs/msg/MultiArrayLayout", dim=[], data_offset=0)
+        return self.make("std_msgs/msg/Float64MultiArray", layout=layout, data=x)
+
+    def controller(self, t: float, x: np.ndarray) -> Any:
+        return self.make(
+            "control_msgs/msg/JointTrajectoryControllerState",
+            header=self.header(t),
+            joint_names=list(JOINTS),
+            reference=self.point(x),
+            feedback=self.point(x),
+            error=self.point(0 * x),
+            output=self.point(np.array([])),
+        )
+
+    def motors(self, kind: str, x: np.ndarray, **rest: object) -> list[Any]:
+        """All 35 motors; the first two are the joints."""
+        return [
+            self.make(kind, q=float(x[i]) if i < 2 else 0.0, dq=0.0, mode=1, **rest)
+            for i in range(35)
+        ]
+
+    def low_command(self, x: np.ndarray) -> Any:
+        kind = "unitree_hg/msg/MotorCmd"
+        return self.make(
+            "unitree_hg/msg/LowCmd",
+            mode_pr=0,
+            mode_machine=0,
+            motor_cmd=self.motors(kind, x, reserve=0, tau=self.tau, kp=20.0, kd=1.0),
+            reserve=np.zeros(4, np.uint32),
+            crc=0,
+        )
+
+    def low_state(self, x: np.ndarray) -> Any:
+        three = np.zeros(3, np.float32)
+        imu = self.make(
+            "unitree_hg/msg/IMUState",
+            quaternion=np.zeros(4, np.float32),
+            gyroscope=three,
+            accelerometer=three,
+            rpy=three,
+            temperature=0,
+        )
+        motors = self.motors(
+            "unitree_hg/msg/MotorState",
+            x,
+            ddq=0.0,
+            tau_est=0.0,
+            temperature=np.zeros(2, np.int16),
+            vol=0.0,
+            motorstate=0,
+            sensor=np.zeros(2, np.uint32),
+            reserve=np.zeros(4, np.uint32),
+        )
+        return self.make(
+            "unitree_hg/msg/LowState",
+            version=np.zeros(2, np.uint32),
+            mode_pr=0,
+            mode_machine=0,
+            tick=0,
+            imu_state=imu,
+            motor_state=motors,
+            wireless_remote=np.zeros(40, np.uint8),
+            reserve=np.zeros(4, np.uint32),
+            crc=0,
+        )
+
+
 def write_bag(
     bag: Path,
     storage: str = "mcap",
@@ -128,146 +282,31 @@ def write_bag(
         tau: Torque that Unitree's command feeds forward, N·m.
     """
     from rosbags.rosbag2 import StoragePlugin, Writer
-    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-    from gaponet.data.formats.rosbag import CONTROLLER, HG
-
-    store = get_typestore(Stores.ROS2_HUMBLE)
-    for name, text in HG.items():
-        store.register(get_types_from_msg(text, f"unitree_hg/msg/{name}"))
-    store.register(get_types_from_msg(CUSTOM, "my_robot_msgs/msg/JointCommand"))
-    store.register(
-        get_types_from_msg(CONTROLLER, "control_msgs/msg/JointTrajectoryControllerState")
-    )
-    make = lambda kind, **fields: store.types[kind](**fields)  # noqa: E731
+    messages = Messages(tau)
     ctrl, qpos = motion(rows)
-    none = np.array([])
-
-    def header(t: float) -> object:
-        stamp = make("builtin_interfaces/msg/Time", sec=int(t), nanosec=round(t % 1 * 1e9))
-        return make("std_msgs/msg/Header", stamp=stamp, frame_id="")
-
-    def state(t: float, x: np.ndarray) -> tuple[str, object]:
-        kind = "sensor_msgs/msg/JointState"
-        return kind, make(
-            kind, header=header(t), name=list(JOINTS), position=x, velocity=none, effort=none
-        )
-
-    def point(x: np.ndarray) -> object:
-        zero = make("builtin_interfaces/msg/Duration", sec=0, nanosec=0)
-        return make(
-            "trajectory_msgs/msg/JointTrajectoryPoint",
-            positions=x,
-            velocities=none,
-            accelerations=none,
-            effort=none,
-            time_from_start=zero,
-        )
-
-    def motors(kind: str, x: np.ndarray) -> list[object]:
-        rest = (
-            {"mode": 1, "reserve": 0, "tau": tau, "kp": 20.0, "kd": 1.0}
-            if kind.endswith("Cmd")
-            else {
-                "mode": 1,
-                "ddq": 0.0,
-                "tau_est": 0.0,
-                "temperature": np.zeros(2, np.int16),
-                "vol": 0.0,
-                "motorstate": 0,
-                "sensor": np.zeros(2, np.uint32),
-                "reserve": np.zeros(4, np.uint32),
-            }
-        )
-        return [make(kind, q=float(x[i]) if i < 2 else 0.0, dq=0.0, **rest) for i in range(35)]
-
-    def message(kind: str, t: float, x: np.ndarray) -> tuple[str, object]:
-        if kind == "trajectory":
-            told = "trajectory_msgs/msg/JointTrajectory"
-            return told, make(told, header=header(t), joint_names=list(JOINTS), points=[point(x)])
-        if kind == "custom":
-            told = "my_robot_msgs/msg/JointCommand"
-            return told, make(
-                told,
-                header=header(t),
-                joints=list(JOINTS),
-                position=x,
-                gains=np.ones(3, np.float32),
-                mode=2,
-            )
-        if kind == "array":
-            layout = make("std_msgs/msg/MultiArrayLayout", dim=[], data_offset=0)
-            return "std_msgs/msg/Float64MultiArray", make(
-                "std_msgs/msg/Float64MultiArray", layout=layout, data=x
-            )
-        if kind == "controller":
-            told = "control_msgs/msg/JointTrajectoryControllerState"
-            return told, make(
-                told,
-                header=header(t),
-                joint_names=list(JOINTS),
-                reference=point(x),
-                feedback=point(x),
-                error=point(0 * x),
-                output=point(none),
-            )
-        if kind == "unitree":
-            told, four = "unitree_hg/msg/LowCmd", np.zeros(4, np.uint32)
-            return told, make(
-                told,
-                mode_pr=0,
-                mode_machine=0,
-                motor_cmd=motors("unitree_hg/msg/MotorCmd", x),
-                reserve=four,
-                crc=0,
-            )
-        return state(t, x)
-
-    def low_state(x: np.ndarray) -> tuple[str, object]:
-        three = np.zeros(3, np.float32)
-        imu = make(
-            "unitree_hg/msg/IMUState",
-            quaternion=np.zeros(4, np.float32),
-            gyroscope=three,
-            accelerometer=three,
-            rpy=three,
-            temperature=0,
-        )
-        told = "unitree_hg/msg/LowState"
-        return told, make(
-            told,
-            version=np.zeros(2, np.uint32),
-            mode_pr=0,
-            mode_machine=0,
-            tick=0,
-            imu_state=imu,
-            motor_state=motors("unitree_hg/msg/MotorState", x),
-            wireless_remote=np.zeros(40, np.uint8),
-            reserve=np.zeros(4, np.uint32),
-            crc=0,
-        )
-
     plugin = StoragePlugin.MCAP if storage == "mcap" else StoragePlugin.SQLITE3
     with Writer(bag, version=9, storage_plugin=plugin) as writer:
-        topics: dict[str, object] = {}
+        topics: dict[str, Any] = {}
 
-        def send(topic: str, received: float, told: tuple[str, object]) -> None:
-            kind, content = told
+        def send(topic: str, received: float, message: Any) -> None:
+            kind = message.__msgtype__
             if topic not in topics:
-                topics[topic] = writer.add_connection(topic, kind, typestore=store)
-            writer.write(topics[topic], round(received * 1e9), store.serialize_cdr(content, kind))
+                topics[topic] = writer.add_connection(topic, kind, typestore=messages.store)
+            data = messages.store.serialize_cdr(message, kind)
+            writer.write(topics[topic], round(received * 1e9), data)
 
         for i in range(rows):
             t = 100.0 + 0.02 * i
-            for _ in range(1 + twice):
-                send(
-                    "/joint_states",
-                    t + 0.001,
-                    low_state(qpos[i]) if command == "unitree" else state(t, qpos[i]),
-                )
+            for _ in range(2 if twice else 1):
+                if command == "unitree":
+                    state = messages.low_state(qpos[i])
+                else:
+                    state = messages.state(t, qpos[i])
+                send("/joint_states", t + 0.001, state)
             if i % 2 == 0 and with_command:
-                told = message(command, t + 0.004 + away + drift * (t - 100.0), ctrl[i])
-                send("/arm/commands", t + 0.005, told)
+                sent = t + 0.004 + away + drift * (t - 100.0)
+                send("/arm/commands", t + 0.005, messages.command(command, sent, ctrl[i]))
     return bag
 
 

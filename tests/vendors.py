@@ -11,7 +11,9 @@ MJCF = """<mujoco model="vendor">
   <option timestep="0.004"/>
   <default>
     <joint damping="0.4" armature="0.03" frictionloss="0.1"/>
-    <default class="look"><geom type="mesh" mesh="link" contype="0" conaffinity="0" mass="0"/></default>
+    <default class="look">
+      <geom type="mesh" mesh="link" contype="0" conaffinity="0" mass="0"/>
+    </default>
     <default class="servo"><position kp="60" dampratio="1" forcerange="-9 9"/></default>
   </default>
   <asset><mesh name="link" file="link.obj"/></asset>
@@ -49,13 +51,15 @@ MJCF = """<mujoco model="vendor">
     </body>
   </worldbody>
   <tendon>
-    <fixed name="grip"><joint joint="left_slide" coef="0.5"/><joint joint="right_slide" coef="0.5"/></fixed>
+    <fixed name="grip">
+      <joint joint="left_slide" coef="0.5"/><joint joint="right_slide" coef="0.5"/>
+    </fixed>
   </tendon>
   <equality><joint joint1="left_slide" joint2="right_slide"/></equality>
   <actuator>
     <position class="servo" name="shoulder_servo" joint="shoulder"/>
-    <general name="elbow_servo" joint="elbow" gear="2" gainprm="10" biastype="affine" biasprm="0 -10 -0.5"
-             forcerange="-4 4"/>
+    <general name="elbow_servo" joint="elbow" gear="2" gainprm="10"
+             biastype="affine" biasprm="0 -10 -0.5" forcerange="-4 4"/>
     <motor name="roll_motor" joint="roll" ctrlrange="-3 3" gear="0.5"/>
     <motor name="hip_motor" joint="hip" ctrlrange="-80 80"/>
     <position name="gripper" tendon="grip" kp="100"/>
@@ -91,20 +95,25 @@ URDF = """<robot name="bar">
   <link name="upper">
     <inertial><origin xyz="0.1 0 0"/><mass value="1.5"/>
       <inertia ixx="0.004" ixy="0" ixz="0" iyy="0.012" iyz="0" izz="0.012"/></inertial>
-    <visual><geometry><mesh filename="package://bar_description/meshes/link.obj"/></geometry></visual>
-    <collision><geometry><mesh filename="package://bar_description/meshes/link.dae"/></geometry></collision>
+    <visual><geometry>
+      <mesh filename="package://bar_description/meshes/link.obj"/></geometry></visual>
+    <collision><geometry>
+      <mesh filename="package://bar_description/meshes/link.dae"/></geometry></collision>
   </link>
   <link name="fore">
     <inertial><origin xyz="0.1 0 0"/><mass value="0.7"/>
       <inertia ixx="0.002" ixy="0" ixz="0" iyy="0.006" iyz="0" izz="0.006"/></inertial>
   </link>
   <link name="tool0"/>
-  <joint name="lift" type="revolute"><parent link="base"/><child link="upper"/><origin xyz="0 0 0.3" rpy="0 0.4 0"/>
+  <joint name="lift" type="revolute">
+    <parent link="base"/><child link="upper"/><origin xyz="0 0 0.3" rpy="0 0.4 0"/>
     <axis xyz="0 1 0"/><limit lower="-2" upper="2" effort="30" velocity="2"/>
     <dynamics damping="0.3" friction="0.2"/></joint>
-  <joint name="bend" type="continuous"><parent link="upper"/><child link="fore"/><origin xyz="0.25 0 0"/>
+  <joint name="bend" type="continuous">
+    <parent link="upper"/><child link="fore"/><origin xyz="0.25 0 0"/>
     <axis xyz="0 1 0"/><limit effort="12" velocity="2"/></joint>
-  <joint name="flange" type="fixed"><parent link="fore"/><child link="tool0"/><origin xyz="0.2 0 0"/></joint>
+  <joint name="flange" type="fixed">
+    <parent link="fore"/><child link="tool0"/><origin xyz="0.2 0 0"/></joint>
   <transmission name="t"><type>simple</type></transmission>
 </robot>
 """
