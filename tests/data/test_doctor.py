@@ -821,8 +821,13 @@ def test_recordings_of_two_robots_under_one_name_are_found(arm, tmp_path):
 
 def test_a_robot_without_a_place_for_payloads_is_judged_by_its_own_weight(tmp_path):
     arm = write_arm(tmp_path / "arm", TOML.split("[[payload_mount]]")[0])
-    logs = [resting(arm, seed, soft=3.0) for seed in range(4)]
-    finding = found(at_rest(arm, tmp_path, logs), "gains", "warning")
+    data = write_dataset(tmp_path / "data", arm, [resting(arm, s, soft=3.0) for s in range(4)])
+
+    def own_weight(qpos, mass, side):
+        assert mass == 0
+        return held(qpos, mass, side)
+
+    finding = found(DoctorResult.of(data, arm, gravity_model=own_weight), "gains", "warning")
     assert finding.joints == ("shoulder",)  # the elbow sags by 10 mrad, too little to tell
 
 

@@ -410,5 +410,5 @@ def test_two_repetitions_cannot_be_split_by_repetition(arm, tmp_path):
     data = Dataset.create(tmp_path / "data", arm)
     for lag in (2, 3):
         data.append(arm_sequence(arm, wave(60, 2), late(wave(60, 2), lag)))
-    with pytest.raises(UsageError, match="repetitions"):
+    with pytest.raises(UsageError, match="3 repetitions"):
         make_split(data, "repetition")

@@ -496,8 +496,8 @@ def test_a_sheet_says_which_recordings_are_virtual_which_to_leave_out_and_what_i
     ("lines", "word"),
     [
         (("file,virtual", "run_7,maybe"), "'maybe'"),
-        (("name,motion", "run_7,lift"), "file"),
-        (("file,motion",), "row"),
+        (("name,motion", "run_7,lift"), "column file"),
+        (("file,motion",), "column file"),
     ],
     ids=["neither yes nor no", "no column file", "no row"],
 )
@@ -549,7 +549,7 @@ def test_a_clock_with_fewer_rows_than_the_state_is_refused(tmp_path, arm):
     np.savez(tmp_path / "a.npz", target=ctrl, q=qpos, clock=0.02 * np.arange(len(qpos) - 1))
     told = 'ctrl = "target"\nqpos = "q"\ntime = "clock"\njoints = ["shoulder", "elbow"]\n'
     (tmp_path / "logs.toml").write_text(UNITS + told)
-    with pytest.raises(LogError, match="clock"):
+    with pytest.raises(LogError, match="'clock'"):
         list(read_logs(tmp_path, arm))
 
 

@@ -141,5 +141,6 @@ def test_an_address_of_another_store_is_to_be_downloaded(arm):
 
 def test_a_folder_of_nothing_that_could_be_a_log_names_the_formats(tmp_path):
     (tmp_path / "robot.stl").write_bytes(b"solid")
-    with pytest.raises(LogError, match="--formats"):
+    with pytest.raises(LogError, match="--formats") as refused:
         detect(tmp_path)
+    assert "--format table" not in str(refused.value)
