@@ -59,31 +59,31 @@ def whole(spec, fleet, tmp_path_factory):
     return out, done
 
 
-def test_every_take_is_there_once_and_says_virtual(whole, spec):
+def test_every_take_is_there_once(whole):
     out, done = whole
     dataset = Dataset(out)
     assert done.written == len(dataset) == 2 * 2 * 2 * 2
     assert done.hours == pytest.approx(dataset.hours())
-    keys = {
-        (m.motion, m.unit_id, m.payload_mass, e.dt, m.repetition)
-        for e in dataset.entries
-        for m in [e.meta]
-    }
-    assert len(keys) == 16
-    assert all(
-        e.meta.virtual and e.meta.unit_id.startswith("virtual-") and "virtual" in e.meta.source
-        for e in dataset.entries
-    )
-    assert set(dataset.entries[0].channels) == {
-        "ctrl",
-        "qpos",
-        "qvel",
-        "qacc",
-        "tau",
-        "tau_eq",
-        "temperature",
-    }
+    played = set()
+    for entry in dataset.entries:
+        meta = entry.meta
+        played.add((meta.motion, meta.unit_id, meta.payload_mass, entry.dt, meta.repetition))
+    assert len(played) == 16
+
+
+def test_every_recording_and_the_collection_say_virtual(whole):
+    out, _ = whole
+    for entry in Dataset(out).entries:
+        assert entry.meta.virtual
+        assert entry.meta.unit_id.startswith("virtual-")
+        assert "virtual" in entry.meta.source
     assert json.loads((out / "collect.json").read_text())["virtual"] is True
+
+
+def test_a_recording_has_every_channel(whole):
+    out, _ = whole
+    channels = {"ctrl", "qpos", "qvel", "qacc", "tau", "tau_eq", "temperature"}
+    assert set(Dataset(out).entries[0].channels) == channels
 
 
 def test_hidden_numbers_stay_out_of_the_dataset(whole):
@@ -102,9 +102,8 @@ def test_a_row_is_the_state_before_its_command(whole, spec):
     entry = next(e for e in dataset.entries if e.meta.motion == "steps-elbow" and e.dt == 0.02)
     s = dataset.read(entry)
     column = spec.index(["elbow"])[0]
-    assert np.array_equal(
-        s.ctrl, Library(spec, 5, 0.2).make("steps-elbow").sample(0.02).astype(np.float32)
-    )
+    motion = Library(spec, 5, 0.2).make("steps-elbow")
+    assert np.array_equal(s.ctrl, motion.sample(0.02).astype(np.float32))
     told = int(np.argmax(np.abs(s.ctrl[:, column] - s.ctrl[0, column]) > 1e-3))
     moved = int(np.argmax(np.abs(s.qpos[:, column] - s.qpos[0, column]) > 5e-3))
     assert np.abs(s.qvel[:5, column]).max() < 0.06  # noise
@@ -113,12 +112,11 @@ def test_a_row_is_the_state_before_its_command(whole, spec):
 
 def test_repetitions_differ_a_little(whole):
     dataset = Dataset(whole[0])
-    same = [
-        e
-        for e in dataset.entries
-        if e.meta.motion == "tour-all-0" and e.dt == 0.02 and e.meta.payload_mass == 0.2
-    ]
-    first, second = (dataset.read(e) for e in same)
+    same = []
+    for entry in dataset.entries:
+        if (entry.meta.motion, entry.dt, entry.meta.payload_mass) == ("tour-all-0", 0.02, 0.2):
+            same.append(dataset.read(entry))
+    first, second = same
     assert np.array_equal(first.ctrl, second.ctrl)
     assert not np.array_equal(first.qpos, second.qpos)
     assert np.abs(first.qpos - second.qpos).mean() < 0.01
@@ -132,9 +130,11 @@ from gaponet.virtual.collect import Recipe, collect
 from gaponet.robot.spec import load_robot
 from gaponet.virtual.fleet import load_fleet
 if __name__ == "__main__":
-    gaponet.virtual.collect.TAKES_PER_JOB = (2, 2)  # four jobs: two are still being played when two are written
+    # Four jobs: two are still being played when two are written.
+    gaponet.virtual.collect.TAKES_PER_JOB = (2, 2)
     robot = load_robot(sys.argv[1])
-    recipe = Recipe("test", (0.0,), ("virtual-2",), ("steps-elbow", "tour-all-0"), (), (50.0, 25.0), 2)
+    motions = ("steps-elbow", "tour-all-0")
+    recipe = Recipe("test", (0.0,), ("virtual-2",), motions, (), (50.0, 25.0), 2)
     collect(robot, load_fleet("easy", robot), recipe, sys.argv[2], seed=5, nproc=2)
 """
 
@@ -152,19 +152,13 @@ def test_killed_at_a_random_moment_it_ends_with_the_same_dataset(whole, spec, tm
     script = tmp_path / "child.py"
     script.write_text(CHILD)
     command = [sys.executable, str(script), str(spec.mjcf.parent), str(out)]
-    journal = out / "sequences.jsonl"
     child = subprocess.Popen(command, start_new_session=True)
-    deadline = time.monotonic() + 600  # on a machine with much other work
-    while time.monotonic() < deadline and child.poll() is None:
-        if journal.is_file() and journal.read_text().count("\n") >= 1:
-            break
-        time.sleep(0.005)
+    _wait_for_a_line(out / "sequences.jsonl", child)
     time.sleep(np.random.default_rng().uniform(0, 0.05))  # any moment must do
     os.kill(child.pid, signal.SIGKILL)
     child.wait()
-    assert (
-        0 < len(Dataset(out)) <= len(expected)
-    )  # all of them where this process had to wait for its turn
+    # All of them where this process had to wait for its turn.
+    assert 0 < len(Dataset(out)) <= len(expected)
     _wait_for_orphans(child.pid)
     begun = len(Dataset(out))
     done = collect(spec, load_fleet("easy", spec), recipe, out, seed=5, nproc=1)
@@ -174,6 +168,15 @@ def test_killed_at_a_random_moment_it_ends_with_the_same_dataset(whole, spec, tm
     assert not list((out / "sequences").glob(".*"))
     dataset = Dataset(out)
     assert all(dataset.has_replay(entry, model_hash(spec)) for entry in dataset.entries)
+
+
+def _wait_for_a_line(journal, child):
+    """The child has written a recording, or has ended."""
+    deadline = time.monotonic() + 600  # on a machine with much other work
+    while time.monotonic() < deadline and child.poll() is None:
+        if journal.is_file() and journal.read_text().count("\n") >= 1:
+            return
+        time.sleep(0.005)
 
 
 def _wait_for_orphans(session):
@@ -199,10 +202,7 @@ def test_a_dataset_keeps_the_robot_with_the_gains_that_its_fleet_sets(spec, flee
 
 def test_what_something_else_collected_is_not_mixed(whole, spec):
     out, _ = whole
-    with pytest.raises(
-        DatasetError,
-        match="seed",
-    ):
+    with pytest.raises(DatasetError, match="seed"):
         collect(spec, load_fleet("easy", spec), RECIPE, out, seed=6, nproc=1)
     with pytest.raises(DatasetError, match="shifted"):
         collect(spec, load_fleet("shifted", spec), RECIPE, out, seed=5, nproc=1)

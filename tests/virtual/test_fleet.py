@@ -45,9 +45,8 @@ def test_a_raw_hand_of_the_firm_fleet_sags_about_2_cm_under_3_kg():
     plans = planner.plans(3)
     held = np.repeat([plan.ctrl[-1] for plan in plans], len(fleet.units), axis=0)
     units = [*fleet.units.values()] * len(plans)
-    robots = VirtualRobot(
-        robot.with_gain_scale(fleet.gain_scale), units, [(3.0, "both")] * len(units)
-    )
+    firm = robot.with_gain_scale(fleet.gain_scale)
+    robots = VirtualRobot(firm, units, [(3.0, "both")] * len(units))
     robots.reset(held, list(range(len(units))))
     sag = (planner.hand_positions(held) - planner.hand_positions(robots.true_qpos()))[..., 2]
     assert 0.015 < sag.mean() < 0.025
@@ -100,8 +99,7 @@ def test_a_fleet_of_numbers_that_no_robot_has_is_refused_with_file_and_field(
     arm, tmp_path, old, new, said
 ):
     file = tmp_path / "mine.toml"
-    file.write_text(
-        (FLEETS / "easy.toml").read_text(encoding="utf-8").replace(old, new, 1), encoding="utf-8"
-    )
+    easy = (FLEETS / "easy.toml").read_text(encoding="utf-8")
+    file.write_text(easy.replace(old, new, 1), encoding="utf-8")
     with pytest.raises(UsageError, match=said):
         load_fleet(file, arm)

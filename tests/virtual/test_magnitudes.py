@@ -35,12 +35,13 @@ def test_four_numbers_leave_of_the_hard_fleet_what_real_arms_leave(short_motions
     """
     robot = load_robot("h1_2")
     recipe = Recipe("test", (0.0, 3.0), ("virtual-4",), MOTIONS)
-    recorded = play(
-        Job(robot, load_fleet("hard", robot), recipe, (), 0, tuple(takes(recipe, list(MOTIONS))))
-    )
+    wanted = tuple(takes(recipe, list(MOTIONS)))
+    recorded = play(Job(robot, load_fleet("hard", robot), recipe, (), 0, wanted))
     fitted = {"frictionloss": 1.74, "damping": 1.007, "delay": 0.011}
-    gains = zip(robot.operated, robot.servo.kp[robot.operated_index], strict=True)
-    four_numbers = robot.with_identified({joint: fitted | {"kp": 0.79 * kp} for joint, kp in gains})
+    servos = {}
+    for joint, kp in zip(robot.operated, robot.servo.kp[robot.operated_index], strict=True):
+        servos[joint] = fitted | {"kp": 0.79 * kp}
+    four_numbers = robot.with_identified(servos)
     for simulator, least, most in ((robot, 0.010, 0.030), (four_numbers, 0.004, 0.015)):
         rollouts = replay(recorded, simulator, lock_idle=True)
         pairs = list(zip(recorded, rollouts, strict=True))

@@ -9,14 +9,7 @@ import gaponet
 
 PACKAGE = Path(gaponet.__file__).parent
 # __init__.py only names what users import
-OPEN = (
-    "virtual",
-    "experiments",
-    "api",
-    "cli",
-    "__init__.py",
-    "__pycache__",
-)
+OPEN = ("virtual", "experiments", "api", "cli", "__init__.py", "__pycache__")
 BLIND = [p for p in PACKAGE.iterdir() if p.name not in OPEN]
 
 

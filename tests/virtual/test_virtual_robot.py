@@ -175,10 +175,7 @@ def test_delay_holds_the_joint_still_until_it_has_passed(arm):
     path, _ = run(arm, [unit(), unit(delay=0.06)], ctrl)
     begun = np.abs(path - path[0]) > 1e-4
     # Three periods of 20 ms later.
-    assert [int(begun[:, i, 0].argmax()) for i in range(2)] == [
-        10,
-        13,
-    ]
+    assert begun[:, :, 0].argmax(axis=0).tolist() == [10, 13]
 
 
 def test_a_cable_pulls_towards_its_angle(arm):
@@ -290,31 +287,34 @@ def test_current_tells_the_torque_that_the_motor_was_asked_for(arm):
     assert robots.read().tau[0] * 0.8 == pytest.approx(force[0], abs=1e-3)
 
 
+HARD = ("presliding", "thinning", "compliance", "current_loop", "torque_speed")
+UNNAMED = ("drag", "churning", "limb_current", "derating", "smoothing", "flex", "grip")
+MORE = {
+    "stribeck": {"friction": np.full(2, 0.5)},
+    "backlash": {"backlash": np.full(2, 0.03)},
+    "supply": {"motor_constant": np.full(2, 0.3)},
+}
+
+
+def with_effect(robot, effect):
+    """A unit with this effect alone, from a fleet that has it, and large enough to be seen."""
+    if effect in HARD:
+        physics = load_fleet("hard", robot).unit("virtual-1").only([effect])
+        return replace(physics, no_load_speed=physics.no_load_speed / 10)
+    if effect in UNNAMED:
+        return load_fleet("unnamed", robot).unit("virtual-1").only([effect, "thermal"])
+    physics = load_fleet("shifted", robot).unit("virtual-1").only([effect])
+    return replace(physics, **MORE.get(effect, {}))
+
+
 @pytest.mark.parametrize("effect", EFFECTS)
 def test_every_effect_has_a_switch_that_matters(arm, effect):
     """With one effect switched on, something that is seen differs from the robot without any."""
-    physics = load_fleet("shifted", arm).unit("virtual-1").only([effect])
-    # Not in that fleet.
-    if effect in (
-        "presliding",
-        "thinning",
-        "compliance",
-        "current_loop",
-        "torque_speed",
-    ):
-        physics = load_fleet("hard", arm).unit("virtual-1").only([effect])
-        physics = replace(physics, no_load_speed=physics.no_load_speed / 10)
-    if effect in ("drag", "churning", "limb_current", "derating", "smoothing", "flex", "grip"):
-        physics = load_fleet("unnamed", arm).unit("virtual-1").only([effect, "thermal"])
-    if effect == "stribeck":
-        physics = replace(physics, friction=np.full(2, 0.5))
-    if effect == "backlash":
-        physics = replace(physics, backlash=np.full(2, 0.03))
-    if effect == "supply":
-        physics = replace(physics, motor_constant=np.full(2, 0.3))
+    physics = with_effect(arm, effect)
     ctrl = hold(0.2, 0.1, 2.0) + 0.6 * np.sin(np.linspace(0, 25, 100))[:, None]
+    off = {field: getattr(unit(), field) for field in FIELDS[effect]}
     seen = []
-    for u in (physics, replace(physics, **{f: getattr(unit(), f) for f in FIELDS[effect]})):
+    for u in (physics, replace(physics, **off)):
         robots = VirtualRobot(arm, [u], [(0.3, "both")])
         robots.reset(ctrl[:1], [0], 12.0, start=ctrl[:1])
         for row in ctrl:
