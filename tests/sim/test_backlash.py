@@ -15,7 +15,10 @@ from gaponet.sim.model import build_model
 from gaponet.sim.replay import replay
 from gaponet.sysid.joint_rollouts import JointRollouts
 
-WIDTH, KP, DAMPING, ARMATURE = 0.03, 3.0, 0.06, 2e-3
+WIDTH = 0.03
+KP = 3.0
+DAMPING = 0.06
+ARMATURE = 2e-3
 SERVO = {
     "kp": KP,
     "damping": DAMPING,
@@ -25,8 +28,18 @@ SERVO = {
     "delay": 0.0,
     "backlash": WIDTH,
 }
-TOML = 'name = "pendulum"\ndt = 0.01\ntimestep = 0.001\n[[joint]]\nname = "swing"\nkp = 3.0\neffort_limit = 50.0\n'
-LINK = '<geom type="capsule" fromto="0 0 0 0 0 -0.2" size="0.01" mass="0.15" contype="0" conaffinity="0"/>'
+TOML = """name = "pendulum"
+dt = 0.01
+timestep = 0.001
+[[joint]]
+name = "swing"
+kp = 3.0
+effort_limit = 50.0
+"""
+LINK = (
+    '<geom type="capsule" fromto="0 0 0 0 0 -0.2" size="0.01" mass="0.15"'
+    ' contype="0" conaffinity="0"/>'
+)
 MODEL = (
     '<mujoco><compiler angle="radian"/><option integrator="implicitfast" timestep="0.0005"/>'
     "<worldbody>{}</worldbody></mujoco>"
@@ -35,8 +48,9 @@ JOINT = (
     '<body><joint name="swing" axis="0 1 0" armature="0.002" damping="0.06" frictionloss="0.01"/>'
 )
 PLAY_HINGE = (
-    f'{JOINT}<inertial pos="0 0 0" mass="1e-6" diaginertia="1e-9 1e-9 1e-9"/><body><joint name="play" axis="0 1 0" '
-    f'limited="true" range="{-WIDTH / 2} {WIDTH / 2}" solreflimit="0.001 1"/>{LINK}</body></body>'
+    f'{JOINT}<inertial pos="0 0 0" mass="1e-6" diaginertia="1e-9 1e-9 1e-9"/>'
+    f'<body><joint name="play" axis="0 1 0" limited="true" range="{-WIDTH / 2} {WIDTH / 2}"'
+    f' solreflimit="0.001 1"/>{LINK}</body></body>'
 )
 
 
@@ -48,7 +62,9 @@ def command():
 def play_hinge(ctrl):
     """Angles of the link in plain MuJoCo, (T, 1) rad; the encoder is on the link."""
     model = mujoco.MjModel.from_xml_string(MODEL.format(PLAY_HINGE))
-    model.dof_solref[:], data, path = [0.00125, 1.0], mujoco.MjData(model), []
+    model.dof_solref[:] = [0.00125, 1.0]
+    data = mujoco.MjData(model)
+    path = []
     for target in ctrl[:, 0]:
         path.append([data.qpos.sum()])
         for _ in range(20):
@@ -69,7 +85,8 @@ def test_joint_and_robot_move_as_a_play_hinge(pendulum):
     recorded = Sequence(
         meta, pendulum.joint_names, 0.01, ctrl, real, np.gradient(real, 0.01, axis=0)
     )
-    rollouts, errors = JointRollouts([recorded], pendulum), []
+    rollouts = JointRollouts([recorded], pendulum)
+    errors = []
     for width in (0.0, WIDTH):
         servo = SERVO | {"backlash": width}
         (whole,) = replay([recorded], pendulum.with_identified({"swing": servo}))
@@ -97,7 +114,8 @@ def test_a_constant_load_hides_the_gap(arm):
 def test_a_state_goes_on_with_its_gap(pendulum):
     sim = BatchSim(pendulum.with_identified({"swing": SERVO}), [(0.0, "both", 0.01)], 1)
     sim.reset(slice(None), np.zeros((1, 1)), np.zeros((1, 1)))
-    ctrl, ends = command(), []
+    ctrl = command()
+    ends = []
     for target in ctrl[:37]:
         sim.step(target[None])
     state = sim.state()

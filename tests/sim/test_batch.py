@@ -73,7 +73,8 @@ def test_delayed_servos_at_two_rates_step_together_as_each_does_alone(tmp_path):
     late = write_arm(tmp_path).with_servo(delay=[0.05, 0.013])
     conditions = [(0.0, "both", 0.02), (0.2, "both", 0.01), (0.0, "both", 0.02006)]
     rng = np.random.default_rng(2)
-    past, targets = rng.uniform(-1, 1, (3, 6, 2)), rng.uniform(-1, 1, (20, 3, 2))
+    past = rng.uniform(-1, 1, (3, 6, 2))
+    targets = rng.uniform(-1, 1, (20, 3, 2))
     together = BatchSim(late, conditions)
     alone = [BatchSim(late, [c]) for c in conditions]
     together.reset(slice(None), np.zeros((3, 2)), np.zeros((3, 2)), past=past)
@@ -103,35 +104,45 @@ def test_one_by_one_is_bit_identical_to_mujocos_batch(tmp_path, monkeypatch, del
     )
     conditions = [(0.0, "both", 0.02), (0.3, "both", 0.02), (0.3, "both", 0.01)]
     rng = np.random.default_rng(3)
-    past, targets, pushes = (rng.uniform(-1, 1, (k, 3, 2)) for k in (8, 20, 20))
-    moved = []
-    for one_by_one in (False, True):
-        if one_by_one:
-            monkeypatch.setattr("gaponet.sim.batch.Batch", OneByOne)
+    past = rng.uniform(-1, 1, (8, 3, 2))
+    targets = rng.uniform(-1, 1, (20, 3, 2))
+    pushes = rng.uniform(-1, 1, (20, 3, 2))
+
+    def moved():
+        """A simulation of these targets and pushes, and what it had after each period."""
         sim = BatchSim(robot, conditions)
-        force, bias = sim.batch.bind("qfrc_applied"), sim.batch.bind("qfrc_bias")
+        force = sim.batch.bind("qfrc_applied")
+        bias = sim.batch.bind("qfrc_bias")
         sim.batch.expand("dof_damping")[1] *= 2
         sim.reset(slice(None), past[0], past[1], past=past[:6].transpose(1, 0, 2))
+        path = []
         for t, target in enumerate(targets):
             force[:] = pushes[t]
             sim.step(target, np.array([0, 2]) if t % 3 == 0 else None)
-            seen = [
-                sim.qpos.copy(),
-                sim.qvel.copy(),
-                sim.torque[[0, 0, 2]],
-            ]  # always of those that moved
-            sim.batch.forward(stage=mujoco.mjtStage.mjSTAGE_VEL.value)
-            moved.append([*seen, bias.copy()])
+            torque = sim.torque[[0, 0, 2]]  # always of those that moved
+            seen = [sim.qpos.copy(), sim.qvel.copy(), torque]
+            look_ahead(sim)
+            path.append([*seen, bias.copy()])
         np.testing.assert_array_equal(sim.batch.get_data(1).qpos, sim.qpos[1])
-        assert isinstance(sim.batch, OneByOne) == one_by_one
-        # a look at what follows from a state leaves each simulation the torque of its own step
-        if one_by_one:
-            sim.step(targets[0])
-            torque = sim.torque.copy()
-            sim.batch.forward(stage=mujoco.mjtStage.mjSTAGE_VEL.value)
-            np.testing.assert_array_equal(sim.torque, torque)
-            assert len(np.unique(torque, axis=0)) == 3
-    np.testing.assert_array_equal(np.array(moved[:20]), np.array(moved[20:]))
+        return sim, np.array(path)
+
+    together, path = moved()
+    monkeypatch.setattr("gaponet.sim.batch.Batch", OneByOne)
+    alone, same_path = moved()
+    np.testing.assert_array_equal(path, same_path)
+    assert not isinstance(together.batch, OneByOne)
+    assert isinstance(alone.batch, OneByOne)
+    # A look at what follows from a state leaves each simulation the torque of its own step.
+    alone.step(targets[0])
+    torque = alone.torque.copy()
+    look_ahead(alone)
+    np.testing.assert_array_equal(alone.torque, torque)
+    assert len(np.unique(torque, axis=0)) == 3
+
+
+def look_ahead(sim):
+    """Compute what follows from positions and speeds."""
+    sim.batch.forward(stage=mujoco.mjtStage.mjSTAGE_VEL.value)
 
 
 @pytest.mark.parametrize("rates", [(0.02, 0.02), (0.01, 0.02)])
@@ -140,10 +151,11 @@ def test_a_speed_limited_servo_moves_as_another_under_ramped_commands(tmp_path, 
     slow = robot.with_servo(target_speed=[0.5, 0.0])
     jumps = np.repeat(np.random.default_rng(2).uniform(-1, 1, (3, 2, 2)), 30, axis=0)
     speed = np.array([0.5, np.inf])
-    ramps = np.stack(
-        [speed_limited(jumps[:, i], np.zeros(2), speed, dt) for i, dt in enumerate(rates)], 1
-    )
-    sims = [BatchSim(r, [(0.0, "both", dt) for dt in rates]) for r in (slow, robot)]
+    ramps = np.zeros_like(jumps)
+    for i, dt in enumerate(rates):
+        ramps[:, i] = speed_limited(jumps[:, i], np.zeros(2), speed, dt)
+    conditions = [(0.0, "both", dt) for dt in rates]
+    sims = [BatchSim(slow, conditions), BatchSim(robot, conditions)]
     for sim in sims:
         sim.reset(slice(None), np.zeros(2), 0.0, past=jumps[0][:, None])
     assert (np.abs(np.diff(ramps[:, 0, 0])) <= 0.5 * rates[0] + 1e-12).all()
@@ -193,36 +205,42 @@ def test_servos_set_in_a_batch_move_as_a_robot_made_with_them(tmp_path, field):
     """One joint's value changes; the other joint keeps the robot's own."""
     robot = write_arm(tmp_path, xml=XML.replace('range="-1.5 1.5"', 'range="-1.5 1.5" ref="0.1"'))
     base = {"damping": 0.5, "frictionloss": 0.05, "armature": 0.02, "kd": 0.3}
-    base |= {"delay": 0.02} if field == "delay" else {}
-    base |= (
-        dict.fromkeys(SERVO_TERMS, 0.02) | {"no_load_speed": 9.0} if field in SERVO_TERMS else {}
-    )
+    if field == "delay":
+        base["delay"] = 0.02
+    if field in SERVO_TERMS:
+        base |= dict.fromkeys(SERVO_TERMS, 0.02)
+        base["no_load_speed"] = 9.0
     robot = robot.with_identified(dict.fromkeys(robot.joint_names, base))
-    other, one = robot.with_identified({"elbow": {field: OTHER[field]}}), (0.0, "both", 0.02)
-    sims = {
-        name: BatchSim(r, [one]) for name, r in (("own", robot), ("set", robot), ("made", other))
-    }
-    given = {f: other.servo[f][1:][None] for f in (*base, "kp", "offset", field)}
-    sims["set"].set_servos(("elbow",), given)
+    other = robot.with_identified({"elbow": {field: OTHER[field]}})
+    condition = (0.0, "both", 0.02)
+    changed = BatchSim(robot, [condition])
+    given = {name: other.servo[name][1:][None] for name in (*base, "kp", "offset", field)}
+    changed.set_servos(("elbow",), given)
     targets = np.repeat(np.random.default_rng(5).uniform(-1, 1, (4, 1, 2)), 15, axis=0)
-    path = {}
-    for name, sim in sims.items():
-        sim.reset(slice(None), np.zeros((1, 2)), 0.0, past=targets[0][:, None])
-        path[name] = np.array([sim.step(target) or sim.qpos.copy() for target in targets])
-    assert np.abs(path["own"] - path["made"]).max() > 1e-3
+    own = driven(BatchSim(robot, [condition]), targets)
+    made = driven(BatchSim(other, [condition]), targets)
+    assert np.abs(own - made).max() > 1e-3
     # Friction holds a little less firmly where MuJoCo computed a joint's mobility with another
     # armature.
-    np.testing.assert_allclose(
-        path["set"], path["made"], atol=1e-4 if field == "armature" else 1e-12
-    )
+    tolerance = 1e-4 if field == "armature" else 1e-12
+    np.testing.assert_allclose(driven(changed, targets), made, atol=tolerance)
+
+
+def driven(sim, targets):
+    """Positions of a simulation after each target, (T, 1, 2) rad."""
+    sim.reset(slice(None), np.zeros((1, 2)), 0.0, past=targets[0][:, None])
+    path = []
+    for target in targets:
+        sim.step(target)
+        path.append(sim.qpos.copy())
+    return np.array(path)
 
 
 @pytest.mark.parametrize("field", [*STOP_FIELDS, "delay", *SERVO_TERMS])
 def test_a_value_that_simulations_cannot_take_is_refused(tmp_path, field):
     robot = write_arm(tmp_path)
-    values = {
-        f: np.full((1, 1), 0.1)
-        for f in ("kp", "damping", "frictionloss", "armature", "offset", field)
-    }
+    sim = BatchSim(robot, [(0.0, "both", 0.02)])
+    fields = ("kp", "damping", "frictionloss", "armature", "offset", field)
+    values = dict.fromkeys(fields, np.full((1, 1), 0.1))
     with pytest.raises(UsageError, match=field):
-        BatchSim(robot, [(0.0, "both", 0.02)]).set_servos(("elbow",), values)
+        sim.set_servos(("elbow",), values)

@@ -29,9 +29,9 @@ def rebuilt(robot: RobotSpec, change: SimulatorChange) -> RobotSpec:
     files.
     """
     model = build_model(robot)
-    mounts = tuple(
-        replace(mount, pos=tuple(np.add(mount.pos, change.mount))) for mount in robot.payload_mounts
-    )
+    mounts = []
+    for mount in robot.payload_mounts:
+        mounts.append(replace(mount, pos=tuple(np.add(mount.pos, change.mount))))
     servo = replace(
         robot.servo,
         kp=robot.servo.kp * change.kp,
@@ -41,7 +41,7 @@ def rebuilt(robot: RobotSpec, change: SimulatorChange) -> RobotSpec:
         frictionloss=model.dof_frictionloss * change.friction,
         delay=robot.servo.delay + change.delay,
     )
-    return replace(robot, servo=servo, payload_mounts=mounts)
+    return replace(robot, servo=servo, payload_mounts=tuple(mounts))
 
 
 def swing(sim: BatchSim, robot: RobotSpec) -> np.ndarray:

@@ -78,7 +78,8 @@ def test_a_scene_with_late_servos_answers_as_the_simulator_that_it_was_built_fro
 
 
 def test_a_rate_of_control_does_not_change_positions_read_at_the_same_time() -> None:
-    slow, fast = (contexts(ROBOT, [EMPTY._replace(dt=dt)])[0] for dt in (0.02, 0.01))
+    (slow,) = contexts(ROBOT, [EMPTY._replace(dt=0.02)])
+    (fast,) = contexts(ROBOT, [EMPTY._replace(dt=0.01)])
 
     positions = [0, 1, 4, 5]
     difference = slow.reshape(8, 5)[positions] - fast.reshape(8, 5)[positions]

@@ -19,21 +19,19 @@ def smooth(robot):
 
 
 def periods(sequence, friction):
-    return [
-        Period(q[None], v[None], nq[None], nv[None], friction * np.sign(nq - q)[None])
-        for q, v, nq, nv in zip(
-            sequence.qpos[:-1].astype(float),
-            sequence.qvel[:-1].astype(float),
-            sequence.qpos[1:].astype(float),
-            sequence.qvel[1:].astype(float),
-            strict=True,
-        )
-    ]
+    qpos = sequence.qpos[:, None].astype(float)  # (T, 1, n)
+    qvel = sequence.qvel[:, None].astype(float)
+    made = []
+    for t in range(len(qpos) - 1):
+        rubbing = friction * np.sign(qpos[t + 1] - qpos[t])
+        made.append(Period(qpos[t], qvel[t], qpos[t + 1], qvel[t + 1], rubbing))
+    return made
 
 
 def test_the_inverse_of_a_recording_is_its_command(tmp_path):
     robot = write_arm(tmp_path, xml=XML.replace('frictionloss="0.05"', 'frictionloss="0"'))
-    sequence, inverse = smooth(robot), AnalyticInverse.of(BatchSim(robot, [CONDITION]))
+    sequence = smooth(robot)
+    inverse = AnalyticInverse.of(BatchSim(robot, [CONDITION]))
     told = np.concatenate([inverse([p]) for p in periods(sequence, 0.0)])
     np.testing.assert_allclose(told, sequence.ctrl[:-1], atol=2e-4)
 
@@ -51,13 +49,16 @@ def test_friction_that_grows_with_the_motors_torque_is_overcome_too(tmp_path):
 
 @pytest.mark.parametrize("count", [1, 2, 4, 10])
 def test_states_within_a_period_follow_parabolic_speeds(count):
-    h, i = 0.005, np.arange(count + 1)
+    h = 0.005
+    i = np.arange(count + 1)
     speed = 0.3 + 0.2 * i - 0.03 * i**2
     position = np.concatenate([[0.0], np.cumsum(h * speed[1:])])
     known = np.array([h * speed[0], h * speed[-1], position[-1]])
-    before, speeds = (weights @ known for weights in weights_within_period(count, 12))
+    of_positions, of_speeds = weights_within_period(count, 12)
+    before = of_positions @ known
+    moved = of_speeds @ known
     np.testing.assert_allclose(before[:count], position[:-1], atol=1e-12)
-    np.testing.assert_allclose(speeds[: count + 1] / h, speed, atol=1e-12)
+    np.testing.assert_allclose(moved[: count + 1] / h, speed, atol=1e-12)
 
 
 def test_inertia_is_mujocos(tmp_path):
@@ -69,7 +70,8 @@ def test_inertia_is_mujocos(tmp_path):
     sim.qpos[:] = [[0.3, -0.4]]
     sim.batch.forward()
     model = build_model(robot, 0.2)
-    data, full = mujoco.MjData(model), np.zeros((2, 2))
+    data = mujoco.MjData(model)
+    full = np.zeros((2, 2))
     data.qpos[:] = [0.3, -0.4]
     mujoco.mj_forward(model, data)
     mujoco.mj_fullM(model, data, full)
@@ -88,9 +90,10 @@ def test_a_torque_speed_line_bounds_the_targets_of_a_moving_joint(tmp_path):
     robot = write_arm(tmp_path, TOML.replace("effort_limit = 5.0", "effort_limit = 0.4"))
     robot = robot.with_identified({joint: {"no_load_speed": 2.0} for joint in robot.joint_names})
     inverse = AnalyticInverse.of(BatchSim(robot, [CONDITION]))
-    at, speed = np.zeros((1, 2)), np.ones((1, 2))
+    at = np.zeros((1, 2))
+    speed = np.ones((1, 2))
     targets = inverse([Period(at, speed, at + 0.02, speed + 1.0, at)])
     assert inverse.servos.high.max() == 0.4
-    np.testing.assert_allclose(
-        inverse.servos.kp * (targets - 0.01), 0.2, rtol=1e-3
-    )  # 0.01 rad: the mean position
+    mean_position = 0.01  # rad
+    torque = inverse.servos.kp * (targets - mean_position)
+    np.testing.assert_allclose(torque, 0.2, rtol=1e-3)

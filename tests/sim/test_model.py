@@ -15,7 +15,7 @@ from files_arm import XML as FILES_XML
 from gaponet.base.errors import RobotError, UsageError
 from gaponet.robot.fingerprint import model_fingerprint
 from gaponet.robot.folder import save_robot
-from gaponet.robot.spec import Scene, Table, load_robot
+from gaponet.robot.spec import RobotSpec, Scene, Table, load_robot
 from gaponet.sim.batch import BatchSim
 from gaponet.sim.dataset_robot import dataset_robot
 from gaponet.sim.dynamics import inverse_dynamics
@@ -34,12 +34,16 @@ def hold(model: mujoco.MjModel, ctrl: np.ndarray, seconds: float) -> tuple[np.nd
     return early, data.qpos.copy()
 
 
+def raised(robot: RobotSpec) -> np.ndarray:
+    """Home and 0.3 rad, but no joint at its stop, (n,) rad."""
+    low, high = robot.qpos_range.T
+    return np.clip(robot.qpos_home + 0.3, low + 0.05, high - 0.05)
+
+
 @pytest.mark.parametrize(("name", "mass"), [("so101", 0.0), ("so101", 0.3), ("h1_2", 3.0)])
 def test_a_loaded_joint_held_for_a_minute_does_not_creep(name, mass):
     robot = load_robot(name)
-    posture = np.clip(
-        robot.qpos_home + 0.3, robot.qpos_range[:, 0] + 0.05, robot.qpos_range[:, 1] - 0.05
-    )
+    posture = raised(robot)
     early, late = hold(build_model(robot, mass), posture, 60.0)
     assert np.abs(late - early).max() < 0.5e-3
     assert np.abs(early - posture).max() > 2e-3  # and it does carry a load
@@ -57,18 +61,15 @@ def test_friction_holds_half_its_limit_for_two_minutes_with_the_smallest_armatur
     model = build_model(robot)
     model.actuator_gainprm[:] = model.actuator_biasprm[:] = 0.0
     data = mujoco.MjData(model)
-    data.qpos[:] = np.clip(
-        robot.qpos_home + 0.3, robot.qpos_range[:, 0] + 0.05, robot.qpos_range[:, 1] - 0.05
-    )
+    data.qpos[:] = raised(robot)
     mujoco.mj_forward(model, data)
     load = data.qfrc_bias.copy()
     model.dof_frictionloss[:] = 2 * np.abs(load) + 0.02
     data.qfrc_applied[:] = -0.01 * np.sign(load)  # beside gravity: half of the limit
     mujoco.mj_step(model, data, round(1 / model.opt.timestep))
     early = data.qpos.copy()
-    mujoco.mj_step(
-        model, data, round(20 / model.opt.timestep)
-    )  # a sixth of the time, a sixth of the way
+    # A sixth of the time, a sixth of the way.
+    mujoco.mj_step(model, data, round(20 / model.opt.timestep))
     assert np.abs(data.qpos - early).max() < 0.6e-3 / 6
 
 
@@ -217,22 +218,24 @@ def test_the_hash_ignores_looks_and_names(tmp_path, xml):
 def test_geoms_that_touch_count_where_contacts_are_on_and_only_there(tmp_path):
     wider = FILES_XML.replace('size="0.02" mass', 'size="0.021" mass')
     for contacts in (False, True):
-        same = [
-            build_model(write_files_arm(tmp_path / f"{contacts}{i}", contacts=contacts, xml=x))
-            for i, x in enumerate((FILES_XML, wider))
-        ]
-        for model in same:  # the capsule's mass is given; its inertia follows from its size
-            model.body_inertia[:] = same[0].body_inertia
-            model.body_ipos[:] = same[0].body_ipos
-            model.body_iquat[:] = same[0].body_iquat
-        first, second = (list(model_fingerprint(model)) for model in same)
-        assert (first == second) is not contacts
+        thin = write_files_arm(tmp_path / f"thin {contacts}", contacts=contacts, xml=FILES_XML)
+        wide = write_files_arm(tmp_path / f"wide {contacts}", contacts=contacts, xml=wider)
+        one = build_model(thin)
+        other = build_model(wide)
+        # The capsule's mass is given; its inertia follows from its size.
+        other.body_inertia[:] = one.body_inertia
+        other.body_ipos[:] = one.body_ipos
+        other.body_iquat[:] = one.body_iquat
+        same = list(model_fingerprint(one)) == list(model_fingerprint(other))
+        assert same is not contacts
 
 
 def test_a_model_in_degrees_moves_as_the_same_one_in_radians(tmp_path):
-    degrees = lambda m: (  # noqa: E731
-        'range="' + " ".join(f"{np.degrees(float(x)):.12g}" for x in m[1].split()) + '"'
-    )
+
+    def degrees(match):
+        low, high = np.degrees([float(word) for word in match[1].split()])
+        return f'range="{low:.12g} {high:.12g}"'
+
     xml = re.sub(r'range="([^"]*)"', degrees, XML.replace('angle="radian"', 'angle="degree"'))
     assert xml != XML
     models = []
@@ -246,6 +249,19 @@ def test_a_model_in_degrees_moves_as_the_same_one_in_radians(tmp_path):
             np.testing.assert_allclose(getattr(ours, field), getattr(theirs, field), atol=1e-9)
 
 
+def pinocchio_model(pin, robot, payload):
+    """Pinocchio's model of the same MJCF, with the payload as an extra body and no armature."""
+    other = pin.buildModelFromMJCF(str(robot.mjcf))
+    other.armature[:] = 0.0  # versions differ in whether rnea counts it
+    for mount in robot.payload_mounts:
+        frame = other.frames[other.getFrameId(mount.body)]
+        place = frame.placement * pin.SE3(np.eye(3), np.array(mount.pos))
+        radius = max((3 * payload / (4 * np.pi * 7850.0)) ** (1 / 3), 1e-3)  # a solid steel ball
+        ball = pin.Inertia.FromSphere(payload, radius)
+        other.appendBodyToJoint(frame.parentJoint, ball, place)
+    return other
+
+
 @pytest.mark.parametrize("payload", [0.0, 3.0])
 def test_h1_2_agrees_with_pinocchio(payload):
     """An independent rigid-body library reads the same MJCF and gets the payload as an extra
@@ -253,28 +269,24 @@ def test_h1_2_agrees_with_pinocchio(payload):
     """
     pin = pytest.importorskip("pinocchio", reason="pinocchio (package pin) is not installed")
     robot = load_robot("h1_2")
-    other = pin.buildModelFromMJCF(str(robot.mjcf))
-    for mount in robot.payload_mounts:
-        frame = other.frames[other.getFrameId(mount.body)]
-        place = frame.placement * pin.SE3(np.eye(3), np.array(mount.pos))
-        radius = max((3 * payload / (4 * np.pi * 7850.0)) ** (1 / 3), 1e-3)  # a solid steel ball
-        other.appendBodyToJoint(frame.parentJoint, pin.Inertia.FromSphere(payload, radius), place)
+    other = pinocchio_model(pin, robot, payload)
     order = [other.joints[other.getJointId(name)].idx_v for name in robot.joint_names]
     rng = np.random.default_rng(0)
     model = build_model(robot, payload)
     low, high = robot.qpos_range.T
-    qpos, qvel, qacc = (
-        rng.uniform(low, high, (50, 27)),
-        rng.normal(size=(50, 27)),
-        5 * rng.normal(size=(50, 27)),
-    )
+    qpos = rng.uniform(low, high, (50, 27))
+    qvel = rng.normal(size=(50, 27))
+    qacc = 5 * rng.normal(size=(50, 27))
     ours = inverse_dynamics(model, qpos, qvel, qacc)
     theirs = np.empty_like(ours)
     data = other.createData()
-    other.armature[:] = 0.0  # added by hand below, since versions differ in whether rnea counts it
     for t in range(50):
-        q, v, a = np.zeros(27), np.zeros(27), np.zeros(27)
-        q[order], v[order], a[order] = qpos[t], qvel[t], qacc[t]
+        q = np.zeros(27)
+        v = np.zeros(27)
+        a = np.zeros(27)
+        q[order] = qpos[t]
+        v[order] = qvel[t]
+        a[order] = qacc[t]
         theirs[t] = pin.rnea(other, data, q, v, a)[order]
     theirs += model.dof_armature * qacc + model.dof_damping * qvel
     assert np.abs(ours - theirs).max() < 1e-6 * np.abs(ours).max()
@@ -290,10 +302,8 @@ def tipped(tmp_path):
 
 def test_nothing_touches_without_a_table(tipped):
     assert build_model(tipped).npair == 0
-    assert (
-        build_model(tipped).opt.disableflags
-        == build_model(replace(tipped, scene=Scene())).opt.disableflags
-    )
+    bare = build_model(replace(tipped, scene=Scene()))
+    assert build_model(tipped).opt.disableflags == bare.opt.disableflags
 
 
 def test_the_tip_presses_into_the_table_by_force_over_stiffness(tipped):
@@ -353,18 +363,14 @@ def test_a_datasets_robot_has_the_gains_that_all_recordings_state(tmp_path):
     robot = write_arm(tmp_path / "arm")
     soft = robot.with_gains((15.0, 15.0), None)
     recorded = record(soft, commands(100, 1), "m")
-    recorded = replace(
-        recorded, meta=replace(recorded.meta, kp=(15.0, 15.0), notes={"gains": "as recorded"})
-    )
+    meta = replace(recorded.meta, kp=(15.0, 15.0), notes={"gains": "as recorded"})
+    recorded = replace(recorded, meta=meta)
     data = write_dataset(tmp_path / "data", robot, [recorded])
     assert dataset_robot(data).servo.kp.tolist() == [15.0, 15.0]
-    for name, nominal, kp in (
-        ("with", soft, 15.0),
-        ("before", robot, 20.0),
-    ):  # fitted with these gains, or without
+    # Fitted with these gains, or without.
+    for name, nominal, kp in (("with", soft, 15.0), ("before", robot, 20.0)):
         save_robot(nominal.with_identified({"elbow": {"delay": 0.01}}), tmp_path / name)
         assert dataset_robot(data, tmp_path / name).servo.kp.tolist() == [kp, kp]
-    data.append(
-        replace(recorded.rows(slice(50)), meta=replace(recorded.meta, motion="n", kp=(9.0, 9.0)))
-    )
+    softer = replace(recorded.meta, motion="n", kp=(9.0, 9.0))
+    data.append(replace(recorded.rows(slice(50)), meta=softer))
     assert dataset_robot(data).servo.kp.tolist() == [20.0, 20.0]

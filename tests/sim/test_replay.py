@@ -16,10 +16,10 @@ from gaponet.sim.replay import idle_limbs, pair_dataset, replay
 def test_the_replay_of_the_nominal_robot_is_bit_identical(tmp_path):
     robot = write_arm(tmp_path)
     # Rows are stored as float32; a start that float32 holds exactly starts the replay exactly.
-    sequences = [
-        record(robot, np.round(commands(rows, seed) * 256) / 256, f"m{seed}")
-        for seed, rows in enumerate((60, 90))
-    ]
+    sequences = []
+    for seed, rows in enumerate((60, 90)):
+        ctrl = np.round(commands(rows, seed) * 256) / 256
+        sequences.append(record(robot, ctrl, f"m{seed}"))
     for sequence, simulated in zip(sequences, replay(sequences, robot), strict=True):
         np.testing.assert_array_equal(sequence.qpos, simulated.qpos)
         np.testing.assert_array_equal(sequence.qvel, simulated.qvel)
@@ -27,10 +27,9 @@ def test_the_replay_of_the_nominal_robot_is_bit_identical(tmp_path):
 
 def test_sequences_of_any_length_and_payload_run_side_by_side(tmp_path):
     robot = write_arm(tmp_path)
-    sequences = [
-        record(robot, commands(rows, rows), f"m{rows}", payload=rows / 500)
-        for rows in (40, 120, 80)
-    ]
+    sequences = []
+    for rows in (40, 120, 80):
+        sequences.append(record(robot, commands(rows, rows), f"m{rows}", payload=rows / 500))
     together = replay(sequences, robot)
     for sequence, simulated in zip(sequences, together, strict=True):
         alone = replay([sequence], robot)[0]
@@ -64,8 +63,11 @@ def test_an_identified_gain_scales_with_the_recorded_one(tmp_path):
 
 def test_a_replay_uses_only_the_first_recorded_row(tmp_path):
     robot = write_arm(tmp_path)
-    weak, strong = (record(robot, commands(50, 3), "m", kp=kp) for kp in (0.5, 2.0))
-    np.testing.assert_array_equal(replay([weak], robot)[0].qpos, replay([strong], robot)[0].qpos)
+    weak = record(robot, commands(50, 3), "m", kp=0.5)
+    strong = record(robot, commands(50, 3), "m", kp=2.0)
+    (one,) = replay([weak], robot)
+    (other,) = replay([strong], robot)
+    np.testing.assert_array_equal(one.qpos, other.qpos)
 
 
 def test_pairing_is_done_once_per_simulator(tmp_path):
@@ -86,21 +88,26 @@ def test_clamping_idle_limbs_changes_nothing_for_the_others():
     ctrl[:, robot.index(["left_elbow_joint"])] = 0.4 * np.sin(np.arange(40) / 6)[:, None]
     meta = SequenceMeta("h1_2", "a", "elbow", 1.0)
     sequence = Sequence(meta, robot.joint_names, robot.dt, ctrl, ctrl, np.zeros_like(ctrl))
-    assert idle_limbs([sequence], robot) == tuple(
-        j for j in robot.joint_names if "hip" in j or "knee" in j or "ankle" in j
-    )
-    whole, arms = (replay([sequence], robot, lock_idle=lock)[0] for lock in (False, True))
-    op = robot.operated_index
-    np.testing.assert_allclose(whole.qpos[:, op], arms.qpos[:, op], atol=1e-6)
+    legs = []
+    for joint in robot.joint_names:
+        if "hip" in joint or "knee" in joint or "ankle" in joint:
+            legs.append(joint)
+    assert idle_limbs([sequence], robot) == tuple(legs)
+    (whole,) = replay([sequence], robot, lock_idle=False)
+    (arms,) = replay([sequence], robot, lock_idle=True)
+    operated = robot.operated_index
+    np.testing.assert_allclose(whole.qpos[:, operated], arms.qpos[:, operated], atol=1e-6)
 
 
 def test_a_simulator_without_payload_ignores_the_recorded_payload(arm):
-    empty, laden = (record(arm, commands(60, 1), "m", payload=p) for p in (0.0, 0.2))
+    empty = record(arm, commands(60, 1), "m", payload=0.0)
+    laden = record(arm, commands(60, 1), "m", payload=0.2)
     bare = replace(arm, scene=Scene(carries_payload=False))
-    own, told = (replay([laden], r)[0].qpos for r in (bare, arm))
-    assert np.abs(own - told).max() > 1e-3
-    same = replace(laden, meta=empty.meta, qpos=laden.qpos, qvel=laden.qvel)
-    np.testing.assert_array_equal(own, replay([same], arm)[0].qpos)
+    (own,) = replay([laden], bare)
+    (told,) = replay([laden], arm)
+    assert np.abs(own.qpos - told.qpos).max() > 1e-3
+    (same,) = replay([replace(laden, meta=empty.meta)], arm)
+    np.testing.assert_array_equal(own.qpos, same.qpos)
 
 
 def test_a_simulator_without_payload_has_another_hash_and_survives_its_folder(arm, tmp_path):

@@ -59,9 +59,8 @@ def test_a_loaded_motor_has_more_friction(tmp_path):
         sim.step(home)
     rest = sim.qpos[0].copy()
     held = -0.2 * 9.81 * 0.1  # N·m: the fore arm's weight
-    assert abs(sim.servo_model.state.torque[0, 1]) == pytest.approx(
-        abs(held) / 1.2, rel=0.05
-    )  # friction carries the rest
+    # Friction carries the rest.
+    assert abs(sim.servo_model.state.torque[0, 1]) == pytest.approx(abs(held) / 1.2, rel=0.05)
     # What friction may take there, it takes: a small push moves nothing.
     sim.batch.bind("qfrc_applied")[1] = [0.0, 0.2 * held]
     for _ in range(100):
@@ -93,10 +92,9 @@ def test_a_minimum_torque_overcomes_friction_at_small_errors(arm):
 
 
 def test_a_servo_model_of_zeros_is_bit_identical_to_none(arm):
-    sims = [
-        BatchSim(arm, [(0.5, "both", 0.02)] * 3, 1, servo_model=with_model)
-        for with_model in (False, True)
-    ]
+    conditions = [(0.5, "both", 0.02)] * 3
+    without = BatchSim(arm, conditions, 1, servo_model=False)
+    sims = [without, BatchSim(arm, conditions, 1, servo_model=True)]
     rng = np.random.default_rng(0)
     for sim in sims:
         sim.reset(slice(None), np.full((3, 2), 0.1), np.zeros((3, 2)))
@@ -157,12 +155,30 @@ def test_a_servo_of_the_simulator_is_one_of_the_arrays_that_exports_take():
         assert here == pytest.approx(friction[i], abs=1e-9)
 
 
+def direct_current_model(robot, kp, kd, no_load, limit):
+    """The robot with MuJoCo's <dcmotor> of this no-load speed and stall torque in every joint."""
+    spec = build_spec(robot)
+    volts = 12.0
+    constant = volts / no_load
+    resistance = constant * volts / limit
+    gains = [kp, 0, kd, 0, 0, volts]
+    for servo in spec.actuators:
+        servo.set_to_dcmotor(
+            motorconst=[constant, 0], resistance=resistance, controller=gains, ctrlspec=1
+        )
+    return spec.compile()
+
+
 @pytest.mark.skipif(
     mujoco.__version__ < "4", reason="MuJoCo's DC motor takes no position before MuJoCo 4"
 )
 def test_a_torque_falls_with_speed_and_brakes_whole(arm):
     """Between ± effort_limit the motor is MuJoCo's own <dcmotor> behind a current controller."""
-    kp, kd, limit, no_load, rows = 20.0, 0.5, 2.0, 2.0, 150
+    kp = 20.0
+    kd = 0.5
+    limit = 2.0
+    no_load = 2.0
+    rows = 150
     values = {
         "kp": kp,
         "effort_limit": limit,
@@ -171,20 +187,15 @@ def test_a_torque_falls_with_speed_and_brakes_whole(arm):
         "frictionloss": 0.0,
     }
     robot = replace(servo_model(arm, **values).with_servo(kd=np.full(2, kd)), timestep=0.0005)
+    model = direct_current_model(robot, kp, kd, no_load, limit)
+    data = mujoco.MjData(model)
     sim = BatchSim(robot, [(0.0, "both", 0.02)], 1)
     targets = np.repeat(np.random.default_rng(0).uniform(-1, 1, (rows // 30, 2)), 30, axis=0)
     sim.reset(slice(None), targets[:1], np.zeros((1, 2)))
-    spec = build_spec(robot)
-    volts, constant = 12.0, 12.0 / no_load
-    resistance = constant * volts / limit
-    for servo in spec.actuators:
-        gains = [kp, 0, kd, 0, 0, volts]
-        servo.set_to_dcmotor(
-            motorconst=[constant, 0], resistance=resistance, controller=gains, ctrlspec=1
-        )
-    model = spec.compile()
-    data = mujoco.MjData(model)
-    data.qpos[:], qpos, torque, qvel = targets[0], [], [], []
+    data.qpos[:] = targets[0]
+    qpos = []
+    torque = []
+    qvel = []
     for target in targets:
         sim.step(target[None])
         data.ctrl[:] = target
@@ -192,9 +203,8 @@ def test_a_torque_falls_with_speed_and_brakes_whole(arm):
         qpos.append(sim.qpos[0] - data.qpos)
         torque.append(sim.torque[0].copy())
         qvel.append(sim.qvel[0].copy())
-    assert (
-        np.abs(qpos).mean() < 2e-3
-    )  # rad; both step by half a millisecond, MuJoCo's back-EMF implicitly
+    # rad; both step by half a millisecond, MuJoCo's back-EMF implicitly.
+    assert np.abs(qpos).mean() < 2e-3
     driving = np.sign(torque) * np.array(qvel) / no_load
     assert driving.max() > 0.3  # it is a matter of speed
     assert (np.abs(torque) <= limit * np.minimum(1, 1 - driving) + 0.05).all()

@@ -20,12 +20,13 @@ import torch
 from gaponet.sim.warp import WarpSim
 
 DEVICE = "cuda" if torch.cuda.is_available() else "warp-cpu"
-PERIODS, HOLD_S = 50, 10.0
-# rad: a few times what a float32 resolves at 2 rad. The band of accelerations in which a joint
-# sticks (sim/model.py) is
-# hardly wider than what one resolves at 100 rad/s², so where a joint stops differs more, mostly by
-# nothing.
-ROUNDING, STOPPED, HELD = 2e-6, {"fr3": 5e-3}, {"fr3": 2e-3}
+PERIODS = 50
+HOLD_S = 10.0
+ROUNDING = 2e-6  # rad: a few times what a float32 resolves at 2 rad
+# The band of accelerations in which a joint sticks (sim/model.py) is hardly wider than what a
+# float32 resolves at 100 rad/s², so where a joint stops differs more, mostly by nothing.
+STOPPED = {"fr3": 5e-3}  # rad
+HELD = {"fr3": 2e-3}  # rad
 
 
 def worlds(robot, friction=True, both_rates=True):
@@ -56,9 +57,11 @@ class Both:
 
     def __init__(self, robot, **how):
         self.ours = worlds(robot, **how)
-        self.theirs, self.apart = WarpSim(self.ours, DEVICE), 0.0
+        self.theirs = WarpSim(self.ours, DEVICE)
+        self.apart = 0.0
         low, high = np.clip(self.ours.commands.range.T, -3, 3)
-        home, inside = robot.qpos_home[robot.index(self.ours.joint_names)], 0.1 * (high - low)
+        home = robot.qpos_home[robot.index(self.ours.joint_names)]
+        inside = 0.1 * (high - low)
         self.at = np.clip(home, low + inside, high - inside)
         self.at = self.at + np.random.default_rng(1).uniform(-0.05, 0.05, self.ours.qpos.shape)
 
@@ -70,7 +73,8 @@ class Both:
     def step(self, target, ids=None):
         for sim in (self.ours, self.theirs):
             sim.step(target, ids)
-        self.apart = np.maximum(self.apart, np.abs(self.ours.qpos - self.theirs.qpos.cpu().numpy()))
+        error = np.abs(self.ours.qpos - self.theirs.qpos.cpu().numpy())
+        self.apart = np.maximum(self.apart, error)
 
 
 @pytest.mark.parametrize("friction", [False, True])
@@ -110,7 +114,8 @@ def test_some_simulations_step_alone_and_a_state_is_restored(tmp_path, rates):
         sim.step(np.ones((3, 2)), np.array([0, 2]))
     assert (sim.qpos[1] == 0).all()
     assert (sim.qpos[[0, 2]] != 0).all()
-    state, paths = sim.state(), []
+    state = sim.state()
+    paths = []
     for _ in range(2):
         sim.set_state(state)
         sim.step(-np.ones((3, 2)))
@@ -118,44 +123,71 @@ def test_some_simulations_step_alone_and_a_state_is_restored(tmp_path, rates):
     assert (paths[0] == paths[1]).all()
 
 
+LAW = {
+    "stribeck": 0.05,
+    "stribeck_speed": 0.2,
+    "friction_motor": 0.1,
+    "friction_external": 0.1,
+    "no_load_speed": 1.0,
+    "encoder_step": 1e-3,
+    "min_torque": 0.02,
+}
+AT = np.full((3, 2), 0.3)  # rad
+
+
+@pytest.fixture
+def lawful(tmp_path, delay):
+    """The arm with all terms of the servo model, the shoulder late."""
+    robot = write_arm(tmp_path).with_servo(delay=[delay, 0.0], **LAW)
+    return robot.with_identified({"elbow": {"offset": 0.1}})
+
+
+def three(robot, rates):
+    """Simulations with 1, 0.5 and 2 times the terms of the robot."""
+    sim = BatchSim(robot, [Condition(0.0, "both", dt) for dt in rates], 1)
+    for term in sim.servo_model.servos.terms.values():
+        term *= np.array([[1.0], [0.5], [2.0]])
+    return sim
+
+
+def put(sim, ids):
+    sim.reset(ids, AT[ids], np.zeros_like(AT[ids]), past=AT[ids][:, None])
+
+
 @pytest.mark.parametrize("rates", [(0.02, 0.02, 0.02), (0.01, 0.02, 0.01)])
 @pytest.mark.parametrize("delay", [0.0, 0.03])
-def test_the_servo_model_agrees_with_mujoco(tmp_path, rates, delay):
-    law = {"stribeck": 0.05, "stribeck_speed": 0.2, "friction_motor": 0.1, "friction_external": 0.1}
-    law["no_load_speed"] = 1.0
-    robot = write_arm(tmp_path).with_servo(
-        delay=[delay, 0.0], encoder_step=1e-3, min_torque=0.02, **law
-    )
-    robot = robot.with_identified({"elbow": {"offset": 0.1}})
-    ours = BatchSim(robot, [Condition(0.0, "both", dt) for dt in rates], 1)
-    for x in ours.servo_model.servos.terms.values():
-        x *= np.array([[1.0], [0.5], [2.0]])
-    theirs, apart, still = WarpSim(ours, DEVICE), 0.0, 0.0
-    plain = BatchSim(
-        robot.with_servo(encoder_step=0.0, min_torque=0.0, **dict.fromkeys(law, 0.0)),
-        [(0.0, "both", 0.02)],
-    )
-    at = np.full((3, 2), 0.3)
-
-    def put(ids):
-        for sim in (ours, theirs):
-            sim.reset(ids, at[ids], np.zeros_like(at[ids]), past=at[ids][:, None])
-
-    put(slice(None))
-    plain.reset(slice(None), at[:1], 0 * at[:1], past=at[:1, None])
+def test_the_servo_model_agrees_with_mujoco(lawful, rates):
+    ours = three(lawful, rates)
+    theirs = WarpSim(ours, DEVICE)
+    for sim in (ours, theirs):
+        put(sim, slice(None))
+    apart = 0.0
     for t in range(PERIODS):
-        if t == PERIODS // 2:
-            put(np.array([0, 2]))
-        target = at + 0.2 * np.sin(0.1 * t)
+        ids = np.array([0, 1]) if t < 5 else None
         for sim in (ours, theirs):
-            sim.step(target, np.array([0, 1]) if t < 5 else None)
-        plain.step(target[:1])
-        still = max(still, np.abs(plain.qpos[0] - ours.qpos[1]).max())
+            if t == PERIODS // 2:
+                put(sim, np.array([0, 2]))
+            sim.step(AT + 0.2 * np.sin(0.1 * t), ids)
         apart = np.maximum(apart, np.abs(ours.qpos - theirs.qpos.cpu().numpy()))
     assert apart.max() <= 5e-4
-    assert still > 5e-3  # without the law they are elsewhere
     for name, x in ours.state().items():
         assert theirs.state()[name].shape == x.shape
+
+
+@pytest.mark.parametrize("rates", [(0.02, 0.02, 0.02), (0.01, 0.02, 0.01)])
+@pytest.mark.parametrize("delay", [0.0, 0.03])
+def test_without_the_servo_model_the_arm_is_elsewhere(lawful, rates):
+    sim = three(lawful, rates)
+    plain = BatchSim(lawful.with_servo(**dict.fromkeys(LAW, 0.0)), [(0.0, "both", 0.02)])
+    put(sim, slice(None))
+    put(plain, slice(1))
+    apart = 0.0
+    for t in range(PERIODS):
+        target = AT + 0.2 * np.sin(0.1 * t)
+        sim.step(target)
+        plain.step(target[:1])
+        apart = max(apart, np.abs(plain.qpos[0] - sim.qpos[1]).max())
+    assert apart > 5e-3
 
 
 @pytest.mark.parametrize(
@@ -171,10 +203,13 @@ def test_the_servo_model_of_a_physics_step_agrees_with_mujoco_up_to_rounding(tmp
         x[:, 0] *= [0.0, 1.0, 2.0]
     ours.batch.expand("actuator_forcerange")[:] *= np.array([1.0, 0.5, 0.1])[:, None, None]
     ours.servo_model.servos.records["effort_limit"] *= np.array([[1.0], [0.5], [0.1]])
-    theirs, rng = WarpSim(ours, DEVICE), np.random.default_rng(0)
+    theirs = WarpSim(ours, DEVICE)
+    rng = np.random.default_rng(0)
     model = theirs._worlds.of_rates[0].model
     for ids in (np.arange(3), np.array([0, 2])):
-        qpos, qvel, past = (rng.normal(0, 0.3, (len(ids), *more)) for more in ((2,), (2,), (1, 2)))
+        qpos = rng.normal(0, 0.3, (len(ids), 2))
+        qvel = rng.normal(0, 0.3, (len(ids), 2))
+        past = rng.normal(0, 0.3, (len(ids), 1, 2))
         target = np.clip(ours.qpos + rng.choice([1e-4, 0.1], (3, 2)), *ours.commands.range.T)
         for sim in (ours, theirs):
             sim.reset(ids, qpos, qvel, past=past)
