@@ -59,12 +59,11 @@ sys.exit(main(["gap", path]) or main(["data", "card", path]))
 
 @pytest.mark.skipif(os.name == "nt", reason="folders there have no such permissions")
 def test_a_dataset_that_may_only_be_read_has_a_gap_and_a_card(arm, tmp_path):
-    data, ctrl = Dataset.create(tmp_path / "disk" / "set", arm), wave(60, 2)
+    data = Dataset.create(tmp_path / "disk" / "set", arm)
+    ctrl = wave(60, 2)
     data.append(arm_sequence(arm, ctrl, late(ctrl, 2), "wave", 0.0))
-    disk, words = (
-        tmp_path / "disk",
-        [sys.executable, "-c", ALL, f"{tmp_path}/disk/set"],
-    )
+    disk = tmp_path / "disk"
+    words = [sys.executable, "-c", ALL, f"{tmp_path}/disk/set"]
     folders = [p for p in (disk, *disk.rglob("*")) if p.is_dir()]
     for folder in folders:
         folder.chmod(0o555)

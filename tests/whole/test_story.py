@@ -11,8 +11,10 @@ from arm import recordings, write_arm
 from gaponet.cli.main import main
 from gaponet.data.store import Dataset
 
-TRAIN = """--model gaponet --budget 3500 --pretraining.rounds 2 --pretraining.num-envs 16 --pretraining.steps 60
---pretraining.gradient-steps 60 --ppo.num-envs 16 --ppo.num-steps 16 --ppo.epochs 1""".split()  # noqa: SIM905
+TRAIN = """--model gaponet --budget 3500
+--pretraining.rounds 2 --pretraining.num-envs 16 --pretraining.steps 60
+--pretraining.gradient-steps 60
+--ppo.num-envs 16 --ppo.num-steps 16 --ppo.epochs 1""".split()  # noqa: SIM905
 
 
 @pytest.fixture(scope="module")
