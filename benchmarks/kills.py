@@ -271,7 +271,8 @@ def further_cases(given: Path) -> dict[str, Case]:
             lambda out: ["robot", "show", identified, "--out", str(out / "known.png")],
             begin="empty",
         ),
-        "start": killed(start, without("*.html", "*.json", "*.npz")),
+        # The commands name the folder.
+        "start": killed(start, without("commands.sh", "*.html", "*.json", "*.npz")),
     }
 
 
