@@ -2,6 +2,8 @@
 has to look at it first.
 """
 
+import tomllib
+
 import numpy as np
 import pytest
 from logs import arm_columns, table_text
@@ -121,6 +123,15 @@ def test_commands_by_other_names_than_the_states_are_named_too(tmp_path, arm):
     lines = guessed(write(tmp_path / "m.csv", columns), arm)
     start = lines.index("[names]")
     assert lines[start + 2 : start + 4] == ['"motor_a" = "shoulder"', '"motor_b" = "elbow"']
+
+
+def test_commands_by_other_names_stand_under_names_where_a_position_is_ignored(tmp_path, arm):
+    columns = {"t": TIME} | by_joint("q_{}", STATE) | {"q_camera": TIME}
+    columns |= by_joint("cmd_{}", COMMAND, ("m1", "m2"))
+    file = write(tmp_path / "m.csv", columns)
+    toml = tomllib.loads("\n".join(guessed(file, arm)))
+    assert toml["ignore"] == ["camera"]
+    assert toml["names"] == {"1": "shoulder", "2": "elbow"}
 
 
 def test_commands_by_number_in_an_array_beside_states_by_name_ask_for_their_order(tmp_path, arm):

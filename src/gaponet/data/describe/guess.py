@@ -125,7 +125,7 @@ def _guess_one_file(
     names = _names(channels, joints, robot)
     commands = _joints(first, channels, "ctrl")
     in_array = "ctrl" in channels and "{joint}" not in channels["ctrl"]
-    names += _names_of_commands(commands, joints, robot, in_array)
+    names += _names_of_commands(commands, joints, robot, in_array, names)
     tables = []  # the tables of TOML come last
     for line in names:
         if line.startswith(("joints =", "ignore =")):
@@ -581,17 +581,25 @@ def _joints_in_order(n: int, robot: RobotSpec) -> str:
 
 
 def _names_of_commands(
-    commands: list[str], joints: list[str], robot: RobotSpec, in_array: bool
+    commands: list[str],
+    joints: list[str],
+    robot: RobotSpec,
+    in_array: bool,
+    written: list[str],
 ) -> list[str]:
-    """Lines for commands that call their joints otherwise than the positions do.
+    """Lines for commands that call their joints otherwise than the positions do: `joints` for an
+    array without names, else [names].
 
     Args:
-        commands: Names of the joints, as the commands have them.
+        commands: Names of the joints, as the commands have them; digits where they have none.
         joints: The same of the positions.
-        in_array: The commands are one array, whose columns a line `joints` names.
+        in_array: The commands are one array, not a column per joint.
+        written: Lines of _names, which these follow.
     """
     strange = [name for name in commands if name not in joints and not _is_joint(name, robot)]
-    if not strange or "0" in joints:
+    if not strange:
+        return []
+    if "0" in joints:  # positions have no names either: their line `joints` is for both
         return []
     if in_array and all(name.isdigit() for name in strange):
         return [f"{_joints_in_order(len(strange), robot)} (of the commands)"]
@@ -599,7 +607,7 @@ def _names_of_commands(
     if len(strange) == len(robot.joint_names):
         ours = list(robot.joint_names)
     lines = []
-    if all(_is_joint(joint, robot) for joint in joints):  # else [names] stands there already
+    if not any(line.startswith("[names]") for line in written):
         lines += ["", "[names]"]
     lines.append("# of the commands  ? in the robot's order: is it theirs?")
     return lines + _equal_names(strange, ours)
