@@ -416,6 +416,20 @@ def test_values_that_are_not_finite_have_no_lasting_effect(robot, model, payload
     assert np.isfinite(one.payload.mass).all()
 
 
+def test_a_first_position_that_is_missing_is_not_taken_for_degrees(robot, model):
+    compensator = Compensator(robot, model, config=NOW)
+    compensator.reset(np.zeros(2), 0.0)
+    sent = compensator.step(np.zeros(2), np.array([0.0, np.nan]))
+    assert np.isfinite(sent).all()
+
+
+def test_a_first_position_that_is_missing_hides_no_degrees_of_another_robot(robot, model):
+    compensator = Compensator(robot, model, config=NOW, num_envs=2)
+    compensator.reset(np.zeros((2, 2)), 0.0)
+    with pytest.raises(LogError, match=r"elbow .*degrees"):
+        compensator.step(np.zeros((2, 2)), np.array([[0.0, np.nan], [0.0, -45.0]]))
+
+
 def test_an_adapted_unit_follows_where_the_model_alone_does_not(robot):
     ignorant = GapModel(Path("exact"), make_card(CONFIG, robot, dt=[0.02]), CONFIG, Operator(0.0))
     targets = np.tile([0.4, 0.8], (200, 1))

@@ -301,14 +301,16 @@ def require_radians(
     row in the error.
 
     A real joint may pass its MJCF limit by a calibration offset, not by a radian and half a turn.
+    NaN, a reading that is missing, is left alone.
     """
     for column, joint in enumerate(joint_names):
         of_joint = values[:, column]
-        row = int(abs(of_joint).argmax())
+        sizes = np.nan_to_num(np.abs(of_joint), nan=0.0)
+        row = int(sizes.argmax())
         value = of_joint[row]
         low, high = robot.qpos_range[robot.joint_names.index(joint)]
         near = low - MAX_BEYOND_RAD <= value <= high + MAX_BEYOND_RAD
-        if abs(value) <= MAX_OFFSET_RAD or (near and abs(value) <= MAX_PLAUSIBLE["qpos"]):
+        if sizes[row] <= MAX_OFFSET_RAD or (near and sizes[row] <= MAX_PLAUSIBLE["qpos"]):
             continue
         raise LogError(
             f"{where(row)} of {joint} is {value:.3f}, outside its range [{low:.2f}, "
