@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 
 from gaponet.base.arrays import Array
+from gaponet.data.describe.plausibility import MAX_BEYOND_RAD, TURN_RAD
 from gaponet.data.log import Channel, Log
 from gaponet.robot.spec import RobotSpec
 
-TURN_RAD = 2 * np.pi
 ROUNDING_RAD = 0.1  # by which angles of one turn may pass its ends
 MAX_STEP_RAD = 1.0  # that a joint moves beside the jump, from one row to the next
 
@@ -41,10 +41,11 @@ def continued_turns(log: Log, robot: RobotSpec) -> Log:
 
 
 def within_range(log: Log, robot: RobotSpec) -> Log:
-    """Return the log with joints of a limited range whose angles were written from 0 to a turn,
-    brought into this range.
+    """Return the log with angles from 0 to a turn brought into their joint's range.
 
-    Of an arm that counts from 0° to 360°, −10° is 350°. The log notes it (notes, "turns").
+    An arm that counts from 0° to 360° writes −10° as 350°. Where command or state of a joint then
+    fits its range, the other one follows by whole turns. Radians that never jump by a turn are left
+    alone: they may be degrees. The log notes it (notes, "turns").
     """
     positions = {name: np.array(log.channels[name].values, float) for name in ("ctrl", "qpos")}
     turned = {}
@@ -52,20 +53,23 @@ def within_range(log: Log, robot: RobotSpec) -> Log:
         low, high = robot.qpos_range[robot.joint_names.index(joint)]
         if not (np.isfinite(low) and np.isfinite(high)):
             continue
-        inside: dict[str, Array] = {}  # channel → angles inside the range, (k,)
+        brought: dict[str, Array] = {}  # channel → its angles in the range, (k,)
         wraps = 0
         for name, values in positions.items():
-            angles = _inside_range(values[:, column], low, high)
+            angles = _brought_into_range(values[:, column], low, high)
             if angles is not None:
-                inside[name] = angles
+                brought[name] = angles
                 wraps += _count_wraps(values[:, column])
-        converted = joint in log.meta.get("converted_from", {})
-        if not inside or not (wraps or converted):  # radians beyond the range may be degrees
+        if not brought:
             continue
-        reference = next(iter(inside.values()))
+        converted = joint in log.meta.get("converted_from", {})
+        if not wraps and not converted:
+            continue  # radians beyond the range may be degrees
+        reference = next(iter(brought.values()))
         for name, values in positions.items():
-            beside = _of_same_turn(values[:, column], reference)
-            values[:, column] = inside.get(name, beside)
+            if name not in brought:
+                brought[name] = _of_same_turn(values[:, column], reference)
+            values[:, column] = brought[name]
         turned[joint] = {"wraps": wraps, "turns": 0}
     return _with_positions(log, positions, turned) if turned else log
 
@@ -85,20 +89,20 @@ def _with_positions(log: Log, positions: dict[str, Array], turned: dict[str, Any
     return replace(log, channels=log.channels | channels, meta=log.meta | {"notes": notes})
 
 
-def _inside_range(values: Array, low: float, high: float) -> Array | None:
-    """Return one joint's angles (k,) of a turn from zero inside its range; None if they are
-    inside already, no such angles, or none of it helps.
+def _brought_into_range(values: Array, low: float, high: float) -> Array | None:
+    """Return one joint's angles (k,), written from 0 to a turn, moved by whole turns into its
+    range; None if they are not written so, lie in the range already, or do not fit it anyhow.
     """
     if values.min() < -ROUNDING_RAD or values.max() > TURN_RAD + ROUNDING_RAD:
         return None
-    if values.max() <= high + MAX_STEP_RAD or values.max() <= TURN_RAD / 2:
+    if values.max() <= high + MAX_BEYOND_RAD or values.max() <= TURN_RAD / 2:
         return None
     continued = values.copy()
     _continue(continued)
     middle = (continued.min() + continued.max()) / 2
     continued -= TURN_RAD * round((middle - (low + high) / 2) / TURN_RAD)
-    reached = continued.min() >= low - MAX_STEP_RAD and continued.max() <= high + MAX_STEP_RAD
-    return continued if reached else None
+    fits = continued.min() >= low - MAX_BEYOND_RAD and continued.max() <= high + MAX_BEYOND_RAD
+    return continued if fits else None
 
 
 def _of_same_turn(values: Array, reference: Array) -> Array:
