@@ -37,7 +37,7 @@ from gaponet.robot.log_joints import LOG_UNITS
 from gaponet.robot.spec import RobotSpec
 
 WIDEST = 500  # columns of an array that may be joints
-MIN_WIDTHS = 10  # times its height: so wide is an array with a column per sample, at least
+MIN_WIDTHS = 10  # columns over rows, from which an array is taken to have a column per sample
 MAX_RATE_ERROR = 0.1  # of the rate that is stated beside a clock
 MAX_GAIN_CHANGE = 1e-3  # of a gain, while it is recorded
 SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
@@ -70,12 +70,16 @@ class Column(NamedTuple):
         return values if self.number is None else values[:, self.number]
 
 
+Columns = dict[str, Column]  # of one channel, by the robot's own joint
+Chosen = dict[str, Columns]  # by channel
+
+
 @dataclass(frozen=True)
 class RawRecording:
     """One recording.
 
-    A signal's columns are named by digits where the file does not name them, and by () for a single
-    column.
+    A signal (k, n) has n names of columns, which are "0", "1", … where the file does not name them;
+    a signal (k,) has none: ().
     """
 
     name: str  # motion, unless logs.toml states another
@@ -144,10 +148,12 @@ class RawRecording:
         part: str = "",
         **more: Any,
     ) -> RawRecording:
-        """A recording of arrays in memory; those that are not one row of numbers per sample are
-        left alone.
+        """Return a recording of arrays in memory, (k,) or (k, n) of numbers; others are left alone.
+
+        Arrays with a column per sample are turned, which is noted.
 
         Args:
+            arrays: By the name that logs.toml may call them.
             names: The names of columns, for arrays that have so many.
             name: Default the file's.
             part: Which of several in the file.
@@ -241,10 +247,12 @@ class RawRecording:
 
 
 def rows_first(arrays: dict[str, Any]) -> tuple[dict[str, Any], list[str]]:
-    """Return arrays with a row per sample, and the names of those that had a column per sample.
+    """Return arrays with a row per sample, and the names of those that had a column per sample, as
+    MATLAB writes them.
 
-    The clock tells the number of samples. Without one, arrays that are all far wider than high are
-    taken as transposed.
+    The longest array of one axis, such as the clock, tells the number of samples. Without one,
+    arrays that are all far wider than high are taken as transposed. A clock (1, k) or (k, 1)
+    becomes (k,).
     """
     tables = {}
     for name, array in arrays.items():
@@ -269,8 +277,8 @@ def _is_clock(name: str, table: Array) -> bool:
 
 
 def _samples(arrays: dict[str, Any], tables: list[Array]) -> int:
-    """Return the number of samples: the length of single columns, else the width of tables that
-    are all far wider than high; 0 if one is not.
+    """Return the number of samples: the length of the longest array of one axis, else the width of
+    the tables; 0 if there is neither, or a table is not far wider than high.
     """
     samples = 0
     for array in arrays.values():
@@ -387,10 +395,6 @@ def by_place(recordings: ListOf[RawRecording]) -> dict[str, RawRecording]:
     return dict(zip(places, recordings, strict=True))
 
 
-Columns = dict[str, Column]  # by joint
-Chosen = dict[str, Columns]  # by channel
-
-
 @dataclass(frozen=True)
 class _Conversion:
     """How columns of a log become SI.
@@ -493,7 +497,7 @@ def _choose(
     single = specified.get("columns", {})
     _require_columns(recording, single)
     clocks = specified.get("clock", {}).values()
-    taken = {*single.values(), specified.get("time", ""), *clocks}  # no pattern finds these columns
+    taken = {*single.values(), specified.get("time", ""), *clocks}  # not to be found by a pattern
     chosen: Chosen = {}
     for channel in (*CHANNELS, *DERIVED):
         found = _matching(recording, specified, channel, taken)
@@ -534,26 +538,27 @@ def _require_columns(recording: RawRecording, single: dict[str, str]) -> None:
 def _matching(
     recording: RawRecording, specified: LogsFile, channel: str, taken: set[str]
 ) -> list[tuple[str, str]]:
-    """Return (joint, column) of a channel: of a pattern such as "{joint}_des", or of an array whose
-    columns are joints.
+    """Return (joint, column) of each column that holds a channel, by the names in the log.
+
+    logs.toml calls either an array whose columns are joints, or a pattern such as "{joint}_des".
 
     Args:
-        taken: Columns that no pattern finds.
+        taken: Columns that are known to hold something else: a pattern does not find them.
     """
-    pattern = specified.get(channel)
-    if not isinstance(pattern, str):
+    stated = specified.get(channel)
+    if not isinstance(stated, str):
         return []
-    if pattern in recording.signals and "{joint}" not in pattern:
-        return _columns_of_array(recording, pattern, specified.get("joints"))
-    if pattern.count("{joint}") != 1:
+    if stated in recording.signals and "{joint}" not in stated:
+        return _columns_of_array(recording, stated, specified.get("joints"))
+    if stated.count("{joint}") != 1:
         return []  # an array that this recording does not have
-    fits = _column_pattern(pattern)
-    longer = [_column_pattern(other) for other in _longer_patterns(specified, pattern)]
+    pattern = _column_pattern(stated)
+    longer = [_column_pattern(other) for other in _longer_patterns(specified, stated)]
     found = []
     for column in recording.columns:
         if column in taken or not _may_hold(column, channel):
             continue
-        match = fits.fullmatch(column)
+        match = pattern.fullmatch(column)
         if match and not _fits_any(column, longer):
             found.append((match["joint"], column))
     return found
@@ -594,14 +599,19 @@ def _columns_of_array(
 
 
 def _longer_patterns(specified: LogsFile, pattern: str) -> list[str]:
-    """Return patterns that say more of a column's name: q_{joint} reads q_des_1 as well, which is
-    q_des_{joint}'s.
+    """Return patterns of other channels that say more of a column's name, and win over this one:
+    q_{joint} fits q_des_1 as well, which is q_des_{joint}'s.
     """
-    patterns = [str(specified.get(channel, "")) for channel in CHANNELS]
-    return [p for p in patterns if p.count("{joint}") == 1 and len(p) > len(pattern)]
+    longer = []
+    for channel in CHANNELS:
+        other = str(specified.get(channel, ""))
+        if other.count("{joint}") == 1 and len(other) > len(pattern):
+            longer.append(other)
+    return longer
 
 
 def _column_pattern(pattern: str) -> re.Pattern[str]:
+    """Return the regular expression of "{joint}_des", with a group `joint`."""
     before, after = map(re.escape, pattern.split("{joint}"))
     return re.compile(f"{before}(?P<joint>.+?){after}")
 
