@@ -41,7 +41,7 @@ MAX_PEEKED = 200  # messages of a topic in which all its joints are named
 # By which a stamp may lie before the recorder's clock, and by which topics may differ in that.
 MAX_LATENCY_S = 0.1
 MAX_DRIFT_S = 0.005  # by which a stamp may run away from the recorder's clock during a recording
-COMMANDS = ("command", "cmd", "desired", "target", "goal", "reference", "setpoint")
+COMMAND_WORDS = ("command", "cmd", "desired", "target", "goal", "reference", "setpoint")
 # words of topics whose numbers without names are no positions
 NO_POSITIONS = {"velocity", "vel", "effort", "torque", "current", "acceleration", "cartesian"}
 COMMAND_FIELDS = (".position", ".point", ".data", ".q")  # that hold commanded positions
@@ -147,7 +147,7 @@ def _is_feedback(signal: str) -> bool:
 def _is_command(signal: str) -> bool:
     if _is_feedback(signal):
         return False
-    return signal.endswith(".point") or any(word in signal.lower() for word in COMMANDS)
+    return signal.endswith(".point") or any(word in signal.lower() for word in COMMAND_WORDS)
 
 
 def _of_state(position: str, signals: Container[str]) -> LogsFile:
@@ -259,10 +259,10 @@ def _peeked(bag: Path) -> Wanted:
 
 
 def _peek(bag: Path, reader: Any) -> Wanted:
-    """topic → field → names of its columns, of all messages together: several publishers may tell
-    of some joints each.
+    """Return topic → field → names of its columns, in all messages together: several publishers may
+    tell of some joints each.
 
-    Arrays without names that have another length are a field of TOPIC#2.
+    An array without names that has another length than the one before is a field of TOPIC#2.
     """
     topics: Wanted = {}
     for connection in _known(reader):
@@ -355,17 +355,17 @@ def _read(bag: Path, names: list[str]) -> tuple[dict[str, Signal], dict[str, Any
     stamps = {topic: _Stamps.of(of_topic) for topic, of_topic in rows.items()}
     times = _clocks(stamps, notes)
     loaded: dict[str, Signal] = {}
-    for topic, known in wanted.items():
+    for topic, columns_of in wanted.items():
         time = times[topic]
         columns = []  # of each field, (k, columns)
-        for i in range(len(known)):
+        for i in range(len(columns_of)):
             columns.append(np.array([row.values[i] for row in rows[topic]], float))
         if topic in in_parts:
             time, columns = _together(time, columns)
         fresh = _fresh(time, columns)
         if not fresh.all():
             notes["repeated"] = notes.get("repeated", 0) + int((~fresh).sum())
-        for field, values in zip(known, columns, strict=True):
+        for field, values in zip(columns_of, columns, strict=True):
             loaded[f"{topic}.{field}"] = Signal(values[fresh], time[fresh])
     return {name: loaded[name] for name in names}, notes
 
@@ -381,27 +381,33 @@ def _wanted(topics: Wanted, names: list[str]) -> Wanted:
 
 
 def _collect(reader: Any, wanted: Wanted) -> tuple[dict[str, list[_Row]], set[str]]:
-    """Return the rows of each topic, and the topics whose messages tell of some of their joints
-    each.
+    """Return the rows of each wanted topic, one for each message that tells of it, and the topics
+    of which some message tells of a part of the joints only.
+
+    Messages of /joints may belong to /joints, or to /joints#2 (_peek).
     """
     rows: dict[str, list[_Row]] = {topic: [] for topic in wanted}
     in_parts = set[str]()
     used = {_without_number(topic) for topic in wanted}
     connections = [connection for connection in _known(reader) if connection.topic in used]
     for message in _messages(reader, connections):
-        for topic, known in wanted.items():
+        for topic, columns_of in wanted.items():
             if _without_number(topic) != message.connection.topic:
                 continue
-            told = _told(message.fields, known)
+            told = _told(message.fields, columns_of)
             if not told:
                 continue
-            if not _tells_all(told, known):
+            if not _tells_all(told, columns_of):
                 in_parts.add(topic)
-            values = [_in_order(told.get(field), labels) for field, labels in known.items()]
-            stamped = message.stamp is not None
-            stamp = message.received if message.stamp is None else message.stamp
-            rows[topic].append(_Row(message.received, stamp, stamped, values))
+            values = [_in_order(told.get(field), labels) for field, labels in columns_of.items()]
+            rows[topic].append(_row(message, values))
     return rows, in_parts
+
+
+def _row(message: _Message, values: list[list[float]]) -> _Row:
+    if message.stamp is None:
+        return _Row(message.received, stamp=message.received, stamped=False, values=values)
+    return _Row(message.received, stamp=message.stamp, stamped=True, values=values)
 
 
 def _without_number(topic: str) -> str:
@@ -409,20 +415,24 @@ def _without_number(topic: str) -> str:
     return topic.split("#")[0]
 
 
-def _told(fields: Fields, known: dict[str, tuple[str, ...]]) -> Fields:
-    """Return the fields of a message that are known, and whose columns are."""
+def _told(fields: Fields, columns_of: dict[str, tuple[str, ...]]) -> Fields:
+    """Return the fields of a message that are wanted, all of whose columns are known.
+
+    Args:
+        columns_of: Wanted field → names of its columns, in all messages together.
+    """
     told: Fields = {}
-    for field, labels in known.items():
+    for field, labels in columns_of.items():
         if field in fields and set(fields[field][0]) <= set(labels):
             told[field] = fields[field]
     return told
 
 
-def _tells_all(told: Fields, known: dict[str, tuple[str, ...]]) -> bool:
-    """Return True if a message tells of every column of every field."""
-    if len(told) < len(known):
+def _tells_all(told: Fields, columns_of: dict[str, tuple[str, ...]]) -> bool:
+    """Return True if a message tells of every column of every wanted field."""
+    if len(told) < len(columns_of):
         return False
-    return all(set(known[field]) <= set(own) for field, (own, _) in told.items())
+    return all(set(columns_of[field]) <= set(own) for field, (own, _) in told.items())
 
 
 def _in_order(told: tuple[tuple[str, ...], Any] | None, labels: tuple[str, ...]) -> list[float]:
@@ -621,14 +631,14 @@ def _motors(field: str, names: tuple[str, ...]) -> Callable[[str, Any], Fields]:
     return fields
 
 
-STATE = _motors("motor_state", ("q", "dq", "tau_est"))
-COMMAND = _motors("motor_cmd", ("q", "dq", "tau", "kp", "kd"))
+LOW_STATE = _motors("motor_state", ("q", "dq", "tau_est"))
+LOW_CMD = _motors("motor_cmd", ("q", "dq", "tau", "kp", "kd"))
 KINDS: dict[str, Callable[[str, Any], Fields]] = {
     "trajectory_msgs/msg/JointTrajectory": _trajectory,
     "control_msgs/msg/JointTrajectoryControllerState": _controller,
     "control_msgs/msg/DynamicJointState": _dynamic,
-    "unitree_hg/msg/LowState": STATE,
-    "unitree_go/msg/LowState": STATE,
-    "unitree_hg/msg/LowCmd": COMMAND,
-    "unitree_go/msg/LowCmd": COMMAND,
+    "unitree_hg/msg/LowState": LOW_STATE,
+    "unitree_go/msg/LowState": LOW_STATE,
+    "unitree_hg/msg/LowCmd": LOW_CMD,
+    "unitree_go/msg/LowCmd": LOW_CMD,
 }
