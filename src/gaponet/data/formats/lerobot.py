@@ -48,7 +48,7 @@ from gaponet.data.formats.lerobot_set import (
     sets_under,
     tasks_of,
 )
-from gaponet.data.log import Channel, Log
+from gaponet.data.log import REQUIRED, Channel, Log
 from gaponet.robot.spec import RobotSpec
 
 OPTIONS = ("position_unit", "joints", "ignore", "calibration", "ctrl", "qpos")
@@ -176,10 +176,10 @@ class _Frames:
         self.file = file
         self.options = options
         robot = options.robot
-        features = self._features()
+        self.features = self._chosen_features()  # by channel
         names = {}  # channel → joints of its columns
         for channel, feature in self.features.items():
-            names[channel] = self._joints(channel, feature, features[feature])
+            names[channel] = self._joints(channel, feature, self._spec(feature))
         self.joints = tuple(joint for joint in robot.joint_names if joint in names["ctrl"])
         self._require_same_joints(names)
         self.units = [self._unit_of(joint) for joint in self.joints]
@@ -206,30 +206,33 @@ class _Frames:
                     f"{self.features['ctrl']} and {self.features[channel]}"
                 )
 
-    def _features(self) -> dict[str, Feature]:
-        """Choose the feature of each channel, and return what info.json says of them."""
-        part = self.part
-        known = dict(part.features)
-        self.features = {ours: theirs for ours, theirs in FEATURES.items() if theirs in known}
-        info = f"{part.path}/meta/info.json"
+    def _chosen_features(self) -> dict[str, str]:
+        """Return the feature of each channel: the usual one, or that of logs.toml."""
+        usual = self.part.features
+        there = self.part.info["features"]
+        chosen = {ours: theirs for ours, theirs in FEATURES.items() if theirs in usual}
+        info = f"{self.part.path}/meta/info.json"
         for channel, name in self.options.features.items():
-            if name not in part.info["features"]:
+            if name not in there:
                 raise LogError(
-                    f"{info}: no feature '{name}' (for {channel}); it has "
-                    f"{', '.join(part.info['features'])}"
+                    f"{info}: no feature '{name}' (for {channel}); it has {', '.join(there)}"
                 )
-            spec = part.info["features"][name]
-            where = f"{info}: features.{name}"
-            known[name] = validated(Feature, spec, where, LogError, AGAIN, allow_extra=True)
-            self.features[channel] = name
-        for need in ("ctrl", "qpos"):
-            if need not in self.features:
+            chosen[channel] = name
+        for need in REQUIRED:
+            if need not in chosen:
                 raise LogError(
-                    f"{info}: no feature '{FEATURES[need]}'; it has "
-                    f"{', '.join(part.info['features'])}. Say "
+                    f"{info}: no feature '{FEATURES[need]}'; it has {', '.join(there)}. Say "
                     f'{need} = "…" in logs.toml if another one holds it'
                 )
-        return known
+        return chosen
+
+    def _spec(self, feature: str) -> Feature:
+        """Return what info.json says of a feature."""
+        if feature in self.part.features:
+            return self.part.features[feature]
+        where = f"{self.part.path}/meta/info.json: features.{feature}"
+        spec = self.part.info["features"][feature]
+        return validated(Feature, spec, where, LogError, AGAIN, allow_extra=True)
 
     def _unit_of(self, joint: str) -> str:
         """The unit of a joint: a gripper is 0..100 of its range wherever the other joints are not

@@ -223,12 +223,14 @@ def _episodes(file: Path, ours: Ours | None) -> list[dict[str, Any]]:
     known = validated(list[Episode], rows, file, LogError, AGAIN, allow_extra=True)
     episodes = cast("list[dict[str, Any]]", known)
     if ours:
-        return [_state(episode, file, hint) for episode in episodes]
+        return [_with_stated(episode, file, hint) for episode in episodes]
     return episodes
 
 
-def _state(row: dict[str, Any], file: Path, hint: str) -> dict[str, Any]:
-    """A row of an export's episodes, with what it says of its recording checked, as `stated`."""
+def _with_stated(row: dict[str, Any], file: Path, hint: str) -> dict[str, Any]:
+    """Return a row of an export's episodes with `stated`, what it says of its recording as fields
+    of SequenceMeta, checked.
+    """
     where = f"{file}: episode {row['episode_index']}"
     stated = {name: row[name] for name in STATED if name in row} | {"robot": "?"}
     stated["notes"] = parse_json(
