@@ -266,7 +266,8 @@ def _peek(bag: Path, reader: Any) -> Wanted:
     """
     topics: Wanted = {}
     for connection in _known(reader):
-        sets: dict[str, list[tuple[str, ...]]] = {}  # field → names of its columns, by topic
+        # field → names of its columns in TOPIC, TOPIC#2, …
+        sets: dict[str, list[tuple[str, ...]]] = {}
         for message in islice(_messages(reader, [connection]), MAX_PEEKED + 1):
             for field, (labels, _) in message.fields.items():
                 of_field = sets.setdefault(field, [])
@@ -449,29 +450,36 @@ def _in_order(told: tuple[tuple[str, ...], Any] | None, labels: tuple[str, ...])
 
 
 def _together(time: Array, columns: list[Array]) -> tuple[Array, list[Array]]:
-    """Return rows in the order of time; messages of one instant that tell of some joints each are
-    one row.
+    """Return rows in the order of time, with one row for all messages of an instant, which tell of
+    some joints each.
+
+    Args:
+        time: Of the messages, (k) s.
+        columns: Values of each field, (k, n); NaN for joints of which a message tells nothing.
     """
     order = np.argsort(time, kind="stable")
     time = time[order]
-    columns = [values[order] for values in columns]
-    first = np.r_[True, np.diff(time) > 0]
-    group = np.cumsum(first) - 1
+    is_first = np.r_[True, np.diff(time) > 0]  # of its instant
+    row_of = np.cumsum(is_first) - 1  # message → row
     joined = []
     for values in columns:
-        row = np.full((group[-1] + 1, values.shape[1]), np.nan)
-        known = np.isfinite(values)
-        where = np.nonzero(known)
-        row[group[where[0]], where[1]] = values[known]
-        joined.append(row)
-    return time[first], joined
+        values = values[order]
+        rows = np.full((row_of[-1] + 1, values.shape[1]), np.nan)
+        messages, joints = np.nonzero(np.isfinite(values))
+        rows[row_of[messages], joints] = values[messages, joints]
+        joined.append(rows)
+    return time[is_first], joined
 
 
-def _fresh(time: Array, values: list[Array]) -> Array:
-    """Rows that are no second copy of the row before, at the same time."""
+def _fresh(time: Array, columns: list[Array]) -> Array:
+    """Return which rows, (k) bool, are no second copy of the row before, at the same time.
+
+    Args:
+        columns: Values of each field, (k, n).
+    """
     same = np.diff(time) == 0
-    for of_field in values:
-        same &= (np.diff(of_field, axis=0) == 0).all(axis=1)
+    for values in columns:
+        same &= (np.diff(values, axis=0) == 0).all(axis=1)
     fresh = np.ones(len(time), bool)
     fresh[1:] = ~same
     return fresh
