@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from gaponet.base.arrays import Array
 from gaponet.base.errors import LogError
 from gaponet.base.sandbox import sandboxed
 from gaponet.data.describe.logs_file import LogsFile
@@ -38,20 +39,26 @@ def recordings(path: Path, specified: LogsFile) -> Iterator[RawRecording]:
     """Every file."""
     for file in files_under(path, SUFFIXES):
         arrays = _read(file)
+        gains = {name: arrays.pop(name) for name in GAINS if name in arrays}
+        default: LogsFile = {}
         qpos = arrays.get(str(specified.get("qpos")))
-        gains: LogsFile = {}
-        for name in GAINS:
-            stated = arrays.pop(name, None)
-            if stated is not None and qpos is not None and qpos.ndim in (1, 2):
-                joints = int(np.prod(qpos.shape[1:]))
-                if stated.size not in (1, joints):
-                    raise LogError(
-                        f"{file}: {name} has {stated.size} values; give 1 or one for each of "
-                        f"{joints} joints"
-                    )
-                arrays[name] = np.broadcast_to(stated.ravel(), qpos.shape)
-                gains[name] = name  # type: ignore[literal-required]
-        yield RawRecording.of_arrays(file, arrays, default=gains)
+        if qpos is not None and qpos.ndim in (1, 2):
+            for name, stated in gains.items():
+                arrays[name] = _in_each_row(file, name, stated, qpos)
+                default[name] = name  # type: ignore[literal-required]
+        yield RawRecording.of_arrays(file, arrays, default=default)
+
+
+def _in_each_row(file: Path, name: str, stated: Array, qpos: Array) -> Array:
+    """Return gains, one for all joints or one for each, in the shape of the positions: (k, n) or
+    (k,).
+    """
+    joints = int(np.prod(qpos.shape[1:]))
+    if stated.size not in (1, joints):
+        raise LogError(
+            f"{file}: {name} has {stated.size} values; give 1 or one for each of {joints} joints"
+        )
+    return np.broadcast_to(stated.ravel(), qpos.shape)
 
 
 @sandboxed(LogError, "numpy")
