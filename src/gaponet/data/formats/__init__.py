@@ -23,9 +23,11 @@ is not enough, they have
 
 A format that needs an extra of the package names it in `EXTRA`.
 
-A field of logs.toml that is neither in ALWAYS nor in OPTIONS is refused: the format fixes it. A
-file that another format detects is no `table`. The shortest readers to copy are pace.py
-(`recordings`) and bam.py (`read`).
+A field of logs.toml that is neither in ALWAYS nor in OPTIONS is refused: the format fixes it.
+
+A path that two formats detect is refused, so that another layout of .npz is a case of npz.py, not a
+format beside it; only a `table` gives way. A new suffix stands in data.describe.logs_file._stem
+too. The shortest readers to copy are pace.py (`recordings`) and bam.py (`read`).
 """
 
 from __future__ import annotations
@@ -257,22 +259,17 @@ def read_logs(
     """
     specified, file = read_logs_file(path, options.logs)
     reader = _reader(path, options.format or specified.get("format"))
-    kind = _require_allowed(reader, path, options.allow_pickle)
+    _require_allowed(reader, path, options.allow_pickle)
     by_hand = options.as_logs_file()
     specified = specified | by_hand
-    for name in specified:
-        if name not in (*ALWAYS, *_options(reader)):
-            option = f"--{name.replace('_', '-')}" if name in by_hand else f"{file}: {name}"
-            raise UsageError(
-                f"{option} means nothing to the {kind} format, which fixes it itself; leave it out"
-            )
-    names = {**specified.get("names", {}), **(options.joint_map or {})}
+    _require_known_fields(reader, specified, by_hand, file)
+    joint_map = {**specified.get("names", {}), **(options.joint_map or {})}
     naming = Naming(specified, file)
     root = path if path.is_dir() else path.parent
     bad = skipped_rows()
-    for name, load in _loaders(reader, path, robot, specified, names):
+    for name, load in _loaders(reader, path, robot, specified, joint_map):
         try:
-            log = _mended(load(), robot, specified, names, options.strict)
+            log = _mended(load(), robot, specified, joint_map, options.strict)
         except LogError as error:
             if bad is None:
                 raise
@@ -282,19 +279,40 @@ def read_logs(
         if facts.pop("leave_out", False):
             continue
         motion = str(facts.pop("motion", name))
-        yield motion, _labelled(log, facts, robot, names)
+        yield motion, _labelled(log, facts, robot, joint_map)
     naming.require_all_used()
 
 
+def _require_known_fields(
+    reader: ModuleType, specified: LogsFile, by_hand: LogsFile, file: Path | None
+) -> None:
+    """Refuse fields that a format does not act on.
+
+    Args:
+        specified: logs.toml (file) and what is said by hand.
+    """
+    for field in specified:
+        if field in (*ALWAYS, *_options(reader)):
+            continue
+        option = f"--{field.replace('_', '-')}" if field in by_hand else f"{file}: {field}"
+        raise UsageError(
+            f"{option} means nothing to the {_format_of(reader)} format, which fixes it itself; "
+            "leave it out"
+        )
+
+
 def _mended(
-    log: Log, robot: RobotSpec, specified: LogsFile, names: dict[str, str], strict: bool
+    log: Log, robot: RobotSpec, specified: LogsFile, joint_map: dict[str, str], strict: bool
 ) -> Log:
-    """Return a log with angles of one turn, without nonsense and repeated rows, and corrected as
-    logs.toml says.
+    """Return a log with what loggers do to it undone: angles that wrap at a turn, nonsense, rows
+    that are written twice, and signs and offsets of logs.toml.
+
+    Raises:
+        LogError: It is implausible beyond repair, or with `strict` at all.
     """
     log = within_range(log, robot)
     log = require_plausible(log, robot, strict)
-    log = _corrected(log, robot, specified, names)
+    log = _corrected(log, robot, specified, joint_map)
     log = without_repeated_rows(log)  # after the checks, which name lines of the file
     return continued_turns(log, robot)
 
@@ -313,44 +331,49 @@ def look(
     """
     specified, _ = read_logs_file(path, options.logs)
     reader = _reader(path, options.format or specified.get("format"))
-    kind = _require_allowed(reader, path, options.allow_pickle)
+    _require_allowed(reader, path, options.allow_pickle)
+    kind = _format_of(reader)
     if not hasattr(reader, "recordings"):
         raise UsageError(f"{path}: {about(kind)}: the format says itself what its columns are")
     return kind, specified, list(islice(_recordings(reader, path, specified), MAX_LOOKED_AT))
 
 
-def _require_allowed(reader: ModuleType, path: Path, allow_pickle: bool) -> str:
-    """The name of the format; refuses pickled files unless they were allowed."""
-    kind = reader.__name__.rsplit(".", 1)[-1]
+def _require_allowed(reader: ModuleType, path: Path, allow_pickle: bool) -> None:
+    """Refuse pickled files unless they were allowed."""
     if getattr(reader, "PICKLED", False) and not allow_pickle:
         raise UsageError(
-            f"{path}: {kind} files are Python pickles, which can hold anything; add "
+            f"{path}: {_format_of(reader)} files are Python pickles, which can hold anything; add "
             "--allow-pickle to open them with an unpickler that makes arrays, numbers and text only"
         )
-    return kind
+
+
+def _format_of(reader: ModuleType) -> str:
+    """Return the name of the format that a module reads."""
+    return reader.__name__.rsplit(".", 1)[-1]
 
 
 def _reader(path: Path, fmt: str | None) -> ModuleType:
+    """Return the module that reads a path: of the format that is given, else by inspection."""
     if not path.exists():
         raise LogError(f"{path}{what_address(path) or ': does not exist'}")
     return module(fmt or detect(path))
 
 
 def _loaders(
-    reader: ModuleType, path: Path, robot: RobotSpec, specified: LogsFile, names: dict[str, str]
+    reader: ModuleType, path: Path, robot: RobotSpec, specified: LogsFile, joint_map: dict[str, str]
 ) -> Iterator[tuple[str, Callable[[], Log]]]:
-    """(name, what reads it) of every recording."""
+    """Yield (name, what reads its Log) of every recording."""
     if not hasattr(reader, "recordings"):
         known = getattr(reader, "OPTIONS", ())
         options = {field: value for field, value in specified.items() if field in known}
-        yield from reader.read(path, robot, names or None, **options)
+        yield from reader.read(path, robot, joint_map or None, **options)
         return
     recordings = _recordings(reader, path, specified)
     if FILES & specified.keys():
         recordings = _with_files(list(recordings), specified)
         specified = _with_prefixes(_defaults(reader) | specified, specified)
     for recording in recordings:
-        yield recording.name, partial(recording.to_log, robot, specified, names or None)
+        yield recording.name, partial(recording.to_log, robot, specified, joint_map or None)
 
 
 def _recordings(reader: ModuleType, path: Path, specified: LogsFile) -> Iterator[RawRecording]:
@@ -367,8 +390,10 @@ def _defaults(reader: ModuleType) -> LogsFile:
 
 
 def _with_prefixes(full: LogsFile, specified: LogsFile) -> LogsFile:
-    """Return logs.toml where signals of other files than the state's have their prefix; full: with
-    the defaults.
+    """Return logs.toml with the prefixes of signals in a command_file or time_file.
+
+    Args:
+        full: It with the defaults of the format, which name the commands if it does not.
     """
     changes: dict[str, Any] = {}
     if "command_file" in specified:
@@ -391,16 +416,16 @@ def _with_files(recordings: list[RawRecording], specified: LogsFile) -> Iterator
         states = _named_by(specified["state_file"], by_file)
     commands = _files_beside(states, specified.get("command_file"))
     clocks = _files_beside(states, specified.get("time_file"))
-    beside = {*commands.values(), *clocks.values()}
+    no_states = {*commands.values(), *clocks.values()}
     for file, name in states.items():
-        if file in beside:
+        if file in no_states:
             continue
         recording = replace(by_file[file], name=name)
         if file in commands:
-            command = _beside(recording, "command_file", commands[file], by_file)
+            command = _require_beside(recording, "command_file", commands[file], by_file)
             recording = recording.beside(command, COMMAND)
         if file in clocks:
-            clock = _beside(recording, "time_file", clocks[file], by_file)
+            clock = _require_beside(recording, "time_file", clocks[file], by_file)
             recording = recording.beside(clock, TIME)
             if len(clock.signals) == 1:
                 only = TIME + next(iter(clock.signals))
@@ -408,10 +433,12 @@ def _with_files(recordings: list[RawRecording], specified: LogsFile) -> Iterator
         yield recording
 
 
-def _beside(
+def _require_beside(
     recording: RawRecording, what: str, file: str, by_file: dict[str, RawRecording]
 ) -> RawRecording:
-    """Return the command_file or time_file (what) of a recording."""
+    """Return the command_file or time_file (what) of a recording, which is missing if by_file does
+    not have it.
+    """
     if file not in by_file:
         raise LogError(f'{recording.source}: its {what} "{file}" is not beside it')
     return by_file[file]
@@ -441,7 +468,7 @@ def _named_by(pattern: str, files: Iterable[str]) -> dict[str, str]:
 
 
 def _beside_clock(specified: LogsFile, commands: tuple[str, ...]) -> dict[str, str]:
-    """Return the clocks of channels where commands lie in a file of their own, with its clock."""
+    """Return channel → column of its clock, where the commands lie in a file with its own clock."""
     clocks = cast("dict[str, str]", dict(specified.get("clock", {})))
     of_commands = clocks.get("ctrl") or specified.get("time")
     if of_commands:
@@ -449,15 +476,15 @@ def _beside_clock(specified: LogsFile, commands: tuple[str, ...]) -> dict[str, s
     return clocks
 
 
-def _corrected(log: Log, robot: RobotSpec, specified: LogsFile, names: dict[str, str]) -> Log:
+def _corrected(log: Log, robot: RobotSpec, specified: LogsFile, joint_map: dict[str, str]) -> Log:
     """Return the log with signs and offsets, where logs.toml says some, noted; and where joints
     stood that it does not hold.
     """
-    posture = _by_joint("posture", specified.get("posture", {}), robot, names)
+    posture = _by_joint("posture", specified.get("posture", {}), robot, joint_map)
     if posture:
         log = replace(log, meta=log.meta | {"posture": posture})
-    signs = _by_joint("signs", specified.get("signs", {}), robot, names)
-    offsets = _by_joint("offsets", specified.get("offsets", {}), robot, names)
+    signs = _by_joint("signs", specified.get("signs", {}), robot, joint_map)
+    offsets = _by_joint("offsets", specified.get("offsets", {}), robot, joint_map)
     if not signs and not offsets:
         return log
     if 0 in signs.values():
@@ -486,14 +513,14 @@ def _turned(channel: str, values: Array, sign: Array, offset: Array) -> Array:
 
 
 def _by_joint(
-    section: str, stated: Mapping[str, float], robot: RobotSpec, names: dict[str, str]
+    section: str, stated: Mapping[str, float], robot: RobotSpec, joint_map: dict[str, str]
 ) -> dict[str, float]:
     """Return what a section of logs.toml says, by the robot's own joint."""
     where = f"[{section}] of logs.toml"
-    return {robot.resolve(joint, where, names): value for joint, value in stated.items()}
+    return {robot.resolve(joint, where, joint_map): value for joint, value in stated.items()}
 
 
-def _labelled(log: Log, facts: dict[str, Any], robot: RobotSpec, names: dict[str, str]) -> Log:
+def _labelled(log: Log, facts: dict[str, Any], robot: RobotSpec, joint_map: dict[str, str]) -> Log:
     """Return the log with what its name and logs.toml say of it; what the format itself says must
     not contradict.
     """
@@ -501,7 +528,7 @@ def _labelled(log: Log, facts: dict[str, Any], robot: RobotSpec, names: dict[str
     stated = dict(log.meta.get("stated", {}))
     for name in ("kp", "kd"):
         if name in facts:
-            meta[name] = _gains(name, facts.pop(name), log, robot, names)
+            meta[name] = _gains(name, facts.pop(name), log, robot, joint_map)
     if "estimated" in facts:
         meta["notes"] = meta.get("notes", {}) | {"estimated": facts.pop("estimated")}
     for name, value in facts.items():
@@ -517,7 +544,7 @@ def _labelled(log: Log, facts: dict[str, Any], robot: RobotSpec, names: dict[str
 
 
 def _gains(
-    name: str, stated: Any, log: Log, robot: RobotSpec, names: dict[str, str]
+    name: str, stated: Any, log: Log, robot: RobotSpec, joint_map: dict[str, str]
 ) -> list[float]:
     """Return the gains of the log's joints.
 
@@ -531,7 +558,7 @@ def _gains(
     by_joint: dict[str, float] = {}
     for joint, gain in stated.items():
         if joint:
-            by_joint[robot.resolve(joint, f"{name} of logs.toml", names)] = gain
+            by_joint[robot.resolve(joint, f"{name} of logs.toml", joint_map)] = gain
     own = robot.before_identification.servo[name][robot.index(log.joint_names)]
     gains: list[float] = []
     for joint, of_robot in zip(log.joint_names, own, strict=True):
