@@ -84,8 +84,9 @@ def _iso(text: str, day_first: bool) -> str:
     match = DAY_OR_MONTH_FIRST.fullmatch(text)
     if match is None:
         return text
-    one, _, other, year, clock, half = match.groups()
-    day, month = (one, other) if day_first else (other, one)
+    month, _, day, year, clock, half = match.groups()
+    if day_first:
+        day, month = month, day
     hours, _, rest = clock.partition(":")
     hour = int(hours)
     if half:

@@ -518,16 +518,19 @@ def _is_word(text: str) -> bool:
 
 
 def _joints(recording: RawRecording, channels: dict[str, str], channel: str = "qpos") -> list[str]:
-    """Names of the joints as a channel has them, in its order; digits where it has none."""
-    pattern = channels.get(channel) or channels.get("ctrl")
+    """Names of the joints as a channel has them, or the command if there is no such channel, in its
+    order; digits where it has none.
+    """
+    if channel not in channels:
+        channel = "ctrl"
+    pattern = channels.get(channel)
     if pattern is None:
         return []
     if "{joint}" not in pattern:
         return list(recording.signals.get(pattern) or ("0",))
-    kind = channel if channel in channels else "ctrl"
     joints = []
     for column, joint in _joint_of_column(recording, pattern).items():
-        if _kind(column) == kind:
+        if _kind(column) == channel:  # q_{joint} fits q_des_1 as well
             joints.append(joint)
     return joints
 

@@ -128,7 +128,8 @@ class Naming:
             value = specified.get(word)
             is_array = word in ("kp", "kd") and isinstance(value, str)  # a name: it says no number
             if value is not None and not is_array:
-                self.all[FIELDS[word][0]] = value
+                field, _ = FIELDS[word]
+                self.all[field] = value
 
     def of(self, name: str, path: str) -> dict[str, Any]:
         """Fields of SequenceMeta for a recording called `name` at a path relative to the logs."""
@@ -220,7 +221,7 @@ def _pattern(text: str, where: str) -> re.Pattern[str]:
             known = ", ".join("{" + field + "}" for field in FIELDS)
             raise UsageError(f'{where}: motion = "{text}": use each of {known} at most once')
         seen.add(word)
-        expression = FIELDS[word][1]
+        _, expression = FIELDS[word]
         if expression.startswith(".+"):
             loose += 1
         parts.append(f"(?P<{word}>{expression})" if word else expression)
@@ -241,7 +242,7 @@ def _fields(stated: Mapping[str, str | None], where: str) -> dict[str, Any]:
         if text is None or not text.strip():
             continue
         kind, _, joint = word.partition(".")
-        field = FIELDS[kind][0]
+        field, _ = FIELDS[kind]
         value: Any = _value(field, text, word, where)
         if joint:
             value = _by_joint(facts.get(field, {})) | {joint: value}

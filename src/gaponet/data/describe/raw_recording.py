@@ -175,13 +175,14 @@ class RawRecording:
 
         return RawRecording(name or file.stem, source, signals, load, source, (str(file),), **more)
 
-    def to_log(
-        self, robot: RobotSpec, specified: LogsFile, joint_map: dict[str, str] | None
-    ) -> Log:
-        """The columns that `specified` calls ctrl, qpos, …, in SI and on one time axis; channels
-        keep their clocks.
+    def to_log(self, robot: RobotSpec, stated: LogsFile, joint_map: dict[str, str] | None) -> Log:
+        """Return the columns that logs.toml calls ctrl, qpos, … as channels in SI, each with its
+        clock; all clocks begin at 0 together.
+
+        Args:
+            stated: logs.toml, which wins over `default`.
+            joint_map: The log's joint → the robot's.
         """
-        stated = specified
         specified = self.default | stated
         chosen = _choose(self, robot, specified, joint_map)
         if FEEDFORWARD in stated and FEEDFORWARD not in chosen:
