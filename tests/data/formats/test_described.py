@@ -16,7 +16,8 @@ from gaponet.base.errors import JointMismatchError, LogError, UsageError
 from gaponet.cli.main import main
 from gaponet.data.describe.guess import guess_logs
 from gaponet.data.describe.joints import resolve_all
-from gaponet.data.formats import PositionUnit, detect, look, read_logs
+from gaponet.data.describe.logs_file import Naming
+from gaponet.data.formats import FORMATS, PositionUnit, detect, look, module, read_logs
 from gaponet.data.importer import ImportRequest, import_logs
 from gaponet.data.log import skip_bad_rows
 from gaponet.data.store import Dataset
@@ -58,6 +59,14 @@ def test_the_name_of_a_file_says_motion_payload_repetition_and_gain(tmp_path, ar
     (tmp_path / "logs" / "other.csv").write_text(table_text(theirs()))
     with pytest.raises(LogError, match="other"):
         list(read_logs(tmp_path / "logs", arm))
+
+
+@pytest.mark.parametrize("fmt", [fmt for fmt in FORMATS if hasattr(module(fmt), "SUFFIXES")])
+def test_the_suffix_of_a_file_is_no_part_of_the_name_that_its_path_says(fmt):
+    naming = Naming({"motion": "{unit}/{motion}"}, None)
+    for suffix in module(fmt).SUFFIXES:
+        for written in (suffix, suffix.upper()):
+            assert naming.of("run", f"b/run{written}")["motion"] == "run"
 
 
 @pytest.mark.parametrize(

@@ -41,6 +41,10 @@ FIELDS = {
 MAX_LOOSE_WORDS = 3
 NUMBERS = ("payload_mass", "repetition", "kp", "kd")
 MAX_SHEET_BYTES = 16 << 20
+# Of the files of all built-in formats (SUFFIXES of each): no part of a recording's name.
+SUFFIX = re.compile(
+    r"\.(csv|tsv|txt|dat|parquet|npz|pt|pkl|mat|h5|hdf5|db3|mcap|bag|json)$", re.IGNORECASE
+)
 
 
 class LogsFile(TypedDict, total=False):
@@ -276,7 +280,8 @@ def _number(text: str) -> float | None:
 
 
 def _stem(file: str) -> str:
-    return re.sub(r"\.(csv|txt|parquet|npz|pt|mat|h5|hdf5|db3|mcap|json|pkl|dat|tsv)$", "", file)
+    """Return the name of a file without the suffix of a built-in format."""
+    return SUFFIX.sub("", file)
 
 
 def _read_sheet(file: Path) -> list[dict[str, str]]:

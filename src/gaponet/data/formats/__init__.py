@@ -26,7 +26,7 @@ A format that needs an extra of the package names it in `EXTRA`.
 A field of logs.toml that is neither in ALWAYS nor in OPTIONS is refused: the format fixes it.
 
 A path that two formats detect is refused, so that another layout of .npz is a case of npz.py, not a
-format beside it; only a `table` gives way. A new suffix stands in data.describe.logs_file._stem
+format beside it; only a `table` gives way. A new suffix stands in data.describe.logs_file.SUFFIX
 too. The shortest readers to copy are pace.py (`recordings`) and bam.py (`read`).
 """
 
