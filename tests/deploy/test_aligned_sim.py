@@ -66,6 +66,15 @@ def test_one_simulation_takes_flat_arrays(robot, model):
     np.testing.assert_allclose(two.qpos, np.stack([one.qpos, one.qpos]), atol=1e-6)
 
 
+def test_the_home_position_has_the_joints_of_the_simulation(tmp_path):
+    shoulder = 'name = "shoulder"\noperated = false\nhome = 0.3'
+    elbow = 'name = "elbow"\nhome = 0.2'
+    toml = TOML.replace('name = "shoulder"', shoulder).replace('name = "elbow"', elbow)
+    robot = write_arm(tmp_path, toml)
+    sim = AlignedSim(robot, options=AlignedSimOptions(locked=("shoulder",)))
+    np.testing.assert_array_equal(sim.qpos_home, [0.2])
+
+
 def test_one_of_several_simulations_can_be_reset(robot, model):
     sim = AlignedSim(robot, model, num_envs=2)
     fresh = AlignedSim(robot, model)

@@ -148,6 +148,12 @@ class AlignedSim:
         return control_periods_of(network, self.dt) == 1
 
     @property
+    def qpos_home(self) -> Array:
+        """Home position of `joint_names`, (n,) rad."""
+        home: Array = self.robot.qpos_home[self.robot.index(self.joint_names)]
+        return home
+
+    @property
     def qpos(self) -> Array:
         """Joint positions, rad; a view: writing to it changes the state of the simulation."""
         return self.sim.qpos[0] if self.single else self.sim.qpos
@@ -180,7 +186,7 @@ class AlignedSim:
             ids: Which simulations, (k,); arrays are then (k, n).
         """
         if qpos is None:
-            qpos = self.robot.qpos_home[self.robot.index(self.joint_names)]
+            qpos = self.qpos_home
         shape = self.target[ids].shape
         q = np.broadcast_to(np.asarray(qpos, float), shape)
         v = np.broadcast_to(np.asarray(qvel, float), shape)
