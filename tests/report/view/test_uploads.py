@@ -22,10 +22,10 @@ def archive(**files):
     return content.getvalue()
 
 
-def broken_archive():
+def broken_archive(compression=zipfile.ZIP_DEFLATED):
     """A .zip of two files; the second one is damaged."""
     packed = io.BytesIO()
-    with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as made:
+    with zipfile.ZipFile(packed, "w", compression) as made:
         for name in "ab":
             made.writestr(f"{name}.csv", "".join(f"{k * k}\n" for k in range(3000)))
         middle = made.infolist()[1].header_offset + 200
@@ -76,6 +76,7 @@ def test_the_files_of_a_zip_keep_their_folders(box):
     [
         (b"no archive", "broken"),
         (broken_archive(), "broken"),
+        (broken_archive(zipfile.ZIP_BZIP2), "Invalid data stream"),
         (archive(**{"a": "x", "a/b.csv": "y"}), "broken"),
         (archive(**{"../a.csv": "x", "a.csv": "y"}), "two files of one name"),
         (archive(), "holds no file"),

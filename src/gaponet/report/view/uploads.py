@@ -44,13 +44,12 @@ BROKEN_ZIP_ERRORS = (
     EOFError,
     RuntimeError,
     ValueError,
-    OSError,
 )
+# OSErrors of the disk. Any other one comes from the .zip too: a file where it has a folder, a name
+# that is too long, damaged bzip2.
+DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EIO, errno.EMFILE)
 MAX_SHOWN_STORED = 5  # lines of stored files; the newest
 MAX_SHOWN_REFUSED = 20  # lines of refused files; the oldest, and the number of the others
-# Errors of the disk. Any other OSError comes from the .zip: a file where it has a folder, a name
-# that is too long.
-DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EIO, errno.EMFILE)
 
 
 class Uploads:
@@ -232,10 +231,14 @@ def unpack(name: str, content: bytes, folder: Path) -> None:
     Raises:
         UsageError: It is a .zip that cannot be unpacked as a whole.
     """
-    if not name.lower().endswith(".zip"):
-        last = re.split(r"[/\\:]", name)[-1].lstrip(".")
-        (folder / (last or "file")).write_bytes(content)
+    if name.lower().endswith(".zip"):
+        _unpack_zip(content, folder)
         return
+    last = re.split(r"[/\\:]", name)[-1].lstrip(".")
+    (folder / (last or "file")).write_bytes(content)
+
+
+def _unpack_zip(content: bytes, folder: Path) -> None:
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
             members = [member for member in archive.infolist() if not member.is_dir()]
@@ -243,19 +246,23 @@ def unpack(name: str, content: bytes, folder: Path) -> None:
                 size = f"{MAX_UNPACKED_BYTES >> 30} GiB"
                 raise UsageError(f"it unpacks to more than {size}; give it in parts")
             archive.extractall(folder)  # which drops .. and a leading / from names
-    except BROKEN_ZIP_ERRORS as error:
-        if isinstance(error, OSError) and error.errno in DISK_ERRORS:
+    except OSError as error:
+        if error.errno in DISK_ERRORS:
             raise
-        reason = error.strerror if isinstance(error, OSError) else str(error)
-        raise UsageError(
-            f"the .zip is broken or has a password ({reason}); pack it again. Nothing of it is "
-            "stored"
-        ) from None
-    files = _files(folder)
-    if not files:
+        raise _broken_zip(error.strerror or str(error)) from None
+    except BROKEN_ZIP_ERRORS as error:
+        raise _broken_zip(str(error)) from None
+    unpacked = _files(folder)
+    if not unpacked:
         raise UsageError("the .zip holds no file")
-    if len(files) < len(members):
+    if len(unpacked) < len(members):
         raise UsageError("the .zip holds two files of one name; pack it again. Nothing is stored")
+
+
+def _broken_zip(reason: str) -> UsageError:
+    return UsageError(
+        f"the .zip is broken or has a password ({reason}); pack it again. Nothing of it is stored"
+    )
 
 
 def move_files(source: Path, target: Path) -> None:
