@@ -7,6 +7,10 @@ def test_a_text_that_begins_with_a_dash_stays_the_value_of_its_option():
     assert option_words({"unit_id": "--allow-pickle"}) == ["--unit-id=--allow-pickle"]
 
 
+def test_a_map_that_begins_with_a_dash_stays_the_value_of_its_option():
+    assert option_words({"map": ("-q1=elbow",)}) == ["--map=-q1=elbow"]
+
+
 def test_options_that_nobody_set_are_not_typed():
     assert option_words({"budget": None, "skip_bad": False, "joints": ()}) == []
 

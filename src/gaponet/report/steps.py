@@ -168,20 +168,24 @@ def option_words(options: Mapping[str, Option]) -> list[str]:
 
     Those that are None, False or () are left out. A text that begins with a dash stays a value.
     """
-    words = list[str]()
+    words: list[str] = []
     for name, value in options.items():
         option = f"--{name.replace('_', '-')}"
         if value is None or value is False or value == ():
             continue
         if value is True:
             words.append(option)
-        elif name in REPEATED and isinstance(value, tuple):
+        elif not isinstance(value, tuple):
+            words += _option_with_value(option, str(value))
+        elif name in REPEATED:
             for each in value:
-                words += [option, each]
-        elif isinstance(value, tuple):
-            words += [option, *value]
-        elif str(value).startswith("-"):
-            words.append(f"{option}={value}")
+                words += _option_with_value(option, each)
         else:
-            words += [option, str(value)]
+            words += [option, *value]
     return words
+
+
+def _option_with_value(option: str, value: str) -> list[str]:
+    if value.startswith("-"):  # in a word of its own, it would be read as another option
+        return [f"{option}={value}"]
+    return [option, value]
