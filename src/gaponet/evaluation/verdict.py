@@ -128,28 +128,29 @@ def next_step(
 ) -> str:
     """Return the next command for a person.
 
-    If a network helps, that is its report, and once that exists its export. Without a useful
-    network it is the export of the identified robot, or its identification.
+    If a network helps, that is its report, and once that exists its export; a network of the
+    package has no report. Without a useful network it is the export of the identified robot, or its
+    identification.
 
     Args:
         methods: Method → its metrics.
         dataset: Dataset, as the command line names it.
         folder: Folder of the identified robot or of the run, or a network of the package by name or
-            folder.
+            folder; None for the nominal simulator alone.
         reported: The report exists.
     """
     identify = shlex.join(["gaponet", "identify", dataset, "--out", "my_robot"])
+    if folder is None:
+        return identify
     networks = _networks(methods)
-    helps = any(network_gain(methods, own).helps for own in networks)
-    if folder is not None and is_packaged(named_folder(folder)):
-        if not helps:
-            return identify
-        return f"gaponet export {folder.name} --to torch --out {folder.name}-torch"
-    if helps and reported:
-        return shlex.join(["gaponet", "export", str(folder), "--to", "torch"])
-    if helps:
+    is_in_package = is_packaged(named_folder(folder))
+    if any(network_gain(methods, own).helps for own in networks):
+        if is_in_package:
+            return f"gaponet export {folder.name} --to torch --out {folder.name}-torch"
+        if reported:
+            return shlex.join(["gaponet", "export", str(folder), "--to", "torch"])
         return shlex.join(["gaponet", "report", str(folder)])
-    if "identified" not in methods or folder is None:
+    if is_in_package or "identified" not in methods:
         return identify
     robot = folder / STORED_ROBOT if networks else folder
     return shlex.join(["gaponet", "export", str(robot), "--to", "mjcf"])
