@@ -43,6 +43,9 @@ def totals(
 ) -> ResultTable:
     """Return a row per method.
 
+    The terminal shows the first columns alone (cli/show.py). A metric that is shown here must also
+    be a field of run_files.Scores, which refuses the stored evaluations that lack it.
+
     Args:
         methods: Method → metrics (sim.metrics.summary).
         angle: Formats the MPJAE.
