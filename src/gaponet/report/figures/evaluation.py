@@ -37,6 +37,7 @@ SHOWN_S = 20.0  # of each motion, so that details are visible
 # rad of a position axis, so that encoder steps of a joint at rest are not magnified
 MIN_POSITION_SPAN = 0.06
 MIN_CORRECTION = 1e-5  # rad; smaller corrections are noise
+MAX_JOINTS = 3  # of a motion
 MAX_COLUMNS = 4
 FLOOR_COLOUR = "#1f7a56"
 QUANTILE_90 = 1.645  # standard deviations on each side of a 90 % interval
@@ -146,23 +147,25 @@ def _trajectory(
 ) -> Figure:
     """Draw three joints of the stored motion `row`, a column each.
 
-    Moving joints come before those at rest, and among these those with the largest nominal error.
-    From top to bottom: positions, positions around the largest turn of the command, errors, and
-    corrections.
+    Joints that move in the drawn part are picked before those at rest, and of either those with the
+    largest nominal error in the whole motion. From top to bottom: positions, positions around the
+    largest turn of the command, errors, and corrections if there are any.
     """
-    recorded = arrays[f"{row}/recorded"]
+    recorded = arrays[f"{row}/recorded"]  # (T, n) rad
+    command = arrays[f"{row}/command"]
     count = round(SHOWN_S / dt)
     start = busiest_window(recorded, count)
     window = slice(start, min(start + count, len(recorded)))
-    is_still = np.ptp(arrays[f"{row}/command"][window], axis=0) <= MIN_MOTION_RAD  # (n,)
-    nominal_error = np.abs(arrays[f"{row}/nominal"] - recorded).mean(axis=0)
-    picked = sorted(np.lexsort((-nominal_error, is_still))[:3].tolist())
+    is_still = np.ptp(command[window], axis=0) <= MIN_MOTION_RAD  # (n,)
+    nominal_error = np.abs(arrays[f"{row}/nominal"] - recorded).mean(axis=0)  # (n,) rad
+    order = np.lexsort((-nominal_error, is_still))  # the last key counts most
+    picked = sorted(order[:MAX_JOINTS].tolist())
     deltas = {}
     for name in methods:
         delta = arrays.get(f"{row}/delta/{name}")
         if delta is not None and np.abs(delta).max() > MIN_CORRECTION:
             deltas[name] = delta[window]
-    heights = {"position, rad": 1.8, "zoom, rad": 1.6, "error, mrad": 1.1}
+    heights = {"position, rad": 1.8, "zoom, rad": 1.6, "error, mrad": 1.1}  # of panels, top first
     if deltas:
         heights["Δa, mrad"] = 0.9
     fig = figure(3.6 * len(picked), 1.0 + 1.1 * sum(heights.values()))
@@ -174,7 +177,7 @@ def _trajectory(
         shown = _JointPaths(
             time,
             dt,
-            command=arrays[f"{row}/command"][window, j],
+            command=command[window, j],
             recorded=recorded[window, j],
             simulated={name: arrays[f"{row}/{name}"][window, j] for name in methods},
             deltas={name: delta[:, j] for name, delta in deltas.items()},
@@ -182,10 +185,10 @@ def _trajectory(
         heading = joint_label(joints[j], wrapped=False)
         column[0].set_title(f"{heading} (stands still)" if is_still[j] else heading)
         _draw_joint(column, shown)
-    for line, label in zip(axes, heights, strict=True):
-        line[0].set_ylabel(label)
-    for line in axes[2:]:
-        _centre_on_zero(line)
+    for panels, label in zip(axes, heights, strict=True):
+        panels[0].set_ylabel(label)
+    for panels in axes[2:]:  # errors and corrections
+        _centre_on_zero(panels)
     fig.align_ylabels(axes[:, 0])
     legend(fig)
     return fig
@@ -205,18 +208,19 @@ class _JointPaths:
 
 def _draw_joint(column: Array, paths: _JointPaths) -> None:
     """Draw a joint into a column of axes, from top to bottom as `_trajectory` says."""
+    whole, zoomed, error = column[:3]
     time = paths.time
     zoom = _turn(paths.command, paths.dt)
-    _draw_positions(column[0], paths, slice(None))
-    _draw_positions(column[1], paths, zoom)
-    column[0].axvspan(*time[zoom][[0, -1]], color="#000000", alpha=0.06, lw=0)
+    _draw_positions(whole, paths, slice(None))
+    _draw_positions(zoomed, paths, zoom)
+    whole.axvspan(*time[zoom][[0, -1]], color="#000000", alpha=0.06, lw=0)
     for name, qpos in paths.simulated.items():
-        column[2].plot(time, (qpos - paths.recorded) * 1e3, color=colour(name), lw=1.0)
-    column[2].axhline(0, color="#111111", lw=0.6)
+        error.plot(time, (qpos - paths.recorded) * 1e3, color=colour(name), lw=1.0)
+    error.axhline(0, color="#111111", lw=0.6)
     for name, delta in paths.deltas.items():
         column[3].plot(time[: len(delta)], delta * 1e3, color=colour(name), lw=0.9)
     column[-1].set_xlabel("time, s")
-    for ax in (column[0], *column[2:]):
+    for ax in (whole, *column[2:]):
         ax.set_xlim(time[0], time[-1])
 
 
@@ -248,11 +252,11 @@ def _draw_positions(ax: Axes, paths: _JointPaths, part: slice) -> None:
         ax.set_ylim((middle_twice - MIN_POSITION_SPAN) / 2, (middle_twice + MIN_POSITION_SPAN) / 2)
 
 
-def _centre_on_zero(line: Array) -> None:
-    """Give axes that stand in a line one vertical range, with zero in the middle."""
-    ends = [np.abs(ax.dataLim.intervaly).max() for ax in line]
+def _centre_on_zero(panels: Array) -> None:
+    """Give panels that stand side by side one vertical range, with zero in the middle."""
+    ends = [np.abs(ax.dataLim.intervaly).max() for ax in panels]
     end = 1.08 * max(ends) or 1.0
-    for ax in line:
+    for ax in panels:
         ax.set_ylim(-end, end)
 
 
