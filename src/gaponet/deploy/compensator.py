@@ -76,7 +76,7 @@ class CompensatorConfig:
     feedback_time: float = 0.5
     """Time constant of the low-pass before the integrator, s."""
     feedback_limit: float = 0.1
-    """Largest integral, rad."""
+    """Largest integral, rad; also the largest error, and deviation for `observe`, that counts."""
     observation_time: float = 0.5
     """Time constant with which `observe` takes over what the robot does differently, s."""
     limit: float = 0.5
@@ -90,12 +90,15 @@ class CompensatorConfig:
     """
 
     def __post_init__(self) -> None:
-        numbers = np.array([x for x in vars(self).values() if not isinstance(x, str)], float)
+        is_aim = self.aim in ("target", "simulator")
         in_range = 0 < self.gain <= 1 and self.limit > 0 and self.iterations > 0
-        finite = ((numbers >= 0) & (numbers < np.inf)).all()
-        if self.aim not in ("target", "simulator") or not in_range or not finite:
-            text = "gain must be in (0, 1], limit and iterations > 0, the rest finite and ≥ 0"
-            raise UsageError(f"compensator: aim is target or simulator; {text}")
+        numbers = np.array([x for x in vars(self).values() if not isinstance(x, str)], float)
+        finite = ((numbers >= 0) & (numbers < np.inf)).all()  # and no NaN
+        if not is_aim or not in_range or not finite:
+            raise UsageError(
+                "compensator: aim is target or simulator; gain must be in (0, 1], limit and "
+                "iterations > 0, the rest finite and ≥ 0"
+            )
 
 
 class Compensator:
@@ -168,6 +171,7 @@ class Compensator:
         self.model = model
         self.extrapolate = extrapolate
         self.shadow = Shadow(robot, loads[0], num, nthread, locked)
+        # Everything that must change with the payload.
         carriers: list[Carrier] = [PayloadFields(self.shadow.sim, loads, locked)]
         self.inverse: NetworkInverse | None = None
         self.follower: Follower | None = None
@@ -188,9 +192,8 @@ class Compensator:
             config.limit, config.blend, dt, self.shadow.low, self.shadow.high, num
         )
         estimate = PayloadEstimate(robot, loads, num, locked)
-        self.payload = Payload(
-            masses, config.payload_max, num, carriers, estimate, compared=num_envs is None
-        )
+        compared = num_envs is None  # `doubt` speaks of one robot
+        self.payload = Payload(masses, config.payload_max, num, carriers, estimate, compared)
         self._rows = JointRows(robot, num_envs)
         self._target: Array | None = None  # last finite target; None before `reset`
 
@@ -233,21 +236,24 @@ class Compensator:
         if payload_mass is not None:
             self.require_payload(payload_mass)
         self.payload.reset(payload_mass)
-        a = self._rows.all_joints(target)
-        if not np.isfinite(a).all():
+        targets = self._rows.all_joints(target)
+        if not np.isfinite(targets).all():
             raise UsageError("compensator: the target to begin at is not a number")
         require_radians(
-            a, self.robot.joint_names, self.robot, lambda row: "compensator: the target to begin at"
+            targets,
+            self.robot.joint_names,
+            self.robot,
+            lambda row: "compensator: the target to begin at",
         )
-        self._target = a
-        operated = a[:, self._rows.operated]
-        self.limits.reset(operated)
+        self._target = targets
+        a = targets[:, self._rows.operated]
+        self.limits.reset(a)
         self.feedback.reset()
         if self.inverse is not None:
             self.inverse.reset()
         if self.feedforward is not None:
-            self.feedforward.reset(operated)
-        rest = within(a[:, self.shadow.free], *self.shadow.sim.commands.range.T)
+            self.feedforward.reset(a)
+        rest = within(targets[:, self.shadow.free], *self.shadow.sim.commands.range.T)
         self.shadow.reset(rest)
         if self.follower is not None:
             self.follower.reset(rest, SETTLING_PERIODS)
@@ -272,7 +278,9 @@ class Compensator:
     def step(
         self, target: Array, qpos: Array | None, qvel: Array | None = None, tau: Array | None = None
     ) -> Array:
-        """Commands for the coming control period, rad.
+        """Return the commands for the coming control period, rad.
+
+        All arrays are (num_envs, n), or (n,) for a single robot.
 
         Args:
             target: Target of the robot, rad. If it is not finite, the last finite one holds.
@@ -294,11 +302,11 @@ class Compensator:
         self._target = targets
         if qpos is not None:
             self._process_state(qpos, qvel, tau)
-        of_free = targets[:, self.shadow.free]
-        a = of_free[:, self.shadow.operated]
+        a = targets[:, self._rows.operated]
         if self.feedforward is not None:
             self.feedforward.update(a)
-        shadow_target = self._shadow_target(of_free)
+        free_targets = targets[:, self.shadow.free]
+        shadow_target = self._shadow_target(free_targets)
         u = shadow_target
         if self.inverse is not None:
             u = self.inverse.command(
@@ -307,7 +315,7 @@ class Compensator:
         u = u + self.feedback.integral
         commands = targets.copy()
         commands[:, self._rows.operated] = self.limits.apply(a, u, self._exhausted())
-        self.shadow.step(of_free, shadow_target)
+        self.shadow.step(free_targets, shadow_target)
         return self._rows.back(commands)
 
     @property
@@ -384,6 +392,8 @@ class Compensator:
     def _shadow_target(self, targets: Array) -> Array:
         """Return a′, the shadow's targets of the operated joints, (num_envs, n) rad.
 
+        Call this once per step of the shadow: a follower steps its nominal simulators in it.
+
         targets: Of the free joints, (num_envs, n_free) rad.
         """
         if self.follower is not None:
@@ -415,7 +425,10 @@ class Compensator:
         q = self._rows.operated_joints(qpos)
         v = np.zeros_like(q) if qvel is None else self._rows.operated_joints(qvel)
         torque = None if tau is None else self._rows.operated_joints(tau)
-        valid = np.isfinite(q + v + (0.0 if torque is None else torque)).all(axis=1)  # robots
+        measured = q + v  # finite where both are
+        if torque is not None:
+            measured = measured + torque
+        valid = np.isfinite(measured).all(axis=1)  # (num_envs,)
         if started:
             self.feedback.update(self.shadow.qpos - q, valid, self.limits.saturation)
         self.payload.observe(q, v, self.limits.command, torque, valid)
@@ -472,7 +485,7 @@ def _possible_masses(
 ) -> Array:
     """Return the masses that the shadow can carry in each hand, at most `step` apart, kg."""
     largest = _max_payload(robot, model, config, extrapolate)
-    steps = int(np.ceil(largest / step - 1e-9))
+    steps = int(np.ceil(largest / step - 1e-9))  # rounding must not add a step
     return np.linspace(0.0, largest, 1 + steps)
 
 
