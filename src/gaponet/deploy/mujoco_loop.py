@@ -67,7 +67,7 @@ class MujocoAligner:
         _require_joints(mj_model, robot, model, prefix)
         if isinstance(model, GapModel):
             model.require_payload(payload_mass, extrapolate)
-        can_agree = _can_agree(model, dt)
+        may_agree = _may_agree(model, dt)
         condition = Condition(payload_mass, "both", dt)
         locked = _undriven(mj_model, robot, prefix)
         reference = BatchSim(robot, [condition], 1, locked)
@@ -76,15 +76,17 @@ class MujocoAligner:
         self.loop: DeltaLoop | None = None
         self.transfer: Transfer | None = None
         of_reference = AnalyticInverse.of(reference)
-        if not can_agree or not inverse.agrees_with(of_reference, reference.commands.range):
+        agrees = may_agree and inverse.agrees_with(of_reference, reference.commands.range)
+        if agrees and isinstance(model, GapModel):
+            self.loop = model.loop(context=own_context(model, robot, [condition]))
+        if not agrees:
             try:
                 self.transfer = Transfer(model, inverse, [condition], locked, 1, extrapolate)
             except ModelError:
                 self.loop = _loop_of_known_scene(model, mj_model, robot, dt, prefix)
                 if self.loop is None:
                     raise
-        elif isinstance(model, GapModel):
-            self.loop = model.loop(context=own_context(model, robot, [condition]))
+        # Without loop and transfer, the scene moves like the robot already.
         joints = reference.joint_names if self.loop is None else robot.operated
         names = [prefix + name for name in joints]
         self.qpos, self.qvel, self.actuator = _addresses(mj_model, names)
@@ -97,6 +99,7 @@ class MujocoAligner:
     def __call__(self, data: mujoco.MjData, ctrl: Array) -> Array:
         """Return corrected targets, (nu,) rad. Call this once per control period."""
         out = np.array(ctrl, float)
+        # (1, n): loop and transfer have a row for each robot
         q = data.qpos[None, self.qpos]
         v = data.qvel[None, self.qvel]
         a = out[None, self.actuator]
@@ -105,7 +108,7 @@ class MujocoAligner:
                 self.loop.reset()
             self.loop.delta(q, v, a, self.payload_mass)
             out[self.actuator] = self.loop.applied[0]
-        elif self.transfer is not None:  # else the scene equals the robot
+        elif self.transfer is not None:
             if self._fresh:
                 self.transfer.reset(slice(None), q, v, a[:, None])
             self.transfer.inverse.dynamics.set_state(data)
@@ -132,8 +135,12 @@ def _require_joints(scene: mujoco.MjModel, robot: RobotSpec, model: Reference, p
             )
 
 
-def _can_agree(model: Reference, dt: float) -> bool:
-    """Return true if a scene of plain MuJoCo can move like the model's simulator."""
+def _may_agree(model: Reference, dt: float) -> bool:
+    """Return true if no transfer is needed where the inverse of scene and simulator agree.
+
+    A network must run in each control period. A robot must have no servo model, which plain MuJoCo
+    lacks.
+    """
     if isinstance(model, GapModel):
         return control_periods_of(model, dt) == 1
     return not model.servo.has_terms
