@@ -28,7 +28,10 @@ FRICTION_SPEED = 0.05
 
 
 class Feedforward:
-    """Targets a + τ / kp, under which the servos of a shadow follow a; all (num, n operated)."""
+    """Targets a + τ / kp − offset, under which the servos of a shadow follow a.
+
+    offset is what the servos add to their targets. All arrays are (num, n operated).
+    """
 
     def __init__(self, shadow: Shadow, robot: RobotSpec, motion: MotionTorque | None) -> None:
         """

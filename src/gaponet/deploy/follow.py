@@ -105,8 +105,8 @@ class Follower:
         """
         inverse = self._transfer.inverse
         period = self._transfer.step_reference(target)
-        way = period.next_qpos - period.qpos
-        ahead = inverse.servos.delay / inverse.steps.dt * way
+        travel = period.next_qpos - period.qpos  # rad, in the period
+        ahead = inverse.servos.delay / inverse.steps.dt * travel
         moved = replace(period, qpos=period.qpos + ahead, next_qpos=period.next_qpos + ahead)
         commands: Array = inverse.targets_in_force(moved)[:, self._operated]
         return commands

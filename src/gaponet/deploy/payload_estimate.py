@@ -129,6 +129,7 @@ class PayloadEstimate:
         """Estimate without the limit of its rate, (num,) kg."""
         projection, leverage, energy = self._sums
         mass = within(projection / np.maximum(leverage, 1e-9), 0.0, self.max_mass)
+        # Squared cosine between the excess torque and that of a payload, with the cosine's sign.
         explained = projection * np.abs(projection)
         similarity = explained / np.maximum(leverage * energy, 1e-9)
         similar = similarity >= MIN_SIMILARITY * (mass / self.max_mass) ** 2

@@ -160,7 +160,8 @@ class Transfer:
         periods = [self.step_reference(corrected)]
         if self.inverse.ahead:
             state = self.sim.state()
-            periods += [self.step_reference(corrected) for _ in range(self.inverse.ahead)]
+            for _ in range(self.inverse.ahead):
+                periods.append(self.step_reference(corrected))
             self.sim.set_state(state)
         return self.inverse(periods)
 
@@ -170,13 +171,17 @@ class Transfer:
         qpos = sim.qpos.copy()
         qvel = sim.qvel.copy()
         sim.step(targets)
-        end = sim.qpos.copy(), sim.qvel.copy()
-        return Period(qpos, qvel, *end, self._friction_share(end[0] - qpos))
+        next_qpos = sim.qpos.copy()
+        next_qvel = sim.qvel.copy()
+        return Period(qpos, qvel, next_qpos, next_qvel, self._friction_share(next_qpos - qpos))
 
     def _friction_share(self, motion: Array) -> Array:
-        """Return the used share of friction.
+        """Return `Period.friction`, (num_envs, n), in [−1, 1].
 
-        Where stops or contacts block a joint, it follows from the speed.
+        It follows from the simulator's constraint force. Where that holds the force of stops or
+        contacts too, it follows from the speed.
+
+        motion: Of the period, (num_envs, n) rad.
         """
         share = -self._constraint_force / np.maximum(self._frictionloss, 1e-9)
         by_speed = np.tanh(motion / self._dt / STICTION_SPEED)
