@@ -129,8 +129,8 @@ def test_a_closeup_may_cut_limbs_without_operated_joints():
     standing = SideBySide(real, h1_2, (Copy("recorded", real.qpos, np.zeros(2)),), None)
     whole = Scene(standing)
     near = Scene(standing, closeup=True)
-    assert whole.box[2] < 0.1 < 0.6 < near.box[2]  # feet, pelvis
-    assert whole.box[3] == near.box[3]
+    assert whole.box.bottom < 0.1 < 0.6 < near.box.bottom  # feet, pelvis
+    assert whole.box.top == near.box.top
     assert whole.floor == near.floor < 0.05
 
 

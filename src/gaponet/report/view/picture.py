@@ -61,7 +61,7 @@ class Camera:
         self.magnify = magnify
         self.width = width - width % 2
         letters = max(width / 960, 0.5)
-        tall = scene.box[3] - scene.box[2]
+        tall = scene.box.height
         self.head = round(34 * letters)  # pixels
         labels = round(60 * letters)  # pixels
         room = MAX_HEIGHT * self.width - self.head - labels  # pixels

@@ -40,7 +40,7 @@ class Bodies:
         self._add_bodies()
         across = float(2.5 * scene.extent)
         server.scene.add_grid("/robots/floor", across, across, position=(0, 0, scene.floor))
-        above = scene.view.axes[1] * 1.08 * scene.box[3]
+        above = scene.view.axes[1] * 1.08 * scene.box.top
         for m, base in zip(scene.shown.motions, scene.base, strict=True):
             server.scene.add_label(
                 f"/robots/label_{m.method}", title(m.method), position=base + above

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -23,9 +24,8 @@ from gaponet.robot.collision import Shapes
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.model import build_spec
 
-COLLISION_RADIUS_SHARE = (
-    0.85  # drawn of the shapes of collision.toml, which are larger than the robot
-)
+# Drawn of the shapes of collision.toml, which are larger than the robot.
+COLLISION_RADIUS_SHARE = 0.85
 PAYLOAD_RGBA = (0.93, 0.60, 0.10, 1.0)
 GHOST_RGBA = (0.07, 0.07, 0.07, 0.4)  # the recording inside each other copy
 GHOST_THICKNESS = 0.9  # of the limbs: a copy without error covers its ghost
@@ -50,6 +50,19 @@ class View:
         return right, np.cross(right, forward)
 
 
+class Outline(NamedTuple):
+    """Outline of one robot on the picture, relative to its base, m."""
+
+    left: float
+    right: float
+    bottom: float
+    top: float
+
+    @property
+    def height(self) -> float:
+        return self.top - self.bottom
+
+
 class Scene:
     """The copies of a SideBySide in one MuJoCo model.
 
@@ -58,8 +71,7 @@ class Scene:
             called METHOD/NAME.
         spacing: Between neighbours along the picture, m.
         extent: Half the size of the scene, m.
-        box: Outline of one robot on the picture over all frames, relative to its base: (left,
-            right, bottom, top), m.
+        box: Outline of one robot over all frames.
         base: Base of each copy, (k, 3), m.
     """
 
@@ -84,14 +96,14 @@ class Scene:
         self.view = view
         self.ghosts = any(m.method == "recorded" for m in shown.motions) and len(shown.motions) > 1
         self.box, self.floor = self._fit(rows, closeup)
-        self.spacing = 1.1 * (self.box[1] - self.box[0])
+        self.spacing = 1.1 * (self.box.right - self.box.left)
         k = len(shown.motions)
         self.base = (np.arange(k) - (k - 1) / 2)[:, None] * self.spacing * view.axes[0]
-        self.extent = max(0.5 * k * self.spacing, self.box[3] - self.box[2])
+        self.extent = max(0.5 * k * self.spacing, self.box.height)
         across, up = view.axes
         behind = np.zeros(3)
         if flat:
-            behind = GHOST_DISTANCE * (self.box[3] - self.box[2]) * np.cross(up, across)
+            behind = GHOST_DISTANCE * self.box.height * np.cross(up, across)
         self.model = self._compose(self.base, behind)
         self.data = mujoco.MjData(self.model)
         methods = [motion.method for motion in shown.motions]
@@ -123,15 +135,15 @@ class Scene:
     @property
     def middle(self) -> Array:
         """Centre of the row of robots, (3), m."""
-        left, right, bottom, top = self.box
+        box = self.box
         across, up = self.view.axes
-        return across * (left + right) / 2 + up * (bottom + top) / 2
+        return across * (box.left + box.right) / 2 + up * (box.bottom + box.top) / 2
 
     def _address(self, prefix: str) -> Array:
         names = self.shown.robot.joint_names
         return np.array([self.model.joint(f"{prefix}/{name}").qposadr[0] for name in names])
 
-    def _fit(self, rows: slice, closeup: bool) -> tuple[tuple[float, float, float, float], float]:
+    def _fit(self, rows: slice, closeup: bool) -> tuple[Outline, float]:
         """Return the outline of one robot on the picture over all motions, and its lowest point."""
         robot = self.shown.robot
         meta = self.shown.real.meta
@@ -143,8 +155,8 @@ class Scene:
             )
         near = _operated_bodies(model, robot) if closeup else set(range(model.nbody))
         fits = np.array([body in near for body in model.geom_bodyid[geoms]])
-        low = np.full(2, np.inf)
-        high = np.full(2, -np.inf)
+        low = np.full(2, np.inf)  # left, bottom
+        high = np.full(2, -np.inf)  # right, top
         floor = np.inf
         axes = np.stack(self.view.axes)
         for points in self._corners(model, geoms, rows):
@@ -152,7 +164,9 @@ class Scene:
             places = points[fits].reshape(-1, 3) @ axes.T
             low = np.minimum(low, places.min(axis=0))
             high = np.maximum(high, places.max(axis=0))
-        return (float(low[0]), float(high[0]), float(low[1]), float(high[1])), floor
+        left, bottom = low.tolist()
+        right, top = high.tolist()
+        return Outline(left, right, bottom, top), floor
 
     def _corners(self, model: mujoco.MjModel, geoms: Array, rows: slice) -> Iterator[Array]:
         """Yield the corners of the boxes around geoms, (k, 8, 3) m, in FITTED_FRAMES of every
