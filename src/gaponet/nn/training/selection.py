@@ -52,8 +52,10 @@ def train_best(out: Path, resume: bool, train: Train) -> GapModel:
     known = candidate_errors(out)
     errors, interrupted = _train_candidates(out, kinds, train)
     if interrupted:
-        # What is there is the result until the run is resumed.
-        _copy(out, _best(errors) if errors else interrupted)
+        best_so_far = interrupted
+        if errors:
+            best_so_far = _best(errors)
+        _copy(out, best_so_far)
         return GapModel.load(out)
     best = _best(errors)
     if _kind(out) != best or best not in known:
@@ -97,8 +99,8 @@ def _train_candidates(
         if kind in errors:
             continue
         run = out / FOLDER / kind
-        again = (run / CHECKPOINT).is_file()
-        model = train(kind, run, SHARE, i * SHARE, again)
+        was_interrupted = (run / CHECKPOINT).is_file()
+        model = train(kind, run, SHARE, i * SHARE, was_interrupted)
         if model.card["interrupted"]:
             return errors, kind
         errors[kind] = _validation_error(model)
@@ -126,10 +128,9 @@ def _kind(run: Path) -> ModelKind | None:
     """Return the kind of network of a run; None if no run is there."""
     if not (run / CHECKPOINT).is_file():
         return None
-    result: ModelKind | None = read_json(dict[str, Any], run / "config.json", ModelError)["model"][
-        "kind"
-    ]
-    return result
+    config = read_json(dict[str, Any], run / "config.json", ModelError)
+    kind: ModelKind = config["model"]["kind"]
+    return kind
 
 
 def _copy(out: Path, kind: ModelKind) -> None:
