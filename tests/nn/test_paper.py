@@ -33,6 +33,7 @@ from gaponet.nn.training.env import DeltaEnv, EnvOptions
 from gaponet.nn.training.ppo import PPO
 from gaponet.nn.training.sensor_fit import fit_inputs, probe_states
 from gaponet.nn.training.trainer import Trainer
+from gaponet.sim.batch import Condition
 from gaponet.sim.replay import replay
 
 PAPER = ModelConfig(kind="paper", num_probes=4, history=2)
@@ -153,10 +154,9 @@ def test_an_absolute_sensor_value_is_the_next_state(tmp_path):
     robot = write_arm(tmp_path)
     q = np.array([[0.2, -0.1]])
     v = np.array([[0.5, -0.3]])
-    change, state = (
-        ProbeOracle(robot, replace(PAPER, sensor_target=form), [(0.0, "both", 0.02)])(q, v)
-        for form in ("delta", "absolute")
-    )
+    nominal = [Condition(0.0, "both", 0.02)]
+    change = ProbeOracle(robot, replace(PAPER, sensor_target="delta"), nominal)(q, v)
+    state = ProbeOracle(robot, replace(PAPER, sensor_target="absolute"), nominal)(q, v)
     np.testing.assert_allclose(
         state - change, np.tile(np.concatenate([q, 0.02 * v], 1), (1, 4, 1)), atol=1e-6
     )

@@ -6,6 +6,7 @@ from arm import write_arm
 
 from gaponet.nn.config import ModelConfig
 from gaponet.nn.sensor import ProbeOracle
+from gaponet.sim.batch import Condition
 from gaponet.sim.model import build_model
 
 
@@ -22,7 +23,7 @@ def test_the_oracle_is_one_control_period_of_the_simulator(tmp_path):
     config = ModelConfig(num_probes=4)
     q = np.array([[0.2, -0.1]])
     v = np.array([[0.5, -0.3]])
-    answer = ProbeOracle(robot, config, [(0.3, "both", 0.02)])(q, v)
+    answer = ProbeOracle(robot, config, [Condition(0.3, "both", 0.02)])(q, v)
     assert answer.shape == (1, 4, 4)
     model = build_model(robot, 0.3)
     for k, offset in enumerate(ProbeOracle.probe_offsets(config, 2)):

@@ -40,6 +40,11 @@ def raised(robot: RobotSpec) -> np.ndarray:
     return np.clip(robot.qpos_home + 0.3, low + 0.05, high - 0.05)
 
 
+def test_a_robot_can_be_built_with_all_joints_locked():
+    robot = load_robot("so101")
+    assert build_model(robot, locked=robot.joint_names).nq == 0
+
+
 @pytest.mark.parametrize(("name", "mass"), [("so101", 0.0), ("so101", 0.3), ("h1_2", 3.0)])
 def test_a_loaded_joint_held_for_a_minute_does_not_creep(name, mass):
     robot = load_robot(name)

@@ -12,6 +12,8 @@ from gaponet.base.errors import UsageError
 ModelKind = Literal["gaponet", "paper", "shared_mlp", "mlp", "trees"]
 Layers = Annotated[tuple[Annotated[int, Interval(ge=1, le=65536)], ...], Len(0, 32)]  # widths
 
+# Refused in Python too. The intervals of all fields are checked for files and the command line
+# (base/structure.py).
 POSITIVE = ("history", "stride", "num_probes", "num_basis", "delta_max", "payload_max")
 PAPER_ONLY = (  # options of kind "paper" alone
     "payload_trunk",
@@ -225,8 +227,13 @@ class ModelConfig:
 
     @property
     def probe_limit(self) -> float:
-        """Largest offset of a learned probe, rad: twice the largest fixed one."""
-        return 2 * max(self.probe_small, self.probe_large) or 1.0
+        """Largest offset of a learned probe, rad: twice the largest fixed one, 1 if those are
+        zero.
+        """
+        largest = max(self.probe_small, self.probe_large)
+        if largest == 0:
+            return 1.0
+        return 2 * largest
 
     def sensor_dim(self, n: int) -> int:
         """Return the number of sensor values: n positions and n velocities for each of m probes."""

@@ -66,12 +66,15 @@ class OperatorNet(DeltaNet):
         if config.sensors != "off":
             further = config.sensor_dim(n)
         columns = np.arange(layout.query.stop + further)
-        joint_onehot = len(columns) + np.eye(n, dtype=int)
+        column_of_0 = len(columns)
+        joint_onehot = column_of_0 + np.eye(n, dtype=int)  # the column of 1 follows that of 0
 
         def per_joint(part: slice) -> Array:
+            """Columns of joint j in row j; in each quantity of a part, the joint varies fastest."""
             return columns[part].reshape(-1, n).T
 
         def all_joints(part: slice) -> Array:
+            """All columns of a part in every row."""
             return np.tile(columns[part], (n, 1))
 
         if config.context:
@@ -123,7 +126,7 @@ class OperatorNet(DeltaNet):
         """
         if self.config.sensors != "off":
             z = torch.cat([z, self.sensors(z)], dim=1)
-        z = pad(pad(z, (0, 1)), (0, 1), value=1.0)
+        z = pad(pad(z, (0, 1)), (0, 1), value=1.0)  # [… | 0 | 1], for the one-hot index
         inputs = self.branch_inputs + self.trunk_inputs  # of a joint
         return z.index_select(1, self.columns).reshape(-1, self.n, inputs)
 

@@ -34,7 +34,7 @@ class ProbeOracle:
         States have the joints that are not in `locked`.
         """
         self.offsets = self.probe_offsets(config, len(robot.operated))
-        self.dt = np.array([c[2] for c in conditions])
+        self.dt = np.array([condition.dt for condition in conditions])
         self.absolute = config.sensor_target == "absolute"
         # A delayed servo would not respond within the control period.
         no_delay = robot.with_servo(delay=np.zeros(len(robot.joint_names)))
@@ -51,6 +51,7 @@ class ProbeOracle:
         offsets = np.zeros((config.num_probes, n))
         for k in range(config.num_probes):
             lap, joint = divmod(k, n)
+            # In four laps, each joint has both signs with both amplitudes.
             sign = 1.0 if (lap + joint) % 2 == 0 else -1.0
             small = (lap // 2 + lap + joint) % 2 == 0
             offsets[k, joint] = sign * (config.probe_small if small else config.probe_large)

@@ -128,16 +128,21 @@ class Condition(NamedTuple):
     def of(cls, sequence: Sequence, robot: RobotSpec) -> Condition:
         """Return the condition of a recording of this robot."""
         meta = sequence.meta
-        gains = sequence.meta.recorded_gains
-        other = (None, None) if robot.with_gains(*gains) is robot else gains
-        warm = any(robot.servo.friction_per_kelvin) or any(robot.servo.damping_per_kelvin)
+        kp, kd = meta.recorded_gains
+        if robot.with_gains(kp, kd) is robot:  # they are the robot's own
+            kp = None
+            kd = None
+        temperature = None
+        if any(robot.servo.friction_per_kelvin) or any(robot.servo.damping_per_kelvin):
+            temperature = sequence.temperatures
         return cls(
-            meta.payload_mass,
-            meta.payload_side,
-            sequence.dt,
-            *other,
-            sequence.temperatures if warm else None,
-            sequence.simulator,
+            payload_mass=meta.payload_mass,
+            payload_side=meta.payload_side,
+            dt=sequence.dt,
+            kp=kp,
+            kd=kd,
+            temperature=temperature,
+            simulator=sequence.simulator,
         )
 
     @property
@@ -161,18 +166,21 @@ class BatchSim:
         locked: tuple[str, ...] = (),
         servo_model: bool = False,
     ) -> None:
-        """Make a simulation for each of `conditions`; nthread 0 uses all cores; n counts joints
-        that are not locked.
+        """Make a simulation for each of `conditions`.
 
-        With `servo_model` its terms may be written, also if the robot has none.
+        Args:
+            nthread: Threads, 0 for all cores.
+            locked: Joints clamped at home; all arrays have the n others.
+            servo_model: Simulate servo terms also if the robot has none, so that `set_servos` can
+                give them.
         """
         self.robot = robot
         self.joint_names = tuple(name for name in robot.joint_names if name not in locked)
         conditions = [Condition(*condition) for condition in conditions]
-        robots = _under_conditions(robot, conditions)
+        robots = _under_conditions(robot, conditions)  # one of each condition
         self.models = _compiled(robots, self.joint_names, locked, _largest_added_delay(conditions))
-        models = [self.models[condition] for condition in conditions]
-        first = models[0]
+        models = [self.models[condition] for condition in conditions]  # one of each simulation
+        first = models[0]  # its names and sizes are those of all
         self._gains = _recorded_gains(robot, [robots[condition] for condition in conditions])
         self.batch = Batch(first, nsim=len(models), nthread=nthread or _useful_threads(len(models)))
         expand_differences(self.batch, models)
@@ -182,7 +190,7 @@ class BatchSim:
         self.torque = bind("actuator_force")
         self._warmstart = bind("qacc_warmstart")
         self.servo_model: ServoModel | None = None
-        if robot.servo.has_terms or servo_model:
+        if robot.servo.has_terms or servo_model:  # after the fields above, which it reads
             self.servo_model = ServoModel(self.batch, first)
         nstep = np.array([robot.steps_per(condition.dt) for condition in conditions])
         timestep = np.array([model.opt.timestep for model in models])
@@ -393,7 +401,14 @@ def _compiled(
             if added_delay:
                 longest = float(robot.servo.delay.max()) + added_delay
                 buffered = robot.with_servo(delay=np.full(len(robot.joint_names), longest))
-            model = build_model(buffered, *condition[:3], locked, physics_only=True)
+            model = build_model(
+                buffered,
+                condition.payload_mass,
+                condition.payload_side,
+                condition.dt,
+                locked,
+                physics_only=True,
+            )
             model.actuator_delay[:] = robot.servo.delay[robot.index(joint_names)]
             unchanged[own] = model
         models[condition] = unchanged[own]

@@ -29,15 +29,13 @@ def dataset_robot(data: Dataset, run: Path | None = None) -> RobotSpec:
     recorded = robot.with_gains(*gains.pop()) if len(gains) == 1 else robot
     if recorded is robot or own is None:
         return recorded
-    from gaponet.sim.model import (
-        model_hash,  # with mujoco, before which view and report choose OpenGL
-    )
+    # With mujoco, before which view and report choose OpenGL.
+    from gaponet.sim.model import model_hash
 
-    return (
-        robot
-        if model_hash(own.before_identification) == model_hash(robot.before_identification)
-        else recorded
+    fitted_with_stated_gains = model_hash(own.before_identification) == model_hash(
+        robot.before_identification
     )
+    return robot if fitted_with_stated_gains else recorded
 
 
 def open_dataset(

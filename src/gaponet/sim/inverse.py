@@ -1,10 +1,10 @@
 """Inverse of a simulator: position targets, held for a control period, that move it along a given
 motion.
 
-The mean torque of a period is inverse dynamics at its mean
-acceleration and at the mean state before its physics steps. A position actuator gives the mean of
-kp·(u + offset − q) − kd·v over the physics steps, each within the motor's limits. The remaining
-error is the variation of torques within a period.
+The mean torque of a period is inverse dynamics at its mean acceleration and at the mean state
+before its physics steps. A position actuator gives the mean of kp·(u + offset − q) − kd·v over the
+physics steps, each within the motor's limits. The remaining error is the variation of torques
+within a period.
 """
 
 from __future__ import annotations

@@ -104,7 +104,7 @@ class LinkAxes:
 def _bodies_of_link(model: mujoco.MjModel, root: int) -> list[int]:
     """Return the bodies with mass that are welded to a moving body, without payloads.
 
-    None if root does not move, or a body has no name or no inertia of its own.
+    Empty if root does not move, or a body has no name or no inertia of its own.
     """
     if model.body_weldid[root] != root or not model.body_jntnum[root]:
         return []

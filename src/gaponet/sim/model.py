@@ -93,7 +93,7 @@ def build_model(
 
 def joint_addresses(model: mujoco.MjModel, names: ListOf[str]) -> tuple[Array, Array]:
     """Return the places of hinge joints in qpos and in qvel, (n,) each."""
-    joints = np.array([model.joint(name).id for name in names])
+    joints = np.array([model.joint(name).id for name in names], int)  # names may be empty
     return model.jnt_qposadr[joints], model.jnt_dofadr[joints]
 
 

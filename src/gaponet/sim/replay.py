@@ -70,14 +70,18 @@ def replay(
     digest = _replay_hash(robot, creeps)
     total = sum(len(s) - 1 for s in sequences)
     done = 0
-    replays: dict[int, SimulatedReplay] = {}
+    replays: dict[int, SimulatedReplay] = {}  # by place in sequences
+
+    def tell(steps: int) -> None:
+        progress(done + steps, total)  # of earlier chunks, and of this one
+
     for chunk in _chunks(sequences, locked):
         part = [sequences[i] for i in chunk]
         sim = _simulations(part, robot, locked[chunk[0]], nthread, creeps=creeps)
-        tell = lambda k, before=done: progress(before + k, total)  # noqa: E731
         out = rollout(sim, part, corrector, tell)
         for i, s in enumerate(part):
-            replays[chunk[i]] = SimulatedReplay(digest, *out[:, : len(s), i].astype(np.float32))
+            qpos, qvel, torque, target = out[:, : len(s), i].astype(np.float32)
+            replays[chunk[i]] = SimulatedReplay(digest, qpos, qvel, tau=torque, ctrl=target)
         done += sum(len(s) - 1 for s in part)
     return [replays[i] for i in range(len(sequences))]
 
@@ -149,11 +153,8 @@ def idle_limbs(sequences: ListOf[Sequence], robot: RobotSpec) -> tuple[str, ...]
     """Return the joints of limbs that no command of these sequences moves and that have no
     operated joint.
     """
-    return tuple(
-        sorted(
-            set.intersection(*map(set, _idle_limbs(sequences, robot))), key=robot.joint_names.index
-        )
-    )
+    idle = set.intersection(*map(set, _idle_limbs(sequences, robot)))  # in all sequences
+    return tuple(sorted(idle, key=robot.joint_names.index))
 
 
 def _held(sequence: Sequence, robot: RobotSpec, idle: tuple[str, ...]) -> Clamped:
@@ -206,11 +207,13 @@ def rollout(
     """Step a batch, one simulation per sequence, from the recorded start under the recorded
     commands.
 
-    A simulation goes on from the recording after the rows of `touch`, (T, k). `progress` is called
-    with the control steps done.
+    Args:
+        touch: Rows in which a simulation goes on from the recording, (T, k).
+        progress: Called with the control steps done.
 
     Returns:
-        qpos, qvel, torque and target by row, (4, T, k, n of all joints): rad, rad/s, N·m, rad.
+        qpos, qvel, torque and target by row, (4, T, k, n of all joints): rad, rad/s, N·m, rad. Row t
+        has the state at t·dt, the torque at the end of [t − 1, t), and the target of [t, t + 1).
         Locked joints stand at sim.robot.qpos_home. Rows after the end of a sequence have no
         meaning.
     """
@@ -218,12 +221,13 @@ def rollout(
     free = sim.robot.index(sim.joint_names)
     ctrl = _commands(sequences)
     out = np.zeros((4, *ctrl.shape))
-    out[0] = sim.robot.qpos_home
-    qpos = np.stack([s.qpos[0, free] for s in sequences])
-    qvel = np.stack([s.qvel[0, free] for s in sequences])
-    sim.reset(slice(None), qpos, qvel, past=ctrl[0][:, None, free])
-    out[0, 0][:, free] = sim.qpos
-    out[1, 0][:, free] = sim.qvel
+    qpos, qvel, torque, targets = out  # views of all rows
+    qpos[:] = sim.robot.qpos_home
+    start_qpos = np.stack([s.qpos[0, free] for s in sequences])
+    start_qvel = np.stack([s.qvel[0, free] for s in sequences])
+    sim.reset(slice(None), start_qpos, start_qvel, past=ctrl[0][:, None, free])
+    qpos[0][:, free] = sim.qpos
+    qvel[0][:, free] = sim.qvel
     if corrector is not None:
         corrector.reset(sequences)
     finished = 0
@@ -232,11 +236,12 @@ def rollout(
         ids = np.flatnonzero(lengths > t + 1)  # still running
         target = ctrl[t]
         if corrector is not None:
-            target = corrector.correct(t, target, out[0, t], out[1, t])
+            target = corrector.correct(t, target, qpos[t], qvel[t])
         sim.step(target[:, free], None if len(ids) == sim.num_envs else ids)
-        for channel, now in enumerate((sim.qpos, sim.qvel, sim.torque)):
-            out[channel, t + 1][:, free] = now
-        out[3, t] = target
+        targets[t] = target
+        qpos[t + 1][:, free] = sim.qpos
+        qvel[t + 1][:, free] = sim.qvel
+        torque[t + 1][:, free] = sim.torque
         if touch is not None:
             _go_on_from_recordings(sim, sequences, ids[touch[t + 1, ids]], t + 1)
         finished += len(ids)

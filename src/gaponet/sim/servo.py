@@ -8,12 +8,15 @@ al. 2024). MuJoCo integrates: the model only changes the actuator's bias, its to
 limit of friction, so friction sticks as MuJoCo's does. A gear with backlash parts the motor
 (armature, damping, friction) from the link while its gap is open.
 
-The model stands here twice. `servo_torque`, `torque_limits`, `friction_limit` and
-`overcome_friction` take arrays, for exports and inverses. `requested_torque`, `motor_limits` and
-`joint_friction` take one servo with fields by name, for numba and Warp, which are faster.
-Simulations (`set_servos`, called by sim/servo_model.py) and the fit of single joints
-(`simulate_joints`) share the latter. A MuJoCo model's actuator_user holds the parameters; without,
-nothing here runs.
+The model stands here twice. `servo_torque`, `friction_limit` and `overcome_friction` take arrays,
+for exports and inverses. `requested_torque`, `motor_limits` and `joint_friction` take one servo with
+fields by name, for numba and Warp, which are faster. Simulations (`set_servos`, called by
+sim/servo_model.py) and the fit of single joints (`simulate_joints`) share the latter. A MuJoCo
+model's actuator_user holds the parameters, in the order of SERVO_TERMS; without, nothing here runs.
+
+A new term is a field of robot/servo_fields.py and a line in both forms of the model. If it is a
+function of its own, `_extend` names it for numba, sim/warp.py for Warp and export/helper_file.py for
+exports.
 """
 
 from __future__ import annotations
@@ -247,6 +250,10 @@ class Play:
         self.gap = np.where(load < 0, -self.half, self.half)
         self.rotor = qvel.copy()
         self.seen = qvel.copy()
+        # of the present step, from `before` to `after`
+        self._limit = np.zeros_like(self.half)
+        self._qvel = np.zeros_like(self.half)
+        self._impact = np.zeros_like(self.half)
 
     def before(self, limit: Any, kp: Any, qpos: Any, qvel: Any, h: Any) -> tuple[Any, ...]:
         """Return friction limit, armature, damping, applied torque and gear of the links for the
@@ -423,20 +430,23 @@ def step_joint(
 def command_rows(joints: Any, period: Any, steps: Any) -> Any:
     """Return the row, from that of the period, whose command is in force in each physics step of a
     period, and the share of the next row's, where it changes on the way: (steps, candidates) each.
+
+    MuJoCo keeps a sample of the command for each physics step, and interpolates between samples. So
+    a command changes to the next row's within the last physics step of its period.
     """
     rows = np.empty((steps, len(joints)), np.int64)
     shares = np.empty((steps, len(joints)))
-    for part in range(steps):
+    for step in range(steps):
         for c in range(len(joints)):
-            late = part / steps - joints[c].delay / period
-            rows[part, c] = np.floor(late)
-            shares[part, c] = max((late - rows[part, c] - 1) * steps + 1, 0.0)
+            sent_at = step / steps - joints[c].delay / period  # periods after this one's start
+            rows[step, c] = np.floor(sent_at)
+            shares[step, c] = max((sent_at - rows[step, c] - 1) * steps + 1, 0.0)
     return rows, shares
 
 
 def simulate_joints(first: int, last: int, joints: Any, windows: Any, out: Any) -> None:
     """Fill out[:, first:last], (candidates, joints · windows, rows), with q_sim − q_real, rad;
-    numba compiles it.
+    numba compiles it. The first row, the common start, is left as it is.
 
     Candidates take each step side by side, so that none waits for its own last one. The function
     stands in this file because numba compiles it again only when its own file changes.
@@ -457,7 +467,10 @@ def simulate_joints(first: int, last: int, joints: Any, windows: Any, out: Any) 
         ctrl = windows.ctrl[j, window]
         real = windows.qpos[j, window]
         real_speed = windows.qvel[j, window]
-        loads = windows.loads[:, j, window]
+        inertias = windows.loads[0, j, window]
+        weights = windows.loads[1, j, window]  # gravity's torques at an angle of zero
+        pulls = windows.loads[2, j, window]
+        slopes = windows.loads[3, j, window]  # of gravity's torques
         low = windows.stops[j, 0]
         high = windows.stops[j, 1]
         end = windows.lengths[window] - 1
@@ -466,19 +479,20 @@ def simulate_joints(first: int, last: int, joints: Any, windows: Any, out: Any) 
         w = np.full(count, real_speed[0])
         rotor = w.copy()
         half = 0.5 * candidates["backlash"]
-        gap = np.where(loads[1, 0] + loads[3, 0] * q < 0, -half, half)
+        gap = np.where(weights[0] + slopes[0] * q < 0, -half, half)
         for t in range(end):
-            inertia = loads[0, t]
-            pull = loads[2, t]
-            for part in range(steps):
+            inertia = inertias[t]
+            pull = pulls[t]
+            for step in range(steps):
                 for c in range(count):
-                    one = candidates[c]
-                    at = t + rows[part, c]
-                    aim = (1 - shares[part, c]) * ctrl[min(max(at, 0), end)] + one.offset
-                    aim += shares[part, c] * ctrl[min(max(at + 1, 0), end)]
-                    load = loads[3, t] * q[c] + loads[1, t]
+                    joint = candidates[c]
+                    row = t + rows[step, c]
+                    share = shares[step, c]
+                    aim = (1 - share) * ctrl[min(max(row, 0), end)] + joint.offset
+                    aim += share * ctrl[min(max(row + 1, 0), end)]
+                    load = slopes[t] * q[c] + weights[t]
                     speed, torque, friction = step_joint(
-                        one, aim, q[c], w[c], inertia, load, pull, h
+                        joint, aim, q[c], w[c], inertia, load, pull, h
                     )
                     if half[c] > 0.0:
                         speed, rotor[c], gap[c] = cross_gap(
@@ -490,9 +504,9 @@ def simulate_joints(first: int, last: int, joints: Any, windows: Any, out: Any) 
                             inertia,
                             load + pull,
                             torque,
-                            one.damping,
+                            joint.damping,
                             friction,
-                            one.armature,
+                            joint.armature,
                             h,
                         )
                     w[c] = speed

@@ -77,6 +77,37 @@ def test_an_interrupted_choice_leaves_the_best_so_far_and_goes_on_where_it_was(r
     assert (run / "checkpoint.pt").read_text() == "shared_mlp"
 
 
+def test_a_candidate_that_was_interrupted_goes_on_from_the_end_of_its_own_training(
+    run, monkeypatch
+):
+    monkeypatch.setattr(GapModel, "load", classmethod(lambda cls, run: run))
+    train_best(run, False, Trainings(interrupted="gaponet"))
+    (run / "checkpoint.pt").write_text("gaponet, interrupted")
+    again = Trainings(gaponet=0.5)
+    begins_with = []
+
+    def train(kind, folder, *budget):
+        if folder == run:
+            begins_with.append((folder / "checkpoint.pt").read_text())
+        return again(kind, folder, *budget)
+
+    train_best(run, True, train)
+    assert begins_with == ["gaponet"]
+
+
+def test_a_run_that_went_on_with_the_best_candidate_is_not_replaced_by_it(run):
+    train_best(run, False, Trainings())
+    (run / "checkpoint.pt").write_text("shared_mlp, later")
+    begins_with = []
+
+    def train(kind, folder, *budget):
+        begins_with.append((folder / "checkpoint.pt").read_text())
+        return Trainings()(kind, folder, *budget)
+
+    train_best(run, True, train)
+    assert begins_with == ["shared_mlp, later"]
+
+
 def test_a_run_of_one_kind_is_resumed_with_its_kind(tmp_path):
     with pytest.raises(UsageError, match="nothing"):
         train_best(tmp_path / "none", True, Trainings())

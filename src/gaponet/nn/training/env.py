@@ -93,16 +93,16 @@ class DeltaEnv:
         self.groups = groups
         sim = _simulations(robot, rows, groups, options.nthread)
         self.sim: Any = _on_device(sim, options.device)
-        place = self.sim.array
+        to_device = self.sim.array
         past_rows = max(config.history_depth, 1 + _delay_periods(robot, groups))
-        self.playback = Playback(rows, options.num_envs, past_rows, place)
+        self.playback = Playback(rows, options.num_envs, past_rows, to_device)
         self.observations = Observations(
             config, self.sim, self.playback, groups.conditions_of_envs, self._oracle()
         )
         if config.context:
             self.observations.network_input.set_context(self._context())
         unobserved = groups.unobserved[groups.of_env][:, rows.operated]
-        self.reward = PositionReward(options.reward, place(_nan_where(unobserved)))
+        self.reward = PositionReward(options.reward, to_device(_nan_where(unobserved)))
         self.reset()
 
     def _oracle(self) -> ProbeOracle | None:
@@ -132,12 +132,14 @@ class DeltaEnv:
         row = self.rng.integers(first, last - self.config.delta_hold + 1)
         self.playback.start(ids, row, first, last)
         before = self.playback.rows_before(ids)  # (k, rows), newest first
-        row = self.sim.array(row)
-        ids = ids if isinstance(ids, slice) else self.sim.array(ids)
+
+        on_device = ids if isinstance(ids, slice) else self.sim.array(ids)
+        row_on_device = self.sim.array(row)
         recorded = self.playback.rows
-        past = recorded.ctrl[before]
-        self.sim.reset(ids, recorded.qpos[row], recorded.qvel[row], past=past)
-        self.observations.reset(ids, before, self.rng)
+        qpos = recorded.qpos[row_on_device]
+        qvel = recorded.qvel[row_on_device]
+        self.sim.reset(on_device, qpos, qvel, past=recorded.ctrl[before])
+        self.observations.reset(on_device, before, self.rng)
 
     def get_observations(self) -> dict[str, torch.Tensor]:
         """Return the observations of actor and critic, float32."""
@@ -192,7 +194,7 @@ class DeltaEnv:
         """
         op = self.playback.rows.operated
         low, high = self.sim.commands.range[op].T
-        target = zeros_like(self.sim.qpos, *self.sim.qpos.shape)
+        target = zeros_like(self.sim.qpos, *self.sim.qpos.shape)  # float32 on a device
         target[:] = self.playback.commanded()
         corrected = target[:, op] + self.sim.array(delta)
         target[:, op] = corrected.clip(low, high)
@@ -201,7 +203,8 @@ class DeltaEnv:
     def _rewards(self) -> Any:
         """Return the reward of each joint in the last control period, (num_envs, n) float32."""
         q = self.sim.qpos[:, self.playback.rows.operated]
-        return self.reward(q, self.playback.recorded[:, : self.num_actions])
+        recorded_q = self.playback.recorded[:, : self.num_actions]
+        return self.reward(q, recorded_q)
 
     def _dones(self) -> Array:
         """Return the environments whose recording or time has ended, (num_envs,), on the host."""
@@ -244,7 +247,7 @@ class PositionReward:
 
     Attributes:
         nan_where_unobserved: 0, or NaN for joints whose positions were not recorded, (num_envs, n).
-            Their reward is zero.
+            Their reward is zero, and pre-training has no labels for them.
     """
 
     def __init__(self, config: RewardConfig, nan_where_unobserved: Any) -> None:
@@ -289,7 +292,8 @@ class PositionReward:
 def _simulations(robot: RobotSpec, rows: RecordedRows, groups: EnvGroups, nthread: int) -> BatchSim:
     """Return the simulations in C MuJoCo.
 
-    Joints without recorded positions stay where the recording says, as in identification.
+    Joints without recorded positions stay where the recording says, as in identification: their
+    armature is so large that nothing moves them. Backlash would part it from the link.
     """
     sim = BatchSim(robot, groups.conditions_of_envs, nthread, rows.locked)
     if groups.unobserved.any():

@@ -49,7 +49,7 @@ class Observations:
         self._playback = playback
         self._oracle = oracle
         num_envs, columns = playback.recorded.shape
-        self._n = columns // 3
+        self._n = columns // 3  # of [q | q̇ | a]
         self.network_input = NetworkInput(config, self._n, num_envs, like=playback.recorded)
         if config.needs_simulator or config.observes_real_state:
             self.network_input.extra = self._extra_inputs

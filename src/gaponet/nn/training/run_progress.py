@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from gaponet.nn.layers import DeltaNet
 from gaponet.nn.training.checkpoint import Checkpoint
@@ -109,7 +110,7 @@ class RunProgress:
             "val_mpjae": error,
             "nominal_mpjae": self.nominal_error,
         } | (metrics or {})
-        state.progress.append({k: v if v == v else None for k, v in line.items()})
+        state.progress.append({name: _nan_to_none(value) for name, value in line.items()})
         self._loggers.write(line)
         state.seconds = self.seconds()
         self._started_at = time.monotonic()
@@ -119,3 +120,9 @@ class RunProgress:
     def close_loggers(self) -> None:
         """Close the files and connections of `--log`."""
         self._loggers.close()
+
+
+def _nan_to_none(value: Any) -> Any:
+    """Return None instead of NaN, which JSON does not have."""
+    is_nan = value != value
+    return None if is_nan else value

@@ -49,27 +49,34 @@ def train_best(out: Path, resume: bool, train: Train) -> GapModel:
     if not resume and (begun or present):
         raise UsageError(f"{out}: holds a run already; add --resume, or choose another --out")
     kinds = [kind for kind in CANDIDATES if kind != "trees" or trees_available()]
+    known = candidate_errors(out)
     errors, interrupted = _train_candidates(out, kinds, train)
     if interrupted:
-        _copy(out, _best(errors) if errors else interrupted)
+        best_so_far = interrupted
+        if errors:
+            best_so_far = _best(errors)
+        _copy(out, best_so_far)
         return GapModel.load(out)
+    best = _best(errors)
+    if _kind(out) != best or best not in known:
+        # OUT holds nothing, another candidate, or this one as it was when it was interrupted. Else
+        # OUT holds the best candidate and may have gone on with it.
+        _copy(out, best)
     return _go_on_with_best(out, errors, SHARE * (len(kinds) - 1), train)
 
 
 def _go_on_with_best(
     out: Path, errors: dict[ModelKind, float], spent: float, train: Train
 ) -> GapModel:
-    """Train the best candidate with the rest of the budget.
+    """Train the best candidate, which OUT holds, with the rest of the budget.
 
     If that is the trees, the best network gets the rest, and the better of the two is the result.
 
     Args:
         errors: Validation errors of all candidates, rad.
-        spent: Share of the budget.
+        spent: Share of the budget that the other candidates took.
     """
     best = _best(errors)
-    if _kind(out) != best:
-        _copy(out, best)
     if best != "trees":
         return train(best, out, 1 - spent, spent, True)
     best_network = _best({kind: error for kind, error in errors.items() if kind != "trees"})
@@ -92,8 +99,8 @@ def _train_candidates(
         if kind in errors:
             continue
         run = out / FOLDER / kind
-        again = (run / CHECKPOINT).is_file()
-        model = train(kind, run, SHARE, i * SHARE, again)
+        was_interrupted = (run / CHECKPOINT).is_file()
+        model = train(kind, run, SHARE, i * SHARE, was_interrupted)
         if model.card["interrupted"]:
             return errors, kind
         errors[kind] = _validation_error(model)
@@ -121,10 +128,9 @@ def _kind(run: Path) -> ModelKind | None:
     """Return the kind of network of a run; None if no run is there."""
     if not (run / CHECKPOINT).is_file():
         return None
-    result: ModelKind | None = read_json(dict[str, Any], run / "config.json", ModelError)["model"][
-        "kind"
-    ]
-    return result
+    config = read_json(dict[str, Any], run / "config.json", ModelError)
+    kind: ModelKind = config["model"]["kind"]
+    return kind
 
 
 def _copy(out: Path, kind: ModelKind) -> None:

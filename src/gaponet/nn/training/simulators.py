@@ -21,9 +21,8 @@ from gaponet.robot.spec import RobotSpec
 # Validation has other simulators than training, and tests have others again.
 VALIDATION_SEED_STEP = 1_000_003
 VALIDATION_SIMULATORS = 24
-PIECE_S = (
-    5.0  # long against the lag of a servo, and short enough for several simulators a recording
-)
+# Long against the lag of a servo, and short enough for several simulators a recording.
+PIECE_S = 5.0
 
 
 def in_many_simulators(
