@@ -78,7 +78,9 @@ def show_steps(screen: Out, table: Mapping[str, Any]) -> None:
 def _show_totals(screen: Out, table: Mapping[str, Any]) -> None:
     """Print the error after each step, its reduction, and the same by payload."""
     steps = list(table["left"])
-    one_motion = _removed(table, steps[-1])[1] == mrad(None)  # it has no standard error
+    # One motion has no standard error, which mrad shows as a dash.
+    _, last_error = _removed(table, steps[-1])
+    one_motion = last_error == mrad(None)
     payloads = table["by_payload"] if len(table["by_payload"]) > 1 else {}
     columns = ["step", "error, mrad", "reduced by, mrad"]
     if not one_motion:
@@ -121,7 +123,9 @@ def _measured_on(table: Mapping[str, Any], one_motion: bool) -> str:
 
 
 def _removed(table: Mapping[str, Any], step: str) -> list[str]:
-    """Return by how much a step reduces the error, and the standard error; "" for the first."""
+    """Return by how much a step reduces the error and the standard error, mrad; "" for the first
+    step.
+    """
     values = table["removed"].get(step, ())
     return [mrad(value) for value in values] or ["", ""]
 
