@@ -3,6 +3,7 @@ identified.
 """
 
 import json
+import shutil
 
 import pytest
 from arm import recordings
@@ -15,7 +16,7 @@ from gaponet.data.store import Dataset
 from gaponet.evaluation.candidate import Candidate, select_entries
 from gaponet.evaluation.verdict import network_gain, next_step, verdict
 from gaponet.report.view.side_by_side import select_entry, side_by_side
-from gaponet.robot.folder import PROVENANCE_FILE, save_robot
+from gaponet.robot.folder import PROVENANCE_FILE, STORED_ROBOT, save_robot
 
 
 @pytest.fixture
@@ -54,6 +55,16 @@ def test_an_identified_folder_has_a_gap_and_its_picture_without_training(fitted,
     error = gp.evaluate(fitted, data).to_dict()["methods"]["identified"]["mpjae"]
     assert by_cause["methods"]["identified"]["mpjae"] == pytest.approx(error)
     assert (fitted / "gap.png").is_file()
+
+
+def test_a_dataset_that_keeps_an_identified_robot_has_its_gap_by_cause(fitted, data, capsys):
+    kept = data.path / STORED_ROBOT
+    shutil.rmtree(kept)
+    shutil.copytree(fitted, kept)
+    assert main(["gap", str(data.path)]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "Mean |error| after each step" in said
+    assert f"next: gaponet export {kept}" in said
 
 
 def test_an_identified_folder_is_seen_beside_its_recordings(fitted, data):

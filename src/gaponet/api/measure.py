@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from gaponet.api.logs import import_logs, unit_recordings
-from gaponet.api.opening import Place, as_robot, as_run, open_dataset, require_commands
+from gaponet.api.opening import Place, as_identified, as_run, open_dataset, require_commands
 from gaponet.api.options import ImportOptions
 from gaponet.api.results import CheckResult, EvalResult, GapResult, PairResult, ReplayResult
 from gaponet.base.errors import UsageError
@@ -224,7 +224,7 @@ def check(
     from gaponet.sysid.evidence.drift import drift
     from gaponet.sysid.uncertainty import ParameterUncertainty
 
-    spec = as_robot(Path(robot) if isinstance(robot, str) else robot)
+    spec = as_identified(robot)
     uncertainty = ParameterUncertainty.require(spec)
     with unit_recordings(logs, spec, unit, motions, payload_mass) as recorded:
         sequences = recorded.sequences()
@@ -270,7 +270,7 @@ def replay(
     from gaponet.export.rollout import BAND_SHARE, predict, sample_robots, summary, validation_error
     from gaponet.sysid.uncertainty import ParameterUncertainty
 
-    spec = as_robot(Path(robot) if isinstance(robot, str) else robot)
+    spec = as_identified(robot)
     uncertainty = ParameterUncertainty.load(spec)
     recordings = read_recordings(spec.folder, data, spec)
     drawn = sample_robots(spec) if uncertainty is not None else []

@@ -26,6 +26,15 @@ def as_robot(robot: RobotSpec | Place) -> RobotSpec:
     return robot if isinstance(robot, RobotSpec) else load_robot(robot)
 
 
+def as_identified(robot: RobotSpec | Place) -> RobotSpec:
+    """Return an identified robot; text is its folder even without a slash, where `as_robot` takes
+    it for the name of a robot as its maker states it.
+    """
+    if isinstance(robot, str):
+        robot = Path(robot)
+    return as_robot(robot)
+
+
 def as_run(run: GapModel | Place) -> Path:
     """Return the folder of a run, or of a network of the package by name; a trained model lies in
     it.

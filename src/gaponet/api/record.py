@@ -96,7 +96,7 @@ def record_motions(
             turn = replace(first, motion=motion, options=replace(options, seed=seed))
             run = execute(turn, report or StderrReporter(), consent)
             if run.recording.fault:
-                on_played(run, None)
+                on_played(run, None)  # _add then keeps the recording, and refuses to add it
             known, entry, sequence = _add(turn, run, folder, known, len(recorded))
             made = Recorded(run=run, id=entry.id, rows=len(sequence), rate=sequence.rate)
             on_played(run, made)

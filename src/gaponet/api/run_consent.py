@@ -28,8 +28,8 @@ class Permission:
         """
         Args:
             driver: Name of the driver.
-            consent: Called with each statement that needs consent, after the plan was shown; it
-                returns True to let the robot move. None: the person at the terminal is asked.
+            consent: Called with each statement that needs consent; it returns True to go on. None:
+                the person at the terminal is asked.
         """
         self.driver = driver
         self.options = options
@@ -51,6 +51,8 @@ class Permission:
 
     def require_hung(self) -> None:
         """Refuse topic lowcmd of the unitree driver unless somebody states that the robot hangs.
+
+        This asks before anything is opened, so before there is a plan.
 
         Raises:
             UsageError: Nobody did.

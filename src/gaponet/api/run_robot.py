@@ -157,8 +157,10 @@ def run_robot(
             identified.
         options: All other settings.
         consent: Called with a statement of what will happen, after the plan was shown. The robot
-            moves only if it returns True. Default: the person at the terminal types yes.
-            RunOptions(yes=True) moves it without asking.
+            moves only if it returns True. With topic lowcmd it is first asked whether the robot
+            hangs, before there is a plan; Connection(hangs=True) replaces that question. Default:
+            the person at the terminal types the answers. RunOptions(yes=True) moves the robot
+            without the question after the plan.
         report: Shows plan, notes and phases; default on standard error.
 
     Returns:
@@ -183,22 +185,23 @@ def run_robot(
 def execute(request: RunRequest, report: RunReporter, consent: Consent | None = None) -> RunResult:
     """Prepare, ask for consent and run.
 
-    The periods are written to options.out as they come, but not saved there.
+    Everything that can be refused without the robot is refused before the driver connects. The
+    periods are written to options.out as they come, but not saved there.
     """
     options = request.options
     permission = Permission(request.driver, options, consent)
     request.require_consistent()
-    identified = resolve_robot(request)
-    robot = with_known_limits(request, identified)
+    identified = resolve_robot(request)  # corrects the commands
+    robot = with_known_limits(request, identified)  # bounds and checks them
     permission.require_someone_to_ask()
     require_shapes(request, robot, report)
     permission.require_hung()
-    motion, limits = find_motion(request, robot)
+    motion, feasibility = find_motion(request, robot)
     clock = SimulatedClock() if request.is_virtual and options.connection.fast else MonotonicClock()
     driver, unit = make_driver(request, robot, clock)
     if motion is not None:
         require_commanded(motion, robot, driver)
-    planner = Planner(robot, driver.commanded, options.control, options.safety, limits)
+    planner = Planner(robot, driver.commanded, options.control, options.safety, feasibility)
     compensation = make_compensation(request, identified, unit, report)
     live = None
     if motion is None:
@@ -209,13 +212,14 @@ def execute(request: RunRequest, report: RunReporter, consent: Consent | None = 
     def plan_and_ask(connected: Driver) -> None:
         """Plan, show and ask: the robot has answered, and nothing was commanded.
 
-        The controller below calls this, and plays the plan that it is given here.
+        `controller`, which is made below, calls this once it is connected, and then plays the plan
+        that it is given here.
         """
         compensation.require_gains(connected)
         if motion is not None:
             plan = planner.plan(motion, connected.read().qpos)
             plan = compensation.judge(planner, plan, options.payload_mass)
-            report.plan(describe_plan(plan, robot, connected, limits.max_payload))
+            report.plan(describe_plan(plan, robot, connected, feasibility.max_payload))
             controller.plan = plan
         how = "as planned" if motion is not None else f"as {options.targets} says"
         permission.require_motion(connected, how)

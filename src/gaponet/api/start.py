@@ -282,13 +282,12 @@ class UnclearLogsError(LogError):
 
 
 class _RecordFields(TypedDict):
-    """start.json: path of the logs, their hashes, options of import, finished command → hash of its
-    inputs."""
+    """What start.json holds."""
 
-    logs: str
-    options: str
-    files: dict[str, str]
-    done: dict[str, str]
+    logs: str  # path
+    options: str  # of import, as they are typed
+    files: dict[str, str]  # file → SHA-256
+    done: dict[str, str]  # finished command → its inputs (StartRecord.inputs)
 
 
 class StartRecord:
@@ -312,12 +311,14 @@ class StartRecord:
             options=known["options"],
             done=known["done"],
         )
-        if not self.data.exists():  # only the robot is there
-            self.fields["options"] = ""
-            done = known["done"].items()
-            self.fields["done"] = {line: made for line, made in done if made == MODEL_INPUT}
+        if self.data.exists():
+            self._require_same_logs(known, path.is_file(), logs)
             return
-        self._require_same_logs(known, path.is_file(), logs)
+        # The data are made anew, with any options; only the step that makes the robot stays done.
+        self.fields["options"] = ""
+        self.fields["done"] = {
+            line: inputs for line, inputs in known["done"].items() if inputs == MODEL_INPUT
+        }
 
     def _require_same_logs(self, known: _RecordFields, stored: bool, logs: Path) -> None:
         """Refuse data that were made from other logs.
@@ -359,7 +360,10 @@ class StartRecord:
         logs_toml = self.out / "logs.toml"
         if logs_toml.is_file():
             self.fields["files"][f"{self.out.name}/logs.toml"] = FileRecord.of(logs_toml).sha256
-        if not self.data.exists():  # an interrupted import leaves data of these logs
+        # An interrupted import leaves data, and the next start has to know of which logs. Where data
+        # are there already, `finish` writes: if the import refuses a log that was added, the log
+        # can be taken away again.
+        if not self.data.exists():
             write_json(self.out / RECORD_FILE, self.fields)
 
     def inputs(self, step: Step) -> str:

@@ -78,7 +78,7 @@ def identify_real_arm(screen: Out, out: Path) -> dict[str, object]:
     motions = test_motions(dataset)
     screen.say(
         f": the simulator gets the commands alone, on {len(motions)} motions that stay out of the "
-        f"fit  ({measure.line}, which takes all 40)",
+        f"fit  ({measure.line} takes all {len(dataset)} recordings)",
         f"2 {measure.title}",
     )
     with progress_bar("gap") as update:

@@ -15,6 +15,7 @@ from gaponet.cli.out import Out
 from gaponet.cli.show import show_baselines, show_methods, show_verdict
 from gaponet.evaluation.methods import title
 from gaponet.evaluation.tables import mrad
+from gaponet.robot.folder import STORED_ROBOT
 
 NO_FLOOR = "floor (what no model can explain): {}, since no motion was recorded twice"
 
@@ -38,11 +39,7 @@ def gap(
         result = api.gap(
             dataset, robot=robot, motions=motions, run=run, executor=executor, progress=update
         )
-    candidate: Path | None = None  # whose causes are shown
-    if result.by_cause and run is not None:
-        candidate = as_run(run)
-    elif result.by_cause and robot is not None:
-        candidate = Path(robot)
+    candidate = _candidate(dataset, run, robot) if result.by_cause else None
     if candidate is None:
         show_methods(screen, result.to_dict())
     else:
@@ -54,6 +51,15 @@ def gap(
     show_baselines(screen, baselines, count)
     show_verdict(screen, result.methods, str(dataset), candidate, baselines)
     screen.result(result.to_dict())
+
+
+def _candidate(dataset: Path, run: Path | None, robot: str | None) -> Path:
+    """Return the folder of the identified robot or of the run whose causes are shown."""
+    if run is not None:
+        return as_run(run)
+    if robot is not None:
+        return Path(robot)
+    return dataset / STORED_ROBOT
 
 
 def show_steps(screen: Out, table: Mapping[str, Any]) -> None:
@@ -72,7 +78,9 @@ def show_steps(screen: Out, table: Mapping[str, Any]) -> None:
 def _show_totals(screen: Out, table: Mapping[str, Any]) -> None:
     """Print the error after each step, its reduction, and the same by payload."""
     steps = list(table["left"])
-    one_motion = _removed(table, steps[-1])[1] == mrad(None)  # it has no standard error
+    # One motion has no standard error, which mrad shows as a dash.
+    _, last_error = _removed(table, steps[-1])
+    one_motion = last_error == mrad(None)
     payloads = table["by_payload"] if len(table["by_payload"]) > 1 else {}
     columns = ["step", "error, mrad", "reduced by, mrad"]
     if not one_motion:
@@ -115,7 +123,9 @@ def _measured_on(table: Mapping[str, Any], one_motion: bool) -> str:
 
 
 def _removed(table: Mapping[str, Any], step: str) -> list[str]:
-    """Return by how much a step reduces the error, and the standard error; "" for the first."""
+    """Return by how much a step reduces the error and the standard error, mrad; "" for the first
+    step.
+    """
     values = table["removed"].get(step, ())
     return [mrad(value) for value in values] or ["", ""]
 

@@ -48,33 +48,44 @@ Json = Annotated[Flag, tyro.conf.arg(help="One JSON object on stdout.")]
 def join_lines(command: Callable[..., Any]) -> None:
     """Join the lines of each option's explanation: tyro would show the line breaks.
 
-    It stands in the docstring of the command, or below the field of a dataclass that it takes.
+    The explanation of an option stands in the docstring of the command or, where the command takes
+    a dataclass, below the field.
     """
     command = inspect.unwrap(command)
     command.__doc__ = re.sub(r"\n {8,}", " ", inspect.getdoc(command) or "")
-    for kind in get_type_hints(command).values():
-        _join_lines_of_fields(kind)
+    for hint in get_type_hints(command).values():
+        _join_lines_of_fields(hint)
 
 
-def _join_lines_of_fields(kind: Any) -> None:
+def _join_lines_of_fields(hint: Any) -> None:
     """Write the explanations of a dataclass's fields into its docstring, each on one line.
 
-    This changes the class, once; tyro reads the docstring.
+    This changes the class, its bases and the dataclasses in its fields: tyro looks for a field in
+    the docstring of the class, then in those of its bases. A second call changes nothing.
+
+    Args:
+        hint: Type of a parameter or a field; nothing happens if it is no dataclass.
     """
-    if not (isinstance(kind, type) and is_dataclass(kind)):
+    if not (isinstance(hint, type) and is_dataclass(hint)):
         return
-    for base in kind.__mro__:
-        fields = parse_from_object(base).params if is_dataclass(base) else []
-        about = inspect.cleandoc(base.__doc__ or "")
-        if not fields or ATTRIBUTES in about:
-            continue
-        lines = []
-        for field in fields:
-            words = (field.description or "").split()
-            lines.append(f"    {field.arg_name}: {' '.join(words)}")
-        base.__doc__ = "\n".join([about, "", ATTRIBUTES, *lines])
-    for nested in get_type_hints(kind).values():
+    for owner in hint.__mro__:
+        if is_dataclass(owner):
+            _list_fields_in_docstring(owner)
+    for nested in get_type_hints(hint).values():
         _join_lines_of_fields(nested)
+
+
+def _list_fields_in_docstring(owner: type) -> None:
+    """Append the heading Attributes and a line for each explained field to a class's docstring."""
+    explained = parse_from_object(owner).params  # from the source: docstrings below the fields
+    about = inspect.cleandoc(owner.__doc__ or "")
+    if not explained or ATTRIBUTES in about:
+        return
+    lines = []
+    for field in explained:
+        words = (field.description or "").split()
+        lines.append(f"    {field.arg_name}: {' '.join(words)}")
+    owner.__doc__ = "\n".join([about, "", ATTRIBUTES, *lines])
 
 
 def like(function: Callable[..., Any]) -> Callable[[Command], Command]:

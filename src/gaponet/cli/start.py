@@ -175,7 +175,7 @@ def _run(step: Step) -> None:
     """
     code = main(list(step.words))
     if code == 128 + signal.SIGINT:
-        raise KeyboardInterrupt("the same command again goes on")
+        raise KeyboardInterrupt("the same command again continues")
     if code:
         raise UsageError(
             f"stopped at: {step.line}; the message above says what to do; then give the same "
