@@ -24,10 +24,15 @@ from gaponet.experiments.paper.printed import (
 )
 from gaponet.experiments.paper.results import Results
 from gaponet.experiments.paper.statistics import Reduction, reduction
-from gaponet.experiments.paper.trainings import BLOCK_TITLES
+from gaponet.experiments.paper.trainings import BLOCK_TITLES, METHOD_BLOCKS
 
-BLOCKS: tuple[Block, ...] = ("labels", "ppo")
 JUDGED = "GAPONet"
+# Way without a network → what it is called in a claim.
+WITHOUT_NETWORK = {
+    "raw": "targets as they are",
+    "feedforward": "feed-forward alone",
+    "integral": "feed-forward and integral alone",
+}
 
 
 @dataclass(frozen=True)
@@ -56,7 +61,7 @@ class Claim:
 def claims(results: Results) -> list[Claim]:
     """Return all claims for both blocks, in the order of the page."""
     found = []
-    for block in BLOCKS:
+    for block in METHOD_BLOCKS:
         if not results.networks(block):
             continue
         found += _alignment_claims(results, block)
@@ -114,13 +119,6 @@ def _command_claims(results: Results, block: Block) -> list[Claim]:
     return found
 
 
-WITHOUT_NETWORK = {
-    "raw": "targets as they are",
-    "feedforward": "feed-forward alone",
-    "integral": "feed-forward and integral alone",
-}
-
-
 def _delivery_claims(results: Results, block: Block) -> list[Claim]:
     """Offsets at the heaviest payload, against the MLP as the paper has it, and against what needs
     no network.
@@ -168,7 +166,7 @@ def _offset_reduction(seeds: list[Array], baseline: Array, axis: int) -> Reducti
         seeds: (goals, 3) m for each seed.
         baseline: (goals, 3) m.
     """
-    goals = list(map(str, range(len(baseline))))
+    goals = [str(goal) for goal in range(len(baseline))]
     return reduction([offsets[:, axis] for offsets in seeds], baseline[:, axis], goals)
 
 
@@ -180,6 +178,13 @@ def _with_payload(results: Results, payload: float | None) -> Array:
 
 
 def _reduction(results: Results, errors: list[Array], baseline: Array, kept: Array) -> Reduction:
+    """Return the reduction on some recordings.
+
+    Args:
+        errors: (recordings,) rad·s for each seed.
+        baseline: (recordings,) rad·s.
+        kept: Mask of the recordings that count, (recordings,).
+    """
     motions = list(compress(results.motions, kept))
     return reduction([error[kept] for error in errors], baseline[kept], motions)
 

@@ -21,7 +21,7 @@ from gaponet.experiments.paper.measure import LARGE_GAPS_RAD
 from gaponet.experiments.paper.options import Block
 from gaponet.experiments.paper.printed import AXES, TABLE_1, TABLE_2, PrintedRow
 from gaponet.experiments.paper.results import Results
-from gaponet.experiments.paper.trainings import BLOCK_TITLES, TABLE_2_CHANGES
+from gaponet.experiments.paper.trainings import BLOCK_TITLES, METHOD_BLOCKS, TABLE_2_CHANGES
 
 CONVERGED_SHARE = 0.5  # of the nominal error; above it a row of Table 2 is not converged
 # Row of Table 2 here → row of the paper. The paper does not say what is held for an action
@@ -257,8 +257,7 @@ def _latency(runs: list[dict[str, Any]], percentile: str) -> MeanStd:
 def method_table(results: Results) -> ResultTable:
     """Return size, training time and latency of each method."""
     rows = []
-    blocks: tuple[Block, ...] = ("labels", "ppo")
-    for block in blocks:
+    for block in METHOD_BLOCKS:
         for name in results.networks(block):
             runs = results.runs(block, name)
             rows.append(
