@@ -15,7 +15,7 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from gaponet.base.errors import ModelError
+from gaponet.base.errors import ModelError, UsageError
 from gaponet.base.files import lock_folder
 from gaponet.base.progress import Running
 from gaponet.base.result_table import ResultTable
@@ -86,8 +86,8 @@ def run_paper_experiment(
         open_bars: Opens the bars of the trainings, title and number → show(running, done).
 
     Raises:
-        UsageError: The dataset or the folder does not fit, or a motion of the experiment was
-            recorded.
+        UsageError: The dataset or the folder does not fit, a motion of the experiment was recorded,
+            or the options leave nothing to train.
         ModelError: Every training failed.
     """
     with lock_folder(out, KIND):
@@ -111,6 +111,11 @@ def prepare(
     nominal = robot.before_identification
     dataset.require_robot(nominal)
     study = Study(str(dataset.path.resolve()), nominal, out, options)
+    if not all_trainings(options, study.rates, study.payloads):
+        raise UsageError(
+            "--methods and --blocks leave nothing to train; name a block, and for labels and ppo a "
+            "method too"
+        )
     if options.quick:
         options = options.for_quick_run()
         study = replace(study, options=options)
