@@ -22,7 +22,7 @@ from gaponet.experiments.paper.printed import (
     CLAIM_BY_AXIS,
     CLAIM_HEAVIEST_PAYLOAD,
 )
-from gaponet.experiments.paper.results import Results
+from gaponet.experiments.paper.results import SIMULATORS, Results
 from gaponet.experiments.paper.statistics import Reduction, reduction
 from gaponet.experiments.paper.trainings import BLOCK_TITLES, METHOD_BLOCKS
 
@@ -74,7 +74,6 @@ def claims(results: Results) -> list[Claim]:
 
 def _alignment_claims(results: Results, block: Block) -> list[Claim]:
     nominal = results.over_joints(results.baseline_q_dis("nominal"))
-    identified = results.over_joints(results.baseline_q_dis("identified"))
     heaviest = results.masses[-1]
     found = []
     rows: list[tuple[str, float, float | None]] = [("all payloads", CLAIM_ALL_PAYLOADS, None)]
@@ -82,7 +81,11 @@ def _alignment_claims(results: Results, block: Block) -> list[Claim]:
         rows.append((f"{heaviest:g} kg", CLAIM_HEAVIEST_PAYLOAD, heaviest))
     for label, printed, payload in rows:
         kept = _with_payload(results, payload)
-        reductions = {"identification": _reduction(results, [identified], nominal, kept)}
+        reductions = {}
+        for name, title in SIMULATORS.items():
+            if name != "nominal":
+                error = results.over_joints(results.baseline_q_dis(name))
+                reductions[title] = _reduction(results, [error], nominal, kept)
         for name in results.networks(block):
             errors = _over_joints(results, results.q_dis(block, name))
             reductions[name] = _reduction(results, errors, nominal, kept)
