@@ -254,6 +254,8 @@ def clear_folder(folder: Path, keep: str = "") -> None:
 
 
 def _holds_marker_alone(folder: Path) -> bool:
+    if not folder.is_dir():  # another program removed it
+        return False
     return [path.name for path in folder.iterdir()] == [FOLDER_MARKER]
 
 
