@@ -1,6 +1,7 @@
 """Atomic writes, one writer per folder, no writes into other people's folders."""
 
 import os
+import shutil
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
@@ -64,6 +65,21 @@ def test_a_block_that_fails_after_writing_removes_nothing(tmp_path):
     with pytest.raises(ZeroDivisionError):
         fail()
     assert names(tmp_path / "a") == [FOLDER_MARKER, "x"]
+
+
+@pytest.mark.skipif(os.name == "nt", reason="an open file cannot be removed there")
+def test_a_block_whose_folder_was_removed_fails_with_its_own_error(tmp_path):
+    folder = tmp_path / "a"
+
+    def fail():
+        with lock_folder(folder, "run"):
+            shutil.rmtree(folder)
+            raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        fail()
+    with lock_folder(folder, "run"):
+        assert names(folder) == [FOLDER_MARKER]  # locked anew
 
 
 @pytest.mark.parametrize("name", ["notes.txt", ".env", "dataset"])

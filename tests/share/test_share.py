@@ -305,7 +305,7 @@ def test_of_two_first_pushes_to_the_hub_the_slower_one_gets_the_error_too(
     other = Dataset.create(tmp_path / "other", arm)
     add(other, arm, ["elsewhere"])
     remote = Hub("me/arm")
-    assert remote.index("dataset") is None
+    assert remote.pushed_index("dataset") is None
     push(other.path, "me/arm")
     index = Index(1, "dataset", "arm", ("a",), {"x": FileRecord(1, "0" * 64)})
     with pytest.raises(RemoteError, match="time"):

@@ -148,19 +148,33 @@ def open_pool(where: str | Executor, workers: int) -> Iterator[Pool]:
     Raises:
         UsageError: There is no such executor, or no cluster at the address.
     """
+    executor: Executor
+    size = workers or os.cpu_count() or 1
     with ExitStack() as stack:
-        executor = stack.enter_context(_ProcessPerWorker()) if where == LOCAL else where
-        size = workers or os.cpu_count() or 1
-        if not isinstance(executor, Executor):
-            kind, _, address = str(executor).partition(":")
-            if kind != "ray":
-                raise UsageError(
-                    f"--executor {where}: choose local, ray or ray:ADDRESS; "
-                    "from Python, give a concurrent.futures.Executor (docs/install.md)"
-                )
+        if isinstance(where, Executor):
+            executor = where
+        elif where == LOCAL:
+            executor = stack.enter_context(_ProcessPerWorker())
+        else:
+            address = _ray_address(where)
             with _child_environment():
                 executor, size = _connect_ray(stack, address, workers)
         yield Pool(executor, max(1, size))
+
+
+def _ray_address(where: str) -> str:
+    """Return ADDRESS of "ray:ADDRESS", "" of "ray".
+
+    Raises:
+        UsageError: It is no Ray.
+    """
+    kind, _, address = str(where).partition(":")
+    if kind != "ray":
+        raise UsageError(
+            f"--executor {where}: choose local, ray or ray:ADDRESS; from Python, give a "
+            "concurrent.futures.Executor (docs/install.md)"
+        )
+    return address
 
 
 class _ProcessPerWorker(Executor):

@@ -3,9 +3,12 @@ people's folders.
 
 Each folder that gaponet writes into holds a marker file `.gaponet`. Its first line is the kind of
 folder. The file is also the lock of the writer: the system releases it when the process ends,
-however that happens. A file is written as `.gaponet-PROCESS-NAME` beside its place and then
-renamed. The next writer removes those of killed processes; gaponet removes nothing else.
-Differences of Windows are handled here and in `deploy/stop.py` only.
+however that happens. Its second line, the number of the writing process, is there only while a
+writer runs, or after one was killed.
+
+A file is written as `.gaponet-PROCESS-NAME` beside its place and then renamed. The next writer
+removes such temporary files of killed processes. Differences of Windows are handled here and in
+`deploy/stop.py` only.
 """
 
 from __future__ import annotations
@@ -29,12 +32,15 @@ FOLDER_MARKER = ".gaponet"
 LOCK_RETRY_S = 0.05
 # Windows: a locked byte cannot be read, so it lies far behind the end of the file
 LOCKED_BYTE = 1 << 30
-# Files by which a folder without a marker is recognised: older versions wrote none.
+# Kind → file by which a folder without a marker is recognised: older versions wrote no marker.
 UNMARKED_FOLDERS = {
-    "dataset": ("dataset.json",),
-    "run": ("split.json",),
-    "model": ("card.json",),
+    "dataset": "dataset.json",
+    "run": "split.json",
+    "model": "card.json",
 }
+# Of the Windows API: the right to wait for the end of a process, and the answer that it still runs.
+SYNCHRONIZE = 0x100000
+WAIT_TIMEOUT = 0x102
 
 _locked_here: set[tuple[str, int]] = set()  # (folder, thread) of this process
 
@@ -111,6 +117,8 @@ def flush_to_disk(path: Path) -> None:
 def require_own_folder(folder: Path, kind: str) -> None:
     """Refuse a folder that is not empty and was not written by gaponet as this kind.
 
+    A missing folder is accepted, and is not created.
+
     Raises:
         FolderError: It is somebody else's, another kind of folder, or a file.
     """
@@ -125,8 +133,9 @@ def require_own_folder(folder: Path, kind: str) -> None:
         raise FolderError(
             f"{folder}: holds gaponet's {stated_kind}, not {kind}; choose another folder"
         )
-    signs = UNMARKED_FOLDERS.get(kind, (FOLDER_MARKER,))
-    if any((folder / sign).exists() for sign in signs):
+    # All other kinds always had a marker; a writer that was killed at once leaves an empty one.
+    sign = UNMARKED_FOLDERS.get(kind, FOLDER_MARKER)
+    if (folder / sign).exists():
         return
     names = sorted(child.name for child in folder.iterdir())
     others = [name for name in names if not name.startswith(FOLDER_MARKER)]
@@ -145,7 +154,10 @@ def _read_marker(folder: Path) -> tuple[str, str]:
     marker = folder / FOLDER_MARKER
     if not marker.is_file():
         return "", ""
-    kind, process, *_ = [*marker.read_text(encoding="utf-8", errors="replace").split(), "", ""]
+    # A third word is the rest of a killed writer's number that was longer than the next one's.
+    words = marker.read_text(encoding="utf-8", errors="replace").split()
+    kind = words[0] if words else ""
+    process = words[1] if len(words) > 1 else ""
     return kind, process
 
 
@@ -169,29 +181,20 @@ def lock_folder(folder: Path, kind: str, wait: float = 0.0) -> Iterator[None]:
     if key in _locked_here:
         yield
         return
-    created = [p for p in (folder, *folder.parents) if not p.exists()]
-    new = not (folder / FOLDER_MARKER).exists()
-    kind_line = f"{kind}\n".encode()
+    created = [path for path in (folder, *folder.parents) if not path.exists()]  # deepest first
+    marker_is_new = not (folder / FOLDER_MARKER).exists()
     descriptor = _lock_marker(folder, kind, wait)
     _locked_here.add(key)
     succeeded = False
     try:
-        size = os.fstat(descriptor).st_size
-        if size == 0:
-            _write_at(descriptor, 0, kind_line)
-        elif size > len(kind_line):  # a second line names a writer that was killed
-            _remove_unfinished(folder)
-        _write_at(descriptor, len(kind_line), f"{os.getpid()}\n".encode())
+        _name_writer(descriptor, folder, kind)
         yield
         succeeded = True
     finally:
-        if not succeeded and new and _holds_marker_alone(folder):
-            with suppress(OSError):  # another program wrote into it; Windows keeps open files
-                (folder / FOLDER_MARKER).unlink()
-                for path in created:
-                    path.rmdir()
-        elif os.fstat(descriptor).st_size > len(kind_line):
-            os.ftruncate(descriptor, len(kind_line))  # the line that names this process
+        if not succeeded and marker_is_new and _holds_marker_alone(folder):
+            _remove_created(folder, created)
+        else:
+            _erase_writer(descriptor, kind)
         _locked_here.discard(key)
         os.close(descriptor)
 
@@ -200,12 +203,13 @@ def lock_folder(folder: Path, kind: str, wait: float = 0.0) -> Iterator[None]:
 def whole_folder(
     folder: Path, kind: str, last: str, obsolete: tuple[str, ...] = ()
 ) -> Iterator[Path]:
-    """Lock a folder and yield an empty one.
+    """Lock a folder and yield an empty temporary folder inside it, for the new files.
 
-    When the block succeeds, its files replace those of `folder`.
+    When the block succeeds, the new files replace those of `folder`. If the block fails, or the
+    process is killed in it, `folder` stays as it was.
 
-    The folder is complete if `last` is there: this file is taken away first and put back last. If
-    the process is killed before, or the block fails, `folder` stays as it was.
+    The folder is complete if `last` is there: the replacement removes this file first and puts it
+    back last.
 
     Args:
         kind: As of `lock_folder`.
@@ -250,7 +254,43 @@ def clear_folder(folder: Path, keep: str = "") -> None:
 
 
 def _holds_marker_alone(folder: Path) -> bool:
+    if not folder.is_dir():  # another program removed it
+        return False
     return [path.name for path in folder.iterdir()] == [FOLDER_MARKER]
+
+
+def _kind_line(kind: str) -> bytes:
+    """Return the first line of a marker."""
+    return f"{kind}\n".encode()
+
+
+def _name_writer(descriptor: int, folder: Path, kind: str) -> None:
+    """Write this process into the second line of a locked marker, and the kind where it is new.
+
+    If a killed writer is named there, its temporary files are removed.
+    """
+    kind_line = _kind_line(kind)
+    size = os.fstat(descriptor).st_size
+    if size == 0:
+        _write_at(descriptor, 0, kind_line)
+    elif size > len(kind_line):
+        _remove_unfinished(folder)
+    _write_at(descriptor, len(kind_line), f"{os.getpid()}\n".encode())
+
+
+def _erase_writer(descriptor: int, kind: str) -> None:
+    """Remove the second line of a marker."""
+    kind_line = _kind_line(kind)
+    if os.fstat(descriptor).st_size > len(kind_line):
+        os.ftruncate(descriptor, len(kind_line))
+
+
+def _remove_created(folder: Path, created: list[Path]) -> None:
+    """Remove the marker of a folder, and the folders that were created for it, deepest first."""
+    with suppress(OSError):  # another program wrote into it; Windows keeps open files
+        (folder / FOLDER_MARKER).unlink()
+        for path in created:
+            path.rmdir()
 
 
 def _write_at(descriptor: int, offset: int, line: bytes) -> None:
@@ -259,7 +299,10 @@ def _write_at(descriptor: int, offset: int, line: bytes) -> None:
 
 
 def _lock_marker(folder: Path, kind: str, wait: float) -> int:
-    """Lock the marker of a folder; returns the file descriptor that holds the lock."""
+    """Lock the marker of a folder; returns the file descriptor that holds the lock.
+
+    Waits up to `wait` s for another writer, whose folder is checked again at each try.
+    """
     deadline = time.monotonic() + wait
     while True:
         require_own_folder(folder, kind)
@@ -280,7 +323,7 @@ def lock_file(path: Path, opener: Callable[[Path], int] | None = None) -> int | 
     """Lock a file against other processes; the file is created if missing.
 
     A descriptor, unlike the locks of libraries, may be inherited by a child and may be of another
-    user's file.
+    user's file. If the file is removed while it is being locked, its successor is locked.
 
     Args:
         opener: Opens the file; by default it is opened for reading and writing.
@@ -288,9 +331,10 @@ def lock_file(path: Path, opener: Callable[[Path], int] | None = None) -> int | 
     Returns:
         The descriptor that holds the lock, or None if another process holds it.
     """
+    if opener is None:
+        opener = _open_or_create
     while True:
-        flags = os.O_RDWR | os.O_CREAT | getattr(os, "O_BINARY", 0)
-        descriptor = opener(path) if opener else os.open(path, flags, 0o666)
+        descriptor = opener(path)
         try:
             _lock_descriptor(descriptor)
             if WINDOWS or os.path.samestat(os.fstat(descriptor), os.stat(path)):
@@ -298,9 +342,14 @@ def lock_file(path: Path, opener: Callable[[Path], int] | None = None) -> int | 
         except (BlockingIOError, PermissionError):  # POSIX, Windows: locked by another process
             os.close(descriptor)
             return None
-        except FileNotFoundError:
+        except FileNotFoundError:  # of os.stat: no file has this name now
             pass
         os.close(descriptor)  # the locked file was removed meanwhile
+
+
+def _open_or_create(path: Path) -> int:
+    flags = os.O_RDWR | os.O_CREAT | getattr(os, "O_BINARY", 0)
+    return os.open(path, flags, 0o666)
 
 
 def _lock_descriptor(descriptor: int) -> None:
@@ -329,10 +378,9 @@ def _process_runs(process: int) -> bool:
         import ctypes
 
         kernel = ctypes.windll.kernel32  # type: ignore[attr-defined]
-        # SYNCHRONIZE: the right to wait for its end
-        handle = kernel.OpenProcess(0x100000, False, process)
+        handle = kernel.OpenProcess(SYNCHRONIZE, False, process)
         try:
-            return bool(handle) and kernel.WaitForSingleObject(handle, 0) == 0x102  # WAIT_TIMEOUT
+            return bool(handle) and kernel.WaitForSingleObject(handle, 0) == WAIT_TIMEOUT
         finally:
             kernel.CloseHandle(handle)
     try:

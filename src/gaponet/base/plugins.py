@@ -51,12 +51,12 @@ def require(group: str, name: str, builtin: Mapping[str, str], what: str) -> Any
     known = registry(group, builtin)
     if name not in known:
         raise UsageError(f"no {what} '{name}'; use one of {', '.join(known)}")
-    entries = attempt(known[name], lambda: load(known[name]), None)
-    if entries is None:
+    found = attempt(known[name], lambda: load(known[name]), None)
+    if found is None:
         raise UsageError(
             f"the package that brings {what} '{name}' is broken; update or uninstall it"
         )
-    return entries
+    return found
 
 
 def load(where: str) -> Any:

@@ -67,6 +67,7 @@ def progress_bars(title: str, total: int) -> Iterator[Callable[[Running, int], N
 
 @contextmanager
 def _progress(title: str) -> Iterator[_Show]:
+    """Show bars in a terminal, and lines anywhere else."""
     console = Console(stderr=True, force_jupyter=False)  # text in a notebook, too
     if not console.is_terminal:
         with _lines(title, console) as lines:
@@ -98,7 +99,7 @@ def _progress(title: str) -> Iterator[_Show]:
             )
 
         yield show
-        task = progress.tasks[0]
+        task = progress.tasks[0]  # the whole
         if task.percentage >= 100 * MAX_UNFINISHED:
             progress.update(whole, completed=task.total)
 
@@ -148,8 +149,9 @@ class _Lines:
         self._note = "; ".join(text for text in notes if text)
         self.fraction = done / total if total else 0.0
         is_first = self._last_line is None
-        if self.fraction < 1 or not is_first:
-            self._print_if_due()
+        if is_first and self.fraction >= 1:
+            return  # `_lines` prints the end, and nothing came before it
+        self._print_if_due()
 
     def print_until(self, done: threading.Event) -> None:
         """Print a line whenever the last one is old enough, until `done` is set."""

@@ -132,7 +132,10 @@ def _csv_value(value: Any) -> Any:
 
 
 def format_cell(cell: Any, digits: int = 2) -> str:
-    """Format a cell of a table: 12.28 ± 0.08 (mean ± standard deviation), 1,234, yes, or blank."""
+    """Format a cell of a table: 12.28 ± 0.08 (mean ± standard deviation), 1,234, yes, or blank.
+
+    None, NaN and infinity are blank. Whole numbers have no decimals, whatever `digits` says.
+    """
     if isinstance(cell, MeanStd):
         mean = format_cell(cell.mean, digits)
         std = format_cell(cell.std, digits)

@@ -99,10 +99,8 @@ def validated(
     """
     try:
         text = to_json(data, inf_nan_mode="constants")
-    except (
-        PydanticSerializationError,
-        ValueError,
-    ) as invalid:  # unpaired surrogates, recursive lists
+    # Of unpaired surrogates and recursive lists.
+    except (PydanticSerializationError, ValueError) as invalid:
         raise error(_message(where, str(invalid), hint)) from None
     return parse_json(kind, text, where, error, hint, allow_extra)
 

@@ -154,7 +154,7 @@ def add_missing(files: Path, robot: RobotSpec, out: Path, new: bool) -> None:
     done = 0  # episodes that the dataset has
     with dataset.appending(), progress_bar("checking") as update:
         for part in sets:
-            if part.ours is None:
+            if part.ours is None:  # the set has no gaponet.json beside its info.json
                 raise RemoteError(f"{part.path}: gaponet did not write this set")
             if new:
                 dataset.set_provenance(**_provenance(part))
@@ -163,6 +163,7 @@ def add_missing(files: Path, robot: RobotSpec, out: Path, new: bool) -> None:
             logs = read_episodes(part, lacking, robot)
             for episode, log in zip(lacking, logs, strict=True):
                 sequence = _pushed_sequence(episode, log, robot)
+                # Empty if the recording was appended without, as Dataset.append allows.
                 findings = episode["findings"] or measure_delays(sequence)
                 dataset.append(sequence, findings, str(episode["content_hash"]))
                 done += 1
@@ -171,7 +172,7 @@ def add_missing(files: Path, robot: RobotSpec, out: Path, new: bool) -> None:
 
 
 def _provenance(part: Set) -> dict[str, str]:
-    """Return licence and source that a set which gaponet wrote (`part.ours`) states."""
+    """Return what a set that gaponet wrote states of licence and source."""
     assert part.ours is not None
     stated: dict[str, Any] = {**part.ours["dataset"]}
     return {name: str(stated[name]) for name in Stated.__annotations__ if name in stated}

@@ -37,8 +37,9 @@ class Hub:
     Attributes:
         repo: USER/NAME.
         revision: Branch, tag or commit.
-        type: Type of the repository, a value of REPOSITORY_TYPES; "" until `index` has found it.
-        commit: Newest commit of the revision when `index` was called; "" before.
+        type: Type of the repository, a value of REPOSITORY_TYPES; "" until `pushed_index` has found
+            it.
+        commit: Newest commit of the revision when `pushed_index` was called; "" before.
     """
 
     def __init__(self, address: str) -> None:
@@ -69,16 +70,20 @@ class Hub:
         self.commit = ""
         self._sizes: dict[str, int | None] = {}  # file at the commit → bytes
 
-    def index(self, kind: Kind | None = None) -> bytes | None:
+    def pushed_index(self, kind: Kind | None = None) -> bytes | None:
         """Return the content of gaponet.json; None if nothing was pushed.
+
+        The methods below are about the repository and the commit that were found here.
 
         Args:
             kind: Look in the repository of this kind only; default: in all that have the name.
         """
         from huggingface_hub.errors import RepositoryNotFoundError
 
-        types = set(REPOSITORY_TYPES.values()) if kind is None else {REPOSITORY_TYPES[kind]}
-        for repo_type in sorted(types):  # a dataset before a model
+        types = ["dataset", "model"]
+        if kind is not None:
+            types = [REPOSITORY_TYPES[kind]]
+        for repo_type in types:
             with network_errors(self.address), suppress(RepositoryNotFoundError):
                 self._look_at(repo_type)
                 if INDEX in self._sizes:
@@ -142,51 +147,64 @@ class Hub:
         require_pushed_files(self.address, index, paths, folder)
 
     def store(self, folder: Path, index: Index, private: bool) -> None:
-        """Commit all files of the index; the Hub itself knows which of them are new.
+        """Replace the files of the repository by those of the index, in one commit.
+
+        A repository that `pushed_index` did not find is created. The Hub itself knows which files
+        are new.
 
         Args:
-            folder: Folder with the files.
+            folder: Folder with the files of the index, and with gaponet.json.
             private: Make a new repository readable by its owner only.
 
         Raises:
-            RemoteError: Somebody else pushed since `index` was called.
+            RemoteError: Somebody else pushed since `pushed_index` was called.
         """
+        with network_errors(self.address):
+            if not self.type:
+                self._create(index.kind, private)
+            self._commit(folder, index)
+            if index.kind == "dataset" and self.revision == "main":
+                self._move_lerobot_tag()
+
+    def _create(self, kind: Kind, private: bool) -> None:
+        """Create the repository, and look at it: somebody else may have been faster."""
+        self.api.create_repo(
+            self.repo,
+            repo_type=REPOSITORY_TYPES[kind],
+            private=private or None,  # None: as the owner's settings say
+            exist_ok=True,
+        )
+        if self.pushed_index(kind) is not None:
+            raise lost_race(self.address)
+
+    def _commit(self, folder: Path, index: Index) -> None:
+        """Add all files of the index, and delete all others, if nobody has pushed meanwhile."""
         from huggingface_hub import CommitOperationAdd, CommitOperationDelete
         from huggingface_hub.errors import HfHubHTTPError
 
-        repo_type = REPOSITORY_TYPES[index.kind]
         files = {*index.files, INDEX}
-        with network_errors(self.address):
-            if not self.type:
-                self.api.create_repo(
-                    self.repo, repo_type=repo_type, private=private or None, exist_ok=True
-                )
-                if self.index(index.kind) is not None:
-                    raise lost_race(self.address)
-            removed = sorted(self._sizes.keys() - files - INITIAL_FILES)
-            additions = [CommitOperationAdd(path, str(folder / path)) for path in sorted(files)]
-            deletions = [CommitOperationDelete(path) for path in removed]
-            try:
-                # upload_folder and upload_large_folder show readers a part of the new state
-                self.api.create_commit(
-                    self.repo,
-                    [*additions, *deletions],
-                    commit_message=f"gaponet push: {index.kind} of {len(index.files)} files",
-                    repo_type=repo_type,
-                    revision=self.revision,
-                    parent_commit=self.commit or None,
-                )
-            except HfHubHTTPError as error:
-                if error.response.status_code == PARENT_CHANGED:
-                    raise lost_race(self.address) from None
-                raise
-            if index.kind == "dataset" and self.revision == "main":
-                self._move_lerobot_tag(repo_type)
+        removed = sorted(self._sizes.keys() - files - INITIAL_FILES)
+        additions = [CommitOperationAdd(path, str(folder / path)) for path in sorted(files)]
+        deletions = [CommitOperationDelete(path) for path in removed]
+        try:
+            # upload_folder and upload_large_folder show readers a part of the new state
+            self.api.create_commit(
+                self.repo,
+                [*additions, *deletions],
+                commit_message=f"gaponet push: {index.kind} of {len(index.files)} files",
+                repo_type=REPOSITORY_TYPES[index.kind],
+                revision=self.revision,
+                parent_commit=self.commit or None,
+            )
+        except HfHubHTTPError as error:
+            if error.response.status_code == PARENT_CHANGED:
+                raise lost_race(self.address) from None
+            raise
 
-    def _move_lerobot_tag(self, repo_type: str) -> None:
+    def _move_lerobot_tag(self) -> None:
         """Let the tag of LeRobot's version name the newest commit: LeRobot opens it, not main."""
         from huggingface_hub.errors import RevisionNotFoundError
 
         with suppress(RevisionNotFoundError):
-            self.api.delete_tag(self.repo, tag=LEROBOT_TAG, repo_type=repo_type)
-        self.api.create_tag(self.repo, tag=LEROBOT_TAG, repo_type=repo_type, exist_ok=True)
+            self.api.delete_tag(self.repo, tag=LEROBOT_TAG, repo_type="dataset")
+        self.api.create_tag(self.repo, tag=LEROBOT_TAG, repo_type="dataset", exist_ok=True)

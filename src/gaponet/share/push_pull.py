@@ -36,6 +36,7 @@ from gaponet.share.remote import (
 )
 
 MODELS: dict[Kind, Any] = {"run": runs, "robot": robots}  # of model repositories
+# Kind → what a push would replace, {} being a number.
 LOST = {"dataset": "{} sequences", "run": "another network", "robot": "another robot"}
 
 
@@ -76,7 +77,7 @@ def push(
     if kind == "dataset" and (licence or trained_on):
         raise UsageError("--licence and --trained-on are for runs and robots; leave them out")
     hub = Hub(address)
-    pushed = hub.index(kind)
+    pushed = hub.pushed_index(kind)
     earlier = None
     if pushed is not None and not replace:
         earlier = read_index(hub.address, pushed)
@@ -143,7 +144,7 @@ def pull(address: str, out: str | Path) -> TransferResult:
     else:
         _require_empty(out)
     hub = Hub(address)
-    index = read_index(hub.address, hub.index())
+    index = read_index(hub.address, hub.pushed_index())
     if own is not None:
         if index.kind != "dataset":
             raise UsageError(

@@ -44,8 +44,9 @@ def write_files(robot: Path, folder: Path, address: str, facts: ModelFacts) -> t
 
 def require_files(index: Index) -> None:
     """Refuse an index with files that no robot has."""
-    for path in index.files.keys() - {README, *DESCRIPTION, *COPIED_FILES}:
-        raise RemoteError(f"{path}: a robot has no such file")
+    unknown = index.files.keys() - {README, *DESCRIPTION, *COPIED_FILES}
+    if unknown:
+        raise RemoteError(f"{min(unknown)}: a robot has no such file")
 
 
 def require_pushed(folder: Path, index: Index) -> None:

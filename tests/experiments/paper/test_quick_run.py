@@ -1,5 +1,7 @@
 """The quick run of the experiment: a few recordings of the dataset."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from arm import record, write_dataset
@@ -16,12 +18,25 @@ def no_bar(text):
     raise AssertionError("the recordings are looked at, although there are none to train on")
 
 
-def test_a_dataset_that_holds_only_the_unseen_unit_is_refused(tmp_path):
-    robot = load_robot("so101")
-    rest = np.tile(robot.qpos_home, (50, 1))
-    dataset = write_dataset(
-        tmp_path / "data", robot, [record(robot, rest, "rest", unit="virtual-1")]
-    )
+@pytest.fixture
+def robot():
+    return load_robot("so101")
 
+
+@pytest.fixture
+def dataset(tmp_path, robot):
+    rest = np.tile(robot.qpos_home, (50, 1))
+    recording = record(robot, rest, "rest", unit="virtual-1")
+    return write_dataset(tmp_path / "data", robot, [recording])
+
+
+def test_a_dataset_that_holds_only_the_unseen_unit_is_refused(tmp_path, robot, dataset):
     with pytest.raises(UsageError, match="unit"):
         prepare(dataset, robot, tmp_path / "out", OPTIONS, no_bar)
+
+
+@pytest.mark.parametrize("left_out", [{"blocks": ()}, {"methods": (), "blocks": ("labels",)}])
+def test_options_that_leave_nothing_to_train_are_refused(tmp_path, robot, dataset, left_out):
+    options = replace(OPTIONS, **left_out)
+    with pytest.raises(UsageError, match="nothing to train"):
+        prepare(dataset, robot, tmp_path / "out", options, no_bar)

@@ -22,12 +22,17 @@ from gaponet.experiments.paper.printed import (
     CLAIM_BY_AXIS,
     CLAIM_HEAVIEST_PAYLOAD,
 )
-from gaponet.experiments.paper.results import Results
+from gaponet.experiments.paper.results import SIMULATORS, Results
 from gaponet.experiments.paper.statistics import Reduction, reduction
-from gaponet.experiments.paper.trainings import BLOCK_TITLES
+from gaponet.experiments.paper.trainings import BLOCK_TITLES, METHOD_BLOCKS
 
-BLOCKS: tuple[Block, ...] = ("labels", "ppo")
 JUDGED = "GAPONet"
+# Way without a network → what it is called in a claim.
+WITHOUT_NETWORK = {
+    "raw": "targets as they are",
+    "feedforward": "feed-forward alone",
+    "integral": "feed-forward and integral alone",
+}
 
 
 @dataclass(frozen=True)
@@ -56,7 +61,7 @@ class Claim:
 def claims(results: Results) -> list[Claim]:
     """Return all claims for both blocks, in the order of the page."""
     found = []
-    for block in BLOCKS:
+    for block in METHOD_BLOCKS:
         if not results.networks(block):
             continue
         found += _alignment_claims(results, block)
@@ -69,7 +74,6 @@ def claims(results: Results) -> list[Claim]:
 
 def _alignment_claims(results: Results, block: Block) -> list[Claim]:
     nominal = results.over_joints(results.baseline_q_dis("nominal"))
-    identified = results.over_joints(results.baseline_q_dis("identified"))
     heaviest = results.masses[-1]
     found = []
     rows: list[tuple[str, float, float | None]] = [("all payloads", CLAIM_ALL_PAYLOADS, None)]
@@ -77,7 +81,11 @@ def _alignment_claims(results: Results, block: Block) -> list[Claim]:
         rows.append((f"{heaviest:g} kg", CLAIM_HEAVIEST_PAYLOAD, heaviest))
     for label, printed, payload in rows:
         kept = _with_payload(results, payload)
-        reductions = {"identification": _reduction(results, [identified], nominal, kept)}
+        reductions = {}
+        for name, title in SIMULATORS.items():
+            if name != "nominal":
+                error = results.over_joints(results.baseline_q_dis(name))
+                reductions[title] = _reduction(results, [error], nominal, kept)
         for name in results.networks(block):
             errors = _over_joints(results, results.q_dis(block, name))
             reductions[name] = _reduction(results, errors, nominal, kept)
@@ -112,13 +120,6 @@ def _command_claims(results: Results, block: Block) -> list[Claim]:
             )
             found.append(Claim(block, text, printed, reductions))
     return found
-
-
-WITHOUT_NETWORK = {
-    "raw": "targets as they are",
-    "feedforward": "feed-forward alone",
-    "integral": "feed-forward and integral alone",
-}
 
 
 def _delivery_claims(results: Results, block: Block) -> list[Claim]:
@@ -168,7 +169,7 @@ def _offset_reduction(seeds: list[Array], baseline: Array, axis: int) -> Reducti
         seeds: (goals, 3) m for each seed.
         baseline: (goals, 3) m.
     """
-    goals = list(map(str, range(len(baseline))))
+    goals = [str(goal) for goal in range(len(baseline))]
     return reduction([offsets[:, axis] for offsets in seeds], baseline[:, axis], goals)
 
 
@@ -180,6 +181,13 @@ def _with_payload(results: Results, payload: float | None) -> Array:
 
 
 def _reduction(results: Results, errors: list[Array], baseline: Array, kept: Array) -> Reduction:
+    """Return the reduction on some recordings.
+
+    Args:
+        errors: (recordings,) rad·s for each seed.
+        baseline: (recordings,) rad·s.
+        kept: Mask of the recordings that count, (recordings,).
+    """
     motions = list(compress(results.motions, kept))
     return reduction([error[kept] for error in errors], baseline[kept], motions)
 

@@ -3,10 +3,10 @@ compensator.
 
 Way            command for a target a
 raw            a
-delta          a − Δa: the robot moves like the nominal simulator, which includes its sag and its
-lag feedforward    a + τ / kp, τ being the nominal simulator's torque for holding and moving both
-feed-forward, and a − Δa on top of it integral       both, and the slow integral of the measured
-error
+delta          a − Δa: the robot moves like the nominal simulator, with its sag and its lag
+feedforward    a + τ / kp, τ being the nominal simulator's torque for holding and moving
+both           feed-forward, and a − Δa on top of it
+integral       both, and the slow integral of the measured error
 
 A network that corrects nothing leaves `delta` at raw and `both` at feed-forward. So the gain of a
 network is measured against raw, feed-forward, and feed-forward with the integral.
@@ -110,11 +110,14 @@ def play(
     states = np.empty((3, *padded.shape), np.float32)
     for row, target in enumerate(padded):
         reading = robots.read()
-        states[:, row] = reading.qpos, reading.qvel, robots.true_qpos()
+        states[0, row] = reading.qpos
+        states[1, row] = reading.qvel
+        states[2, row] = robots.true_qpos()
         command = target
         if compensator is not None:
             command = compensator.step(target, reading.qpos, reading.qvel)
-        robots.step(command, np.arange(np.count_nonzero(lengths > row)))
+        moving = np.count_nonzero(lengths > row)  # the first ones, as the longest come first
+        robots.step(command, np.arange(moving))
         progress((row + 1) / len(padded))
     return Playback(*states)
 

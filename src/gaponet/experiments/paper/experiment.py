@@ -2,7 +2,7 @@
 
 1. Motions that are in no recording, played by a unit that no network sees.
 2. Identification of the nominal robot, and every network: equal recordings, inputs, training and
-seeds.
+   seeds.
 3. Each is measured on these motions: the simulator with Δa against the robot (equation 5), commands
    on the robot, and delivery of payloads.
 4. The paper's claims, Figures 2 and 3, Tables 1 and 2, on one page.
@@ -15,7 +15,7 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from gaponet.base.errors import ModelError
+from gaponet.base.errors import ModelError, UsageError
 from gaponet.base.files import lock_folder
 from gaponet.base.progress import Running
 from gaponet.base.result_table import ResultTable
@@ -27,7 +27,7 @@ from gaponet.experiments.paper.commands import ShareDone
 from gaponet.experiments.paper.figure3 import draw_figure_3, figure_3_table
 from gaponet.experiments.paper.jobs import Job, make_shared_inputs, run_jobs
 from gaponet.experiments.paper.measure import record_unit
-from gaponet.experiments.paper.options import Block, PaperOptions
+from gaponet.experiments.paper.options import PaperOptions
 from gaponet.experiments.paper.page import Section, write_page
 from gaponet.experiments.paper.results import Results
 from gaponet.experiments.paper.study import Study, entries_at, quick_dataset
@@ -39,12 +39,11 @@ from gaponet.experiments.paper.tables import (
     table_1,
     table_2,
 )
-from gaponet.experiments.paper.trainings import BLOCK_TITLES, all_trainings
+from gaponet.experiments.paper.trainings import BLOCK_TITLES, METHOD_BLOCKS, all_trainings
 from gaponet.experiments.paper.unseen_motions import require_unseen
 from gaponet.robot.spec import RobotSpec
 
 KIND = "experiments"  # of the results folder
-BLOCKS: tuple[Block, ...] = ("labels", "ppo")
 
 OpenBar = Callable[[str], AbstractContextManager[ShareDone]]
 OpenBars = Callable[[str, int], AbstractContextManager[Callable[[Running, int], None]]]
@@ -87,8 +86,8 @@ def run_paper_experiment(
         open_bars: Opens the bars of the trainings, title and number → show(running, done).
 
     Raises:
-        UsageError: The dataset or the folder does not fit, or a motion of the experiment was
-            recorded.
+        UsageError: The dataset or the folder does not fit, a motion of the experiment was recorded,
+            or the options leave nothing to train.
         ModelError: Every training failed.
     """
     with lock_folder(out, KIND):
@@ -99,8 +98,8 @@ def run_paper_experiment(
             make_shared_inputs(study, trainings[0].config, update)
         with open_bars("trainings", len(jobs)) as show:
             failures = run_jobs(jobs, show)
-        done = [job.result_file.is_file() for job in jobs]
-        if not done[0] or not any(done[1:]):
+        baselines, *networks = [job.result_file.is_file() for job in jobs]
+        if not baselines or not any(networks):
             raise ModelError(f"{out}: nothing could be trained; the first: {failures[0]}")
         return summarise(study, jobs, failures)
 
@@ -112,6 +111,11 @@ def prepare(
     nominal = robot.before_identification
     dataset.require_robot(nominal)
     study = Study(str(dataset.path.resolve()), nominal, out, options)
+    if not all_trainings(options, study.rates, study.payloads):
+        raise UsageError(
+            "--methods and --blocks leave nothing to train; name a block, and for labels and ppo a "
+            "method too"
+        )
     if options.quick:
         options = options.for_quick_run()
         study = replace(study, options=options)
@@ -133,7 +137,8 @@ def prepare(
             )
     study.require_same_setup()
     if study.virtual:
-        for rate in {study.rates[0], study.rates[-1]}:
+        compared_rates = {study.rates[0], study.rates[-1]}  # one, if all recordings have it
+        for rate in compared_rates:
             with open_bar(f"the unseen {study.unit_name} at {rate:g} Hz") as update:
                 record_unseen(study, rate, update)
     return study
@@ -174,7 +179,7 @@ def summarise(study: Study, jobs: list[Job], failures: list[str]) -> PaperResult
         sections.append(Section("", title, tables=[sensor_table(results)]))
     sections.append(Section("", "Methods", tables=[method_table(results)]))
     gaps = []
-    for block in BLOCKS:
+    for block in METHOD_BLOCKS:
         if results.networks(block):
             gaps.append(large_gaps_table(results, block))
     sections.append(Section("", "Large gaps by payload", tables=gaps))
@@ -201,7 +206,7 @@ def _figure_2(study: Study) -> Section:
 
 def _figure_3(results: Results) -> list[Section]:
     sections = []
-    for block in BLOCKS:
+    for block in METHOD_BLOCKS:
         if not results.networks(block):
             continue
         sections.append(
@@ -219,7 +224,7 @@ def _figure_3(results: Results) -> list[Section]:
 
 def _table_1(results: Results) -> list[Section]:
     sections = []
-    for block in BLOCKS:
+    for block in METHOD_BLOCKS:
         if not results.networks(block):
             continue
         if results.study.delivers:

@@ -10,7 +10,7 @@ import numpy as np
 from gaponet.base.arrays import Array
 from gaponet.base.result_table import MeanStd, ResultTable
 from gaponet.experiments.paper.options import Block
-from gaponet.experiments.paper.results import Results
+from gaponet.experiments.paper.results import SIMULATORS, Results
 from gaponet.report.figures.style import figure, joint_label, legend, styled
 
 if TYPE_CHECKING:
@@ -118,8 +118,9 @@ def figure_3_table(results: Results, block: Block) -> ResultTable:
     for mass in results.masses:
         kept = results.payloads == mass
         cells: list[object] = []
-        for name in ("nominal", "identified"):
-            cells.append(float(results.over_joints(results.baseline_q_dis(name))[kept].mean()))
+        for name in SIMULATORS:
+            q_dis = results.over_joints(results.baseline_q_dis(name))  # (recordings,)
+            cells.append(float(q_dis[kept].mean()))
         for name in methods:
             seeds = []
             for q_dis in results.q_dis(block, name):
@@ -130,5 +131,5 @@ def figure_3_table(results: Results, block: Block) -> ResultTable:
         "Q_dis between simulator and robot, mean over joints without wrists and over motions; ± "
         "is the standard deviation over training seeds."
     )
-    columns = ("Q_dis, rad·s", "nominal (raw)", "identification", *methods)
+    columns = ("Q_dis, rad·s", *SIMULATORS.values(), *methods)
     return ResultTable(f"figure3_{block}", columns, tuple(rows), caption, digits=4)

@@ -159,20 +159,23 @@ class GoalPlanner:
                 return None
             for ik, place in zip(self.ik, goal, strict=True):
                 q = ik.solve(q, place)
-            if np.abs(
-                self.hand_positions(q) - goal
-            ).max() > IK_TOLERANCE_M or not self.limits.can_hold(q):
+            away = np.abs(self.hand_positions(q) - goal).max()
+            if away > IK_TOLERANCE_M or not self.limits.can_hold(q):
                 return None
             postures.append(q)
             goals.append(goal)
-        points = np.array(postures)
+        points = np.array(postures)  # (G + 1, n) rad
         moves = move_time(np.abs(np.diff(points, axis=0)).max(axis=1), MAX_JOINT_SPEED, MIN_MOVE_S)
-        moves = np.ceil(moves / self.robot.dt) * self.robot.dt
+        moves = np.ceil(moves / self.robot.dt) * self.robot.dt  # (G,) s, whole control periods
         holds = np.array([REST_S, *[self.hold] * GOALS_PER_TRAJECTORY])
         if not self.limits.demand(through(points, moves, holds, GRID), GRID).met:
             return None
         ctrl = through(points, moves, holds, self.robot.dt)
-        rows = [round(x / self.robot.dt) for x in (REST_S, *moves, self.hold)]
-        start = rows[0] + np.cumsum([0, *(np.array(rows[1:-2]) + rows[-1])])
-        arrive = start + np.array(rows[1:-1])
-        return Plan(ctrl, np.array(goals), start, arrive, arrive + rows[-1])
+        rest_rows = round(REST_S / self.robot.dt)
+        hold_rows = round(self.hold / self.robot.dt)
+        move_rows = np.array([round(move / self.robot.dt) for move in moves])
+        before = np.concatenate([[0], move_rows[:-1] + hold_rows])  # rows of the goal before
+        start = rest_rows + np.cumsum(before)
+        arrive = start + move_rows
+        leave = arrive + hold_rows
+        return Plan(ctrl, np.array(goals), start, arrive, leave)

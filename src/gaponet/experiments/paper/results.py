@@ -16,6 +16,8 @@ from gaponet.experiments.paper.study import Study
 from gaponet.experiments.paper.trainings import NETWORKS
 
 WRIST = "wrist"  # the paper's Figure 3 and MPJAE are without wrists
+# Simulator without a network in baselines.json (`jobs.measure_baselines`) → its heading in tables.
+SIMULATORS = {"nominal": "nominal (raw)", "identified": "identification"}
 
 
 @dataclass(frozen=True)
@@ -23,8 +25,8 @@ class Results:
     """What was measured.
 
     Attributes:
-        baselines: Result of the job without a training.
-        trainings: Results of the finished trainings.
+        baselines: Result of the job without a training, as `jobs.measure_baselines` writes it.
+        trainings: Results of the finished trainings, as `jobs.train_and_measure` writes them.
     """
 
     study: Study

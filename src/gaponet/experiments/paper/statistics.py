@@ -17,10 +17,9 @@ class Reduction:
 
     Attributes:
         mean: Over all seeds and motions: 100 (1 − Σ error / Σ error of the baseline).
-        seed_error: Standard error over training seeds; 0 for one seed or none, because nothing is
-            known of it.
+        seed_error: Standard error over training seeds; 0 for one seed, which tells nothing of it.
         motion_error: Standard error over motions.
-        seeds, motions: Their numbers.
+        seeds, motions: How many there are.
     """
 
     mean: float
@@ -50,19 +49,22 @@ class Reduction:
 def reduction(errors: ListOf[Array], baseline: Array, motions: ListOf[str]) -> Reduction:
     """Return the reduction of an error.
 
-    The standard error over motions is that of a delete-one-motion jackknife (Efron & Stein 1981):
-    the reduction is a ratio of sums, whose terms are paired by motion.
+    Errors are paired: entry i of every array is of recording i. The standard error over motions is
+    that of a delete-one-motion jackknife (Efron & Stein 1981): each motion in turn is left out of
+    the error and of the baseline. A motion that is hard for both then adds no uncertainty, because
+    the reduction is a ratio of sums over the same motions.
 
     Args:
-        errors: Error of each recording, (recordings,), one array for each training seed.
+        errors: Error of each recording, (recordings,), one array for each training seed; of a
+            method that is not trained, one array. In any unit, that of the baseline.
         baseline: Error of each recording by the baseline, (recordings,).
         motions: Motion of each recording: recordings of one motion are not independent.
     """
-    by_seed = np.array([_percent_less(error, baseline) for error in errors])
+    by_seed = np.array([_percent_less(error, baseline) for error in errors])  # (seeds,) %
     mean_error = np.mean(errors, axis=0)  # (recordings,)
     names = list(dict.fromkeys(motions))
     motion_of = np.array(motions)  # (recordings,)
-    left_out = []
+    left_out = []  # reduction without each motion, %
     for name in names:
         kept = motion_of != name
         left_out.append(_percent_less(mean_error[kept], baseline[kept]))

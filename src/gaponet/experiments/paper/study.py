@@ -6,8 +6,8 @@ OUT/unseen/            recordings of the unit that no network sees, a dataset
 OUT/identified/        the robot as `gaponet identify` finds it on the training recordings
 OUT/trainings/NAME/    run folder of a training, and its result.json
 OUT/baselines.json     what is measured without a network
-OUT/paper.html         all figures and tables; paper.json and the folders figures/ and tables/ have
-the numbers
+OUT/paper.html         all figures and tables
+OUT/paper.json         their numbers, as do the folders OUT/figures/ and OUT/tables/
 """
 
 from __future__ import annotations

@@ -20,8 +20,8 @@ from gaponet.experiments.paper.commands import (
 from gaponet.experiments.paper.measure import LARGE_GAPS_RAD
 from gaponet.experiments.paper.options import Block
 from gaponet.experiments.paper.printed import AXES, TABLE_1, TABLE_2, PrintedRow
-from gaponet.experiments.paper.results import Results
-from gaponet.experiments.paper.trainings import BLOCK_TITLES, TABLE_2_CHANGES
+from gaponet.experiments.paper.results import SIMULATORS, Results
+from gaponet.experiments.paper.trainings import BLOCK_TITLES, METHOD_BLOCKS, TABLE_2_CHANGES
 
 CONVERGED_SHARE = 0.5  # of the nominal error; above it a row of Table 2 is not converged
 # Row of Table 2 here → row of the paper. The paper does not say what is held for an action
@@ -149,7 +149,7 @@ def large_gaps_table(results: Results, block: Block) -> ResultTable:
         for mass in results.masses:
             kept = results.payloads == mass
             cells: list[Any] = []
-            for name in ("nominal", "identified"):
+            for name in SIMULATORS:
                 shares = np.array(results.baselines[name]["alignment"]["large_gaps"][key])
                 cells.append(100 * float(shares[kept].mean()))
             for name in methods:
@@ -160,7 +160,7 @@ def large_gaps_table(results: Results, block: Block) -> ResultTable:
                 cells.append(MeanStd.from_values(seeds))
             rows.append((f"above {threshold:g} rad, {mass:g} kg", *cells))
     caption = "Share of time and joints at which simulator and robot are further apart, %."
-    columns = ("gap", "nominal (raw)", "identification", *methods)
+    columns = ("gap", *SIMULATORS.values(), *methods)
     return ResultTable(f"large_gaps_{block}", columns, tuple(rows), caption)
 
 
@@ -257,8 +257,7 @@ def _latency(runs: list[dict[str, Any]], percentile: str) -> MeanStd:
 def method_table(results: Results) -> ResultTable:
     """Return size, training time and latency of each method."""
     rows = []
-    blocks: tuple[Block, ...] = ("labels", "ppo")
-    for block in blocks:
+    for block in METHOD_BLOCKS:
         for name in results.networks(block):
             runs = results.runs(block, name)
             rows.append(

@@ -1,4 +1,5 @@
-"""What is trained: a plain list. All networks of a block have equal data, inputs and training.
+"""What is trained: a plain list. All methods of a block have equal data, inputs and training:
+`method_trainings` makes them, and `_recipe` holds the training of a block.
 
 Block "labels": supervised pre-training on labels, then PPO. Block "ppo": PPO from an untrained
 network, the paper's recipe. Block "table2": the paper's network in its own form, one setting
@@ -19,6 +20,9 @@ BLOCK_TITLES: dict[Block, str] = {
     "table2": "Table 2",
 }
 
+# Blocks that compare the methods.
+METHOD_BLOCKS: tuple[Block, ...] = ("labels", "ppo")
+
 # Method → kind of network. The order is that of all tables.
 NETWORKS: dict[Method, ModelKind] = {
     "MLP": "mlp",  # ASAP's form, the paper's baseline
@@ -30,7 +34,7 @@ NETWORKS: dict[Method, ModelKind] = {
 PRETRAINING = PretrainingConfig(rounds=2, num_envs=128, steps=300, gradient_steps=800)
 TABLE_2_MODEL = ModelConfig(kind="paper", payload_input=False)  # the paper's own row has no payload
 
-# Row of Table 2 → what differs from TABLE_2_MODEL. Rows without a change share one training.
+# Row of Table 2 → what differs from TABLE_2_MODEL. Each row has a training of its own.
 TABLE_2_CHANGES: dict[str, dict[str, object]] = {
     "payload out": {},
     "payload in": {"payload_input": True},
@@ -95,7 +99,7 @@ def all_trainings(
         payloads: Payloads of the dataset, kg.
     """
     trainings: list[Training] = []
-    for block in ("labels", "ppo"):
+    for block in METHOD_BLOCKS:
         if block not in options.blocks:
             continue
         for seed in range(options.seeds):
@@ -109,21 +113,21 @@ def all_trainings(
 def method_trainings(
     options: PaperOptions, block: Block, seed: int, rates: tuple[float, ...]
 ) -> list[Training]:
-    """Return one training of each network with the same settings."""
+    """Return one training of each method: their settings differ in the kind of network alone."""
     config = _recipe(TrainConfig(rates=rates, seed=seed), block, options)
     trainings = []
     for name, kind in NETWORKS.items():
         if name in options.methods:
             model = replace(config.model, kind=kind)
-            own = replace(config, model=model)
-            trainings.append(Training(block, name, seed, own, options.steps))
+            of_method = replace(config, model=model)
+            trainings.append(Training(block, name, seed, of_method, options.steps))
     return trainings
 
 
 def table_2_trainings(
     options: PaperOptions, seed: int, rates: tuple[float, ...], payloads: tuple[float, ...]
 ) -> list[Training]:
-    """Return the rows of Table 2 that the dataset allows."""
+    """Return the rows of Table 2 that the dataset allows, all trained like block "labels"."""
     trainings = []
     for row, changes in TABLE_2_CHANGES.items():
         if row == "100 Hz" and len(rates) < 2:
@@ -138,7 +142,7 @@ def table_2_trainings(
 
 
 def _recipe(config: TrainConfig, block: Block, options: PaperOptions) -> TrainConfig:
-    """Return the settings with the training of a block."""
+    """Return the settings with the training of a block: labels first, or without for "ppo"."""
     config = replace(config, threads=1, pretraining=PRETRAINING)
     if options.quick:
         config = replace(
@@ -147,4 +151,6 @@ def _recipe(config: TrainConfig, block: Block, options: PaperOptions) -> TrainCo
             ppo=QUICK_PPO,
             validate_every=QUICK_NO_VALIDATION,
         )
-    return config.paper_recipe() if block == "ppo" else config
+    if block == "ppo":
+        config = config.paper_recipe()
+    return config
