@@ -163,3 +163,13 @@ def test_a_scene_moves_like_an_identified_robot_without_a_model(robot):
     assert (
         MujocoAligner(robot, mj_model, dt=0.02, payload_mass=0.2).transfer is None
     )  # it moves so of itself
+
+
+def test_a_network_on_a_simulator_with_backlash_is_transferred_to_a_scene_without(robot, tmp_path):
+    loose = robot.with_identified(dict.fromkeys(robot.joint_names, {"backlash": 0.05}))
+    save_robot(loose, tmp_path / "robot")
+    model = small_model(loose, tmp_path / "model")
+
+    align = MujocoAligner(model, build_model(robot), dt=0.02, payload_mass=0.0)
+
+    assert align.transfer is not None

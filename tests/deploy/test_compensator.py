@@ -194,6 +194,16 @@ def test_a_payload_that_is_not_stated_is_estimated(robot, model):
     assert np.abs(np.diff(q[-50:], axis=0)).max() < 1e-3
 
 
+def test_a_payload_that_is_stated_during_a_motion_is_no_longer_estimated(robot, model):
+    targets = np.repeat([[0.3, -0.2]], 200, axis=0)
+    compensator = Compensator(robot, model, config=NOW)
+    events = {100: lambda: compensator.set_payload(0.2)}
+
+    play(WeakArm(robot, 0.4), targets, compensator, None, events)
+
+    assert compensator.payload.mass == pytest.approx(0.2, abs=0)
+
+
 def test_a_payload_is_estimated_from_the_moment_on_at_which_its_torques_suffice(robot):
     """At rest the leverage is the integral of the squared torque per kg, with forgetting, in
     (N·m/kg)² s.

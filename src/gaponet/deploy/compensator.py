@@ -261,12 +261,13 @@ class Compensator:
             self.shadow.step(rest, self._shadow_target(rest))
 
     def set_payload(self, payload_mass: Array | float) -> None:
-        """Set the payload after a pick or place, kg, one number or (num_envs,).
+        """State the payload after a pick or place, kg, one number or (num_envs,).
 
-        Errors as of `reset`.
+        It holds until the next `reset` or `set_payload`; it is not estimated meanwhile. Errors as
+        of `reset`.
         """
         self.require_payload(payload_mass)
-        self.payload.set(payload_mass)
+        self.payload.state(payload_mass)
 
     def require_payload(self, payload_mass: Array | float) -> None:
         """Refuse payloads, kg, that are not physical, or that model or shadow cannot carry."""

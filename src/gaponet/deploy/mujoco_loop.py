@@ -138,11 +138,13 @@ def _require_joints(scene: mujoco.MjModel, robot: RobotSpec, model: Reference, p
 def _may_agree(model: Reference, dt: float) -> bool:
     """Return true if no transfer is needed where the inverse of scene and simulator agree.
 
-    A network must run in each control period. A robot must have no servo model, which plain MuJoCo
-    lacks.
+    A network must run in each control period. The simulator must have no servo model: plain MuJoCo
+    lacks it, and inverse dynamics do not show all of it, such as backlash.
     """
     if isinstance(model, GapModel):
-        return control_periods_of(model, dt) == 1
+        if control_periods_of(model, dt) != 1:
+            return False
+        return not model.simulator().servo.has_terms
     return not model.servo.has_terms
 
 

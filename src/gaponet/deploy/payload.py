@@ -97,10 +97,14 @@ class Payload:
         """Start with a stated mass, kg, one number or (num,); None to estimate it, from 0 on."""
         self.stated = mass is not None or len(self.masses) == 1
         self.estimate.reset()
-        self.set(0.0 if mass is None else mass)
+        self._set(0.0 if mass is None else mass)
 
-    def set(self, mass: Array | float) -> None:
-        """Set the mass, kg, one number or (num,)."""
+    def state(self, mass: Array | float) -> None:
+        """State the mass, kg, one number or (num,); it is no longer estimated."""
+        self.stated = True
+        self._set(mass)
+
+    def _set(self, mass: Array | float) -> None:
         self.mass = np.array(np.broadcast_to(np.asarray(mass, float), self.mass.shape))
         self._carry_nearest()
 
