@@ -97,8 +97,8 @@ def split_entries(
         holdout_units: Units that appear in the test split only.
         holdout_payloads: Payloads that appear in the test split only, kg.
         rates: Rates of the recordings to use, Hz; all by default.
-        train_share: Share of the training motions to use, in hash_order: a smaller set is part of a
-            larger one.
+        train_share: Share of the training motions to use, at least one, in hash_order: a smaller
+            set is part of a larger one.
 
     Raises:
         UsageError: A unit, payload or rate is not in the dataset, or a split would be empty.
@@ -108,25 +108,37 @@ def split_entries(
     canonical = canonical_motions(dataset)
     if _repeats_few_motions(dataset, canonical):
         splits = split_by_order(dataset, "repetition")
-        for name in ("train", "val"):
-            splits[name] = _not_held_out(splits[name], holdout_units, holdout_payloads)
-        return splits
-    unrecorded: dict[str, frozenset[str]] = {}
-    for entry in dataset.entries:
-        unrecorded[canonical[entry.meta.motion]] = frozenset(entry.meta.unrecorded)
-    motions = _split_by_joints(unrecorded)
-    training_motions = max(1, round(train_share * len(motions["train"])))
-    motions["train"] = motions["train"][:training_motions]
-    entries = [entry for entry in dataset.entries if not rates or _has_rate(entry, rates)]
-    splits = {}
-    for name in SPLITS:
-        chosen = [entry for entry in entries if canonical[entry.meta.motion] in motions[name]]
-        if name != "test":
-            chosen = _not_held_out(chosen, holdout_units, holdout_payloads)
-        splits[name] = chosen
+    else:
+        splits = _split_by_motion(dataset, canonical)
+    splits["train"] = _share_of_motions(splits["train"], train_share, canonical)
+    for name in ("train", "val"):
+        splits[name] = _not_held_out(splits[name], holdout_units, holdout_payloads)
+    if rates:
+        for name in SPLITS:
+            splits[name] = [entry for entry in splits[name] if _has_rate(entry, rates)]
     held_out = [*holdout_units, *(f"{mass:g} kg" for mass in holdout_payloads)]
     _require_entries(dataset, splits, held_out or ["all other rates"])
     return splits
+
+
+def _split_by_motion(dataset: Dataset, canonical: dict[str, str]) -> Splits:
+    """Return all entries, those of equal commands (`canonical`) in one split."""
+    unrecorded: dict[str, frozenset[str]] = {}  # motion → joints that its recordings do not hold
+    for entry in dataset.entries:
+        unrecorded[canonical[entry.meta.motion]] = frozenset(entry.meta.unrecorded)
+    motions = _split_by_joints(unrecorded)
+    splits: Splits = {}
+    for name in SPLITS:
+        chosen = [e for e in dataset.entries if canonical[e.meta.motion] in motions[name]]
+        splits[name] = chosen
+    return splits
+
+
+def _share_of_motions(entries: list[Entry], share: float, canonical: dict[str, str]) -> list[Entry]:
+    """Return the entries of the first motions in hash_order, a share of them, at least one."""
+    motions = hash_order(canonical[entry.meta.motion] for entry in entries)
+    kept = motions[: max(1, round(share * len(motions)))]
+    return [entry for entry in entries if canonical[entry.meta.motion] in kept]
 
 
 def _require_entries(dataset: Dataset, splits: Splits, held_out: list[str]) -> None:
