@@ -164,10 +164,18 @@ class Feasibility:
         raise UsageError(
             f"motion '{motion.name}' does not fit {self.robot.name} after {MAX_CHANGES} changes: "
             f"{demand.worst_joint} needs {demand.torque:.2f} of its usable torque at "
-            f"{self.max_payload:g} kg, speed is {demand.speed:.2f} of {MAX_SPEED_RAD_S:g} rad/s, "
-            f"{demand.nearest or 'limbs'} come as near as {demand.clearance * 100:.1f} cm (at "
-            f"least {self.collision.clearance * 100:g}). Start it from a posture that is easier to "
-            "hold, or collect with a lighter payload"
+            f"{self.max_payload:g} kg, speed is {demand.speed:.2f} of {MAX_SPEED_RAD_S:g} rad/s"
+            f"{self._space_left(demand)}. Start it from a posture that is easier to hold, or "
+            "collect with a lighter payload"
+        )
+
+    def _space_left(self, demand: Demand) -> str:
+        """Say how near bodies come; nothing of a robot without shapes."""
+        if not demand.nearest:
+            return ""
+        return (
+            f", {demand.nearest} come as near as {demand.clearance * 100:.1f} cm (at least "
+            f"{self.collision.clearance * 100:g})"
         )
 
     def can_hold(self, posture: Array, need: Array | None = None) -> bool:
