@@ -139,9 +139,7 @@ def _peak_offset(score: Array, best: int) -> float:
 
 
 def range_before(values: Array, rows: int) -> Array:
-    """Return the greatest less the least value of each row and those before it, `rows` in all, (T,
-    n).
-    """
+    """Return the range of each value over its row and those before, `rows` in all, (T, n)."""
     from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
     origin = (rows - 1) // 2
