@@ -17,7 +17,7 @@ class Check(NamedTuple):
     name: str  # of the finding that stands for none; others may have another
     ok_message: str  # of that finding; "" if the function always yields one
     may_be_error: bool = False  # only such a check may yield errors; the gate runs no others
-    needs_commands: bool = False  # means nothing of a robot that is driven by torque
+    needs_commands: bool = False  # not run where a robot is driven by torque
 
     def run(self, surveys: list[Survey], robot: RobotSpec) -> list[Finding]:
         """Return the findings, at least one."""

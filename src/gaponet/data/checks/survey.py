@@ -143,10 +143,12 @@ class Tracking:
         follows, opposes = _correlations(ctrl, qpos, dt)
         delay = estimate_delay(ctrl, qpos, dt, MAX_LAG_S)
         lead = estimate_delay(qpos, ctrl, dt, MAX_LAG_S)
+        # periodic motion shows both: a joint that follows its command does not lead it
+        leads = (lead > 1.5 * dt) & ~(delay > 0.5 * dt)
         return Tracking(
             speed=speed,
             delay=delay,
-            lead=np.where((lead > 1.5 * dt) & ~(delay > 0.5 * dt), lead, np.nan),
+            lead=np.where(leads, lead, np.nan),
             follows=follows,
             opposes=opposes,
             slope=_slope(ctrl, qpos, dt, np.nan_to_num(delay) / dt, speed),
