@@ -110,9 +110,9 @@ class Feasibility:
         torque_at_rest = self._torque_share(ctrl, zero, zero)
         space = self.collision.along(ctrl)  # (pairs + capsules,) m, empty without shapes
         required = self.collision.clearance if need is None else need
-        centre = (self.low + self.high) / 2
-        half = (self.high - self.low) / 2
-        with np.errstate(invalid="ignore"):  # joints without a limit: inf / inf
+        with np.errstate(invalid="ignore"):  # joints without a limit: inf − inf, inf / inf
+            centre = (self.low + self.high) / 2
+            half = (self.high - self.low) / 2
             position = np.nan_to_num(np.abs(ctrl - centre) / half, nan=0.0)  # (T, n)
         return Demand(
             position=float(position[:, named].max()),
