@@ -218,6 +218,13 @@ def test_a_fault_in_one_recording_is_found_and_named(arm, tmp_path, fault):
     assert words in found(diagnosis, check, level).message
 
 
+def test_every_joint_of_another_scale_is_named(arm, tmp_path):
+    ctrl, qpos = good()
+    diagnosis = examine(arm, tmp_path, arm_sequence(arm, ctrl, 1.3 * qpos))
+    scales = [f.joints for f in diagnosis.findings if f.check == "unit" and "slope" in f.values]
+    assert scales == [("shoulder",), ("elbow",)]
+
+
 def test_swapped_joints_are_an_error(arm, tmp_path):
     ctrl, qpos = good()
     diagnosis = examine(arm, tmp_path, arm_sequence(arm, ctrl, qpos[:, ::-1]))

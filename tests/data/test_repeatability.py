@@ -60,3 +60,19 @@ def test_one_command_that_begins_later_cannot_be_compared_row_by_row(arm):
     waited = np.concatenate([np.repeat(ctrl[:1], 40, axis=0), ctrl])
     two = [played(arm, ctrl), played(arm, waited, 0.01)]
     assert repetition_difference(two, JOINTS).tolist() == [0, 0]
+
+
+def test_a_torque_that_was_recorded_once_has_no_repeatability(arm):
+    ctrl = wave(200, 2)
+    repetitions = Repetitions()
+    repetitions.add(arm_sequence(arm, ctrl, late(ctrl, 2), tau=ctrl))
+    repetitions.add(played(arm, ctrl, 0.01))
+    assert sorted(repetitions.result().variance) == ["qpos", "qvel"]
+
+
+def test_the_variance_of_two_states_is_half_their_distance_squared(arm):
+    ctrl = wave(200, 2)
+    repetitions = Repetitions()
+    repetitions.add(played(arm, ctrl))
+    repetitions.add(played(arm, ctrl, 0.02))
+    assert repetitions.result().variance["qpos"] == pytest.approx([2e-4, 2e-4], rel=1e-3)

@@ -355,6 +355,41 @@ def test_one_command_played_again_is_split_by_repetition_and_long_logs_by_time(a
     assert named == [["long@0s", "long@4s"], ["long@9s"], ["long@14s"]]
 
 
+@pytest.fixture
+def one_motion(arm, tmp_path):
+    """One motion, four times by each of two units, at two rates."""
+    data = Dataset.create(tmp_path / "one", arm)
+    for dt in (0.02, 0.01):
+        for unit in ("one", "two"):
+            for repetition in range(4):
+                ctrl = walk(round(4 / dt), 1, dt)
+                state = late(ctrl, 2) + 1e-3 * len(data)
+                played = arm_sequence(replace(arm, dt=dt), ctrl, state, unit=unit)
+                data.append(replace(played, meta=replace(played.meta, repetition=repetition)))
+    return data
+
+
+def test_a_split_by_repetition_holds_only_the_rates_that_are_asked_for(one_motion):
+    splits = split_entries(one_motion, rates=(100,))
+    used = splits["train"] + splits["val"] + splits["test"]
+    assert {entry.dt for entry in used} == {0.01}
+
+
+def test_a_split_by_repetition_with_every_unit_held_out_is_refused(one_motion):
+    with pytest.raises(UsageError, match="nothing left for train after holding out one, two"):
+        split_entries(one_motion, holdout_units=("one", "two"))
+
+
+def test_half_of_two_repeated_motions_is_one(arm, tmp_path):
+    data = Dataset.create(tmp_path / "two", arm)
+    for motion, seed in (("a", 1), ("b", 2)):
+        for repetition in range(3):
+            played = arm_sequence(arm, walk(200, seed), walk(200, seed) + 1e-3 * repetition, motion)
+            data.append(replace(played, meta=replace(played.meta, repetition=repetition)))
+    half = split_entries(data, train_share=0.5)
+    assert [len(values(half[part], "motion")) for part in SPLITS] == [1, 2, 2]
+
+
 def test_joints_recorded_one_at_a_time_are_all_judged_and_asked(arm, tmp_path):
     data = Dataset.create(tmp_path / "data", arm)
     for joint, others in (("shoulder", "abc"), ("elbow", "defg")):

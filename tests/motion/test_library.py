@@ -38,6 +38,7 @@ def test_per_joint_motions_cover_nine_tenths_of_every_operated_joint_at_three_ki
         assert np.ptp(column) >= 0.9 * (high - low), joint
 
 
+@pytest.mark.filterwarnings("error::RuntimeWarning")
 def test_a_joint_that_turns_without_end_sweeps_a_turn_about_its_home():
     robot = load_robot("xl330_bench")
     (joint,) = robot.operated

@@ -79,3 +79,9 @@ def test_a_motion_that_cannot_be_fitted_is_refused_with_the_reason(arm):
     limits = Feasibility(arm, 5.0)
     with pytest.raises(UsageError, match=r"shoulder.* 5 kg"):
         limits.fit(Motion("hold", "joint", GRID, still(arm, 0.0)))
+
+
+def test_the_refusal_of_a_robot_without_shapes_names_no_distance(arm):
+    limits = Feasibility(arm, 5.0)
+    with pytest.raises(UsageError, match=r"of 4 rad/s\. Start it"):
+        limits.fit(Motion("hold", "joint", GRID, still(arm, 0.0)))

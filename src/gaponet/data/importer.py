@@ -198,21 +198,26 @@ def _require_piece(seconds: float) -> None:
 class _Source:
     """Logs to import, with what the user states of them.
 
-    `check` fills hashes, of the content of each recording; provenance; and held: the recordings,
-    None if they are too large to hold.
+    `check` fills hashes, held and provenance, and `write` needs them.
     """
 
     src: Path
     robot: RobotSpec
-    labels: dict[str, Any]
-    cut: float | None
+    labels: dict[str, Any]  # fields of SequenceMeta that the user states
+    cut: float | None  # length of pieces, s
     options: ReadOptions
-    hashes: list[str] = field(default_factory=list)
+    hashes: list[str] = field(default_factory=list)  # of the content of each recording or piece
+    # the recordings; None if they are more than MAX_HELD_BYTES
     held: list[Sequence] | None = field(default_factory=list)
-    provenance: dict[str, str] = field(default_factory=dict)
+    provenance: dict[str, str] = field(default_factory=dict)  # licence and source that logs state
 
     def check(self, existing: Dataset | None, progress: Progress) -> None:
-        """Read and check every recording."""
+        """Read every recording; refuse those that are in the source twice, or in the dataset under
+        other labels.
+
+        Args:
+            existing: Dataset into which they will be written; None if it is new.
+        """
         total = len(find_logs(self.src, self.options.format))
         source_of: dict[str, str] = {}  # content hash → source
         duplicates: list[tuple[str, str]] = []
@@ -255,23 +260,28 @@ class _Source:
     ) -> tuple[list[Entry], list[Entry]]:
         """Append what is new; return the added and the present entries.
 
+        Call `check` first.
+
         Args:
-            poses: Filled with content hash → static poses.
+            poses: Filled with content hash → static poses, of what is present too; None: not
+                measured.
         """
         if self.provenance and not dataset.entries:
             dataset.set_provenance(**self.provenance)
         found = map(dataset.find, self.hashes)
         present = [entry for entry in found if entry is not None]
         repetitions = Counter(entry.meta.repetition_key for entry in dataset.entries)
-        sequences: Iterable[Sequence] = (sequence for sequence, _ in self.sequences())
-        if self.held is not None:
+        sequences: Iterable[Sequence]
+        if self.held is None:  # too large to hold: read again
+            sequences = (sequence for sequence, _ in self.sequences())
+        else:
             sequences = self.held
         added = []
         with dataset.appending():
             for content_hash, sequence in zip(self.hashes, sequences, strict=True):
                 if poses is not None:
                     poses[content_hash] = StaticPoses.of(sequence, self.robot.operated_index)
-                if dataset.find(content_hash):
+                if dataset.find(content_hash):  # present, or an equal piece was just added
                     continue
                 key = sequence.meta.repetition_key
                 if sequence.meta.repetition == UNSTATED_REPETITION:

@@ -113,8 +113,9 @@ def record_offsets(
 
 
 def read_offsets(dataset: Dataset) -> dict[str, Any]:
-    """Return the content of offsets.json: {"applied": false, "units": {unit_id: {joints,
-    simulator}}}.
+    """Return the content of offsets.json.
+
+    Its units are {unit_id: {"joints": {joint: fields of JointOffset}, "simulator": hash}}.
 
     Raises:
         DatasetError: The file is damaged.

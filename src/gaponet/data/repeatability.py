@@ -98,7 +98,8 @@ class RepetitionResult:
     count: int  # of the first command
     other_commands: int  # repetitions with another command, which are left out
     moved: Array  # joints that were commanded to move, (n) bool
-    variance: dict[str, Array]  # channel → over repetitions, averaged over rows, (n)
+    # channel that all repetitions hold → variance over them, averaged over rows, (n)
+    variance: dict[str, Array]
 
 
 class Repetitions:
@@ -119,7 +120,8 @@ class Repetitions:
     def add(self, sequence: Sequence) -> None:
         """Add a repetition.
 
-        Welford's update (1962): mean and squared deviations so far are enough.
+        Welford's update (1962): mean and squared deviations so far are enough. Channels that one
+        repetition lacks are left out.
         """
         arrays = {}
         for channel in CHANNELS:
@@ -138,13 +140,16 @@ class Repetitions:
             return
         self.count += 1
         self._ctrl = self._ctrl[:rows]
-        for name in self._mean.keys() & arrays.keys():
+        means = {}
+        squares = {}
+        for name in [channel for channel in self._mean if channel in arrays]:
             mean = self._mean[name][:rows]
             value = arrays[name][:rows]
             deviation = value - mean
-            self._mean[name] = mean + deviation / self.count
-            squares = deviation * (value - self._mean[name])
-            self._squares[name] = self._squares[name][:rows] + squares
+            means[name] = mean + deviation / self.count
+            squares[name] = self._squares[name][:rows] + deviation * (value - means[name])
+        self._mean = means
+        self._squares = squares
 
     def result(self) -> RepetitionResult:
         """Return the result of two or more repetitions."""

@@ -139,9 +139,7 @@ def _peak_offset(score: Array, best: int) -> float:
 
 
 def range_before(values: Array, rows: int) -> Array:
-    """Return the greatest less the least value of each row and those before it, `rows` in all, (T,
-    n).
-    """
+    """Return the range of each value over its row and those before, `rows` in all, (T, n)."""
     from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
     origin = (rows - 1) // 2
@@ -279,9 +277,9 @@ class Response:
         own = np.stack([r.own for r in responses]).astype(float)  # (recordings, SPLITS, n, lags)
         cross = np.stack([r.cross for r in responses]).astype(float)
         power = np.stack([r.power for r in responses]).astype(float)  # (recordings, SPLITS, n)
-        own_sum = own[mask].sum(axis=(0, 1))
-        cross_sum = cross[mask].sum(axis=(0, 1))
-        power_sum = power[mask].sum(axis=(0, 1))
+        own_sum = own[mask].sum(axis=(0, 1))  # (n, lags)
+        cross_sum = cross[mask].sum(axis=(0, 1))  # (n, lags)
+        power_sum = power[mask].sum(axis=(0, 1))  # (n)
         sharp = Response.sharp(responses)
         onset = np.full(n, np.nan)
         early = np.full(n, np.nan)
@@ -295,6 +293,8 @@ class Response:
             early[j] = joint.early
             if sharp[j]:
                 onset[j] = _onset(joint.weights, at, step)
+            # Least squares: weights w leave |v − w∗u|² = power − 2 w·cross + (w∗w)·own unexplained.
+            # A fit is minus half of that without the power, in units of the usual residual.
             shifted, square = _shifted_weights(joint.weights, at)
             fits += (cross[:, :, j] @ shifted.T - 0.5 * own[:, :, j] @ square.T) / joint.residual
         return CommonResponse(onset, early, _best_shifts(fits), _best_shifts(fits.sum(axis=1)))
@@ -372,7 +372,7 @@ def _shifted_weights(weights: Array, at: Array) -> tuple[Array, Array]:
     shifted = np.stack([np.interp(at - s, at, weights, left=0.0, right=0.0) for s in SHIFTS_S])
     spectrum = np.fft.rfft(shifted, 2 * lags, axis=1)
     square = np.fft.irfft(np.abs(spectrum) ** 2, 2 * lags, axis=1)[:, :lags]
-    square[:, 1:] *= 2
+    square[:, 1:] *= 2  # for negative lags, at which both correlations are the same
     return shifted, square
 
 

@@ -97,8 +97,8 @@ def split_entries(
         holdout_units: Units that appear in the test split only.
         holdout_payloads: Payloads that appear in the test split only, kg.
         rates: Rates of the recordings to use, Hz; all by default.
-        train_share: Share of the training motions to use, in hash_order: a smaller set is part of a
-            larger one.
+        train_share: Share of the training motions to use, at least one, in hash_order: a smaller
+            set is part of a larger one.
 
     Raises:
         UsageError: A unit, payload or rate is not in the dataset, or a split would be empty.
@@ -108,25 +108,37 @@ def split_entries(
     canonical = canonical_motions(dataset)
     if _repeats_few_motions(dataset, canonical):
         splits = split_by_order(dataset, "repetition")
-        for name in ("train", "val"):
-            splits[name] = _not_held_out(splits[name], holdout_units, holdout_payloads)
-        return splits
-    unrecorded: dict[str, frozenset[str]] = {}
-    for entry in dataset.entries:
-        unrecorded[canonical[entry.meta.motion]] = frozenset(entry.meta.unrecorded)
-    motions = _split_by_joints(unrecorded)
-    training_motions = max(1, round(train_share * len(motions["train"])))
-    motions["train"] = motions["train"][:training_motions]
-    entries = [entry for entry in dataset.entries if not rates or _has_rate(entry, rates)]
-    splits = {}
-    for name in SPLITS:
-        chosen = [entry for entry in entries if canonical[entry.meta.motion] in motions[name]]
-        if name != "test":
-            chosen = _not_held_out(chosen, holdout_units, holdout_payloads)
-        splits[name] = chosen
+    else:
+        splits = _split_by_motion(dataset, canonical)
+    splits["train"] = _share_of_motions(splits["train"], train_share, canonical)
+    for name in ("train", "val"):
+        splits[name] = _not_held_out(splits[name], holdout_units, holdout_payloads)
+    if rates:
+        for name in SPLITS:
+            splits[name] = [entry for entry in splits[name] if _has_rate(entry, rates)]
     held_out = [*holdout_units, *(f"{mass:g} kg" for mass in holdout_payloads)]
     _require_entries(dataset, splits, held_out or ["all other rates"])
     return splits
+
+
+def _split_by_motion(dataset: Dataset, canonical: dict[str, str]) -> Splits:
+    """Return all entries, those of equal commands (`canonical`) in one split."""
+    unrecorded: dict[str, frozenset[str]] = {}  # motion → joints that its recordings do not hold
+    for entry in dataset.entries:
+        unrecorded[canonical[entry.meta.motion]] = frozenset(entry.meta.unrecorded)
+    motions = _split_by_joints(unrecorded)
+    splits: Splits = {}
+    for name in SPLITS:
+        chosen = [e for e in dataset.entries if canonical[e.meta.motion] in motions[name]]
+        splits[name] = chosen
+    return splits
+
+
+def _share_of_motions(entries: list[Entry], share: float, canonical: dict[str, str]) -> list[Entry]:
+    """Return the entries of the first motions in hash_order, a share of them, at least one."""
+    motions = hash_order(canonical[entry.meta.motion] for entry in entries)
+    kept = motions[: max(1, round(share * len(motions)))]
+    return [entry for entry in entries if canonical[entry.meta.motion] in kept]
 
 
 def _require_entries(dataset: Dataset, splits: Splits, held_out: list[str]) -> None:
@@ -205,6 +217,7 @@ def split_by_order(dataset: Dataset, by: str) -> Splits:
         UsageError: No recording has three.
     """
     canonical = canonical_motions(dataset) if by == "repetition" else {}
+    # repetitions of one motion, or pieces of one source, by one unit with one payload
     groups: dict[tuple[Any, ...], list[Entry]] = {}
     for entry in dataset.entries:
         whole = canonical.get(entry.meta.motion, entry.meta.source)
@@ -263,25 +276,24 @@ def make_split(dataset: Dataset, by: str, holdout: tuple[str, ...] = ()) -> Spli
     def motion_of(entry: Entry) -> str:
         return canonical[entry.meta.motion]
 
-    key = motion_of if by == "motion" else PROPERTIES[by]
-    held_out = _held_out_values(dataset, by, holdout, key)
+    value_of = motion_of if by == "motion" else PROPERTIES[by]
+    held_out = _held_out_values(dataset, by, holdout, value_of)
     splits: Splits = {"train": [], "val": [], "test": []}
     rest = []
     for entry in dataset.entries:
-        if key(entry) in held_out:
+        if value_of(entry) in held_out:
             splits["test"].append(entry)
         else:
             rest.append(entry)
-    if by in ORDERED:  # the last that is left is for validation
-        val_key = key
-        val_values = {max(map(key, rest), key=float)} if rest else set()
-    else:
-        val_key = motion_of
+    if by in ORDERED:  # the last repetition or piece that is left is for validation
+        last = max(map(value_of, rest), key=float, default="")
+        validates = [value_of(entry) == last for entry in rest]
+    else:  # some of the motions that are left, whichever property was held out
         count = max(1, round(len(set(canonical.values())) * VAL_SHARE))
-        val_values = set(hash_order(map(motion_of, rest))[:count])
-    for entry in rest:
-        split = "val" if val_key(entry) in val_values else "train"
-        splits[split].append(entry)
+        motions = hash_order(map(motion_of, rest))[:count]
+        validates = [motion_of(entry) in motions for entry in rest]
+    for entry, is_val in zip(rest, validates, strict=True):
+        splits["val" if is_val else "train"].append(entry)
     empty = [name for name in SPLITS if not splits[name]]
     if empty:
         left = len(set(map(motion_of, rest)))
@@ -293,9 +305,15 @@ def make_split(dataset: Dataset, by: str, holdout: tuple[str, ...] = ()) -> Spli
 
 
 def _held_out_values(
-    dataset: Dataset, by: str, holdout: tuple[str, ...], key: Callable[[Entry], str]
+    dataset: Dataset, by: str, holdout: tuple[str, ...], value_of: Callable[[Entry], str]
 ) -> set[str]:
-    """Return the keys that are held out; a motion takes those with equal commands with it."""
+    """Return the values that are for testing, as `value_of` has them.
+
+    Args:
+        holdout: Values that a person names, as PROPERTIES has them; default a quarter.
+        value_of: As PROPERTIES[by]; of a motion, the canonical one, so that a motion takes those
+            with equal commands with it.
+    """
     values = hash_order(map(PROPERTIES[by], dataset.entries))
     if by == "payload":
         try:
@@ -312,15 +330,15 @@ def _held_out_values(
         raise UsageError(
             f"{dataset.path}: one {by} only ({', '.join(values)}); split it by another property"
         )
-    keys = hash_order(map(key, dataset.entries))
-    if len(keys) < 2:
+    distinct = hash_order(map(value_of, dataset.entries))
+    if len(distinct) < 2:
         raise UsageError(
             f"{dataset.path}: all {len(values)} {by}s have equal commands, so they are one: "
             "nothing to split"
         )
     if holdout:
-        return {key(entry) for entry in dataset.entries if PROPERTIES[by](entry) in holdout}
-    return set(keys[: max(1, round(len(keys) * TEST_SHARE))])
+        return {value_of(entry) for entry in dataset.entries if PROPERTIES[by](entry) in holdout}
+    return set(distinct[: max(1, round(len(distinct) * TEST_SHARE))])
 
 
 def canonical_motions(dataset: Dataset) -> dict[str, str]:
@@ -335,7 +353,7 @@ def canonical_motions(dataset: Dataset) -> dict[str, str]:
         for command in fingerprints[name]:
             owners.append(name)
             commands.append(command)
-    group = {name: name for name in names}
+    group = {name: name for name in names}  # motion → a name that its group has in common
     for i, j in equal_commands(commands):
         joined = group[owners[i]]
         other = group[owners[j]]

@@ -138,7 +138,7 @@ class Dataset:
                 write_json(path / "dataset.json", header)
             if not has_stored_robot(path):
                 save_robot(robot.nominal or robot, path / STORED_ROBOT)
-        return cls.create(path, robot)
+        return cls.create(path, robot)  # now it exists
 
     @classmethod
     def open_existing(cls, path: str | Path, robot: RobotSpec) -> Dataset | None:

@@ -42,8 +42,8 @@ class Demand:
     torque: float  # over the usable torque
     gravity: float  # the same at rest
     worst_joint: str  # by torque
-    clearance: float  # least free space, m
-    nearest: str  # bodies between which it is
+    clearance: float  # least free space, m; inf without shapes
+    nearest: str  # bodies between which it is; "" without shapes
     clear: bool  # whether it is enough
 
     @property
@@ -98,30 +98,31 @@ class Feasibility:
         Args:
             ctrl: Command, (T, n) rad.
             dt: Its period, s.
-            named: Columns of joints that must be within their ranges.
-            need: Free space to keep, (pairs + shells,) m; default: the clearance.
+            named: Columns of joints that must be within their ranges; speed, torque and free space
+                are those of all joints.
+            need: Free space to keep, (pairs + capsules,) m as in Collision.along; default: the
+                clearance.
         """
         qvel = np.gradient(ctrl, dt, axis=0)
         qacc = np.gradient(qvel, dt, axis=0)
         zero = np.zeros_like(ctrl)
-        share = self._torque_share(ctrl, qvel, qacc)
-        still = self._torque_share(ctrl, zero, zero)
-        free = self.collision.along(ctrl)
-        least = float(free.min(initial=np.inf))
-        centre = (self.low + self.high) / 2
-        half = (self.high - self.low) / 2
-        with np.errstate(invalid="ignore"):  # joints without a limit: inf / inf
-            position = np.nan_to_num(np.abs(ctrl - centre) / half, nan=0.0)
+        torque = self._torque_share(ctrl, qvel, qacc)  # (T, n)
+        torque_at_rest = self._torque_share(ctrl, zero, zero)
+        space = self.collision.along(ctrl)  # (pairs + capsules,) m, empty without shapes
         required = self.collision.clearance if need is None else need
+        with np.errstate(invalid="ignore"):  # joints without a limit: inf − inf, inf / inf
+            centre = (self.low + self.high) / 2
+            half = (self.high - self.low) / 2
+            position = np.nan_to_num(np.abs(ctrl - centre) / half, nan=0.0)  # (T, n)
         return Demand(
             position=float(position[:, named].max()),
             speed=float(np.abs(qvel).max() / MAX_SPEED_RAD_S),
-            torque=float(share.max()),
-            gravity=float(still.max()),
-            worst_joint=self.robot.joint_names[int(share.max(axis=0).argmax())],
-            clearance=least,
-            nearest=self.collision.nearest(free) if len(free) else "",
-            clear=bool((free >= required).all()),
+            torque=float(torque.max()),
+            gravity=float(torque_at_rest.max()),
+            worst_joint=self.robot.joint_names[int(torque.max(axis=0).argmax())],
+            clearance=float(space.min(initial=np.inf)),
+            nearest=self.collision.nearest(space) if len(space) else "",
+            clear=bool((space >= required).all()),
         )
 
     def _torque_share(self, qpos: Array, qvel: Array, qacc: Array) -> Array:
@@ -147,7 +148,7 @@ class Feasibility:
         high = np.full_like(self.high, np.inf)
         high[named] = self.high[named]
         ctrl = np.clip(motion.ctrl, low, high)
-        anchor = ctrl[0].copy()
+        anchor = ctrl[0].copy()  # the posture that is fine, (n) rad
         if not self.can_hold(anchor, need):  # of all joints, those that are only held too
             anchor[named] = np.clip(self.robot.qpos_home, low, high)[named]
         for _ in range(MAX_CHANGES):
@@ -164,10 +165,18 @@ class Feasibility:
         raise UsageError(
             f"motion '{motion.name}' does not fit {self.robot.name} after {MAX_CHANGES} changes: "
             f"{demand.worst_joint} needs {demand.torque:.2f} of its usable torque at "
-            f"{self.max_payload:g} kg, speed is {demand.speed:.2f} of {MAX_SPEED_RAD_S:g} rad/s, "
-            f"{demand.nearest or 'limbs'} come as near as {demand.clearance * 100:.1f} cm (at "
-            f"least {self.collision.clearance * 100:g}). Start it from a posture that is easier to "
-            "hold, or collect with a lighter payload"
+            f"{self.max_payload:g} kg, speed is {demand.speed:.2f} of {MAX_SPEED_RAD_S:g} rad/s"
+            f"{self._space_left(demand)}. Start it from a posture that is easier to hold, or "
+            "collect with a lighter payload"
+        )
+
+    def _space_left(self, demand: Demand) -> str:
+        """Say how near bodies come; nothing of a robot without shapes."""
+        if not demand.nearest:
+            return ""
+        return (
+            f", {demand.nearest} come as near as {demand.clearance * 100:.1f} cm (at least "
+            f"{self.collision.clearance * 100:g})"
         )
 
     def can_hold(self, posture: Array, need: Array | None = None) -> bool:
@@ -244,7 +253,8 @@ def _span(limits: Feasibility, posture: Array, j: int) -> ExcitationRange:
     rows = np.repeat(posture[None], GRID_POINTS, axis=0)
     rows[:, j] = grid
     empty = ExcitationRange(posture, grid[0], grid[0], 0.0)
-    fits = limits.collision.distance(rows) >= limits.collision.clearance
+    fits = limits.collision.distance(rows) >= limits.collision.clearance  # (GRID_POINTS,)
+    # torques take longer: only where at least half of the range is clear
     start, stop = _longest_run(fits)
     if stop - start < GRID_POINTS // 2:
         return empty

@@ -70,9 +70,7 @@ class Trajectory:
 
 
 def line(a: Array, b: Array) -> Array:
-    """Return postures from a to b (n,) rad, at most POSTURE_STEP_RAD apart, both included, (T,
-    n).
-    """
+    """Return postures (T, n) rad from a to b (n,), both included, at most POSTURE_STEP_RAD apart."""
     steps = int(np.ceil(np.abs(b - a).max() / POSTURE_STEP_RAD))
     return np.linspace(a, b, max(1, steps) + 1)
 

@@ -1,8 +1,9 @@
 """Checks of a dataset, judged from the surveys of its sequences.
 
 A check takes the surveys and the robot, and yields findings; if it yields none, its finding is
-`ok_message`. CHECKS are run on every dataset. The gravity and static checks need a gravity model
-too (data.doctor).
+`ok_message`. CHECKS are run on every dataset; the gravity and static checks need a gravity model
+too (data.doctor). A new check is a function and a row of CHECKS in one of the modules, and a
+measurement in data.checks.survey where none there serves.
 """
 
 from __future__ import annotations
@@ -16,12 +17,7 @@ from gaponet.robot.finding import Finding
 from gaponet.robot.spec import RobotSpec
 
 CHECKS: tuple[Check, ...] = (*wiring.CHECKS, *timing.CHECKS, *completeness.CHECKS, *motor.CHECKS)
-# their errors name exchanged, mirrored or mis-scaled joints
-WRONG_JOINT_CHECKS = (
-    "order",
-    "sign",
-    "unit",
-)
+WRONG_JOINT_CHECKS = ("order", "sign", "unit")  # errors name exchanged, mirrored, scaled joints
 CONSEQUENCES = ("blocked", "stuck", "sag")  # checks that such a joint fails too
 
 

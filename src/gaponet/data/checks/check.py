@@ -11,15 +11,13 @@ from gaponet.robot.spec import RobotSpec
 
 
 class Check(NamedTuple):
-    """A function that yields findings of surveys, and what is reported if there is none: `name:
-    ok_message`.
-    """
+    """A function that yields findings of surveys, and the finding that stands for none."""
 
     function: Callable[[list[Survey], RobotSpec], Iterator[Finding]]
-    name: str
-    ok_message: str
+    name: str  # of the finding that stands for none; others may have another
+    ok_message: str  # of that finding; "" if the function always yields one
     may_be_error: bool = False  # only such a check may yield errors; the gate runs no others
-    needs_commands: bool = False  # means nothing of a robot that is driven by torque
+    needs_commands: bool = False  # not run where a robot is driven by torque
 
     def run(self, surveys: list[Survey], robot: RobotSpec) -> list[Finding]:
         """Return the findings, at least one."""

@@ -387,31 +387,35 @@ def _degrees_beside_radians(step: Array, robot: RobotSpec) -> Iterator[Finding]:
 
 
 def _stuck(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
-    """Does every channel change when it should?"""
+    """Does every position change while its command moves?
+
+    Three faults, each told once: a joint that never moves in a recording, a joint that repeats one
+    number in a part of it, and a part in which the whole state repeats itself.
+    """
     for i, name in enumerate(robot.joint_names):
-        moved = [survey for survey in surveys if survey.ctrl_range[i] > MIN_COMMANDED_RAD]
-        still = [survey for survey in moved if _stands_still(survey, i)]
+        commanded = [survey for survey in surveys if survey.ctrl_range[i] > MIN_COMMANDED_RAD]
+        still = [survey for survey in commanded if _stands_still(survey, i)]
         if still:
             text = (
                 f"{name} does not move when commanded in {_motions(still)}: unplugged, torque off "
                 "or not read; leave these out"
             )
-            level = "error" if len(still) == len(moved) else "warning"
+            level = "error" if len(still) == len(commanded) else "warning"
             yield Finding(level, "stuck", text, (name,))
-        repeated = [survey for survey in _repeating(surveys, i) if survey not in still]
-        whole_state = any(_repeats_whole_state(survey) for survey in repeated)
-        if repeated and not whole_state:
-            seconds = max(survey.standstill.repeated_s[i] for survey in repeated)
+        repeating = [survey for survey in _repeating(surveys, i) if survey not in still]
+        whole_state = any(_repeats_whole_state(survey) for survey in repeating)
+        if repeating and not whole_state:  # _frozen tells of the whole state
+            seconds = max(survey.standstill.repeated_s[i] for survey in repeating)
             text = (
                 f"{name} repeats one number for up to {seconds:.2f} s while its command moves on "
-                f"in {_motions(repeated)}: it was not read; cut these logs there"
+                f"in {_motions(repeating)}: it was not read; cut these logs there"
             )
             yield Finding("warning", "stuck", text, (name,))
     yield from _frozen(surveys)
 
 
 def _stands_still(survey: Survey, i: int) -> bool:
-    """Return True if joint i moves little, and far less than commanded."""
+    """Return True if the position of joint i changes little, and far less than its command."""
     moved = survey.qpos_range[i]
     return bool(moved < MAX_STILL_RAD and moved < MAX_STILL_SHARE * survey.ctrl_range[i])
 

@@ -119,7 +119,7 @@ def static_checks(surveys: list[Survey], robot: RobotSpec, model: Gravity) -> It
         yield Finding("ok", "rests", text)
         return
     findings = _swapped_labels(surveys, poses, judged) or _two_units(surveys, robot, poses, judged)
-    if findings:
+    if findings:  # they would spoil every fit to all recordings
         yield from findings
         return
     findings, poses = _odd_sequences(surveys, robot, poses, judged)

@@ -143,10 +143,12 @@ class Tracking:
         follows, opposes = _correlations(ctrl, qpos, dt)
         delay = estimate_delay(ctrl, qpos, dt, MAX_LAG_S)
         lead = estimate_delay(qpos, ctrl, dt, MAX_LAG_S)
+        # periodic motion shows both: a joint that follows its command does not lead it
+        leads = (lead > 1.5 * dt) & ~(delay > 0.5 * dt)
         return Tracking(
             speed=speed,
             delay=delay,
-            lead=np.where((lead > 1.5 * dt) & ~(delay > 0.5 * dt), lead, np.nan),
+            lead=np.where(leads, lead, np.nan),
             follows=follows,
             opposes=opposes,
             slope=_slope(ctrl, qpos, dt, np.nan_to_num(delay) / dt, speed),
@@ -201,7 +203,8 @@ class Encoders:
     zero_rows: int  # rows in which every joint is exactly 0, far from the rows around
     # recorded qvel over the derivative of qpos, (n); NaN where the joint hardly moves
     qvel_ratio: Array
-    # step between positions, (n) rad; 0 where positions are continuous, or too few
+    # Step between positions, (n) rad. 0 where it is not known: positions are continuous, or fewer
+    # than MIN_LEVELS or more than a quarter of the rows are distinct.
     resolution: Array
 
     @classmethod
@@ -696,8 +699,8 @@ def _repeated(ctrl: Array, qpos: Array, dt: float) -> Array:
 
 
 def _resolution(qpos: Array) -> Array:
-    """Return the step of which all differences of positions are multiples, where there are few
-    distinct positions.
+    """Return the step of which all differences of positions are multiples, (T, n) → (n) rad; 0 as
+    in Encoders.resolution.
     """
     resolution = np.zeros(qpos.shape[1])
     for j, column in enumerate(qpos.T):

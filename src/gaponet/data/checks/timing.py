@@ -67,9 +67,10 @@ def _timing(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     complete = [survey for survey in comparable if not survey.timing.missing_samples] or comparable
     uneven_ms = max(survey.timing.uneven_ms for survey in complete)
     unknown = uneven_ms * UNEVEN_ROWS_SHARE / 1e3  # s
-    findings = [*_late_recordings(comparable, unknown)]
-    common = _common_response(complete, findings)
+    late = _late_recordings(comparable, unknown)
+    common = _common_response(complete, late)
     onset = _usual_onset(common)
+    findings = [*_report_late(late)]  # of what is wrong
     if _moves_early(common, onset, unknown, step):
         findings.append(_early(onset))
     elif np.isfinite(onset):
@@ -81,17 +82,22 @@ def _timing(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     yield from findings or [Finding("ok", "timing", "commands and states have the same clock")]
 
 
-def _common_response(surveys: list[Survey], late: list[Finding]) -> CommonResponse:
-    """Return the common response of the recordings that were not found to be late."""
-    odd = set()
-    for finding in late:
-        odd.update(finding.values["recordings"])
+# recordings that follow their commands later than the others, and by how much, s; < 0 is sooner
+_Late = list[tuple[Survey, float]]
+
+
+def _common_response(surveys: list[Survey], late: _Late) -> CommonResponse:
+    """Return the common response of the recordings that are not late."""
+    odd = {survey.entry.id for survey, _ in late}
     usual = [survey.entry.id not in odd for survey in surveys]
     return Response.common([survey.tracking.response for survey in surveys], usual)
 
 
 def _usual_onset(common: CommonResponse) -> float:
-    """Return when joints usually begin to move after their commands, s; NaN if it is not known."""
+    """Return when joints usually begin to move after their commands, s; NaN if it is not known.
+
+    It is negative only where commands that are still to come explain the motion: else it is chance.
+    """
     known = np.isfinite(common.onset)
     if not known.any():
         return np.nan
@@ -109,9 +115,11 @@ def _moves_early(common: CommonResponse, onset: float, unknown: float, step: flo
         unknown: Time that uneven rows leave open, s.
         step: Resolution of the response, s.
     """
+    if onset < -unknown - MIN_LEAD_S - step:
+        return True
+    # a shorter lead counts where the joints agree on it
     error = MIN_DRIFT_ERRORS * _standard_error(common.onset - onset)
-    surely = onset < -unknown - MIN_LEAD_S - step
-    return surely or onset < -unknown - max(MIN_LEAD_S / 3, step, error)
+    return onset < -unknown - max(MIN_LEAD_S / 3, step, error)
 
 
 def _early(onset: float) -> Finding:
@@ -196,33 +204,36 @@ def _shifts(responses: list[Response]) -> Array:
     return np.asarray(shifts + np.nan_to_num(more))
 
 
-def _late_recordings(surveys: list[Survey], unknown: float) -> Iterator[Finding]:
-    """Find recordings that follow their commands later, or sooner, than the others.
+def _late_recordings(surveys: list[Survey], unknown: float) -> _Late:
+    """Return the recordings that follow their commands later, or sooner, than the others.
 
     Args:
         unknown: Time that uneven rows leave open, s.
     """
     shifts = _shifts([survey.tracking.response for survey in surveys])
     if np.isfinite(shifts).sum() < MIN_RECORDINGS:
-        return
+        return []
     shifts = shifts - np.nanmedian(shifts)
     scatter = max(1.48 * float(np.nanmedian(np.abs(shifts))), 1e-3)
     period = float(np.median([1 / survey.timing.rate_hz for survey in surveys]))
     limit = max(MIN_SHIFT_S, SHIFT_SCATTERS * scatter, unknown, MIN_SHIFT_PERIODS * period)
     delays = _relative_delays(surveys)
-    far: list[tuple[Survey, float]] = []
-    for survey, late, delay in zip(surveys, shifts.tolist(), delays.tolist(), strict=True):
+    late: _Late = []
+    for survey, shift, delay in zip(surveys, shifts.tolist(), delays.tolist(), strict=True):
         fast = max(survey.tracking.speed) >= FAST_COMMAND_RAD_S  # stiction delays slow motions
-        if abs(late) > limit and fast and _agree(late, delay):
-            far.append((survey, late))
-    yield from _shifted("later", [(survey, late) for survey, late in far if late > 0])
-    yield from _shifted("sooner", [(survey, late) for survey, late in far if late < 0])
+        if abs(shift) > limit and fast and _agree(shift, delay):
+            late.append((survey, shift))
+    return late
 
 
-def _shifted(word: str, group: list[tuple[Survey, float]]) -> Iterator[Finding]:
-    """Report recordings that follow later or sooner by some s: a few each by itself, many as
-    one.
-    """
+def _report_late(late: _Late) -> Iterator[Finding]:
+    """Report recordings that follow their commands later, or sooner, than the others."""
+    yield from _report_group("later", [(survey, shift) for survey, shift in late if shift > 0])
+    yield from _report_group("sooner", [(survey, shift) for survey, shift in late if shift < 0])
+
+
+def _report_group(word: str, group: _Late) -> Iterator[Finding]:
+    """Report recordings that are all later, or all sooner: a few each by itself, many as one."""
     if len(group) >= MIN_RECORDINGS:
         yield _shift_finding(word, group)
         return
@@ -230,12 +241,12 @@ def _shifted(word: str, group: list[tuple[Survey, float]]) -> Iterator[Finding]:
         yield _shift_finding(word, [one])
 
 
-def _shift_finding(word: str, group: list[tuple[Survey, float]]) -> Finding:
+def _shift_finding(word: str, group: _Late) -> Finding:
     labels = []
     for survey, _ in group:
         meta = survey.meta
         labels.append(f"{meta.motion} ({meta.unit_id}, {meta.payload_mass:g} kg)")
-    ms = sorted(abs(late) * 1e3 for _, late in group)
+    ms = sorted(abs(shift) * 1e3 for _, shift in group)
     follow = "follow their"
     by = f"{ms[0]:.0f} to {ms[-1]:.0f} ms"
     if len(group) == 1:
@@ -247,7 +258,7 @@ def _shift_finding(word: str, group: list[tuple[Survey, float]]) -> Finding:
     )
     values = {
         "recordings": [survey.entry.id for survey, _ in group],
-        "late_s": [late for _, late in group],
+        "late_s": [shift for _, shift in group],
     }
     return Finding("warning", "lag", text, (), values)
 
@@ -269,13 +280,13 @@ def _relative_delays(surveys: list[Survey]) -> Array:
     return result
 
 
-def _agree(late: float, delay: float) -> bool:
+def _agree(shift: float, delay: float) -> bool:
     """Return True if the delays that the same page shows do not contradict a shift; both relative
     to the others, s.
     """
     if np.isnan(delay):
-        return abs(late) < float(SHIFTS_S[-1])
-    return delay * late > 0 and abs(delay) >= min(MIN_AGREEMENT * abs(late), MIN_SHIFT_S)
+        return abs(shift) < float(SHIFTS_S[-1])
+    return delay * shift > 0 and abs(delay) >= min(MIN_AGREEMENT * abs(shift), MIN_SHIFT_S)
 
 
 def clock_drift(surveys: list[Survey], shifts: Array, unknown: float = 0.0) -> Iterator[Finding]:

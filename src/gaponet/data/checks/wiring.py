@@ -325,9 +325,8 @@ def _unit(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     """Are commands, positions and velocities in the same unit, the radian?"""
     wrong: list[Finding] = []
     for i, name in enumerate(robot.joint_names):
-        wrong += _range_unit(surveys, i, name)
-        if not wrong:
-            wrong += _scale(surveys, i, name)
+        other_unit = [*_range_unit(surveys, i, name)]
+        wrong += other_unit or _scale(surveys, i, name)
         wrong += _velocity_unit(surveys, i, name)
     wrong += _small_commands(surveys)
     yield from _converted(surveys, robot)
