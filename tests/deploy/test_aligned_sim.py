@@ -166,7 +166,8 @@ def test_a_scene_moves_like_an_identified_robot_without_a_model(robot):
 
 
 def test_a_network_on_a_simulator_with_backlash_is_transferred_to_a_scene_without(robot, tmp_path):
-    loose = robot.with_identified(dict.fromkeys(robot.joint_names, {"backlash": 0.05}))
+    gap = {"backlash": 0.05}
+    loose = robot.with_identified(dict.fromkeys(robot.joint_names, gap))
     save_robot(loose, tmp_path / "robot")
     model = small_model(loose, tmp_path / "model")
 
