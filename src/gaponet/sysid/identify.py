@@ -6,7 +6,7 @@ delay, then what validation motions accept: terms of the servo model (sim/servo.
 links. `identify` goes this way:
 
 1. Fit the classic fields, every joint by itself and then all together where that helps
-(steps/classic.py).
+   (steps/classic.py).
 2. Propose one step after the other: terms (steps/servo_term.py), links (steps/link_masses.py). Each
    is fitted to the same recordings; motions that were not fitted accept or reject it (`Judge`).
 3. Estimate standard errors (standard_errors.py), and fit the table under the tips

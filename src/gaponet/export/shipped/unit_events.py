@@ -2,9 +2,11 @@
 
 This file is copied into exports; it needs torch, not gaponet. A unit is a row of the file.
 
-mjlab:      EventTermCfg(func=mjlab_units(FILE), mode="reset")
-Isaac Lab:  EventTermCfg(func=apply_units, mode="reset", params={"asset_cfg":
-SceneEntityCfg("robot"), "file": FILE})
+    # mjlab
+    EventTermCfg(func=mjlab_units(FILE), mode="reset")
+    # Isaac Lab
+    params = {"asset_cfg": SceneEntityCfg("robot"), "file": FILE}
+    EventTermCfg(func=apply_units, mode="reset", params=params)
 
 FILE is the path of randomization.json. Mode "reset" draws a unit for each episode, "startup" one
 for each world.
