@@ -1,6 +1,5 @@
-"""Identified servos in a user's own scene.
-
-It is an mjSpec with other objects, other robots or another table.
+"""Identified servos in a user's own scene: an mjSpec with other objects, other robots or another
+table.
 
 `apply` writes what MuJoCo can hold into the specification, by joint name. What it cannot hold, the
 servo model, is computed before each physics step by the object that `Applied.servos` returns.
