@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from gaponet.export.helper_file import MODULES, helper_text
+from gaponet.export.helper_file import MODULES, SHIPPED, helper_text
 
 
 def defined_names(text: str) -> list[str]:
@@ -43,3 +43,11 @@ def test_a_helper_imports_where_there_is_no_gaponet(helper, tmp_path):
     )
 
     assert done.stdout.strip() == helper
+
+
+@pytest.mark.parametrize("file", sorted(SHIPPED.glob("*.py")), ids=lambda file: file.stem)
+def test_each_command_and_statement_to_copy_has_a_line_of_its_own(file):
+    docstring = ast.get_docstring(ast.parse(file.read_text(encoding="utf-8"))) or ""
+    for line in docstring.splitlines():
+        if "python check.py" in line or "--out" in line:
+            assert line.lstrip().startswith(("python", "gaponet"))

@@ -8,7 +8,8 @@ import numpy as np
 
 from gaponet.base.progress import no_progress
 from gaponet.sim.metrics import Comparison
-from gaponet.sysid.identify import with_steps
+from gaponet.sysid.identify import _makers_of_steps, with_steps
+from gaponet.sysid.options import IdentifyOptions
 from gaponet.sysid.search_progress import SearchProgress
 from gaponet.sysid.steps.servo_term import ServoTerm
 from gaponet.sysid.steps.step import Fits, FitState
@@ -49,6 +50,12 @@ def start(chosen="joints"):
 def fits(seconds=None, count=3):
     progress = SearchProgress(seconds, count, 1, no_progress)
     return Fits([], None, [], ErrorIsFriction(), progress, 1)
+
+
+def test_terms_come_in_their_order_and_then_the_masses():
+    options = IdentifyOptions(terms=("load", "backlash"), masses=True)
+    steps = [make(fits()) for make in _makers_of_steps(options)]
+    assert [step.name for step in steps] == ["load", "backlash", "masses"]
 
 
 def test_each_step_goes_on_from_the_steps_that_were_accepted():

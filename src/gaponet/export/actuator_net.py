@@ -1,6 +1,5 @@
-"""Actuator networks of a run, one per joint.
-
-Past target − position and past velocity go in, the torque comes out.
+"""Actuator networks of a run, one per joint: past errors of the target and past velocities go in,
+the torque comes out.
 
 mjlab, Newton and Isaac Lab load this form (Hwangbo et al. 2019, Science Robotics 4, eaau5872). It
 contains the identified servo exactly: a delayed target minus the present position is the error at
@@ -42,20 +41,31 @@ PAST_S = 0.1  # beyond the longest delay
 HIDDEN = (32, 32)
 MAX_INPUT_STD = 5.0
 MAX_RECORDINGS = 40  # of each split
-# of the fit, as in supervised pre-training
-ROWS = 60_000
+# Of the fit of a joint's network, as in supervised pre-training.
+ROWS = 60_000  # of all recordings
 STEPS = 2000
 BATCH = 512
 RATE = 2e-3
 DECAY = 1.0
-NOISE = 0.4
+NOISE = 0.4  # standard deviations of the inputs
 GAINS = (1.0, 0.5, 0.0)  # factors of kp · Δa that are tried on validation motions
 
 
 class ActuatorNet(nn.Module):
     """Network of one joint: [e_t … e_{t-L+1} | q̇_t … q̇_{t-L+1}], (B, 2L) → torque, (B, 1) N·m.
 
-    e = target − q, rad; q̇ in rad/s.
+    e = target − q, rad; q̇ in rad/s. The torque is that of the identified servo, which is linear in
+    these, and kp · Δa, which the small network adds.
+
+    Attributes:
+        servo: Torque of the servo for one of each input, (2L, 1).
+        mean, std: Of the inputs, (2L,).
+        offset_torque: kp · offset, N·m.
+        limit: Torque limit, N·m.
+        net: The small network, (B, 2L) → (B, 1).
+        scale: Torque that is added for an output of 1, N·m: kp · the RMS of Δa in the fit.
+        gain: Factor on what is added, one of GAINS; chosen after the fit.
+        most_added: kp · delta_max, N·m.
     """
 
     servo: Tensor
@@ -85,11 +95,11 @@ class ActuatorNet(nn.Module):
         self.register_buffer("servo", torch.tensor(servo, dtype=torch.float32))
         self.register_buffer("mean", torch.zeros(2 * length))
         self.register_buffer("std", torch.ones(2 * length))
-        self.rest = kp * joint["offset"]  # N·m
-        self.limit = joint["effort_limit"]  # N·m
-        self.scale = kp
+        self.offset_torque = kp * joint["offset"]
+        self.limit = joint["effort_limit"]
+        self.scale = kp  # until the fit
         self.gain = 1.0
-        self.most_added = kp * delta_max  # N·m
+        self.most_added = kp * delta_max
         layers: list[nn.Module] = []
         for inputs, outputs in pairwise((2 * length, *HIDDEN)):
             layers += [nn.Linear(inputs, outputs), nn.ELU()]
@@ -105,7 +115,7 @@ class ActuatorNet(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         added = (self.gain * self.scale) * self.net(self.standardised(x))
         added = added.clamp(-self.most_added, self.most_added)
-        torque: Tensor = x @ self.servo + self.rest + added
+        torque: Tensor = x @ self.servo + self.offset_torque + added
         return torque.clamp(-self.limit, self.limit)
 
 
@@ -150,11 +160,12 @@ def write_networks(
     """
     rollouts = replay(sequences, robot, corrector, lock_idle=True)
     nets = _fit_networks(sequences, rollouts, robot, facts)
-    op = robot.operated_index
-    aligned = zip(motions, replay(motions, robot, corrector, lock_idle=True), strict=True)
-    file = folder / facts["file"]
-    errors = {g: _error_in_mujoco(file, motions, robot, nets, facts, g) for g in GAINS}
+    errors = {}  # gain → mean |error|, rad
+    for tried in GAINS:
+        _set_gain(nets, tried)
+        errors[tried] = _error_in_mujoco(folder / facts["file"], motions, robot, nets, facts)
     gain = min(errors, key=errors.__getitem__)
+    _set_gain(nets, gain)
     info = {
         "length": _length(facts),
         "step": facts["options"]["timestep"],
@@ -162,17 +173,24 @@ def write_networks(
         "input_order": "pos_vel",
     }
     for name, net in nets.items():
-        net.gain = gain
         _write(net, folder, name, info | {"joint": name, "robot": robot.name})
     facts["actuator_net"] = info
+    op = robot.operated_index
     errors_of_run = []
-    for motion, played in aligned:
+    corrected = replay(motions, robot, corrector, lock_idle=True)
+    for motion, played in zip(motions, corrected, strict=True):
         errors_of_run.append(mean_error(motion.qpos[:, op], played.qpos[:, op]))
     return {
         "the run, in gaponet": float(np.mean(errors_of_run)),
         "actuator networks": errors[gain],
         "of these the servo alone": errors[0.0],
     }
+
+
+def _set_gain(nets: dict[str, ActuatorNet], gain: float) -> None:
+    """Multiply what the networks add by a gain."""
+    for net in nets.values():
+        net.gain = gain
 
 
 def _length(facts: dict[str, Any]) -> int:
@@ -216,7 +234,12 @@ def _samples(
     rng: np.random.Generator,
     rows: int,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return inputs of a joint in random physics steps, (k, 2L), and delayed Δa, (k, 1) rad."""
+    """Return inputs of joint i in random physics steps, (rows, 2L), and delayed Δa, (rows, 1) rad.
+
+    Args:
+        s: Recording, with the targets.
+        rollout: What the run's network makes of it, with the corrected targets.
+    """
     count = facts["decimation"]
     length = len(net.mean) // 2
     path = CubicHermiteSpline(np.arange(len(s)) * s.dt, rollout.qpos[:, i], rollout.qvel[:, i])
@@ -257,15 +280,16 @@ def _fit(net: ActuatorNet, x: Tensor, y: Tensor) -> None:
         loss.backward()
         optimiser.step()
         schedule.step()
-    net.scale *= unit
+    net.scale *= unit  # since the output is Δa over its RMS
 
 
 def _stack(tensors: ListOf[Tensor]) -> np.ndarray:
+    """Return tensors as one numpy array, (n, …)."""
     return np.stack([tensor.detach().numpy() for tensor in tensors])
 
 
 def _stacked_layer(nets: ListOf[ActuatorNet], k: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return weights (n, outputs, inputs) and biases (n, outputs) of the networks' k-th module."""
+    """Return weights (n, outputs, inputs) and biases (n, outputs) of module k of n networks."""
     linear: list[Any] = [net.net[k] for net in nets]
     weights = _stack([layer.weight for layer in linear])
     biases = _stack([layer.bias for layer in linear])
@@ -273,28 +297,37 @@ def _stacked_layer(nets: ListOf[ActuatorNet], k: int) -> tuple[np.ndarray, np.nd
 
 
 def _stacked(nets: ListOf[ActuatorNet]) -> Callable[[np.ndarray], np.ndarray]:
-    """Return the networks of all joints as one numpy function: pasts (n, 2L) → torque (n,) N·m."""
+    """Return the networks of n joints as one numpy function, `ActuatorNet.forward` of each: pasts
+    (n, 2L) → torques (n,) N·m.
 
-    servo = _stack([net.servo for net in nets])
-    mean = _stack([net.mean for net in nets])
+    A later change of a network, such as of its gain, does not change the function.
+    """
+    servo = _stack([net.servo[:, 0] for net in nets])  # (n, 2L)
+    mean = _stack([net.mean for net in nets])  # (n, 2L)
     std = _stack([net.std for net in nets])
-    rest = np.array([net.rest for net in nets])
+    offset_torque = np.array([net.offset_torque for net in nets])  # (n,), as all that follow
     limit = np.array([net.limit for net in nets])
     scale = np.array([net.gain * net.scale for net in nets])
     most_added = np.array([net.most_added for net in nets])
-    layers = [_stacked_layer(nets, k) for k in (0, 2, 4)]
+    # Linear modules, with an ELU between each two.
+    *hidden, head = [_stacked_layer(nets, k) for k in range(0, len(nets[0].net), 2)]
 
-    def torque(past: np.ndarray) -> np.ndarray:
-        z = np.clip((past - mean) / std, -MAX_INPUT_STD, MAX_INPUT_STD)
-        for k, (weight, bias) in enumerate(layers):
-            z = np.einsum("noi,ni->no", weight, z) + bias
-            if k < len(layers) - 1:
-                z = np.where(z > 0, z, np.expm1(np.minimum(z, 0)))
-        added = np.clip(scale * z[:, 0], -most_added, most_added)
-        asked = (past * servo[:, :, 0]).sum(1) + rest + added
+    def torques(past: np.ndarray) -> np.ndarray:
+        x = np.clip((past - mean) / std, -MAX_INPUT_STD, MAX_INPUT_STD)
+        for weight, bias in hidden:
+            x = _elu(np.einsum("noi,ni->no", weight, x) + bias)
+        weight, bias = head
+        output = np.einsum("noi,ni->no", weight, x) + bias  # (n, 1)
+        added = np.clip(scale * output[:, 0], -most_added, most_added)
+        asked = (past * servo).sum(axis=1) + offset_torque + added
         return np.asarray(np.clip(asked, -limit, limit))
 
-    return torque
+    return torques
+
+
+def _elu(x: np.ndarray) -> np.ndarray:
+    """Return what torch's ELU does."""
+    return np.where(x > 0, x, np.expm1(np.minimum(x, 0)))
 
 
 def _error_in_mujoco(
@@ -303,7 +336,6 @@ def _error_in_mujoco(
     robot: RobotSpec,
     nets: dict[str, ActuatorNet],
     facts: dict[str, Any],
-    gain: float,
 ) -> float:
     """Return the mean |error| of the networks in plain MuJoCo, rad; the scene has no servos."""
     model = mujoco.MjModel.from_xml_path(str(file))
@@ -313,24 +345,22 @@ def _error_in_mujoco(
     at = model.jnt_qposadr[ids]
     dof = model.jnt_dofadr[ids]
     model.dof_invweight0[dof] *= facts["dof_invweight0_factor"]
-    for net in nets.values():
-        net.gain = gain
     data = mujoco.MjData(model)
-    torque = _stacked(list(nets.values()))
+    torques = _stacked(list(nets.values()))
     length = _length(facts)
     for s in motions:
         mujoco.mj_resetData(model, data)
         data.qpos[at] = s.qpos[0]
         data.qvel[dof] = s.qvel[0]
         path = [s.qpos[0]]
-        past = np.zeros((len(ids), 2, length))
+        past = np.zeros((len(ids), 2, length))  # errors and velocities, newest first
         past[:, 0] = (s.ctrl[0] - s.qpos[0])[:, None]
         for target in s.ctrl[:-1]:
             for _ in range(facts["decimation"]):
                 past[:, :, 1:] = past[:, :, :-1].copy()
                 past[:, 0, 0] = target - data.qpos[at]
                 past[:, 1, 0] = data.qvel[dof]
-                data.qfrc_applied[dof] = torque(past.reshape(len(ids), -1))
+                data.qfrc_applied[dof] = torques(past.reshape(len(ids), -1))
                 mujoco.mj_step(model, data)
             path.append(data.qpos[at].copy())
         errors.append(mean_error(s.qpos[:, op], np.array(path)[:, op]))

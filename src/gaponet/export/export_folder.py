@@ -106,7 +106,10 @@ class _RobotExport:
         return float(self.facts["options"]["timestep"])
 
     def write_robot(self, source: Source | None) -> Path | None:
-        """Write the file of the robot, and return it; None for json, which has none."""
+        """Write the file of the robot, and return it; None for json, which has none.
+
+        A target that edits no file of the user's gets a scene, robot.xml.
+        """
         if TARGETS[self.to].edits_mjcf:
             return self.write_mjcf(source.file if source else self.robot.mjcf)
         if self.to == "urdf":
@@ -148,7 +151,10 @@ class _RobotExport:
         return file
 
     def write_scene(self) -> Path:
-        """Write robot.xml, for mjlab with servos, and the configuration of Isaac Lab or Newton."""
+        """Write robot.xml, and for Isaac Lab and Newton also the servos in their own classes.
+
+        Only mjlab reads the servos of robot.xml; for the others it has none.
+        """
         file = self.out / ROBOT
         has_servos = self.to == "mjlab"
         robot = self.robot if has_servos else self.plain
@@ -275,22 +281,28 @@ def _measured_export(
 
 
 def _notes(robot: RobotSpec, facts: dict[str, Any], to: str) -> list[str]:
-    """Return effects that an engine's form of a robot lacks."""
+    """Return effects that a target's form of a robot lacks, and questions for the user, in the
+    order in which they are printed.
+
+    Args:
+        facts: facts.json; its "plain" are the servos as fitted without the servo model.
+        to: One of TARGETS.
+    """
+    target = TARGETS[to]
     notes = []
-    servos = facts["plain"].values()
-    if TARGETS[to].edits_mjcf:
+    if target.edits_mjcf:
         notes += _stop_notes(robot)
     if robot.servo.target_speed.any():
         notes.append(_ramp_note(robot, to))
     if robot.servo.friction_per_kelvin.any():
         notes.append(_temperature_note(robot))
-    is_late = any(servo["delay"] for servo in servos)
-    if is_late and TARGETS[to].delay_note:
-        notes.append(TARGETS[to].delay_note)
+    is_late = any(servo["delay"] for servo in facts["plain"].values())
+    if is_late and target.delay_note:
+        notes.append(target.delay_note)
     if to == "urdf":
         notes.append(_urdf_note(facts))
-    if not TARGETS[to].has_servo_model:
-        notes += _law_notes(facts["law"], to)
+    if not target.has_servo_model:
+        notes += _servo_model_notes(facts["law"], to)
     if to == "mjlab" and robot.servo.backlash.any():
         notes.append("mjlab simulates no backlash: use the form for MuJoCo, or identify without it")
     return notes
@@ -316,13 +328,15 @@ def _temperature_note(robot: RobotSpec) -> str:
     return f"friction and damping are those at {warm} °C: no engine has a temperature"
 
 
-def _law_notes(law: ListOf[str], to: str) -> list[str]:
-    """Return which terms of the servo model an engine lacks."""
-    lacking = [term for term in law if term not in own_terms(to)]
+def _servo_model_notes(terms: ListOf[str], to: str) -> list[str]:
+    """Return a note on the terms of a robot's servo model that an engine lacks, if there are
+    some.
+    """
+    lacking = [term for term in terms if term not in own_terms(to)]
     if not lacking:
         return []
-    terms = ", ".join(lacking)
-    return [f"the servo model ({terms}) is not in {to}: the numbers were fitted without it"]
+    names = ", ".join(lacking)
+    return [f"the servo model ({names}) is not in {to}: the numbers were fitted without it"]
 
 
 def _ramp_note(robot: RobotSpec, to: str) -> str:
@@ -439,6 +453,7 @@ def _write_scene(
 
 
 def _write_motions(file: Path, motions: ListOf[Sequence]) -> None:
+    """Write check.npz, which `Check` of mujoco_servos.py reads."""
     arrays: dict[str, Any] = {
         "count": np.array(len(motions)),
         "names": np.array([motion.meta.motion for motion in motions]),

@@ -186,7 +186,8 @@ def _actuator(joint: str, servo: dict[str, Any]) -> str:
 def readme(robot: str, form: NativeForm, errors_mrad: dict[str, float], motions: str) -> str:
     """Return the README of the export.
 
-    errors_mrad: form of the robot → error on the motions of check.npz.
+    Args:
+        errors_mrad: Form of the robot → error on the motions of check.npz.
     """
     return README.format(
         robot=robot,

@@ -275,8 +275,9 @@ def check_motions(
 ) -> list[Sequence]:
     """Return the first motions by name, cut in length, for check.npz.
 
-    ramped: Targets change as slowly as the servos change them, for engines that do not limit the
-    speed of targets.
+    Args:
+        ramped: Whether targets change as slowly as the servos change them, for engines that do not
+            limit the speed of targets.
     """
     first = {recording.meta.motion: recording for recording in reversed(recordings)}
     low, high = robot.qpos_range.T

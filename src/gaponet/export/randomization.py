@@ -318,9 +318,8 @@ def _robots(spec: RobotSpec, fields: tuple[str, ...], others: ListOf[Path]) -> A
 
 
 def _uncorrelated_share(deviations: Array) -> float:
-    """Return the share of the variance that is sampled number by number.
-
-    The deviations are those of k days or robots, (k, n, P).
+    """Return the share of the variance of k days or robots, (k, n, P), that is sampled number by
+    number.
 
     In few days or robots, numbers change together by chance (shrinkage of correlations, Schäfer and
     Strimmer 2005).
@@ -334,9 +333,8 @@ def _uncorrelated_share(deviations: Array) -> float:
 
 
 def _std_factor(count: int) -> float:
-    """Return by which factor a standard deviation may be too small, 9 of 10 times.
-
-    It is that of `count` values.
+    """Return by which factor the standard deviation of `count` values may be too small, 9 of 10
+    times.
     """
     from scipy.stats import chi2
 

@@ -47,9 +47,8 @@ def sample_robots(robot: RobotSpec) -> list[RobotSpec]:
 
 
 def validation_error(robot: RobotSpec, recordings: ListOf[Sequence]) -> Array:
-    """Return an |error| that BAND_SHARE of the rows of every recording stay below.
-
-    It is (n,) rad for the operated joints.
+    """Return an |error| that BAND_SHARE of the rows of every recording stay below, (n,) rad for the
+    operated joints.
 
     The quantile over all rows together would be too narrow: motions differ, and there are few of
     them.
@@ -98,9 +97,8 @@ def predict(
 def summary(
     predictions: ListOf[RolloutPrediction], joints: ListOf[str]
 ) -> dict[str, dict[str, Any]]:
-    """Return mean and largest differences of each joint over all rollouts.
-
-    They are in rad, and in shares of time.
+    """Return mean and largest differences of each joint over all rollouts, in rad, and the share of
+    time inside the band.
     """
 
     def rows(values: Any) -> Array:

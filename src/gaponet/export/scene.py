@@ -1,6 +1,5 @@
-"""Identified servos in a user's own scene.
-
-It is an mjSpec with other objects, other robots or another table.
+"""Identified servos in a user's own scene: an mjSpec with other objects, other robots or another
+table.
 
 `apply` writes what MuJoCo can hold into the specification, by joint name. What it cannot hold, the
 servo model, is computed before each physics step by the object that `Applied.servos` returns.
@@ -23,9 +22,8 @@ from gaponet.robot.spec import RobotSpec
 from gaponet.sim.model import STIFF_SOLIMP, STIFF_SOLREF, TOLERANCE, build_model, write_link
 
 MAX_AXIS_DIFFERENCE_RAD = 0.02  # between two joints' axes, in the scene and in the robot
-MAX_RANGE_DIFFERENCE_RAD = (
-    0.1  # of an end of a joint's range; official files of one robot differ by less
-)
+# Of an end of a joint's range; official files of one robot differ by less.
+MAX_RANGE_DIFFERENCE_RAD = 0.1
 MAX_GAIN_DIFFERENCE = 1e-6  # relative, of the two gains of a servo whose targets are in rad
 POSITION_INPUT = 1  # of a <pid>: its only input is the target position
 DELAY_SAMPLES = 2  # of a delay's buffer, beyond the delay itself

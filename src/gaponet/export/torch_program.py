@@ -2,8 +2,8 @@
 
 Plain torch loads it:
 
-step = torch.export.load("delta.pt2").module()
-delta, frames = step(qpos, qvel, ctrl, payload_mass, frames, fresh)   # as DeltaStep.forward
+    step = torch.export.load("delta.pt2").module()
+    delta, frames = step(qpos, qvel, ctrl, payload_mass, frames, fresh)  # as DeltaStep.forward
 """
 
 from __future__ import annotations

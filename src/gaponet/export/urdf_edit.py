@@ -1,8 +1,6 @@
 """Write a copy of a user's URDF with identified damping, friction, effort limits and inertias.
 
-Nothing else changes.
-
-URDF has no place for gains, armature, delay or offsets.
+Nothing else changes, and URDF has no place for gains, armature, delay or offsets.
 """
 
 from __future__ import annotations

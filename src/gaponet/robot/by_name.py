@@ -3,11 +3,12 @@ Hugging Face Hub.
 
 Identified robots of the package are here, its networks in nn/packaged_networks.py:
 
-IDENTIFIED/ROBOT@DATA/robot.toml, robot.xml  the identified robot
-                      card.json              what it is, and how good it is
-                      identified.json        hashes of its data
-                      uncertainty.json       of its values
-                      plain_servos.json      its nearest PD servos, for export without recordings
+    IDENTIFIED/ROBOT@DATA/
+        robot.toml, robot.xml  the identified robot
+        card.json              what it is, and how good it is
+        identified.json        hashes of its data
+        uncertainty.json       of its values
+        plain_servos.json      its nearest PD servos, for export without recordings
 
 `benchmarks/ship_robots.py` makes such a folder from one of `gaponet identify`. The Hub's own
 library keeps what it downloads in its cache, by commit. Nothing writes into either afterwards.

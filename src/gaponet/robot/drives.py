@@ -51,12 +51,10 @@ class Drive:
     @property
     def passive_source(self) -> str:
         """Source of these values."""
+        if self.servo is None:
+            return "the model"
         values = ", ".join(self.passive) or "no values"
-        return (
-            f"servo {self.servo.name} ({values}: {self.servo.source})"
-            if self.servo
-            else "the model"
-        )
+        return f"servo {self.servo.name} ({values}: {self.servo.source})"
 
 
 def drives(
@@ -95,20 +93,19 @@ def drives(
         limit = _limit_and_source(model, name, actuators, stated, servos.get(name), file)
         actuator = model.actuator(actuators[0]).name if len(actuators) == 1 else ""
         home = float(pose[model.jnt_qposadr[j]])
-        found.append(
-            Drive(
-                name,
-                actuator,
-                kp.value,
-                kp.source,
-                kd.value,
-                kd.source,
-                limit.value,
-                limit.source,
-                home,
-                servos.get(name),
-            )
+        drive = Drive(
+            name=name,
+            actuator=actuator,
+            kp=kp.value,
+            kp_source=kp.source,
+            kd=kd.value,
+            kd_source=kd.source,
+            limit=limit.value,
+            limit_source=limit.source,
+            home=home,
+            servo=servos.get(name),
         )
+        found.append(drive)
     if without_gain:
         raise UsageError(
             f"{file} has no position gain for {abbreviate(without_gain)}: give those of the "
@@ -169,7 +166,8 @@ def _limit_and_source(
 
 def _gains(model: mujoco.MjModel, actuators: list[int]) -> tuple[float, float]:
     """Return kp and kd at the joint, summed over its position and damping actuators."""
-    kp = kd = 0.0
+    kp = 0.0
+    kd = 0.0
     for a in actuators:
         if model.actuator_biastype[a] == mujoco.mjtBias.mjBIAS_AFFINE:
             gear = float(model.actuator_gear[a, 0]) ** 2
@@ -203,7 +201,7 @@ def _limits(
 
 def _by_joint(name: str, words: tuple[str, ...], joints: list[str]) -> dict[str, str]:
     """Return joint → its last word among ("100", "*wrist*=20")."""
-    by = dict[str, str]()
+    word_of_joint: dict[str, str] = {}
     option = f"--{name.replace('_', '-')}"
     if any("=" not in word for word in words[1:]):
         raise UsageError(
@@ -214,11 +212,12 @@ def _by_joint(name: str, words: tuple[str, ...], joints: list[str]) -> dict[str,
         matches = [j for j in joints if fnmatchcase(j, word.rpartition("=")[0] or "*")]
         if not matches:
             raise UsageError(f"{option} {word}: no such joint; there are: {', '.join(joints)}")
-        by |= dict.fromkeys(matches, word)
-    return by
+        word_of_joint |= dict.fromkeys(matches, word)
+    return word_of_joint
 
 
 def _number(name: str, word: str) -> float:
+    """Return the number of a word such as "100" or "*wrist*=20" of an option."""
     try:
         value = float(word.rpartition("=")[2])
     except ValueError:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable
 from dataclasses import dataclass, field
-from itertools import compress
 from typing import Any
 
 from gaponet.base.arrays import Array
@@ -72,4 +71,5 @@ def abbreviate(names: list[str]) -> str:
 
 def masked_names(robot: RobotSpec, mask: Array) -> tuple[str, ...]:
     """Return the joint names where mask (n) is true."""
-    return tuple(compress(robot.joint_names, mask))
+    named = zip(robot.joint_names, mask, strict=True)
+    return tuple(name for name, is_selected in named if is_selected)

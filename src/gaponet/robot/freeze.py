@@ -12,11 +12,9 @@ from gaponet.base.errors import RobotError
 
 def units_per_si(spec: mujoco.MjSpec, joint: mujoco.MjsJoint) -> float:
     """Return the specification's units per rad or m of a joint: an MJCF may use degrees."""
-    return (
-        math.degrees(1)
-        if spec.compiler.degree and joint.type == mujoco.mjtJoint.mjJNT_HINGE
-        else 1.0
-    )
+    if spec.compiler.degree and joint.type == mujoco.mjtJoint.mjJNT_HINGE:
+        return math.degrees(1)
+    return 1.0
 
 
 def freeze(spec: mujoco.MjSpec, joint: mujoco.MjsJoint, value: float) -> None:
@@ -32,16 +30,18 @@ def freeze(spec: mujoco.MjSpec, joint: mujoco.MjsJoint, value: float) -> None:
             f"joint '{joint.name}' turns after '{body.joints[0].name}' in one body: keep or clamp "
             "both"
         )
-    turn = np.zeros(4)
-    quat = np.zeros(4)
-    offset = np.zeros(3)
-    slides = joint.type == mujoco.mjtJoint.mjJNT_SLIDE
     axis = np.array(joint.axis) / np.linalg.norm(joint.axis)
-    mujoco.mju_axisAngle2Quat(turn, axis, 0.0 if slides else move)
-    mujoco.mju_rotVecQuat(offset, np.array(joint.pos), turn)
-    mujoco.mju_rotVecQuat(
-        offset, axis * move if slides else np.array(joint.pos) - offset, np.array(body.quat)
-    )
+    turn = np.array([1.0, 0.0, 0.0, 0.0])  # of the body, in its own frame
+    shift = axis * move  # of the body's origin, in its own frame, m
+    if joint.type != mujoco.mjtJoint.mjJNT_SLIDE:
+        mujoco.mju_axisAngle2Quat(turn, axis, move)
+        anchor = np.array(joint.pos)
+        turned_anchor = np.zeros(3)
+        mujoco.mju_rotVecQuat(turned_anchor, anchor, turn)
+        shift = anchor - turned_anchor
+    offset = np.zeros(3)  # the same in the frame of the parent
+    mujoco.mju_rotVecQuat(offset, shift, np.array(body.quat))
+    quat = np.zeros(4)
     mujoco.mju_mulQuat(quat, np.array(body.quat), turn)
     body.pos = np.array(body.pos) + offset
     body.quat = quat

@@ -205,9 +205,11 @@ class RobotSpec:
         new_kd = np.array(old.kd if kd is None else kd)
         if np.allclose((new_kp, new_kd), (old.kp, old.kd), rtol=GAIN_TOLERANCE, atol=0.0):
             return self
-        servo = self.servo.with_gains(new_kp, new_kd, old)
-        own = self.nominal and nominal.with_servo(kp=new_kp, kd=new_kd)
-        return dataclasses.replace(self, servo=servo, nominal=own)
+        changed = dataclasses.replace(self, servo=self.servo.with_gains(new_kp, new_kd, old))
+        if self.nominal is None:
+            return changed
+        new_nominal = nominal.with_servo(kp=new_kp, kd=new_kd)
+        return dataclasses.replace(changed, nominal=new_nominal)
 
     def at_temperature(self, temperature: tuple[float, ...] | None) -> RobotSpec:
         """Return the robot with friction and damping at joint temperatures, (n) °C; None or NaN:
@@ -222,8 +224,10 @@ class RobotSpec:
         [[joint]].
         """
         servo = self.servo.with_gain_scale(scale, self.operated_index)
-        nominal = self.nominal and self.nominal.with_gain_scale(scale)
-        return dataclasses.replace(self, servo=servo, nominal=nominal)
+        changed = dataclasses.replace(self, servo=servo)
+        if self.nominal is None:
+            return changed
+        return dataclasses.replace(changed, nominal=self.nominal.with_gain_scale(scale))
 
     @functools.cached_property
     def qpos_range(self) -> Array:
@@ -320,22 +324,22 @@ def load_robot(name_or_path: str | Path) -> RobotSpec:
         RobotError: It names the folder, the field and what to write there.
     """
     folder = _folder(name_or_path)
-    toml = folder / "robot.toml"
-    if not toml.is_file():
+    file = folder / "robot.toml"
+    if not file.is_file():
         raise RobotError(
             f"{folder}: no robot.toml there; put robot.toml and robot.xml there, or choose another"
         )
-    table = read_toml(RobotTable, toml, RobotError, "docs/new-robot.md lists the fields")
-    mjcf = folder / table.mjcf
+    toml = read_toml(RobotTable, file, RobotError, "docs/new-robot.md lists the fields")
+    mjcf = folder / toml.mjcf
     if not mjcf.is_file():
         raise RobotError(
-            f"{toml}: {mjcf.name} is missing beside it; put the MJCF there or name it with mjcf = "
+            f"{file}: {mjcf.name} is missing beside it; put the MJCF there or name it with mjcf = "
             '"..."'
         )
     try:
-        return _spec(table, mjcf, folder)
+        return _spec(toml, mjcf, folder)
     except RobotError as error:
-        raise RobotError(f"{toml}: {error}") from None
+        raise RobotError(f"{file}: {error}") from None
 
 
 def robot_argument(folder: Path) -> str:
@@ -404,33 +408,37 @@ def servo_type(name: str, where: str, own: tuple[ServoType, ...] = ()) -> ServoT
     return types[name]
 
 
-def _spec(table: RobotTable, mjcf: Path, folder: Path) -> RobotSpec:
+def _spec(toml: RobotTable, mjcf: Path, folder: Path) -> RobotSpec:
     """Return the robot of a robot.toml, with its identified values.
 
     Raises:
         RobotError: Names contradict each other.
     """
-    _require_known_names(table)
-    robot = _nominal(table, mjcf, folder)
+    _require_known_names(toml)
+    robot = _nominal(toml, mjcf, folder)
     identified = robot
-    servos = _identified_servos(table)
+    servos = _identified_servos(toml)
     if servos:
         identified = robot.with_identified(servos)
     changed: dict[str, Any] = {}
-    if table.identified_table is not None:
-        changed["scene"] = dataclasses.replace(robot.scene, table=table.identified_table)
-    if table.identified_mount:
-        changed["payload_mounts"] = _identified_mounts(table)
-    if table.identified_link:
-        changed["links"] = table.identified_link
+    if toml.identified_table is not None:
+        changed["scene"] = dataclasses.replace(robot.scene, table=toml.identified_table)
+    if toml.identified_mount:
+        changed["payload_mounts"] = _identified_mounts(toml)
+    if toml.identified_link:
+        changed["links"] = toml.identified_link
     if changed:
         identified = dataclasses.replace(identified, **changed, nominal=robot)
     return identified
 
 
-def _nominal(table: RobotTable, mjcf: Path, folder: Path) -> RobotSpec:
-    """Return the robot of a robot.toml without its identified values."""
-    joints = table.joint
+def _nominal(toml: RobotTable, mjcf: Path, folder: Path) -> RobotSpec:
+    """Return the robot of a robot.toml without its identified values.
+
+    Of its servos, robot.toml states only kp, kd, effort_limit and the type; all else has the
+    defaults of ServoParameters, which are the MJCF's values or no effect.
+    """
+    joints = toml.joint
     aliases: dict[str, str] = {}
     followers = {}
     for joint in joints:
@@ -441,12 +449,12 @@ def _nominal(table: RobotTable, mjcf: Path, folder: Path) -> RobotSpec:
         kp=np.array([joint.kp for joint in joints]),
         kd=np.array([joint.kd for joint in joints]),
         effort_limit=np.array([joint.effort_limit for joint in joints]),
-        types=_servo_types(table),
+        types=_servo_types(toml),
     )
     units = tuple(joint.log_unit for joint in joints)
     robot = RobotSpec(
-        name=table.name,
-        description=table.description or table.name,
+        name=toml.name,
+        description=toml.description or toml.name,
         mjcf=mjcf,
         folder=folder.absolute(),  # other processes may have another current folder
         joint_names=tuple(joint.name for joint in joints),
@@ -454,44 +462,49 @@ def _nominal(table: RobotTable, mjcf: Path, folder: Path) -> RobotSpec:
         log_joints=LogJoints(units, aliases, followers),
         servo=servo,
         qpos_home=np.array([joint.home for joint in joints]),
-        payload_mounts=table.payload_mount,
-        dt=table.dt,
-        timestep=table.timestep,
-        scene=Scene(table.tip, table.table, table.contacts, table.carries_payload),
+        payload_mounts=toml.payload_mount,
+        dt=toml.dt,
+        timestep=toml.timestep,
+        scene=Scene(toml.tip, toml.table, toml.contacts, toml.carries_payload),
     )
-    return robot.with_gain_scale(table.gain_scale)
+    return robot.with_gain_scale(toml.gain_scale)
 
 
-def _servo_types(table: RobotTable) -> tuple[ServoType | None, ...]:
+def _servo_types(toml: RobotTable) -> tuple[ServoType | None, ...]:
     """Return the servo type of each joint; None where robot.toml names none."""
     servos: list[ServoType | None] = []
-    for joint in table.joint:
+    for joint in toml.joint:
         servo = None
         if joint.servo:
-            servo = servo_type(joint.servo, f"joint '{joint.name}'", table.servo)
+            servo = servo_type(joint.servo, f"joint '{joint.name}'", toml.servo)
         servos.append(servo)
     return tuple(servos)
 
 
-def _require_known_names(table: RobotTable) -> None:
-    """Refuse names that appear twice, and identified values of what is not there."""
-    joints = [joint.name for joint in table.joint]
+def _require_known_names(toml: RobotTable) -> None:
+    """Refuse joint names that appear twice, a table without tips, and identified values of joints
+    and mounts that are not there.
+
+    Bodies of identified links are looked for when the MJCF is compiled.
+    """
+    joints = [joint.name for joint in toml.joint]
     names: list[str] = []
-    for joint in table.joint:
+    for joint in toml.joint:
+        # A joint may repeat its own name among its aliases; two joints may share none.
         names += dict.fromkeys((joint.name, *joint.aliases))
     if len(set(names)) != len(names):
         raise RobotError(
-            f"{table.name}: a joint name appears twice in {', '.join(names)} (names and aliases)"
+            f"{toml.name}: a joint name appears twice in {', '.join(names)} (names and aliases)"
         )
-    if (table.table or table.identified_table) and not table.tip:
+    if (toml.table or toml.identified_table) and not toml.tip:
         raise RobotError(
             "[table]: no [[tip]] can touch it; add a [[tip]] with body, pos and radius"
         )
-    for name in table.identified:
+    for name in toml.identified:
         if name not in joints:
             raise RobotError(f"[identified.{name}] names no joint; joints are {', '.join(joints)}")
-    sides = [mount.side for mount in table.payload_mount]
-    for side in table.identified_mount:
+    sides = [mount.side for mount in toml.payload_mount]
+    for side in toml.identified_mount:
         if side not in sides:
             raise RobotError(
                 f"[identified_mount.{side}] names no [[payload_mount]]; sides are "
@@ -499,10 +512,10 @@ def _require_known_names(table: RobotTable) -> None:
             )
 
 
-def _identified_servos(table: RobotTable) -> dict[str, dict[str, float]]:
+def _identified_servos(toml: RobotTable) -> dict[str, dict[str, float]]:
     """Return joint → field → identified value, SI."""
     servos: dict[str, dict[str, float]] = {}
-    for joint, servo in table.identified.items():
+    for joint, servo in toml.identified.items():
         servos[joint] = {}
         for name, value in vars(servo).items():
             if value is not None:
@@ -510,10 +523,10 @@ def _identified_servos(table: RobotTable) -> dict[str, dict[str, float]]:
     return servos
 
 
-def _identified_mounts(table: RobotTable) -> tuple[PayloadMount, ...]:
+def _identified_mounts(toml: RobotTable) -> tuple[PayloadMount, ...]:
     """Return the payload mounts with their identified places and masses."""
     mounts = []
-    for mount in table.payload_mount:
-        moved = table.identified_mount.get(mount.side)
+    for mount in toml.payload_mount:
+        moved = toml.identified_mount.get(mount.side)
         mounts.append(mount if moved is None else dataclasses.replace(mount, **vars(moved)))
     return tuple(mounts)

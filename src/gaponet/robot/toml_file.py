@@ -25,9 +25,8 @@ class _Joint:
     operated: bool = True
     log_unit: Literal["rad", "deg", "fraction"] = "rad"
     servo: str = ""  # name of a servo type
-    follows: str = (
-        ""  # joint that moves this one by a linkage or gear: a mimic joint, without a motor
-    )
+    # Joint that moves this one by a linkage or gear: a mimic joint, without a motor.
+    follows: str = ""
     ratio: Annotated[float, Interval(ge=-100, le=100)] = 1.0  # its angle per rad of that joint
     at_zero: Angle = 0.0  # its angle where that joint is at 0, rad
     aliases: tuple[str, ...] = ()
@@ -64,9 +63,8 @@ class ServoType:
     robots: Count = 0  # that the values are of
     joints: Count = 0
     gain: Gain | None = None  # N·m/rad for a firmware kp of 1
-    gain_volts: Annotated[float, Interval(ge=0.1, le=1000)] | None = (
-        None  # V, of its supply; gain is in proportion
-    )
+    # V, of its supply; gain is in proportion
+    gain_volts: Annotated[float, Interval(ge=0.1, le=1000)] | None = None
     effort_limit: Gain | None = None  # N·m
     speed_limit: Gain | None = None  # rad/s
     limit_source: str = ""
@@ -195,6 +193,8 @@ class Table:
 
 @dataclass(frozen=True)
 class RobotTable:
+    """Content of robot.toml."""
+
     name: Name
     dt: Annotated[float, Interval(ge=1e-4, le=1)]  # s
     timestep: Annotated[float, Interval(ge=1e-6, le=1)]  # s
@@ -205,9 +205,8 @@ class RobotTable:
     table: Table | None = None
     contacts: bool = False  # links collide as the MJCF states; else only tips and table collide
     carries_payload: bool = True  # false: the simulator omits the payload
-    gain_scale: Annotated[float, Interval(gt=0, le=1000)] = (
-        1.0  # factor on kp and kd of operated joints in [[joint]]
-    )
+    # Factor on kp and kd of operated joints in [[joint]].
+    gain_scale: Annotated[float, Interval(gt=0, le=1000)] = 1.0
     identified: dict[str, IdentifiedServo] = field(default_factory=dict)
     identified_table: Table | None = None
     identified_mount: dict[str, _Mount] = field(default_factory=dict)

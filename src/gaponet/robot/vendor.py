@@ -28,13 +28,14 @@ from gaponet.robot.mjcf import (
 )
 
 MESHES = (".stl", ".obj", ".msh")  # formats that MuJoCo reads
+FOREIGN_TAGS = ("transmission", "gazebo", "ros2_control")  # of a URDF, for other programs
 URDF_COMPILER = {
     "strippath": "false",
     "fusestatic": "false",
     "discardvisual": "false",
     "balanceinertia": "true",
-    "boundmass": "1e-6",
-    "boundinertia": "1e-9",
+    "boundmass": "1e-6",  # kg, of links with less
+    "boundinertia": "1e-9",  # kg·m²
     "autolimits": "true",
 }
 AXES = ("xx", "yy", "zz", "xy", "xz", "yz")  # of an inertia tensor
@@ -77,10 +78,12 @@ def _cache() -> Path:
 
 
 def _stated(variables: tuple[str, ...]) -> list[Path]:
+    """Return the folders that environment variables name, in their order."""
     return [Path(os.environ[v]).expanduser() for v in variables if os.environ.get(v)]
 
 
 def _of_menagerie(name: str) -> Path:
+    """Return the model of FOLDER or FOLDER/FILE in a copy of MuJoCo Menagerie."""
     versions = sorted(_cache().glob("mujoco_menagerie-*/mujoco_menagerie"))
     usual = [
         _cache() / "mujoco_menagerie",
@@ -117,6 +120,7 @@ def _main_model(folder: Path, name: str) -> Path:
 
 
 def _of_robot_descriptions(name: str) -> Path:
+    """Return the model of a description of the package robot_descriptions, if it was pulled."""
     try:
         cache: Any = importlib.import_module("robot_descriptions._cache")
         repositories = importlib.import_module("robot_descriptions._repositories").REPOSITORIES
@@ -164,6 +168,7 @@ def _description(name: str) -> Any:
 
 
 def _of_example_robot_data(name: str) -> Path:
+    """Return the URDF of a name in example-robot-data."""
     roots = [place for place in _places_of_example_robot_data() if place.is_dir()]
     if not roots:
         raise RobotError(
@@ -231,16 +236,21 @@ def read_vendor(path: Path, packages: dict[str, Path]) -> tuple[mujoco.MjSpec, l
 
 @sandboxed(RobotError, "mujoco", 0.5)
 def _try(path: Path, packages: dict[str, Path]) -> None:
+    """Read a model and simulate a step in a process of its own, which it may crash."""
     spec, _ = _read(path, packages)
     require_simulable(compile_spec(spec, path), path)
 
 
 def _read(path: Path, packages: dict[str, Path]) -> tuple[mujoco.MjSpec, list[str]]:
+    """Return a model as a specification, and notes."""
     root = ET.parse(path).getroot()
-    return _urdf(root, path, packages) if root.tag == "robot" else _mjcf(path)
+    if root.tag == "robot":
+        return _urdf(root, path, packages)
+    return _mjcf(path)
 
 
 def _mjcf(path: Path) -> tuple[mujoco.MjSpec, list[str]]:
+    """Return an MJCF as a specification without the meshes that are missing, and notes."""
     spec = read_mjcf(path, tried=True)
     place = path.parent / spec.meshdir
     missing = {}
@@ -250,17 +260,37 @@ def _mjcf(path: Path) -> tuple[mujoco.MjSpec, list[str]]:
     _delete_geoms(spec, missing)
     for mesh in missing.values():
         spec.delete(mesh)
-    return spec, _left_out(sorted(missing), f"are not in {place}") + _drop_unreadable_meshes(spec)
+    notes = _left_out(sorted(missing), f"are not in {place}")
+    notes += _drop_unreadable_meshes(spec)
+    return spec, notes
 
 
 def _urdf(
     root: ET.Element, path: Path, packages: dict[str, Path]
 ) -> tuple[mujoco.MjSpec, list[str]]:
-    missing: list[str] = []
-    unread: list[str] = []
+    """Return the URDF at `path` as a specification, and notes.
+
+    `root` is its element, which is changed into one that MuJoCo reads.
+    """
     for element in list(root):
-        if element.tag in ("transmission", "gazebo", "ros2_control"):
+        if element.tag in FOREIGN_TAGS:
             root.remove(element)
+    notes = _resolve_meshes(root, path, packages)
+    notes_on_inertias = _correct_inertias(root)
+    _set_compiler(root)
+    with mujoco_errors(path, "not valid URDF"):
+        spec = mujoco.MjSpec.from_string(ET.tostring(root, encoding="unicode"))
+    _add_mimic_joints(spec, root)
+    notes += _drop_unreadable_meshes(spec)
+    return spec, notes + notes_on_inertias
+
+
+def _resolve_meshes(root: ET.Element, path: Path, packages: dict[str, Path]) -> list[str]:
+    """Write the paths of meshes into a URDF, and remove the shapes of meshes that are missing or
+    have another format; return notes.
+    """
+    missing = []
+    of_other_format = []
     for link in root.iter("link"):
         for shape in [part for part in link if part.tag in ("visual", "collision")]:
             mesh = shape.find("geometry/mesh")
@@ -272,22 +302,24 @@ def _urdf(
                 missing.append(name)
                 link.remove(shape)
             elif file.suffix.lower() not in MESHES:
-                unread.append(name)
+                of_other_format.append(name)
                 link.remove(shape)
             else:
                 mesh.set("filename", str(file.resolve()))
-    corrected = _correct_inertias(root)
-    own = root.find("mujoco")
-    own = ET.SubElement(root, "mujoco") if own is None else own
-    for compiler in own.findall("compiler"):
-        own.remove(compiler)
-    ET.SubElement(own, "compiler", URDF_COMPILER)
-    with mujoco_errors(path, "not valid URDF"):
-        spec = mujoco.MjSpec.from_string(ET.tostring(root, encoding="unicode"))
-    _add_mimic_joints(spec, root)
     hint = "were not found; --packages NAME=FOLDER says where package://NAME is"
-    notes = _left_out(missing, hint) + _left_out(unread, f"are none of {', '.join(MESHES)}")
-    return spec, notes + _drop_unreadable_meshes(spec) + corrected
+    notes = _left_out(missing, hint)
+    notes += _left_out(of_other_format, f"are none of {', '.join(MESHES)}")
+    return notes
+
+
+def _set_compiler(root: ET.Element) -> None:
+    """Give a URDF the options of URDF_COMPILER in place of its own."""
+    extension = root.find("mujoco")
+    if extension is None:
+        extension = ET.SubElement(root, "mujoco")
+    for compiler in extension.findall("compiler"):
+        extension.remove(compiler)
+    ET.SubElement(extension, "compiler", URDF_COMPILER)
 
 
 def _add_mimic_joints(spec: mujoco.MjSpec, root: ET.Element) -> None:
@@ -316,30 +348,36 @@ def _add_mimic_joints(spec: mujoco.MjSpec, root: ET.Element) -> None:
 
 
 def _left_out(names: list[str], why: str) -> list[str]:
-    return [f"{len(names)} mesh(es) {why}; left out: {abbreviate(names)}"] if names else []
+    """Return a note on meshes that are left out; nothing if there are none."""
+    if not names:
+        return []
+    return [f"{len(names)} mesh(es) {why}; left out: {abbreviate(names)}"]
 
 
 def _correct_inertias(root: ET.Element) -> list[str]:
-    """Replace impossible inertias, such as zeros, by those of a ball of the link's mass; return
-    notes.
+    """Replace impossible inertias, such as zeros, by those of a ball of the link's mass, and remove
+    those of links without mass; return notes.
+
+    A tensor with a number that is not finite stays as it is.
     """
     impossible = []
-    light = []
+    massless = []
     for link in root.iter("link"):
+        name = link.get("name", "")
         inertial = link.find("inertial")
         stated = None if inertial is None else inertial.find("mass")
         if inertial is None or stated is None:
-            light.append(link.get("name", ""))
+            massless.append(name)
             continue
         mass = _number(stated, "value")
         if mass <= 0:
             link.remove(inertial)
-            light.append(link.get("name", ""))
+            massless.append(name)
             continue
         inertia = inertial.find("inertia")
         if inertia is not None and _is_impossible(inertia):
             _set_ball(inertia, mass)
-            impossible.append(link.get("name", ""))
+            impossible.append(name)
     notes = []
     if impossible:
         notes.append(
@@ -347,9 +385,10 @@ def _correct_inertias(root: ET.Element) -> list[str]:
             f"{abbreviate(impossible)}"
         )
     moved = _moved_links(root)
-    light = [name for name in light if name in moved]
-    if light:
-        notes.append(f"links without mass behind a joint, taken as 1 mg: {abbreviate(light)}")
+    moved_massless = [name for name in massless if name in moved]
+    if moved_massless:  # MuJoCo gives them the least mass of URDF_COMPILER
+        links = abbreviate(moved_massless)
+        notes.append(f"links without mass behind a joint, taken as 1 mg: {links}")
     return notes
 
 
@@ -379,9 +418,10 @@ def _moved_links(root: ET.Element) -> set[str]:
     return moved
 
 
-def _number(element: ET.Element | None, name: str) -> float:
+def _number(element: ET.Element, name: str) -> float:
+    """Return a number of an element: 0 if it is missing, NaN if it is no number."""
     try:
-        return float(element.get(name, "0")) if element is not None else 0.0
+        return float(element.get(name, "0"))
     except ValueError:
         return float("nan")
 
@@ -422,15 +462,28 @@ def _named_mesh(spec: mujoco.MjSpec, message: str) -> mujoco.MjsMesh | None:
 
 
 def _resolve(name: str, path: Path, packages: dict[str, Path]) -> Path | None:
-    """Return the path of a mesh, or None."""
-    kind, _, rest = name.rpartition("://")
-    if kind not in ("package", "model"):
-        places = [path.parent / rest]
-    else:
-        package, _, inner = rest.partition("/")
-        above = path.resolve().parents
-        places = [packages[package] / inner] if package in packages else []
-        places += [place / inner for place in above if place.name == package]
-        places += [place / rest for place in above]
-        places += [place / inner for place in above if (place / "package.xml").is_file()]
-    return next((place for place in places if place.is_file()), None)
+    """Return the file of a mesh that a URDF at `path` names; None if there is none.
+
+    package://NAME/FILE is looked for in the folder that the user gave, then around the URDF.
+    """
+    scheme, _, rest = name.rpartition("://")
+    places = [path.parent / rest]
+    if scheme in ("package", "model"):
+        places = _places_in_package(rest, path, packages)
+    for place in places:
+        if place.is_file():
+            return place
+    return None
+
+
+def _places_in_package(name: str, path: Path, packages: dict[str, Path]) -> list[Path]:
+    """Return where PACKAGE/FILE may be, the most likely place first."""
+    package, _, file = name.partition("/")
+    above = path.resolve().parents
+    places = []
+    if package in packages:
+        places.append(packages[package] / file)
+    places += [folder / file for folder in above if folder.name == package]
+    places += [folder / name for folder in above]
+    places += [folder / file for folder in above if (folder / "package.xml").is_file()]
+    return places

@@ -199,10 +199,12 @@ class _Problem:
         """
         price = PRIOR_RAD / ERROR_SCALE_RAD
         single = price * np.eye(self.n)
-        of_mean = price * (1 - SHARED_PRIOR_RATIO) / self.n
+        mean_of_joints = np.full((self.n, self.n), price * (1 - SHARED_PRIOR_RATIO) / self.n)
         prior = np.zeros((self.low.size, self.low.size))
         for i, field in enumerate(FIELDS):
-            block = single - of_mean if field in SHARED_FIELDS else single
+            block = single
+            if field in SHARED_FIELDS:
+                block = single - mean_of_joints
             if field == "kp":
                 block = LARGE_KP_LOG_CHANGE * block
             here = np.arange(self.n) * len(FIELDS) + i  # of this field in x, joint by joint

@@ -6,7 +6,7 @@ delay, then what validation motions accept: terms of the servo model (sim/servo.
 links. `identify` goes this way:
 
 1. Fit the classic fields, every joint by itself and then all together where that helps
-(steps/classic.py).
+   (steps/classic.py).
 2. Propose one step after the other: terms (steps/servo_term.py), links (steps/link_masses.py). Each
    is fitted to the same recordings; motions that were not fitted accept or reject it (`Judge`).
 3. Estimate standard errors (standard_errors.py), and fit the table under the tips
@@ -21,8 +21,10 @@ for all recordings.
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from collections.abc import Sequence as ListOf
 from dataclasses import dataclass, replace
+from functools import partial
 
 from gaponet.base.progress import Progress, no_progress
 from gaponet.data.sequence import Sequence
@@ -147,17 +149,20 @@ def _fit_positions(
     progress: Progress,
 ) -> Identified:
     """Fit to positions."""
-    # Stops that nobody confirmed are taken back in the end.
+    # Stops that nobody confirmed are taken back in the end, by `_fitted`.
     robot = with_stops(given, recordings.fitted)
     heights = tip_heights(recordings.fitted, robot)
     contact = contact_height(robot, heights)
-    fits = _fits(recordings, robot, given, options, progress, contact)
+    makers = _makers_of_steps(options)
+    fits = _fits(recordings, robot, given, options, progress, contact, steps=len(makers))
     classic = fit_classic(fits, joints_alone=options.joints_alone)
-    steps = _steps(fits, options)
+    steps = [make(fits) for make in makers]
     state, comparisons, untried = with_steps(steps, fits, classic)
     errors = _standard_errors(state)
     robots = _robots(fits, state)
-    without_table = robot if state.chosen == "given" else robots[-1]
+    without_table = robots[-1]  # of the last set of recordings, as all that is returned
+    if state.chosen == "given":
+        without_table = robot  # which has the stops, unlike robots[-1]
     table = None
     if options.table and robot.scene.tips:
         windows = low_windows(recordings.fitted, heights, contact)
@@ -170,17 +175,17 @@ def _fit_positions(
     warnings += far_from_servo_type(fitted)
     warnings += errors.sentences
     fits.progress.show("validation motions, with the fitted robot and from recorded torque")
-    first_values = [joints.bounds.first for joints in fits.joints]
+    given_values = [joints.bounds.first for joints in fits.joints]
     return Identified(
         robot=fitted,
-        before=float(fits.judge.errors(first_values).mean()),
+        before=float(fits.judge.errors(given_values).mean()),
         after=float(fits.judge.errors(state.values, state.links).mean()),
         chosen=state.chosen,
         warnings=tuple(warnings),
         std=errors.std,
         comparisons=comparisons,
         table_fit=table,
-        by_joint=_errors_by_joint(fits, first_values, state),
+        by_joint=_errors_by_joint(fits, given_values, state),
         covariance=errors.covariance,
         undetermined=errors.undetermined,
         held_out=tuple(_held_out(recordings, fitted, robots)),
@@ -197,35 +202,40 @@ def _fits(
     options: IdentifyOptions,
     progress: Progress,
     contact: float,
+    *,
+    steps: int,
 ) -> Fits:
-    """Return the fits of all sets, and their judge; `contact` is the height under which a tip may
-    touch, m.
+    """Return the fits of all sets, and their judge.
+
+    Args:
+        robot: Start of the fits: `given` with the stops that recordings show.
+        contact: Height under which a tip may touch, m.
+        steps: Number of steps after the classic fit, among which the time is divided.
     """
     sets = recordings.fitted_sets
-    steps = len(options.terms or ()) + options.masses
     shown = SearchProgress(options.seconds, steps, len(sets), progress)
     joints = []
-    for train in sets:
-        windows = cut(train, options.windows)
+    for recordings_of_set in sets:
+        windows = cut(recordings_of_set, options.windows)
         rollouts = JointRollouts(windows, robot, contact, options.nthread)
-        joints.append(JointFit(rollouts, robot, Bounds(robot, train)))
+        joints.append(JointFit(rollouts, robot, Bounds(robot, recordings_of_set)))
     fitted_windows = joints[0].rollouts.parts
     judging = [split.held_out or fitted_windows for split in recordings.splits]
     judge = Judge(judging, robot, contact, options.nthread)
     return Fits(sets, given, joints, judge, shown, options.nthread)
 
 
-def _steps(fits: Fits, options: IdentifyOptions) -> list[Step]:
-    """Return the steps after the classic fit, in their order."""
-    steps: list[Step] = []
+def _makers_of_steps(options: IdentifyOptions) -> list[Callable[[Fits], Step]]:
+    """Return what makes the steps after the classic fit, in their order."""
+    makers: list[Callable[[Fits], Step]] = []
     for term in options.terms or NO_TERMS:
         if term == "backlash":
-            steps.append(Backlash(fits))
+            makers.append(Backlash)
         else:
-            steps.append(ServoTerm(term, fits))
+            makers.append(partial(ServoTerm, term))
     if options.masses:
-        steps.append(LinkMasses(fits))
-    return steps
+        makers.append(LinkMasses)
+    return makers
 
 
 def with_steps(
@@ -395,13 +405,13 @@ def _held_out(
 
 def _errors_by_joint(
     fits: Fits,
-    first_values: list[Values],
+    given_values: list[Values],
     state: FitState,
 ) -> dict[str, tuple[float, float]]:
     """Return joint → mean |error| on motions that judge, of the given robot and of the fitted one,
     rad.
     """
-    before = fits.judge.errors_by_joint(first_values).tolist()
+    before = fits.judge.errors_by_joint(given_values).tolist()
     after = fits.judge.errors_by_joint(state.values, state.links).tolist()
     return {joint: (before[i], after[i]) for i, joint in enumerate(fits.given.operated)}
 

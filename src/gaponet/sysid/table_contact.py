@@ -266,9 +266,8 @@ class _TableProgress:
         self._report = report
         self._rows = rows
         self._iterations = 0  # of the present start
-        self._least_cost = (
-            np.inf
-        )  # of the starts before, after COMPARED_AFTER_ITERATIONS iterations
+        # Of the starts before, after COMPARED_AFTER_ITERATIONS iterations.
+        self._least_cost = np.inf
 
     def begin_start(self) -> None:
         """Begin with the next start."""

@@ -52,11 +52,11 @@ class _Rows(NamedTuple):
     """Filtered rows of a recording, operated joints."""
 
     torque: Array  # N·m or A, for each of DELAYS_S, (delays, rows, n)
-    required: Array  # by inverse dynamics without the fitted fields, N·m, (rows, n)
-    acceleration: Array
-    velocity: Array
-    sign: Array
-    moving: Array  # bool
+    required: Array  # by inverse dynamics without the fitted fields, (rows, n) N·m
+    acceleration: Array  # (rows, n) rad/s²
+    velocity: Array  # (rows, n) rad/s
+    sign: Array  # of the velocity, smoothed, (rows, n)
+    moving: Array  # whether the joint moves, (rows, n) bool
 
 
 @dataclass(frozen=True)

@@ -2,10 +2,13 @@
 
 robot.xml has no servos.
 
-mjlab:      EntityArticulationInfoCfg(actuators=mjlab_actuators(FOLDER))
-Isaac Lab:  ArticulationCfg(actuators=isaaclab_actuators(FOLDER), …)
-Newton:     builder.add_actuator(newton.actuators.DriveNeuralMLP, index=…, pos_index=…,
-model_path=FOLDER/JOINT.onnx)
+    # mjlab
+    EntityArticulationInfoCfg(actuators=mjlab_actuators(FOLDER))
+    # Isaac Lab
+    ArticulationCfg(actuators=isaaclab_actuators(FOLDER), …)
+    # Newton, joint by joint
+    drive = newton.actuators.DriveNeuralMLP
+    builder.add_actuator(drive, index=…, pos_index=…, model_path=FOLDER/JOINT.onnx)
 
 Targets are in rad. Each network is evaluated once per physics step; facts.json has its length.
 """

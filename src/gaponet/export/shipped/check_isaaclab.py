@@ -2,10 +2,12 @@
 
 A few worlds run on Newton's MuJoCo-Warp. The USD is made by mujoco-usd-converter.
 
-python check.py                            # robot_cfg.py: Isaac Lab's own classes, its native
-actuators python check.py action                     # the action term of gaponet_action.py; its
-native actuators are off python check.py randomization.json ROW     # the action term, with a unit
-of gaponet export ROBOT --to randomization
+    python check.py                         # robot_cfg.py: Isaac Lab's own classes
+    python check.py action                  # the action term of gaponet_action.py
+    python check.py randomization.json ROW  # the action term, with a unit of the file
+
+Isaac Lab's native actuators play its own classes; they are off with the action term.
+`gaponet export ROBOT --to randomization` writes the file; a unit is a row of it.
 """
 
 import sys

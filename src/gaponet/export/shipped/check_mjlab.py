@@ -1,9 +1,9 @@
 """Play the motions of check.npz in a few worlds of mjlab, and print the error beside gaponet's.
 
-python check.py
+    python check.py
+    python check.py randomization.json ROW  # the same with a unit of the file
 
-python check.py randomization.json ROW     # the same with a unit of gaponet export ROBOT --to
-randomization
+`gaponet export ROBOT --to randomization` writes the file; a unit is a row of it.
 
 In an export of actuator networks mjlab's learned actuators play them.
 """

@@ -2,18 +2,23 @@
 
 This file is copied into exports; it needs torch, not gaponet.
 
-gaponet export RUN --to torch --out FOLDER     # FOLDER: gaponet_action.py (this file), delta.pt2,
-facts.json, … gaponet export ROBOT --to mjlab --out FOLDER   # the identified servos without a
-network (and --to isaaclab)
+    gaponet export RUN --to torch --out FOLDER       # a network, with the servos of its simulator
+    gaponet export ROBOT --to mjlab --out FOLDER     # identified servos without a network
+    gaponet export ROBOT --to isaaclab --out FOLDER  # the same for Isaac Lab
 
-mjlab:      cfg.scene.entities["robot"] = mjlab_entity(FOLDER)
-            cfg.sim.mujoco, cfg.decimation = mjlab_options(FOLDER)
-            cfg.events |= mjlab_events(FOLDER)
-            and of a run, for its network:
-            cfg.actions["joint_pos"] = mjlab_action(FOLDER, entity_name="robot",
-            actuator_names=(".*",))
-Isaac Lab:  cfg.scene.robot.actuators = isaaclab_actuators(FOLDER)
-            cfg.actions.joint_pos = isaaclab_action(FOLDER, asset_name="robot", joint_names=[".*"])
+FOLDER then holds this file, facts.json and, of a run, delta.pt2. In mjlab:
+
+    cfg.scene.entities["robot"] = mjlab_entity(FOLDER)
+    cfg.sim.mujoco, cfg.decimation = mjlab_options(FOLDER)
+    cfg.events |= mjlab_events(FOLDER)
+    # and of a run, for its network:
+    joints = {"entity_name": "robot", "actuator_names": (".*",)}
+    cfg.actions["joint_pos"] = mjlab_action(FOLDER, **joints)
+
+In Isaac Lab:
+
+    cfg.scene.robot.actuators = isaaclab_actuators(FOLDER)
+    cfg.actions.joint_pos = isaaclab_action(FOLDER, asset_name="robot", joint_names=[".*"])
 
 Both action terms call process_actions once per control period. It replaces the targets of the
 policy by targets that make the simulator move like the robot. Options are those of

@@ -1,9 +1,10 @@
-"""Make two USDs of robot.xml by mujoco-usd-converter: python make_usd.py
+"""Make two USDs of robot.xml by mujoco-usd-converter.
 
-usd/         The robot without servos, for a scene that configures actuators (robot_cfg.py, or the
-action term). usd_servos/  The same with each servo as a NewtonActuator prim, for programs that read
-these: Newton, and Isaac Lab for
-             joints without a configuration.
+    python make_usd.py
+
+usd/ holds the robot without servos, for a scene that configures actuators (robot_cfg.py, or the
+action term). In usd_servos/ each servo is a NewtonActuator prim too, for programs that read these:
+Newton, and Isaac Lab for joints without a configuration.
 """
 
 import json

@@ -2,8 +2,9 @@
 
 This file is copied into exports; it needs torch, not gaponet.
 
-EntityArticulationInfoCfg(actuators=(mjlab_servos(FOLDER),)), and mjlab_events(FOLDER) of
-gaponet_action.py
+    EntityArticulationInfoCfg(actuators=(mjlab_servos(FOLDER),))
+
+It also needs the events of mjlab_events(FOLDER) of gaponet_action.py.
 """
 
 from __future__ import annotations

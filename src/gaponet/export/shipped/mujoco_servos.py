@@ -371,7 +371,8 @@ class Check:
     def report_motions(self, engine: str, paths: list[Any], form: str = "plain") -> None:
         """Print the same for motions played one by one.
 
-        paths: positions after each period, (T, n) rad each.
+        Args:
+            paths: Positions after each period, (T, n) rad each.
         """
         columns = [self.names.index(name) for name in self.facts["corrected"]]
         pairs = zip(paths, self.motions, strict=True)

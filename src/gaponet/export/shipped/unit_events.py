@@ -2,9 +2,11 @@
 
 This file is copied into exports; it needs torch, not gaponet. A unit is a row of the file.
 
-mjlab:      EventTermCfg(func=mjlab_units(FILE), mode="reset")
-Isaac Lab:  EventTermCfg(func=apply_units, mode="reset", params={"asset_cfg":
-SceneEntityCfg("robot"), "file": FILE})
+    # mjlab
+    EventTermCfg(func=mjlab_units(FILE), mode="reset")
+    # Isaac Lab
+    params = {"asset_cfg": SceneEntityCfg("robot"), "file": FILE}
+    EventTermCfg(func=apply_units, mode="reset", params=params)
 
 FILE is the path of randomization.json. Mode "reset" draws a unit for each episode, "startup" one
 for each world.
@@ -14,7 +16,7 @@ from __future__ import annotations
 
 import inspect
 import json
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -69,12 +71,17 @@ def draw_units(
     return ids, joints, {field: x[row].to(env.device) for field, x in units.items()}
 
 
-def columns_of(joints: Iterable[str], names: Iterable[str], what: str) -> list[int]:
-    """Return the places of joints among names; a joint that is missing is an error."""
+def require_joints(joints: Iterable[str], names: Collection[str], what: str) -> None:
+    """Raise ValueError if a joint is not among names; `what` says whose names they are."""
     for joint in joints:
         if joint not in names:
             raise ValueError(f"randomization.json has joint '{joint}'; {what}: {', '.join(names)}")
-    return [list(names).index(name) for name in joints]
+
+
+def columns_of(joints: Iterable[str], names: Collection[str], what: str) -> list[int]:
+    """Return the places of joints among names; errors as of `require_joints`."""
+    require_joints(joints, names, what)
+    return [list(names).index(joint) for joint in joints]
 
 
 # ---- mjlab
@@ -109,23 +116,25 @@ def mjlab_units(file: str | Path, term: str = "joint_pos", rows: Any = None) -> 
             identified[0].set_units(env.sim.model, ids, joints, units)
             return
         joints = [f"{action.cfg.entity_name}/{name}" for name in joints]
-        servos, dofs = torch.tensor(_addresses(env.sim.mj_model, joints), device=env.device)
-        write_model(env.sim.model, ids, dofs, servos, units)
+        servos, dofs = _addresses(env.sim.mj_model, joints)
+        servo = torch.tensor(servos, device=env.device)
+        dof = torch.tensor(dofs, device=env.device)
+        write_model(env.sim.model, ids, dof, servo, units)
 
     return use_units
 
 
-def _addresses(model: Any, joints: list[str]) -> list[list[int]]:
+def _addresses(model: Any, joints: list[str]) -> tuple[list[int], list[int]]:
     """Return the numbers of the joints' position servos, and of their degrees of freedom."""
-    driven = {}
+    driven = {}  # joint → number of its position servo
     for servo, joint in enumerate(model.actuator_trnid[:, 0]):
         kind = model.actuator_trntype[servo], model.actuator_biastype[servo]
         if kind == (0, 1):  # of a joint, with an affine bias
             driven[model.joint(joint).name] = servo
-    columns_of(joints, driven, "joints with position servos")
+    require_joints(joints, driven, "joints with position servos")
     servos = [driven[name] for name in joints]
     dofs = [model.joint(name).dofadr[0] for name in joints]
-    return [servos, dofs]
+    return servos, dofs
 
 
 def write_model(model: Any, env_ids: Tensor, dof: Tensor, servo: Tensor, units: Units) -> None:
@@ -135,8 +144,10 @@ def write_model(model: Any, env_ids: Tensor, dof: Tensor, servo: Tensor, units: 
     limit = units["effort_limit"]
     model.dof_armature[at, dof] = units["armature"]
     model.dof_frictionloss[at, dof] = units["frictionloss"]
-    damping = model.dof_damping  # MuJoCo's versions differ in whether it has powers of the speed
-    damping[(at, dof, 0) if damping.ndim == 3 else (at, dof)] = units["damping"]
+    if model.dof_damping.ndim == 3:  # of newer MuJoCo a polynomial of the speed
+        model.dof_damping[at, dof, 0] = units["damping"]
+    else:
+        model.dof_damping[at, dof] = units["damping"]
     model.actuator_gainprm[at, servo, 0] = kp
     model.actuator_biasprm[at, servo, 0] = kp * units["offset"]
     model.actuator_biasprm[at, servo, 1] = -kp
@@ -144,13 +155,13 @@ def write_model(model: Any, env_ids: Tensor, dof: Tensor, servo: Tensor, units: 
 
 
 def write_links(sim: Any, env_ids: Tensor, bodies: list[str], links: Tensor) -> None:
-    """Write masses, centres of mass and inertias to a model of mjlab, (worlds, bodies, 11)."""
+    """Write links to a model of mjlab, (worlds, bodies, 11): mass, centre of mass, principal
+    inertias and their orientation.
+    """
     model = sim.model
     parents = sim.mj_model.body_parentid.tolist()
-    at = (
-        env_ids[:, None],
-        torch.tensor([sim.mj_model.body(name).id for name in bodies], device=links.device),
-    )
+    numbers = [sim.mj_model.body(name).id for name in bodies]
+    at = (env_ids[:, None], torch.tensor(numbers, device=links.device))
     model.body_mass[at] = links[..., 0]
     model.body_ipos[at] = links[..., 1:4]
     model.body_inertia[at] = links[..., 4:7]
@@ -172,9 +183,9 @@ def apply_units(
     term: str | None = "joint_pos",
     rows: Any = None,
 ) -> None:
-    """Event term of Isaac Lab 2.3 and 3.
+    """Give worlds units: the function of an event term for Isaac Lab 2.3 and 3.
 
-    Of the servo model units have torque-speed lines; kd stays.
+    Units are those without the servo model, of which only torque-speed lines are left. kd stays.
 
     Args:
         asset_cfg: SceneEntityCfg of the robot. All joints of the file are set.
@@ -190,7 +201,7 @@ def apply_units(
     ids, joints, units = draw_units(file, "plain_units", env, env_ids, rows)
     columns = columns_of(joints, robot.joint_names, "joints of the articulation")
     groups = _actuator_groups(robot)
-    columns_of(
+    require_joints(
         joints, groups, "joints with PD actuators (set cfg.sim.use_newton_actuators = False)"
     )
     if "no_load_speed" in units:
@@ -205,17 +216,15 @@ def apply_units(
             )
         action.set_units(ids, joints, units)
     _write(robot, "armature", columns, ids, units["armature"])
-    # PhysX, where rest ≥ motion
-    both = any(name.startswith("write_joint_dynamic_friction") for name in dir(robot))
-    friction = units["frictionloss"], units["frictionloss"] if both else None, units["damping"]
-    _write(robot, "friction_coefficient", columns, ids, *friction)
-    # Simulations have gains of implicit actuators only.
+    _write_friction(robot, columns, ids, units)
+    # The simulation itself has gains and limits of implicit actuators only.
     implicit = [i for i, joint in enumerate(joints) if _is_implicit(groups[joint])]
+    implicit_columns = [columns[i] for i in implicit]
     for what, field in (("stiffness", "kp"), ("effort_limit", "effort_limit")):
         for i, joint in enumerate(joints):
             _set_actuator(groups[joint], what, joint, ids, units[field][:, i])
         if implicit:
-            _write(robot, what, [columns[i] for i in implicit], ids, units[field][:, implicit])
+            _write(robot, what, implicit_columns, ids, units[field][:, implicit])
 
 
 def _actuator_groups(robot: Any) -> dict[str, Any]:
@@ -230,6 +239,7 @@ def _actuator_groups(robot: Any) -> dict[str, Any]:
 
 
 def _is_implicit(group: Any) -> bool:
+    """Return True for actuators that the simulation computes, not Isaac Lab."""
     return bool(getattr(group, "is_implicit_model", False))
 
 
@@ -242,18 +252,32 @@ def _set_actuator(group: Any, what: str, joint: str, ids: Tensor, values: Tensor
     getattr(own, "torch", own)[ids, column] = values
 
 
+def _write_friction(robot: Any, columns: list[int], ids: Tensor, units: Units) -> None:
+    """Write static, dynamic and viscous friction, which is the damping of joints."""
+    friction = units["frictionloss"]
+    dynamic: Tensor | None = None
+    if any(name.startswith("write_joint_dynamic_friction") for name in dir(robot)):
+        dynamic = friction  # of PhysX, where it is at most the static one
+    _write(robot, "friction_coefficient", columns, ids, friction, dynamic, units["damping"])
+
+
 def _write(robot: Any, what: str, columns: list[int], ids: Tensor, *values: Tensor | None) -> None:
-    """Call a writer of Isaac Lab 3 or 2; its first parameters are values, (worlds, joints)."""
-    names = f"write_joint_{what}_to_sim_index", f"write_joint_{what}_to_sim"
-    write = getattr(robot, names[0], getattr(robot, names[1], None))
-    places = (
-        []
-        if write is None
-        else [name for name in inspect.signature(write).parameters if name[-4:] != "_ids"]
-    )
-    if write is None or len(places) < len(values):
-        raise ValueError(f"{names[1]} is missing or lacks parameters: take Isaac Lab 2.3 or 3")
-    write(**dict(zip(places, values, strict=False)), joint_ids=columns, env_ids=ids)
+    """Call the writer of Isaac Lab 3 or 2 for `what`, such as "armature".
+
+    Args:
+        columns: Numbers of the joints in the articulation.
+        ids: Worlds.
+        values: For the writer's first parameters, (worlds, joints) each; None for their default.
+    """
+    name = f"write_joint_{what}_to_sim"
+    write = getattr(robot, f"{name}_index", getattr(robot, name, None))  # of 3, else of 2
+    parameters: list[str] = []
+    if write is not None:
+        parameters = list(inspect.signature(write).parameters)
+    for_values = [parameter for parameter in parameters if not parameter.endswith("_ids")]
+    if write is None or len(for_values) < len(values):
+        raise ValueError(f"{name} is missing or lacks parameters: take Isaac Lab 2.3 or 3")
+    write(**dict(zip(for_values, values, strict=False)), joint_ids=columns, env_ids=ids)
 
 
 def _speed_lines(

@@ -37,6 +37,7 @@ MIN_RELATIVE_INFORMATION = 1e-6  # of a parameter; less counts as none
 BOUND_QUANTILE = 0.9  # of all samples
 # Fewer recordings are divided into more clusters.
 MIN_RECORDINGS_AS_CLUSTERS = 6
+WITHOUT_PLAY = slice(-1)  # of the Q numbers of an `Evidence`, the last of which is play
 
 
 @dataclass(frozen=True)
@@ -238,27 +239,30 @@ def estimate_uncertainty(
     is_validated = bool(judges or held_out)
     joints = {}
     for i, joint in enumerate(robot.operated):
-        from_rows = step.covariance[i, :-1, :-1]
+        from_rows = step.covariance[i, WITHOUT_PLAY, WITHOUT_PLAY]
+        information = step.information[i, WITHOUT_PLAY, WITHOUT_PLAY]
         covariance = _covariance(joint, fields, values[joint], from_rows, covariances, before)
-        today = JointUncertainty(
+        uncertainty = JointUncertainty(
             values=_nested(values[joint]),
             covariance=_nested(covariance),
             gauss_newton_step=_nested(step.change[i]),
             gauss_newton_covariance=_nested(step.covariance[i]),
             overdispersion=_nested(overdispersion[i]),
-            parameter_rms=_predicted_rms(covariance, step.information[i, :-1, :-1], seen.rows[i]),
-            residual_rms=float(np.sqrt(np.mean(np.concatenate(errors[joint]) ** 2))),
+            parameter_rms=_predicted_rms(covariance, information, seen.rows[i]),
+            residual_rms=_root_mean_square(errors[joint]),
             residual_p90=_error_bound(errors[joint]),
             repeatability=float(repeatability[i]),
         )
-        joints[joint] = today
         if before:
             old = before.joints[joint]
-            joints[joint] = _no_better(today, old, errors_are_of_fit=not is_validated)
-    sources = before.sources if before else ()
+            uncertainty = _no_better(uncertainty, old, errors_are_of_fit=not is_validated)
+        joints[joint] = uncertainty
+    # Only `adapt` gives neither motions that judge nor covariances of its own.
     made_by = "identify" if judges or covariances else "adapt"
-    source = _provenance(sequences, joints, made_by)
-    return ParameterUncertainty(fields, joints, (*sources, source), clusters, is_validated)
+    sources = [_provenance(sequences, joints, made_by)]
+    if before:
+        sources = [*before.sources, *sources]
+    return ParameterUncertainty(fields, joints, tuple(sources), clusters, is_validated)
 
 
 class _GaussNewtonStep(NamedTuple):
@@ -304,7 +308,7 @@ def _no_better(
     *,
     errors_are_of_fit: bool,
 ) -> JointUncertainty:
-    """Return a joint's uncertainty with repetitions that differ no less than before.
+    """Return a joint's uncertainty of today with repetitions that differ no less than before.
 
     Errors of recordings that were fitted are too small, so they are no less than those of motions
     that were not.
@@ -422,13 +426,13 @@ def _errors_by_joint(folds: ListOf[HeldOut], nthread: int) -> dict[str, list[Arr
             for joint, i in zip(robot.operated, robot.operated_index, strict=True):
                 if joint not in s.meta.unrecorded:
                     errors.setdefault(joint, []).append(error[:, i])
-    worst = max(errors.values(), key=_mean_square, default=[np.zeros(1)])
+    worst = max(errors.values(), key=_root_mean_square, default=[np.zeros(1)])
     return {joint: errors.get(joint, worst) for joint in robot.operated}
 
 
-def _mean_square(errors: ListOf[Array]) -> float:
-    """Return the mean square of all samples, rad²."""
-    return float(np.square(np.concatenate(errors)).mean())
+def _root_mean_square(errors: ListOf[Array]) -> float:
+    """Return the root mean square of the samples of all arrays, rad."""
+    return float(np.sqrt(np.square(np.concatenate(errors)).mean()))
 
 
 def _error_bound(motions: ListOf[Array]) -> float:

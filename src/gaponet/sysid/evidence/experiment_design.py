@@ -80,9 +80,8 @@ class ExperimentDesign:
         """Return the covariance after recordings with this information, (…, n, P, P)."""
         size = np.sqrt(np.maximum(np.einsum("...ii->...i", normal), MIN_INFORMATION))
         scale = size[..., :, None] * size[..., None, :]
-        scaled = normal / scale + MIN_INFORMATION * np.eye(
-            normal.shape[-1]
-        )  # with a diagonal of one
+        least = MIN_INFORMATION * np.eye(normal.shape[-1])
+        scaled = normal / scale + least  # with a diagonal of one
         less_sure = scaled / np.sqrt(self.overdispersion)[:, None, :]
         added = less_sure @ np.linalg.solve(scaled, np.swapaxes(less_sure, -1, -2))
         added = size[..., :, None] * added * size[..., None, :]

@@ -174,12 +174,12 @@ class LinkFit:
             changes.append(torque_changes)
         _, qvel, qacc = np.concatenate(motions, axis=1)
         op = self.whole.rollouts.op
-        slopes = np.concatenate(changes, axis=1) / DIFFERENCE_STEP  # (10 L, rows, n) N·m
+        torque_slopes = np.concatenate(changes, axis=1) / DIFFERENCE_STEP  # (10 L, rows, n) N·m
         return _DynamicsRows(
             qvel=qvel[:, op],
             qacc=qacc[:, op],
             torque=np.concatenate(torques),
-            moved=slopes / self._first["kp"],
+            moved=torque_slopes / self._first["kp"],
         )
 
     def _information_beyond_servo(self, joint: int, rows: _DynamicsRows) -> Array:

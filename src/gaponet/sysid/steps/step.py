@@ -43,9 +43,9 @@ class FitState:
 
     Attributes:
         chosen: Name of the classic candidate that the judge chose.
-        values: Its values with the steps that were accepted, (n,) each.
-        base: Values from which the next step is fitted; those of the best fit where the given robot
-            was chosen.
+        values: Its values with the steps that were accepted, (n,) each; the judge compares them.
+        base: Values from which the next step is fitted: `values`, but where the given robot was
+            chosen those of the best fit.
         robots: Fits in the simulator of the whole robot; their prior is that of the joints' fits.
         together: Whether a fit of all joints together helps.
         links: Links, if they were fitted and accepted; nothing else.
@@ -73,8 +73,13 @@ class FitState:
 class Step(Protocol):
     """One thing that a simulator may lack.
 
-    A new one is a class here, a line in `_steps` of sysid/identify.py, and an option in
-    sysid/options.py. Each step may take one share of the time (`SearchProgress`).
+    A new one is a class in a file of this folder, a line in `_makers_of_steps` of
+    sysid/identify.py, and an option in sysid/options.py, which api/options.py passes on. A step
+    that fits something else than `values` and `links` also needs a place for it in `FitState`, and
+    in what the judge simulates (`Judge.errors`, `RobotRollouts.flat_errors`).
+
+    The steps share the time equally: `propose` may call `SearchProgress.begin_search` once for each
+    set of recordings, and no more.
     """
 
     name: str

@@ -52,20 +52,18 @@ MAX_OWN = 20.0  # of a joint's own friction, armature and damping, SI
 
 
 class TorqueOptions(NamedTuple):
-    """Options of a fit from torque: payload's place from torque, friction as well, and the prior
-    of the positions' fit around it, rad per large change.
-    """
+    """Options of a fit from torque."""
 
-    place: bool
-    friction: bool
-    prior: float
+    place: bool  # whether torque gives the payload's place
+    friction: bool  # whether it gives the joints' friction as well; only with the place
+    prior: float  # of the fit to positions around the values from torque, rad per large change
 
 
 OPTIONS = (
-    TorqueOptions(True, False, 2.0),
-    TorqueOptions(True, False, PRIOR_RAD),
-    TorqueOptions(True, True, 2.0),
-    TorqueOptions(False, False, PRIOR_RAD),
+    TorqueOptions(place=True, friction=False, prior=2.0),
+    TorqueOptions(place=True, friction=False, prior=PRIOR_RAD),
+    TorqueOptions(place=True, friction=True, prior=2.0),
+    TorqueOptions(place=False, friction=False, prior=PRIOR_RAD),
 )
 
 
@@ -84,8 +82,7 @@ class Gains(NamedTuple):
 
 
 def servo_gains(recordings: ListOf[Array], last: int = 0, late: int = 1) -> Gains:
-    """Estimate a servo's gains: torque = kp (command so many periods before − position) − kd
-    velocity.
+    """Estimate a servo's gains: torque = kp (earlier command − position) − kd velocity + constant.
 
     Rows are means of five. Noise of measured position and speed would lower the gains, so two-stage
     least squares take the commands of INSTRUMENTS periods as instruments (Janot, Vandanjon &
@@ -95,10 +92,10 @@ def servo_gains(recordings: ListOf[Array], last: int = 0, late: int = 1) -> Gain
         recordings: Command, position, velocity and torque of the joint, (4, T) each.
         last: Only so many rows at the end of each count, as their mean, by plain least squares; 0
             for all.
-        late: Periods.
+        late: How many periods earlier the command was given.
     """
-    sums = []
-    rows = []
+    sums = []  # of each recording, as `_two_stage_least_squares` takes them
+    rows = []  # columns x and the torque, (rows, 4) of each recording
     for recording in recordings:
         x, torque, z = _regression_rows(recording, late)
         if last:
