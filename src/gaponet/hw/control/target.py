@@ -324,6 +324,8 @@ class TargetGenerator:
         if isinstance(first, Fault):
             return first
         goal = self.start if first is None else first[self.context.joints]
+        if not np.isfinite(goal).all():
+            return Fault("target", "the first target is not a number any more")
         place = self.approach.step(goal)
         if isinstance(place, Fault):
             return place
