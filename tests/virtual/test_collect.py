@@ -131,7 +131,8 @@ from gaponet.robot.spec import load_robot
 from gaponet.virtual.fleet import load_fleet
 if __name__ == "__main__":
     # Four jobs: two are still being played when two are written.
-    gaponet.virtual.collect.TAKES_PER_JOB = (2, 2)
+    gaponet.virtual.collect.MIN_TAKES_PER_JOB = 2
+    gaponet.virtual.collect.MAX_TAKES_PER_JOB = 2
     robot = load_robot(sys.argv[1])
     motions = ("steps-elbow", "tour-all-0")
     recipe = Recipe("test", (0.0,), ("virtual-2",), motions, (), (50.0, 25.0), 2)

@@ -35,11 +35,8 @@ from gaponet.virtual.play import Job, library, play
 __all__ = ["CollectResult", "Recipe", "collect", "load_recipe"]
 
 COLLECT_FILE = "collect.json"  # fleet, seed and payloads of a collected dataset
-# Least and most; more lose more when killed, fewer spend more time in numpy.
-TAKES_PER_JOB = (
-    36,
-    144,
-)
+MIN_TAKES_PER_JOB = 36  # fewer spend more time in numpy
+MAX_TAKES_PER_JOB = 144  # more lose more when killed
 
 
 @dataclass(frozen=True)
@@ -102,7 +99,7 @@ def collect(
             "seed ≥ 0"
         )
     for unit in recipe.units:
-        fleet.unit(unit)
+        fleet.unit(unit)  # refuses an unknown one
     files = tuple(read_motion(file, robot) for file in recipe.files)
     wanted = takes(recipe, library(robot, seed, recipe, files).names(recipe.variants))
     with lock_folder(Path(out), KIND):
@@ -116,12 +113,12 @@ def collect(
         pair_dataset(dataset, robot, lock_idle=True)
         written = 0
         hours = 0.0
-        seconds = 0.0
+        recorded_s = 0.0
         for sequence, simulated in _play_jobs(jobs, nproc, executor):
             dataset.write_replay(dataset.append(sequence), simulated)
             written += 1
-            seconds += sequence.duration
-            hours = seconds / 3600
+            recorded_s += sequence.duration
+            hours = recorded_s / 3600
             note = f"{written} of {len(missing)}, {hours:.2f} h recorded"
             progress(written, len(missing), note)
     return CollectResult(
@@ -134,9 +131,14 @@ def collect(
 
 
 def fleet_name(dataset: Dataset) -> str:
-    """Return the name of the fleet that a dataset was collected from; hard for another dataset."""
+    """Return the name of the fleet that a dataset was collected from.
+
+    It is "hard" for a dataset that was not collected.
+    """
     path = dataset.path / COLLECT_FILE
-    return str(_read_source(path).get("fleet", "hard")) if path.is_file() else "hard"
+    if not path.is_file():
+        return "hard"
+    return str(_read_source(path).get("fleet", "hard"))
 
 
 def _read_source(path: Path) -> dict[str, Any]:
@@ -209,7 +211,7 @@ def _batches(missing: list[Take], nproc: int) -> Iterator[list[Take]]:
     groups: dict[tuple[float, str], list[Take]] = {}
     for take in missing:
         groups.setdefault((take.rate, take.motion), []).append(take)
-    size = min(max(len(missing) // (4 * nproc), TAKES_PER_JOB[0]), TAKES_PER_JOB[1])
+    size = min(max(len(missing) // (4 * nproc), MIN_TAKES_PER_JOB), MAX_TAKES_PER_JOB)
     part: list[Take] = []
     for (rate, _), group in sorted(groups.items(), key=lambda item: item[0][0]):
         if part and (part[0].rate != rate or len(part) + len(group) > size):

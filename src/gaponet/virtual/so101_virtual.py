@@ -87,7 +87,8 @@ class VirtualSO101:
         # The arm rests on a table while its torque is off.
         robot = robot.with_table(robot.scene.table or Table(height=0.0))
         self.robot = robot
-        self._frame = None if frame is None else round(frame / PERIOD)
+        # None: real time
+        self._steps_per_goal = None if frame is None else round(frame / PERIOD)
         self.live = LiveUnit(robot, physics, payload, period=PERIOD)
         self._order = robot.index(JOINTS)  # servo number − 1 → joint
         self.calibration = ArmCalibration(_as_calibrated(robot), robot)
@@ -109,12 +110,12 @@ class VirtualSO101:
         while time.monotonic() - began < seconds:
             due = start + self.live.steps * PERIOD
             wait = MAX_LAG_S
-            if self._frame is None:
+            if self._steps_per_goal is None:
                 wait = min(max(0.0, due - time.monotonic()), PERIOD)
             readable, _, _ = select.select([bus], [], [], wait)
             if readable:
                 os.write(bus, self.receive(os.read(bus, 4096)))
-            if self._frame is not None:
+            if self._steps_per_goal is not None:
                 continue
             now = time.monotonic()
             if now - due > MAX_LAG_S:
@@ -144,7 +145,14 @@ class VirtualSO101:
         return self._replies
 
     def _execute(self, servo: int, instruction: int, parameters: bytes) -> None:
-        """Do what a packet asks for, and append the replies."""
+        """Do what a packet asks for, and append the replies.
+
+        Args:
+            servo: Who is asked; BROADCAST in SYNC_READ and SYNC_WRITE.
+            instruction: One of drivers.feetech.
+            parameters: Of READ: address, size. Of WRITE: address, data. Of SYNC_READ: address,
+                size, servos. Of SYNC_WRITE: address, size, then number and data of each servo.
+        """
         if instruction == reg.PING:
             self._answer(servo, b"")
         elif instruction == reg.READ:
@@ -154,7 +162,7 @@ class VirtualSO101:
             receivers = range(1, len(JOINTS) + 1) if servo == reg.BROADCAST else (servo,)
             for receiver in receivers:
                 self._store(receiver, parameters[0], parameters[1:])
-            self._answer(servo, b"")
+            self._answer(servo, b"")  # nobody answers a broadcast
         elif instruction == reg.SYNC_READ:
             self._refresh()
             for receiver in parameters[2:]:
@@ -170,14 +178,17 @@ class VirtualSO101:
 
     def _play_frame(self) -> None:
         """Simulate the time that one goal position stands for, if time is not real."""
-        for _ in range(self._frame or 0):
+        for _ in range(self._steps_per_goal or 0):
             self.live.step()
 
     def _answer(self, servo: int, data: bytes) -> None:
         if not 1 <= servo <= len(JOINTS) or servo in self.silent:
             return
         reply = reg.packet(servo, self.status[servo - 1], data)
-        self._replies += reply[:-1] + bytes([reply[-1] ^ self.damaged])
+        if self.damaged:
+            wrong_checksum = reply[-1] ^ 1
+            reply = reply[:-1] + bytes([wrong_checksum])
+        self._replies += reply
 
     def _bytes(self, servo: int, address: int, size: int) -> bytes:
         if not 1 <= servo <= len(JOINTS):

@@ -244,6 +244,16 @@ def test_times_that_no_run_can_have_are_refused(field, value):
         ControlConfig(**{field: value})
 
 
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("wrong", [np.nan, np.inf])
+def test_a_first_target_that_ceases_to_be_a_number_is_refused_without_a_warning(arm, wrong):
+    targets = iter([0.3])
+
+    recording = control(NotedArm(arm)).run(lambda k, state: np.full(2, next(targets, wrong)))
+
+    assert recording.fault.kind == "target"
+
+
 def test_a_policy_that_gives_nan_leaves_the_robot_damped(arm):
     driver = NotedArm(arm)
     recording = control(driver).run(lambda k, state: np.full(2, np.nan if k == 10 else 0.0))

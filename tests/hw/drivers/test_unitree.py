@@ -146,6 +146,15 @@ def heard(clock: RobotClock) -> list[dict]:
     return clock.robot.heard
 
 
+def test_a_robot_is_virtual_once_it_has_said_so(robot, clock):
+    driver = UnitreeDriver(robot)
+    before = driver.virtual
+
+    driver.connect()
+
+    assert [before, driver.virtual] == [False, True]
+
+
 def test_on_arm_sdk_the_torso_is_held_where_it_was_found_with_its_gains(robot, clock):
     torso = robot.index(["torso_joint"])[0]
     driver = connected(robot)

@@ -105,7 +105,8 @@ class Periods:
     Attributes:
         number: Of the present period.
         now: When it began, s.
-        due: When it should have begun, s: the period after the last one.
+        due: When the period after the last one should have begun, s. It is the present period,
+            unless periods were missed.
     """
 
     def __init__(self, clock: Clock, dt: float) -> None:
@@ -116,7 +117,7 @@ class Periods:
         self._clock = clock
         self._dt = dt
         self._start = 0.0  # of the first period, s
-        self._next = 0  # the period after the last one; `number` is the next one that is possible
+        self._due_number = 0  # of the period that is due; `number` skips those that were missed
         self._suspended_before = 0.0  # s
 
     def begin(self) -> None:
@@ -131,13 +132,13 @@ class Periods:
     def wait(self) -> float:
         """Wait for the present period; return how late it begins, s."""
         self.now = self._clock.wait_until(self._start + self.number * self._dt)
-        self.due = self._start + self._next * self._dt
+        self.due = self._start + self._due_number * self._dt
         return self.now - self.due
 
     def end(self) -> int:
         """End the present period; return the number of periods that were missed meanwhile."""
         passed = int((self._clock.now() - self._start) / self._dt) - self.number  # whole periods
-        self._next = self.number + 1
+        self._due_number = self.number + 1
         self.number += max(1, passed)
         return max(passed - 1, 0)
 

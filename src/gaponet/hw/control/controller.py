@@ -334,7 +334,7 @@ class Controller:
             self._fire(Trigger.READY, f"to the first target in {duration:.1f} s")
 
     def _send(self, state: State, policy: Policy) -> tuple[Array, Array] | None:
-        """Send this period's command.
+        """Send this period's command. If its phase is over, the next one gives the target.
 
         Return target and command of all joints, (n) rad; None if none was sent.
         """
@@ -346,12 +346,14 @@ class Controller:
             if isinstance(target, PhaseChange):
                 self._fire(*target)
                 continue
-            weight = self._targets.weight
-            sent = target if isinstance(target, Fault) else self.output.send(target, weight, state)
-            if not isinstance(sent, Fault):
-                return sent
-            self._fail(sent)
-            break
+            if isinstance(target, Fault):
+                self._fail(target)
+                return None
+            sent = self.output.send(target, self._targets.weight, state)
+            if isinstance(sent, Fault):
+                self._fail(sent)
+                return None
+            return sent
         return None
 
     def _damp(self) -> None:

@@ -132,31 +132,33 @@ class Output:
         """
         driver = self.context.driver
         joints = self.context.joints
-        at = qpos[joints]
+        found = qpos[joints]
         ranges = self.context.robot.qpos_range[joints]
         # Servos that know their own range cut goals beyond it.
         tolerance = MAX_BEYOND_RANGE_RAD if driver.qpos_range is None else MAX_START_DRIFT_RAD
         ends = ranges if driver.qpos_range is None else driver.qpos_range[joints]
         low = np.minimum(ranges, ends)[:, 0] - tolerance
         high = np.maximum(ranges, ends)[:, 1] + tolerance
-        beyond = np.maximum(low - at, at - high)
+        beyond = np.maximum(low - found, found - high)
         if beyond.max() > 0:
             i = int(beyond.argmax())
             return Fault(
                 "plan",
-                f"{driver.commanded[i]} was found at {at[i]:.2f} rad, beyond its range of "
+                f"{driver.commanded[i]} was found at {found[i]:.2f} rad, beyond its range of "
                 f"{low[i]:.2f} to {high[i]:.2f}; bring it there by hand, or calibrate",
             )
         self.limits = replace(
-            self.limits, low=np.minimum(self.limits.low, at), high=np.maximum(self.limits.high, at)
+            self.limits,
+            low=np.minimum(self.limits.low, found),
+            high=np.maximum(self.limits.high, found),
         )
         return None
 
     def begin(self, qpos: Array) -> None:
         """Take the measured position, (n) rad, as the command in force."""
-        at = qpos[self.context.joints]
-        self._request = Request(at)
-        self.ctrl = at
+        found = qpos[self.context.joints]
+        self._request = Request(found)
+        self.ctrl = found
 
     def expected(self) -> Array:
         """Return where the joints are asked to be, rad, as far as the robot is handed over."""
@@ -194,6 +196,8 @@ class Output:
         # Before the command, so that the watchdog guards the first one too.
         if self.watchdog and not self.watchdog.beat(weight):
             return Fault("stop", "the watchdog ended")
+        # The limits hold at the time of the last look at the clock: they are computed again if that
+        # was too long ago.
         last_look = -np.inf
         while (now := context.clock.now()) - last_look > MAX_SEND_DELAY_S:
             last_look = now
@@ -250,7 +254,8 @@ class Output:
         weight = left * (self.weight or 0.0)
         if self.watchdog and not self.watchdog.fired():
             self.watchdog.beat(weight)
-        self.context.driver.damp(weight, left * self._lower)
+        share = left if self._lower else 0.0
+        self.context.driver.damp(weight, share)
 
     def confirm(self) -> tuple[str, str]:
         """Return what the robot itself reports after damping, and the kind of fault if it does not

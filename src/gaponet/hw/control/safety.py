@@ -606,11 +606,12 @@ class StateMonitor:
         return np.asarray(moved / (state.time - self._last.time))
 
     def _checksum(self, now: float, state: State) -> Fault | None:
-        self._refused = [
-            *(r for r in self._refused if now - r[0] <= CHECKSUM_WINDOW_S),
-            (now, state.refused),
+        recent = [
+            (time, refused) for time, refused in self._refused if now - time <= CHECKSUM_WINDOW_S
         ]
-        count = state.refused - self._refused[0][1]
+        self._refused = [*recent, (now, state.refused)]
+        _, refused_before = self._refused[0]
+        count = state.refused - refused_before
         if count > self.config.refused:
             return Fault(
                 "checksum",

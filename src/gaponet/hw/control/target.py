@@ -89,22 +89,24 @@ class Readiness:
             self.since = now  # all else is well
             return None
         if isinstance(first, Fault):
-            # Senders of live targets wait while the robot plans.
-            is_planning = first.kind == "silence" and self.plan and not waits_too_long
-            return None if is_planning else first
+            # A sender of live targets waits while the robot plans, and may go on afterwards.
+            may_go_on = first.kind == "silence" and self.plan is not None
+            if may_go_on and not waits_too_long:
+                return None
+            return first
         if first is None or not np.isfinite(first[self.context.joints]).all():
             return Fault("target", "the motion has no first target, or it is not a number")
         return self._admitted(first, state, now)
 
     def _admitted(self, first: Array, state: State, now: float) -> Array | Fault | None:
         """Return the first target if the robot may go there from this state; None: wait."""
-        before = self.plan
+        plan_before = self.plan
         fault = self._update_plan(first, state, now) or self.output.admit(state.qpos)
         if fault:
             return fault
-        plan_is_new = before is None or self.plan is not before
-        if self.context.planner and plan_is_new:
-            return None  # planning took time: look at a fresh state
+        searched = plan_before is None or self.plan is not plan_before
+        if self.context.planner and searched:
+            return None  # the search goes on, or took time: look at a fresh state
         return first
 
     def _prepare(self, state: State) -> None:
@@ -181,7 +183,7 @@ class Approach:
 
     def step(self, goal: Array) -> Array | Fault:
         """Return the place in this period on the way to the first target, rad, or why the robot
-        may not be handed over.
+        may not be handed over. Go on by a period.
         """
         distance = np.abs(goal - self._start)
         is_far = bool(distance.max() >= FAR_RAD)
@@ -190,8 +192,10 @@ class Approach:
             return self._following.fault(int(distance.argmax()))
         place = _on_path(self.path, self._progress, self._start, goal, self._context.joints)
         self._hand_over(MAX_UNPROVEN_WEIGHT if unproven else 1.0)
-        # While it is handed over joints lag, each in its own way: a far target stands meanwhile.
-        if unproven or not (is_far and self._is_partly_handed_over()):
+        # While it is handed over joints lag, each in its own way: on a far way it stands meanwhile,
+        # unless the joints must move to show that they follow.
+        stands = is_far and not unproven and self._is_partly_handed_over()
+        if not stands:
             self._progress += self._context.dt
         return place
 
@@ -320,6 +324,8 @@ class TargetGenerator:
         if isinstance(first, Fault):
             return first
         goal = self.start if first is None else first[self.context.joints]
+        if not np.isfinite(goal).all():
+            return Fault("target", "the first target is not a number any more")
         place = self.approach.step(goal)
         if isinstance(place, Fault):
             return place
@@ -418,12 +424,18 @@ class TargetGenerator:
 
 
 def _on_path(path: Trajectory, passed: float, start: Array, goal: Array, joints: Array) -> Array:
-    """Return the place of the joints on a path after some s, with its ends moved to the true start
-    and goal, rad.
+    """Return the place of the joints on a path after `passed` s, rad, with its ends moved to the
+    true start and goal.
+
+    Args:
+        path: Of all joints, from about the start to about the goal.
+        passed: s since its beginning.
+        start, goal: Of `joints`, rad.
+        joints: Indices of the commanded joints.
     """
-    share = float(blend(np.array(passed / path.duration)))
-    first = path.points[0][joints]
-    last = path.points[-1][joints]
-    moved_ends: Array = (1 - share) * (start - first) + share * (goal - last)
-    place: Array = path.at(passed)[joints] + moved_ends
+    share = float(blend(np.array(passed / path.duration)))  # of the way, 0 to 1
+    shift_of_start = start - path.points[0][joints]
+    shift_of_goal = goal - path.points[-1][joints]
+    shift = (1 - share) * shift_of_start + share * shift_of_goal
+    place: Array = path.at(passed)[joints] + shift
     return place

@@ -113,7 +113,7 @@ class Watchdog:
             self.answer_time = time.monotonic()
         try:
             self._in.write(bytes([round(WEIGHT_STEPS * weight)]))
-        except BlockingIOError:
+        except BlockingIOError:  # the pipe is full: the watchdog hangs; `problem` says so
             return True
         except (BrokenPipeError, ValueError):
             return False

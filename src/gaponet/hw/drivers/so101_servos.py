@@ -56,8 +56,8 @@ class FoundServos:
     Attributes:
         arm: Their calibration.
         settings: Their gains and calibration.
-        registers: GAINS, LIMITS and voltage by name; one value of each servo.
-        goals: That they held, steps.
+        registers: GAINS, LIMITS and voltage by name; one value of each servo, in joint order.
+        goals: All goal positions that any of them held, steps.
         facts: Driver.facts.
     """
 
@@ -88,11 +88,11 @@ def find_servos(
         DriverError: A servo does not answer or is another one, or its calibration is not the given
             one.
     """
-    servos = (given or uncalibrated(robot)).servos
-    numbers = dict(zip(robot.joint_names, servos, strict=True))
+    servos = (given or uncalibrated(robot)).servos  # ids, in the robot's joint order
+    servo_of = dict(zip(robot.joint_names, servos, strict=True))
     settings_blocks = bus.sync_read(servos, reg.SETTINGS)
     running_blocks = bus.sync_read(servos, reg.RUNNING)
-    for joint, servo in numbers.items():
+    for joint, servo in servo_of.items():
         where = f"{port}: servo {servo} ({joint})"
         if servo not in settings_blocks or servo not in running_blocks:
             raise DriverError(f"{where} does not answer; check power and cable")
@@ -101,8 +101,9 @@ def find_servos(
     running = [running_blocks[servo] for servo in servos]
     registers = _registers(settings, running)
     stored = {}
-    for joint, servo in numbers.items():
+    for joint, servo in servo_of.items():
         row = {name: settings.stored[servo][name] for name in CALIBRATION}
+        # A servo does not store the direction of its joint, only the file does.
         stored[joint] = ServoRow(id=servo, drive_mode=0, **row)
     arm = resolve_calibration(given, stored, robot, port)
     goals = {reg.GOAL_POSITION.value_in(reg.RUNNING, block) for block in running}

@@ -5,8 +5,8 @@ echoed from the state, and mode_pr 0 for pitch/roll ankles are from Unitree's pu
 (h1_2_arm_sdk_dds_example.cpp, h1_2_low_level_example.py). Tested against a virtual robot and
 against programs on Unitree's IDL and DDS version only. Not checked, for want of a robot:
 
-- that `tick` counts milliseconds (measured when connecting; arrival times are used where it does
-not)
+- that `tick` counts milliseconds: it is measured when connecting, and arrival times are used where
+  it does not
 - how the robot behaves when commands cease
 - the sign and scale of tau_est
 - that slots without a motor stay zero, and that motorstate is 0 without an error
@@ -99,12 +99,16 @@ class UnitreeDriver:
         self.facts: dict[str, Any] = {}
         self.at_end: EndAction = "hand_over" if topic == "arm_sdk" else "damp"
         self.address = f"unitree dds domain {domain}"
-        self.virtual = False
         self._joints = joints
         self._at = robot.index(self.commanded)
         self._link = UnitreeLink(topic, domain, interface, sole, silent)
         self._states = StateReceiver(motor_numbers(robot))
         self._commands = CommandMessages(robot, self.commanded, topic == "arm_sdk")
+
+    @property
+    def virtual(self) -> bool:
+        """True if the robot says that it is our virtual one; False before it was found."""
+        return self._states.virtual
 
     @property
     def kp(self) -> Array:
@@ -132,7 +136,6 @@ class UnitreeDriver:
         require_h1_2(first.messages, link.interface)
         self._states.begin(source, first)
         self._commands.set_machine(self._states.machine)
-        self.virtual = self._states.virtual
         self.facts = {
             "mode_machine": self._states.machine,
             "topic": link.topic,

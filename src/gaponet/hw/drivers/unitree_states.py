@@ -172,15 +172,15 @@ class StateReceiver:
         self._source = None
 
     def read(self) -> State:
-        """Return the newest state with a right checksum.
+        """Take all messages that have come; return the newest state with a right checksum.
 
-        Its time is the robot's, mapped to ours (TickClock).
+        A fault in any of them stays in all later states. The time of a state is the robot's, mapped
+        to ours (TickClock). Without a new message the last state is returned again.
         """
         assert self._source is not None
         assert self._clock is not None
         assert self.newest is not None
         now = time.monotonic()
-        newest = None
         messages = self._source.receive()
         if self._source.second and self._fault is None:
             self._fault = Fault(
@@ -188,16 +188,18 @@ class StateReceiver:
                 f"a second robot publishes {STATES_TOPIC} and takes the same commands: "
                 f"{self._source.second}",
             )
+            # It counts also if no intact message has come.
             self.newest = replace(self.newest, fault=self._fault)
+        last_intact = None
         for data in messages:
             if is_intact(data):
-                newest = data
+                last_intact = data
                 self.received += 1
                 self._fault = self._fault or self.reported_fault(data)
             else:
                 self._refused += 1
-        if newest is not None:
-            self.newest = self._decode(newest, self._clock, now)
+        if last_intact is not None:
+            self.newest = self._decode(last_intact, self._clock, now)
         elif self._refused != self.newest.refused:
             self.newest = replace(self.newest, refused=self._refused)
         return self.newest
@@ -222,9 +224,9 @@ class StateReceiver:
         return None
 
     def _decode(self, data: Array, clock: TickClock, now: float) -> State:
+        """Return the state in a message that arrived at `now` s."""
         message = hg.LowState
         at = self._motors
-        measured = clock.time(_tick_in(data), now)
         self.virtual = int(message.view(data, "reserve")[0]) == VIRTUAL_MARK
         q = message.motors(data, "q")[at].astype(float)
         dq = message.motors(data, "dq")[at].astype(float)
@@ -238,7 +240,16 @@ class StateReceiver:
         valid = abs(np.linalg.norm(quaternion) - 1.0) < MAX_QUATERNION_ERROR
         upright = 1.0 - 2.0 * (x * x + y * y) if valid else np.nan
         tilt = float(np.arccos(np.clip(upright, -1.0, 1.0)))
-        return State(measured, q, dq, tau, temperature, self._refused, tilt, self._fault)
+        return State(
+            time=clock.time(_tick_in(data), now),
+            qpos=q,
+            qvel=dq,
+            tau=tau,
+            temperature=temperature,
+            refused=self._refused,
+            tilt=tilt,
+            fault=self._fault,
+        )
 
 
 def _tick_in(data: Array) -> int:
