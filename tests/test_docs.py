@@ -51,9 +51,9 @@ def widths(layers: tuple[int, ...]) -> str:
         ("reference/paper-network.md", f"m = {MODEL.num_probes} targets"),
         (
             "reference/paper-network.md",
-            f"Those at ±{MODEL.probe_small} rad read gains and friction",
+            f"Those at ±{MODEL.probe_small} rad show gains and friction",
         ),
-        ("reference/paper-network.md", f"those at ±{MODEL.probe_large} rad read inertia"),
+        ("reference/paper-network.md", f"those at ±{MODEL.probe_large} rad show inertia"),
         ("network.md", f"Δ_max = {MODEL.delta_max} rad"),
         ("network.md", f"{MODEL.observation_dim(10) - 1} for n = 10, H = {MODEL.history}, and"),
         ("reference/paper-network.md", f"own answers at {TRAIN.pretraining.sensor_states} states"),

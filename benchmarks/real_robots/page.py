@@ -44,13 +44,15 @@ COLUMNS = (
 STEM = "real"
 HEADING = """# Real robots
 
-This table is what `benchmarks/compare_methods.py` writes ([compare your method](../benchmark.md)):
-errors in mrad on public recordings of real robots, of motions that no method was fitted to. Each
-simulation starts at the recorded state and then receives only commands.
+`benchmarks/compare_methods.py` writes this table. It has errors in mrad (1 mrad is 0.057°) on public
+recordings of real robots, of motions that no method was fitted to. Each simulation starts at the
+recorded state and then receives only commands. [Compare your
+method](../benchmark.md#the-benchmark-of-real-robots) explains the questions and the methods.
 
-± is the standard error over independent motions; differences are paired, motion by motion. "Floor"
-is the difference between two recordings of one command. "Identified elsewhere" means on another
-session or unit."""
+± is the standard error over independent motions; differences are paired, motion by motion. "Of
+nominal" is the error divided by that of the nominal simulator, which is the robot as its maker's
+file describes it. "Floor" is the difference between two recordings of one command. "Identified
+elsewhere" means on another session or unit."""
 
 
 def result_table(rows: list[dict[str, Any]]) -> ResultTable:
