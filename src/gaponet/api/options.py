@@ -25,9 +25,9 @@ class IdentifyOptions:
     """Number of 8 s rollouts that are fitted, taken evenly from the training motions."""
     terms: tuple[Term, ...] | None = None
     """Terms of the servo model to try; each is accepted only if validation motions improve.
-    Default: stribeck and load, after limit if a joint reaches its stated torque limit; then
-    backlash where a gap makes the rollouts better at otherwise equal values; then temperature where
-    it varies at equal gains and payload."""
+    Default: limit if a joint reaches its stated torque limit; speed if it needs much of that torque
+    while it moves fast; stribeck and load; backlash where a gap makes the rollouts better at
+    otherwise equal values; temperature where it varies at equal gains and payload."""
     table: bool = True
     """Look for a table under the robot's tips ([[tip]] in robot.toml)."""
     threads: int = 0
