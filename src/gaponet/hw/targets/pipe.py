@@ -1,5 +1,5 @@
-"""Targets on standard input: one line of JSON per message (live.MessageFields), from a program at
-the other end.
+"""Targets on standard input: one line of JSON per message (message.MessageFields), from a program
+at the other end.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Targets and states over ZeroMQ: a ROUTER here, one DEALER that commands (targets.client).
 
-Messages are JSON: live.MessageFields.
+Messages are JSON: message.MessageFields.
 """
 
 from __future__ import annotations
