@@ -39,7 +39,9 @@ from gaponet.hw.control.watchdog import Watchdog
 from gaponet.hw.targets.policy import Policy, motion_policy
 from gaponet.robot.spec import RobotSpec
 
-# Control periods without a heartbeat after which the watchdog damps the robot.
+# Control periods without a heartbeat after which the watchdog damps the robot. More than three:
+# with the default of SafetyConfig.overrun, two heartbeats are so far apart if a period is only
+# just in time to send its command.
 WATCHDOG_PERIODS = 5.0
 
 

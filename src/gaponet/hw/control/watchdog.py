@@ -3,10 +3,10 @@
 In each period, from just before its first command on, the controller sends the watchdog a byte
 through a pipe: the weight of that command. The watchdog answers each byte, so that the controller
 notices a watchdog that hangs. The pipe closes when the controller's process ends, however it ends;
-if it hangs, no byte comes. Then the watchdog damps the robot, as after a fault that is not the
-robot's own, until the robot confirms it, for at most MAX_RETRY_S. Without any byte nothing was
-commanded, and the watchdog sends nothing. It holds the controller's lock as long as it lives, so
-that no other controller starts while it damps.
+if it hangs, no byte comes for WATCHDOG_PERIODS of controller.py. Then the watchdog damps the robot,
+as after a fault that is not the robot's own, until the robot confirms it, for at most MAX_RETRY_S.
+Without any byte nothing was commanded, and the watchdog sends nothing. It holds the controller's
+lock as long as it lives, so that no other controller starts while it damps.
 """
 
 from __future__ import annotations
