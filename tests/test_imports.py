@@ -45,8 +45,8 @@ MODULES = {
     ".".join(file.relative_to(PACKAGE.parent).with_suffix("").parts).removesuffix(".__init__"): file
     for file in PACKAGE.rglob("*.py")
 }
-# files in a folder; 16 in all others
-MOST = {"api": 19, "cli": 31, "data": 17, "export": 17, "robot": 18}
+# files in a folder; 16 in all others. Folders with a module for each command or format may grow.
+MOST = {"api": 19, "cli": 31, "data": 17, "export": 17, "formats": 20, "robot": 18}
 
 
 def rank(module: str) -> int:

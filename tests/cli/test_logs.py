@@ -190,7 +190,7 @@ def test_a_table_asks_for_its_units(arm, tmp_path, capsys):
     table.write_text(table_text(arm_columns()))
     assert import_arm(table, arm, tmp_path / "data") == 2
     assert (
-        "the table's time unit is not given; say it with --position-unit rad --time-unit s"
+        "the log's time unit is not given; say it with --position-unit rad --time-unit s"
         in capsys.readouterr().err
     )
 

@@ -335,8 +335,17 @@ def test_an_action_term_corrects_what_was_processed_in_the_present_state(place):
 
 def test_a_servos_law_in_torch_is_the_simulators(tmp_path):
     rng = np.random.default_rng(0)
-    values = (0.1, 0.2, 0.05, 0.08, 0.3, 0.02, 3.0, 0.0)
-    law = dict(zip(SERVO_TERMS, values, strict=True))
+    law = {
+        "stribeck": 0.1,
+        "stribeck_speed": 0.2,
+        "friction_motor": 0.05,
+        "friction_external": 0.08,
+        "min_torque": 0.3,
+        "encoder_step": 0.02,
+        "no_load_speed": 3.0,
+        "backlash": 0.0,  # mjlab has none
+    }
+    assert set(law) == set(SERVO_TERMS)
     robot = write_arm(tmp_path / "arm").with_identified(
         {"elbow": law | {"offset": 0.1}, "shoulder": {"kp": 11.0}}
     )

@@ -296,8 +296,8 @@ def require_network(holder: Path) -> None:
         UsageError: It is one.
     """
     if (holder / "robot.toml").is_file():
-        engines = "mjcf, mjlab, isaaclab, newton or json"
-        raise UsageError(f"{holder}: is a robot, which has no network; --to {engines}")
+        targets = ", ".join(get_args(RobotTarget))
+        raise UsageError(f"{holder}: is a robot, which has no network; choose --to of {targets}")
 
 
 def require_out(holder: Path, out: Place | None) -> None:

@@ -197,7 +197,7 @@ def export_robot(
 
     Args:
         robot: Identified, or nominal.
-        to: mjcf, envhub, urdf, mjlab, isaaclab, newton or json.
+        to: One of TARGETS that is a robot's (api.files.RobotTarget).
         out: Folder.
         recordings: Training and validation motions; default: simulated motions of the robot itself.
         source: For mjcf, envhub and urdf, a file of the user's; by default, except for urdf, the

@@ -529,7 +529,7 @@ def simulate_joints(first: int, last: int, joints: Any, windows: Any, out: Any) 
 def compiled(function: Any) -> Any:
     """Return a function of this file compiled by numba, which is imported at the first call."""
     numba = import_module("numba")
-    _extend()
+    _register_functions()
     try:
         return numba.njit(cache=True, nogil=True, error_model="numpy")(function)
     except RuntimeError:  # no folder for the cache is writable
@@ -537,8 +537,8 @@ def compiled(function: Any) -> Any:
 
 
 @functools.cache
-def _extend() -> None:
-    """Make functions of this file known to numba."""
+def _register_functions() -> None:
+    """Make the functions of this file that compiled ones call known to numba."""
     extending = import_module("numba.extending")
     extending.overload(exp)(lambda x: lambda x: np.exp(x))
     functions = (

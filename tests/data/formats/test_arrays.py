@@ -14,7 +14,7 @@ from strange_logs import motion, write_bag
 
 from gaponet.base.errors import LogError, UsageError
 from gaponet.cli.main import main
-from gaponet.data.formats import ReadOptions, detect, pickles, read_logs
+from gaponet.data.formats import ReadOptions, about, detect, pickles, read_logs
 from gaponet.data.sequence import SequenceMeta, to_sequence
 
 WRITERS = {
@@ -39,6 +39,10 @@ HEADINGS = {
 def documented(heading):
     """The logs.toml below a heading of docs/logs.md."""
     return PAGE.split(heading)[1].split("```toml\n")[1].split("```")[0]
+
+
+def test_a_description_of_two_lines_is_shown_whole():
+    assert about("npz").endswith("arrays of one row per sample")
 
 
 @pytest.mark.parametrize("fmt", WRITERS)

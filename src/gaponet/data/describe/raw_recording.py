@@ -687,7 +687,7 @@ def _require_unit(what: str, unit: str, known: ListOf[str]) -> None:
     """Refuse a unit that is not known, or not given."""
     if unit not in known:
         given = f"'{unit}' is not one of {', '.join(known)}" if unit else "is not given"
-        raise UsageError(f"the table's {what} {given}; say it with {SAY_UNITS}")
+        raise UsageError(f"the log's {what} {given}; say it with {SAY_UNITS}")
 
 
 def _time(

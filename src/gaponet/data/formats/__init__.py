@@ -1,8 +1,8 @@
 """Log formats: one module each, imported when its format is asked for; heavy libraries are
 imported when it reads.
 
-The first line of a format's docstring says what the format is. A format whose columns logs.toml
-explains has
+The first paragraph of a format's docstring says what the format is; `gaponet import --formats`
+prints it. A format whose columns logs.toml explains has
 
 - `recordings(path, specified)`: yields RawRecordings (data.describe.raw_recording).
 - `DEFAULT`: content of logs.toml unless the recording or the user states something else; default:
@@ -27,7 +27,8 @@ A field of logs.toml that is neither in ALWAYS nor in OPTIONS is refused: the fo
 
 A path that two formats detect is refused, so that another layout of .npz is a case of npz.py, not a
 format beside it; only a `table` gives way. A new suffix stands in data.describe.logs_file.SUFFIX
-too. The shortest readers to copy are pace.py (`recordings`) and bam.py (`read`).
+too. The shortest readers to copy are pace.py (`recordings`) and bam.py (`read`). JSON has one
+suffix for many layouts: bam.py knows its own by the first bytes of a file.
 """
 
 from __future__ import annotations
@@ -96,9 +97,10 @@ def module(fmt: str) -> ModuleType:
 
 
 def about(fmt: str) -> str:
-    """Return the description of a format in one line."""
+    """Return the description of a format, the first paragraph of its docstring, in one line."""
     doc = attempt(formats()[fmt], lambda: module(fmt).__doc__, None)
-    return (doc or "").split("\n")[0].rstrip(".")
+    paragraph = (doc or "").strip().split("\n\n")[0]
+    return " ".join(paragraph.split()).rstrip(".")
 
 
 def extra_of(fmt: str) -> str | None:

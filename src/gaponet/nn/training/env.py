@@ -281,7 +281,7 @@ class PositionReward:
         return mean
 
     def state(self) -> tuple[float, int]:
-        """Return sum and number of periods."""
+        """Return sum and number of periods, for a checkpoint: numbers, and tensors on the CPU."""
         return float(self._sum), self._periods
 
     def set_state(self, state: tuple[float, int]) -> None:
