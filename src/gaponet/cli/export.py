@@ -157,6 +157,11 @@ def _show(screen: Out, made: ExportResult) -> None:
     rows = [[form, mrad(error)] for form, error in made.errors.items()]
     title = f"Mean |error| on {made.motions} {kind} motion{plural}"
     screen.table(title, ["form", "mrad"], rows)
+    if made.virtual:
+        screen.say(
+            "  These motions are simulated, over most of each joint's range; recorded ones may lose "
+            "less. --data DATASET takes recorded ones."
+        )
     for line in made.notes:
         screen.say(f"  {line}", "warning", "yellow")
     screen.say(f"{made.path}: {made.robot} for {made.to}")
