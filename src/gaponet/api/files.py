@@ -65,13 +65,13 @@ def export_robot(
         to: mjcf (plain MuJoCo), envhub (an environment of LeRobot's EnvHub in MuJoCo), mjlab,
             isaaclab and newton, each with a check.py that needs no gaponet; urdf (damping,
             friction, effort limits); json (the numbers).
-        out: Folder; default one with that name in the robot or run.
-        data: Dataset on which a servo model's nearest plain servos are fitted, and every form is
-            measured; default the one that the robot was identified from, and without any the
-            robot's own simulated motions.
-        into: For mjcf, envhub and urdf: a file of the user's own; an edited copy is written (but
-            for urdf, default the robot's).
-        prefix: Prefix of joint names in that file.
+        out: Folder to write. Default: a folder in the robot or run that has the name of the target.
+        data: Dataset with which the export is measured, and to which plain servos are fitted if the
+            engine cannot play the servo model. Default: the dataset of the identification, or else
+            simulated motions of the robot.
+        into: For mjcf, envhub and urdf: a file of the user's, of which an edited copy is written.
+            Default: the robot's file; urdf has none.
+        prefix: Prefix that joint names have in that file.
         payload_mass: kg in each hand.
 
     Raises:

@@ -210,7 +210,8 @@ def collect(
         out: Dataset folder.
         robot: A robot of the package, or a folder with robot.toml.
         options: Fleet, recipe, payloads, units, seed, and number of processes.
-        executor: Where it is played: local, ray or ray:ADDRESS (docs/install.md).
+        executor: Where robots are simulated: local (processes on this machine), ray or
+            ray:HOST:PORT (docs/install.md).
 
     Raises:
         UsageError: The recipe names a motion, unit or file that does not exist.
