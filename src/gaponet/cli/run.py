@@ -41,8 +41,8 @@ class ControlArgs(ControlOptions):
 
     driver: DriverName = VIRTUAL
     """Connection to the robot: virtual (a simulated robot in this process), unitree (DDS: a real
-    H1-2 or gaponet virtual serve), so101 (serial), or the driver of an installed extension. Options
-    that begin with such a name are of that driver alone."""
+    H1-2 or gaponet virtual serve), so101 (serial), or the driver of an installed extension. An
+    option whose help begins with such a name is of that driver alone."""
     robot: str | None = None
     """Robot name or folder; it may be identified. Default: the robot of --model; without it, so101
     for driver so101, the robot of --limits-from for the driver of an extension, and h1_2 for the
