@@ -40,13 +40,13 @@ def test_a_mistyped_command_is_told_its_neighbour(capsys):
 
 
 def test_the_help_of_an_option_has_no_line_breaks_of_the_source(monkeypatch, capsys):
-    monkeypatch.setenv("COLUMNS", "400")
+    monkeypatch.setenv("COLUMNS", "1000")
     with pytest.raises(SystemExit):
         main(["identify", "--help"])
     (line,) = [
         line for line in capsys.readouterr().out.splitlines() if "servo model to try" in line
     ]
-    assert "at equal gains and payload" in line
+    assert "temperature if it varies" in line
 
 
 def test_a_fault_that_a_virtual_robot_does_not_have_is_refused(capsys):

@@ -65,14 +65,14 @@ def export_robot(
         to: mjcf (plain MuJoCo), envhub (an environment of LeRobot's EnvHub in MuJoCo), mjlab,
             isaaclab and newton, each with a check.py that needs no gaponet; urdf (damping,
             friction, effort limits); json (the numbers).
-        out: Folder; default one with that name in the robot or run.
-        data: Dataset on which a servo model's nearest plain servos are fitted, and every form is
-            measured; default the one that the robot was identified from, and without any the
-            robot's own simulated motions.
-        into: For mjcf, envhub and urdf: a file of the user's own; an edited copy is written (but
-            for urdf, default the robot's).
-        prefix: Prefix of joint names in that file.
-        payload_mass: kg in each hand.
+        out: Folder to write. Default: a folder in the robot or run that has the name of the target.
+        data: Dataset with which the export is measured, and to which plain servos are fitted if the
+            engine cannot play the servo model. Default: the dataset of the identification, or else
+            simulated motions of the robot.
+        into: For mjcf, envhub and urdf: a file of the user's, of which an edited copy is written.
+            Default: the robot's file; urdf has none.
+        prefix: Prefix that joint names have in that file.
+        payload_mass: Payload in each hand, kg.
 
     Raises:
         RobotError: The file cannot be edited.
@@ -119,9 +119,10 @@ def export_network(
         to: onnx (model.onnx and card.json), torch (delta.pt2 with simulator and action term for
             mjlab and Isaac Lab), actuator-net (one network per joint: past of target − position and
             speed in, torque out; the form of mjlab, Newton and Isaac Lab).
-        out: Folder; default one with that name in the run, for onnx the run's model folder.
+        out: Folder to write. Default: a folder in the run that has the name of the target; for onnx
+            the run's model folder.
         data: For actuator-net: where the run's recordings are now; default where they were.
-        payload_mass: kg in each hand.
+        payload_mass: Payload in each hand, kg.
 
     Raises:
         ModelError, UsageError: The run holds no such model, its payload is beyond those trained on,
@@ -237,7 +238,7 @@ def attach_correction(
     Args:
         policy: Folder of a policy (pretrained_model) that holds policy_postprocessor.json.
         holder: Robot folder, run folder or name of the package; None removes the correction.
-        payload_mass: kg in each hand.
+        payload_mass: Payload in each hand, kg.
         dynamics: Feed forward inertia and damping too, for smooth targets.
 
     Raises:

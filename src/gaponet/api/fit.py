@@ -444,14 +444,14 @@ def adapt_model(
     Args:
         run: Run folder, or a trained model.
         dataset: Recordings of the unit, perhaps among others.
-        unit: Unit to adapt to, where the dataset holds several.
-        motions: Only these; default: those that the run was trained on, so that its test motions
-            stay unseen, or all where the unit played none of them.
-        seconds: Duration of the recordings to use, in windows of 8 s.
+        unit: Unit to adapt to. Needed if the dataset holds several.
+        motions: Use only these motions. Default for a run: those that it was trained on, so that
+            its test motions stay unseen, or all if the unit played none of them.
+        seconds: How much of the recordings is fitted, s, in pieces of 8 s.
         robot: Another robot than the one that the dataset keeps.
-        mixed_gains: Accept recordings made with different kp or kd together.
-        despite_errors: Go on although the doctor finds an error in the recordings; the result keeps
-            the errors.
+        mixed_gains: For a run: fit recordings with different kp or kd together.
+        despite_errors: Go on although the doctor finds an error in the recordings. The result then
+            contains the error.
 
     Raises:
         DatasetError: The doctor finds an error in the recordings of the unit.
@@ -520,11 +520,12 @@ def adapt_robot(
         robot: The folder that `identify` wrote, or a nominal robot.
         source: A dataset, or logs that `import_logs` reads.
         out: Robot folder to write.
-        unit: Unit to adapt to, where the dataset holds several.
-        motions: Only these.
+        unit: Unit to adapt to, or name of the robot in the logs. Needed if the dataset holds several
+            units, or if the logs state none.
+        motions: Use only these motions. Default: all of the unit.
         seconds: Duration of the recordings to fit, in windows of 8 s; all of them are used for
             validation.
-        payload_mass: kg in each hand, of logs whose format does not state it.
+        payload_mass: Payload in each hand, kg. Needed for logs that do not state it.
         despite_errors: Go on although the doctor finds an error in the recordings; the result keeps
             the errors.
 

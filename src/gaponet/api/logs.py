@@ -53,10 +53,11 @@ def import_logs(
         src: File or folder of logs, or hf://USER/DATASET; `gaponet import --formats` lists what is
             read.
         robot: The robot that was recorded.
-        out: Dataset folder; appended to where it exists.
-        unit_id: Name of the recorded robot, the same for all its logs. Needed unless the format
-            states it.
-        payload_mass: kg in each hand, 0.0 when empty. Needed unless the format states it.
+        out: Dataset folder to write. If it exists, new recordings are added to it.
+        unit_id: Name that you choose for the recorded robot, the same in all its logs. Needed if
+            the logs do not state it.
+        payload_mass: Payload in each hand, kg; 0.0 for empty hands. Needed if the logs do not state
+            it.
         options: How the logs are read: names, units, clocks, gains, what to do with bad rows.
 
     Raises:
@@ -210,7 +211,8 @@ def collect(
         out: Dataset folder.
         robot: A robot of the package, or a folder with robot.toml.
         options: Fleet, recipe, payloads, units, seed, and number of processes.
-        executor: Where it is played: local, ray or ray:ADDRESS (docs/install.md).
+        executor: Where robots are simulated: local (processes on this machine), ray or
+            ray:HOST:PORT (docs/install.md).
 
     Raises:
         UsageError: The recipe names a motion, unit or file that does not exist.

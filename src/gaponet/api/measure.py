@@ -70,12 +70,13 @@ def gap(
         dataset: Recordings; those without a paired simulation are simulated first.
         robot: Another robot than the one that the dataset keeps. If the robot is identified, it is
             measured as `run` is.
-        motions: Only these.
-        run: Robot folder that `identify` wrote, a run of `train`, or a network of the package by
-            name. The result then says how much each identified cause and the model reduce the
-            error, and the floor, on motions that were not used in training; a folder of yours keeps
-            it as gap.json, gap.svg and gap.png.
-        executor: Where recordings are simulated: local, ray or ray:ADDRESS (docs/install.md).
+        motions: Use only these motions.
+        run: Robot folder of `identify`, run folder of `train`, or name of a network of the package.
+            The result then says, on test motions, how much each identified cause and the network
+            reduce the error, and how large the floor is. gap.json, gap.svg and gap.png in the
+            folder keep it.
+        executor: Where recordings are simulated: local (processes on this machine), ray or
+            ray:HOST:PORT (docs/install.md).
     """
     from gaponet.evaluation.baselines import baseline_errors, command_run
     from gaponet.sim.metrics import Run, summary
@@ -162,7 +163,7 @@ def evaluate(
             trained model. The result is kept in a folder of yours.
         dataset: The dataset trained on (its test motions are used) or another.
         also: Further runs to compare, e.g. the MLP's.
-        motions: Only these.
+        motions: Use only these motions.
         robot: Another robot than the one that the dataset keeps. If it is not the simulator that
             the run was trained in, it is shown as it is, and with the run transferred into it
             (deploy/transfer.py).
@@ -212,10 +213,11 @@ def check(
     Args:
         robot: Robot folder that `identify` or `adapt_robot` wrote.
         logs: A dataset, or logs that `import_logs` reads.
-        unit: Unit to check, where there are several.
-        motions: Only these.
-        payload_mass: kg in each hand, of logs whose format does not state it.
-        threads: 0 for all cores.
+        unit: Unit to check, or name of the robot in the logs. Needed if the dataset holds several
+            units, or if the logs state none.
+        motions: Use only these motions. Default: all of the unit.
+        payload_mass: Payload in each hand, kg. Needed for logs that do not state it.
+        threads: Number of threads; 0 means all cores.
 
     Raises:
         RobotError: The robot folder holds no parameter uncertainty.
@@ -257,9 +259,9 @@ def replay(
         logs: File or folder of rollouts, in any format that `import_logs` reads: targets as
             commands, and states.
         robot: Robot folder that `identify` wrote.
-        data: Dataset whose validation motions give the band; default that of the identification.
+        data: Dataset whose validation motions give the band. Default: that of the identification.
         described: A logs.toml that says what the rollouts' columns mean.
-        payload_mass: kg in each hand.
+        payload_mass: Payload in each hand, kg.
 
     Raises:
         UsageError: Neither recordings nor an uncertainty of the robot exist.

@@ -22,35 +22,42 @@ class IdentifyOptions:
     """What an identification fits, to which recordings, and from where it starts."""
 
     windows: int = 40
-    """Number of 8 s rollouts that are fitted, taken evenly from the training motions."""
+    """Number of rollouts of 8 s to fit; they are taken evenly from the training motions."""
     terms: tuple[Term, ...] | None = None
-    """Terms of the servo model to try; each is accepted only if validation motions improve.
-    Default: limit if a joint reaches its stated torque limit; speed if it needs much of that torque
-    while it moves fast; stribeck and load; backlash where a gap makes the rollouts better at
-    otherwise equal values; temperature where it varies at equal gains and payload."""
+    """Effects of the servo model to try, in this order. Each is kept only if it reduces the error on
+    validation motions. stribeck: more friction at rest. load: friction that grows with the torque
+    of the motor. external: friction that grows with the torque of gravity. limit: largest torque.
+    speed: largest torque that falls with speed. min_torque: least torque with which the motor
+    turns. encoder: steps in which the servo reads its angle. backlash: play of the gear.
+    temperature: effect of temperature on friction and damping. Default: limit if a joint reaches
+    its stated torque limit; speed if it needs much of that torque while it moves fast; stribeck and
+    load; backlash if a gap in the gear makes the simulated motion better while all else stays
+    equal; temperature if it varies at equal gains and payload."""
     table: bool = True
     """Look for a table under the robot's tips ([[tip]] in robot.toml)."""
     threads: int = 0
-    """0 for all cores."""
+    """Number of threads; 0 means all cores."""
     budget: str | None = None
-    """Time such as 60s or 4m that the fit may take, the table included; default no limit. What does
-    not fit into it is left out and named in a warning. Results are the same on every machine only
-    without a limit."""
+    """Time that the whole fit may take, such as 60s or 4m. A warning names what was left out for
+    lack of time. Results are the same on every machine only without a limit, which is the
+    default."""
     stops: bool = False
-    """Add an end stop to joints that stayed behind several commands; otherwise they are
-    reported."""
+    """Add an end stop where a joint stopped several times although its commands went on. Without
+    this option such places are only reported."""
     masses: bool = False
-    """Fit masses, centres of mass and inertias of the links too; accepted as a term is."""
+    """Also fit masses, centres of mass and inertias of the links. They are kept only if they reduce
+    the error on validation motions."""
     like: str | Path | None = None
-    """Identified robot whose servos are the start and the prior, by joint name, mirrored name
-    (left, right) or type of servo: another arm, another unit, another robot."""
+    """Identified robot from whose servos the fit starts and which is its prior: another arm, unit
+    or robot. Joints are matched by name, mirrored name (left, right) or servo type."""
     units: tuple[str, ...] = ()
-    """Only these, pooled: one set of parameters for all of them; default: all others than
-    --holdout-units."""
+    """Fit the recordings of these units alone, with one set of parameters for all of them. Default:
+    all units but --holdout-units."""
     holdout_units: tuple[str, ...] = ()
-    """Units to leave out, as in training."""
+    """Units whose recordings are not fitted."""
     despite_errors: bool = False
-    """Go on although the doctor finds an error in the recordings; the result keeps the errors."""
+    """Go on although the doctor finds an error in the recordings. The result then contains the
+    error."""
 
     def seconds(self) -> float | None:
         """Return the budget, s; None without a limit.
@@ -100,19 +107,20 @@ class CollectOptions:
     """Which motions of which virtual robots are recorded."""
 
     fleet: str | Path = "hard"
-    """Virtual units: hard, easy, shifted, unnamed, firm (hard at nine times the gains), or a .toml
-    file."""
+    """Fleet of virtual robots: hard, easy, shifted, unnamed, firm (hard with nine times the gains),
+    or a .toml file."""
     recipe: str = "small"
-    """demo (under a minute), small (about two), simlifter (30 h: 48 min on one core), arm (any
+    """Which motions are recorded, with which payloads and units: demo (takes under a minute), small
+    (about two minutes), simlifter (30 h of recordings; 48 minutes on one core), arm (for any
     robot), or a .toml file."""
     payloads: tuple[float, ...] = ()
-    """kg per hand instead of the recipe's."""
+    """Payloads in each hand, kg, instead of those of the recipe."""
     units: tuple[str, ...] = ()
-    """Units of the fleet instead of the recipe's."""
+    """Units of the fleet, such as virtual-4, instead of those of the recipe."""
     seed: int = 0
     """Seed of motions, noise and start states."""
     nproc: int = 0
-    """Processes, or jobs at a time; 0 for one per core. More than one starts fresh interpreters: a
+    """Number of processes, or of jobs at a time; 0 means one per core. With more than one, a Python
     script that calls this needs `if __name__ == "__main__":`."""
 
 
@@ -124,10 +132,10 @@ class ExciteOptions:
     """Total duration of the motions. 10 (default) suffice to identify gains, friction and delay, 40
     to train a good model. For an identified robot (--for) the default is half a minute."""
     payloads: tuple[float, ...] = (0.0,)
-    """kg in each hand; every motion is played with each payload. With --for: payloads to choose
-    from."""
+    """Payloads in each hand, kg. Every motion is played with each of them. With --for: payloads to
+    choose from."""
     rate: float = 50.0
-    """Commands per second, Hz."""
+    """Rate of the commands, Hz."""
     format: Literal["txt", "csv", "npz"] = "txt"
     """txt (SAGE, 50 Hz), csv (with time) or npz; gaponet run and record play each."""
     seed: int = 0
@@ -141,17 +149,18 @@ class TrainOptions:
     model: ModelKind | Literal["auto"] | None = None
     """gaponet, paper (the paper's literal network), or a baseline: shared_mlp, mlp, trees. auto:
     gaponet, shared_mlp, mlp and, with scikit-learn, trees get a fifth of the budget each. The best
-    network on validation gets the rest, and trees are chosen if they are still better. Default:
-    that of the config."""
+    network on validation gets the rest, and trees are chosen if they are still better. None: the
+    kind that config names."""
     holdout_units: tuple[str, ...] = ()
-    """Units never trained on; their test motions stay in the test split."""
+    """Units that are not trained on. Their test motions are still measured."""
     resume: bool = False
-    """Continue the run in that folder."""
+    """Continue the run in the folder OUT."""
     log: tuple[Literal["tensorboard", "wandb"], ...] = ()
     """Also write the training curve to TensorBoard event files in OUT/tensorboard, or to Weights &
     Biases."""
     despite_errors: bool = False
-    """Go on although the doctor finds an error in the recordings; the result keeps the errors."""
+    """Go on although the doctor finds an error in the recordings. The result then contains the
+    error."""
 
 
 def parse_joint_map(pairs: tuple[str, ...]) -> dict[str, str] | None:

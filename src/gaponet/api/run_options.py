@@ -23,7 +23,7 @@ class Connection:
     """unitree: arm_sdk leaves legs and balance to the robot's own controller; lowcmd requires that
     the robot hangs."""
     joints: Literal["arms", "upper_body", "all"] = "arms"
-    """unitree: joints that are commanded. The legs are commanded with all on lowcmd only."""
+    """unitree: joints that are commanded. all includes the legs and needs --topic lowcmd."""
     domain: int = 0
     """unitree, and targets over DDS: DDS domain."""
     interface: str = "lo"
@@ -37,10 +37,10 @@ class Connection:
     unit: str = "4"
     """virtual: number or name of the robot in the fleet."""
     fleet: str = "hard"
-    """virtual: hard, easy, shifted, unnamed, or a .toml file."""
+    """virtual: fleet of the robot: hard, easy, shifted, unnamed, firm, or a .toml file."""
     hangs: bool = False
-    """unitree: state that the robot hangs. lowcmd switches off all motors that are not commanded,
-    legs too."""
+    """unitree: state that the robot hangs, instead of answering the question. --topic lowcmd
+    switches off all motors that are not commanded, those of the legs too."""
     fast: bool = False
     """virtual: run as fast as this machine can instead of in real time."""
 
@@ -67,14 +67,15 @@ class ControlOptions:
     """Robot, limits and control loop."""
 
     limits_from: str | None = None
-    """Robot folder whose gains, joint ranges, effort limits and collision shapes are used on
-    hardware instead of the packaged robot. Check its values first. The driver of an extension
-    requires it. Identified values come from --robot or --model."""
+    """Robot folder whose gains, joint ranges, effort limits and collision shapes are used for a
+    real robot, instead of those of the packaged robot. Check its values first. The driver of an
+    extension needs this option. Identified values come from --robot or --model."""
     payload_side: str = "both"
     """Hand that carries the payload: both, or the side of one payload mount."""
     max_payload: float | None = None
-    """Payload for which the motion must be feasible, kg in each hand. Default: payload_mass, or 0.
-    To play one library motion with several payloads, give the heaviest."""
+    """Heaviest payload with which the motion must be possible, kg in each hand. Default:
+    --payload-mass, or 0. To play one library motion with several payloads, give the heaviest of
+    them each time."""
     connection: Connection = Connection()
     """Connection to the robot."""
     control: ControlConfig = ControlConfig()  # noqa: RUF009
@@ -103,12 +104,12 @@ class RunOptions(ControlOptions):
     payload_mass: float | None = None
     """Payload, kg in each hand. Compensation estimates it if it is not given."""
     model: Path | None = None
-    """Run or artifact folder, or name of a network of the package, whose network corrects the
-    commands in addition."""
+    """Run folder of gaponet train, folder of an exported network, or name of a network of the
+    package. The network corrects the commands in addition."""
     follow: Literal["nominal"] | None = None
-    """Command the robot so that it moves as its nominal simulator does under the targets, for a
-    policy that was trained in an ordinary simulator. --robot must be identified. Instead of
-    --compensate and --model."""
+    """nominal: command the robot so that it moves as its nominal simulator does under the targets,
+    for a policy that was trained in an ordinary simulator. --robot must be identified. Not together
+    with --compensate or --model."""
     compensation: CompensatorConfig = CompensatorConfig()  # noqa: RUF009
     """Settings of the compensation."""
     unit_id: str = ""
@@ -122,4 +123,4 @@ class RunOptions(ControlOptions):
     """Folder for the recording: MOTION.parquet (gaponet import reads it), MOTION.json and
     MOTION.cycles.npy."""
     seed: int = 0
-    """virtual: seed of the robot's noise."""
+    """virtual: seed of the noise of the robot."""

@@ -48,41 +48,46 @@ class StartOptions:
     """What the steps are told about the robot and its logs."""
 
     unit_id: str = "lab"
-    """Name of the recorded robot."""
+    """Name that you choose for the recorded robot."""
     payload_mass: float = 0.0
-    """kg in each hand while recording."""
+    """Payload in each hand in all logs, kg."""
     joints: tuple[str, ...] = ()
-    """Recorded joints of the model, by name or pattern. Default: those that the logs name."""
+    """Joints of the model that were recorded, by name or pattern ('*_elbow_*'). Default: those that
+    the logs name."""
     kp: tuple[str, ...] = ()
-    """Position gain of the controller while recording, N·m/rad: NUMBER or PATTERN=NUMBER. Default:
-    the model's."""
+    """Stiffness of the controller that recorded the logs, N·m/rad: NUMBER for all joints,
+    PATTERN=NUMBER for some. Default: the model's."""
     kd: tuple[str, ...] = ()
-    """Damping gain, likewise, N·m·s/rad."""
+    """Damping gain of that controller, N·m·s/rad: NUMBER or PATTERN=NUMBER. Default: the model's."""
     effort_limit: tuple[str, ...] = ()
-    """Torque limit, likewise, N·m."""
+    """Largest torque of the motors, N·m: NUMBER or PATTERN=NUMBER. Default: the model's."""
     format: str | None = None
-    """Format of the logs; gaponet import --formats lists them."""
+    """Format of the logs; gaponet import --formats lists all. Default: recognised from the
+    files."""
     position_unit: PositionUnit | None = None
-    """Unit of positions, where the format leaves it open."""
+    """Unit of the positions. Needed if the logs do not state it."""
     time_unit: TimeUnit | None = None
-    """Unit of time, where the format leaves it open."""
+    """Unit of the clock. Needed if the logs do not state it."""
     rate: float | None = None
-    """Hz, of logs without a clock."""
+    """Rows per second, Hz, of logs that have no clock."""
     cut: float | None = None
-    """Length of the pieces of long recordings, s; default 8 where there are fewer than three
-    recordings."""
+    """Cut long recordings into equal pieces of about this length, s. Default: no cut, but 8 s if
+    there are fewer than three recordings."""
     skip_bad: bool = False
-    """Cut bad rows and leave out logs that cannot be read."""
+    """Cut bad rows and leave out logs that cannot be read. Without this option one bad log stops
+    the command."""
     allow_pickle: bool = False
-    """Open pickled files."""
+    """Open pickled files (ASAP). The unpickler makes only arrays, numbers and text, and runs no
+    code of the file."""
     to: Target = "mjcf"
-    """Engine to export to."""
+    """Engine for which the identified robot is exported; mjcf is plain MuJoCo."""
     budget: str | None = None
-    """Time that identification may take, such as 4m; default no limit."""
+    """Time that identification may take, such as 4m. Default: no limit."""
     despite_errors: bool = False
-    """Continue although the doctor finds errors in the logs; the identified robot keeps them."""
+    """Go on although the doctor finds errors in the logs. The identified robot then contains
+    them."""
     map: tuple[str, ...] = ()
-    """A joint's name in the log and the robot's, as a=b; may be repeated."""
+    """NAME_IN_LOG=NAME_OF_ROBOT of a joint; give the option once for each joint."""
 
     @property
     def robot(self) -> RobotOptions:

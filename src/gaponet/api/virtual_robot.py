@@ -29,11 +29,11 @@ class VirtualOptions:
     unit: str = "4"
     """Number or name of the robot in the fleet."""
     payload_mass: float = 0.0
-    """kg in each hand that payload_side names."""
+    """Payload in each hand that payload_side names, kg."""
     payload_side: str = "both"
     """both, or one hand."""
     fleet: str = "hard"
-    """Virtual units: hard, easy, shifted, unnamed, or a .toml file."""
+    """Fleet of the robot: hard, easy, shifted, unnamed, firm, or a .toml file."""
     domain: int = 0
     """DDS domain."""
     interface: str = "lo"

@@ -21,12 +21,16 @@ from gaponet.robot.spec import robot_argument
 Known = Annotated[
     Folder,
     tyro.conf.arg(
-        help="Robot folder (with --out), or run folder of gaponet train.", metavar="ROBOT|RUN"
+        help="Robot folder (give --out too), or run folder of gaponet train.",
+        metavar="ROBOT|RUN",
     ),
 ]
 Logs = Annotated[
     tyro.conf.Positional[str],
-    tyro.conf.arg(help="Dataset folder; for a robot folder logs as well.", metavar="LOGS"),
+    tyro.conf.arg(
+        help="Dataset folder. If a robot folder is adapted, it may be a folder of logs too.",
+        metavar="LOGS",
+    ),
 ]
 
 
@@ -46,13 +50,15 @@ def adapt(
 ) -> None:
     """Adapt an identified robot to another unit or day with short logs.
 
-    For a robot folder, a new robot folder is written:
-    gaponet adapt ./my_robot LOGS --out ./my_robot_today. For a run, the trained model stays
-    unchanged, and gaponet eval then shows the unit without and with its adaptation.
+    For a robot folder, a new robot folder is written, for example by
+    gaponet adapt ./my_robot LOGS --out ./my_robot_today. For a run, the network stays unchanged,
+    and the run keeps the adaptation: gaponet eval then shows the unit without and with it.
 
     Args:
-        out: Robot folder to write; required for a robot folder.
-        payload_mass: kg in each hand, for logs of a robot folder whose format does not state it.
+        out: Robot folder to write. Needed if a robot folder is adapted.
+        unit: Unit to adapt to, or name of the robot in the logs. Needed if the dataset holds several
+            units, or if the logs state none.
+        payload_mass: Payload in each hand, kg. Needed for logs that do not state it.
     """
     screen = Out(json)
     folder = as_run(run)

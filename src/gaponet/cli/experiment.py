@@ -48,11 +48,11 @@ def experiment(
 
     Every network has the same recordings, inputs, training and seeds, and is measured on motions
     and on a unit that no network has seen. The same command continues an interrupted experiment.
-    With three seeds it takes a night on two cores, with one about two hours.
+    On two cores it takes a night with three seeds, and about two hours with one.
 
     Args:
-        name: "paper", the only experiment.
-        out: Folder of the results; OUT/paper.html is the page.
+        name: The word "paper"; there is no other experiment.
+        out: Folder for the results. OUT/paper.html shows them.
         options: Size of the experiment, and where it runs.
     """
     if name != "paper":

@@ -61,36 +61,36 @@ class ExportArgs:
     """What is exported and where to; each target uses some of the options."""
 
     to: RobotTarget | NetworkTarget | Literal["randomization", "lerobot"] = "onnx"
-    """Simulator of a robot or a run: mjcf (plain MuJoCo), envhub (an environment of LeRobot's
-    EnvHub in MuJoCo), mjlab, isaaclab and newton, each with a check.py that needs no gaponet; urdf
-    (damping, friction, effort limits); json (the numbers). Network of a run: onnx (model.onnx and
-    card.json), torch (delta.pt2 with simulator and action term for mjlab and Isaac Lab),
-    actuator-net (one network per joint; its inputs are past target − position and speed, its output
-    is the torque). randomization: sets of a robot's parameters ("units") for training. lerobot: add
-    the correction to the LeRobot policy in --into; LeRobot finds it through the plug-in
-    lerobot_robot_gaponet."""
+    """What is written. The simulator of a robot or a run: mjcf (plain MuJoCo), envhub (an
+    environment of LeRobot's EnvHub in MuJoCo), mjlab, isaaclab or newton, each with a check.py that
+    needs no gaponet; urdf (damping, friction, effort limits); json (the numbers). The network of
+    a run: onnx (model.onnx and card.json), torch (delta.pt2 with simulator and action term for
+    mjlab and Isaac Lab), actuator-net (one network per joint; its inputs are past target − position
+    and speed, its output is the torque). randomization: sets of a robot's parameters, called units,
+    for training. lerobot: add the correction to the LeRobot policy in --into; LeRobot finds it
+    through the plug-in lerobot_robot_gaponet."""
     out: Path | None = None
-    """Folder; default one with that name in the robot or run."""
+    """Folder to write. Default: a folder in the robot or run that has the name of the target."""
     data: str | None = None
-    """Dataset on which a servo model's nearest plain servos are fitted, and every form is measured;
-    default the one that the robot was identified from, and without any the robot's own simulated
-    motions."""
+    """Dataset with which an export is measured, and to which plain servos are fitted if the engine
+    cannot play the servo model. Default: the dataset of the identification, or else simulated
+    motions of the robot."""
     into: Path | None = None
-    """For mjcf, envhub and urdf: a file of your own; an edited copy is written (but for urdf,
-    default the robot's). For lerobot: folder of a policy (pretrained_model) that holds
-    policy_postprocessor.json."""
+    """For mjcf, envhub and urdf: file of your own, of which an edited copy is written; urdf needs
+    it, the others take the robot's file by default. For lerobot: folder of a policy
+    (pretrained_model) that holds policy_postprocessor.json."""
     prefix: str = ""
-    """Prefix of joint names in that file."""
+    """Prefix that joint names have in the file of --into."""
     payload_mass: float = 0.0
-    """kg in each hand."""
+    """Payload in each hand, kg."""
     engine: Literal["json", "mujoco", "mjlab", "isaaclab"] = "json"
     """For randomization: engine for which a file is written that applies units of
     randomization.json."""
     scope: Literal["today", "any-day", "any-robot"] = "today"
-    """today: this robot as last fitted. any-day: sessions on several days. any-robot: all robots of
-    its type."""
+    """For randomization, what the units stand for. today: this robot as last fitted. any-day: this
+    robot over days. any-robot: robots of its type."""
     units: tuple[Path, ...] = ()
-    """For any-robot: robot folders of the type."""
+    """For --scope any-robot: robot folders of several robots of the type."""
     dynamics: Flag = False
     """For lerobot: feed forward inertia and damping too; use it for smooth targets only."""
     remove: Flag = False

@@ -31,8 +31,8 @@ def gap(
 ) -> None:
     """How far is the simulator from the robot, by joint and payload?
 
-    Without --robot the nominal simulator is measured. With an identified robot the causes of the
-    error are shown.
+    Without --robot and --run the nominal simulator is measured. With an identified robot or a
+    network the causes of the error are shown.
     """
     screen = Out(json)
     with progress_bar("gap") as update:

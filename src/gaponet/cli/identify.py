@@ -30,21 +30,20 @@ def identify(
 ) -> None:
     """Fit the simulator's servos to logs and write a robot folder.
 
-    Gains, damping, friction, armature, zero offsets and delays are fitted to the training motions.
-    For a robot that is driven by torque (no position was commanded), armature, damping, friction
-    and delay are fitted.
+    Gains, damping, friction, armature, offsets and delays are fitted to the training motions. For a
+    robot that is driven by torque (no position was commanded), armature, damping, friction and
+    delay are fitted.
 
-    Use the robot folder with --robot and a slash: gaponet gap DATASET --robot ./OUT. The fit starts
-    from the gains in the robot's file. kp is fitted too; where recordings state it, it stays near
-    what they state. If no fit is better than the robot as it is, nothing is written and the exit
-    status is 2.
+    Use the result with --robot and a slash: gaponet gap DATASET --robot ./OUT. The fit starts from
+    the gains in the robot's file. kp is fitted too; if the recordings state it, it stays near that
+    value. If no fit is better than the given robot, nothing is written and the exit status is 2.
 
     Args:
-        out: Robot folder to write; `train(…, robot=out)` starts from it.
+        out: Robot folder to write.
         options: What is fitted.
-        current: Torque-driven robots: fit the torque constant too, where the recorded torque is a
-            current or its unit is unknown.
-        details: List the parameters of every joint that these logs do not determine.
+        current: For robots driven by torque: the recorded torque is a current, or its unit is
+            unknown. The torque constant is fitted too.
+        details: List, for each joint, the parameters that these logs do not determine.
     """
     screen = Out(json)
     data, spec = open_dataset(dataset, robot)

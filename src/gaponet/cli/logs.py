@@ -41,11 +41,13 @@ class ImportArgs(ImportOptions):
 
     joint_map: tyro.conf.Suppress[None] = None
     map: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
-    """A joint's name in the log and the robot's, as a=b; may be repeated."""
+    """NAME_IN_LOG=NAME_OF_ROBOT of a joint; give the option once for each joint."""
     guess: bool = False
-    """Print a logs.toml for these logs, filled in as far as they show it, and import nothing."""
+    """Print a proposal for the logs.toml of these logs, and import nothing. A line with a ? is a
+    guess that you must check."""
     formats: Flag = False
-    """List the formats that are read, and what each needs."""
+    """List the formats that can be read and what each of them needs; no logs are needed for
+    this."""
 
     def options(self) -> ImportOptions:
         """Return the options of api.import_logs."""
@@ -55,7 +57,7 @@ class ImportArgs(ImportOptions):
 
 
 def import_logs(
-    src: tyro.conf.Positional[Path | None] = None,
+    src: Annotated[tyro.conf.Positional[Path | None], tyro.conf.arg(metavar="LOGS")] = None,
     robot: str = "",
     out: Path | None = None,
     unit_id: str | None = None,
@@ -65,15 +67,17 @@ def import_logs(
 ) -> None:
     """Read a robot's logs into a dataset; the same call adds what is new.
 
-    If one log is bad, nothing is imported. With --skip-bad only the bad log is left out.
+    Give LOGS, --robot and --out. If one log is bad, nothing is imported. With --skip-bad only bad
+    rows and logs that cannot be read are left out.
 
     Args:
         src: File or folder of logs, or hf://USER/DATASET of the Hugging Face Hub.
-        robot: Robot name or folder.
-        out: Dataset folder; appended to where it exists.
-        unit_id: Name of the recorded robot, the same for all its logs. Needed unless the format
-            states it.
-        payload_mass: kg in each hand, 0.0 when empty. Needed unless the format states it.
+        robot: Recorded robot: a name such as so101, or a robot folder such as ./my_arm.
+        out: Dataset folder to write. If it exists, new recordings are added to it.
+        unit_id: Name that you choose for the recorded robot, such as lab, the same in all its logs.
+            Needed if the logs do not state it.
+        payload_mass: Payload in each hand, kg; 0 for empty hands. Needed if the logs do not state
+            it.
         args: How the logs are read.
     """
     if args.formats:
@@ -116,9 +120,9 @@ def doctor(
     """Check a dataset: order, signs, units, rates, gaps, lag, payload.
 
     Args:
-        robot: Robot name or folder, if not the one that the dataset stores.
-        fix: Print a proposal for logs.toml after the findings; nothing is applied.
-        figures: Folder for a picture of each finding.
+        robot: Robot name or folder. Default: the robot that the dataset stores.
+        fix: Print lines for logs.toml that would correct the findings; nothing is changed.
+        figures: Folder to which a picture of each finding is written.
     """
     screen = Out(json)
     data, spec = open_dataset(dataset, robot)

@@ -23,7 +23,9 @@ Folder = tyro.conf.Positional[Path]
 Logs = Annotated[Folder, tyro.conf.arg(metavar="LOGS")]
 Model = Annotated[Folder, tyro.conf.arg(metavar="MODEL")]
 Flag = tyro.conf.FlagCreatePairsOff[bool]
-Data = Annotated[Folder, tyro.conf.arg(help="Dataset folder.", metavar="DATASET")]
+Data = Annotated[
+    Folder, tyro.conf.arg(help="Dataset folder, as gaponet import writes it.", metavar="DATASET")
+]
 Run = Annotated[Folder, tyro.conf.arg(help="Run folder of gaponet train.", metavar="RUN")]
 Known = Annotated[
     Folder,
@@ -33,16 +35,18 @@ Known = Annotated[
         metavar="ROBOT|RUN|NAME",
     ),
 ]
-Motions = Annotated[tuple[str, ...], tyro.conf.arg(help="Only these motions.")]
+Motions = Annotated[tuple[str, ...], tyro.conf.arg(help="Use only these motions.")]
 Robot = Annotated[
     str | None,
     tyro.conf.arg(
-        help="Robot name or folder, if not the one that the dataset or the run stores.",
+        help="Robot name or folder. Default: the robot that the dataset or the run stores.",
         metavar="ROBOT",
     ),
 ]
 Unit = Annotated[str, tyro.conf.arg(aliases=["--unit-id"])]  # gaponet import calls it --unit-id
-Json = Annotated[Flag, tyro.conf.arg(help="One JSON object on stdout.")]
+Json = Annotated[
+    Flag, tyro.conf.arg(help="Print the result as one JSON object on stdout; tables go to stderr.")
+]
 
 
 def join_lines(command: Callable[..., Any]) -> None:

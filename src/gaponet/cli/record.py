@@ -44,7 +44,7 @@ def record(
         out: Dataset folder; created or appended to. The full recording of every run goes to
             OUT/recordings.
         unit_id: Name of the recorded robot; the virtual driver sets it.
-        payload_mass: kg in each hand that payload_side names; 0 when empty.
+        payload_mass: Payload in each hand that --payload-side names, kg; 0 if the hands are empty.
         repetitions: Number of times that each motion is played.
         args: Robot and control loop.
     """

@@ -40,11 +40,13 @@ class ControlArgs(ControlOptions):
     """Options about robot and control loop. The docstrings are the command-line help."""
 
     driver: DriverName = VIRTUAL
-    """virtual (a simulated robot in this process), unitree (DDS: a real H1-2 or gaponet virtual
-    serve), so101 (serial), or the driver of an installed extension."""
+    """Connection to the robot: virtual (a simulated robot in this process), unitree (DDS: a real
+    H1-2 or gaponet virtual serve), so101 (serial), or the driver of an installed extension. An
+    option whose help begins with such a name is of that driver alone."""
     robot: str | None = None
-    """Robot name or folder; it may be identified. Default: the robot of the model's run; without a
-    model that of --limits-from for the driver of an extension, so101 for so101, otherwise h1_2."""
+    """Robot name or folder; it may be identified. Default: the robot of --model; without it, so101
+    for driver so101, the robot of --limits-from for the driver of an extension, and h1_2 for the
+    others."""
     connection: tyro.conf.OmitArgPrefixes[Connection] = Connection()  # noqa: RUF009
     """Connection to the robot."""
     control: tyro.conf.OmitArgPrefixes[ControlConfig] = ControlConfig()  # noqa: RUF009
@@ -56,9 +58,9 @@ class RunArgs(ControlArgs, RunOptions):
     """Options of a run: those of ControlArgs, compensation and live targets."""
 
     compensate: bool = False
-    """Correct the commands so that the robot follows the motion: feed-forward by --robot, best a
-    folder of gaponet identify. Velocity and acceleration of a motion are fed forward; those of live
-    targets only with --compensation.dynamics."""
+    """Correct the commands so that the robot follows the motion, with a feed-forward of the model
+    in --robot, which should be identified. Velocity and acceleration of a motion are fed forward;
+    those of live targets only with --compensation.dynamics."""
 
 
 def run(
@@ -72,8 +74,8 @@ def run(
     after you typed yes, unless --yes skips this question.
 
     Args:
-        motion: Motion name (gaponet collect lists the forms) or motion file (.txt, .csv, .npz). Or
-            give --targets.
+        motion: Name of a motion of the library, or motion file (.txt, .csv, .npz). Needed unless
+            --targets is given.
         args: Robot, control loop and model.
     """
     screen = Out(json)

@@ -36,7 +36,7 @@ class StartArgs(StartOptions):
     """What the steps are told about the robot and its logs."""
 
     map: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
-    """A joint's name in the log and the robot's, as a=b; may be repeated."""
+    """NAME_IN_LOG=NAME_OF_ROBOT of a joint; give the option once for each joint."""
 
 
 def start(
@@ -51,16 +51,17 @@ def start(
 ) -> None:
     """All steps in one command: from model file and logs to a report.
 
-    OUT/commands.sh lists the commands that ran. The same command again continues after an
-    interruption or a question. Logs that were added to the folder are imported, and later commands
-    run again. Other logs need another OUT.
+    OUT/commands.sh lists the commands that ran. After an interruption or a question, give the same
+    command again: it continues. Logs that were added to the folder are then imported, and later
+    commands run again. Other logs need another OUT.
 
     Args:
-        model: MJCF or URDF file; or a robot folder, or a packaged robot's name.
+        model: MJCF or URDF file of the robot, a robot folder, or a name such as so101.
         logs: Folder of logs, in any format that gaponet import reads.
         out: Folder for all results.
         options: The robot and its logs.
-        dry_run: Print the inspection and the commands, and write nothing.
+        dry_run: Print how the model and the logs were understood and which commands would run;
+            write nothing.
     """
     screen = Out(json)
     task = Start(model=model, logs=logs, out=out, options=options)

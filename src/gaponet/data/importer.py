@@ -92,19 +92,23 @@ class ImportOptions(ReadOptions):
     """How logs are read, and what they are of."""
 
     payload_side: str | None = None
-    """Hand that carries the payload: both (default), or the side of one payload mount."""
+    """Hand that carries the payload: both (default), or the side of one payload mount, such as
+    left."""
     cut: float | None = None
-    """Cut long recordings into equal pieces of about this length, s; each is a motion of its
-    own."""
+    """Cut long recordings into equal pieces of about this length, s. Each piece counts as a motion
+    of its own."""
     level: Literal["joint", "upper_body", "whole_body"] | None = None
-    """What the motions move; default whole_body."""
+    """What the motions move: a single joint, the upper body or the whole body. Default:
+    whole_body."""
     kp: tuple[str, ...] = ()
-    """Stiffness while recording, N·m/rad: a number, or JOINT=NUMBER for some joints; default what
-    the format states, else the robot's."""
+    """Stiffness of the controller while it recorded, N·m/rad: NUMBER for all joints, JOINT=NUMBER
+    for some. Default: what the logs state, or else the robot's file."""
     kd: tuple[str, ...] = ()
-    """Damping gain while recording, N·m·s/rad, likewise."""
+    """Damping gain of the controller while it recorded, N·m·s/rad: NUMBER for all joints,
+    JOINT=NUMBER for some. Default: what the logs state, or else the robot's file."""
     skip_bad: bool = False
-    """Cut bad rows and leave out unreadable logs, instead of refusing all."""
+    """Cut bad rows and leave out logs that cannot be read. Without this option one bad log refuses
+    the whole import."""
 
 
 @dataclass(frozen=True, kw_only=True)

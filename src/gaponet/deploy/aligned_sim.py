@@ -68,8 +68,9 @@ class AlignedSim:
                 fixed probes (`transfer` is None).
             model: A trained model, or an identified robot that the simulator then moves like; None
                 for the simulator without correction.
-            payload_mass: kg in each hand of options.payload_side, one number or one per simulation.
-            dt: Control period, s; default the robot's.
+            payload_mass: Payload in each hand of options.payload_side, kg; one number, or one per
+                simulation.
+            dt: Control period, s. Default: the robot's.
             num_envs: Simulations side by side; None for one, with arrays (n,).
             extrapolate: Take payloads beyond those trained on, and simulators beyond those
                 measured.

@@ -136,7 +136,7 @@ class Compensator:
                 target, the simulator of training replaces another one. With aim simulator, another
                 one is refused.
             model: The trained model; None for the feed-forward of the robot alone.
-            dt: Control period, s; default the robot's.
+            dt: Control period, s. Default: the robot's.
             num_envs: Number of robots; None for one, with arrays (n,).
             payload_side: The hands that carry the payload: "both", or the side of one mount.
             payload_step: Distance between the masses that the shadow can carry, kg.

@@ -224,17 +224,19 @@ class RobotOptions:
     """Recorded joints, by name or pattern ('*_elbow_*'); all others are frozen. Default: all hinges
     with an actuator, or all hinges."""
     kp: tuple[str, ...] = ()
-    """Position gain of the controller while recording, N·m/rad: 100 for all joints, '*wrist*=20'
-    for some; a later value replaces an earlier one. Default: the model's actuators."""
+    """Stiffness of the controller that recorded the logs, N·m/rad: 100 for all joints,
+    '*wrist*=20' for some. A later value replaces an earlier one. Default: the model's actuators."""
     kd: tuple[str, ...] = ()
-    """Damping gain, likewise, N·m·s/rad."""
+    """Damping gain of that controller, N·m·s/rad: NUMBER or PATTERN=NUMBER. Default: the model's
+    actuators."""
     effort_limit: tuple[str, ...] = ()
-    """Torque limit, likewise, N·m."""
+    """Largest torque of the motors, N·m: NUMBER or PATTERN=NUMBER. Default: the model's
+    actuators."""
     servo: tuple[str, ...] = ()
-    """Servo type, likewise, as gaponet robot servos lists them: its measured damping, friction and
-    armature and its torque limit replace the model's."""
+    """Type of the servos, TYPE or PATTERN=TYPE; gaponet robot servos lists the types. Damping,
+    friction, armature and torque limit of the type replace the model's."""
     packages: tuple[str, ...] = ()
-    """NAME=FOLDER for package://NAME in a URDF. Default: searched around the file."""
+    """NAME=FOLDER: where package://NAME of a URDF is. Default: searched around the file."""
     rate: float = 50.0
     """Commands per second, Hz."""
     keyframe: str = ""

@@ -218,22 +218,25 @@ class ReadOptions:
     """
 
     format: str | None = None
-    """Format of the logs; default by inspection; gaponet import --formats lists them."""
+    """Format of the logs; gaponet import --formats lists all. Default: recognised from the
+    files."""
     joint_map: Mapping[str, str] | None = None
     """Joint name in the logs → joint name of the robot."""
     logs: str | Path | None = None
-    """A logs.toml: what columns, names, units, signs and clocks mean; default the one in the folder
-    of the logs."""
+    """A logs.toml, which says what columns, names, units, signs and clocks mean. Default: the one
+    in the folder of the logs."""
     position_unit: PositionUnit | None = None
-    """Unit of positions, where the format leaves it open."""
+    """Unit of the positions. Needed if neither the format nor logs.toml states it."""
     time_unit: TimeUnit | None = None
-    """Unit of time, where the format leaves it open."""
+    """Unit of the clock. Needed if neither the format nor logs.toml states it."""
     rate: float | None = None
-    """Hz, of logs without a clock."""
+    """Rows per second, Hz, of logs that have no clock."""
     strict: bool = False
-    """Refuse logs with implausible velocity, torque or temperature, instead of repairing them."""
+    """Refuse logs with impossible velocities, torques or temperatures. By default such values are
+    replaced."""
     allow_pickle: bool = False
-    """Open pickled files (ASAP), with an unpickler that makes arrays, numbers and text only."""
+    """Open pickled files (ASAP). The unpickler makes only arrays, numbers and text, and runs no
+    code of the file."""
 
     def as_logs_file(self) -> LogsFile:
         """Return what is said here of fields of logs.toml."""

@@ -21,35 +21,38 @@ class PaperOptions:
     """Size of the experiment, and where it runs."""
 
     seeds: Count = 3
-    """Trainings of each setting."""
+    """Number of trainings of each network, each with another seed."""
     steps: Annotated[int, Interval(ge=1_000, le=10**10)] = 600_000
-    """Length of each training, control steps."""
+    """Length of each training, in control steps."""
     methods: tuple[Method, ...] = ("MLP", "shared MLP", "literal", "GAPONet")
-    """Networks. MLP: ASAP's form, the paper's baseline. shared MLP: the inputs and the number of
-    weights of GAPONet. literal: the paper's network in its own form."""
+    """Networks to train. MLP: a plain network in the form of ASAP, the paper's baseline. shared
+    MLP: a plain network with the inputs and the number of weights of GAPONet. literal: the network
+    as the paper writes it. GAPONet: the operator network of this package."""
     blocks: tuple[Block, ...] = ("labels", "ppo", "table2")
-    """Comparisons. labels: supervised pre-training, then PPO. ppo: PPO alone, the paper's recipe.
-    table2: one setting of the literal network at a time."""
+    """Parts of the experiment. labels: train all networks with supervised pre-training, then PPO.
+    ppo: train them with PPO alone, as the paper does. table2: vary one setting of the literal
+    network at a time, as in the paper's Table 2."""
     motions: Count = 10
-    """Motions of Figure 3, made for the experiment."""
+    """Number of motions in Figure 3; they are made for the experiment."""
     goals: Count = 50
-    """Goals of Table 1, per payload."""
+    """Number of goals in Table 1 for each payload."""
     unit: str = ""
     """Unit that no network sees. Default: the last unit of the fleet."""
     fleet: str = ""
     """Virtual fleet, or a .toml file. Default: the fleet that was recorded."""
     robot: str | None = None
-    """Robot name or folder, if not the one that the dataset stores."""
+    """Robot name or folder. Default: the robot that the dataset stores."""
     workers: Annotated[int, Interval(ge=0, le=1024)] = 0
-    """Trainings at a time, on one thread each; 0 for as many as there are cores."""
+    """Number of trainings at a time, each on one thread; 0 means as many as there are cores."""
     executor: str = LOCAL
-    """Where they run: local, ray or ray:ADDRESS (docs/install.md)."""
+    """Where trainings and simulations run: local (processes on this machine), ray or ray:HOST:PORT
+    (docs/install.md)."""
     identify_windows: Count = 40
-    """Rollouts of 8 s that identification fits; fewer are faster and less exact."""
+    """Number of rollouts of 8 s that identification fits. Fewer are faster and less exact."""
     despite_errors: Flag = False
-    """Train on recordings in which gaponet doctor finds an error; the page says so."""
+    """Train on recordings in which gaponet doctor finds an error. The page of results says so."""
     quick: Flag = False
-    """See every part work in three minutes. The numbers mean nothing."""
+    """Run every part in three minutes, to see that it works. The numbers mean nothing."""
 
     def for_quick_run(self) -> PaperOptions:
         """Return the options of a quick run."""

@@ -146,15 +146,15 @@ class ControlConfig:
     blend: float = 2.0
     """Shortest duration of the moves to the first target and back, s."""
     blend_speed: float = 0.5
-    """Fastest joint in those moves, rad/s."""
+    """Speed of the fastest joint in those moves, rad/s."""
     settle: float = 0.5
-    """Standing still at the first target before the run, s."""
+    """How long the robot stands still at the first target before the run, s."""
     blend_out: bool = True
-    """Whether the robot goes back, after the run, to where it was at the start. With
-    --no-blend-out it ends where the run ends. A fault never waits for the way back."""
+    """After the run the robot goes back to where it was at the start. With --no-blend-out it stays
+    where the run ends. A fault never waits for the way back."""
     damp: float = 2.0
-    """Damping after a fault, or handing the arms back after a run, before the robot is let go,
-    s."""
+    """How long the robot is damped after a fault, or hands its arms back after a run, before it is
+    let go, s."""
 
     def __post_init__(self) -> None:
         if not 1 <= self.rate <= 1000:

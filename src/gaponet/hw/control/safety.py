@@ -56,46 +56,48 @@ class SafetyConfig:
     """Limits and checks of states."""
 
     margin: float = 0.02
-    """Distance kept from each end of a joint's range, rad."""
+    """Distance that commands keep from each end of a joint's range, rad."""
     speed: float = 5.0
     """Fastest change of a command, rad/s."""
     torque_share: float = 0.95
     """Share of a joint's effort limit that a command may request."""
     acceleration: float = 50.0
-    """Fastest acceleration of a joint, rad/s²; bounds where it can be since its last state."""
+    """Largest acceleration of a joint, rad/s². It bounds where a joint can be now, given its last
+    state."""
     delta: float = 0.5
     """Largest correction of a model, rad."""
     delta_rate: float = 2.0
     """Fastest change of a model's correction, rad/s."""
     stale: float = 2.0
-    """Control periods after which a state is too old."""
+    """Number of control periods after which a state is too old."""
     frozen: int = 2
-    """Control periods with new messages but equal readings until a state counts as frozen; 0:
-    never."""
+    """Number of control periods with new messages but equal readings after which a state counts as
+    frozen; 0 means never."""
     frozen_travel: float = 0.3
-    """Way of a command while nothing moves, rad; on coarse encoders, whose readings may repeat."""
+    """States count as frozen if a command moves this far while no joint moves, rad. For coarse
+    encoders, whose readings may repeat."""
     frozen_joint: float = 0.1
-    """Way of one joint's command or velocity while its position stands still, rad; on fine
-    encoders."""
+    """A joint counts as frozen if its command, or its velocity over time, moves this far while its
+    position stands still, rad. For fine encoders."""
     joint_speed: float = 12.0
-    """A joint that moves faster between two states has jumped, rad/s."""
+    """A reading has jumped if its joint moves faster than this between two states, rad/s."""
     jump: float = 0.05
-    """Distance allowed beyond that before it counts as a jump, rad."""
+    """Distance beyond that speed that is not yet a jump, rad."""
     temperature: float = 85.0
-    """Hottest motor, °C."""
+    """Highest temperature of a motor, °C."""
     tilt: float = 0.7
     """Largest lean of the trunk, rad."""
     tracking: float = 0.6
-    """Largest |requested − measured| before the torque limit, rad, …"""
+    """Largest |requested − measured| position, before the torque limit changes the command, rad."""
     tracking_time: float = 0.25
-    """… for longer than this, s."""
+    """How long that difference may be exceeded, s."""
     following: float = 0.25
-    """Share of its command's way that a joint must go, on robots whose commands cannot be read
-    back; 0: not checked, for joints that press on something."""
+    """Share of the way of its command that a joint must go. For robots whose commands cannot be
+    read back. 0 means no check, for joints that press on something."""
     overrun: float = 2.0
-    """Control periods by which a period may start late."""
+    """How late a control period may start, in periods."""
     refused: int = 20
-    """Messages with a wrong checksum within one second."""
+    """How many messages with a wrong checksum may arrive within one second."""
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
