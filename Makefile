@@ -70,6 +70,7 @@ tournament: setup
 # runs only these; STEPS=quick runs the short form of each, an hour; STEPS=--list shows all, and when each ran.
 STEPS ?=
 results: setup
+	$(BIN)/pip install -q "mujoco[sysid]"  # a baseline
 	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/results.py results_work $(STEPS)
 
 # Changed files at random into everything that reads files: a quarter of an hour; counts as JSON, exit code 1 where one

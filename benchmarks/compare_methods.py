@@ -7,6 +7,7 @@ docs/benchmark.md says what is asked and how somebody adds a method or a data se
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -31,6 +32,9 @@ def compare(
 ) -> None:
     """Compare methods on public recordings of real robots.
 
+    The exit code is 1 if a method failed; the other rows are there, and the same command tries
+    again.
+
     Args:
         data: Folder of the public recordings; default GAPONET_DATA, else ../shared/data.
         out: Folder for datasets, table and figure.
@@ -43,7 +47,8 @@ def compare(
     methods = METHODS | {name: (name, function) for name, function in map(load_method, method)}
     if networks:
         methods |= network_methods(networks)
-    result = Bench(read_cards(), data_folder(data), out, methods, screen.say).run(sets, questions)
+    bench = Bench(read_cards(), data_folder(data), out, methods, screen.say)
+    result = bench.run(sets, questions)
     screen.show(
         "Real robots, recordings that no method was fitted to", result_table(result["rows"])
     )
@@ -52,6 +57,8 @@ def compare(
     for path in write_page(result, out):
         screen.say(f"written: {path!s}")
     screen.result(result)
+    if bench.failed:
+        sys.exit(f"no rows of: {'; '.join(bench.failed)}")
 
 
 if __name__ == "__main__":

@@ -8,7 +8,7 @@ import json
 import re
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +34,7 @@ class Bench:
     work: Path  # folder for datasets, trainings and evaluations
     methods: dict[str, tuple[str, Method]]  # name → title and method
     say: Callable[[str], None] = print  # called with a line about each step
+    failed: list[str] = field(default_factory=list)  # rows that a method's error cost
 
     def run(self, sets: tuple[str, ...] = (), names: tuple[str, ...] = ()) -> dict[str, Any]:
         """Import, split, fit and measure.
@@ -138,6 +139,7 @@ class Bench:
             except Exception as error:  # anybody's method: it loses its own row and no other
                 kind = "" if isinstance(error, GAPONetError) else f"{type(error).__name__}: "
                 self.say(f"{card.name}, {name}, {title}: {kind}{error}")
+                self.failed.append(f"{card.name}, {name}, {title}")
                 continue
             by_motion, by_joint = _averages(folds, [fold["errors"] for fold in evaluated])
             errors = np.array([*by_motion.values()])

@@ -192,6 +192,7 @@ def test_a_failing_method_loses_its_own_row_and_single_joints_have_errors_by_pay
     bench = bench_of(methods, tmp_path, said.append)
     (row,) = bench.evaluate(card_of("so101"), question.name, [question])
     assert any("mine: ZeroDivisionError" in text for text in said)
+    assert bench.failed == ["so101, 0.5 kg left out, mine"]
     ((mrad, count),) = row["by_joint_mrad"][arm.operated[0]].values()
     assert mrad == pytest.approx(row["mrad"])
     assert count == 12
