@@ -46,7 +46,7 @@ def widths(layers: tuple[int, ...]) -> str:
             f"Branch ({widths(MODEL.branch_hidden)}, ELU) and trunk ({widths(MODEL.trunk_hidden)})",
         ),
         ("reference/paper-network.md", f"(hidden layers of {widths(MODEL.sensor_hidden)})"),
-        ("network.md", f"{widths(MODEL.mlp_hidden)} on the features"),
+        ("network.md", f"layers of {widths(MODEL.mlp_hidden)}."),
         ("network.md", f"p = {MODEL.num_basis} features"),
         ("reference/paper-network.md", f"m = {MODEL.num_probes} targets"),
         (
