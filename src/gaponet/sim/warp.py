@@ -260,7 +260,7 @@ class _AllWorlds:
                 self.fields[name] = view.new_zeros(sim.num_envs, *view.shape[1:])
 
     def model_field(self, name: str) -> Tensor:
-        """Return a copy of a field that the simulations' models have of their own, (num_envs, …)."""
+        """Return a copy of a field that differs between simulations, (num_envs, …)."""
         parts = [warp.to_torch(getattr(worlds.model, name)) for worlds in self.of_rates]
         order = torch.argsort(torch.cat(self._rows))
         return torch.cat(parts)[order]
