@@ -38,15 +38,11 @@ def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Calla
         for name, text in modules.items():
             (tmp_path / f"{tmp_path.name}_{name}.py").write_text(text)
         monkeypatch.syspath_prepend(str(tmp_path))
-        forget()
-
-    def forget() -> None:
-        plugins._points.cache_clear()
-        plugins._WARNED.clear()
+        plugins.forget_extensions()
 
     yield install
     monkeypatch.undo()
-    forget()
+    plugins.forget_extensions()
 
 
 # The command line knows the drivers that were there when it was imported.

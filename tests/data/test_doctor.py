@@ -287,41 +287,43 @@ def lively(seed: int) -> tuple[np.ndarray, np.ndarray]:
     return ctrl, late(lowpass(ctrl, 0.02, 4.0), 4)
 
 
+def five_logs(arm, change=lambda number, qpos: qpos):
+    """Logs m0 to m4, whose states are changed by change(number, state)."""
+    logs = []
+    for number in range(5):
+        ctrl, qpos = lively(number)
+        logs.append(arm_sequence(arm, ctrl, change(number, qpos), motion=f"m{number}"))
+    return logs
+
+
+def of_a_fast_clock(number, qpos):
+    """The state by a clock that is faster than the commands' by 3 in 1000."""
+    rows = np.arange(len(qpos))
+    return np.stack([np.interp(rows * 1.003, rows, column) for column in qpos.T], axis=1)
+
+
+def of_one_late_recording(number, qpos):
+    return late(qpos, 3) if number == 2 else qpos
+
+
+def test_times_that_belong_together_are_left_alone(arm, tmp_path):
+    diagnosis = examine(arm, tmp_path, *five_logs(arm))
+    warned = {f.check for f in diagnosis.findings if f.level in ("warning", "error")}
+    assert not warned & {"clock", "lag", "copied", "averaged"}
+
+
 @pytest.mark.parametrize(
     ("odd", "check", "words"),
     [
-        (
-            lambda i, q: np.stack(
-                [np.interp(np.arange(len(q)) * 1.003, np.arange(len(q)), c) for c in q.T], axis=1
-            ),
-            "clock",
-            "each recording follows its commands sooner",
-        ),
-        (lambda i, q: late(q, 3) if i == 2 else q, "lag", "m2 (a, 0 kg) follows its commands"),
+        (of_a_fast_clock, "clock", "each recording follows its commands sooner"),
+        (of_one_late_recording, "lag", "m2 (a, 0 kg) follows its commands"),
     ],
     ids=["clocks that drift", "one late recording"],
 )
-def test_times_that_do_not_belong_together_are_found_and_others_are_left_alone(
-    arm, tmp_path, odd, check, words
-):
-    logs = [(f"m{i}", *lively(i)) for i in range(5)]
-    fine = examine(arm, tmp_path / "fine", *(arm_sequence(arm, u, q, motion=m) for m, u, q in logs))
-    assert not {f.check for f in fine.findings if f.level in ("warning", "error")} & {
-        "clock",
-        "lag",
-        "copied",
-        "averaged",
-    }
-    bad = examine(
-        arm,
-        tmp_path / "bad",
-        *(arm_sequence(arm, u, odd(i, q), motion=m) for i, (m, u, q) in enumerate(logs)),
-    )
-    assert any(
-        f.check == check and words in f.message
-        for f in bad.findings
-        if f.level in ("warning", "error")
-    )
+def test_times_that_do_not_belong_together_are_found(arm, tmp_path, odd, check, words):
+    diagnosis = examine(arm, tmp_path, *five_logs(arm, odd))
+    bad = [f for f in diagnosis.findings if f.level in ("warning", "error")]
+    assert any(words in f.message for f in bad if f.check == check)
 
 
 @pytest.mark.parametrize(("middle", "told"), [(0.5, True), (2.5, False)], ids=["drift", "jumps"])
@@ -483,38 +485,50 @@ def test_a_motor_too_weak_for_its_load_is_no_error_of_the_commands(arm, tmp_path
     assert "though they move with them: motors too weak for their load" in finding.message
 
 
+def sampled(values, step, times):
+    """Columns of values (T, n) that stand `step` s apart, at other times, s."""
+    clock = step * np.arange(len(values))
+    return np.stack([np.interp(times, clock, column) for column in values.T], axis=1)
+
+
+def slow_rows(arm, times, rng):
+    """A log's columns with rows at these times, s: commands hold for 20 ms, states are 60 ms
+    late.
+    """
+    step = 0.005
+    targets = np.repeat(rng.uniform(-1, 1, (40, 2)), 200, axis=0)
+    ctrl = lowpass(targets, step, 0.8)
+    held = sampled(ctrl, step, np.floor(times / 0.02) * 0.02)
+    state = sampled(ctrl, step, times - 0.06)
+    columns = {"time": times}
+    for i, joint in enumerate(arm.joint_names):
+        columns[f"ctrl.{joint}"] = held[:, i]
+        columns[f"qpos.{joint}"] = state[:, i]
+    return columns
+
+
 @pytest.mark.parametrize("rows", ["uniform 12 to 40 Hz", "slower and slower"])
 def test_rows_at_12_to_40_hz_are_no_error_of_clocks_and_say_which_times_are_not_known(
     arm, tmp_path, rows
 ):
-    even = rows.startswith("uniform")
     folder = tmp_path / "logs"
     folder.mkdir()
     for seed in range(4):
         rng = np.random.default_rng(seed)
-        time = np.cumsum(1 / (rng.uniform(12, 40, 700) if even else np.linspace(40, 12, 700)))
-        clock, ctrl = (
-            0.005 * np.arange(8000),
-            lowpass(np.repeat(rng.uniform(-1, 1, (40, 2)), 200, axis=0), 0.005, 0.8),
-        )
-        at = lambda x, t, clock=clock: np.stack([np.interp(t, clock, c) for c in x.T], axis=1)  # noqa: E731
-        held, state = at(ctrl, np.floor(time / 0.02) * 0.02), at(ctrl, time - 0.06)
-        names = [f"{c}.{j}" for c in ("ctrl", "qpos") for j in arm.joint_names]
-        columns = dict(zip(names, np.concatenate([held, state], axis=1).T, strict=True))
-        (folder / f"m{seed}.csv").write_text(table_text({"time": time} | columns))
-    data = import_logs(
-        folder,
-        arm,
-        tmp_path / "data",
-        ImportRequest(unit_id="a", payload_mass=0.0, position_unit="rad", time_unit="s"),
-    ).dataset
+        rates = np.linspace(40, 12, 700)
+        if rows.startswith("uniform"):
+            rates = rng.uniform(12, 40, 700)
+        columns = slow_rows(arm, np.cumsum(1 / rates), rng)
+        (folder / f"m{seed}.csv").write_text(table_text(columns))
+    request = ImportRequest(unit_id="a", payload_mass=0.0, position_unit="rad", time_unit="s")
+    data = import_logs(folder, arm, tmp_path / "data", request).dataset
     assert "apart, and shorter delays are not known" in data.entries[0].meta.notes["why_resampled"]
     diagnosis = DoctorResult.of(data, arm)
-    assert [
-        f.message
-        for f in diagnosis.findings
-        if f.level == "error" or f.check in ("copied", "averaged")
-    ] == ["no state comes before its command"]
+    messages = []
+    for finding in diagnosis.findings:
+        if finding.level == "error" or finding.check in ("copied", "averaged"):
+            messages.append(finding.message)
+    assert messages == ["no state comes before its command"]
     assert "cannot be told between such rows" in found(diagnosis, "jitter", "warning").message
 
 
@@ -614,22 +628,43 @@ def test_the_inventory_counts_units_payloads_and_minutes(arm, tmp_path):
     )
 
 
-def test_real_so101_logs_show_their_lag_sag_torque_gripper_and_rate(real_dataset, so101):
-    diagnosis = DoctorResult.of(real_dataset, so101, gravity_model=gravity_of(so101))
-    assert diagnosis.verdict == "Usable. Read the 3 warnings first."
-    lags = found(diagnosis, "lag", "note").values
+@pytest.fixture(scope="module")
+def real_diagnosis(real_dataset, so101) -> DoctorResult:
+    return DoctorResult.of(real_dataset, so101, gravity_model=gravity_of(so101))
+
+
+def test_real_so101_logs_are_usable(real_diagnosis):
+    assert real_diagnosis.verdict == "Usable. Read the 3 warnings first."
+
+
+def test_real_so101_logs_show_their_lag(real_diagnosis, so101):
+    lags = found(real_diagnosis, "lag", "note").values
     for joint in so101.operated:
         assert 0.08 <= lags[joint]["median"] <= 0.16
         assert 0.07 <= lags[joint]["min"] <= lags[joint]["max"] <= 0.16
-    assert found(diagnosis, "sag", "note").joints == ("shoulder_lift", "elbow_flex")
-    assert found(diagnosis, "unit", "note").message.startswith(
-        "gripper is logged as 0..1, not in rad"
-    )
-    torque = [f.message for f in diagnosis.findings if f.check == "torque"]
+
+
+def test_real_so101_logs_show_their_sag(real_diagnosis):
+    assert found(real_diagnosis, "sag", "note").joints == ("shoulder_lift", "elbow_flex")
+
+
+def test_real_so101_logs_show_the_unit_of_their_gripper(real_diagnosis):
+    message = found(real_diagnosis, "unit", "note").message
+    assert message.startswith("gripper is logged as 0..1, not in rad")
+
+
+def test_real_so101_logs_show_what_their_torque_is(real_diagnosis):
+    torque = [f.message for f in real_diagnosis.findings if f.check == "torque"]
     assert torque[0].startswith("torque is unsigned")
     assert torque[1].startswith("torque spikes")
-    assert {row["rate_hz"] for row in diagnosis.sequences} == {49.85}
-    assert found(diagnosis, "blocked", "warning").joints == ("wrist_roll",)
+
+
+def test_real_so101_logs_show_their_rate(real_diagnosis):
+    assert {row["rate_hz"] for row in real_diagnosis.sequences} == {49.85}
+
+
+def test_real_so101_logs_show_the_joint_that_was_blocked(real_diagnosis):
+    assert found(real_diagnosis, "blocked", "warning").joints == ("wrist_roll",)
 
 
 def read(arm, tmp_path, columns, **more) -> DoctorResult:

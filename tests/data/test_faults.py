@@ -12,8 +12,7 @@ from gaponet.report.figures.dataset_figures import draw_findings
 from gaponet.robot.finding import Finding
 from gaponet.robot.spec import load_robot
 
-# Check, level and words of the finding that names it; no level: the import refuses with these
-# words.
+# Check, level and words of the finding that names it.
 NAMED = {
     "sign of command and state": ("gravity", "warning", "with its angle mirrored at elbow_flex"),
     "offset of 20 mrad": ("offset", "note", "elbow_flex rests +2"),
@@ -41,13 +40,13 @@ NAMED = {
     "quantised": ("resolution", "warning", "come in steps of up to 10.0 mrad"),
     "saturated torque": ("saturation", "warning", "torque of elbow_flex is cut off flat at"),
     "saturated command": ("unit", "warning", "elbow_flex goes 1."),
-    "truncated at a row's end": ("", "", "its states end"),
 }
-MENDED = (
-    "sign of command and state",
-    "zero of command and state",
-    "joint order",
-)  # by lines for logs.toml
+# Words of the error with which the import refuses it.
+REFUSED = {"truncated at a row's end": "its states end"}
+# By lines for logs.toml.
+MENDED = ("sign of command and state", "zero of command and state", "joint order")
+# Checks that may warn of what follows from another fault.
+CONSEQUENCES = {"jitter", "blocked", "jumps", "unit", "stuck", "range"}
 
 
 @pytest.fixture(scope="module")
@@ -64,13 +63,8 @@ def logs(robot):
 def test_good_logs_of_soft_and_stiff_motors_are_good(robot, tmp_path, kp):
     diagnosis = examine(robot, recordings(robot, kp), tmp_path)
     assert diagnosis.verdict == "Good: no error and no warning."
-    assert not {f.check for f in diagnosis.findings} & {
-        "offset",
-        "scale",
-        "gains",
-        "payload",
-        "unit_id",
-    }
+    checks = {finding.check for finding in diagnosis.findings}
+    assert not checks & {"offset", "scale", "gains", "payload", "unit_id"}
     assert Finding.proposal(diagnosis.findings) == "# gaponet doctor --fix: nothing to mend.\n"
 
 
@@ -82,39 +76,66 @@ def test_encoder_steps_of_12_bits_are_no_fault(robot, logs, tmp_path):
     assert examine(robot, coarse, tmp_path).verdict.startswith("Good")
 
 
-@pytest.mark.parametrize("fault", FAULTS)
-def test_a_fault_is_found_and_named_or_refused(robot, logs, tmp_path, fault):
-    change, how = FAULTS[fault]
+def examine_fault(robot, logs, fault, folder, **how):
+    change, options = FAULTS[fault]
+    return examine(robot, change(logs), folder, **options, **how)
+
+
+def warnings_of(diagnosis):
+    """The findings that are warnings or errors."""
+    return [f for f in diagnosis.findings if f.level in ("warning", "error")]
+
+
+def test_every_fault_is_named_or_refused():
+    assert FAULTS.keys() == NAMED.keys() | REFUSED.keys()
+
+
+@pytest.fixture(scope="module", params=NAMED)
+def fault(request):
+    return request.param
+
+
+@pytest.fixture(scope="module")
+def diagnosis(robot, logs, fault, tmp_path_factory):
+    """The doctor's, of logs with the fault."""
+    return examine_fault(robot, logs, fault, tmp_path_factory.mktemp("fault"))
+
+
+def test_a_fault_is_found_and_named(diagnosis, fault):
     check, level, words = NAMED[fault]
-    answer = examine(robot, change(logs), tmp_path, **how)
-    if not check:
-        assert isinstance(answer, GAPONetError)
-        assert words in str(answer)
-        return
-    assert [
-        f for f in answer.findings if (f.check, f.level) == (check, level) and words in f.message
-    ]
-    others = {f.check for f in answer.findings if f.level in ("warning", "error")} - {check}
-    assert others <= {
-        "jitter",
-        "blocked",
-        "jumps",
-        "unit",
-        "stuck",
-        "range",
-    }  # what follows from it
-    if fault in MENDED:
-        proposed = Finding.proposal(answer.findings)
-        assert "applied to nothing" in proposed
-        mended = examine(robot, change(logs), tmp_path / "mended", logs_toml=proposed)
-        assert [f.message for f in mended.findings if f.level in ("warning", "error")] == []
+    messages = [f.message for f in diagnosis.findings if (f.check, f.level) == (check, level)]
+    assert any(words in message for message in messages)
+
+
+def test_beside_a_fault_only_its_consequences_are_warned_of(diagnosis, fault):
+    check, _, _ = NAMED[fault]
+    assert {f.check for f in warnings_of(diagnosis)} <= {check} | CONSEQUENCES
+
+
+@pytest.mark.parametrize("fault", MENDED, scope="module")
+def test_a_fault_of_all_logs_is_mended_by_the_lines_that_are_proposed(
+    diagnosis, robot, logs, fault, tmp_path
+):
+    proposed = Finding.proposal(diagnosis.findings)
+    assert "applied to nothing" in proposed
+    mended = examine_fault(robot, logs, fault, tmp_path, logs_toml=proposed)
+    assert [f.message for f in warnings_of(mended)] == []
+
+
+@pytest.mark.parametrize("fault", REFUSED)
+def test_a_fault_is_refused(robot, logs, fault, tmp_path):
+    error = examine_fault(robot, logs, fault, tmp_path)
+    assert isinstance(error, GAPONetError)
+    assert REFUSED[fault] in str(error)
 
 
 def test_each_finding_has_a_picture(robot, logs, tmp_path):
-    change, _ = FAULTS["spike of a state"]
-    findings = examine(robot, change(logs), tmp_path).findings
+    findings = examine_fault(robot, logs, "spike of a state", tmp_path).findings
     written = draw_findings(Dataset(tmp_path / "data"), robot, findings, tmp_path)
     assert (tmp_path / "01-jumps.png") in written
-    assert len(written) == 2 * sum(
-        f.level != "ok" and (f.level != "note" or bool(f.joints)) for f in findings
-    )
+    pictured = 0
+    for finding in findings:
+        is_of_joints = finding.level == "note" and finding.joints
+        if finding.level in ("warning", "error") or is_of_joints:
+            pictured += 1
+    assert len(written) == 2 * pictured

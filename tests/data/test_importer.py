@@ -8,6 +8,8 @@ import itertools
 import json
 import os
 import shutil
+from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -23,13 +25,17 @@ SI = {"position_unit": "rad", "time_unit": "s"}
 LAB = ImportRequest(unit_id="lab", payload_mass=0.0)
 
 
-@pytest.fixture
-def logs(tmp_path):
-    """Two SO-101 motions, 2 periods late."""
+def write_two_motions(folder):
+    """Write two SO-101 motions, 2 periods late."""
     for i, name in enumerate(("up", "down")):
         ctrl = wave(200, 6, hertz=0.5 + 0.2 * i)
-        write_sage(tmp_path / "logs" / "real" / "so101" / "custom" / name, ctrl, late(ctrl, 2))
-    return tmp_path / "logs"
+        write_sage(folder / "real" / "so101" / "custom" / name, ctrl, late(ctrl, 2))
+    return folder
+
+
+@pytest.fixture
+def logs(tmp_path):
+    return write_two_motions(tmp_path / "logs")
 
 
 def test_every_motion_becomes_a_sequence_with_its_origin(logs, so101, tmp_path):
@@ -136,49 +142,90 @@ def test_one_bad_file_leaves_nothing_behind(logs, so101, tmp_path):
     assert not (tmp_path / "data").exists()
 
 
-def test_an_import_cut_short_at_any_write_is_finished_by_the_same_call(
-    logs, so101, tmp_path, monkeypatch
-):
-    """Every operation on the disk fails once; the journal lists all files, whole ones; the end is
-    always the same.
+class FailingDisk:
+    """Makes one operation on the disk fail as on a full disk, the one after `before_failure` - 1
+    others.
     """
-    whole = import_logs(logs, so101, tmp_path / "whole", LAB, gravity=lambda q, m, s: 0 * q)
-    real = {name: getattr(os, name) for name in ("replace", "fsync", "pwrite", "mkdir")}
-    left = None
 
-    def failing(name):
+    def __init__(self, patch):
+        self.before_failure = 0
+        for name in ("replace", "fsync", "pwrite", "mkdir"):
+            patch.setattr(os, name, self.counted(getattr(os, name)))
+
+    def counted(self, operation):
         def call(*args, **more):
-            nonlocal left
-            left -= 1
-            if left == 0:
+            self.before_failure -= 1
+            if self.before_failure == 0:
                 raise OSError(errno.ENOSPC, "No space left on device")
-            return real[name](*args, **more)
+            return operation(*args, **more)
 
         return call
 
-    for name in real:
-        monkeypatch.setattr(os, name, failing(name))
-    for n in itertools.count(1):
-        left, out = n, tmp_path / f"cut{n}"
-        try:
-            import_logs(logs, so101, out, LAB, gravity=lambda q, m, s: 0 * q)
-        except OSError:
-            assert left <= 0
-        if left > 0:  # there are no more
-            break
-        left = -1
-        if (out / "dataset.json").exists():
-            files = {f.stem for f in out.glob("sequences/*")}
-            assert files == {e.id for e in Dataset(out).entries}
-            Dataset(out).sequences()
-        else:
-            assert not out.exists()
-        import_logs(logs, so101, out, LAB, gravity=lambda q, m, s: 0 * q)
-        assert Dataset(out).entries == whole.dataset.entries
-        assert sorted(f.name for f in out.rglob("*")) == sorted(
-            f.name for f in whole.dataset.path.rglob("*")
-        )
-    assert n > 20
+    @property
+    def has_failed(self):
+        return self.before_failure <= 0
+
+
+def import_without_gravity(logs, robot, out):
+    no_load = lambda qpos, mass, side: 0 * qpos  # noqa: E731
+    return import_logs(logs, robot, out, LAB, gravity=no_load)
+
+
+def import_cut_short(disk, operations, logs, robot, out):
+    """Import, and return True if the disk failed: at this of the import's operations."""
+    disk.before_failure = operations
+    try:
+        import_without_gravity(logs, robot, out)
+    except OSError:
+        assert disk.has_failed
+    return disk.has_failed
+
+
+class CutImports(NamedTuple):
+    logs: Path
+    folders: list[Path]  # one for each operation on the disk that can fail
+
+
+@pytest.fixture(scope="module")
+def cut_imports(so101, tmp_path_factory):
+    """What imports of two motions leave behind, each cut short at another operation."""
+    place = tmp_path_factory.mktemp("cut_imports")
+    logs = write_two_motions(place / "logs")
+    folders = []
+    with pytest.MonkeyPatch.context() as patch:
+        disk = FailingDisk(patch)
+        for operations in itertools.count(1):
+            out = place / f"cut{operations}"
+            if not import_cut_short(disk, operations, logs, so101, out):
+                break
+            folders.append(out)
+    assert len(folders) > 20
+    return CutImports(logs, folders)
+
+
+def test_an_import_cut_short_at_any_write_leaves_whole_sequences_or_nothing(cut_imports):
+    for folder in cut_imports.folders:
+        if not (folder / "dataset.json").exists():
+            assert not folder.exists()
+            continue
+        dataset = Dataset(folder)
+        files = {file.stem for file in folder.glob("sequences/*")}
+        assert files == {entry.id for entry in dataset.entries}
+        dataset.sequences()  # reads each
+
+
+def test_an_import_cut_short_at_any_write_is_finished_by_the_same_call(
+    cut_imports, so101, tmp_path
+):
+    whole = import_without_gravity(cut_imports.logs, so101, tmp_path / "whole").dataset
+    names = sorted(file.name for file in whole.path.rglob("*"))
+    for folder in cut_imports.folders:
+        out = tmp_path / folder.name
+        if folder.exists():
+            shutil.copytree(folder, out)
+        import_without_gravity(cut_imports.logs, so101, out)
+        assert Dataset(out).entries == whole.entries
+        assert sorted(file.name for file in out.rglob("*")) == names
 
 
 def test_a_folder_with_something_else_in_it_is_left_as_it_is(logs, so101, tmp_path):

@@ -258,40 +258,71 @@ def test_motions_that_rest_at_one_place_are_not_one():
     ) == [(0, 1)]
 
 
-def test_motions_with_equal_commands_are_one_motion_for_every_split(arm, tmp_path):
+def forget_sketches(dataset):
+    """Rewrite the journal so that two of three sequences are from before sketches of commands were
+    kept.
+    """
+    journal = dataset.path / "sequences.jsonl"
+    lines = []
+    for i, text in enumerate(journal.read_text().splitlines()):
+        line = json.loads(text)
+        if i % 3:
+            line["command"] = None
+        lines.append(json.dumps(line) + "\n")
+    journal.write_text("".join(lines))
+    return Dataset(dataset.path)
+
+
+@pytest.fixture
+def lifts(arm, tmp_path):
+    """Twelve commands, each under two names with another payload: lift3_0kg and lift3_1kg."""
+    data = Dataset.create(tmp_path / "data", arm)
+    for number in range(12):
+        ctrl = walk(200, number)
+        for payload, lag in ((0.0, 2), (1.0, 5)):
+            name = f"lift{number}_{payload:g}kg"
+            data.append(arm_sequence(arm, ctrl, late(ctrl, lag), name, payload))
+    return forget_sketches(data)
+
+
+def commands_of(entries):
+    return {entry.meta.motion.partition("_")[0] for entry in entries}
+
+
+def test_motions_with_equal_commands_have_one_canonical_name(lifts):
+    assert len(set(canonical_motions(lifts).values())) == 12
+
+
+@pytest.mark.parametrize(
+    "split",
+    [
+        split_entries,
+        lambda data: make_split(data, "motion"),
+        lambda data: make_split(data, "motion", ("lift3_1kg",)),
+    ],
+)
+def test_motions_with_equal_commands_are_one_motion_for_every_split(lifts, split):
     """lift_0kg and lift_1kg are told the same: one in training would show the other's test
     commands.
     """
-    data = Dataset.create(tmp_path / "data", arm)
-    for k in range(12):
-        ctrl = walk(200, k)
-        for name, payload, lag in ((f"lift{k}_0kg", 0.0, 2), (f"lift{k}_1kg", 1.0, 5)):
-            data.append(arm_sequence(arm, ctrl, late(ctrl, lag), name, payload))
-    journal = data.path / "sequences.jsonl"
-    lines = [json.loads(line) for line in journal.read_text().splitlines()]
-    old = [
-        line | {"command": None} if i % 3 else line for i, line in enumerate(lines)
-    ]  # before sketches were kept
-    journal.write_text("".join(json.dumps(line) + "\n" for line in old))
-    data = Dataset(data.path)
-    assert len(set(canonical_motions(data).values())) == 12
-    for parts in (
-        split_entries(data),
-        make_split(data, "motion"),
-        make_split(data, "motion", ("lift3_1kg",)),
-        make_split(data, "payload", ("1",)),
-    ):
-        sides = {
-            part: {re.sub("_.*", "", e.meta.motion) for e in entries}
-            for part, entries in parts.items()
-        }
-        if {e.meta.payload_mass for e in parts["test"]} == {0.0, 1.0}:
-            assert not sides["test"] & (sides["train"] | sides["val"])
-        assert not sides["train"] & sides["val"]
-    assert values(make_split(data, "motion", ("lift3_1kg",))["test"], "motion") == {
-        "lift3_0kg",
-        "lift3_1kg",
-    }
+    parts = split(lifts)
+    assert values(parts["test"], "payload_mass") == {0.0, 1.0}
+    train = commands_of(parts["train"])
+    val = commands_of(parts["val"])
+    test = commands_of(parts["test"])
+    assert not test & (train | val)
+    assert not train & val
+
+
+def test_motions_with_equal_commands_are_one_motion_for_training_and_validation_by_payload(lifts):
+    parts = make_split(lifts, "payload", ("1",))
+    assert values(parts["test"], "payload_mass") == {1.0}
+    assert not commands_of(parts["train"]) & commands_of(parts["val"])
+
+
+def test_a_motion_with_the_command_of_a_test_motion_is_tested_as_well(lifts):
+    parts = make_split(lifts, "motion", ("lift3_1kg",))
+    assert values(parts["test"], "motion") == {"lift3_0kg", "lift3_1kg"}
 
 
 def test_motions_that_are_all_one_are_repetitions_and_no_motions(arm, tmp_path):
@@ -308,51 +339,61 @@ def test_motions_that_are_all_one_are_repetitions_and_no_motions(arm, tmp_path):
         make_split(data, "motion")
 
 
-def test_one_command_played_again_is_split_by_repetition_and_long_logs_by_time(arm, tmp_path):
-    data, whole = Dataset.create(tmp_path / "data", arm), wave(900, 2)
+@pytest.fixture
+def played_again(arm, tmp_path):
+    """One command, played seven times."""
+    data = Dataset.create(tmp_path / "data", arm)
+    ctrl = wave(900, 2)
     for i in range(7):
-        played = arm_sequence(arm, whole, late(whole, 2) + 1e-3 * i, "chirp")
+        played = arm_sequence(arm, ctrl, late(ctrl, 2) + 1e-3 * i, "chirp")
         data.append(replace(played, meta=replace(played.meta, repetition=i)))
-    first = split_entries(data)
-    assert [sorted(e.meta.repetition for e in first[part]) for part in SPLITS] == [
-        [0, 1, 2, 3],
-        [4],
-        [5, 6],
-    ]
-    parts = make_split(data, "repetition", ("2",))
-    assert [sorted(e.meta.repetition for e in parts[part]) for part in SPLITS] == [
-        [0, 1, 3, 4, 5],
-        [6],
-        [2],
-    ]
+    return data
+
+
+def repetitions(parts):
+    """Of train, val and test."""
+    return [sorted(entry.meta.repetition for entry in parts[part]) for part in SPLITS]
+
+
+def test_one_command_played_again_is_split_by_repetition(played_again):
+    assert repetitions(split_entries(played_again)) == [[0, 1, 2, 3], [4], [5, 6]]
+
+
+def test_a_repetition_that_is_named_is_the_test_part(played_again):
+    parts = make_split(played_again, "repetition", ("2",))
+    assert repetitions(parts) == [[0, 1, 3, 4, 5], [6], [2]]
+
+
+def test_repetitions_cannot_be_split_by_time(played_again):
     with pytest.raises(UsageError, match="pieces"):
-        make_split(data, "time")
-    (tmp_path / "long.csv").write_text(table_text(arm_columns(900)))
-    report = import_logs(
-        tmp_path / "long.csv",
-        arm,
-        tmp_path / "cut",
-        ImportRequest(unit_id="a", payload_mass=0.0, cut=4.0, position_unit="rad", time_unit="s"),
+        make_split(played_again, "time")
+
+
+def import_in_pieces(arm, columns, file):
+    """Import a table, cut every 4 s."""
+    file.write_text(table_text(columns))
+    request = ImportRequest(
+        unit_id="a", payload_mass=0.0, cut=4.0, position_unit="rad", time_unit="s"
     )
-    assert [(e.meta.motion, e.rows) for e in report.entries] == [
-        ("long@0s", 225),
-        ("long@4s", 225),
-        ("long@9s", 225),
-        ("long@14s", 225),
-    ]
-    rested = arm_columns(900) | {k: np.zeros(900) for k in arm_columns() if k != "time"}
-    (tmp_path / "rest.csv").write_text(table_text(rested))
-    how = {"cut": 4.0, "position_unit": "rad", "time_unit": "s"}
-    (piece,) = import_logs(
-        tmp_path / "rest.csv",
-        arm,
-        tmp_path / "rests",
-        ImportRequest(unit_id="a", payload_mass=0.0, **how),
-    ).entries
-    assert piece.meta.motion == "rest@0s"  # equal pieces of one recording are one
-    parts = make_split(report.dataset, "time")
-    named = [[e.meta.motion for e in parts[part]] for part in SPLITS]
-    assert named == [["long@0s", "long@4s"], ["long@9s"], ["long@14s"]]
+    return import_logs(file, arm, file.with_suffix(""), request)
+
+
+def test_a_long_log_is_cut_into_equal_pieces_and_split_by_time(arm, tmp_path):
+    pieces = import_in_pieces(arm, arm_columns(900), tmp_path / "long.csv")
+    names = ["long@0s", "long@4s", "long@9s", "long@14s"]
+    assert [entry.meta.motion for entry in pieces.entries] == names
+    assert [entry.rows for entry in pieces.entries] == [225] * 4
+    parts = make_split(pieces.dataset, "time")
+    motions = [[entry.meta.motion for entry in parts[part]] for part in SPLITS]
+    assert motions == [["long@0s", "long@4s"], ["long@9s"], ["long@14s"]]
+
+
+def test_equal_pieces_of_one_recording_are_one(arm, tmp_path):
+    columns = arm_columns(900)
+    for name in columns.keys() - {"time"}:
+        columns[name] = np.zeros(900)
+    (piece,) = import_in_pieces(arm, columns, tmp_path / "rest.csv").entries
+    assert piece.meta.motion == "rest@0s"
 
 
 @pytest.fixture

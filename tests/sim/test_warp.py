@@ -205,7 +205,6 @@ def test_the_servo_model_of_a_physics_step_agrees_with_mujoco_up_to_rounding(tmp
     ours.servo_model.servos.records["effort_limit"] *= np.array([[1.0], [0.5], [0.1]])
     theirs = WarpSim(ours, DEVICE)
     rng = np.random.default_rng(0)
-    model = theirs._worlds.of_rates[0].model
     for ids in (np.arange(3), np.array([0, 2])):
         qpos = rng.normal(0, 0.3, (len(ids), 2))
         qvel = rng.normal(0, 0.3, (len(ids), 2))
@@ -220,6 +219,6 @@ def test_the_servo_model_of_a_physics_step_agrees_with_mujoco_up_to_rounding(tmp
         theirs.step(target)
         for name in ("actuator_biasprm", "dof_frictionloss", "actuator_forcerange"):
             np.testing.assert_allclose(
-                getattr(model, name).numpy(), ours.batch.expanded(name), rtol=1e-5, atol=1e-5
+                theirs.model_field(name).cpu(), ours.batch.expanded(name), rtol=1e-5, atol=1e-5
             )
         ours.set_state({name: x.cpu().numpy() for name, x in theirs.state().items()})

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from gaponet.sysid.evidence.drift import EVERY_JOINT, ParameterChange, _advice
+from gaponet.sysid.evidence.drift import EVERY_JOINT, ParameterChange, drift_advice
 from gaponet.sysid.evidence.evidence import (
     Evidence,
-    _no_better,
     gradient_covariance,
     inverted,
+    no_better_than,
     widened,
 )
 from gaponet.sysid.uncertainty import PLAY, JointUncertainty
@@ -74,7 +74,7 @@ def joint_uncertainty(residual, repeatability):
 def test_an_adaptation_keeps_the_larger_error_unless_new_motions_measured_it(of_fit, residual):
     today = joint_uncertainty(0.001, 0.0001)
     old = joint_uncertainty(0.004, 0.002)
-    kept = _no_better(today, old, errors_are_of_fit=of_fit)
+    kept = no_better_than(today, old, errors_are_of_fit=of_fit)
     assert (kept.residual_rms, kept.residual_p90) == (residual, 2 * residual)
     assert kept.repeatability == 0.002
 
@@ -98,8 +98,8 @@ def changed(joint, field, by=1.0):
     ],
 )
 def test_the_advice_follows_from_what_changed(moved, word):
-    assert word in _advice("drifted", moved, [], JOINTS, {})
+    assert word in drift_advice("drifted", moved, [], JOINTS, {})
 
 
 def test_errors_that_no_parameter_explains_are_another_robots_or_payloads():
-    assert "payload" in _advice("drifted", [], [], JOINTS, {"pan": 4.0})
+    assert "payload" in drift_advice("drifted", [], [], JOINTS, {"pan": 4.0})

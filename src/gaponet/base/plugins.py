@@ -65,6 +65,12 @@ def load(where: str) -> Any:
     return getattr(import_module(module), attribute) if attribute else import_module(module)
 
 
+def forget_extensions() -> None:
+    """Look at the installed packages again at the next call, and warn of each extension again."""
+    _points.cache_clear()
+    _WARNED.clear()
+
+
 def attempt(where: str, call: Callable[[], Result], otherwise: Result) -> Result:
     """Return call(). If it fails in an extension, warn and return `otherwise`.
 

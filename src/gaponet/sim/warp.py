@@ -259,6 +259,12 @@ class _AllWorlds:
             for name, view in self._views[0].items():
                 self.fields[name] = view.new_zeros(sim.num_envs, *view.shape[1:])
 
+    def model_field(self, name: str) -> Tensor:
+        """Return a copy of a field that differs between simulations, (num_envs, …)."""
+        parts = [warp.to_torch(getattr(worlds.model, name)) for worlds in self.of_rates]
+        order = torch.argsort(torch.cat(self._rows))
+        return torch.cat(parts)[order]
+
     def each_rate(self) -> Iterator[_Worlds]:
         """Yield the worlds of each control period with their simulations' state, and copy it
         back.
@@ -337,6 +343,13 @@ class WarpSim:
     def num_envs(self) -> int:
         """Number of simulations."""
         return len(self.qpos)
+
+    def model_field(self, name: str) -> Tensor:
+        """Return a copy of a field of the model that differs between simulations, (num_envs, …).
+
+        Bias, friction and torque limits of a servo model are those of the last physics step.
+        """
+        return self._worlds.model_field(name)
 
     def array(self, values: Any) -> Tensor:
         """Copy values to the device, floats as float32, without waiting."""

@@ -235,10 +235,16 @@ class VirtualH12:
                     self.refused += 1
                     continue
                 self.first_command = self.first_command or now
-                self._apply(topic, data, now)
+                self.apply_command(topic, data, now)
 
-    def _apply(self, topic: str, data: Array, now: float) -> None:
-        """Note a command, and set the drives between it and the robot's own by the weight."""
+    def apply_command(self, topic: str, data: Array, now: float) -> None:
+        """Note a command, and set the drives between it and the robot's own by the weight.
+
+        Args:
+            topic: "arm_sdk" or "lowcmd".
+            data: An intact LowCmd message; one with a number that is not finite is refused.
+            now: s.
+        """
         command = MotorCommands.of_message(data)
         if not command.is_finite():
             self.refused += 1

@@ -223,7 +223,9 @@ def test_a_robot_driven_by_torques_is_refused_in_a_sentence(tmp_path, arm):
         list(read_logs(write(tmp_path / "logs", NAMES, columns=columns), arm))
 
 
-def test_bad_rows_are_cut_and_listed_where_that_is_asked_for(tmp_path, arm, capsys):
+@pytest.fixture
+def damaged_logs(tmp_path):
+    """A log with three bad rows, and one that cannot be read at all."""
     folder = write(tmp_path / "logs", NAMES)
     lines = (folder / "wave.csv").read_text().split("\n")
     lines[5] = lines[5].replace(",", ",x", 1)  # no number
@@ -231,31 +233,50 @@ def test_bad_rows_are_cut_and_listed_where_that_is_asked_for(tmp_path, arm, caps
     lines[20] = lines[10]  # back in time
     (folder / "wave.csv").write_text("\n".join(lines))
     (folder / "short.csv").write_text("t,shoulder_des\n0,1\n")
+    return folder
+
+
+def test_bad_rows_are_cut_and_listed_where_that_is_asked_for(damaged_logs, arm):
     with skip_bad_rows() as bad:
-        ((_, log),) = read_logs(folder, arm)
-    assert [line.rpartition("/")[2].split(":")[1] for line in bad if line.endswith("cut")] == [
-        "6",
-        "10",
-        "21",
-    ]
-    assert any(line.startswith("left out: ") and "short.csv" in line for line in bad)
+        ((_, log),) = read_logs(damaged_logs, arm)
+    cut = [line for line in bad if line.endswith("cut")]
+    numbers = [line.rpartition("/")[2].split(":")[1] for line in cut]
+    assert numbers == ["6", "10", "21"]
     assert len(log.channels["qpos"].time) == 57
     assert log.meta["notes"]["rows_cut"] == 3
-    told = [
-        "--robot",
-        str(arm.mjcf.parent),
-        "--unit-id",
-        "lab",
-        "--payload-mass",
-        "0",
-        "--out",
-        str(tmp_path / "data"),
-    ]
-    assert main(["import", str(folder), *told]) == 2
-    assert main(["import", str(folder), *told, "--skip-bad", "--json"]) == 0
+
+
+def test_a_log_without_a_good_row_is_left_out_and_listed_where_that_is_asked_for(damaged_logs, arm):
+    with skip_bad_rows() as bad:
+        list(read_logs(damaged_logs, arm))
+    (left_out,) = [line for line in bad if line.startswith("left out: ")]
+    assert "short.csv" in left_out
+
+
+def command_line(logs, arm, out):
+    """The arguments of `gaponet import`."""
+    told = ["--robot", str(arm.mjcf.parent), "--unit-id", "lab", "--payload-mass", "0"]
+    return ["import", str(logs), *told, "--out", str(out)]
+
+
+def test_import_refuses_bad_rows_and_leaves_nothing(damaged_logs, arm, tmp_path):
+    assert main(command_line(damaged_logs, arm, tmp_path / "data")) == 2
+    assert not (tmp_path / "data").exists()
+
+
+def test_import_lists_the_bad_rows_and_logs_that_it_skips(damaged_logs, arm, tmp_path, capsys):
+    arguments = command_line(damaged_logs, arm, tmp_path / "data")
+    assert main([*arguments, "--skip-bad", "--json"]) == 0
     assert len(json.loads(capsys.readouterr().out)["cut"]) == 4
+
+
+def test_rows_that_were_cut_are_interpolated_on_the_clock_of_the_others(
+    damaged_logs, arm, tmp_path
+):
+    """Nothing is stretched."""
+    assert main([*command_line(damaged_logs, arm, tmp_path / "data"), "--skip-bad"]) == 0
     (entry,) = Dataset(tmp_path / "data").entries
-    assert entry.rows == 60  # nothing is stretched: what was cut is interpolated on the same clock
+    assert entry.rows == 60
     assert "resampled" in entry.meta.notes["rows"]
 
 

@@ -104,48 +104,50 @@ def test_several_rates_become_several_sets_and_come_back(dataset, arm, tmp_path)
     same(dataset, back(tmp_path / "out", arm, tmp_path / "again"))
 
 
-def test_the_layout_is_the_standards(dataset, tmp_path):
-    out = export_lerobot(dataset, tmp_path / "out")[0].path
-    info = json.loads((out / "meta" / "info.json").read_text())
-    assert (info["codebase_version"], info["fps"], info["robot_type"]) == ("v3.0", 50, "arm")
-    assert (info["total_episodes"], info["total_frames"], info["splits"]) == (
-        3,
-        171,
-        {"train": "0:3"},
-    )
+@pytest.fixture
+def exported(dataset, tmp_path):
+    """The one set of the dataset."""
+    return export_lerobot(dataset, tmp_path / "out")[0].path
+
+
+def test_the_layout_is_the_standards(exported):
+    info = json.loads((exported / "meta" / "info.json").read_text())
+    assert info["codebase_version"] == "v3.0"
+    assert info["fps"] == 50
+    assert info["robot_type"] == "arm"
+    assert info["total_episodes"] == 3
+    assert info["total_frames"] == 171
+    assert info["splits"] == {"train": "0:3"}
     assert info["features"]["action"]["names"] == ["shoulder", "elbow"]
     assert info["features"]["observation.torque"]["info"] == {"unit": "N·m"}
-    frames = pq.read_table(out / "data" / "chunk-000" / "file-000.parquet")
-    assert frames.column_names[-5:] == [
-        "timestamp",
-        "frame_index",
-        "episode_index",
-        "index",
-        "task_index",
-    ]
+
+
+def test_frames_are_numbered_in_all_and_in_their_episode(exported):
+    frames = pq.read_table(exported / "data" / "chunk-000" / "file-000.parquet")
+    numbers = ["timestamp", "frame_index", "episode_index", "index", "task_index"]
+    assert frames.column_names[-5:] == numbers
     assert frames["index"].to_pylist() == list(range(171))
     assert frames["frame_index"].to_pylist()[50:53] == [0, 1, 2]
-    episodes = pq.read_table(
-        out / "meta" / "episodes" / "chunk-000" / "file-000.parquet"
-    ).to_pylist()
-    assert [(e["dataset_from_index"], e["dataset_to_index"]) for e in episodes] == [
-        (0, 50),
-        (50, 107),
-        (107, 171),
-    ]
-    assert (episodes[1]["unit_id"], episodes[1]["payload_mass"], episodes[1]["virtual"]) == (
-        "two",
-        0.2,
-        True,
-    )
+
+
+def test_an_episode_says_its_frames_its_unit_its_payload_and_its_motion(exported):
+    file = exported / "meta" / "episodes" / "chunk-000" / "file-000.parquet"
+    episodes = pq.read_table(file).to_pylist()
+    assert [episode["dataset_from_index"] for episode in episodes] == [0, 50, 107]
+    assert [episode["dataset_to_index"] for episode in episodes] == [50, 107, 171]
+    assert episodes[1]["unit_id"] == "two"
+    assert episodes[1]["payload_mass"] == 0.2
+    assert episodes[1]["virtual"] is True
     assert episodes[2]["tasks"] == ["m2"]
-    tasks = pq.read_table(out / "meta" / "tasks.parquet")
+
+
+def test_the_tasks_are_the_index_of_their_table(exported):
+    tasks = pq.read_table(exported / "meta" / "tasks.parquet")
     assert json.loads(tasks.schema.metadata[b"pandas"])["index_columns"] == ["task"]
 
 
-def test_statistics_are_those_of_all_frames(dataset, tmp_path):
-    out = export_lerobot(dataset, tmp_path / "out")[0].path
-    stats = json.loads((out / "meta" / "stats.json").read_text())["observation.state"]
+def test_statistics_are_those_of_all_frames(dataset, exported):
+    stats = json.loads((exported / "meta" / "stats.json").read_text())["observation.state"]
     every = np.concatenate([s.qpos for s in dataset.sequences()]).astype(float)
     for name, value in (
         ("min", every.min(0)),

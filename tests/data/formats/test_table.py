@@ -97,10 +97,7 @@ def test_a_folder_holds_one_motion_per_file(tmp_path, arm):
 def test_a_unit_that_was_not_said_is_asked_for(tmp_path, arm, given):
     file = write(tmp_path / "wave.csv", arm_columns())
     missing = "position" if "time_unit" in given else "time"
-    with pytest.raises(
-        UsageError,
-        match=missing,
-    ):
+    with pytest.raises(UsageError, match=missing):
         list(read_logs(file, arm, ReadOptions(**given)))
 
 
@@ -123,6 +120,20 @@ def test_90_degrees_are_half_pi_and_1500_ms_are_one_and_a_half_seconds(tmp_path,
     )  # from any start
 
 
+COLUMN_MAP = """
+time = "t"
+time_unit = "ms"
+position_unit = "rad"
+[columns]
+"ctrl.shoulder" = "cmd_1"
+"ctrl.elbow" = "cmd_2"
+"qpos.shoulder" = "pos_1"
+"qpos.elbow" = "pos_2"
+[joint_units]
+elbow = "deg"
+"""
+
+
 def test_a_column_map_names_columns_and_units(tmp_path, arm):
     theirs = dict(
         zip(["t", "cmd_1", "cmd_2", "pos_1", "pos_2"], arm_columns().values(), strict=True)
@@ -130,10 +141,7 @@ def test_a_column_map_names_columns_and_units(tmp_path, arm):
     theirs["t"] = theirs["t"] * 1000
     file = write(tmp_path / "wave.csv", theirs)
     toml = tmp_path / "map.toml"
-    toml.write_text(
-        'time = "t"\ntime_unit = "ms"\nposition_unit = "rad"\n[columns]\n"ctrl.shoulder" = "cmd_1"\n'
-        '"ctrl.elbow" = "cmd_2"\n"qpos.shoulder" = "pos_1"\n"qpos.elbow" = "pos_2"\n[joint_units]\nelbow = "deg"\n'
-    )
+    toml.write_text(COLUMN_MAP)
     ((_, log),) = read_logs(file, arm, ReadOptions(logs=toml))
     assert np.array_equal(log.channels["qpos"].values[:, 0], theirs["pos_1"])
     assert np.allclose(log.channels["qpos"].values[:, 1], theirs["pos_2"] * np.pi / 180)

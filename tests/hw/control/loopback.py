@@ -83,7 +83,7 @@ class Disobedient(VirtualH12):
     way = ""
     at = 0.0
 
-    def _apply(self, topic: str, data: np.ndarray, now: float) -> None:
+    def apply_command(self, topic: str, data: np.ndarray, now: float) -> None:
         wrong = now - (self.first_command or now) >= self.at
         if wrong and self.way == "ignores":
             return
@@ -91,7 +91,7 @@ class Disobedient(VirtualH12):
             return
         if wrong and self.way in ("limp", "all limp", "crossed", "mirrored"):
             data = self._mistaken(data)
-        super()._apply(topic, data, now)
+        super().apply_command(topic, data, now)
         if wrong and self.way == "blocked":
             self._block_elbow()
         if wrong and self.way == "weak":

@@ -96,7 +96,7 @@ def beat(dog: Watchdog, weight: float) -> None:
 def test_a_robot_is_damped_with_the_last_weight_that_was_commanded(dog, notes):
     beat(dog, 0.1)
     # Two beats that are read at once.
-    dog._in.write(bytes([round(WEIGHT_STEPS * weight) for weight in (0.2, 0.8)]))
+    dog.process.stdin.write(bytes([round(WEIGHT_STEPS * weight) for weight in (0.2, 0.8)]))
     dog.release(unconfirmed=True)
     dog.process.wait(20)
     weights = damped(notes)[:, 1]

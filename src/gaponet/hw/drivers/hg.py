@@ -104,18 +104,24 @@ def flatten(
 class Message:
     """Layout of a fixed-size message: fields of all motors at once, other fields, and the
     checksum.
+
+    Attributes:
+        layout: Path of a field, as `flatten` names it → kind, count, and offset on the wire.
+        wire_size: Bytes on the wire.
+        packed_size: Bytes of the C struct, with padding.
+        columns: Name of a motor's field → its offset on the wire for each motor.
     """
 
     def __init__(self, fields: Fields, motors: str) -> None:
         wire, self.wire_size = flatten(fields, 0, padded=False)
         packed, self.packed_size = flatten(fields, 0, padded=True)
-        self._at = {path: (kind, count, offset) for path, kind, count, offset in wire}
+        self.layout = {path: (kind, count, offset) for path, kind, count, offset in wire}
         names = [path.split(".")[-1] for path, *_ in wire if path.startswith(f"{motors}[1].")]
         # From the second motor on, slots repeat every `stride` bytes; the first may begin closer to
         # what precedes it.
         self.columns = {}
         for name in names:
-            offsets = [self._at[f"{motors}[{i}].{name}"][2] for i in range(MOTORS)]
+            offsets = [self.layout[f"{motors}[{i}].{name}"][2] for i in range(MOTORS)]
             self.columns[name] = np.array(offsets)
         self._gather = self._bytes(wire, packed)
 
@@ -139,12 +145,12 @@ class Message:
 
     def view(self, data: Array, path: str) -> Array:
         """Return a field outside the motors as a writable view, (count,)."""
-        kind, count, at = self._at[path]
+        kind, count, at = self.layout[path]
         return data[at : at + np.dtype(kind).itemsize * count].view(kind)
 
     def motors(self, data: Array, name: str) -> Array:
         """Return a field of all motors, (35,) or (35, count), as a copy."""
-        kind, count, _ = self._at[self._path(name)]
+        kind, count, _ = self.layout[self._path(name)]
         size = np.dtype(kind).itemsize * count
         values = np.ascontiguousarray(data[self.columns[name][:, None] + np.arange(size)]).view(
             kind
@@ -153,12 +159,12 @@ class Message:
 
     def set_motors(self, data: Array, name: str, values: Array) -> None:
         """Write a field of all motors, (35,) or (35, count)."""
-        kind, count, _ = self._at[self._path(name)]
+        kind, count, _ = self.layout[self._path(name)]
         table = np.ascontiguousarray(np.asarray(values, kind).reshape(MOTORS, count)).view(np.uint8)
         data[self.columns[name][:, None] + np.arange(table.shape[1])] = table
 
     def _path(self, name: str) -> str:
-        return next(path for path in self._at if path.endswith(f"[0].{name}"))
+        return next(path for path in self.layout if path.endswith(f"[0].{name}"))
 
     def checksum(self, data: Array) -> int:
         """Return CRC-32/MPEG-2 of the C struct's words: polynomial 0x04c11db7, start 0xffffffff,

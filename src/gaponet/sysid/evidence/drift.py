@@ -166,7 +166,7 @@ def drift(
         largest=largest,
         min_effect={joint.name: joint.min_effect for joint in gradients},
         against=tuple(against),
-        advice=_advice(verdict, moved, against, joints, far),
+        advice=drift_advice(verdict, moved, against, joints, far),
         threshold=threshold,
         seconds=float(sum(s.duration for s in sequences)),
         far=far,
@@ -512,14 +512,22 @@ def _differences(
     return differences
 
 
-def _advice(
+def drift_advice(
     verdict: Verdict,
     moved: ListOf[ParameterChange],
     against: ListOf[Contradiction],
     joints: ListOf[str],
     far: Mapping[str, float],
 ) -> str:
-    """Return what to do."""
+    """Return what to do after a comparison.
+
+    Args:
+        verdict: Of the comparison.
+        moved: Parameters that changed.
+        against: Recordings that contradict the others.
+        joints: All joints that are operated.
+        far: Joint → how many times the stored residual its error is, where that is too much.
+    """
     if verdict == "same":
         return "nothing to do"
     if verdict == "contradictory":

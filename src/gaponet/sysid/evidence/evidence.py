@@ -255,7 +255,7 @@ def estimate_uncertainty(
         )
         if before:
             old = before.joints[joint]
-            uncertainty = _no_better(uncertainty, old, errors_are_of_fit=not is_validated)
+            uncertainty = no_better_than(uncertainty, old, errors_are_of_fit=not is_validated)
         joints[joint] = uncertainty
     # Only `adapt` gives neither motions that judge nor covariances of its own.
     made_by = "identify" if judges or covariances else "adapt"
@@ -302,7 +302,7 @@ def _fitted_fields(robot: RobotSpec) -> tuple[str, ...]:
     return tuple(fields)
 
 
-def _no_better(
+def no_better_than(
     today: JointUncertainty,
     old: JointUncertainty,
     *,
