@@ -44,9 +44,9 @@ COLUMNS = (
 STEM = "real"
 HEADING = """# Real robots
 
-`benchmarks/compare_methods.py` writes this table. It has errors in mrad (1 mrad is 0.057°) on public
-recordings of real robots, of motions that no method was fitted to. Each simulation starts at the
-recorded state and then receives only commands. [Compare your
+`benchmarks/compare_methods.py` writes this table. It has errors in mrad (1 mrad is 0.057°) on
+public recordings of real robots, of motions that no method was fitted to. Each simulation starts at
+the recorded state and then receives only commands. [Compare your
 method](../benchmark.md#the-benchmark-of-real-robots) explains the questions and the methods.
 
 ± is the standard error over independent motions; differences are paired, motion by motion. "Of

@@ -520,8 +520,8 @@ def adapt_robot(
         robot: The folder that `identify` wrote, or a nominal robot.
         source: A dataset, or logs that `import_logs` reads.
         out: Robot folder to write.
-        unit: Unit to adapt to, or name of the robot in the logs. Needed if the dataset holds several
-            units, or if the logs state none.
+        unit: Unit to adapt to, or name of the robot in the logs. Needed if the dataset holds
+            several units, or if the logs state none.
         motions: Use only these motions. Default: all of the unit.
         seconds: Duration of the recordings to fit, in windows of 8 s; all of them are used for
             validation.

@@ -24,11 +24,11 @@ class IdentifyOptions:
     windows: int = 40
     """Number of rollouts of 8 s to fit; they are taken evenly from the training motions."""
     terms: tuple[Term, ...] | None = None
-    """Effects of the servo model to try, in this order. Each is kept only if it reduces the error on
-    validation motions. stribeck: more friction at rest. load: friction that grows with the torque
-    of the motor. external: friction that grows with the torque of gravity. limit: largest torque.
-    speed: largest torque that falls with speed. min_torque: least torque with which the motor
-    turns. encoder: steps in which the servo reads its angle. backlash: play of the gear.
+    """Effects of the servo model to try, in this order. Each is kept only if it reduces the error
+    on validation motions. stribeck: more friction at rest. load: friction that grows with the
+    torque of the motor. external: friction that grows with the torque of gravity. limit: largest
+    torque. speed: largest torque that falls with speed. min_torque: least torque with which the
+    motor turns. encoder: steps in which the servo reads its angle. backlash: play of the gear.
     temperature: effect of temperature on friction and damping. Default: limit if a joint reaches
     its stated torque limit; speed if it needs much of that torque while it moves fast; stribeck and
     load; backlash if a gap in the gear makes the simulated motion better while all else stays

@@ -58,7 +58,9 @@ class StartOptions:
     """Stiffness of the controller that recorded the logs, N·m/rad: NUMBER for all joints,
     PATTERN=NUMBER for some. Default: the model's."""
     kd: tuple[str, ...] = ()
-    """Damping gain of that controller, N·m·s/rad: NUMBER or PATTERN=NUMBER. Default: the model's."""
+    """Damping gain of that controller, N·m·s/rad: NUMBER or PATTERN=NUMBER. Default: the
+    model's.
+    """
     effort_limit: tuple[str, ...] = ()
     """Largest torque of the motors, N·m: NUMBER or PATTERN=NUMBER. Default: the model's."""
     format: str | None = None
@@ -365,9 +367,9 @@ class StartRecord:
         logs_toml = self.out / "logs.toml"
         if logs_toml.is_file():
             self.fields["files"][f"{self.out.name}/logs.toml"] = FileRecord.of(logs_toml).sha256
-        # An interrupted import leaves data, and the next start has to know of which logs. Where data
-        # are there already, `finish` writes: if the import refuses a log that was added, the log
-        # can be taken away again.
+        # An interrupted import leaves data, and the next start has to know of which logs. Where
+        # data are there already, `finish` writes: if the import refuses a log that was added, the
+        # log can be taken away again.
         if not self.data.exists():
             write_json(self.out / RECORD_FILE, self.fields)
 

@@ -56,8 +56,8 @@ def adapt(
 
     Args:
         out: Robot folder to write. Needed if a robot folder is adapted.
-        unit: Unit to adapt to, or name of the robot in the logs. Needed if the dataset holds several
-            units, or if the logs state none.
+        unit: Unit to adapt to, or name of the robot in the logs. Needed if the dataset holds
+            several units, or if the logs state none.
         payload_mass: Payload in each hand, kg. Needed for logs that do not state it.
     """
     screen = Out(json)

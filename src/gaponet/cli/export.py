@@ -159,8 +159,8 @@ def _show(screen: Out, made: ExportResult) -> None:
     screen.table(title, ["form", "mrad"], rows)
     if made.virtual:
         screen.say(
-            "  These motions are simulated, over most of each joint's range; recorded ones may lose "
-            "less. --data DATASET takes recorded ones."
+            "  These motions are simulated, over most of each joint's range; recorded ones may "
+            "lose less. --data DATASET takes recorded ones."
         )
     for line in made.notes:
         screen.say(f"  {line}", "warning", "yellow")

@@ -286,14 +286,15 @@ def make_split(dataset: Dataset, by: str, holdout: tuple[str, ...] = ()) -> Spli
         else:
             rest.append(entry)
     if by in ORDERED:  # the last repetition or piece that is left is for validation
-        last = max(map(value_of, rest), key=float, default="")
-        validates = [value_of(entry) == last for entry in rest]
+        validating = {max(map(value_of, rest), key=float, default="")}
+        group_of = value_of
     else:  # some of the motions that are left, whichever property was held out
         count = max(1, round(len(set(canonical.values())) * VAL_SHARE))
-        motions = hash_order(map(motion_of, rest))[:count]
-        validates = [motion_of(entry) in motions for entry in rest]
-    for entry, is_val in zip(rest, validates, strict=True):
-        splits["val" if is_val else "train"].append(entry)
+        validating = set(hash_order(map(motion_of, rest))[:count])
+        group_of = motion_of
+    for entry in rest:
+        name = "val" if group_of(entry) in validating else "train"
+        splits[name].append(entry)
     empty = [name for name in SPLITS if not splits[name]]
     if empty:
         left = len(set(map(motion_of, rest)))

@@ -1,5 +1,6 @@
-"""What an environment of LeRobot's EnvHub has beside the MJCF: units of the robot to draw, LeRobot's
-units of joints, and a model card.
+"""What an environment of LeRobot's EnvHub has beside the MJCF.
+
+Units of the robot to draw, LeRobot's units of joints, and a model card.
 """
 
 from __future__ import annotations

@@ -70,7 +70,7 @@ class Trajectory:
 
 
 def line(a: Array, b: Array) -> Array:
-    """Return postures (T, n) rad from a to b (n,), both included, at most POSTURE_STEP_RAD apart."""
+    """Return postures (T, n) rad from a to b, both included, at most POSTURE_STEP_RAD apart."""
     steps = int(np.ceil(np.abs(b - a).max() / POSTURE_STEP_RAD))
     return np.linspace(a, b, max(1, steps) + 1)
 

@@ -212,8 +212,8 @@ def rollout(
         progress: Called with the control steps done.
 
     Returns:
-        qpos, qvel, torque and target by row, (4, T, k, n of all joints): rad, rad/s, N·m, rad. Row t
-        has the state at t·dt, the torque at the end of [t − 1, t), and the target of [t, t + 1).
+        qpos, qvel, torque and target by row, (4, T, k, n of all joints): rad, rad/s, N·m, rad. Row
+        t has the state at t·dt, the torque at the end of [t − 1, t), and the target of [t, t + 1).
         Locked joints stand at sim.robot.qpos_home. Rows after the end of a sequence have no
         meaning.
     """

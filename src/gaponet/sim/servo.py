@@ -9,14 +9,14 @@ limit of friction, so friction sticks as MuJoCo's does. A gear with backlash par
 (armature, damping, friction) from the link while its gap is open.
 
 The model stands here twice. `servo_torque`, `friction_limit` and `overcome_friction` take arrays,
-for exports and inverses. `requested_torque`, `motor_limits` and `joint_friction` take one servo with
-fields by name, for numba and Warp, which are faster. Simulations (`set_servos`, called by
+for exports and inverses. `requested_torque`, `motor_limits` and `joint_friction` take one servo
+with fields by name, for numba and Warp, which are faster. Simulations (`set_servos`, called by
 sim/servo_model.py) and the fit of single joints (`simulate_joints`) share the latter. A MuJoCo
 model's actuator_user holds the parameters, in the order of SERVO_TERMS; without, nothing here runs.
 
 A new term is a field of robot/servo_fields.py and a line in both forms of the model. If it is a
-function of its own, `_extend` names it for numba, sim/warp.py for Warp and export/helper_file.py for
-exports.
+function of its own, `_register_functions` names it for numba, sim/warp.py for Warp and
+export/helper_file.py for exports.
 """
 
 from __future__ import annotations

@@ -51,7 +51,7 @@ def within_range(log: Log, robot: RobotSpec) -> Log:
     turned = {}
     for column, joint in enumerate(log.joint_names):
         low, high = robot.qpos_range[robot.joint_names.index(joint)]
-        if not (np.isfinite(low) and np.isfinite(high)):
+        if not np.isfinite([low, high]).all():
             continue
         brought: dict[str, Array] = {}  # channel → its angles in the range, (k,)
         wraps = 0

@@ -40,14 +40,9 @@ def train_best(out: Path, resume: bool, train: Train) -> GapModel:
     """
     present = _kind(out)
     begun = (out / FOLDER).is_dir()
-    if resume and not begun:
-        if present:
-            return train(present, out, 1.0, 0.0, True)
-        raise UsageError(
-            f"{out}: nothing to resume; train without --resume, or choose another --out"
-        )
-    if not resume and (begun or present):
-        raise UsageError(f"{out}: holds a run already; add --resume, or choose another --out")
+    _require_begun_if_resumed(out, resume, begun or present is not None)
+    if present and not begun:
+        return train(present, out, 1.0, 0.0, True)
     kinds = [kind for kind in CANDIDATES if kind != "trees" or trees_available()]
     known = candidate_errors(out)
     errors, interrupted = _train_candidates(out, kinds, train)
@@ -63,6 +58,16 @@ def train_best(out: Path, resume: bool, train: Train) -> GapModel:
         # OUT holds the best candidate and may have gone on with it.
         _copy(out, best)
     return _go_on_with_best(out, errors, SHARE * (len(kinds) - 1), train)
+
+
+def _require_begun_if_resumed(out: Path, resume: bool, begun: bool) -> None:
+    """Refuse to resume nothing, or to begin anew where a run is."""
+    if resume and not begun:
+        raise UsageError(
+            f"{out}: nothing to resume; train without --resume, or choose another --out"
+        )
+    if begun and not resume:
+        raise UsageError(f"{out}: holds a run already; add --resume, or choose another --out")
 
 
 def _go_on_with_best(
