@@ -57,6 +57,15 @@ def no_old_garbage() -> None:
     gc.freeze()
 
 
+@pytest.fixture
+def tmp_path(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder of the test's own, without the test's name, as pytest's has it.
+
+    Messages name paths: a word that a test expects in one may not stand in its path.
+    """
+    return tmp_path_factory.mktemp("t")
+
+
 @pytest.fixture(scope="session")
 def so101() -> RobotSpec:
     return load_robot("so101")
