@@ -264,6 +264,22 @@ def test_a_policy_that_gives_nan_leaves_the_robot_damped(arm):
     assert driver.sent[-1][1] is None
 
 
+@pytest.mark.parametrize("wrong", [np.nan, np.inf])
+def test_a_compensator_that_gives_no_number_leaves_the_robot_damped(arm, wrong):
+    driver = NotedArm(arm)
+    periods: list[int] = []
+
+    def step(target, *_):
+        periods.append(len(periods))
+        return target + (wrong if len(periods) == 30 else 0.0)
+
+    broken = SimpleNamespace(reset=lambda *_: None, step=step)
+    recording = run(driver, compensator=broken)
+    assert recording.fault.kind == "target"
+    assert len(driver.commands) == 29
+    assert driver.sent[-1][1] is None
+
+
 @pytest.mark.parametrize(
     ("where", "error"),
     [

@@ -276,6 +276,14 @@ def test_torque_comes_on_with_the_first_goal_and_a_hold_leaves_it_on(driver, ser
     assert len(servos.heard) == count
 
 
+def test_an_arm_that_is_closed_without_a_hold_is_let_go(driver, servos):
+    driver.write(driver.read().qpos)
+
+    driver.close()
+
+    assert [servos.get(s, "torque") for s in range(1, 7)] == [0] * 6
+
+
 def test_from_the_first_goal_until_the_end_no_other_program_can_open_the_port(
     driver, wire, monkeypatch
 ):
