@@ -30,6 +30,7 @@ from gaponet.api.options import IdentifyOptions
 from gaponet.base.plugins import load
 from gaponet.cli.main import COMMANDS, main
 from gaponet.data.store import Dataset
+from gaponet.export import drawn_robots
 from gaponet.nn.artifact import GapModel
 from gaponet.robot.folder import save_robot
 from gaponet.robot.spec import load_robot
@@ -191,9 +192,9 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def quick(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Identification of seconds, done once; and a network that nobody trained.
+    """Identification of seconds, done once; few drawn units; and a network that nobody trained.
 
-    Both have tests of their own.
+    All have tests of their own.
     """
     original = gaponet.api.identify
 
@@ -208,6 +209,8 @@ def quick(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         model = GapModel.load(untrained(Path(out), load_robot("so101"), Dataset(dataset), **parts))
         return SimpleNamespace(model=model)
 
+    monkeypatch.setattr(drawn_robots, "DRAWN", 8)
+    monkeypatch.setattr(drawn_robots, "JUDGED", 2)
     monkeypatch.setattr(gaponet.api, "identify", identify)
     monkeypatch.setattr(gaponet.api, "train", train)
 
