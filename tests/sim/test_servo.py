@@ -48,6 +48,14 @@ def test_friction_at_rest_exceeds_that_in_motion(arm):
     assert pull(sticky, 1.05, 0.5) == pytest.approx(2.0, rel=0.02)
 
 
+def test_stribeck_friction_falls_to_a_share_of_1_over_e_at_its_speed():
+    terms = {"stribeck": np.array([0.2]), "stribeck_speed": np.array([0.1])}
+    qvel = np.array([0.0, 0.1, -0.1, 10.0])
+    friction = friction_limit(terms, 0.05, qvel, 0.0, 0.0)
+    at_speed = 0.05 + 0.2 / np.e
+    np.testing.assert_allclose(friction, [0.25, at_speed, at_speed, 0.05], rtol=1e-6)
+
+
 def test_a_loaded_motor_has_more_friction(tmp_path):
     robot = servo_model(
         write_arm(tmp_path / "arm"), frictionloss=0.0, friction_motor=0.2, damping=3.0
