@@ -114,6 +114,16 @@ def test_a_command_is_no_further_from_its_target_than_the_limit(robot, given):
     assert np.abs(sent).max() == pytest.approx(given.get("limit", 0.5))
 
 
+def test_a_command_stays_within_the_range_of_its_joint(robot):
+    compensate = Compensator(robot, config=NOW)
+    _, high = robot.qpos_range[0]
+    target = np.array([high - 0.03, 0.0])
+    compensate.reset(target)
+    # The shoulder stays behind, and feedback asks for up to 0.1 rad more.
+    sent = [compensate.step(target, target - [0.1, 0.0])[0] for _ in range(300)]
+    assert max(sent) == high
+
+
 def test_what_is_measured_changes_nothing_without_feedback(robot, model):
     targets = commands(60, 2)
     one, two = (Compensator(robot, model, config=replace(NOW, feedback=0.0)) for _ in range(2))
