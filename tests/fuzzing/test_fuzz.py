@@ -13,7 +13,7 @@ from fuzzing.__main__ import GROUPS, replay
 from fuzzing.harness import WHY
 from fuzzing.readers import TARGETS
 
-MUTANTS = 10  # of each reader
+MUTANTS = 5  # of each reader
 
 
 @pytest.mark.parametrize("group", GROUPS)
