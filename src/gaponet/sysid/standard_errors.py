@@ -106,7 +106,7 @@ def _covariance(problem: FitProblem, axes: Axes, x: Array) -> tuple[Array, Array
     unseen = size < MIN_SLOPE
     is_fixed = axes.low == axes.high
     inverse = _inverse(curvature, np.where(unseen | is_fixed, np.inf, size))
-    scatter = _scatter(gradient[:, :-PRIORS], problem.rollouts.window)
+    scatter = cluster_scatter(gradient[:, :-PRIORS], problem.rollouts.window)
     prior_slopes = slopes[:, -PRIORS:] * problem.prior.error_std()[:, None, None]
     scatter += np.swapaxes(prior_slopes, -1, -2) @ prior_slopes
     step = (inverse @ gradient.sum(axis=1)[..., None])[..., 0]  # (n, P)
@@ -115,9 +115,12 @@ def _covariance(problem: FitProblem, axes: Axes, x: Array) -> tuple[Array, Array
     return inverse @ scatter @ inverse + squared_step, unseen
 
 
-def _scatter(gradient: Array, window: Array) -> Array:
-    """Return the spread over clusters of gradients (n, rows, P), (n, P, P), with the jackknife's
-    correction; the window of each row, (rows,).
+def cluster_scatter(gradient: Array, window: Array) -> Array:
+    """Return the spread over clusters of gradients (n, rows, P), (n, P, P); the window of each row,
+    (rows,).
+
+    With the correction of the delete-one jackknife: C clusters and P parameters make it larger by
+    (C / (C − P))².
     """
     by_cluster, _ = cluster_sums(gradient, window)  # (n, C, P)
     by_cluster -= by_cluster.mean(axis=1, keepdims=True)
