@@ -204,6 +204,17 @@ def test_a_watchdog_gives_up_after_ten_minutes_and_not_before(monkeypatch, capsy
     assert "gave up after 600 s; switch the supply off" in capsys.readouterr().err
 
 
+def test_a_failure_is_reported_once_although_the_age_in_its_text_changes(monkeypatch, capsys):
+    robot = LooseRobot(monkeypatch)
+
+    def damp(weight: float, share: float) -> None:
+        raise DriverError(f"nothing was heard of the robot for {robot.now:.1f} s")
+
+    robot.damp = damp
+    watchdog.damp_robot(robot, 2.0, 1.0)
+    assert capsys.readouterr().err.count("trying again") == 1
+
+
 @pytest.mark.parametrize(
     ("words", "damped"), [((b"\x64", b"\xc8"), True), ((b"\x64", b"\xff"), False)]
 )

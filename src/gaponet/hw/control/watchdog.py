@@ -14,6 +14,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import re
 import select
 import signal
 import subprocess
@@ -34,6 +35,7 @@ DAMP_INTERVAL_S = 0.01  # between two damping messages
 RETRY_INTERVAL_S = 0.1  # after a damping message that failed
 READY_TIMEOUT_S = 20.0
 END_TIMEOUT_S = 5.0
+NUMBER = re.compile(r"[\d.]+")
 
 
 class Watchdog:
@@ -183,7 +185,7 @@ def damp_robot(driver: Driver, seconds: float, weight: float) -> None:
     """
     start = time.monotonic()
     damping_since = None
-    last_error = ""
+    last_failure = ""  # without its numbers: an age in it changes with each try
 
     def report(text: str) -> None:
         print(f"watchdog: {driver.address} {text}", file=sys.stderr, flush=True)
@@ -200,9 +202,10 @@ def damp_robot(driver: Driver, seconds: float, weight: float) -> None:
                 break
         except (DriverError, OSError) as error:
             wait = RETRY_INTERVAL_S
-            if str(error) != last_error:
-                last_error = str(error)
-                report(f"could NOT be damped: switch the supply off ({last_error}); trying again")
+            failure = NUMBER.sub("", str(error))
+            if failure != last_failure:
+                last_failure = failure
+                report(f"could NOT be damped: switch the supply off ({error}); trying again")
             if time.monotonic() - start > MAX_RETRY_S:
                 report(
                     f"could NOT be damped: gave up after {MAX_RETRY_S:g} s; switch the supply off"
