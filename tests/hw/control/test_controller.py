@@ -99,7 +99,7 @@ def test_its_recording_can_be_imported_and_trained_on(arm, tmp_path):
         tmp_path / "logs",
         arm,
         tmp_path / "set",
-        ImportRequest(unit_id="virtual-1", payload_mass=0.0, position_unit="rad", time_unit="s"),
+        ImportRequest(unit_id="virtual-1", payload_mass=0.0),
     )
     stored = report.dataset.read(report.entries[0])
     np.testing.assert_allclose(

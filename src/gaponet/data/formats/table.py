@@ -4,8 +4,9 @@ Columns are called `time`, `ctrl.<joint>`, `qpos.<joint>` and, where the robot s
 `qvel.<joint>`, `tau.<joint>`, `temperature.<joint>`; others are left alone. A logs.toml
 (data.describe.logs_file) says other names, the units, and the names of the columns where the file
 has none. A column with the number of the episode (formats.episodes) makes several recordings of a
-file. Torques are N·m and temperatures °C. Units have no default: a wrong guess looks like a
-sim-to-real gap. A table with a column `joint` has a row per joint and time (formats.joint_rows).
+file. Torques are N·m and temperatures °C. Units have no default: a wrong guess looks like a sim-to-
+real gap. Only the Parquet file of a run of gaponet states its own. A table with a column `joint`
+has a row per joint and time (formats.joint_rows).
 """
 
 from __future__ import annotations
@@ -42,6 +43,8 @@ SUFFIXES = (".csv", ".tsv", ".txt", ".dat", ".parquet")
 NOT_OURS = ("control.csv", "state_motor.csv", "event.csv", "joint_list.txt")  # of SAGE folders
 # metadata of a table that is no data, and why (hw/control/recording.py)
 NOT_OBEYED = "gaponet.not_obeyed"
+# metadata of a table of gaponet itself: its times are in s and its positions in rad
+SI_UNITS = "gaponet.si_units"
 # Cells of the first row of a table that can be transposed; where no row is named, there are also so
 # many times as many cells as rows.
 MIN_TRANSPOSED_CELLS = 20
@@ -120,6 +123,7 @@ def recordings(path: Path, specified: LogsFile) -> Iterator[RawRecording]:
             files=(str(file),),
             first_line=table.first_line,
             meta=table.meta,
+            default=table.default,
         )
         yield from episodes(recording)
 
@@ -132,22 +136,24 @@ class _Table(NamedTuple):
     lists: dict[str, tuple[str, ...]]  # column whose cells are lists → names of their numbers
     first_line: int  # where its rows begin
     meta: dict[str, Any]  # as in RawRecording
+    default: LogsFile  # what the file states itself
 
 
 def _opened(file: Path, specified: LogsFile) -> _Table:
     """Read the beginning of a file."""
     if file.suffix.lower() == ".parquet":
-        names = _parquet_header(file)
+        names, default = _parquet_header(file)
         lists = {}
         for column, width in parquet.list_widths(file).items():
             lists[column] = tuple(str(i) for i in range(width))
-        return _Table(names, partial(_read_parquet, file), lists, 1, {})
+        return _Table(names, partial(_read_parquet, file), lists, 1, {}, default)
     heading = _heading(file, specified.get("header"))
     meta: dict[str, Any] = {}
     if heading.units:
         units = dict(zip(heading.names, heading.units, strict=False))
         meta = {"notes": {"units": units}}
-    return _Table(heading.names, partial(_read_csv, file, heading), {}, heading.first + 1, meta)
+    load = partial(_read_csv, file, heading)
+    return _Table(heading.names, load, {}, heading.first + 1, meta, LogsFile())
 
 
 def _refuse_twice(file: Path, names: list[str], wanted: list[str]) -> None:
@@ -370,14 +376,17 @@ def _no_number(name: str, cell: str) -> str:
     return f"column '{name}' is '{cell}', not a number"
 
 
-def _parquet_header(file: Path) -> list[str]:
+def _parquet_header(file: Path) -> tuple[list[str], LogsFile]:
+    """Return the names of the columns, and the units that the file states."""
     names, metadata = parquet.header(file)
     if reason := metadata.get(NOT_OBEYED):
         raise LogError(
             f"{file}: no data, the robot did not do what it was told ({reason[:300]}); leave it "
             "out, or --skip-bad does"
         )
-    return names
+    if SI_UNITS in metadata:
+        return names, LogsFile(time_unit="s", position_unit="rad")
+    return names, LogsFile()
 
 
 def _read_parquet(file: Path, wanted: list[str]) -> dict[str, Signal]:

@@ -15,7 +15,7 @@ import numpy as np
 from gaponet.base.arrays import Array
 from gaponet.base.errors import LogError
 from gaponet.base.files import atomic_write, lock_folder, write_text
-from gaponet.data.formats.table import NOT_OBEYED
+from gaponet.data.formats.table import NOT_OBEYED, SI_UNITS
 from gaponet.data.log import Channel, Log
 from gaponet.hw.control.rows import READINGS, ROWS_SUFFIX, Rows
 from gaponet.hw.control.safety import FAULT_KINDS
@@ -179,7 +179,9 @@ class Recording:
                     for channel, (_, values) in log.channels.items():
                         for i, joint in enumerate(log.joint_names):
                             columns[f"{channel}.{joint}"] = values[:, i]
-                    metadata = {NOT_OBEYED: self.disobedience} if self.disobedience else None
+                    metadata = {SI_UNITS: "s, rad"}
+                    if self.disobedience:
+                        metadata[NOT_OBEYED] = self.disobedience
                     table = pa.table(columns, metadata=metadata)
                     with atomic_write(path) as temporary:
                         pq.write_table(table, temporary)
