@@ -14,7 +14,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from servos import Servos, Wire
+from servos import Servos, Wire, on_port
 
 from gaponet.base.errors import UsageError
 from gaponet.hw.control.driver import DriverError
@@ -313,6 +313,15 @@ def test_damping_tells_all_servos_at_once_without_asking_any(driver, servos):
     assert servos.heard[0] == OFF
     assert set(instructions(servos)) == {reg.WRITE, reg.SYNC_WRITE}
     assert [servos.get(s, "torque") for s in range(1, 7)] == [0] * 6
+
+
+def test_reading_after_the_port_was_lost_is_an_error_of_the_driver(so101, servos):
+    with on_port(servos) as port:
+        driver = SO101Driver(so101, port=port)
+        driver.connect()
+        driver._port.close()
+        with pytest.raises(DriverError, match="cable"):
+            driver.read()
 
 
 def test_a_port_that_is_lost_while_damping_is_opened_again(driver, servos, wire):

@@ -57,8 +57,13 @@ class SO101Port:
 
     @property
     def bus(self) -> ServoBus:
-        """The bus; after a lost port, one whose port is closed, which then fails again."""
-        assert self._bus is not None
+        """The bus of the open port.
+
+        Raises:
+            DriverError: The port is closed, as it is after its cable fell out.
+        """
+        if self._serial is None or self._bus is None:
+            raise DriverError(f"{self.name}: the port is closed; is the cable in?")
         return self._bus
 
     def open(self) -> ServoBus:
