@@ -85,6 +85,13 @@ def test_a_network_that_halves_every_error_has_fifty_percent_in_every_claim():
         assert claim.reductions["GAPONet"].mean == pytest.approx(50.0), claim.text
 
 
+def test_every_network_is_compared_with_the_mlp_on_the_same_recordings():
+    found = claims(make_results(training("MLP", 0.8), training("GAPONet", 0.4)))
+    (claim,) = [claim for claim in found if claim.text.endswith("less Q_dis than the MLP")]
+    assert claim.reductions.keys() == {"GAPONet"}
+    assert claim.reductions["GAPONet"].mean == pytest.approx(50.0)
+
+
 def test_the_paper_s_numbers_stand_beside_its_own_claims_alone():
     found = claims(make_results(training("MLP", 1.0), training("GAPONet", 0.5)))
     printed = [claim.printed for claim in found if claim.printed is not None]

@@ -91,7 +91,21 @@ def _alignment_claims(results: Results, block: Block) -> list[Claim]:
             reductions[name] = _reduction(results, errors, nominal, kept)
         text = f"simulator + Δa to robot, {label}: less Q_dis than the nominal simulator"
         found.append(Claim(block, text, printed, reductions))
+    if "MLP" in results.networks(block):
+        found.append(_less_than_mlp(results, block))
     return found
+
+
+def _less_than_mlp(results: Results, block: Block) -> Claim:
+    """Return how much nearer to the robot each network brings the simulator than the MLP does."""
+    mlp = _over_joints(results, results.q_dis(block, "MLP"))
+    reductions = {}
+    for name in results.networks(block):
+        if name != "MLP":
+            errors = _over_joints(results, results.q_dis(block, name))
+            reductions[name] = reduction(errors, mlp, results.motions)
+    text = "simulator + Δa to robot, all payloads: less Q_dis than the MLP"
+    return Claim(block, text, None, reductions)
 
 
 def _over_joints(results: Results, by_seed: list[Array]) -> list[Array]:
@@ -130,7 +144,7 @@ def _delivery_claims(results: Results, block: Block) -> list[Claim]:
     heaviest = f"{results.masses[-1]:g} kg"
     for way in ("delta", "both"):
         reference = REFERENCE_WAY[way]
-        plain = results.plain_offsets(reference)[-1]  # (goals, 3) m
+        plain = [results.plain_offsets(reference)[-1]]  # (goals, 3) m
         offsets = {}
         for name in results.networks(block):
             offsets[name] = [seed[-1] for seed in results.offsets(block, name, way)]
@@ -143,7 +157,7 @@ def _delivery_claims(results: Results, block: Block) -> list[Claim]:
             found.append(Claim(block, text, None, reductions))
         if "MLP" not in offsets:
             continue
-        mlp = np.mean(offsets.pop("MLP"), axis=0)
+        mlp = offsets.pop("MLP")
         for axis, letter in enumerate(AXES):
             reductions = _offset_reductions(offsets, mlp, axis)
             text = f"hand to goal along {letter}, {WAY_TITLES[way]}, {heaviest}: less than the MLP"
@@ -153,24 +167,25 @@ def _delivery_claims(results: Results, block: Block) -> list[Claim]:
 
 
 def _offset_reductions(
-    offsets: dict[str, list[Array]], baseline: Array, axis: int
+    offsets: dict[str, list[Array]], baselines: list[Array], axis: int
 ) -> dict[str, Reduction]:
     """Return method → reduction along an axis; arguments as of `_offset_reduction`."""
     reductions = {}
     for name, seeds in offsets.items():
-        reductions[name] = _offset_reduction(seeds, baseline, axis)
+        reductions[name] = _offset_reduction(seeds, baselines, axis)
     return reductions
 
 
-def _offset_reduction(seeds: list[Array], baseline: Array, axis: int) -> Reduction:
+def _offset_reduction(seeds: list[Array], baselines: list[Array], axis: int) -> Reduction:
     """Return the reduction along an axis; goals are independent of each other.
 
     Args:
         seeds: (goals, 3) m for each seed.
-        baseline: (goals, 3) m.
+        baselines: (goals, 3) m, one array, or one for each seed.
     """
-    goals = [str(goal) for goal in range(len(baseline))]
-    return reduction([offsets[:, axis] for offsets in seeds], baseline[:, axis], goals)
+    goals = [str(goal) for goal in range(len(baselines[0]))]
+    errors = [offsets[:, axis] for offsets in seeds]
+    return reduction(errors, [offsets[:, axis] for offsets in baselines], goals)
 
 
 def _with_payload(results: Results, payload: float | None) -> Array:
@@ -189,7 +204,7 @@ def _reduction(results: Results, errors: list[Array], baseline: Array, kept: Arr
         kept: Mask of the recordings that count, (recordings,).
     """
     motions = list(compress(results.motions, kept))
-    return reduction([error[kept] for error in errors], baseline[kept], motions)
+    return reduction([error[kept] for error in errors], [baseline[kept]], motions)
 
 
 def claim_table(found: list[Claim], block: Block) -> ResultTable:

@@ -46,10 +46,11 @@ class Reduction:
         return f"{mean} ± {format_cell(self.error, 0)}" if self.error > 0 else mean
 
 
-def reduction(errors: ListOf[Array], baseline: Array, motions: ListOf[str]) -> Reduction:
+def reduction(errors: ListOf[Array], baselines: ListOf[Array], motions: ListOf[str]) -> Reduction:
     """Return the reduction of an error.
 
-    Errors are paired: entry i of every array is of recording i. The standard error over motions is
+    Errors are paired: entry i of every array is of recording i, and seeds are compared with equal
+    seeds. The standard error over motions is
     that of a delete-one-motion jackknife (Efron & Stein 1981): each motion in turn is left out of
     the error and of the baseline. A motion that is hard for both then adds no uncertainty, because
     the reduction is a ratio of sums over the same motions.
@@ -57,17 +58,22 @@ def reduction(errors: ListOf[Array], baseline: Array, motions: ListOf[str]) -> R
     Args:
         errors: Error of each recording, (recordings,), one array for each training seed; of a
             method that is not trained, one array. In any unit, that of the baseline.
-        baseline: Error of each recording by the baseline, (recordings,).
+        baselines: Error of each recording by the baseline, (recordings,): one array, or for a
+            trained baseline one for each seed.
         motions: Motion of each recording: recordings of one motion are not independent.
     """
-    by_seed = np.array([_percent_less(error, baseline) for error in errors])  # (seeds,) %
+    if len(baselines) == 1:
+        baselines = [baselines[0]] * len(errors)
+    pairs = zip(errors, baselines, strict=True)
+    by_seed = np.array([_percent_less(error, baseline) for error, baseline in pairs])  # (seeds,) %
     mean_error = np.mean(errors, axis=0)  # (recordings,)
+    mean_baseline = np.mean(baselines, axis=0)  # (recordings,)
     names = list(dict.fromkeys(motions))
     motion_of = np.array(motions)  # (recordings,)
     left_out = []  # reduction without each motion, %
     for name in names:
         kept = motion_of != name
-        left_out.append(_percent_less(mean_error[kept], baseline[kept]))
+        left_out.append(_percent_less(mean_error[kept], mean_baseline[kept]))
     count = len(names)
     motion_error = 0.0
     if count > 1:
