@@ -18,6 +18,7 @@ from gaponet.evaluation.run_files import read_gap
 from gaponet.evaluation.verdict import LEARNED
 from gaponet.report.figures.evaluation import waterfall
 from gaponet.robot.folder import save_robot
+from gaponet.robot.servo_fields import SERVO_FIELDS
 from gaponet.sim.metrics import Run
 from gaponet.sim.model import model_hash
 from gaponet.sim.replay import replay, rollout_errors
@@ -221,3 +222,16 @@ def test_a_gap_that_is_measured_again_simulates_nothing(tmp_path, monkeypatch):
     monkeypatch.delattr("gaponet.sim.replay.rollout")
     assert gap_by_step(candidate, Dataset(data.path)) == first
     assert first["left"]["friction"] != first["left"]["creep"]
+
+
+def test_after_the_last_cause_the_simulator_is_the_identified_robot(tmp_path):
+    """Also where every number of a servo was identified: a new one needs a cause in CAUSES."""
+    arm = write_arm(tmp_path)
+    numbers = dict.fromkeys(SERVO_FIELDS, 0.01)
+    numbers |= {"kp": 15.0, "effort_limit": 4.0, "no_load_speed": 20.0}
+    numbers |= {"stop_low": -1.4, "stop_high": 1.4}
+    identified = arm.with_identified(dict.fromkeys(arm.joint_names, numbers))
+
+    last = cause_steps(identified)[-1]
+
+    assert model_hash(last.simulator) == model_hash(identified)
