@@ -259,6 +259,22 @@ def test_a_stated_payload_is_compared_with_the_servo_torques(robot, model, held,
     assert compensator.payload.mass[0] == told
 
 
+def test_a_payload_stated_at_a_pick_is_not_compared_with_the_torques_before(robot, model):
+    arm = WeakArm(robot)
+    compensator = Compensator(robot, model, config=NOW, payload_step=0.1)
+    doubts = []
+
+    def pick():
+        arm.load(1)
+        compensator.set_payload(0.4)
+        doubts.append(compensator.doubt)
+
+    play(arm, np.repeat([[0.3, -0.2]], 400, axis=0), compensator, 0.0, {200: pick})
+
+    assert doubts == [""]
+    assert compensator.doubt == ""
+
+
 def test_torques_unlike_a_payload_give_mass_zero(robot, model):
     target = np.array([0.3, -0.2])
     compensator = Compensator(robot, model, config=NOW, payload_step=0.1)

@@ -100,8 +100,12 @@ class Payload:
         self._set(0.0 if mass is None else mass)
 
     def state(self, mass: Array | float) -> None:
-        """State the mass, kg, one number or (num,); it is no longer estimated."""
+        """State the mass, kg, one number or (num,); it is no longer estimated.
+
+        The torques so far were those of another mass, and do not contradict this one.
+        """
         self.stated = True
+        self.estimate.reset()
         self._set(mass)
 
     def _set(self, mass: Array | float) -> None:

@@ -98,14 +98,38 @@ def _alignment_claims(results: Results, block: Block) -> list[Claim]:
 
 def _less_than_mlp(results: Results, block: Block) -> Claim:
     """Return how much nearer to the robot each network brings the simulator than the MLP does."""
-    mlp = _over_joints(results, results.q_dis(block, "MLP"))
-    reductions = {}
+    errors = {}
     for name in results.networks(block):
-        if name != "MLP":
-            errors = _over_joints(results, results.q_dis(block, name))
-            reductions[name] = reduction(errors, mlp, results.motions)
+        errors[name] = _over_joints(results, results.q_dis(block, name))
+    reductions = {}
+    for name, (own, mlp) in _beside_mlp(results, block, errors).items():
+        reductions[name] = reduction(own, mlp, results.motions)
     text = "simulator + Δa to robot, all payloads: less Q_dis than the MLP"
     return Claim(block, text, None, reductions)
+
+
+def _beside_mlp(
+    results: Results, block: Block, errors: dict[str, list[Array]]
+) -> dict[str, tuple[list[Array], list[Array]]]:
+    """Return network → its errors and those of the MLP, one array for each seed.
+
+    Seeds are left out of which only one of the two was trained: a training may have failed.
+
+    Args:
+        errors: Network, the MLP among them → its errors for each of its seeds.
+    """
+    of_mlp = dict(zip(results.seeds(block, "MLP"), errors["MLP"], strict=True))
+    found = {}
+    for name, by_seed in errors.items():
+        own = []
+        mlp = []
+        for seed, error in zip(results.seeds(block, name), by_seed, strict=True):
+            if seed in of_mlp:
+                own.append(error)
+                mlp.append(of_mlp[seed])
+        if name != "MLP" and own:
+            found[name] = (own, mlp)
+    return found
 
 
 def _over_joints(results: Results, by_seed: list[Array]) -> list[Array]:
@@ -149,7 +173,9 @@ def _delivery_claims(results: Results, block: Block) -> list[Claim]:
         for name in results.networks(block):
             offsets[name] = [seed[-1] for seed in results.offsets(block, name, way)]
         for axis, letter in enumerate(AXES):
-            reductions = _offset_reductions(offsets, plain, axis)
+            reductions = {}
+            for name, seeds in offsets.items():
+                reductions[name] = _offset_reduction(seeds, plain, axis)
             text = (
                 f"hand to goal along {letter}, {WAY_TITLES[way]}, {heaviest}: less than "
                 f"{WITHOUT_NETWORK[reference]}"
@@ -157,23 +183,15 @@ def _delivery_claims(results: Results, block: Block) -> list[Claim]:
             found.append(Claim(block, text, None, reductions))
         if "MLP" not in offsets:
             continue
-        mlp = offsets.pop("MLP")
+        beside_mlp = _beside_mlp(results, block, offsets)
         for axis, letter in enumerate(AXES):
-            reductions = _offset_reductions(offsets, mlp, axis)
+            reductions = {}
+            for name, (own, mlp) in beside_mlp.items():
+                reductions[name] = _offset_reduction(own, mlp, axis)
             text = f"hand to goal along {letter}, {WAY_TITLES[way]}, {heaviest}: less than the MLP"
             printed = CLAIM_BY_AXIS[letter] if way == "delta" else None
             found.append(Claim(block, text, printed, reductions))
     return found
-
-
-def _offset_reductions(
-    offsets: dict[str, list[Array]], baselines: list[Array], axis: int
-) -> dict[str, Reduction]:
-    """Return method → reduction along an axis; arguments as of `_offset_reduction`."""
-    reductions = {}
-    for name, seeds in offsets.items():
-        reductions[name] = _offset_reduction(seeds, baselines, axis)
-    return reductions
 
 
 def _offset_reduction(seeds: list[Array], baselines: list[Array], axis: int) -> Reduction:

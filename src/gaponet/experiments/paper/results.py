@@ -85,6 +85,10 @@ class Results:
         runs = [run for run in self.trainings if (run["block"], run["name"]) == (block, name)]
         return sorted(runs, key=lambda run: int(run["seed"]))
 
+    def seeds(self, block: Block, name: str) -> list[int]:
+        """Return the seeds of the finished trainings of a setting, in the order of `runs`."""
+        return [int(run["seed"]) for run in self.runs(block, name)]
+
     # ---- errors, by recording
 
     def baseline_q_dis(self, name: str) -> Array:
