@@ -49,6 +49,18 @@ def test_the_help_of_an_option_has_no_line_breaks_of_the_source(monkeypatch, cap
     assert "temperature if it varies" in line
 
 
+@pytest.mark.parametrize("command", ["identify", "train", "collect", "experiment", "export"])
+def test_help_names_no_default_where_there_is_none(command, monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", "1000")
+    with pytest.raises(SystemExit):
+        main([command, "--help"])
+    text = capsys.readouterr().out
+    assert "{None}" not in text
+    assert "(default: )" not in text
+    assert "(default: None)" not in text
+    assert "(default: '')" not in text
+
+
 def test_a_fault_that_a_virtual_robot_does_not_have_is_refused(capsys):
     assert main(["virtual", "serve", "--robot", "so101", "--fault", "stop"]) == 2
     assert "--fault stop: only h1_2 has faults" in capsys.readouterr().err

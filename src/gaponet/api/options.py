@@ -149,8 +149,8 @@ class TrainOptions:
     model: ModelKind | Literal["auto"] | None = None
     """gaponet, paper (the paper's literal network), or a baseline: shared_mlp, mlp, trees. auto:
     gaponet, shared_mlp, mlp and, with scikit-learn, trees get a fifth of the budget each. The best
-    network on validation gets the rest, and trees are chosen if they are still better. None: the
-    kind that config names."""
+    network on validation gets the rest, and trees are chosen if they are still better. None, in
+    Python alone: the kind that config names."""
     holdout_units: tuple[str, ...] = ()
     """Units that are not trained on. Their test motions are still measured."""
     resume: bool = False

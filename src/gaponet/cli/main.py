@@ -120,10 +120,17 @@ def _run(argv: list[str], begin: Callable[[], object]) -> None:
         raise UsageError(f"no command '{name}'; {guess}gaponet --help lists them all")
     import tyro
 
+    from gaponet.cli.options import OPTIONAL
+
     wanted = COMMANDS if is_completion else {name: COMMANDS[name]}
     functions = {command: _prepared(load(where), begin) for command, where in wanted.items()}
     tyro.extras.subcommand_cli_from_dict(
-        functions, prog="gaponet", description=ABOUT, args=argv, sort_subcommands=False
+        functions,
+        prog="gaponet",
+        description=ABOUT,
+        args=argv,
+        sort_subcommands=False,
+        registry=OPTIONAL,
     )
 
 
@@ -131,9 +138,10 @@ def _prepared(function: Callable[..., Any], begin: Callable[[], object]) -> Call
     """Return the function of a command for tyro: with options explained in one line each, that are
     checked before it begins.
     """
-    from gaponet.cli.options import join_lines
+    from gaponet.cli.options import hide_nothing, join_lines
 
     join_lines(function)
+    hide_nothing(function)
 
     @wraps(function)
     def run(*args: Any, **kwargs: Any) -> Any:

@@ -1,7 +1,8 @@
 """Options that several commands have, each said once; and how their help reaches tyro.
 
 tyro makes the command line of a function: its parameters are the options, and its docstring is the
-help. `like` and `join_lines` change that docstring before tyro reads it.
+help. `like` and `join_lines` change that docstring before tyro reads it. `hide_nothing` and
+`OPTIONAL` keep the word None out of the help.
 """
 
 from __future__ import annotations
@@ -9,12 +10,14 @@ from __future__ import annotations
 import inspect
 import re
 from collections.abc import Callable
-from dataclasses import is_dataclass
+from dataclasses import is_dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, TypeVar, Union, get_type_hints
+from types import NoneType, UnionType
+from typing import Annotated, Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import tyro
 from docstring_parser import parse_from_object
+from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
 Command = TypeVar("Command", bound=Callable[..., Any])
 
@@ -90,6 +93,70 @@ def _list_fields_in_docstring(owner: type) -> None:
         words = (field.description or "").split()
         lines.append(f"    {field.arg_name}: {' '.join(words)}")
     owner.__doc__ = "\n".join([about, "", ATTRIBUTES, *lines])
+
+
+NOTHING = (None, (), "")
+"""Defaults that say nothing: the option's explanation says what happens without it."""
+NO_HINT = tyro.conf.arg(help_behavior_hint="")
+
+
+def hide_nothing(command: Callable[..., Any]) -> None:
+    """Leave out "(default: None)" and the like in the help of a command's options.
+
+    This annotates parameters and, where the command takes a dataclass, its fields. A second call
+    changes nothing.
+    """
+    command = inspect.unwrap(command)
+    hints = get_type_hints(command, include_extras=True)
+    for name, parameter in inspect.signature(command).parameters.items():
+        if parameter.default in NOTHING:
+            command.__annotations__[name] = Annotated[hints[name], NO_HINT]
+    for hint in get_type_hints(command).values():
+        _hide_nothing_of_fields(hint)
+
+
+def _hide_nothing_of_fields(hint: Any) -> None:
+    """Annotate the fields of a dataclass and of the dataclasses in them.
+
+    Args:
+        hint: Type of a parameter or a field; nothing happens if it is no dataclass.
+    """
+    if not (isinstance(hint, type) and is_dataclass(hint)):
+        return
+    hints = get_type_hints(hint, include_extras=True)
+    for owner in hint.__mro__:
+        for name in vars(owner).get("__annotations__", {}):
+            if vars(owner).get(name, NO_HINT) in NOTHING:
+                owner.__annotations__[name] = Annotated[hints[name], NO_HINT]
+    for nested in get_type_hints(hint).values():
+        _hide_nothing_of_fields(nested)
+
+
+OPTIONAL = ConstructorRegistry()
+"""How tyro reads an option that may be None: as one of its other types. tyro itself would show
+"{None}|STR" and read the word None as no value."""
+
+
+@OPTIONAL.primitive_rule
+def _read_optional(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
+    kinds = get_args(info.type)
+    if get_origin(info.type) not in (Union, UnionType) or NoneType not in kinds:
+        return None
+    others = tuple(kind for kind in kinds if kind is not NoneType)
+    one_of_them: Any = Union[others]  # noqa: UP007
+    value = PrimitiveTypeInfo.make(one_of_them, info.markers)
+    spec = ConstructorRegistry.get_primitive_spec(value)
+    if not isinstance(spec, PrimitiveConstructorSpec):
+        return None
+    of_value = spec
+
+    def is_instance(given: Any) -> Any:
+        return given is None or of_value.is_instance(given)
+
+    def words(given: Any) -> list[str]:
+        return [] if given is None else of_value.str_from_instance(given)
+
+    return replace(of_value, is_instance=is_instance, str_from_instance=words)
 
 
 def like(function: Callable[..., Any]) -> Callable[[Command], Command]:
