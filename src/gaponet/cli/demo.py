@@ -41,7 +41,7 @@ def demo(out: Path = Path("demo_run"), real: Flag = False, json: Json = False) -
     The experiment records three units of an H1-2 and an unseen fourth with 0 and 3 kg, shows how
     far the simulator is from them, identifies the robot, trains GAPONet and an MLP on three units,
     and measures both on the fourth. Lengths are counted in control steps, so that every machine
-    gets the same result. It takes four minutes on two cores; an interrupted demo continues.
+    gets the same result. It takes seven minutes on two cores; an interrupted demo continues.
 
     With --real it takes the public recordings of a real SO-101 arm, measures the simulator's error,
     identifies the arm, draws what each cause removes, and exports the result for MuJoCo. It needs

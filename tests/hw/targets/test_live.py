@@ -351,32 +351,45 @@ def test_a_sender_that_dies_while_the_robot_goes_to_its_first_target_ends_in_dam
     judge(arm, recording)
 
 
-def test_a_sender_that_waits_for_states_survives_a_plan_that_took_long(so101):
-    """It says something only where it has heard a state; none comes while the way to its first
-    target is looked for.
-    """
+SEARCH_S = 2.0  # of a long search for a clear path
+
+
+class Waiting(Scripted):
+    """A sender that says something only where it has heard a state."""
+
+    def __init__(self, clock, joints, silence):
+        """silence: It says nothing for so many s after its first target."""
+        super().__init__(clock, None)
+        self.joints = joints
+        self.silence = silence
+        self.said = []
+        self.first = None
+
+    def receive(self):
+        said = self.said
+        self.said = []
+        return said
+
+    def publish(self, to, state):
+        now = self.clock.now()
+        if self.first is not None and now < self.first + self.silence:
+            return
+        self.first = now if self.first is None else self.first
+        self.said = [Message("a", now, dict.fromkeys(self.joints, 0.0))]
+
+
+@pytest.mark.parametrize("silence", [0.0, SEARCH_S + 0.5])
+def test_a_sender_that_waits_survives_a_search_that_takes_long(so101, silence):
     clock = SimulatedClock()
-
-    class Answering(Scripted):
-        def receive(self):
-            said = self.said
-            self.said = []
-            return said
-
-        def senders(self):
-            return set()
-
-        def publish(self, to, state):
-            self.said = [Message("a", self.clock.now(), dict.fromkeys(so101.joint_names, 0.0))]
-
-    transport = Answering(clock, None)
+    transport = Waiting(clock, so101.joint_names, silence)
     config = ControlConfig(blend=0.3, blend_speed=2.0, settle=0.1, damp=0.1)
     targets = LiveTargets(transport, so101, so101.joint_names, clock, DT, 5.0)
     controller = Controller(NotedArm(so101, clock), so101, config=config, clock=clock)
     begin = controller.readiness.context.planner.begin
 
     def slow(first, found):
-        for _ in range(400):
+        until = clock.now() + SEARCH_S
+        while clock.now() < until:
             clock.advance(0.005)
             yield
         return (yield from begin(first, found))

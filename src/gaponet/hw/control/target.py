@@ -90,6 +90,8 @@ class Readiness:
             return None
         if isinstance(first, Fault):
             # A sender of live targets waits while the robot plans, and may go on afterwards.
+            if first.kind == "silence" and self._search is not None:
+                return self._continue_search(now)
             may_go_on = first.kind == "silence" and self.plan is not None
             if may_go_on and not waits_too_long:
                 return None
@@ -137,6 +139,12 @@ class Readiness:
             return None
         if self._search is None:
             self._search = context.planner.begin(first, state.qpos)
+        return self._continue_search(now)
+
+    def _continue_search(self, now: float) -> Fault | None:
+        """Search for a part of a period; the plan is there when the search ends."""
+        assert self._search is not None
+        context = self.context
         try:
             self.plan = advance(self._search, context.clock, SEARCH_SHARE * context.dt)
         except UsageError as error:
