@@ -276,6 +276,7 @@ def test_a_consent_of_true_writes_to_the_servos(bus, nobody, tmp_path):
     )
     assert any(request[4] in WRITES for request in servos.heard)
     assert not result.recording.virtual
+    assert result.recording.summary()["consent"] == "the caller's function"
 
 
 def test_lowcmd_needs_a_statement_that_the_robot_hangs_beside_yes(nobody):

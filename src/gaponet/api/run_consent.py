@@ -15,6 +15,9 @@ SWITCHED_OFF = {  # by Connection.joints, with topic lowcmd
     "upper_body": "the legs",
     "all": "at the end of the run all motors",
 }
+# Where a consent comes from that was asked for.
+TYPED = "typed on the terminal"
+CALLED = "the caller's function"
 
 
 class Permission:
@@ -36,9 +39,20 @@ class Permission:
         self.consent = consent
 
     @property
+    def source(self) -> str:
+        """Where the consent to a motion comes from, in words for the recording."""
+        if self.options.dry_run:
+            return "none needed: dry run"
+        if self.driver == "virtual":
+            return "none needed: virtual robot in this process"
+        if self.options.yes:
+            return "option yes"
+        return TYPED if self.consent is None else CALLED
+
+    @property
     def needed(self) -> bool:
-        """True if somebody must consent before the robot moves."""
-        return self.driver != "virtual" and not self.options.dry_run and not self.options.yes
+        """True if somebody must be asked before the robot moves."""
+        return self.source in (TYPED, CALLED)
 
     def require_someone_to_ask(self) -> None:
         """Refuse a run whose consent nobody could give, before anything is opened.

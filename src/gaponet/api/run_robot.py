@@ -223,6 +223,7 @@ def execute(request: RunRequest, report: RunReporter, consent: Consent | None = 
             controller.plan = plan
         how = "as planned" if motion is not None else f"as {options.targets} says"
         permission.require_motion(connected, how)
+        controller.recording.meta["consent"] = permission.source
 
     facts = facts_of(request, robot, motion, unit, compensation)
     if live is not None:

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from gaponet import __version__
 from gaponet.base.arrays import Array
 from gaponet.base.errors import LogError
 from gaponet.base.files import atomic_write, lock_folder, write_text
@@ -140,6 +141,7 @@ class Recording:
             events.append([round(event.time - start, 4), event.phase, event.kind, event.text])
         incomplete = {"not_whole": self.rows.error.strerror} if self.rows.error else {}
         facts = {
+            "gaponet": __version__,
             "robot": self.robot,
             "virtual": self.virtual,
             "obeyed": not self.disobedience,
