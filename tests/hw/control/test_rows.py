@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 from gaponet.base.errors import FolderError, LogError
+from gaponet.data.formats import find_logs
 from gaponet.hw.control import rows as module
 from gaponet.hw.control.driver import State
 from gaponet.hw.control.recording import Recording
@@ -58,6 +59,12 @@ def test_rows_come_back_as_they_were(count):
         assert (found.ctrl is None) == (want.ctrl is None)
         np.testing.assert_array_equal(found.state.tau, want.state.tau)
     assert [r.time for r in rows[-2:]] == [row(k).time for k in range(count)][-2:]
+
+
+def test_an_import_of_a_run_whose_motion_did_not_begin_says_so(tmp_path):
+    recording(0, tmp_path).save(tmp_path, "sweep")
+    with pytest.raises(LogError, match=r"did not begin; the events in sweep\.json say why"):
+        find_logs(tmp_path)
 
 
 def test_memory_holds_none_of_an_hours_rows():

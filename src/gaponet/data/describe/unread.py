@@ -12,6 +12,7 @@ SPREADSHEETS = (".xlsx", ".xls", ".ods")
 JSON = (".json", ".jsonl", ".ndjson")
 TEXT = (".txt", ".dat")
 MAX_FILES = 2000  # that are looked at
+OWN_RUN = ".cycles.npy"  # as hw/control/rows.py names the periods of a run on a robot
 ADDRESS = re.compile(r"(hf|https?|s3|gs):/+(?:datasets/)?(.*)")
 
 
@@ -34,6 +35,11 @@ def why_unread(path: Path, files: list[Path]) -> str:
             return f". {name} is packed: unpack it first"
         if suffix in SPREADSHEETS:
             return f". {name} is a spreadsheet: save its sheet as CSV"
+        if file.name.endswith(OWN_RUN):
+            return (
+                f". {name} has the periods of a run of gaponet whose motion did not begin; the "
+                f"events in {file.name.removesuffix(OWN_RUN)}.json say why"
+            )
         if suffix == ".npy":
             return (
                 f". {name} is one array without a name: put command, position and time into one "
