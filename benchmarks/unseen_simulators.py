@@ -68,7 +68,7 @@ from gaponet.sim.metrics import standard_error
 from gaponet.sim.replay import Corrector, rollout_errors
 
 TEST_SEED = 20_261_128
-WITHIN = 20  # simulators
+WITHIN = 20  # simulators; --tests says how many of these
 BEYOND = 10
 MAX_RECORDINGS = 24  # of the test, evenly spaced
 PIECE_S = (4.0, 16.0)  # of each longer one: all methods in thirty simulators take ten minutes then
@@ -115,9 +115,12 @@ def rows(arguments: argparse.Namespace) -> dict[str, Row]:
     return chosen
 
 
-def test_simulators(joints: int) -> dict[str, list[SimulatorChange]]:
+def test_simulators(joints: int, most: int) -> dict[str, list[SimulatorChange]]:
     """Return the simulators of the test. Those beyond have a stiffness outside the range of
     training.
+
+    Args:
+        most: Largest number of simulators in each group.
     """
     ranges = SimulatorRanges()
     within = ranges.draw(joints, WITHIN, TEST_SEED)
@@ -127,7 +130,7 @@ def test_simulators(joints: int) -> dict[str, list[SimulatorChange]]:
         *softer.draw(joints, BEYOND // 2, TEST_SEED + 1),
         *stiffer.draw(joints, BEYOND - BEYOND // 2, TEST_SEED + 2),
     ]
-    return {"within": within, "beyond": beyond}
+    return {"within": within[:most], "beyond": beyond[:most]}
 
 
 def run_folder(out: Path, name: str, seed: int) -> Path:
@@ -172,7 +175,7 @@ def test(arguments: argparse.Namespace) -> None:
     robot = robot.before_identification
     by_payload = test_recordings(dataset, arguments)
     groups: dict[str, ListOf[SimulatorChange | None]] = {"nominal": [None]}
-    groups.update(test_simulators(len(robot.joint_names)))
+    groups.update(test_simulators(len(robot.joint_names), arguments.tests))
     methods = all_methods(arguments, robot)
     found: dict[str, dict[str, list[list[float]]]] = {name: {} for name in methods}
     for group, simulators in groups.items():
@@ -427,6 +430,9 @@ def add_options(command: argparse.ArgumentParser) -> None:
     )
     command.add_argument(
         "--recordings", type=int, default=MAX_RECORDINGS, help="of the test, by payload"
+    )
+    command.add_argument(
+        "--tests", type=int, default=WITHIN, help="largest number of test simulators in a group"
     )
     command.add_argument("--rates", type=float, nargs="*", default=[])
     command.add_argument("--identified")
