@@ -124,6 +124,13 @@ def test_backlash_opens_only_when_the_torque_turns():
     assert Backlash(one(), np.array([0.1])).step(np.array([[-1.0]]), 0.002)[0, 0] == 1.0
 
 
+def test_a_motor_without_armature_crosses_its_backlash_at_once():
+    play = Backlash(one(backlash=0.02), np.array([0.0]))
+    play.reset(np.array([[1.0]]))
+    with np.errstate(all="raise"):
+        assert play.step(np.array([[-1.0]]), 0.002)[0, 0] == 1.0
+
+
 def test_heating_curve_has_the_winding_time_constant():
     # 4 N·m at 2 N·m/√W: 4 W through 3 K/W, 12 K at last, 63.2 % of it after one time constant
     p = one(

@@ -20,6 +20,8 @@ DERATING_TEMPERATURE = 40.0  # °C above which a drive reduces its gain
 STUCK_SPEED = 1e-3  # rad/s below which a joint counts as stuck
 KT_TEMPERATURE = 25.0  # °C at which kt_scale is stated
 COPPER_COEFFICIENT = 0.00393  # 1/K, of the resistance, IEC 60028
+# kg·m², of a motor that crosses its backlash; a model without armature states 0
+MIN_ROTOR_INERTIA = 1e-9
 
 
 def friction_limit(
@@ -249,7 +251,7 @@ class Backlash:
 
     def __init__(self, physics: Physics, armature: Array) -> None:
         self.half = physics.backlash / 2
-        self.armature = np.broadcast_to(armature, self.half.shape)
+        self.armature = np.broadcast_to(np.maximum(armature, MIN_ROTOR_INERTIA), self.half.shape)
         self.play = self.half > 0
         self.any = bool(self.play.any())
         self.gap = self.half.copy()  # motor ahead of link, rad
