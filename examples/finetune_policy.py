@@ -1,14 +1,16 @@
 """Fine-tune a policy in the aligned simulator, then test it on an unseen robot, as ASAP does.
 
     pip install "rsl-rl-lib>=5.4.2,<6"
-    python examples/finetune_policy.py RUN
+    gaponet demo
+    python examples/finetune_policy.py demo_run/experiment/trainings/labels-GAPONet-0 \\
+        --identified demo_run/experiment/identified
 
-RUN is a run of gaponet train (or demo) on virtual H1-2 units 1 to 3.
+RUN is a run of gaponet train on VIRTUAL H1-2 units 1 to 3; gaponet demo makes one.
 
 PPO trains a small network in the nominal simulator to follow arm motions with 0 to 3 kg in each
 hand. Training then continues in the aligned simulator and, for comparison, equally long in the
-nominal one. All three policies are tested on VIRTUAL unit 4 with other motions. Neither the gap
-model nor a policy was trained on that unit.
+nominal one and in that of an identified robot. All policies are tested on VIRTUAL unit 4 with other
+motions. Neither the gap model nor a policy was trained on that unit.
 
 The policy observes the measured state, the reference up to 0.2 s ahead, the payload, its last
 action, and the torque of the reference by nominal inverse dynamics, divided by kp. Its output is
@@ -59,6 +61,8 @@ POSITION_NOISE = 0.0005  # rad, of observations in training
 VELOCITY_NOISE = 0.02  # rad/s
 EPISODE = 200  # control periods
 WARMTH = 12.0  # K above ambient, of the motors
+NUM_ENVS = 256  # simulations side by side
+UNSEEN_UNIT = "virtual-4"
 SKIP = 50  # control periods at the start of a motion without effect on the score
 
 PPO: dict[str, Any] = {
@@ -236,7 +240,7 @@ class Unit:
         task: Task,
         name: str,
         payload_mass: Array,
-        fleet: str = "easy",
+        fleet: str,
         extra_delay: float = 0.0,
     ) -> None:
         """extra_delay: s by which commands arrive later than the unit's own do."""
@@ -357,9 +361,9 @@ def main(
     run: tyro.conf.Positional[Path],
     first: int = 150,
     more: int = 80,
-    num_envs: int = 256,
     seeds: tuple[int, ...] = (0,),
-    unit: str = "virtual-4",
+    identified: Path | None = None,
+    fleet: str = "firm",
     quick: bool = False,
 ) -> None:
     """Train, fine-tune and test on the unseen unit; print the mean |error| in mrad.
@@ -367,14 +371,15 @@ def main(
     Args:
         run: Folder of gaponet train, H1-2.
         first: PPO updates in the nominal simulator.
-        more: Further updates, once in the aligned and once in the nominal simulator.
-        num_envs: Simulations side by side.
+        more: Further updates, in the nominal, the aligned and the identified simulator each.
         seeds: Seeds of training.
-        unit: Unit of the fleet `easy`.
+        identified: Folder of gaponet identify; without it, nothing is trained in its simulator.
+        fleet: VIRTUAL fleet of whose units 1 to 3 RUN was trained.
         quick: Test run with a few steps.
     """
     begin = time.perf_counter()
     torch.set_num_threads(1)  # the simulators take the other cores
+    num_envs = NUM_ENVS
     names = LEARN
     if quick:
         first = 2
@@ -391,13 +396,23 @@ def main(
     mass = np.resize(np.linspace(0, heaviest, 4), num_envs)
     tried = np.repeat([0.0, heaviest], len(unseen.first))
     options = AlignedSimOptions(locked=task.locked)
-    plants: dict[str, AlignedSim | Unit] = {
-        "nominal simulator": AlignedSim(robot, None, tried, num_envs=len(tried), options=options),
-        "aligned simulator": AlignedSim(
-            corrected, model, tried, num_envs=len(tried), options=options
-        ),
-        unit: Unit(robot, unseen, unit, tried),
+
+    def simulator(of: str, payload_mass: Array) -> AlignedSim:
+        """Return simulations of the nominal robot, the aligned or the identified one."""
+        spec, corrector = simulators[of]
+        count = len(payload_mass)
+        return AlignedSim(spec, corrector, payload_mass, num_envs=count, options=options)
+
+    simulators: dict[str, tuple[RobotSpec, GapModel | None]] = {
+        "nominal": (robot, None),
+        "aligned": (corrected, model),
     }
+    if identified is not None:
+        simulators["identified"] = (load_robot(identified), None)
+    plants: dict[str, AlignedSim | Unit] = {}
+    for of in simulators:
+        plants[f"{of} simulator"] = simulator(of, tried)
+    plants[UNSEEN_UNIT] = Unit(robot, unseen, UNSEEN_UNIT, tried, fleet)
     results: dict[str, list[Array]] = {}
 
     def evaluate(name: str, policy: OnPolicyRunner | None) -> None:
@@ -414,17 +429,14 @@ def main(
     evaluate("reference as target", None)
     for seed in seeds:
         torch.manual_seed(seed)
-        nominal_sim = AlignedSim(robot, None, mass, num_envs=num_envs, options=options)
-        env = TrackingEnv(task, nominal_sim, seed)
+        env = TrackingEnv(task, simulator("nominal", mass), seed)
         policy = train("nominal", make_runner(env), env, first)
         evaluate("policy, nominal", policy)
         env.error = []
-        longer = make_runner(env, policy)
-        aligned_sim = AlignedSim(corrected, model, mass, num_envs=num_envs, options=options)
-        aligned = TrackingEnv(task, aligned_sim, seed)
-        tuned = train("fine-tuning", make_runner(aligned, policy), aligned, more)
-        evaluate("policy, fine-tuned", tuned)
-        evaluate("policy, nominal as long", train("nominal, on", longer, env, more))
+        for of in simulators:
+            there = env if of == "nominal" else TrackingEnv(task, simulator(of, mass), seed)
+            tuned = train(f"{of}, fine-tuning", make_runner(there, policy), there, more)
+            evaluate(f"policy, fine-tuned in the {of} simulator", tuned)
     print(table(results, list(plants), heaviest))
     print(f"{time.perf_counter() - begin:.0f} s in all")
 

@@ -51,7 +51,7 @@ def test_it_is_as_good_on_a_robot_that_is_like_the_simulator(robot, task, monkey
     monkeypatch.setattr(
         example, "load_fleet", lambda *_: Fleet("none", 0, (), {"unit": neutral(2)})
     )
-    unit = example.Unit(robot, task, "unit", np.array([0.0, 0.4]))
+    unit = example.Unit(robot, task, "unit", np.array([0.0, 0.4]), "none")
     sim = AlignedSim(robot, None, np.array([0.0, 0.4]), num_envs=2, options=ONE_THREAD)
     on_unit, in_sim = (example.follow(task, plant, Reader(task)) for plant in (unit, sim))
     np.testing.assert_allclose(on_unit, in_sim, atol=2e-3)
