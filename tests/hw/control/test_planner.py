@@ -98,6 +98,25 @@ def test_a_motion_is_slowed_until_no_joint_accelerates_beyond_the_limit_and_no_f
     assert 0.8 < acceleration <= 1.0
 
 
+def test_a_plan_is_slowed_to_a_share_of_the_speed_that_commands_may_have(so101):
+    """Faster targets would be cut joint by joint, and leave the path that was checked."""
+    planner = Planner(so101, so101.joint_names, config=QUICK, safety=SafetyConfig(speed=0.2))
+    plan = planner.plan(motion(so101, OVER), FOLDED)
+    assert "times slower" in plan.changed
+    fastest = np.abs(np.diff(plan.sample(0.02), axis=0)).max() / 0.02
+    assert 0.14 < fastest < 0.17
+
+
+def test_a_plan_that_needs_more_than_the_stated_share_of_torque_is_refused(so101):
+    level = np.zeros(6)
+    need = Planner(so101, so101.joint_names).plan(motion(so101, level), OVER).torque * 0.85
+    enough = Planner(so101, so101.joint_names, safety=SafetyConfig(torque_share=1.05 * need))
+    enough.plan(motion(so101, level), OVER)
+    little = Planner(so101, so101.joint_names, safety=SafetyConfig(torque_share=0.9 * need))
+    with pytest.raises(UsageError, match="torque-share"):
+        little.plan(motion(so101, level), OVER)
+
+
 def test_a_way_begins_and_ends_at_rest_and_keeps_its_speed():
     way = Trajectory.minimum_jerk(np.array([[0.0, 0.0], [1.0, 0.2], [0.4, 0.2]]), 0.5, 50.0, 2.0)
     rows = way.rows(0.01)
@@ -259,7 +278,7 @@ def test_a_plan_is_judged_as_a_whole_whatever_was_found_on_the_way(so101, monkey
     far[robot.index(robot.operated)] = ACROSS
     with pytest.raises(UsageError, match="into"):
         finish_search(Planner(robot, robot.operated).begin(far, found))
-    hasty = ControlConfig(blend=0.01, blend_speed=1e3), SafetyConfig(acceleration=1e5)
+    hasty = ControlConfig(blend=0.01, blend_speed=1e3), SafetyConfig(speed=1e4, acceleration=1e5)
     with pytest.raises(UsageError, match="torque"):
         Planner(so101, so101.joint_names, *hasty).plan(motion(so101, OVER), so101.qpos_home)
 

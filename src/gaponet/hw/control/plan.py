@@ -21,7 +21,7 @@ from gaponet.base.errors import UsageError
 from gaponet.hw.control.clock import Clock
 from gaponet.hw.control.phases import ControlConfig
 from gaponet.hw.control.safety import Limits, SafetyConfig, limit_delta
-from gaponet.motion.feasible import MAX_STATIC_SHARE, Feasibility, stretch
+from gaponet.motion.feasible import MAX_STATIC_SHARE, TORQUE_SHARE, Feasibility, stretch
 from gaponet.motion.motion import GRID, Motion
 from gaponet.motion.path_planner import Search, Trajectory, find_points, finish_search
 from gaponet.robot.spec import RobotSpec
@@ -33,6 +33,7 @@ MAX_START_DRIFT_RAD = 0.02  # by which the robot may have moved since the plan w
 MAX_APPROACH_M = 0.001  # by which shells that start nearer than the clearance may come nearer
 # of shells at the start: they are generous, and an arm rests on its table
 MAX_START_OVERLAP_M = 0.03
+ROUNDING = 1e-8  # relative, of speeds
 NO_MOVEMENT = 1e-3  # rad, or m of free space
 # time constant with which a live target may use up the free space beyond the clearance
 APPROACH_TIME_S = 0.1
@@ -46,6 +47,9 @@ GRADIENT_STEP_RAD = 1e-4  # of numerical gradients of the free space
 GOAL_SHARES = 41  # places on the straight line to a first live target that are tried as its goal
 # of a plan's torque over the usable one, or over that of the start if this is larger
 MAX_TORQUE_EXCESS = 1.1
+# of the speed of commands that a plan uses: a faster one would leave its checked path, each joint by
+# its own lag. The rest is for corrections.
+PLANNED_SPEED_SHARE = 0.8
 
 
 class TargetCompensator(Protocol):
@@ -159,7 +163,7 @@ class Planner:
             raise UsageError(
                 f"motion '{motion.name}' begins with {self._describe(first)}. Begin it elsewhere"
             )
-        fitted = self._limit_acceleration(self.limits.fit(wanted, need=need))
+        fitted = self._slow_down(self.limits.fit(wanted, need=need))
         columns = robot.index(named)
         place = "where the robot is (bring it nearer by hand, or name more joints)"
         to_motion = f"to the motion's begin from {place}"
@@ -245,15 +249,20 @@ class Planner:
             least = min(least, float(free.min(initial=np.inf)))
         return replace(plan, correction=correction, corrected_joint=joint, command_clearance=least)
 
-    def _limit_acceleration(self, motion: Motion) -> Motion:
-        """Return the motion, slowed if it accelerates more than joints can."""
+    def _slow_down(self, motion: Motion) -> Motion:
+        """Return the motion, slowed if it is faster than commands may be, or accelerates more than
+        joints can.
+        """
         rows = motion.sample(1 / self.config.rate)
-        most = np.abs(np.diff(rows, 2, axis=0)).max(initial=0.0) * self.config.rate**2
-        if most <= self.safety.acceleration:
-            return motion
-        return replace(
-            motion, ctrl=stretch(motion.ctrl, 1.02 * np.sqrt(most / self.safety.acceleration))
+        acceleration = np.abs(np.diff(rows, 2, axis=0)).max(initial=0.0) * self.config.rate**2
+        speed = np.abs(np.gradient(motion.ctrl, motion.dt, axis=0)).max()
+        slower = max(
+            np.sqrt(acceleration / self.safety.acceleration),
+            speed / (PLANNED_SPEED_SHARE * self.safety.speed),
         )
+        if slower <= 1.0 + ROUNDING:
+            return motion
+        return replace(motion, ctrl=stretch(motion.ctrl, 1.02 * slower))
 
     def _required_clearance(self, start: Array) -> Array:
         """Return the free space (pairs + shells,) m that a robot must keep which starts in a
@@ -317,9 +326,8 @@ class Planner:
                 "through the home posture is not clear either. Bring the robot by hand near its "
                 "home posture, or to a posture from where the straight way is clear"
             )
-        return Trajectory.minimum_jerk(
-            points, self.config.blend_speed, self.safety.acceleration, self.config.blend
-        )
+        speed = way_speed(self.config, self.safety)
+        return Trajectory.minimum_jerk(points, speed, self.safety.acceleration, self.config.blend)
 
     def _check(self, plan: Plan, required: Array) -> Plan:
         """Check the whole plan again, however it was made.
@@ -334,10 +342,16 @@ class Planner:
             )
         demand = self.limits.demand(rows, GRID)
         here = self.limits.demand(np.stack([plan.start] * 2), GRID)
-        if demand.torque > MAX_TORQUE_EXCESS * max(1.0, here.torque):
+        share = self.safety.torque_share
+        allowed = min(1.0, share / (MAX_TORQUE_EXCESS * TORQUE_SHARE))
+        if demand.torque > MAX_TORQUE_EXCESS * max(allowed, here.torque):
+            why = ""
+            if allowed < 1.0:
+                why = f", and --safety.torque-share {share:g} allows {allowed:.2f}"
             raise UsageError(
                 f"the plan asks {demand.worst_joint} for {demand.torque:.2f} of the torque that "
-                "may be used; go slower (--blend-speed), or from a posture that is easier to hold"
+                f"may be used{why}; go slower (--blend-speed), or from a posture that is easier "
+                "to hold"
             )
         nearest = self.collision.nearest(free) if len(free) else ""
         clearance = float(free.min(initial=np.inf))
@@ -413,7 +427,7 @@ class CollisionGuard:
             dt: Control period, s.
         """
         self._sag = np.clip(self._free - self.collision.along(qpos[None]), 0.0, self._max_sag)
-        speed = self.config.blend_speed if self._cut else self.safety.speed
+        speed = way_speed(self.config, self.safety) if self._cut else self.safety.speed
         move = np.clip(target - self.qpos, -speed * dt, speed * dt)
         if self._try(move, STEP_SHARES[:1], dt):
             self.obstacle = ""
@@ -464,6 +478,11 @@ class CollisionGuard:
         aside = np.zeros_like(move)
         aside[moved] = np.clip(step, -np.abs(move).max(), np.abs(move).max())
         return aside
+
+
+def way_speed(config: ControlConfig, safety: SafetyConfig) -> float:
+    """Return the speed of the ways to the first target and back, rad/s: commands can follow it."""
+    return min(config.blend_speed, PLANNED_SPEED_SHARE * safety.speed)
 
 
 def _describe_changes(wanted: Motion, fitted: Motion) -> str:

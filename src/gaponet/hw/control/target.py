@@ -20,6 +20,7 @@ from gaponet.hw.control.plan import (
     CollisionGuard,
     Plan,
     advance,
+    way_speed,
 )
 from gaponet.hw.targets.policy import NotYet, Policy
 from gaponet.motion.motion import blend
@@ -428,7 +429,8 @@ class TargetGenerator:
         config = self.context.config
         joints = self.context.joints
         points = np.stack([state.qpos_with(joints, start), state.qpos_with(joints, goal)])
-        return Trajectory.minimum_jerk(points, config.blend_speed, np.inf, config.blend)
+        speed = way_speed(config, self.context.safety)
+        return Trajectory.minimum_jerk(points, speed, np.inf, config.blend)
 
 
 def _on_path(path: Trajectory, passed: float, start: Array, goal: Array, joints: Array) -> Array:
