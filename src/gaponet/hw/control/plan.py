@@ -254,8 +254,8 @@ class Planner:
         joints can.
         """
         rows = motion.sample(1 / self.config.rate)
+        speed = np.abs(np.diff(rows, axis=0)).max(initial=0.0) * self.config.rate
         acceleration = np.abs(np.diff(rows, 2, axis=0)).max(initial=0.0) * self.config.rate**2
-        speed = np.abs(np.gradient(motion.ctrl, motion.dt, axis=0)).max()
         slower = max(
             np.sqrt(acceleration / self.safety.acceleration),
             speed / (PLANNED_SPEED_SHARE * self.safety.speed),
