@@ -19,7 +19,7 @@ from gaponet.base.errors import NoGainError, RobotError
 from gaponet.cli.main import main
 from gaponet.export import drawn_robots
 from gaponet.export.plain_servos import own_motions, rollout_error
-from gaponet.export.randomization import judge_units, sample_units
+from gaponet.export.randomization import NO_PLAIN_UNITS, judge_units, sample_units
 from gaponet.robot.folder import save_robot
 from gaponet.robot.spec import load_robot
 from gaponet.sim.links import COORDINATES, LinkAxes
@@ -281,6 +281,22 @@ def test_units_are_not_compared_with_recordings_at_other_gains(judged, monkeypat
         others.append([replace(s, meta=replace(s.meta, kp=(5.0, 5.0))) for s in motions])
     notes = judge_units(judged.drawn, judged.robot, tuple(others)).notes
     assert "were not compared with recordings" in notes[-1]
+
+
+def test_a_note_says_that_units_without_the_servo_model_are_missing(arm, tmp_path, capsys):
+    servo = {**SERVO_FIELDS, "stribeck": 0.02, "stribeck_speed": 0.1}
+    folder = written(arm, tmp_path / "known", servo)
+    exported(capsys, folder, "--engine", "isaaclab")
+    drawn = json.loads((folder / "randomization" / "randomization.json").read_text())
+    assert "plain_units" not in drawn
+    assert NO_PLAIN_UNITS in drawn["notes"]
+
+
+def test_no_note_speaks_of_the_servo_model_of_a_robot_without_one(arm, tmp_path, capsys):
+    folder = written(arm, tmp_path / "known")
+    exported(capsys, folder)
+    drawn = json.loads((folder / "randomization" / "randomization.json").read_text())
+    assert NO_PLAIN_UNITS not in drawn["notes"]
 
 
 def test_units_worse_than_ranges_by_hand_are_refused(judged):

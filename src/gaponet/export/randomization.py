@@ -24,7 +24,7 @@ from gaponet.base.progress import Progress, no_progress
 from gaponet.data.sequence import Sequence
 from gaponet.export.drawn_robots import RANGE_PERCENT, DrawnRobots, draw_robots
 from gaponet.export.plain_servos import comparable
-from gaponet.robot.servo_fields import SERVO_FIELDS
+from gaponet.robot.servo_fields import SERVO_FIELDS, SERVO_TERMS
 from gaponet.robot.spec import RobotSpec, load_robot
 from gaponet.sim.links import LinkAxes
 from gaponet.sysid.uncertainty import ParameterUncertainty, from_axes, prior_std, to_axes
@@ -40,6 +40,10 @@ RANGE_SAMPLES = 4096
 # of the prior's: logs with a larger standard deviation say nothing about a number
 UNDETERMINED_STD = 0.8
 MIN_ROBOTS = 3  # of a type
+NO_PLAIN_UNITS = (
+    "units for servos without the servo model are fitted to recordings, so the file has none: play "
+    "these with mujoco_servos.py or the servos of --to mjlab, or identify with --terms and no word"
+)
 
 
 @dataclass(frozen=True)
@@ -222,10 +226,11 @@ def judge_units(
     The engine has the `engine_terms` of the servo model.
     """
     if made.scope != "today":
-        return _not_judged(made, f"scope {made.scope}")
+        return _not_judged(made, robot, engine_terms, f"scope {made.scope}")
     train, validation = _comparable_motions(recordings, robot)
     if not train or not validation:
-        return _not_judged(made, "no recording with the robot's own gains")
+        why = "no recording with the robot's own gains"
+        return _not_judged(made, robot, engine_terms, why)
     judged = draw_robots(robot, made.units, (train, validation), progress=progress)
     plain = judged
     if robot.servo.has_terms:
@@ -237,9 +242,15 @@ def judge_units(
     return replace(made, units=units, ranges=_ranges(units, values), judged=judged, plain=plain)
 
 
-def _not_judged(made: Randomization, why: str) -> Randomization:
-    note = f"{why}: the units were not compared with recordings"
-    return replace(made, notes=(*made.notes, note))
+def _not_judged(
+    made: Randomization, robot: RobotSpec, engine_terms: tuple[str, ...], why: str
+) -> Randomization:
+    """Return units as drawn, with notes on what they lack."""
+    notes = [*made.notes, f"{why}: the units were not compared with recordings"]
+    missing = [name for name in SERVO_TERMS if name not in engine_terms]
+    if robot.servo.has(missing):
+        notes.append(NO_PLAIN_UNITS)
+    return replace(made, notes=tuple(notes))
 
 
 def _comparable_motions(
