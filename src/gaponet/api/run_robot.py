@@ -524,6 +524,9 @@ def make_compensation(
     assert compensator is not None
     if options.payload_mass is not None:
         compensator.require_payload(options.payload_mass)
+    if options.dry_run:
+        # Its states follow the commands at once, as if nothing weighed on the robot.
+        compensator.payload.compared = False
     if not request.is_virtual:
         require_plausible(compensator.robot)
     return compensation

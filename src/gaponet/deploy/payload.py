@@ -55,6 +55,7 @@ class Payload:
         mass: Of each robot, (num,) kg, as stated or estimated.
         stated: Whether it was stated, or can only be zero.
         estimate: From the torques of the same robots.
+        compared: Whether a stated mass is compared with the torques of the first robot.
     """
 
     def __init__(
@@ -82,7 +83,7 @@ class Payload:
         self._max_stated = max_stated
         self._carriers = carriers
         self._carried = np.full(num, -1)  # index of the mass that is carried for each robot
-        self._compared = compared and len(masses) > 1
+        self.compared = compared and len(masses) > 1
 
     def require(self, mass: Array | float) -> None:
         """Refuse masses, kg, that are not physical or too large."""
@@ -116,7 +117,7 @@ class Payload:
         self, qpos: Array, qvel: Array, command: Array, tau: Array | None, valid: Array
     ) -> None:
         """Estimate the mass, or compare the stated one; arguments as of PayloadEstimate."""
-        if self.stated and not self._compared:
+        if self.stated and not self.compared:
             return
         self.estimate.observe(qpos, qvel, command, tau, valid)
         if not self.stated:
@@ -126,7 +127,7 @@ class Payload:
     @property
     def contradiction(self) -> str:
         """Message if torques are those of another mass than stated; else ""."""
-        if self.stated and self._compared:
+        if self.stated and self.compared:
             return self.estimate.contradiction(float(self.mass[0]))
         return ""
 

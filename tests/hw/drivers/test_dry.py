@@ -18,6 +18,7 @@ from gaponet.hw.drivers.dry import DryRun, summarize_commands
 from gaponet.hw.drivers.link import measure_link
 from gaponet.hw.drivers.open import open_driver
 from gaponet.hw.targets.policy import motion_policy
+from gaponet.motion.motion import Motion
 from gaponet.robot.spec import load_robot
 
 
@@ -61,32 +62,29 @@ def test_a_dry_run_beside_a_run_of_the_same_robot_is_refused(arm, tmp_path, monk
         Controller(DryRun(inner), arm, clock=inner.clock).run(motion_policy(MOTION, DT))
 
 
+def dry_run(arm, folder, motion):
+    """The command of a dry run of a motion."""
+    file = folder / f"{motion.name}.npz"
+    write_motion(file, motion, arm)
+    command = ["run", "--motion", str(file), "--robot", str(arm.folder)]
+    command += ["--payload-side", "hand", "--fast", "--dry-run"]
+    command += ["--blend", "0.2", "--blend-speed", "4", "--settle", "0.1", "--damp", "0.1"]
+    return command
+
+
 def test_a_dry_run_on_the_command_line_says_what_would_be_sent(arm, tmp_path, capsys):
-    write_motion(tmp_path / "sway.npz", MOTION, arm)
-    command = [
-        "run",
-        "--motion",
-        str(tmp_path / "sway.npz"),
-        "--robot",
-        str(arm.folder),
-        "--payload-side",
-        "hand",
-    ]
-    command += [
-        "--fast",
-        "--dry-run",
-        "--blend",
-        "0.2",
-        "--blend-speed",
-        "4",
-        "--settle",
-        "0.1",
-        "--damp",
-        "0.1",
-    ]
+    command = dry_run(arm, tmp_path, MOTION)
     assert main(command) == 0
     assert "nothing was sent" in " ".join(capsys.readouterr().out.split())
     assert main([*command, "--out", str(tmp_path / "out")]) == 2
+
+
+def test_a_dry_run_does_not_compare_a_stated_payload_with_torques(arm, tmp_path, capsys):
+    hold = Motion("hold", "whole_body", DT, np.full((150, 2), 0.1))  # 3 s, rad
+    command = dry_run(arm, tmp_path, hold)
+    command += ["--compensate", "--payload-mass", "0.2", "--compensation.payload-max", "0.2"]
+    assert main(command) == 0
+    assert "in the hand?" not in " ".join(capsys.readouterr().out.split())
 
 
 def test_a_link_that_loses_every_fifth_state_says_so():
