@@ -29,6 +29,7 @@ from gaponet.hw.control.plan import Planner
 from gaponet.hw.control.recording import Event, Recording
 from gaponet.hw.control.safety import SafetyConfig
 from gaponet.hw.drivers.open import open_driver
+from gaponet.motion.files import write_motion
 from gaponet.motion.motion import Motion
 from gaponet.robot.folder import save_robot
 from gaponet.robot.spec import load_robot
@@ -152,6 +153,32 @@ def test_nothing_is_recorded_before_the_payload_is_stated(arm, tmp_path):
     with pytest.raises(UsageError, match="--payload-mass"):
         record_motions(("sway",), request, out=tmp_path / "set", report=SilentReporter())
     assert not (tmp_path / "set").exists()
+
+
+def test_a_motion_that_did_not_fit_is_repeated_as_it_was_played(arm, tmp_path, monkeypatch):
+    write_motion(tmp_path / "fast.npz", SWAY, arm, 50.0)
+    planned = []
+
+    class Noted(Planner):
+        def plan(self, motion, start):
+            plan = super().plan(motion, start)
+            planned.append((motion.ctrl, plan.motion.ctrl))
+            return plan
+
+    monkeypatch.setattr("gaponet.api.run_robot.Planner", Noted)
+    options = gp.RunOptions(
+        connection=gp.Connection(fast=True),
+        control=QUICK,
+        safety=SafetyConfig(speed=0.5),
+        payload_mass=0.0,
+        unchecked=True,
+    )
+    request = RunRequest(arm, options=options)
+    names = (str(tmp_path / "fast.npz"),)
+    record_motions(names, request, out=tmp_path / "set", repetitions=2, report=SilentReporter())
+    (wanted, played), (again, _) = planned
+    assert not np.array_equal(played, wanted)
+    np.testing.assert_array_equal(again, played)
 
 
 def test_a_recording_is_written_where_out_says(arm, tmp_path):

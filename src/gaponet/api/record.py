@@ -14,10 +14,12 @@ from gaponet.api.run_consent import Consent
 from gaponet.api.run_report import RunReporter, StderrReporter
 from gaponet.api.run_robot import RunRequest, execute, resolve_robot
 from gaponet.base.errors import UsageError
+from gaponet.base.files import lock_folder
 
 if TYPE_CHECKING:
     from gaponet.data.sequence import Sequence
     from gaponet.data.store import Dataset, Entry
+    from gaponet.motion.motion import Motion
 
 RECORDINGS = "recordings"  # folder in a dataset with the full recording of every run
 
@@ -88,20 +90,25 @@ def record_motions(
         raise UsageError("say what each hand carries: --payload-mass KG, 0 when empty")
     options = replace(request.options, unit_id=_unit_id(request), out=folder / RECORDINGS)
     first = replace(request, motion=motions[0], options=options)
-    known = require_robot_of_folder(folder, resolve_robot(first))  # before anything moves
     recorded: list[Recorded] = []
     seed = options.seed
-    for motion in motions:
-        for _ in range(repetitions):
-            turn = replace(first, motion=motion, options=replace(options, seed=seed))
-            run = execute(turn, report or StderrReporter(), consent)
-            if run.recording.fault:
-                on_played(run, None)  # _add then keeps the recording, and refuses to add it
-            known, entry, sequence = _add(turn, run, folder, known, len(recorded))
-            made = Recorded(run=run, id=entry.id, rows=len(sequence), rate=sequence.rate)
-            on_played(run, made)
-            recorded.append(made)
-            seed += 1
+    with lock_folder(folder, "dataset"):
+        known = require_robot_of_folder(folder, resolve_robot(first))  # before anything moves
+        for motion in motions:
+            wanted: Motion | str = motion
+            for _ in range(repetitions):
+                turn = replace(first, motion=wanted, options=replace(options, seed=seed))
+                run = execute(turn, report or StderrReporter(), consent)
+                # A motion that had to be made smaller is repeated as it was played: from where the
+                # robot is next time, another size would fit.
+                wanted = run.motion or motion
+                if run.recording.fault:
+                    on_played(run, None)  # _add then keeps the recording, and refuses to add it
+                known, entry, sequence = _add(turn, run, folder, known, len(recorded))
+                made = Recorded(run=run, id=entry.id, rows=len(sequence), rate=sequence.rate)
+                on_played(run, made)
+                recorded.append(made)
+                seed += 1
     return RecordResult(folder=folder, recorded=tuple(recorded))
 
 
