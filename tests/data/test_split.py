@@ -3,6 +3,7 @@
 import json
 import re
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from logs import arm_columns, arm_sequence, late, table_text, wave
 from gaponet.base.errors import DatasetError, UsageError
 from gaponet.data.fingerprint import equal_commands, fingerprint
 from gaponet.data.importer import ImportRequest, import_logs
+from gaponet.data.sequence import SequenceMeta
 from gaponet.data.split import (
     SPLITS,
     canonical_motions,
@@ -84,6 +86,20 @@ def test_a_few_entries_are_of_every_payload_and_unit_and_of_several_motions(data
     assert len(conditions) == 6
     assert len(values(few, "motion")) >= 6
     assert stratified_subset(few, 100) == few
+
+
+def test_a_few_of_many_entries_are_of_motions_from_all_parts_of_a_recipe():
+    """Neighbours in a recipe are alike: single joints come first, the whole body last."""
+    entries = []
+    for motion in range(40):
+        for repetition in range(3):
+            for unit in ("one", "two"):
+                meta = SequenceMeta("arm", unit, f"m{motion:02}", 0.0, repetition=repetition)
+                entries.append(SimpleNamespace(id=f"{len(entries)}", meta=meta, dt=0.02))
+    few = stratified_subset(entries, 20)
+    motions = sorted(int(entry.meta.motion[1:]) for entry in few)
+    assert np.diff([-1, *motions, 40]).max() <= 5
+    assert len(set(motions)) >= 16
 
 
 def test_payloads_are_numbers_however_they_are_written(dataset):

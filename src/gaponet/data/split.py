@@ -18,6 +18,7 @@ from collections.abc import Sequence as ListOf
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from typing_extensions import TypedDict
 
 from gaponet.base.errors import DatasetError, UsageError
@@ -43,6 +44,7 @@ MIN_MOTIONS = 3  # one for each split
 TEST_SHARE = 0.25  # of motions, units or payloads; at least one
 VAL_SHARE = 0.125  # of motions; at least one
 RATE_TOLERANCE = 0.02  # relative; rates are measured
+GOLDEN_RATIO = (5**0.5 - 1) / 2
 
 
 class SplitHashes(TypedDict):
@@ -426,6 +428,9 @@ def _split_by_joints(unrecorded: dict[str, frozenset[str]]) -> dict[str, list[st
 def stratified_subset(entries: ListOf[Entry], count: int) -> list[Entry]:
     """Return at most `count` entries, taken in turn from each payload, unit and rate, with
     different motions.
+
+    Those of each payload, unit and rate are spread evenly over the order of the entries, in which
+    similar motions, and repetitions of one, are neighbours.
     """
     groups: dict[tuple[object, ...], list[Entry]] = {}
     for entry in entries:
@@ -433,15 +438,25 @@ def stratified_subset(entries: ListOf[Entry], count: int) -> list[Entry]:
         rate = round(1 / entry.dt, 1)
         kind = (meta.payload_mass, meta.payload_side, meta.unit_id, rate)
         groups.setdefault(kind, []).append(entry)
-    rotated = []  # groups, each beginning with another motion
-    for i, group in enumerate(groups.values()):
-        start = i % len(group)
-        rotated.append(group[start:] + group[:start])
+    orders = []
+    for number, group in enumerate(groups.values()):
+        orders.append(_evenly_spread(group, number / len(groups)))
     in_turn: list[str] = []
-    for turn in itertools.zip_longest(*rotated):
+    for turn in itertools.zip_longest(*orders):
         in_turn += [entry.id for entry in turn if entry is not None]
-    chosen = in_turn[:count]
+    chosen = set(in_turn[:count])
     return [entry for entry in entries if entry.id in chosen]
+
+
+def _evenly_spread(group: list[Entry], phase: float) -> list[Entry]:
+    """Return the entries in an order whose first ones, however many, are spread evenly over the
+    group: multiples of the golden ratio fill the circle in this way.
+
+    Args:
+        phase: 0 to 1. Groups with different ones begin with different entries.
+    """
+    places = [(GOLDEN_RATIO * number + phase) % 1.0 for number in range(len(group))]
+    return [group[number] for number in np.argsort(places)]
 
 
 def require_distinct_samples(
