@@ -102,6 +102,20 @@ def test_windows_cover_all_recordings(tmp_path):
         identify([s.rows(slice(0, 20)) for s in sequences], robot)
 
 
+def test_windows_are_of_all_payloads_and_of_different_motions(tmp_path):
+    """Four payloads of one motion are stored after the other: every fourth would have none."""
+    robot = write_arm(tmp_path)
+    sequences = []
+    for s in recordings(robot, 10, rows=900):
+        for kg in (0.0, 0.1, 0.2, 0.3):
+            sequences.append(replace(s, meta=replace(s.meta, payload_mass=kg)))
+    parts = cut(sequences, 10)
+    payloads = [part.meta.payload_mass for part in parts]
+    assert len(parts) == 10
+    assert min(payloads.count(kg) for kg in (0.0, 0.1, 0.2, 0.3)) >= 2
+    assert len({part.meta.motion for part in parts}) >= 7
+
+
 def test_a_joint_behind_one_command_has_no_stop_and_one_behind_several_has(tmp_path):
     robot = write_arm(tmp_path)
     s = recordings(robot, 1, rows=200)[0]

@@ -12,6 +12,7 @@ import numpy as np
 
 Array = np.ndarray
 _T = TypeVar("_T")
+GOLDEN_RATIO = (5**0.5 - 1) / 2
 
 
 def array_module(x: Any) -> Any:
@@ -58,3 +59,16 @@ def joined(parts: Sequence[_T]) -> _T:
     for name in vars(parts[0]):
         fields[name] = np.concatenate([getattr(part, name) for part in parts])
     return type(parts[0])(**fields)
+
+
+def evenly_spread_order(count: int, phase: float = 0.0) -> Array:
+    """Return 0 to count − 1 in an order whose first ones, however many, are spread evenly, (count,).
+
+    Multiples of the golden ratio fill the circle in this way. Unlike an even step, they do not meet
+    the same ones of a regular sequence again and again.
+
+    Args:
+        phase: 0 to 1; another one begins elsewhere.
+    """
+    places = (GOLDEN_RATIO * np.arange(count) + phase) % 1.0
+    return np.argsort(places)

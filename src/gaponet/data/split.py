@@ -18,9 +18,9 @@ from collections.abc import Sequence as ListOf
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from typing_extensions import TypedDict
 
+from gaponet.base.arrays import evenly_spread_order
 from gaponet.base.errors import DatasetError, UsageError
 from gaponet.base.files import write_json
 from gaponet.base.progress import Progress, no_progress
@@ -44,7 +44,6 @@ MIN_MOTIONS = 3  # one for each split
 TEST_SHARE = 0.25  # of motions, units or payloads; at least one
 VAL_SHARE = 0.125  # of motions; at least one
 RATE_TOLERANCE = 0.02  # relative; rates are measured
-GOLDEN_RATIO = (5**0.5 - 1) / 2
 
 
 class SplitHashes(TypedDict):
@@ -440,23 +439,13 @@ def stratified_subset(entries: ListOf[Entry], count: int) -> list[Entry]:
         groups.setdefault(kind, []).append(entry)
     orders = []
     for number, group in enumerate(groups.values()):
-        orders.append(_evenly_spread(group, number / len(groups)))
+        order = evenly_spread_order(len(group), phase=number / len(groups))
+        orders.append([group[place] for place in order])
     in_turn: list[str] = []
     for turn in itertools.zip_longest(*orders):
         in_turn += [entry.id for entry in turn if entry is not None]
     chosen = set(in_turn[:count])
     return [entry for entry in entries if entry.id in chosen]
-
-
-def _evenly_spread(group: list[Entry], phase: float) -> list[Entry]:
-    """Return the entries in an order whose first ones, however many, are spread evenly over the
-    group: multiples of the golden ratio fill the circle in this way.
-
-    Args:
-        phase: 0 to 1. Groups with different ones begin with different entries.
-    """
-    places = [(GOLDEN_RATIO * number + phase) % 1.0 for number in range(len(group))]
-    return [group[number] for number in np.argsort(places)]
 
 
 def require_distinct_samples(

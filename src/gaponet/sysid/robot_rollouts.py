@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from gaponet.base.arrays import Array
+from gaponet.base.arrays import Array, evenly_spread_order
 from gaponet.base.errors import UsageError
 from gaponet.data.sequence import Sequence
 from gaponet.robot.servo_fields import SERVO_TERMS
@@ -41,7 +41,22 @@ def cut(sequences: ListOf[Sequence], count: int) -> list[Sequence]:
             f"no recording is as long as {MIN_WINDOW_S:g} s; identification needs longer ones"
         )
     count = min(count, len(parts))
-    return [parts[i * len(parts) // count] for i in range(count)]
+    picked = [parts[i * len(parts) // count] for i in range(count)]
+    if len(_conditions(picked)) < min(count, len(_conditions(parts))):
+        # Recordings are often stored in a regular order, such as four payloads of one motion after
+        # the other. Every fourth window has the same payload.
+        places = sorted(evenly_spread_order(len(parts))[:count])
+        picked = [parts[place] for place in places]
+    return picked
+
+
+def _conditions(parts: list[Sequence]) -> set[tuple[object, ...]]:
+    """Return the units, payloads and rates of windows."""
+    found: set[tuple[object, ...]] = set()
+    for part in parts:
+        meta = part.meta
+        found.add((meta.unit_id, meta.payload_mass, meta.payload_side, round(part.rate)))
+    return found
 
 
 class RobotRollouts:
