@@ -269,8 +269,9 @@ def to_sequence(log: Log, robot: RobotSpec, meta: SequenceMeta) -> Sequence:
     as they are and dt is the median period rounded to 10 µs: the robot's real rate (49.85 Hz stays
     49.85 Hz); or the exact period where the format states one; or the mean period. It is the first
     by which no row is moved by more than half a period: time is never stretched. Where none is, or
-    rows are uneven, measurements are interpolated and commands held on a grid of the state's median
-    period. The manifest says which. Refused are clocks that cannot be right: periods below 0.1 ms
+    rows are uneven, measurements are interpolated and commands held: on the periods of the loop
+    that wrote the rows, if they share timestamps and keep to one, else on a grid of the state's
+    median period. The manifest says which. Refused are clocks that cannot be right: periods below 0.1 ms
     or above 1 s, a gap of more than 2 s, three times as many rows as were recorded, a stated period
     that the timestamps contradict, states that end long before the commands.
 
