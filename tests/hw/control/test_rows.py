@@ -11,10 +11,12 @@ import subprocess
 import sys
 import threading
 import tracemalloc
+from datetime import datetime
 
 import numpy as np
 import pytest
 
+import gaponet
 from gaponet.base.errors import FolderError, LogError
 from gaponet.data.formats import find_logs
 from gaponet.hw.control import rows as module
@@ -59,6 +61,14 @@ def test_rows_come_back_as_they_were(count):
         assert (found.ctrl is None) == (want.ctrl is None)
         np.testing.assert_array_equal(found.state.tau, want.state.tau)
     assert [r.time for r in rows[-2:]] == [row(k).time for k in range(count)][-2:]
+
+
+def test_a_saved_recording_says_when_and_with_which_version(tmp_path):
+    before = datetime.now().astimezone().replace(microsecond=0)
+    recording(3, tmp_path).save(tmp_path, "sweep")
+    facts = json.loads((tmp_path / "sweep.json").read_text())
+    assert before <= datetime.fromisoformat(facts["saved"]) <= datetime.now().astimezone()
+    assert facts["gaponet"] == gaponet.__version__
 
 
 def test_an_import_of_a_run_whose_motion_did_not_begin_says_so(tmp_path):

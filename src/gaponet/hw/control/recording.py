@@ -7,6 +7,7 @@ from __future__ import annotations
 import json
 from array import array
 from dataclasses import dataclass, field
+from datetime import datetime
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -187,10 +188,10 @@ class Recording:
                     table = pa.table(columns, metadata=metadata)
                     with atomic_write(path) as temporary:
                         pq.write_table(table, temporary)
-                write_text(
-                    folder / f"{name}.json",
-                    json.dumps(self.summary(), indent=1, ensure_ascii=False) + "\n",
-                )
+                saved = datetime.now().astimezone().isoformat(timespec="seconds")
+                facts = {"saved": saved} | self.summary()
+                text = json.dumps(facts, indent=1, ensure_ascii=False)
+                write_text(folder / f"{name}.json", text + "\n")
             except OSError as error:
                 explanation = (
                     f"{error.strerror or error}; all periods that were written are in "
