@@ -287,8 +287,7 @@ class Trainer:
         A resumed run continues with gain 1.
         """
         state = self.progress.state
-        has_gain = self.config.model.kind != "paper"
-        if not np.isfinite(state.best_trained.error) or not has_gain:
+        if not np.isfinite(state.best_trained.error):
             return
         self.progress.begin_stage("gain")
         net = self._network(state.best_trained.weights)
