@@ -66,7 +66,7 @@ adversary: setup
 tournament: setup
 	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/tournament.py tournament_work --robots 10 --small
 
-# The numbers of README.md and docs/results.md, one command after the other, resumable: eight hours. STEPS="tournament backlash"
+# The numbers of README.md and docs/results.md, one command after the other, resumable: about a day. STEPS="tournament backlash"
 # runs only these; STEPS=quick runs the short form of each, an hour; STEPS=--list shows all, and when each ran.
 STEPS ?=
 results: setup
