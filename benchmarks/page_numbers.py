@@ -47,6 +47,7 @@ def value(source: str) -> str:
     kind, *words = [word.strip() for word in source.split(";")]
     readers: dict[str, Callable[..., str]] = {
         "real": _real,
+        "more": _more,
         "paper": _paper,
         "unseen": _unseen,
         "step": _step,
@@ -57,10 +58,24 @@ def value(source: str) -> str:
 
 
 def _real(question: str, method: str, field: str, form: str) -> str:
-    rows = json.loads((RESULTS / "real.json").read_text(encoding="utf-8"))["rows"]
+    return f"{_real_row(question, method)[field]:{form}}"
+
+
+def _more(question: str, method: str) -> str:
+    """Return the error beyond that of identification, mrad: mean over motions ± standard error."""
+    errors = _real_row(question, method)["by_motion_mrad"]
+    identified = _real_row(question, "identification")["by_motion_mrad"]
+    more = np.array([errors[motion] - identified[motion] for motion in identified])
+    return f"{more.mean():.1f} ± {more.std(ddof=1) / np.sqrt(len(more)):.1f}"
+
+
+def _real_row(question: str, method: str) -> dict[str, Any]:
+    rows: list[dict[str, Any]] = json.loads((RESULTS / "real.json").read_text(encoding="utf-8"))[
+        "rows"
+    ]
     for row in rows:
         if f"{row['set']}, {row['question']}" == question and row["method"] == method:
-            return f"{row[field]:{form}}"
+            return row
     raise LookupError(f"real.json: no row {question}, {method}")
 
 

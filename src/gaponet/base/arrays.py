@@ -62,10 +62,11 @@ def joined(parts: Sequence[_T]) -> _T:
 
 
 def evenly_spread_order(count: int, phase: float = 0.0) -> Array:
-    """Return 0 to count − 1 in an order whose first ones, however many, are spread evenly, (count,).
+    """Return 0 to count − 1, (count,), in an order whose first ones are spread evenly, however
+    many of them are taken.
 
-    Multiples of the golden ratio fill the circle in this way. Unlike an even step, they do not meet
-    the same ones of a regular sequence again and again.
+    Multiples of the golden ratio fill a circle in this way. In a regular sequence, such as four
+    payloads again and again, an even step may meet one payload alone; this order does not.
 
     Args:
         phase: 0 to 1; another one begins elsewhere.

@@ -47,8 +47,8 @@ GRADIENT_STEP_RAD = 1e-4  # of numerical gradients of the free space
 GOAL_SHARES = 41  # places on the straight line to a first live target that are tried as its goal
 # of a plan's torque over the usable one, or over that of the start if this is larger
 MAX_TORQUE_EXCESS = 1.1
-# of the speed of commands that a plan uses: a faster one would leave its checked path, each joint by
-# its own lag. The rest is for corrections.
+# of the speed of commands that a plan uses: a faster one would leave its checked path, each joint
+# by its own lag. The rest is for corrections.
 PLANNED_SPEED_SHARE = 0.8
 
 

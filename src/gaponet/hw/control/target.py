@@ -77,29 +77,39 @@ class Readiness:
 
         None: wait. A fault: the robot may not go there.
         """
-        waits_too_long = now - self.since > MAX_WAIT_S
         if self._good_states < MIN_GOOD_STATES:
-            if waits_too_long:
+            if self._waits_too_long(now):
                 return Fault(self._fault.kind, f"never ready: {self._fault.text}")
             return None
         if not self._prepared:
             self._prepare(state)
             return None
         first = policy(0, state)
-        if isinstance(first, NotYet):
-            self.since = now  # all else is well
-            return None
         if isinstance(first, Fault):
-            # A sender of live targets waits while the robot plans, and may go on afterwards.
-            if first.kind == "silence" and self._search is not None:
-                return self._continue_search(now)
-            may_go_on = first.kind == "silence" and self.plan is not None
-            if may_go_on and not waits_too_long:
-                return None
-            return first
+            return self._without_target(first, now)
         if first is None or not np.isfinite(first[self.context.joints]).all():
             return Fault("target", "the motion has no first target, or it is not a number")
         return self._admitted(first, state, now)
+
+    def _waits_too_long(self, now: float) -> bool:
+        return now - self.since > MAX_WAIT_S
+
+    def _without_target(self, fault: Fault, now: float) -> Fault | None:
+        """Return the fault in place of a first target, or None to wait.
+
+        A sender of live targets may be silent while the robot plans: it waits for the robot, and
+        goes on afterwards.
+        """
+        if isinstance(fault, NotYet):
+            self.since = now  # all else is well
+            return None
+        if fault.kind != "silence":
+            return fault
+        if self._search is not None:
+            return self._continue_search(now)
+        if self.plan is None or self._waits_too_long(now):
+            return fault
+        return None
 
     def _admitted(self, first: Array, state: State, now: float) -> Array | Fault | None:
         """Return the first target if the robot may go there from this state; None: wait."""
