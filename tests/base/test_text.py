@@ -1,6 +1,7 @@
 import pytest
 
 from gaponet.base.errors import GAPONetError
+from gaponet.base.result_table import ResultTable
 from gaponet.base.text import escape_markdown, format_uncertainty
 
 
@@ -39,3 +40,9 @@ def test_errors_do_not_show_credentials_of_addresses(text, shown):
 
 def test_markdown_markup_in_a_name_is_escaped():
     assert escape_markdown("![x](https:evil.example)") == r"!\[x\](https:evil.example)"
+
+
+def test_in_a_markdown_table_numbers_are_on_the_right_and_words_on_the_left():
+    rows = (("so101", "new motions", 3.1), ("h1_2", "2 kg left out", None))
+    table = ResultTable("t", ("set", "question", "mrad"), rows)
+    assert table.markdown().splitlines()[1] == "| --- | --- | ---: |"

@@ -76,9 +76,13 @@ class ResultTable:
 
     def markdown(self) -> str:
         """Return the table in Markdown, with the caption below."""
-        numbers = ["---:"] * (len(self.columns) - 1)  # aligned on the right
-        lines = [_markdown_line(self.columns), f"| {' | '.join(['---', *numbers])} |"]
-        lines += [_markdown_line(row) for row in self.texts()]
+        texts = self.texts()
+        rules = ["---"]
+        for column in range(1, len(self.columns)):
+            has_words = any(row[column][:1].isalpha() for row in texts)
+            rules.append("---" if has_words else "---:")  # numbers are aligned on the right
+        lines = [_markdown_line(self.columns), f"| {' | '.join(rules)} |"]
+        lines += [_markdown_line(row) for row in texts]
         if self.caption:
             lines += ["", escape_markdown(self.caption)]
         return "\n".join(lines)
