@@ -5,6 +5,7 @@ happened.
 from __future__ import annotations
 
 import io
+import json
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -188,6 +189,33 @@ def test_a_recording_is_written_where_out_says(arm, tmp_path):
     result = gp.run_robot(arm, motion=SWAY, options=options, report=SilentReporter())
     assert result.file == tmp_path / "out" / "sway.parquet"
     assert result.file.is_file()
+
+
+def test_a_run_that_ends_with_an_error_leaves_a_recording_that_says_why(arm, tmp_path):
+    class Broken(SilentReporter):
+        """Fails as soon as the motion has begun."""
+
+        def event(self, event: Event) -> None:
+            if event.phase == "run":
+                raise ValueError("the window is closed")
+
+    options = replace(FAST, out=tmp_path / "out")
+    with pytest.raises(ValueError, match="the window is closed"):
+        gp.run_robot(arm, motion=SWAY, options=options, report=Broken())
+    facts = json.loads((tmp_path / "out" / "sway.json").read_text())
+    assert "the window is closed" in str(facts["events"])
+    assert not list((tmp_path / "out").glob("unfinished*"))
+
+
+def test_a_run_that_is_refused_after_its_plan_leaves_no_recording(arm, tmp_path):
+    class Refusing(SilentReporter):
+        def plan(self, text: PlanText) -> None:
+            raise UsageError("not this plan")
+
+    options = replace(FAST, out=tmp_path / "out")
+    with pytest.raises(UsageError, match="not this plan"):
+        gp.run_robot(arm, motion=SWAY, options=options, report=Refusing())
+    assert not list(tmp_path.glob("out/*"))
 
 
 def test_the_plan_names_the_source_of_the_states_where_the_driver_knows_it(so101):

@@ -7,6 +7,7 @@ the same.
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -178,15 +179,15 @@ def run_robot(
     result = execute(request, report or StderrReporter(), consent)
     if options.out is None:
         return result
-    name = result.motion.name if result.motion else "live"
-    return replace(result, file=result.recording.save(options.out, name))
+    return replace(result, file=result.recording.save(options.out, recording_name(result.plan)))
 
 
 def execute(request: RunRequest, report: RunReporter, consent: Consent | None = None) -> RunResult:
     """Prepare, ask for consent and run.
 
     Everything that can be refused without the robot is refused before the driver connects. The
-    periods are written to options.out as they come, but not saved there.
+    periods are written to options.out as they come. They are saved there only if an error ends the
+    run; otherwise the caller does it.
     """
     options = request.options
     permission = Permission(request.driver, options, consent)
@@ -243,7 +244,11 @@ def execute(request: RunRequest, report: RunReporter, consent: Consent | None = 
         unchecked=options.unchecked,
         metadata=facts,
     )
-    recording = run_controller(controller, live)
+    try:
+        recording = run_controller(controller, live)
+    except BaseException:
+        save_after_error(request, controller)
+        raise
     compensation.note_failures(recording, report)
     return RunResult(
         recording=recording,
@@ -636,6 +641,27 @@ def run_controller(controller: Controller, live: LiveTargets | None) -> Recordin
         if live is not None:
             events = controller.recording.events
             live.close(events[-1].text if events else "nothing was commanded")
+
+
+def recording_name(plan: Plan | None) -> str:
+    """Return the name of a recording: that of the planned motion, or of live targets."""
+    if plan is None or plan.motion is None:
+        return "live"
+    return plan.motion.name
+
+
+def save_after_error(request: RunRequest, controller: Controller) -> None:
+    """Save the recording of a run that an error ended, so that it says why.
+
+    A run that was refused has no events, and nothing to save. If the recording cannot be saved
+    either, the error itself is the more important one: its caller raises it.
+    """
+    folder = request.options.out
+    recording = controller.recording
+    if folder is None or not recording.events:
+        return
+    with suppress(OSError):
+        recording.save(folder, recording_name(controller.plan))
 
 
 def would_send(
