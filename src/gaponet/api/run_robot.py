@@ -660,7 +660,7 @@ def save_after_error(request: RunRequest, controller: Controller) -> None:
     recording = controller.recording
     if folder is None or not recording.events:
         return
-    with suppress(OSError):
+    with suppress(Exception):
         recording.save(folder, recording_name(controller.plan))
 
 

@@ -79,6 +79,26 @@ def test_a_policy_takes_states_sends_targets_and_hears_why_it_is_over(listening)
         assert robot.ended == "damped"
 
 
+def test_a_policy_that_stalled_finds_the_newest_state_and_why_the_run_is_over(listening):
+    from gaponet.hw.targets.client import RemoteRobot
+
+    with RemoteRobot(listening.address, patience=20.0) as robot:
+        (hello,) = received(listening, 1)
+        for k in range(500):
+            listening.publish(hello.sender, STATE | {"time": float(k)})
+            time.sleep(0.001)
+        time.sleep(1.0)
+        states = iter(robot)
+        assert next(states).time == 499.0
+        for _ in range(500):
+            listening.publish(hello.sender, STATE)
+            time.sleep(0.001)
+        listening.close("no target was accepted")
+        time.sleep(1.0)  # the transport is gone before the policy looks again
+        assert list(states) == []
+        assert robot.ended == "no target was accepted"
+
+
 def test_a_policy_that_leaves_ends_the_run_and_one_that_crashes_does_not(listening):
     from gaponet.hw.targets.client import RemoteRobot
 

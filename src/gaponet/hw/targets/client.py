@@ -16,6 +16,11 @@ from gaponet.base.arrays import Array
 from gaponet.hw.control.driver import DriverError, State
 from gaponet.hw.targets.zeromq import ADDRESS
 
+UNREAD_TARGETS = 8  # that wait to be sent; further ones are dropped
+# A policy may stall for long and must then still find the newest state, and why the run is over.
+# ZeroMQ forgets what a full queue has not taken when the other side leaves.
+UNREAD_STATES = 100_000
+
 
 class RemoteRobot:
     """Receives states of a robot that `gaponet run --targets zmq` commands, and sends it targets.
@@ -49,8 +54,9 @@ class RemoteRobot:
         self.nominal_qvel: Array | None = None
         self._context = zmq.Context()
         self._socket = self._context.socket(zmq.DEALER)
-        for option, value in ((zmq.LINGER, 200), (zmq.SNDHWM, 8), (zmq.RCVHWM, 8)):
-            self._socket.setsockopt(option, value)
+        self._socket.setsockopt(zmq.LINGER, 200)
+        self._socket.setsockopt(zmq.SNDHWM, UNREAD_TARGETS)
+        self._socket.setsockopt(zmq.RCVHWM, UNREAD_STATES)
         self._socket.connect(address)
         self._send({})
 
