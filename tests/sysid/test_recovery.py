@@ -61,6 +61,14 @@ def start_of(fit, terms=()):
     return values
 
 
+def test_a_delay_shorter_than_the_time_between_two_rows_is_recovered(tmp_path):
+    robot = write_arm(tmp_path / "arm")
+    acting = robot.with_identified(dict.fromkeys(robot.joint_names, SERVO | {"delay": 0.006}))
+    fit = joint_fit(played(robot, acting, 3, 120), robot)
+    assert fit.rollouts.dt == 0.02
+    np.testing.assert_allclose(fit.search(start_of(fit))["delay"], 0.006, atol=0.002)
+
+
 @pytest.mark.parametrize(
     "law",
     [
