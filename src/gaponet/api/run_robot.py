@@ -639,8 +639,7 @@ def run_controller(controller: Controller, live: LiveTargets | None) -> Recordin
         return controller.run(live, keys=True)
     finally:
         if live is not None:
-            events = controller.recording.events
-            live.close(events[-1].text if events else "nothing was commanded")
+            live.close(controller.recording.ending or "nothing was commanded")
 
 
 def recording_name(plan: Plan | None) -> str:

@@ -227,6 +227,13 @@ def test_a_stop_is_latched(arm):
         controller.run(motion_policy(MOTION, DT))
 
 
+def test_a_driver_with_another_order_of_joints_is_refused_before_it_connects(arm):
+    driver = NotedArm(arm)
+    driver.joint_names = arm.joint_names[::-1]
+    with pytest.raises(UsageError, match="one order"):
+        control(driver)
+
+
 @pytest.mark.parametrize(
     ("field", "value"),
     [

@@ -348,6 +348,7 @@ def test_a_sender_that_dies_while_the_robot_goes_to_its_first_target_ends_in_dam
     recording, *_ = live(arm, lambda t: [good(t)] if t < 0.1 else [], config=LiveConfig(hold=0.1))
     assert phases(recording) == ["idle", "blend_in", "damp", "stopped"]
     assert recording.fault.kind == "silence"
+    assert "no target was accepted" in recording.ending, "not how it was damped afterwards"
     judge(arm, recording)
 
 

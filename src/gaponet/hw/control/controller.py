@@ -148,7 +148,16 @@ class Controller:
             folder: Folder in which the recording is written period by period; default a temporary
                 file.
             metadata: Saved with the recording (unit id, model …).
+
+        Raises:
+            UsageError: The driver has other joints than the robot, or another order of them.
         """
+        if tuple(driver.joint_names) != robot.joint_names:
+            raise UsageError(
+                f"the driver of {driver.address} has the joints {', '.join(driver.joint_names)}, "
+                f"robot '{robot.name}' has {', '.join(robot.joint_names)}; both must name the same "
+                "ones in one order, else commands go to the wrong joints"
+            )
         config = config or ControlConfig()
         safety = safety or SafetyConfig()
         if planner is None and not unchecked and (robot.folder / "collision.toml").is_file():

@@ -83,6 +83,13 @@ class Recording:
         """Return the fault that ended the run, or None."""
         return next((e for e in self.events if e.kind in FAULT_KINDS), None)
 
+    @property
+    def ending(self) -> str:
+        """Return why the run ended: its fault, else its last event. Empty: it did not begin."""
+        if self.fault is not None:
+            return self.fault.text
+        return self.events[-1].text if self.events else ""
+
     def log(self, source: str = "controller") -> Log:
         """Return the periods of the phase `run` as a Log of the commanded joints.
 
@@ -108,8 +115,7 @@ class Recording:
     def _log(self, source: str) -> Log:
         rows = self.run_rows()
         if len(rows) < 2:
-            last = self.events[-1] if self.events else None
-            why = f"; it ended with: {last.text}" if last else ""
+            why = f"; it ended with: {self.ending}" if self.ending else ""
             raise LogError(
                 f"{source}: {len(rows)} periods of phase 'run', nothing to learn from{why}"
             )
