@@ -1,4 +1,4 @@
-"""Fine-tune a policy in the aligned simulator, then test it on an unseen robot, as ASAP does.
+"""Fine-tune a policy in the aligned simulator, then test it on unseen robots, as ASAP does.
 
     pip install "rsl-rl-lib>=5.4.2,<6"
     gaponet demo
@@ -9,12 +9,16 @@ RUN is a run of gaponet train on VIRTUAL H1-2 units 1 to 3; gaponet demo makes o
 
 PPO trains a small network in the nominal simulator to follow arm motions with 0 to 3 kg in each
 hand. Training then continues in the aligned simulator and, for comparison, equally long in the
-nominal one and in that of an identified robot. All policies are tested on VIRTUAL unit 4 with other
-motions. Neither the gap model nor a policy was trained on that unit.
+nominal one and in that of an identified robot. All policies are tested on eight other VIRTUAL units
+with other motions. Neither the gap model nor a policy was trained on these units.
 
 The policy observes the measured state, the reference up to 0.2 s ahead, the payload, its last
 action, and the torque of the reference by nominal inverse dynamics, divided by kp. Its output is
 added to the reference. On the robot, the policy runs without the gap model.
+
+Half of the simulations of training receive each target one control period later. Without this
+(--no-late) a policy learns feedback that is too strong for the delay of a robot, and oscillates
+there.
 """
 
 from __future__ import annotations
@@ -24,7 +28,7 @@ import copy
 import io
 import time
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -41,7 +45,8 @@ from gaponet.nn.artifact import GapModel
 from gaponet.robot.spec import RobotSpec, load_robot
 from gaponet.sim.dynamics import inverse_dynamics
 from gaponet.sim.model import build_model, idle_joints
-from gaponet.virtual.fleet import load_fleet
+from gaponet.virtual.fleet import load_fleet, sample_unit
+from gaponet.virtual.physics import Physics
 from gaponet.virtual.virtual_robot import VirtualRobot
 
 Array = np.ndarray
@@ -62,7 +67,7 @@ VELOCITY_NOISE = 0.02  # rad/s
 EPISODE = 200  # control periods
 WARMTH = 12.0  # K above ambient, of the motors
 NUM_ENVS = 256  # simulations side by side
-UNSEEN_UNIT = "virtual-4"
+UNSEEN_UNITS = range(4, 12)  # numbers of the units of the test
 SKIP = 50  # control periods at the start of a motion without effect on the score
 
 PPO: dict[str, Any] = {
@@ -170,7 +175,10 @@ class Task:
 class TrackingEnv(VecEnv):
     """Environment of rsl_rl: simulations that follow motions from a random row on."""
 
-    def __init__(self, task: Task, sim: AlignedSim, seed: int) -> None:
+    def __init__(self, task: Task, sim: AlignedSim, seed: int, late: Array | None = None) -> None:
+        """late: Simulations that receive each target one control period later, (num_envs,) bool;
+        default none.
+        """
         self.task = task
         self.sim = sim
         self.rng = np.random.default_rng(seed)
@@ -183,6 +191,8 @@ class TrackingEnv(VecEnv):
         self.row = np.zeros(sim.num_envs, int)
         self.last = np.zeros(sim.num_envs, int)
         self.action = np.zeros((sim.num_envs, task.n))
+        self.late = np.zeros(sim.num_envs, bool) if late is None else late
+        self.last_target = np.zeros((sim.num_envs, len(task.joints)))  # rad
         self.error: list[float] = []
         self._begin(np.arange(sim.num_envs))
 
@@ -194,6 +204,7 @@ class TrackingEnv(VecEnv):
         speed = (reference[self.row[ids] + 1] - reference[self.row[ids]]) / self.sim.dt
         self.sim.reset(reference[self.row[ids]], speed, ids=ids)
         self.action[ids] = 0.0
+        self.last_target[ids] = reference[self.row[ids]]
         self.episode_length_buf[torch.from_numpy(ids)] = 0
 
     def get_observations(self) -> TensorDict:
@@ -213,7 +224,9 @@ class TrackingEnv(VecEnv):
         action.
         """
         action = actions.numpy().astype(float)
-        self.sim.step(self.task.target(self.row, self.last, action))
+        target = self.task.target(self.row, self.last, action)
+        self.sim.step(np.where(self.late[:, None], self.last_target, target))
+        self.last_target = target
         self.row += 1
         error = np.abs(self.sim.qpos - self.task.reference[self.row])[:, self.task.op].mean(axis=1)
         rough = np.square(action - self.action).mean(axis=1)
@@ -234,18 +247,7 @@ class Unit:
     Its positions and velocities are sensor readings.
     """
 
-    def __init__(
-        self,
-        robot: RobotSpec,
-        task: Task,
-        name: str,
-        payload_mass: Array,
-        fleet: str,
-        extra_delay: float = 0.0,
-    ) -> None:
-        """extra_delay: s by which commands arrive later than the unit's own do."""
-        physics = load_fleet(fleet, robot).unit(name)
-        physics = replace(physics, delay=physics.delay + extra_delay)
+    def __init__(self, robot: RobotSpec, task: Task, physics: Physics, payload_mass: Array) -> None:
         payloads = [(float(mass), "both") for mass in payload_mass]
         self.robots = VirtualRobot(
             robot, [physics] * len(payloads), payloads, robot.dt, locked=task.locked, nthread=0
@@ -357,106 +359,180 @@ def motions(robot: RobotSpec, heaviest: float, seed: int, names: list[str]) -> l
     return [library.make(name).sample(robot.dt) for name in names]
 
 
-def main(
-    run: tyro.conf.Positional[Path],
-    first: int = 150,
-    more: int = 80,
-    seeds: tuple[int, ...] = (0,),
-    identified: Path | None = None,
-    fleet: str = "firm",
-    quick: bool = False,
-) -> None:
-    """Train, fine-tune and test on the unseen unit; print the mean |error| in mrad.
+@dataclass(frozen=True)
+class Options:
+    """Options of the command line."""
 
-    Args:
-        run: Folder of gaponet train, H1-2.
-        first: PPO updates in the nominal simulator.
-        more: Further updates, in the nominal, the aligned and the identified simulator each.
-        seeds: Seeds of training.
-        identified: Folder of gaponet identify; without it, nothing is trained in its simulator.
-        fleet: VIRTUAL fleet of whose units 1 to 3 RUN was trained.
-        quick: Test run with a few steps.
+    run: tyro.conf.Positional[Path]
+    """Folder of gaponet train, H1-2."""
+    first: int = 150
+    """PPO updates in the nominal simulator."""
+    more: int = 80
+    """Further updates, in the nominal, the aligned and the identified simulator each."""
+    seeds: tuple[int, ...] = (0,)
+    """Seeds of training."""
+    identified: Path | None = None
+    """Folder of gaponet identify; without it, nothing is trained in its simulator."""
+    fleet: str = "firm"
+    """VIRTUAL fleet of whose units 1 to 3 RUN was trained."""
+    late: bool = True
+    """Half of the simulations of training receive each target one control period later."""
+    quick: bool = False
+    """Test run with a few steps."""
+
+    @property
+    def num_envs(self) -> int:
+        return 16 if self.quick else NUM_ENVS
+
+    @property
+    def updates(self) -> tuple[int, int]:
+        """First and further updates."""
+        return (2, 1) if self.quick else (self.first, self.more)
+
+    @property
+    def names(self) -> tuple[list[str], list[str]]:
+        """Motions to learn from and to try."""
+        return (LEARN[:2], TRY[:2]) if self.quick else (LEARN, TRY)
+
+
+class Experiment:
+    """Simulators, motions and unseen units.
+
+    Attributes:
+        simulators: Name → robot, and the model that corrects it.
+        task, unseen: Motions to learn from, and to try.
+        heaviest: Largest payload, kg.
+        plants: What policies are tried on: the simulators and then the units; each plays every
+            motion with an empty hand and with the largest payload.
     """
-    begin = time.perf_counter()
-    torch.set_num_threads(1)  # the simulators take the other cores
-    num_envs = NUM_ENVS
-    names = LEARN
-    if quick:
-        first = 2
-        more = 1
-        num_envs = 16
-        names = LEARN[:2]
-    model = GapModel.load(run, threads=0)
-    # The simulator that the model corrects: nominal, or identified.
-    corrected = load_robot(run / "robot")
-    robot = corrected.nominal or corrected
-    heaviest = float(max(model.card["payload_seen"])) or model.config.payload_max
-    task = Task(robot, motions(robot, heaviest, LEARN_SEED, names), heaviest)
-    unseen = Task(robot, motions(robot, heaviest, TRY_SEED, TRY[: len(names)]), heaviest)
-    mass = np.resize(np.linspace(0, heaviest, 4), num_envs)
-    tried = np.repeat([0.0, heaviest], len(unseen.first))
-    options = AlignedSimOptions(locked=task.locked)
 
-    def simulator(of: str, payload_mass: Array) -> AlignedSim:
+    def __init__(self, options: Options) -> None:
+        model = GapModel.load(options.run, threads=0)
+        # The simulator that the model corrects: nominal, or identified.
+        corrected = load_robot(options.run / "robot")
+        robot = corrected.nominal or corrected
+        self.simulators: dict[str, tuple[RobotSpec, GapModel | None]] = {
+            "nominal": (robot, None),
+            "aligned": (corrected, model),
+        }
+        if options.identified is not None:
+            self.simulators["identified"] = (load_robot(options.identified), None)
+        heaviest = float(max(model.card["payload_seen"])) or model.config.payload_max
+        learn, attempt = options.names
+        self.task = Task(robot, motions(robot, heaviest, LEARN_SEED, learn), heaviest)
+        self.unseen = Task(robot, motions(robot, heaviest, TRY_SEED, attempt), heaviest)
+        self.heaviest = heaviest
+        masses = np.linspace(0, heaviest, 4)
+        self.mass = np.resize(masses, options.num_envs)
+        # Each payload is late in half of its simulations.
+        turn = np.arange(options.num_envs) // len(masses)
+        self.late = (turn % 2 == 1) & options.late
+        tried = np.repeat([0.0, heaviest], len(self.unseen.first))
+        self.plants: list[AlignedSim | Unit] = [self.simulator(of, tried) for of in self.simulators]
+        fleet = load_fleet(options.fleet, robot)
+        for number in UNSEEN_UNITS:
+            physics = sample_unit(robot, fleet.distributions, fleet.seed, number)
+            self.plants.append(Unit(robot, self.unseen, physics, tried))
+
+    def simulator(self, of: str, payload_mass: Array) -> AlignedSim:
         """Return simulations of the nominal robot, the aligned or the identified one."""
-        spec, corrector = simulators[of]
+        spec, corrector = self.simulators[of]
+        options = AlignedSimOptions(locked=self.task.locked)
         count = len(payload_mass)
         return AlignedSim(spec, corrector, payload_mass, num_envs=count, options=options)
 
-    simulators: dict[str, tuple[RobotSpec, GapModel | None]] = {
-        "nominal": (robot, None),
-        "aligned": (corrected, model),
-    }
-    if identified is not None:
-        simulators["identified"] = (load_robot(identified), None)
-    plants: dict[str, AlignedSim | Unit] = {}
-    for of in simulators:
-        plants[f"{of} simulator"] = simulator(of, tried)
-    plants[UNSEEN_UNIT] = Unit(robot, unseen, UNSEEN_UNIT, tried, fleet)
-    results: dict[str, list[Array]] = {}
+    def environment(self, of: str, seed: int) -> TrackingEnv:
+        return TrackingEnv(self.task, self.simulator(of, self.mass), seed, self.late)
 
-    def evaluate(name: str, policy: OnPolicyRunner | None) -> None:
+    def errors(self, policy: OnPolicyRunner | None) -> Array:
+        """Return the errors of a policy on all plants, (plants, 2 payloads) mrad."""
         errors = []
-        for plant in plants.values():
-            of_payloads = follow(unseen, plant, policy).reshape(2, -1)
+        for plant in self.plants:
+            of_payloads = follow(self.unseen, plant, policy).reshape(2, -1)
             errors.append(of_payloads.mean(axis=1))
-        results.setdefault(name, []).append(1e3 * np.array(errors))
+        return 1e3 * np.array(errors)
 
+
+def main(options: Options) -> None:
+    """Train, fine-tune and test on unseen units; print the mean |error| in mrad."""
+    begin = time.perf_counter()
+    torch.set_num_threads(1)  # the simulators take the other cores
+    experiment = Experiment(options)
+    first, more = options.updates
     print(
-        f"{len(task.first)} motions to learn from, {len(unseen.first)} to try; "
-        f"{time.perf_counter() - begin:.0f} s"
+        f"{len(experiment.task.first)} motions to learn from, {len(experiment.unseen.first)} to "
+        f"try on {len(UNSEEN_UNITS)} unseen units; {time.perf_counter() - begin:.0f} s"
     )
-    evaluate("reference as target", None)
-    for seed in seeds:
+    results: dict[str, list[Array]] = {"reference as target": [experiment.errors(None)]}
+    for seed in options.seeds:
         torch.manual_seed(seed)
-        env = TrackingEnv(task, simulator("nominal", mass), seed)
-        policy = train("nominal", make_runner(env), env, first)
-        evaluate("policy, nominal", policy)
-        env.error = []
-        for of in simulators:
-            there = env if of == "nominal" else TrackingEnv(task, simulator(of, mass), seed)
+        nominal = experiment.environment("nominal", seed)
+        policy = train("nominal", make_runner(nominal), nominal, first)
+        results.setdefault("before fine-tuning", []).append(experiment.errors(policy))
+        nominal.error = []
+        for of in experiment.simulators:
+            there = nominal if of == "nominal" else experiment.environment(of, seed)
             tuned = train(f"{of}, fine-tuning", make_runner(there, policy), there, more)
-            evaluate(f"policy, fine-tuned in the {of} simulator", tuned)
-    print(table(results, list(plants), heaviest))
+            results.setdefault(f"fine-tuned in {of}", []).append(experiment.errors(tuned))
+    stacked = {name: np.array(errors) for name, errors in results.items()}
+    print(simulator_table(stacked, list(experiment.simulators), experiment.heaviest))
+    print(unit_table(stacked, len(experiment.simulators), experiment.heaviest))
     print(f"{time.perf_counter() - begin:.0f} s in all")
 
 
-def table(results: dict[str, list[Array]], plants: list[str], heaviest: float) -> str:
-    """Return a Markdown table: mean over seeds (± standard deviation), without and with payload."""
+def simulator_table(results: dict[str, Array], simulators: list[str], heaviest: float) -> str:
+    """Return a Markdown table of the errors in simulators, mrad.
+
+    Args:
+        results: Policy → errors, (seeds, simulators and then units, 2 payloads) mrad.
+    """
     columns = []
-    for plant in plants:
-        columns += [f"{plant}, 0 kg", f"{plant}, {heaviest:g} kg"]
-    lines = [f"| mean abs error, mrad; units are VIRTUAL | {' | '.join(columns)} |"]
+    for of in simulators:
+        columns += [f"{of} simulator, 0 kg", f"{of} simulator, {heaviest:g} kg"]
+    lines = [f"| mean abs error, mrad | {' | '.join(columns)} |"]
     lines.append("| --- |" + " ---: |" * len(columns))
     for name, errors in results.items():
-        mean = np.mean(errors, axis=0).ravel()
-        cells = [f"{value:.1f}" for value in mean]
-        if len(errors) > 1:
-            std = np.std(errors, axis=0).ravel()
-            cells = [f"{m:.1f} ± {s:.1f}" for m, s in zip(mean, std, strict=True)]
+        of_seeds = errors[:, : len(simulators)].reshape(len(errors), -1)
+        cells = [spread(column) for column in of_seeds.T]
         lines.append(f"| {name} | {' | '.join(cells)} |")
     return "\n".join(lines)
 
 
+def unit_table(results: dict[str, Array], first_unit: int, heaviest: float) -> str:
+    """Return a Markdown table of the errors on the unseen units, mrad.
+
+    The differences are to the policy fine-tuned in the nominal simulator, in per cent, paired over
+    units; ± is the standard error over units.
+
+    Args:
+        results: Policy → errors, (seeds, simulators and then units, 2 payloads) mrad.
+        first_unit: Column of the first unit.
+    """
+    loads = ("0 kg", f"{heaviest:g} kg")
+    columns = [f"VIRTUAL units, {load}" for load in loads]
+    columns += [f"worst unit, {load}" for load in loads]
+    columns += [f"to nominal, {load}, %" for load in loads]
+    lines = [f"| mean abs error, mrad | {' | '.join(columns)} |"]
+    lines.append("| --- |" + " ---: |" * len(columns))
+    nominal = results["fine-tuned in nominal"][:, first_unit:].mean(axis=0)  # (units, 2)
+    for name, errors in results.items():
+        of_units = errors[:, first_unit:]
+        cells = [spread(column) for column in of_units.mean(axis=1).T]
+        cells += [spread(column) for column in of_units.max(axis=1).T]
+        change = 100 * (of_units.mean(axis=0) / nominal - 1)
+        error = change.std(axis=0, ddof=1) / np.sqrt(len(change))
+        for mean, standard_error in zip(change.mean(axis=0), error, strict=True):
+            cells.append(f"{mean:+.0f} ± {standard_error:.0f}")
+        lines.append(f"| {name} | {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def spread(values: Array) -> str:
+    """Return the mean over seeds, and ± the standard deviation if there are several; (seeds,)."""
+    if len(values) == 1:
+        return f"{values[0]:.1f}"
+    return f"{values.mean():.1f} ± {values.std():.1f}"
+
+
 if __name__ == "__main__":
-    tyro.cli(main)
+    main(tyro.cli(Options, description=__doc__))

@@ -35,6 +35,7 @@ from gaponet.deploy.aligned_sim import AlignedSim, AlignedSimOptions
 from gaponet.deploy.compensator import Compensator
 from gaponet.export.drawn_robots import robots_of
 from gaponet.robot.spec import RobotSpec, load_robot
+from gaponet.virtual.fleet import load_fleet
 
 Array = np.ndarray
 # Different motions.
@@ -136,7 +137,9 @@ class Followed:
 def make_plant(trial: Trial, spec: RobotSpec, task: Task, fleet: str) -> Unit:
     """Return copies of a trial's unit, one per motion."""
     empty = np.zeros(len(task.first))
-    plant = Unit(spec, task, trial.unit, empty, fleet, trial.extra_delay)
+    physics = load_fleet(fleet, spec).unit(trial.unit)
+    physics = replace(physics, delay=physics.delay + trial.extra_delay)
+    plant = Unit(spec, task, physics, empty)
     if trial.torque is not None:
         limits = np.full(len(spec.joint_names), trial.torque)
         plant.robots.set_gains(spec.servo.kp, spec.servo.kd, limits)

@@ -9,6 +9,7 @@ import torch
 from arm import commands, write_arm
 
 from gaponet.deploy.aligned_sim import AlignedSim, AlignedSimOptions
+from gaponet.virtual.physics import neutral
 
 FILE = Path(__file__).parents[2] / "examples" / "finetune_policy.py"
 SPEC = importlib.util.spec_from_file_location("finetune_policy", FILE)
@@ -44,14 +45,8 @@ def test_the_feed_forward_it_is_told_is_right_for_the_nominal_simulator(robot, t
     assert (fed < 0.35 * alone).all()
 
 
-def test_it_is_as_good_on_a_robot_that_is_like_the_simulator(robot, task, monkeypatch):
-    from gaponet.virtual.fleet import Fleet
-    from gaponet.virtual.physics import neutral
-
-    monkeypatch.setattr(
-        example, "load_fleet", lambda *_: Fleet("none", 0, (), {"unit": neutral(2)})
-    )
-    unit = example.Unit(robot, task, "unit", np.array([0.0, 0.4]), "none")
+def test_it_is_as_good_on_a_robot_that_is_like_the_simulator(robot, task):
+    unit = example.Unit(robot, task, neutral(2), np.array([0.0, 0.4]))
     sim = AlignedSim(robot, None, np.array([0.0, 0.4]), num_envs=2, options=ONE_THREAD)
     on_unit, in_sim = (example.follow(task, plant, Reader(task)) for plant in (unit, sim))
     np.testing.assert_allclose(on_unit, in_sim, atol=2e-3)
@@ -72,3 +67,20 @@ def test_ppo_learns_to_hold_the_arm_up_and_hands_its_policy_on(robot, task):
     )
     on = example.make_runner(example.TrackingEnv(task, weaker, seed=0), policy)
     np.testing.assert_array_equal(example.follow(task, sim, on), learnt)
+
+
+def test_half_of_the_simulations_receive_their_targets_a_control_period_later(robot, task):
+    def environment(late):
+        sim = AlignedSim(robot, None, np.zeros(2), num_envs=2, options=ONE_THREAD)
+        return example.TrackingEnv(task, sim, 0, np.array(late))
+
+    still = torch.zeros(2, task.n)
+    punctual = environment([False, False])
+    mixed = environment([False, True])
+    positions = []
+    for env in (punctual, mixed):
+        for _ in range(10):
+            env.step(still)
+        positions.append(env.sim.qpos)
+    np.testing.assert_array_equal(positions[1][0], positions[0][0])
+    assert np.abs(positions[1][1] - positions[0][1]).max() > 1e-3
