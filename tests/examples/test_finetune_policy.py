@@ -1,6 +1,7 @@
 """The fine-tuning example on a two-joint arm."""
 
 import importlib.util
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ FILE = Path(__file__).parents[2] / "examples" / "finetune_policy.py"
 SPEC = importlib.util.spec_from_file_location("finetune_policy", FILE)
 ONE_THREAD = AlignedSimOptions(nthread=1)
 example = importlib.util.module_from_spec(SPEC)
+sys.modules[SPEC.name] = example  # its dataclass looks itself up there
 SPEC.loader.exec_module(example)
 
 
