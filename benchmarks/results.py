@@ -3,8 +3,8 @@
     python benchmarks/results.py WORK [STEP …]
 
 results.toml lists the steps: commands with their seeds. The output, commit, date and seconds of a
-step go to WORK/answers/STEP.json. A step with an answer is skipped, and an interrupted command
-resumes where it can. Then docs/results/real.md, benchmarks/steps.md, README's table and its picture
+step go to WORK/answers/STEP.json. A step whose command has an answer is skipped, and an interrupted
+command resumes where it can. Then docs/results/real.md, benchmarks/steps.md, README's table and its picture
 are written from the answers, and page_numbers.py puts the numbers into the other pages. What was
 not measured again stays as it was.
 
@@ -53,10 +53,10 @@ STEPS_HEAD = """# Steps of `make results`
 
 Commands of `benchmarks/results.toml`, and when `make results` last ran each. DATA is the folder of
 the public recordings (`GAPONET_DATA`), WORK is `results_work`. `make results STEPS="backlash
-hinge"` runs two steps. A step with an answer in WORK/answers is skipped; delete the answer to
-repeat it. A killed step starts again. Commands that store each robot or set, such as `python
-benchmarks/compare_methods.py`, then continue. `make results STEPS=quick` runs each step in its
-short form and writes no page. Below the table is what steps printed.
+hinge"` runs two steps. A step with an answer in WORK/answers is skipped unless its command has
+changed; delete the answer to repeat it. A killed step starts again. Commands that store each robot
+or set, such as `python benchmarks/compare_methods.py`, then continue. `make results STEPS=quick`
+runs each step in its short form and writes no page. Below the table is what steps printed.
 """
 
 Answer = dict[str, Any]  # commit, date, seconds and output of a step
@@ -99,7 +99,7 @@ def listed_steps() -> list[Step]:
 def run_steps(
     steps: Iterable[Step], work: Path, data: Path, *, quick: bool, dry: bool
 ) -> list[str]:
-    """Run the steps without an answer, and return the names of those that failed.
+    """Run the steps whose commands have no answer, and return the names of those that failed.
 
     Args:
         quick: Run their short forms.
@@ -119,8 +119,11 @@ def run_steps(
 
 
 def _state(step: Step, command: str, answers: Path, dry: bool) -> str:
-    if (answers / f"{step.name}.json").is_file():
-        return "done before"
+    file = answers / f"{step.name}.json"
+    if file.is_file():
+        answer = json.loads(file.read_text(encoding="utf-8"))
+        if answer.get("command") == command:  # a short form is no answer to the whole one
+            return "done before"
     if not command:
         return "left out, it has no short form"
     if dry:
@@ -144,6 +147,7 @@ def _measure(name: str, command: str, answers: Path) -> bool:
     if done.returncode != 0:
         return False
     answer = {
+        "command": command,
         "commit": commit,
         "date": date.today().isoformat(),
         "seconds": round(time.monotonic() - began),
@@ -237,6 +241,7 @@ def _write_steps(steps: list[Step], answers: dict[str, Answer], work: Path) -> N
             text = answer["output"].replace(str(work), "WORK")
             output = re.sub(r"/tmp/\S+", "TEMPORARY", text).splitlines()[-TAIL:]
         stored[name] = answer | {"output": output}
+        stored[name].pop("command", None)  # steps.md has it
     kept = {step.name: stored[step.name] for step in steps if step.name in stored}
     text = json.dumps(kept, indent=1, ensure_ascii=False)
     STEPS_LOG.write_text(text + "\n", encoding="utf-8")

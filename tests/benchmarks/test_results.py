@@ -22,6 +22,13 @@ def test_a_step_with_an_answer_does_not_run_again(tmp_path):
     assert (tmp_path / "runs").read_text() == "x\n"
 
 
+def test_a_step_whose_command_has_changed_runs_again(tmp_path):
+    run(step(f"echo x >> {tmp_path}/runs"), tmp_path)
+    run(step(f"echo y >> {tmp_path}/runs"), tmp_path)
+
+    assert (tmp_path / "runs").read_text() == "x\ny\n"
+
+
 def test_a_step_that_fails_has_no_answer_and_runs_again(tmp_path):
     failing = step("exit 3")
 
