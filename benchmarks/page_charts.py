@@ -106,6 +106,22 @@ CHARTS = (
         ),
     ),
     Chart(
+        "assets/finetuned.svg",
+        "results/policies.md",
+        "Eight VIRTUAL H1-2 with 3 kg: tracking error of the policy, mrad",
+        2,
+        (
+            ("nothing: the reference as it is", "no policy, reference as target", "target"),
+            ("the nominal simulator", "trained further in nominal", "nominal"),
+            ("the identified simulator", "trained further in identified", "identified"),
+            (
+                "**the aligned simulator, with GAPONet**",
+                "trained further in aligned, GAPONet",
+                "gaponet",
+            ),
+        ),
+    ),
+    Chart(
         "assets/simulators.svg",
         "simulators.md",
         "Error in twenty unseen simulators, over that of the uncorrected simulator (1 = no help)",
