@@ -51,6 +51,8 @@ def value(source: str) -> str:
         "paper": _paper,
         "unseen": _unseen,
         "step": _step,
+        "cell": _cell,
+        "less": _less,
         "commit": _commit,
         "seconds": _seconds,
     }
@@ -70,9 +72,8 @@ def _more(question: str, method: str) -> str:
 
 
 def _real_row(question: str, method: str) -> dict[str, Any]:
-    rows: list[dict[str, Any]] = json.loads((RESULTS / "real.json").read_text(encoding="utf-8"))[
-        "rows"
-    ]
+    result: dict[str, Any] = json.loads((RESULTS / "real.json").read_text(encoding="utf-8"))
+    rows: list[dict[str, Any]] = result["rows"]
     for row in rows:
         if f"{row['set']}, {row['question']}" == question and row["method"] == method:
             return row
@@ -120,6 +121,26 @@ def _step(name: str, pattern: str) -> str:
     if found is None:
         raise LookupError(f"steps.json: {name} printed nothing like {pattern}")
     return found[1]
+
+
+def _cell(name: str, row: str, column: str) -> str:
+    """Return a cell of a Markdown table that a step printed."""
+    columns: list[str] = []
+    before: list[str] = []
+    lines: list[str] = _answer(name)["output"]
+    for line in lines:
+        cells = [cell.strip() for cell in line.strip("|").split("|")]
+        if line.startswith("| ---"):
+            columns = before  # the line above is the head of a table
+        elif cells[0] == row and column in columns:
+            return cells[columns.index(column)]
+        before = cells
+    raise LookupError(f"steps.json: {name} printed no row {row} with a column {column}")
+
+
+def _less(name: str, row: str, column: str) -> str:
+    """Return a cell with a negative number for a sentence that says "less"."""
+    return _cell(name, row, column).removeprefix("-")
 
 
 def filled(page: str, sentence: dict[str, Any]) -> str:

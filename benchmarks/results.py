@@ -3,10 +3,10 @@
     python benchmarks/results.py WORK [STEP …]
 
 results.toml lists the steps: commands with their seeds. The output, commit, date and seconds of a
-step go to WORK/answers/STEP.json. A step whose command has an answer is skipped, and an interrupted
-command resumes where it can. Then docs/results/real.md, benchmarks/steps.md, README's table and its picture
-are written from the answers, and page_numbers.py puts the numbers into the other pages. What was
-not measured again stays as it was.
+step go to WORK/answers/STEP.json. A step whose command has an answer is skipped, and an
+interrupted command resumes where it can. Then docs/results/real.md, benchmarks/steps.md, README's
+table and its picture are written from the answers, and page_numbers.py puts the numbers into the
+other pages. What was not measured again stays as it was.
 
     quick     every step in its short form, in WORK/quick; no page changes
     --list    show steps and answers
@@ -59,7 +59,7 @@ or set, such as `python benchmarks/compare_methods.py`, then continue. `make res
 runs each step in its short form and writes no page. Below the table is what steps printed.
 """
 
-Answer = dict[str, Any]  # commit, date, seconds and output of a step
+Answer = dict[str, Any]  # command, commit, date, seconds and output of a step
 
 
 @dataclass(frozen=True)

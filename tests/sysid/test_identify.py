@@ -103,7 +103,7 @@ def test_windows_cover_all_recordings(tmp_path):
 
 
 def test_windows_are_of_all_payloads_and_of_different_motions(tmp_path):
-    """Four payloads of one motion are stored after the other: every fourth window has one payload."""
+    """Four payloads of one motion are stored after the other: every fourth would have one."""
     robot = write_arm(tmp_path)
     sequences = []
     for s in recordings(robot, 10, rows=900):

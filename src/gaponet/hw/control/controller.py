@@ -106,6 +106,16 @@ class Session:
         return pressed
 
 
+def _require_same_joints(driver: Driver, robot: RobotSpec) -> None:
+    """Refuse a driver with other joints, or another order: commands would go to the wrong ones."""
+    if tuple(driver.joint_names) != robot.joint_names:
+        raise UsageError(
+            f"the driver of {driver.address} has the joints {', '.join(driver.joint_names)}, robot "
+            f"'{robot.name}' has {', '.join(robot.joint_names)}; both must name the same ones in "
+            "one order, or commands go to the wrong joints"
+        )
+
+
 class Controller:
     """Plays targets on one robot, once: go to the first target, track, hold or damp at the end."""
 
@@ -152,12 +162,7 @@ class Controller:
         Raises:
             UsageError: The driver has other joints than the robot, or another order of them.
         """
-        if tuple(driver.joint_names) != robot.joint_names:
-            raise UsageError(
-                f"the driver of {driver.address} has the joints {', '.join(driver.joint_names)}, "
-                f"robot '{robot.name}' has {', '.join(robot.joint_names)}; both must name the same "
-                "ones in one order, else commands go to the wrong joints"
-            )
+        _require_same_joints(driver, robot)
         config = config or ControlConfig()
         safety = safety or SafetyConfig()
         if planner is None and not unchecked and (robot.folder / "collision.toml").is_file():
