@@ -26,9 +26,10 @@ from __future__ import annotations
 import contextlib
 import copy
 import io
+import sys
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -68,6 +69,7 @@ EPISODE = 200  # control periods
 WARMTH = 12.0  # K above ambient, of the motors
 NUM_ENVS = 256  # simulations side by side
 UNSEEN_UNITS = range(4, 12)  # numbers of the units of the test
+OSCILLATION_HZ = 3.0  # faster errors count as oscillation
 SKIP = 50  # control periods at the start of a motion without effect on the score
 
 PPO: dict[str, Any] = {
@@ -298,7 +300,7 @@ def train(name: str, runner: OnPolicyRunner, env: TrackingEnv, updates: int) -> 
             env.error = []
             seconds = time.perf_counter() - start
             line = f"{name}: {k} of {updates} updates, {seconds:.0f} s, {error:.1f} mrad"
-            print(line, flush=True)
+            print(line, file=sys.stderr, flush=True)
     return runner
 
 
@@ -316,6 +318,17 @@ def follow(
     """Return the mean |q − reference| of every simulation or unit, (N,) rad.
 
     Each plays one motion to its end.
+    """
+    return mean_size(play(task, plant, policy, observe))
+
+
+def play(
+    task: Task,
+    plant: AlignedSim | Unit,
+    policy: OnPolicyRunner | None,
+    observe: Callable[[Any], tuple[Array, Array]] = measured,
+) -> Array:
+    """Return q − reference of every simulation or unit, (rows, N, n) rad; NaN after its motion.
 
     Args:
         observe: Returns the positions and velocities of `plant` that the policy sees, (N, free) rad
@@ -328,9 +341,8 @@ def follow(
     action = np.zeros((count, task.n))
     plant.reset(task.reference[row])
     actor = None if policy is None else policy.get_inference_policy()
-    total = np.zeros(count)
-    rows = np.zeros(count)
-    for t in range(int((last - row).max())):
+    errors = np.full((int((last - row).max()), count, task.n), np.nan)
+    for t in range(len(errors)):
         if actor is not None:
             q, v = observe(plant)
             seen = task.observe(q[:, task.op], v[:, task.op], row, last, plant.payload_mass, action)
@@ -338,11 +350,29 @@ def follow(
         plant.step(task.target(row, last, action))
         going = row < last
         row = np.minimum(row + 1, last)
-        error = np.abs(plant.qpos - task.reference[row])[:, task.op].mean(axis=1)
-        if t >= SKIP:
-            total += going * error
-            rows += going
-    return total / rows
+        error = (plant.qpos - task.reference[row])[:, task.op]
+        errors[t, going] = error[going]
+    return errors
+
+
+def mean_size(errors: Array) -> Array:
+    """Return the mean |error| of every simulation or unit, (N,) rad; of play()."""
+    size: Array = np.nanmean(np.abs(errors[SKIP:]), axis=(0, 2))
+    return size
+
+
+def oscillating_share(errors: Array, dt: float) -> Array:
+    """Return the share of the squared error that is faster than OSCILLATION_HZ, (N,); of play().
+
+    Motions of arms are slower than that, and so are the errors of a policy that follows them.
+    """
+    shares = []
+    for error in errors[SKIP:].transpose(1, 0, 2):  # (rows, n) of one simulation
+        whole = error[~np.isnan(error[:, 0])]
+        power = np.square(np.abs(np.fft.rfft(whole - whole.mean(axis=0), axis=0))).sum(axis=1)
+        fast = np.fft.rfftfreq(len(whole), dt) > OSCILLATION_HZ
+        shares.append(power[fast].sum() / power.sum())
+    return np.array(shares)
 
 
 def act(actor: Any, seen: Array) -> Array:
@@ -377,6 +407,8 @@ class Options:
     """VIRTUAL fleet of whose units 1 to 3 RUN was trained."""
     late: bool = True
     """Half of the simulations of training receive each target one control period later."""
+    opposite: bool = False
+    """A control: the corrections of the model have the wrong sign."""
     quick: bool = False
     """Test run with a few steps."""
 
@@ -402,12 +434,16 @@ class Experiment:
         simulators: Name → robot, and the model that corrects it.
         task, unseen: Motions to learn from, and to try.
         heaviest: Largest payload, kg.
+        dt: Control period, s.
         plants: What policies are tried on: the simulators and then the units; each plays every
             motion with an empty hand and with the largest payload.
     """
 
     def __init__(self, options: Options) -> None:
         model = GapModel.load(options.run, threads=0)
+        if options.opposite:
+            infer = model.infer
+            model = replace(model, infer=lambda inputs: -np.asarray(infer(inputs)))
         # The simulator that the model corrects: nominal, or identified.
         corrected = load_robot(options.run / "robot")
         robot = corrected.nominal or corrected
@@ -422,6 +458,7 @@ class Experiment:
         self.task = Task(robot, motions(robot, heaviest, LEARN_SEED, learn), heaviest)
         self.unseen = Task(robot, motions(robot, heaviest, TRY_SEED, attempt), heaviest)
         self.heaviest = heaviest
+        self.dt = robot.dt
         masses = np.linspace(0, heaviest, 4)
         self.mass = np.resize(masses, options.num_envs)
         # Each payload is late in half of its simulations.
@@ -444,13 +481,16 @@ class Experiment:
     def environment(self, of: str, seed: int) -> TrackingEnv:
         return TrackingEnv(self.task, self.simulator(of, self.mass), seed, self.late)
 
-    def errors(self, policy: OnPolicyRunner | None) -> Array:
-        """Return the errors of a policy on all plants, (plants, 2 payloads) mrad."""
-        errors = []
+    def measure(self, policy: OnPolicyRunner | None) -> Array:
+        """Return what a policy reaches on all plants, (plants, 2 quantities, 2 payloads): the error
+        in mrad, and the share of its square that is an oscillation, in per cent.
+        """
+        rows = []
         for plant in self.plants:
-            of_payloads = follow(self.unseen, plant, policy).reshape(2, -1)
-            errors.append(of_payloads.mean(axis=1))
-        return 1e3 * np.array(errors)
+            errors = play(self.unseen, plant, policy)
+            quantities = (1e3 * mean_size(errors), 100 * oscillating_share(errors, self.dt))
+            rows.append([of_all.reshape(2, -1).mean(axis=1) for of_all in quantities])
+        return np.array(rows)
 
 
 def main(options: Options) -> None:
@@ -463,17 +503,17 @@ def main(options: Options) -> None:
         f"{len(experiment.task.first)} motions to learn from, {len(experiment.unseen.first)} to "
         f"try on {len(UNSEEN_UNITS)} unseen units; {time.perf_counter() - begin:.0f} s"
     )
-    results: dict[str, list[Array]] = {"reference as target": [experiment.errors(None)]}
+    results: dict[str, list[Array]] = {"reference as target": [experiment.measure(None)]}
     for seed in options.seeds:
         torch.manual_seed(seed)
         nominal = experiment.environment("nominal", seed)
         policy = train("nominal", make_runner(nominal), nominal, first)
-        results.setdefault("before fine-tuning", []).append(experiment.errors(policy))
+        results.setdefault("before fine-tuning", []).append(experiment.measure(policy))
         nominal.error = []
         for of in experiment.simulators:
             there = nominal if of == "nominal" else experiment.environment(of, seed)
             tuned = train(f"{of}, fine-tuning", make_runner(there, policy), there, more)
-            results.setdefault(f"fine-tuned in {of}", []).append(experiment.errors(tuned))
+            results.setdefault(f"fine-tuned in {of}", []).append(experiment.measure(tuned))
     stacked = {name: np.array(errors) for name, errors in results.items()}
     print(simulator_table(stacked, list(experiment.simulators), experiment.heaviest))
     print(unit_table(stacked, len(experiment.simulators), experiment.heaviest))
@@ -484,7 +524,7 @@ def simulator_table(results: dict[str, Array], simulators: list[str], heaviest: 
     """Return a Markdown table of the errors in simulators, mrad.
 
     Args:
-        results: Policy → errors, (seeds, simulators and then units, 2 payloads) mrad.
+        results: Policy → measure() of each seed, simulators first.
     """
     columns = []
     for of in simulators:
@@ -492,7 +532,7 @@ def simulator_table(results: dict[str, Array], simulators: list[str], heaviest: 
     lines = [f"| mean abs error, mrad | {' | '.join(columns)} |"]
     lines.append("| --- |" + " ---: |" * len(columns))
     for name, errors in results.items():
-        of_seeds = errors[:, : len(simulators)].reshape(len(errors), -1)
+        of_seeds = errors[:, : len(simulators), 0].reshape(len(errors), -1)
         cells = [spread(column) for column in of_seeds.T]
         lines.append(f"| {name} | {' | '.join(cells)} |")
     return "\n".join(lines)
@@ -502,27 +542,30 @@ def unit_table(results: dict[str, Array], first_unit: int, heaviest: float) -> s
     """Return a Markdown table of the errors on the unseen units, mrad.
 
     The differences are to the policy fine-tuned in the nominal simulator, in per cent, paired over
-    units; ± is the standard error over units.
+    units; ± is the standard error over units. The last columns have the share of the squared error
+    that is an oscillation.
 
     Args:
-        results: Policy → errors, (seeds, simulators and then units, 2 payloads) mrad.
-        first_unit: Column of the first unit.
+        results: Policy → measure() of each seed; the units begin with plant `first_unit`.
     """
     loads = ("0 kg", f"{heaviest:g} kg")
     columns = [f"VIRTUAL units, {load}" for load in loads]
     columns += [f"worst unit, {load}" for load in loads]
     columns += [f"to nominal, {load}, %" for load in loads]
+    columns += [f"above {OSCILLATION_HZ:g} Hz, {load}, %" for load in loads]
     lines = [f"| mean abs error, mrad | {' | '.join(columns)} |"]
     lines.append("| --- |" + " ---: |" * len(columns))
-    nominal = results["fine-tuned in nominal"][:, first_unit:].mean(axis=0)  # (units, 2)
-    for name, errors in results.items():
-        of_units = errors[:, first_unit:]
+    nominal = results["fine-tuned in nominal"][:, first_unit:, 0].mean(axis=0)  # (units, 2)
+    for name, measured_values in results.items():
+        of_units = measured_values[:, first_unit:, 0]  # (seeds, units, 2)
+        shares = measured_values[:, first_unit:, 1].mean(axis=1)  # (seeds, 2)
         cells = [spread(column) for column in of_units.mean(axis=1).T]
         cells += [spread(column) for column in of_units.max(axis=1).T]
         change = 100 * (of_units.mean(axis=0) / nominal - 1)
         error = change.std(axis=0, ddof=1) / np.sqrt(len(change))
         for mean, standard_error in zip(change.mean(axis=0), error, strict=True):
             cells.append(f"{mean:+.0f} ± {standard_error:.0f}")
+        cells += [f"{share:.0f}" for share in shares.mean(axis=0)]
         lines.append(f"| {name} | {' | '.join(cells)} |")
     return "\n".join(lines)
 

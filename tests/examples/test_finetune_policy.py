@@ -86,3 +86,13 @@ def test_half_of_the_simulations_receive_their_targets_a_control_period_later(ro
         positions.append(env.sim.qpos)
     np.testing.assert_array_equal(positions[1][0], positions[0][0])
     assert np.abs(positions[1][1] - positions[0][1]).max() > 1e-3
+
+
+def test_a_fast_swing_is_an_oscillation_and_a_slow_error_is_none():
+    time = 0.02 * np.arange(300)
+    slow = np.sin(2 * np.pi * 0.4 * time)
+    fast = np.sin(2 * np.pi * 7.0 * time)
+    errors = np.stack([slow, fast, slow + fast], axis=1)[:, :, None]
+    errors[250:, 0] = np.nan  # a motion that has ended
+    shares = example.oscillating_share(errors, 0.02)
+    np.testing.assert_allclose(shares, [0.0, 1.0, 0.5], atol=0.03)
