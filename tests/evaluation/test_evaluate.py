@@ -194,3 +194,18 @@ def test_a_split_by_unit_tests_motions_that_were_trained_on_with_other_units(arm
 def test_an_untrained_model_leaves_the_nominal_simulator_as_it_is(arm, data, run):
     methods = evaluate([run], data, arm).result["methods"]
     assert methods["gaponet"]["mpjae"] == pytest.approx(methods["nominal"]["mpjae"], rel=1e-3)
+
+
+def test_a_simulator_that_transfer_was_not_measured_in_is_refused_before_anything_is_simulated(
+    arm, data, run
+):
+    simulated = []
+    with pytest.raises(ModelError, match="joint 'shoulder': kp, as a ratio"):
+        evaluate(
+            [run],
+            data,
+            arm,
+            target=arm.with_servo(kp=100 * arm.servo.kp),
+            progress=lambda done, total, note="": simulated.append(done),
+        )
+    assert not simulated

@@ -130,7 +130,8 @@ def evaluate(
 
     Raises:
         UsageError: Two runs of one method, or several identified simulators.
-        ModelError, RobotError: A folder does not fit the robot.
+        ModelError, RobotError: A folder does not fit the robot, or the target is outside the range
+            in which transfer was measured.
     """
     dataset.require_robot(robot)
     candidates = _load_candidates(folders, robot)
@@ -139,7 +140,11 @@ def evaluate(
     for candidate in candidates.values():
         _require_control_periods(candidate, rollouts.sequences)
     nominal = rollouts.first.robot.before_identification
-    for name, simulator, corrector in _methods(candidates, nominal, target):
+    methods = list(_methods(candidates, nominal, target))
+    for _, _, corrector in methods:
+        if corrector is not None:  # one that cannot run refuses now, and not after hours of others
+            corrector.reset(rollouts.sequences[:1])
+    for name, simulator, corrector in methods:
         rollouts.add_method(name, simulator, corrector, with_note(progress, name))
     rollouts.add_adapted(with_note(progress, "adapted"))
     command = _command(folders, os.path.normpath(dataset.path), motions)
