@@ -25,7 +25,9 @@ DRIFT_RAD_S = 0.2  # of an encoder
 
 
 class Loopback:
-    """Stands in for drivers.dds: a message that is sent arrives at once."""
+    """Stands in for drivers.dds: a message that is sent arrives at once, at all readers of its
+    topic.
+    """
 
     LowState = "LowState"
     LowCmd = "LowCmd"
@@ -34,27 +36,40 @@ class Loopback:
         self.queues: dict[str, list[deque]] = defaultdict(list)
         self.writers: dict[str, list[int]] = defaultdict(list)  # by topic, their handles
 
-    def Bus(self, domain: int, interface: str) -> Loopback:  # noqa: N802
-        return self
-
-    def reader(self, topic: str, kind: str) -> LoopbackReader:
-        queue: deque = deque(maxlen=64)
-        self.queues[topic].append(queue)
-        return LoopbackReader(queue, self.writers[topic])
-
-    def writer(self, topic: str, kind: str) -> SimpleNamespace:
-        handle = sum(map(len, self.writers.values())) + 1
-        self.writers[topic].append(handle)
-
-        def send(data: np.ndarray) -> None:
-            for queue in self.queues[topic]:
-                queue.append((handle, np.array(data)))
-
-        return SimpleNamespace(send=send)
+    def Bus(self, domain: int, interface: str) -> LoopbackBus:  # noqa: N802
+        return LoopbackBus(self)
 
     def publishers(self) -> dict[str, list[str]]:
         robots = [f"robot {handle}" for handle in self.writers["rt/lowstate"]]
         return defaultdict(list, {"rt/lowstate": robots})
+
+
+class LoopbackBus:
+    """One participant, as drivers.dds.Bus."""
+
+    def __init__(self, loopback: Loopback) -> None:
+        self.publishers = loopback.publishers
+        self._loopback = loopback
+        self._ignoring: list[deque] = []  # queues for which its own messages are not meant
+
+    def reader(self, topic: str, kind: str, of_others: bool = False) -> LoopbackReader:
+        queue: deque = deque(maxlen=64)
+        self._loopback.queues[topic].append(queue)
+        if of_others:
+            self._ignoring.append(queue)
+        return LoopbackReader(queue, self._loopback.writers[topic])
+
+    def writer(self, topic: str, kind: str) -> SimpleNamespace:
+        writers = self._loopback.writers
+        handle = sum(map(len, writers.values())) + 1
+        writers[topic].append(handle)
+
+        def send(data: np.ndarray) -> None:
+            for queue in self._loopback.queues[topic]:
+                if not any(queue is ignoring for ignoring in self._ignoring):
+                    queue.append((handle, np.array(data)))
+
+        return SimpleNamespace(send=send)
 
 
 class LoopbackReader:

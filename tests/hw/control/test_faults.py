@@ -242,6 +242,28 @@ def test_two_publishers_on_the_bus_are_refused(served):
         robot.kill()
 
 
+def test_a_program_that_sends_commands_later_is_reported_and_one_that_only_connects_is_not(served):
+    robot = RobotProcess(DOMAIN + 3)
+    driver = UnitreeDriver(ROBOT, domain=DOMAIN + 3)
+    other = UnitreeDriver(ROBOT, domain=DOMAIN + 3, sole=False)
+    try:
+        driver.connect()
+        other.connect()
+        for _ in range(20):
+            driver.damp()
+            assert driver.read().fault is None
+            time.sleep(0.02)
+        other.damp()
+        wait(lambda: driver.read().fault is not None, 5.0)
+        fault = driver.read().fault
+        assert fault.kind == "source"
+        assert f"process {os.getpid()}" in fault.text
+    finally:
+        driver.close()
+        other.close()
+        robot.kill()
+
+
 def test_without_a_robot_it_says_where_it_looked(served):
     with pytest.raises(DriverError, match="nobody"):
         UnitreeDriver(ROBOT, domain=231).connect()

@@ -1,4 +1,5 @@
-"""Two H1-2 on one bus: refused before the start, damped during a run.
+"""Two H1-2, or two programs that command one, on one bus: refused before the start, damped during
+a run.
 
 In simulated time, and on a real DDS bus.
 """
@@ -17,7 +18,9 @@ from gaponet.hw.control.controller import Controller
 from gaponet.hw.control.driver import DriverError
 from gaponet.hw.control.phases import ControlConfig
 from gaponet.hw.control.recording import Recording
+from gaponet.hw.drivers import hg
 from gaponet.hw.drivers.unitree import MOTOR_NAMES, UnitreeDriver
+from gaponet.hw.drivers.unitree_link import UnitreeLink
 from gaponet.robot.spec import RobotSpec, load_robot
 from gaponet.virtual.unitree_virtual import VirtualH12
 
@@ -135,3 +138,42 @@ def test_a_watchdog_also_damps_when_there_are_two_robots(robot, clock):
 
     for each in (clock.robot, *clock.seconds):
         assert each.heard[-1]["kp"][ELBOW] == 0
+
+
+def other_program() -> UnitreeLink:
+    """Another program that commands the robot on our topic, once it is open."""
+    return UnitreeLink("arm_sdk", DOMAIN, "lo", sole=False, silent=False)
+
+
+@pytest.fixture
+def commanded_twice(robot: RobotSpec, clock: RobotClock) -> Recording:
+    """A run during which another program connects, and later sends commands."""
+    other = other_program()
+
+    def during(k: int) -> None:
+        if k == 20:
+            other.open()
+        if k >= 40:
+            other.send(np.zeros(hg.LowCmd.wire_size, np.uint8))
+
+    return sway(robot, clock, during)
+
+
+def test_a_program_that_begins_to_command_the_robot_during_a_run_is_the_fault_source(
+    commanded_twice,
+):
+    assert commanded_twice.fault.kind == "source"
+    assert "another program commands the robot on rt/arm_sdk" in commanded_twice.fault.text
+    assert phases(commanded_twice)[-2:] == ["damp", "stopped"]
+
+
+def test_a_run_in_which_another_program_commanded_the_robot_is_no_data(commanded_twice):
+    assert "another program" in commanded_twice.disobedience
+
+
+def test_a_program_that_connects_and_sends_nothing_ends_no_run(robot, clock):
+    other = other_program()
+
+    recording = sway(robot, clock, during=lambda k: other.open() if k == 20 else None)
+
+    assert recording.fault is None

@@ -212,9 +212,22 @@ class Bus:
         """Return a writer as Unitree's SDK makes it: reliable, the newest sample only."""
         return Writer(DataWriter(self._participant, self._topic(topic, kind)), kind)
 
-    def reader(self, topic: str, kind: type[IdlStruct], queue_length: int = QUEUE_LENGTH) -> Reader:
-        """Return a reader that buffers the newest messages since the last call."""
-        qos = Qos(Policy.Reliability.BestEffort, Policy.History.KeepLast(queue_length))
+    def reader(
+        self,
+        topic: str,
+        kind: type[IdlStruct],
+        queue_length: int = QUEUE_LENGTH,
+        of_others: bool = False,
+    ) -> Reader:
+        """Return a reader that buffers the newest messages since the last call.
+
+        Args:
+            of_others: Leave out what this participant itself publishes.
+        """
+        policies = [Policy.Reliability.BestEffort, Policy.History.KeepLast(queue_length)]
+        if of_others:
+            policies.append(Policy.IgnoreLocal.Participant)
+        qos = Qos(*policies)
         return Reader(DataReader(self._participant, self._topic(topic, kind), qos), queue_length)
 
     def _topic(self, name: str, kind: type[IdlStruct]) -> Topic:

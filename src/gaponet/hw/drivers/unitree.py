@@ -24,7 +24,7 @@ from typing import Any, Literal
 
 from gaponet.base.arrays import Array
 from gaponet.base.errors import UsageError
-from gaponet.hw.control.driver import DriverError, EndAction, State
+from gaponet.hw.control.driver import DriverError, EndAction, Fault, State
 from gaponet.hw.control.hardware import accepted_folder, range_violation, require_known_limits
 from gaponet.hw.drivers.unitree_commands import CommandMessages
 from gaponet.hw.drivers.unitree_link import STATES_TOPIC, UnitreeLink
@@ -74,7 +74,7 @@ class UnitreeDriver:
             domain: DDS domain; 0 on a robot.
             interface: Network interface to the robot; lo for a virtual one on this machine.
             sole: Refuse to connect if another participant publishes the topic, or if two robots
-                publish their states.
+                publish their states; report a participant that sends commands later.
             silent: Only listen: publish nothing, and accept other publishers of the topic.
 
         Raises:
@@ -145,8 +145,13 @@ class UnitreeDriver:
     def read(self) -> State:
         """Return the newest state with a right checksum.
 
-        Its time is the robot's, mapped to ours.
+        Its time is the robot's, mapped to ours. From the moment at which another program commands
+        the robot on our topic, each state has the fault `source`.
         """
+        if commander := self._link.other_commander():
+            topic = self._link.topic
+            text = f"another program commands the robot on rt/{topic}: {commander}"
+            self._states.report(Fault("source", text))
         return self._states.read()
 
     def write(self, ctrl: Array, weight: float = 1.0) -> None:

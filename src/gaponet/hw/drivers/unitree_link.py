@@ -74,6 +74,7 @@ class UnitreeLink:
         self._silent = silent
         self._bus: Bus | None = None
         self._writer: Writer | None = None
+        self._of_others: Reader | None = None  # their commands
 
     @property
     def is_open(self) -> bool:
@@ -98,6 +99,8 @@ class UnitreeLink:
         states = SoleSource(self._bus.reader(STATES_TOPIC, dds.LowState), STATES_TOPIC)
         if not self._silent:
             self._writer = self._bus.writer(topic, dds.LowCmd)
+            if self._sole:
+                self._of_others = self._bus.reader(topic, dds.LowCmd, of_others=True)
         publishers = self._bus.publishers() if self._sole else {}
         others = [] if self._silent else publishers.get(topic, [])
         if others:
@@ -134,6 +137,24 @@ class UnitreeLink:
         assert self._writer is not None
         self._writer.send(message)
 
+    def other_commander(self) -> str:
+        """Return a program that has sent the robot a command since the last call, in words; empty
+        if this one alone commands.
+
+        A program that is only connected does not count: a second gaponet connects, sees this one
+        and leaves again.
+
+        Raises:
+            DriverError: DDS fails.
+        """
+        if self._of_others is None:
+            return ""
+        messages = self._of_others.receive_with_publisher()
+        if not messages:
+            return ""
+        publisher, _ = messages[0]
+        return self._of_others.describe(publisher)
+
     def publishers(self) -> dict[str, list[str]]:
         """Return the other publishers on the bus: topic → programs.
 
@@ -148,3 +169,4 @@ class UnitreeLink:
         """Leave the bus."""
         self._bus = None
         self._writer = None
+        self._of_others = None

@@ -182,14 +182,14 @@ class StateReceiver:
         assert self.newest is not None
         now = time.monotonic()
         messages = self._source.receive()
-        if self._source.second and self._fault is None:
-            self._fault = Fault(
-                "source",
-                f"a second robot publishes {STATES_TOPIC} and takes the same commands: "
-                f"{self._source.second}",
+        if self._source.second:
+            self.report(
+                Fault(
+                    "source",
+                    f"a second robot publishes {STATES_TOPIC} and takes the same commands: "
+                    f"{self._source.second}",
+                )
             )
-            # It counts also if no intact message has come.
-            self.newest = replace(self.newest, fault=self._fault)
         last_intact = None
         for data in messages:
             if is_intact(data):
@@ -203,6 +203,16 @@ class StateReceiver:
         elif self._refused != self.newest.refused:
             self.newest = replace(self.newest, refused=self._refused)
         return self.newest
+
+    def report(self, fault: Fault) -> None:
+        """Add a fault to all states from now on, unless they have one.
+
+        It is in the newest state too, so that it counts also if no intact message comes.
+        """
+        if self._fault is None:
+            assert self.newest is not None
+            self._fault = fault
+            self.newest = replace(self.newest, fault=fault)
 
     def reported_fault(self, data: Array) -> Fault | None:
         """Return what the robot itself reports in a message: its operator's stop keys, motor
