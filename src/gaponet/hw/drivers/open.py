@@ -58,12 +58,16 @@ def open_driver(
     if limits_from is not None:
         spec = hardware_robot(spec, reference_robot(kind, limits_from))
     driver: Driver = plugins.require(plugins.DRIVERS, kind, DRIVERS, "driver")(spec, **options)
-    members = list(Driver.__annotations__)
-    members += [name for name in vars(Driver) if not name.startswith("_")]
-    missing = [name for name in members if not hasattr(driver, name)]
-    if missing:
+    if missing := missing_members(driver):
         raise UsageError(
             f"driver '{kind}' lacks {', '.join(missing)} (gaponet.hw.control.driver.Driver says "
             "what they do)"
         )
     return driver
+
+
+def missing_members(driver: object) -> list[str]:
+    """Return the members of `Driver` that an object does not have."""
+    members = list(Driver.__annotations__)
+    members += [name for name in vars(Driver) if not name.startswith("_")]
+    return [name for name in members if not hasattr(driver, name)]
