@@ -21,6 +21,7 @@ PERIOD_S = 0.02  # of control
 PERIODS = 10  # of holding, and of damping
 MAX_READ_S = 0.5 * PERIOD_S  # median
 MAX_AGE_S = 0.5  # of a state
+ROUNDING_S = 1e-3  # of the time of a state
 MAX_MOTION_RAD = 0.1  # of a joint that is held where it is
 STATE_ARRAYS = ("qpos", "qvel", "tau", "temperature")
 
@@ -243,7 +244,7 @@ class _Trial:
             elif name in ("qpos", "qvel") and not np.isfinite(values).all():
                 yield f"{name} of a state is not finite"
         age = self._clock.now() - state.time
-        if age < 0:
+        if age < -ROUNDING_S:
             yield "a state is from the future: its time is not that of the clock"
         elif age > MAX_AGE_S:
             yield f"a state is {age:.1f} s old"
