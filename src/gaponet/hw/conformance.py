@@ -13,17 +13,23 @@ import numpy as np
 from gaponet.base.arrays import Array
 from gaponet.base.errors import GAPONetError
 from gaponet.hw.control.clock import Clock, MonotonicClock
-from gaponet.hw.control.driver import Driver, EndAction, State
+from gaponet.hw.control.driver import Driver, EndAction, Fault, State
 from gaponet.hw.drivers.open import missing_members, open_driver
 from gaponet.robot.spec import RobotSpec
 
 PERIOD_S = 0.02  # of control
-PERIODS = 10  # of holding, and of damping
-MAX_READ_S = 0.5 * PERIOD_S  # median
+PERIODS = 10  # of reading, of holding, of each move, and of damping
+MAX_CALL_S = 0.25 * PERIOD_S  # median duration of `read` and `write`
 MAX_AGE_S = 0.5  # of a state
 ROUNDING_S = 1e-3  # of the time of a state
 MAX_MOTION_RAD = 0.1  # of a joint that is held where it is
+MOVE_RAD = 0.1  # to which each joint is told to move
+MIN_MOVE_RAD = 0.03  # by which it then moves at least
+MAX_OTHER_MOVE_RAD = 0.05  # by which the other joints then move at most
+MAX_READING_ERROR_RAD = 0.05
+MAX_GAIN_RATIO = 10.0  # of kp to that of the robot folder, or the inverse
 STATE_ARRAYS = ("qpos", "qvel", "tau", "temperature")
+HINT = "is the order of the joints, a sign or a unit wrong?"
 
 
 def broken_promises(
@@ -31,37 +37,44 @@ def broken_promises(
     robot: RobotSpec,
     *,
     commands: Callable[[], int] | None = None,
+    positions: Callable[[], Array] | None = None,
     clock: Clock | None = None,
 ) -> list[str]:
-    """Use a driver as a run does: connect, read, hold, damp, leave.
+    """Use a driver as a run does: connect, read, hold, move, damp, leave.
 
-    The joints are held where they are for 0.2 s and then damped. Let a simulated robot be at the
-    other end of the bus.
+    The joints are held where they are for 0.2 s. Then each commanded joint is moved by 0.1 rad
+    towards the middle of its range, and all are damped. Let a simulated robot be at the other end
+    of the bus.
 
     Args:
         driver: Not yet connected.
         robot: The robot that it was made for.
-        commands: Number of commands that the simulated robot has received so far. With it the
+        commands: Number of commands that have arrived at the simulated robot so far. With it the
             promises to send nothing are tested too.
+        positions: Joint positions of the simulated robot, (n) rad, in the order of
+            robot.joint_names. With it the readings are compared. Without it a mistake that `read`
+            and `write` have in common is not seen.
         clock: That of the states; default: the machine's.
 
     Returns:
         What the driver does not keep, a sentence each; empty if it keeps all. What comes after an
         exception is not tested.
     """
-    trial = _Trial(driver, robot, commands, clock or MonotonicClock())
+    trial = _Trial(driver, robot, commands, positions, clock or MonotonicClock())
     broken: list[str] = []
     for stage in (
         trial.before_connecting,
         trial.connecting,
         trial.reading,
         trial.holding,
+        trial.moving,
         trial.damping,
         trial.watchdog,
         trial.leaving,
     ):
         try:
-            broken += stage()
+            for problem in stage():  # those before an exception count too
+                broken.append(problem)
         except Exception as error:
             broken.append(f"{stage.__name__}: {trial.doing} raised {error!r}")
             break
@@ -84,6 +97,7 @@ class _Trial:
         driver: Driver,
         robot: RobotSpec,
         commands: Callable[[], int] | None,
+        positions: Callable[[], Array] | None,
         clock: Clock,
     ) -> None:
         """Arguments as of broken_promises."""
@@ -91,7 +105,9 @@ class _Trial:
         self._driver = driver
         self._robot = robot
         self._commands = commands
+        self._positions = positions
         self._clock = clock
+        self._write_s: list[float] = []  # durations of `write`
 
     def before_connecting(self) -> Iterator[str]:
         """Members, joints, and leaving without having been there."""
@@ -104,9 +120,9 @@ class _Trial:
         if driver.joint_names != self._robot.joint_names:
             yield "joint_names are not robot.joint_names, in the same order"
         if not driver.commanded:
-            yield "commanded is empty"
-        if unknown := set(driver.commanded) - set(driver.joint_names):
-            yield f"commanded has {', '.join(sorted(unknown))}, not in joint_names"
+            raise ValueError("commanded is empty")
+        if unknown := set(driver.commanded) - set(self._robot.joint_names):
+            raise ValueError(f"commanded has {', '.join(sorted(unknown))}, no joint of the robot")
         if driver.at_end not in get_args(EndAction):
             yield f"at_end is {driver.at_end!r}, none of {', '.join(get_args(EndAction))}"
         if driver.at_stop not in ("damps", "lowers"):
@@ -117,34 +133,67 @@ class _Trial:
     def connecting(self) -> Iterator[str]:
         """What a connected driver says of its robot."""
         driver = self._driver
-        n = len(self._robot.joint_names)
         yield from self._silent("connect", driver.connect)
         self.doing = "an attribute after connect"
-        for name in ("kp", "kd"):
-            gains = np.asarray(getattr(driver, name), float)
-            if gains.shape != (n,) or not np.isfinite(gains).all() or (gains < 0).any():
-                yield f"{name} is not {n} finite numbers that are 0 or more"
-        if driver.qpos_range is not None and np.shape(driver.qpos_range) != (n, 2):
-            yield f"qpos_range has shape {np.shape(driver.qpos_range)} instead of ({n}, 2)"
+        yield from self._problems_of_gains()
+        n = len(self._robot.joint_names)
+        if driver.qpos_range is not None:
+            limits = np.asarray(driver.qpos_range, float)
+            if limits.shape != (n, 2):
+                yield f"qpos_range has shape {limits.shape} instead of ({n}, 2)"
+            elif not (limits[:, 0] < limits[:, 1]).all():
+                yield "qpos_range has a lower limit that is not below the upper one"
         try:
             json.dumps(driver.facts)
         except TypeError as error:
             yield f"facts cannot be stored as JSON: {error}"
 
+    def _problems_of_gains(self) -> Iterator[str]:
+        n = len(self._robot.joint_names)
+        for name in ("kp", "kd"):
+            gains = np.asarray(getattr(self._driver, name), float)
+            if gains.shape != (n,) or not np.isfinite(gains).all() or (gains < 0).any():
+                yield f"{name} is not {n} finite numbers that are 0 or more"
+            elif name == "kp":
+                own = self._robot.before_identification.servo.kp
+                for joint, here, there in zip(self._robot.joint_names, gains, own, strict=True):
+                    if not there / MAX_GAIN_RATIO <= here <= there * MAX_GAIN_RATIO:
+                        yield (
+                            f"kp of {joint} is {here:.3g} N·m/rad, and that of the robot folder "
+                            f"is {there:.3g}"
+                        )
+
     def reading(self) -> Iterator[str]:
         """States: shapes, units as far as they can be told, and times."""
         durations = []
         states: list[State] = []
+        copies: list[Array] = []  # of qpos
         for _ in range(PERIODS):
-            began = time.monotonic()
             yield from self._silent("read", lambda: states.append(self._driver.read()))
-            durations.append(time.monotonic() - began)
             yield from self._problems_of(states[-1])
+            copies.append(np.array(states[-1].qpos, float))
+            began = time.monotonic()
+            self._driver.read()  # nothing new has come since
+            durations.append(time.monotonic() - began)
             self._wait()
-        if np.median(durations) > MAX_READ_S:
+        if np.median(durations) > MAX_CALL_S:
             yield (
-                f"read takes {1e3 * np.median(durations):.0f} ms; it must not wait for the robot"
+                f"read takes {1e3 * np.median(durations):.1f} ms; it must not wait for the robot"
             )
+        pairs = zip(states, copies, strict=True)
+        if any(not np.array_equal(state.qpos, copy) for state, copy in pairs):
+            yield "a later read changes the arrays of an earlier state"
+        yield from self._problems_of_times(states)
+        if self._positions is not None:
+            difference = np.abs(states[-1].qpos - self._positions())
+            if not difference.max() <= MAX_READING_ERROR_RAD:
+                joint = self._robot.joint_names[int(np.argmax(difference))]
+                yield (
+                    f"{joint} is read {difference.max():.2f} rad away from where the simulated "
+                    f"robot has it; {HINT}"
+                )
+
+    def _problems_of_times(self, states: list[State]) -> Iterator[str]:
         times = [state.time for state in states]
         if (np.diff(times) < 0).any():
             yield "the time of a state is before that of an earlier state"
@@ -166,28 +215,53 @@ class _Trial:
         driver = self._driver
         self.doing = "read"
         found = np.array(driver.read().qpos, float)
-        ctrl = found.copy()
-        commanded = self._robot.index(driver.commanded)
-        others = np.setdiff1d(np.arange(len(ctrl)), commanded)
-        ctrl[others] = np.nan  # these entries are ignored
+        ctrl = self._command(found)
         sent = ctrl.copy()
         for _ in range(PERIODS):
-            self.doing = "write"
-            driver.write(ctrl)
-            self._wait()
-            self.doing = "read"
-            state = driver.read()
+            state = self._write_and_read(ctrl)
         if not np.array_equal(ctrl, sent, equal_nan=True):
             yield "write changes the array that it is given"
         if state.fault is not None:
             yield f"a robot that is held has the fault {state.fault.kind}: {state.fault.text}"
-        moved = np.abs(state.qpos - found)[commanded]
+        moved = np.abs(state.qpos - found)
         if not moved.max() <= MAX_MOTION_RAD:
-            joint = driver.commanded[int(np.argmax(moved))]
-            yield f"{joint} moved by {moved.max():.2f} rad while it was told to stay"
-        self.doing = "verify"
-        if fault := driver.verify():
+            joint = self._robot.joint_names[int(np.argmax(moved))]
+            yield (
+                f"{joint} moved by {moved.max():.2f} rad while all were told to stay; {HINT} "
+                "write ignores the entries of joints that are not commanded"
+            )
+        if np.median(self._write_s) > MAX_CALL_S:
+            yield f"write takes {1e3 * np.median(self._write_s):.1f} ms; it must not wait"
+        answers: list[Fault | None] = []
+        yield from self._silent("verify", lambda: answers.append(driver.verify()), wait_first=True)
+        (fault,) = answers
+        if fault is not None and not isinstance(fault, Fault):
+            yield f"verify returns {fault!r}, neither a Fault nor None"
+        elif fault is not None:
             yield f"verify reports {fault.text}"
+
+    def moving(self) -> Iterator[str]:
+        """Each commanded joint moves where it is told to, and no other joint moves."""
+        driver = self._driver
+        self.doing = "read"
+        ctrl = np.array(driver.read().qpos, float)
+        low, high = self._robot.qpos_range.T
+        for joint in driver.commanded:
+            i = self._robot.joint_names.index(joint)
+            before = np.array(driver.read().qpos, float)
+            begin = ctrl[i]
+            move = -MOVE_RAD if begin - low[i] > high[i] - begin else MOVE_RAD
+            for share in np.minimum(np.arange(1, 2 * PERIODS + 1) / PERIODS, 1.0):
+                ctrl[i] = begin + share * move
+                state = self._write_and_read(self._command(ctrl))
+            moved = state.qpos - before
+            if not moved[i] * np.sign(move) >= MIN_MOVE_RAD:
+                yield f"{joint} was told to move by {move:+.2f} rad and moved by {moved[i]:+.2f}"
+            others = np.abs(moved)
+            others[i] = 0.0
+            if not others.max() <= MAX_OTHER_MOVE_RAD:
+                other = self._robot.joint_names[int(np.argmax(others))]
+                yield f"{other} moved by {others.max():.2f} rad when {joint} was told to; {HINT}"
 
     def damping(self) -> Iterator[str]:
         """Damping down to weight 0, and what the robot says of it."""
@@ -224,12 +298,41 @@ class _Trial:
         self.doing = "a second close"
         self._driver.close(hold=True)
 
-    def _silent(self, words: str, call: Callable[[], object]) -> Iterator[str]:
-        """Call what must send nothing."""
+    def _command(self, ctrl: Array) -> Array:
+        """Return targets with NaN for the joints that are not commanded."""
+        command = np.full_like(ctrl, np.nan)
+        commanded = self._robot.index(self._driver.commanded)
+        command[commanded] = ctrl[commanded]
+        return command
+
+    def _write_and_read(self, ctrl: Array) -> State:
+        """Write targets, (n) rad; return the state one period later."""
+        self.doing = "write"
+        began = time.monotonic()
+        self._driver.write(ctrl, 1.0)
+        self._write_s.append(time.monotonic() - began)
+        self._wait()
+        self.doing = "read"
+        return self._driver.read()
+
+    def _silent(
+        self, words: str, call: Callable[[], object], wait_first: bool = False
+    ) -> Iterator[str]:
+        """Call what must send nothing.
+
+        Args:
+            wait_first: Wait until the last commands have arrived.
+        """
         self.doing = words
-        before = self._commands() if self._commands else 0
+        if self._commands is None:
+            call()
+            return
+        if wait_first:
+            self._wait()
+        before = self._commands()
         call()
-        if self._commands and self._commands() != before:
+        self._wait()  # until it would have arrived
+        if self._commands() != before:
             yield f"{words} sends a command"
 
     def _wait(self) -> None:
@@ -238,11 +341,18 @@ class _Trial:
     def _problems_of(self, state: State) -> Iterator[str]:
         n = len(self._robot.joint_names)
         for name in STATE_ARRAYS:
-            values: Array = np.asarray(getattr(state, name), float)
-            if values.shape != (n,):
-                yield f"{name} of a state has shape {values.shape} instead of ({n},)"
-            elif name in ("qpos", "qvel") and not np.isfinite(values).all():
+            values = getattr(state, name)
+            if not isinstance(values, np.ndarray) or values.shape != (n,):
+                raise TypeError(f"{name} of a state is no array of shape ({n},)")
+            if name in ("qpos", "qvel") and not np.isfinite(values).all():
                 yield f"{name} of a state is not finite"
+        if not isinstance(state.refused, int):
+            yield f"refused of a state is {state.refused!r}, no whole number"
+        low, high = self._robot.qpos_range.T
+        outside = np.maximum(low - state.qpos, state.qpos - high)
+        if outside.max() > MAX_MOTION_RAD:
+            joint = self._robot.joint_names[int(np.argmax(outside))]
+            yield f"{joint} is read {outside.max():.2f} rad outside its range; {HINT}"
         age = self._clock.now() - state.time
         if age < -ROUNDING_S:
             yield "a state is from the future: its time is not that of the clock"

@@ -75,7 +75,7 @@ class RobotSpec:
     Arrays have n joints in the order of `joint_names`.
 
     Attributes:
-        name: Folder name, e.g. "so101".
+        name: As in its robot.toml, e.g. "so101".
         description: What the robot is, in a few words.
         mjcf: Path of the MJCF.
         folder: Folder of robot.toml.
