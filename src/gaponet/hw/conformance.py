@@ -344,7 +344,7 @@ class _Trial:
             values = getattr(state, name)
             if not isinstance(values, np.ndarray) or values.shape != (n,):
                 raise TypeError(f"{name} of a state is no array of shape ({n},)")
-            if name in ("qpos", "qvel") and not np.isfinite(values).all():
+            if name != "temperature" and not np.isfinite(values).all():
                 yield f"{name} of a state is not finite"
         if not isinstance(state.refused, int):
             yield f"refused of a state is {state.refused!r}, no whole number"

@@ -34,8 +34,8 @@ class State:
 
     Attributes:
         time: When it was measured, on this machine's monotonic clock, s.
-        qpos, qvel, tau, temperature: rad, rad/s, N·m, °C; temperature NaN where a robot does not
-            measure it.
+        qpos, qvel, tau, temperature: rad, rad/s, N·m, °C. Of a robot that does not measure them,
+            tau is 0 and temperature is NaN.
         refused: Number of messages with a wrong checksum so far.
         tilt: Angle of the trunk against the vertical, rad; 0 where a robot does not measure it.
         fault: Reported by the robot itself, or a stop by its operator; the driver keeps it for
