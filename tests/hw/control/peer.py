@@ -120,7 +120,7 @@ TABLE = [entry(byte) for byte in range(256)]
 
 def numbers(value: object) -> list:
     """All numbers of a message in turn."""
-    if isinstance(value, (list, tuple)):
+    if isinstance(value, (list, tuple, bytes)):  # an array of uint8 may come as bytes
         return [n for part in value for n in numbers(part)]
     return (
         numbers([getattr(value, f.name) for f in fields(value)]) if is_dataclass(value) else [value]

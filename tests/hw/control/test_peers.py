@@ -33,6 +33,7 @@ pytestmark = pytest.mark.peers
 DOMAIN = 20 + os.getpid() % 150
 SECONDS = float(os.environ.get("GAPONET_PEER_SECONDS", "60"))
 GAPONET = [sys.executable, "-m", "gaponet"]
+RATE = 50.0  # targets per second
 PINNED = "cyclonedds==0.10.2"
 
 
@@ -68,26 +69,28 @@ def told(process: subprocess.Popen[str], seconds: float) -> dict:
     return json.loads(out.strip().splitlines()[-1])
 
 
-def test_gaponet_run_moves_a_robot_on_the_sdks_dds_and_leaves_it_alive(start, tmp_path):
+def sway(folder: Path, seconds: float) -> Path:
+    """A motion file in which the left elbow sways."""
     robot = load_robot("h1_2")
-    rows = int((SECONDS - 12) * 50)
+    rows = int(seconds * RATE)
     ctrl = np.repeat(robot.qpos_home[None], rows, axis=0)
-    ctrl[:, robot.index(["left_elbow_joint"])] += 0.3 * np.sin(np.arange(rows) * 0.02)[:, None]
-    write_motion(tmp_path / "sway.npz", Motion("sway", "joint", 0.02, ctrl), robot)
+    ctrl[:, robot.index(["left_elbow_joint"])] += 0.3 * np.sin(np.arange(rows) / RATE)[:, None]
+    write_motion(folder / "sway.npz", Motion("sway", "joint", 1 / RATE, ctrl), robot)
+    return folder / "sway.npz"
+
+
+def run_command(domain: int, motion: Path) -> list[str]:
+    bus = ["--driver", "unitree", "--domain", str(domain)]
+    return [*GAPONET, "run", *bus, "--motion", str(motion), "--yes", "--json"]
+
+
+def test_gaponet_run_moves_a_robot_on_the_sdks_dds_and_leaves_it_alive(start, tmp_path):
+    seconds = SECONDS - 12
+    motion = sway(tmp_path, seconds)
     peer = start.peer("robot", DOMAIN, SECONDS + 15)
     time.sleep(2.0)
     began = time.monotonic()
-    command = [
-        *GAPONET,
-        "run",
-        "--driver",
-        "unitree",
-        "--domain",
-        str(DOMAIN),
-        "--motion",
-        str(tmp_path / "sway.npz"),
-    ]
-    said = told(start([*command, "--yes", "--json"]), SECONDS + 60)
+    said = told(start(run_command(DOMAIN, motion)), SECONDS + 60)
     assert peer.poll() is None, "the robot's program ended when gaponet connected"
     assert time.monotonic() - began > SECONDS - 10
     assert [e[1] for e in said["events"]] == [
@@ -101,10 +104,25 @@ def test_gaponet_run_moves_a_robot_on_the_sdks_dds_and_leaves_it_alive(start, tm
     assert said["mode_machine"] == 6
     heard = told(peer, SECONDS + 60)
     print(f"\n{SECONDS:g} s: {heard}")
-    assert heard["commands"] > 0.9 * rows
+    assert heard["commands"] > 0.9 * seconds * RATE
     assert heard["wrong_crc"] == 0
     assert heard["last_weight"] == 0.0
-    assert heard["largest_kp"] == robot.servo.kp[12:].max()  # the torso is held as well
+    # The torso is held as well.
+    assert heard["largest_kp"] == load_robot("h1_2").servo.kp[12:].max()
+
+
+def test_a_program_of_the_sdk_that_begins_to_command_the_robot_ends_the_run(start, tmp_path):
+    start.peer("robot", DOMAIN + 2, 60.0)
+    time.sleep(2.0)
+    control = start(run_command(DOMAIN + 2, sway(tmp_path, 40.0)))
+    time.sleep(12.0)  # from start-up to the middle of the motion
+    start.peer("client", DOMAIN + 2, 10.0)
+
+    out, _ = control.communicate(timeout=60)
+
+    kinds = [kind for _, _, kind, _ in json.loads(out.strip().splitlines()[-1])["events"]]
+    assert "source" in kinds
+    assert control.returncode == 3
 
 
 def test_a_client_of_the_sdk_finds_virtual_serve_on_loopback_and_moves_it(start):
