@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import subprocess
 import sys
 import tomllib
 from collections.abc import Iterator
@@ -14,7 +16,7 @@ import pytest
 from arm import commands
 from motion_files import write_motion
 
-from gaponet.cli.main import main
+from gaponet.base import plugins
 from gaponet.hw import conformance
 from gaponet.motion.motion import Motion
 
@@ -31,11 +33,14 @@ def my_arm(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
     ((group, points),) = project["entry-points"].items()
     lines = [f"{name} = {value}" for name, value in points.items()]
     (info / "entry_points.txt").write_text("\n".join([f"[{group}]", *lines]))
-    monkeypatch.syspath_prepend(info.parent)
-    monkeypatch.syspath_prepend(EXAMPLE)
+    for place in (info.parent, EXAMPLE):
+        monkeypatch.syspath_prepend(place)
+    plugins.forget_extensions()
     import my_arm
 
     yield my_arm
+    monkeypatch.undo()
+    plugins.forget_extensions()
     sys.modules.pop("my_arm", None)
 
 
@@ -57,13 +62,21 @@ def test_the_example_keeps_all_promises(my_arm, simulated, arm, monkeypatch):
     assert found == []
 
 
-def test_gaponet_run_finds_the_example_by_its_name(simulated, arm, tmp_path, capsys):
+def test_gaponet_run_finds_the_example_by_its_name(simulated, arm, tmp_path):
     motion = tmp_path / "sway.npz"
     write_motion(motion, Motion("sway", "whole_body", 0.02, 0.2 * commands(20, seed=1)), arm)
 
     words = ["run", "--driver", "my_arm", "--port", simulated.port, "--motion", str(motion)]
-    main([*words, "--limits-from", str(arm.folder), "--dry-run", "--yes", "--unchecked", "--json"])
+    words += ["--limits-from", str(arm.folder), "--dry-run", "--yes", "--unchecked", "--json"]
+    # The command line knows the drivers that were there when it was imported.
+    run = subprocess.run(
+        [sys.executable, "-m", "gaponet", *words],
+        env=os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)},
+        stdout=subprocess.PIPE,
+        text=True,
+        check=True,
+    )
 
-    assert json.loads(capsys.readouterr().out)["dry_run"] is True
+    assert json.loads(run.stdout)["dry_run"] is True
     assert simulated.commands_received() == 0
     assert np.allclose(simulated.positions(), arm.qpos_home)

@@ -130,8 +130,7 @@ def evaluate(
 
     Raises:
         UsageError: Two runs of one method, or several identified simulators.
-        ModelError, RobotError: A folder does not fit the robot, or the target is outside the range
-            in which transfer was measured.
+        ModelError, RobotError: A folder does not fit the robot, or no method can run in the target.
     """
     dataset.require_robot(robot)
     candidates = _load_candidates(folders, robot)
@@ -141,9 +140,11 @@ def evaluate(
         _require_control_periods(candidate, rollouts.sequences)
     nominal = rollouts.first.robot.before_identification
     methods = list(_methods(candidates, nominal, target))
-    for _, _, corrector in methods:
-        if corrector is not None:  # one that cannot run refuses now, and not after hours of others
-            corrector.reset(rollouts.sequences[:1])
+    is_told = any(name == "told" for name, _, _ in methods)
+    for name, _, corrector in methods:
+        refusal_is_a_note = name == "transfer" and is_told  # see add_method
+        if corrector is not None and not refusal_is_a_note:
+            corrector.reset(rollouts.sequences[:1])  # it refuses now, not after all other methods
     for name, simulator, corrector in methods:
         rollouts.add_method(name, simulator, corrector, with_note(progress, name))
     rollouts.add_adapted(with_note(progress, "adapted"))
