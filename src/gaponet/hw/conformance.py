@@ -22,6 +22,7 @@ PERIODS = 10  # of reading, of holding, of each move, and of damping
 MAX_CALL_S = 0.25 * PERIOD_S  # median duration of `read` and `write`
 MAX_AGE_S = 0.5  # of a state
 ROUNDING_S = 1e-3  # of the time of a state
+MAX_OUTSIDE_RAD = 0.1  # of a reading, outside the range of its joint
 MAX_MOTION_RAD = 0.1  # of a joint that is held where it is
 MOVE_RAD = 0.1  # to which each joint is told to move
 MIN_MOVE_RAD = 0.03  # by which it then moves at least
@@ -57,8 +58,8 @@ def broken_promises(
         clock: That of the states; default: the machine's.
 
     Returns:
-        What the driver does not keep, a sentence each; empty if it keeps all. What comes after an
-        exception is not tested.
+        What the driver does not keep, a sentence each; empty if it keeps all. After an exception,
+        and where what follows cannot work, nothing more is tested.
     """
     trial = _Trial(driver, robot, commands, positions, clock or MonotonicClock())
     broken: list[str] = []
@@ -75,6 +76,9 @@ def broken_promises(
         try:
             for problem in stage():  # those before an exception count too
                 broken.append(problem)
+        except _UntestableError as error:
+            broken.append(str(error))
+            break
         except Exception as error:
             broken.append(f"{stage.__name__}: {trial.doing} raised {error!r}")
             break
@@ -83,6 +87,10 @@ def broken_promises(
     except Exception as error:
         broken.append(f"close raised {error!r}; it must never raise")
     return list(dict.fromkeys(broken))
+
+
+class _UntestableError(Exception):
+    """A broken promise without which the rest cannot be tested."""
 
 
 class _Trial:
@@ -114,15 +122,16 @@ class _Trial:
         driver = self._driver
         self.doing = "an attribute"
         if missing := missing_members(driver):
-            raise AttributeError(f"it lacks {', '.join(missing)}")
+            raise _UntestableError(f"the driver lacks {', '.join(missing)}")
         if not driver.address:
             yield "address is empty; it names the robot that one controller at a time may have"
         if driver.joint_names != self._robot.joint_names:
             yield "joint_names are not robot.joint_names, in the same order"
         if not driver.commanded:
-            raise ValueError("commanded is empty")
+            raise _UntestableError("commanded is empty")
         if unknown := set(driver.commanded) - set(self._robot.joint_names):
-            raise ValueError(f"commanded has {', '.join(sorted(unknown))}, no joint of the robot")
+            names = ", ".join(sorted(unknown))
+            raise _UntestableError(f"commanded has {names}, no joint of the robot")
         if driver.at_end not in get_args(EndAction):
             yield f"at_end is {driver.at_end!r}, none of {', '.join(get_args(EndAction))}"
         if driver.at_stop not in ("damps", "lowers"):
@@ -185,12 +194,11 @@ class _Trial:
             yield "a later read changes the arrays of an earlier state"
         yield from self._problems_of_times(states)
         if self._positions is not None:
-            difference = np.abs(states[-1].qpos - self._positions())
-            if not difference.max() <= MAX_READING_ERROR_RAD:
-                joint = self._robot.joint_names[int(np.argmax(difference))]
+            joint, error = self._largest(np.abs(states[-1].qpos - self._positions()))
+            if error > MAX_READING_ERROR_RAD:
                 yield (
-                    f"{joint} is read {difference.max():.2f} rad away from where the simulated "
-                    f"robot has it; {HINT}"
+                    f"{joint} is read {error:.2f} rad away from where the simulated robot has it; "
+                    f"{HINT}"
                 )
 
     def _problems_of_times(self, states: list[State]) -> Iterator[str]:
@@ -223,11 +231,10 @@ class _Trial:
             yield "write changes the array that it is given"
         if state.fault is not None:
             yield f"a robot that is held has the fault {state.fault.kind}: {state.fault.text}"
-        moved = np.abs(state.qpos - found)
-        if not moved.max() <= MAX_MOTION_RAD:
-            joint = self._robot.joint_names[int(np.argmax(moved))]
+        joint, moved = self._largest(np.abs(state.qpos - found))
+        if moved > MAX_MOTION_RAD:
             yield (
-                f"{joint} moved by {moved.max():.2f} rad while all were told to stay; {HINT} "
+                f"{joint} moved by {moved:.2f} rad while all were told to stay; {HINT} "
                 "write ignores the entries of joints that are not commanded"
             )
         if np.median(self._write_s) > MAX_CALL_S:
@@ -255,13 +262,13 @@ class _Trial:
                 ctrl[i] = begin + share * move
                 state = self._write_and_read(self._command(ctrl))
             moved = state.qpos - before
-            if not moved[i] * np.sign(move) >= MIN_MOVE_RAD:
+            if not moved[i] * np.sign(move) >= MIN_MOVE_RAD:  # NaN is not enough either
                 yield f"{joint} was told to move by {move:+.2f} rad and moved by {moved[i]:+.2f}"
-            others = np.abs(moved)
-            others[i] = 0.0
-            if not others.max() <= MAX_OTHER_MOVE_RAD:
-                other = self._robot.joint_names[int(np.argmax(others))]
-                yield f"{other} moved by {others.max():.2f} rad when {joint} was told to; {HINT}"
+            of_others = np.abs(moved)
+            of_others[i] = 0.0
+            other, size = self._largest(of_others)
+            if size > MAX_OTHER_MOVE_RAD:
+                yield f"{other} moved by {size:.2f} rad when {joint} was told to; {HINT}"
 
     def damping(self) -> Iterator[str]:
         """Damping down to weight 0, and what the robot says of it."""
@@ -335,6 +342,12 @@ class _Trial:
         if self._commands() != before:
             yield f"{words} sends a command"
 
+    def _largest(self, sizes: Array) -> tuple[str, float]:
+        """Return the joint with the largest of n sizes, and that size; NaN counts as infinite."""
+        sizes = np.nan_to_num(sizes, nan=np.inf)
+        i = int(np.argmax(sizes))
+        return self._robot.joint_names[i], float(sizes[i])
+
     def _wait(self) -> None:
         self._clock.wait_until(self._clock.now() + PERIOD_S)
 
@@ -343,16 +356,15 @@ class _Trial:
         for name in STATE_ARRAYS:
             values = getattr(state, name)
             if not isinstance(values, np.ndarray) or values.shape != (n,):
-                raise TypeError(f"{name} of a state is no array of shape ({n},)")
+                raise _UntestableError(f"{name} of a state is no array of shape ({n},)")
             if name != "temperature" and not np.isfinite(values).all():
                 yield f"{name} of a state is not finite"
         if not isinstance(state.refused, int):
             yield f"refused of a state is {state.refused!r}, no whole number"
         low, high = self._robot.qpos_range.T
-        outside = np.maximum(low - state.qpos, state.qpos - high)
-        if outside.max() > MAX_MOTION_RAD:
-            joint = self._robot.joint_names[int(np.argmax(outside))]
-            yield f"{joint} is read {outside.max():.2f} rad outside its range; {HINT}"
+        joint, outside = self._largest(np.maximum(low - state.qpos, state.qpos - high))
+        if outside > MAX_OUTSIDE_RAD:
+            yield f"{joint} is read {outside:.2f} rad outside its range; {HINT}"
         age = self._clock.now() - state.time
         if age < -ROUNDING_S:
             yield "a state is from the future: its time is not that of the clock"

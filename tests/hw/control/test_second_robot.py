@@ -140,6 +140,9 @@ def test_a_watchdog_also_damps_when_there_are_two_robots(robot, clock):
         assert each.heard[-1]["kp"][ELBOW] == 0
 
 
+COMMAND = np.zeros(hg.LowCmd.wire_size, np.uint8)  # of another program
+
+
 def other_program() -> UnitreeLink:
     """Another program that commands the robot on our topic, once it is open."""
     return UnitreeLink("arm_sdk", DOMAIN, "lo", sole=False, silent=False)
@@ -154,7 +157,7 @@ def commanded_twice(robot: RobotSpec, clock: RobotClock) -> Recording:
         if k == 20:
             other.open()
         if k >= 40:
-            other.send(np.zeros(hg.LowCmd.wire_size, np.uint8))
+            other.send(COMMAND)
 
     return sway(robot, clock, during)
 
@@ -177,3 +180,36 @@ def test_a_program_that_connects_and_sends_nothing_ends_no_run(robot, clock):
     recording = sway(robot, clock, during=lambda k: other.open() if k == 20 else None)
 
     assert recording.fault is None
+
+
+def test_a_program_that_commands_the_robot_while_a_person_reads_the_plan_prevents_the_start(
+    robot, clock
+):
+    def command_once(_: object) -> None:
+        other = other_program()
+        other.open()
+        other.send(COMMAND)
+
+    driver = UnitreeDriver(robot, domain=DOMAIN)
+    controller = Controller(driver, robot, clock=clock, watchdog=False, on_connect=command_once)
+
+    recording = controller.run(lambda k, state: robot.qpos_home if k < 10 else None)
+
+    assert recording.fault.kind == "source"
+    assert "nothing was commanded" in recording.fault.text
+    assert stiff_commands(clock.robot) == []
+
+
+def test_a_stall_after_which_the_watchdog_damped_the_robot_is_reported_as_a_stall(robot, clock):
+    watchdog = other_program()
+
+    def during(k: int) -> None:
+        if k == 20:
+            watchdog.open()
+        if k == 40:
+            clock.wait_until(clock.now() + 0.4)
+            watchdog.send(COMMAND)
+
+    recording = sway(robot, clock, during)
+
+    assert recording.fault.kind == "overrun"
