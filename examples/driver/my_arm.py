@@ -1,9 +1,11 @@
 """A driver for gaponet, and a simulated arm at the other end of its bus. Copy this folder, and put
 your bus where this one sends JSON in UDP messages.
 
-    pip install -e .            # gaponet then knows the driver my_arm
-    python my_arm.py FOLDER     # a simulated arm with the joints of a robot folder; prints its port
-    gaponet run --driver my_arm --port 127.0.0.1:PORT --limits-from FOLDER --motion FILE --dry-run
+    pip install -e .         # gaponet then knows the driver my_arm
+    python my_arm.py so101   # a simulated arm with the joints of an SO-101; it prints PORT
+    gaponet run --driver my_arm --port PORT --limits-from so101 --motion sweep-wrist_flex
+
+For your robot, name its robot folder in place of so101. With --dry-run nothing is sent.
 
 The bus speaks of angles in degrees by joint, so the driver converts them:
 
