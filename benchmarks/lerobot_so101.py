@@ -24,6 +24,7 @@ from types import SimpleNamespace
 import numpy as np
 import pyarrow.parquet as pq
 import tyro
+from common import print_table
 
 from gaponet.robot.spec import load_robot
 
@@ -45,7 +46,7 @@ JUDGED_S = 8.0
 
 
 def main(work: tyro.conf.Positional[Path]) -> None:
-    """Print errors as JSON, rad; work is the folder for everything that is made."""
+    """Print the errors; work is the folder for everything that is made."""
     work = work.resolve()
     work.mkdir(parents=True, exist_ok=True)
     os.environ |= {"HF_LEROBOT_HOME": str(work / "lerobot"), "HF_HUB_OFFLINE": "1"}
@@ -59,21 +60,13 @@ def main(work: tyro.conf.Positional[Path]) -> None:
     with served(work):
         learn(work, sets)
         errors = play_test_motions(work, sets)
-    ratios = {}
-    for how in WAYS:
-        ratios[how] = [errors[f"{m} {how}"] / errors[f"{m} uncorrected"] for m in MOTIONS]
     gap = json.loads(call("gap", work / "data", "--json"))
-    result = {
-        "virtual": True,
-        "unit": UNIT,
-        "fps": FPS,
-        "gap_rad": gap["methods"]["nominal"]["mpjae"],
-        "opened_by_lerobot": opened(work / "exported"),
-        "error_rad": errors,
-        "ratio": ratios,
-        "mean": {how: float(np.mean(values)) for how, values in ratios.items()},
-    }
-    print(json.dumps(result, indent=1))
+    nominal = 1000 * gap["methods"]["nominal"]["mpjae"]
+    episodes, frames, joints = opened(work / "exported")
+    print(f"VIRTUAL so101, fleet hard, unit virtual-{UNIT}, {FPS} Hz")
+    print(f"The nominal simulator is {nominal:.1f} mrad away from the recordings.")
+    print(f"LeRobot opens the export: {episodes} episodes, {frames} frames, {joints} joints.")
+    print_errors(errors)
 
 
 def learn(work: Path, sets: Path) -> None:
@@ -112,6 +105,18 @@ def play_test_motions(work: Path, sets: Path) -> dict[str, float]:
             record(out, work, motion, 1, LEAD_S + JUDGED_S, step)
             errors[f"{motion} {how}"] = error(out)
     return errors
+
+
+def print_errors(errors: dict[str, float]) -> None:
+    """Print the errors, mrad, and their mean share of the uncorrected ones; `errors` is in rad."""
+    lines = []
+    shares = []
+    for motion in MOTIONS:
+        of_motion = np.array([errors[f"{motion} {how}"] for how in WAYS])
+        lines.append([motion, *(f"{1000 * error:.1f}" for error in of_motion)])
+        shares.append(of_motion / errors[f"{motion} uncorrected"])
+    lines.append(["of uncorrected", *(f"{share:.2f}" for share in np.mean(shares, axis=0))])
+    print_table(["mrad", *WAYS], lines)
 
 
 def wait_longer() -> None:

@@ -23,7 +23,7 @@ RESULTS = ROOT / "docs" / "results"
 STEPS = ROOT / "benchmarks" / "steps.json"
 LIST = Path(__file__).with_suffix(".toml")
 COMMIT = r"[0-9a-f]{8}(?![\w.])"
-NUMBER = rf"{COMMIT}|[-+−]?\d+(?:[.,]\d+)*(?: ± \d+(?:\.\d+)?)?"
+NUMBER = rf"{COMMIT}|[-+−]?\d+(?:[.,]\d+)*(?: ± \d+(?:\.\d+)?)?(?: of \d+)?(?: %)?"
 PLACE = re.compile(r"\{(\w+)\}")
 
 
@@ -56,7 +56,8 @@ def value(source: str) -> str:
         "commit": _commit,
         "seconds": _seconds,
     }
-    return readers[kind](*words).replace("-", "−")
+    text = readers[kind](*words).replace("-", "−")
+    return re.sub(r"^−(?=0\.0+\b)", "", text)  # no negative zero
 
 
 def _real(question: str, method: str, field: str, form: str) -> str:
@@ -123,19 +124,34 @@ def _step(name: str, pattern: str) -> str:
     return found[1]
 
 
-def _cell(name: str, row: str, column: str) -> str:
-    """Return a cell of a Markdown table that a step printed."""
+def _cell(name: str, row: str, column: str, below: str = "") -> str:
+    """Return a cell of a Markdown table that a step printed.
+
+    Args:
+        below: Beginnings of lines, one below the other, with " > " between them: the row is looked
+            for below the last one.
+    """
     columns: list[str] = []
     before: list[str] = []
-    lines: list[str] = _answer(name)["output"]
-    for line in lines:
+    for line in _lines_below(name, below):
         cells = [cell.strip() for cell in line.strip("|").split("|")]
         if line.startswith("| ---"):
             columns = before  # the line above is the head of a table
         elif cells[0] == row and column in columns:
             return cells[columns.index(column)]
         before = cells
-    raise LookupError(f"steps.json: {name} printed no row {row} with a column {column}")
+    raise LookupError(f"steps.json: {name} printed no row {row} with a column {column} {below}")
+
+
+def _lines_below(name: str, below: str) -> list[str]:
+    """Return what a step printed from the line `below` on; its head, if it is of a table, too."""
+    lines: list[str] = _answer(name)["output"]
+    for begin in below.split(" > "):
+        while lines and not lines[0].startswith(begin):
+            lines = lines[1:]
+        if not lines:
+            raise LookupError(f"steps.json: {name} printed no line that begins with {begin}")
+    return lines
 
 
 def _less(name: str, row: str, column: str) -> str:

@@ -48,7 +48,7 @@ README_COLUMNS = (
     ("identification + network",),
 )
 QUICK = "quick"
-TAIL = 60  # lines of an output on the page
+TAIL = 120  # lines of an output on the page
 STEPS_HEAD = """# Steps of `make results`
 
 Commands of `benchmarks/results.toml`, and when `make results` last ran each. DATA is the folder of

@@ -281,11 +281,17 @@ def real(folder: Path, day: Path, other: Path, work: Path) -> None:
     test = data.sequences(parts["test"])
     robot, mine = _with_uncertainty(folder, train, val, work)
     error = absolute_errors(robot, test)
-    bands = [known.residual_p90 for known in mine.joints.values()]
     inside = shares_inside(error, mine)
-    inside["every joint"] = float((error <= bands).mean())
-    shares = ", ".join(f"{joint} {100 * share:.0f} %" for joint, share in inside.items())
-    print(f"test samples inside the 90 % bands: {shares}", flush=True)
+    alone = shares_by_parameters(error, mine)
+    bands = {joint: known.residual_p90 for joint, known in mine.joints.items()}
+    all_inside = float((error <= [*bands.values()]).mean())
+    lines = []
+    for joint, band in bands.items():
+        shares = (f"{100 * share:.0f} %" for share in (inside[joint], alone[joint]))
+        lines.append((joint, f"{1000 * band:.1f}", *shares))
+    lines.append(("all joints", "", f"{100 * all_inside:.1f} %", ""))
+    columns = ("test motions", "band, mrad", "samples inside", "inside by the parameters alone")
+    print_table(columns, lines)
     there = Dataset(other)
     later = there.sequences(there.entries)
     verdicts = []
@@ -303,12 +309,16 @@ def real(folder: Path, day: Path, other: Path, work: Path) -> None:
         }
         verdicts.append(line)
         print(f"{name}: {'; '.join([found.verdict, *_moves(found)])}", flush=True)
+    for day_name in ("first day", "other day"):
+        said = [line["verdict"] for line in verdicts if str(line["what"]).startswith(day_name)]
+        for verdict, count in Counter(said).items():
+            print(f"{day_name}: {verdict}, {count} of {len(said)}", flush=True)
     joints = {}
     for joint, known in mine.joints.items():
         joints[joint] = (known.parameter_rms, known.residual_rms, known.residual_p90)
     facts = {
-        "inside": inside,
-        "alone": shares_by_parameters(error, mine),
+        "inside": inside | {"every joint": all_inside},
+        "alone": alone,
         "drift": verdicts,
         "joints": joints,
     }
