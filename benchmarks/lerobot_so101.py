@@ -37,6 +37,7 @@ WAYS: dict[str, dict[str, bool] | None] = {
 # Of the test; excitation has other ones.
 MOTIONS = ("tour-all-20", "tour-all-21", "limber-all-20", "limber-all-21")
 EXCITATION_MINUTES = 8
+STEPS = 2_000_000  # control steps of training: unlike a time, they do not depend on the machine
 EPISODE_S = 30.0  # of excitation
 FPS = 25  # LeRobot's rate
 UNIT = "1"  # of the fleet `hard`
@@ -88,7 +89,7 @@ def learn(work: Path, sets: Path) -> None:
     if not (arm / "robot.toml").is_file():
         call("identify", data, "--out", arm, "--windows", 12, "--no-table", "--terms")
     if not (run / "model" / "card.json").is_file():
-        call("train", data, "--robot", arm, "--out", run, "--budget", "10m")
+        call("train", data, "--robot", arm, "--out", run, "--budget", STEPS)
     if not (work / "exported").is_dir():
         call("data", "export", data, "--out", work / "exported")
 
