@@ -58,9 +58,8 @@ def main(work: tyro.conf.Positional[Path]) -> None:
     count_frames()
     tell_where_it_is()
     sets = work / "lerobot" / "me"
-    with served(work):
-        learn(work, sets)
-        errors = play_test_motions(work, sets)
+    learn(work, sets)
+    errors = play_test_motions(work, sets)
     gap = json.loads(call("gap", work / "data", "--json"))
     nominal = 1000 * gap["methods"]["nominal"]["mpjae"]
     episodes, frames, joints = opened(work / "exported")
@@ -206,6 +205,9 @@ def record(
 ) -> None:
     """Run LeRobot's record() with its own SO-101 and our motions.
 
+    The arm has just been switched on, so that its motors are equally warm however often the script
+    was interrupted.
+
     Args:
         step: Options of the processor step, through which actions go.
     """
@@ -242,7 +244,9 @@ def record(
         push_to_hub=False,
         no_stamp=True,
     )
-    play(RecordConfig(robot, dataset, teleop, play_sounds=False), robot_action_processor=processor)
+    config = RecordConfig(robot, dataset, teleop, play_sounds=False)
+    with served(work):
+        play(config, robot_action_processor=processor)
 
 
 def opened(folder: Path) -> list[int]:
