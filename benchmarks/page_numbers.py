@@ -22,7 +22,7 @@ ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "docs" / "results"
 STEPS = ROOT / "benchmarks" / "steps.json"
 LIST = Path(__file__).with_suffix(".toml")
-COMMIT = r"[0-9a-f]{8}(?![\w.])"
+COMMIT = r"[0-9a-f]{8}(?!\w|\.\d)"
 NUMBER = rf"{COMMIT}|[-+−]?\d+(?:[.,]\d+)*(?: ± \d+(?:\.\d+)?)?(?: of \d+)?(?: %)?"
 PLACE = re.compile(r"\{(\w+)\}")
 
@@ -160,8 +160,8 @@ def _less(name: str, row: str, column: str) -> str:
 
 
 def filled(page: str, sentence: dict[str, Any]) -> str:
-    """Return the text of a page with the numbers of one sentence, below the heading `section` if it
-    names one.
+    """Return the text of a page with the numbers of one sentence: wherever it is, or the first below
+    `section` if it names one.
 
     Raises:
         LookupError: The page has no such sentence.
@@ -182,7 +182,8 @@ def filled(page: str, sentence: dict[str, Any]) -> str:
         return text
 
     begin = page.index(sentence.get("section", ""))
-    new, count = re.subn(pattern, with_numbers, page[begin:])
+    most = 1 if "section" in sentence else 0  # 0 is no limit
+    new, count = re.subn(pattern, with_numbers, page[begin:], count=most)
     if count == 0:
         raise LookupError(f"no such sentence: {sentence['text']}")
     return page[:begin] + new
