@@ -120,15 +120,7 @@ class Camera:
         for i, copy in enumerate(self.scene.shown.motions):
             x = self.width / 2 + (i - (k - 1) / 2) * pitch
             tint = colour(copy.method)
-            draw.text(
-                (x, top),
-                title(copy.method),
-                tint,
-                large,
-                anchor="ma",
-                stroke_width=0.3,
-                stroke_fill=tint,
-            )
+            draw.text((x, top), title(copy.method), tint, large, anchor="ma")
             if copy.method != "recorded":
                 text = f"{copy.error[row] * 1e3:.1f} mrad now, {copy.mpjae * 1e3:.1f} mean"
                 draw.text((x, top + 1.5 * large.size), text, FAINT, small, anchor="ma")
@@ -158,7 +150,7 @@ class Camera:
         mark = "VIRTUAL ROBOT   " if meta.virtual else ""
         while font.getlength(mark + left + right) > self.width - 4 * pad and font.size > 8:
             font = font.font_variant(size=font.size - 0.5)
-        draw.text((pad, pad * 0.8), mark, ALARM, font, stroke_width=0.4, stroke_fill=ALARM)
+        draw.text((pad, pad * 0.8), mark, ALARM, font)
         draw.text((pad + font.getlength(mark), pad * 0.8), left, INK, font)
         draw.text((self.width - pad, pad * 0.8), right, INK, font, anchor="ra")
 
