@@ -13,7 +13,7 @@ from gaponet.robot.folder import save_robot
 from gaponet.robot.spec import Link, load_robot
 from gaponet.sim.batch import MODEL_FIELDS
 from gaponet.sim.links import COORDINATES, LinkAxes
-from gaponet.sim.model import build_model, model_hash, with_links
+from gaponet.sim.model import LINK_FIELDS, build_model, model_hash, with_links
 from gaponet.sysid.axes import CLASSIC, Bounds
 from gaponet.sysid.identify import identify
 from gaponet.sysid.joint_rollouts import JointRollouts
@@ -81,12 +81,26 @@ def test_a_compiled_model_with_other_links_is_the_model_that_is_compiled_with_th
     for payload in (0.0, 0.3):
         one = with_links(build_model(robot, payload), other)
         two = build_model(other, payload)
-        for field in sorted(MODEL_FIELDS - {"body_iquat"}):
+        # Axes of inertia may have another order; dof_length is of sleeping bodies, which nobody uses.
+        for field in sorted(MODEL_FIELDS - {"body_iquat", "dof_length"}):
             value = getattr(two, field, None)
             if isinstance(value, np.ndarray):
                 np.testing.assert_allclose(
                     getattr(one, field), value, rtol=1e-6, atol=1e-9, err_msg=field
                 )
+
+
+def test_simulations_with_other_links_get_every_field_that_differs(robot):
+    x = np.random.default_rng(1).normal(0, 2, 2 * COORDINATES)
+    before = build_model(robot)
+    after = build_model(replace(robot, links=LinkAxes(robot).links(x)))
+    differ = set()
+    for field in MODEL_FIELDS - {"actuator_acc0", "dof_length"}:  # no step reads these
+        value = getattr(after, field, None)
+        if isinstance(value, np.ndarray) and not np.array_equal(value, getattr(before, field)):
+            differ.add(field)
+    assert "geom_sameframe" in differ  # a box of the arm is where the inertia was
+    assert differ <= set(LINK_FIELDS)
 
 
 def test_a_robot_folder_has_its_links_and_the_robot_before_them(robot, tmp_path):

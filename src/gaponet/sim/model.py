@@ -277,14 +277,16 @@ def write_link(body: mujoco.MjsBody, link: Link) -> None:
     body.fullinertia = link.inertia
 
 
-# Fields of a model that follow from its links; body_sameframe is a shortcut for links whose centre
-# is their origin.
+# Fields of a model that follow from its links; the *_sameframe are MuJoCo's shortcuts for frames
+# that coincide.
 LINK_FIELDS = (
     "body_mass",
     "body_ipos",
     "body_inertia",
     "body_iquat",
     "body_sameframe",
+    "geom_sameframe",
+    "site_sameframe",
     "body_subtreemass",
     "body_invweight0",
     "dof_invweight0",
@@ -318,11 +320,27 @@ def with_links(model: mujoco.MjModel, robot: RobotSpec) -> mujoco.MjModel:
         body.mass[:] = link.mass
         body.ipos[:] = link.pos
         body.inertia[:], body.iquat[:] = principal_axes(link)
-        model.body_sameframe[body.id] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
+        _forget_same_frames(model, body.id)
     mujoco.mj_setConst(model, mujoco.MjData(model))
     stiffen_friction(model)
     soften_table(model, robot)
     return model
+
+
+def _forget_same_frames(model: mujoco.MjModel, body: int) -> None:
+    """Let the geoms and sites of a body stay where they are when its centre of mass moves.
+
+    MuJoCo takes the frame of the inertia for a geom that coincides with it. Before MuJoCo 4
+    mj_setConst does not notice that it no longer does.
+    """
+    frames = mujoco.mjtSameFrame
+    of_inertia = (frames.mjSAMEFRAME_INERTIA, frames.mjSAMEFRAME_INERTIAROT)
+    model.body_sameframe[body] = frames.mjSAMEFRAME_NONE
+    for same, owner in (
+        (model.geom_sameframe, model.geom_bodyid),
+        (model.site_sameframe, model.site_bodyid),
+    ):
+        same[(owner == body) & np.isin(same, of_inertia)] = frames.mjSAMEFRAME_NONE
 
 
 def _remove_fixed(spec: mujoco.MjSpec, body: mujoco.MjsBody, keep: set[str]) -> None:

@@ -134,7 +134,8 @@ class Disobedient(VirtualH12):
     def _block_elbow(self) -> None:
         """Something holds the forearm: it creeps."""
         unit = self.live.unit
-        elbow = unit.batch.model.joint("left_elbow_joint").dofadr[0]
+        joint = self._order[MOTOR_NAMES.index("left_elbow_joint")]
+        elbow = np.flatnonzero(unit.active == joint)[0]
         unit.batch.expand("dof_damping")[:, elbow] = 1000.0
         unit.motors.cold_damping[:, elbow] = 1000.0
 

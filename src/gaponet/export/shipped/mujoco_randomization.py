@@ -75,8 +75,23 @@ def set_links(model: mujoco.MjModel, drawn: dict[str, Any], row: int, form: str 
         body.ipos[:] = x[1:4]
         body.inertia[:] = x[4:7]
         body.iquat[:] = x[7:]
-        model.body_sameframe[body.id] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
+        _forget_same_frames(model, body.id)
     mujoco.mj_setConst(model, mujoco.MjData(model))
+
+
+def _forget_same_frames(model: mujoco.MjModel, body: int) -> None:
+    """Let the geoms and sites of a body stay where they are when its centre of mass moves.
+
+    Before MuJoCo 4 mj_setConst does not notice that a geom no longer is where the inertia is.
+    """
+    frames = mujoco.mjtSameFrame
+    of_inertia = (frames.mjSAMEFRAME_INERTIA, frames.mjSAMEFRAME_INERTIAROT)
+    model.body_sameframe[body] = frames.mjSAMEFRAME_NONE
+    for same, owner in (
+        (model.geom_sameframe, model.geom_bodyid),
+        (model.site_sameframe, model.site_bodyid),
+    ):
+        same[(owner == body) & np.isin(same, of_inertia)] = frames.mjSAMEFRAME_NONE
 
 
 def unit_facts(facts: dict[str, Any], drawn: dict[str, Any], row: int) -> dict[str, Any]:
