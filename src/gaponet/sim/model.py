@@ -320,14 +320,14 @@ def with_links(model: mujoco.MjModel, robot: RobotSpec) -> mujoco.MjModel:
         body.mass[:] = link.mass
         body.ipos[:] = link.pos
         body.inertia[:], body.iquat[:] = principal_axes(link)
-        _forget_same_frames(model, body.id)
+        forget_same_frames(model, body.id)
     mujoco.mj_setConst(model, mujoco.MjData(model))
     stiffen_friction(model)
     soften_table(model, robot)
     return model
 
 
-def _forget_same_frames(model: mujoco.MjModel, body: int) -> None:
+def forget_same_frames(model: mujoco.MjModel, body: int) -> None:
     """Let the geoms and sites of a body stay where they are when its centre of mass moves.
 
     MuJoCo takes the frame of the inertia for a geom that coincides with it. Before MuJoCo 4

@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 
 from gaponet.robot.spec import RobotSpec
-from gaponet.sim.model import build_model, stiffen_friction
+from gaponet.sim.model import build_model, forget_same_frames, stiffen_friction
 from gaponet.virtual.physics import Physics
 from gaponet.virtual.time_steps import TimeSteps
 
@@ -54,6 +54,7 @@ def _add_effects(
         model.body_mass[body] *= unit.mass_scale[i]
         model.body_inertia[body] *= unit.mass_scale[i]
         model.body_ipos[body] += (unit.com_x[i], unit.com_y[i], unit.com_z[i])
+        forget_same_frames(model, body)
     for mount in robot.payload_mounts:
         model.body(f"payload_{mount.side}").pos += (unit.grip_x[0], 0.0, unit.grip_z[0])
     roll = float(unit.tilt_roll[0])
