@@ -123,13 +123,13 @@ resolve: .tools/.done
 wheels: .tools/.done
 	$(TOOLS) $(PYTHON) .ci/wheels.py
 
-# The tests with the lowest versions that pyproject.toml allows, and with the newest.
+# The tests with the lowest versions that pyproject.toml allows, and with the newest: half an hour.
 TESTS ?= tests
 ends: .tools/.done
 	for end in lowest-direct highest; do \
 	  $(TOOLS) uv venv -q --clear --python $(PYTHON) .ends/$$end && \
 	  $(TOOLS) uv pip install -q --python .ends/$$end --resolution $$end -e ".[$(EXTRAS)]" && \
-	  .ends/$$end/bin/python -m pytest $(TESTS) || exit 1; done
+	  OMP_NUM_THREADS=1 .ends/$$end/bin/python -m pytest -n $(JOBS) --dist loadfile $(TESTS) || exit 1; done
 
 # The container of Dockerfile, made and started.
 image:
