@@ -164,6 +164,9 @@ def test_an_exported_unit_has_its_links_in_mujoco_and_isaac_lab_says_that_it_has
             getattr(moved, name), getattr(wanted, name)[:3], rtol=1e-5, atol=1e-9
         )
     assert wanted.body_mass[1] != build_model(load_robot(folder)).body_mass[1]
+    np.testing.assert_allclose(
+        places_of_geoms(moved), places_of_geoms(model.from_xml_path(str(arm.mjcf)))
+    )
     assert exported(capsys, folder, "--engine", "isaaclab", "--out", tmp_path / "isaac")[0] == 0
     content = json.loads((tmp_path / "isaac" / "randomization.json").read_text())
     assert "links" not in content["units"]
@@ -172,6 +175,13 @@ def test_an_exported_unit_has_its_links_in_mujoco_and_isaac_lab_says_that_it_has
     (folder / "robot.toml").write_text(re.sub(r'(fore"\]\nmass = )[\d.]+', r"\g<1>9.0", text))
     with pytest.raises(RobotError, match="links"):
         ParameterUncertainty.load(load_robot(folder))
+
+
+def places_of_geoms(model):
+    """Return where the geoms are in the first posture, (geoms, 3) m."""
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    return data.geom_xpos
 
 
 def test_what_no_log_determines_is_said(arm, tmp_path, capsys):

@@ -6,6 +6,7 @@ from dataclasses import fields, replace
 
 import numpy as np
 import pytest
+from arm import XML, write_arm
 
 from gaponet.robot.spec import load_robot
 from gaponet.sim.batch import BatchSim
@@ -322,3 +323,17 @@ def test_every_effect_has_a_switch_that_matters(arm, effect):
         r = robots.read()
         seen.append(np.concatenate([r.qpos, r.qvel, r.tau]))
     assert np.abs(seen[0] - seen[1]).max() > 1e-6
+
+
+def test_a_centre_of_mass_at_the_origin_of_its_link_can_be_shifted(tmp_path):
+    ball = XML.replace(
+        'type="capsule" fromto="0 0 0 0.2 0 0" size="0.02" mass="0.3"', 'size="0.05"'
+    )
+    robot = write_arm(tmp_path / "arm", xml=ball)
+    robots = VirtualRobot(robot, [unit(), unit(com_x=0.01)], [(0.0, "both")] * 2, 0.02)
+    centres = robots.batch.bind("xipos")
+    robots.batch.forward()
+
+    upper = build_model(robot).body("upper").id
+    plain, shifted = np.reshape(centres, (2, -1, 3))[:, upper]
+    np.testing.assert_allclose(shifted - plain, (0.01, 0, 0))

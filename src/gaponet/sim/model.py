@@ -330,17 +330,13 @@ def with_links(model: mujoco.MjModel, robot: RobotSpec) -> mujoco.MjModel:
 def forget_same_frames(model: mujoco.MjModel, body: int) -> None:
     """Let the geoms and sites of a body stay where they are when its centre of mass moves.
 
-    MuJoCo takes the frame of the inertia for a geom that coincides with it. Before MuJoCo 4
-    mj_setConst does not notice that it no longer does.
+    MuJoCo puts a geom that coincided with the frame of the inertia into that frame. Before MuJoCo 4
+    mj_setConst does not notice that they no longer coincide.
     """
-    frames = mujoco.mjtSameFrame
-    of_inertia = (frames.mjSAMEFRAME_INERTIA, frames.mjSAMEFRAME_INERTIAROT)
-    model.body_sameframe[body] = frames.mjSAMEFRAME_NONE
-    for same, owner in (
-        (model.geom_sameframe, model.geom_bodyid),
-        (model.site_sameframe, model.site_bodyid),
-    ):
-        same[(owner == body) & np.isin(same, of_inertia)] = frames.mjSAMEFRAME_NONE
+    none = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
+    model.body_sameframe[body] = none
+    model.geom_sameframe[model.geom_bodyid == body] = none
+    model.site_sameframe[model.site_bodyid == body] = none
 
 
 def _remove_fixed(spec: mujoco.MjSpec, body: mujoco.MjsBody, keep: set[str]) -> None:

@@ -68,6 +68,8 @@ def set_links(model: mujoco.MjModel, drawn: dict[str, Any], row: int, form: str 
 
     The form "units" has the servo model, "plain_units" has not.
     """
+    # Geoms and sites stay where they are. Before MuJoCo 4 mj_setConst does not see to that.
+    none = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
     for i, name in enumerate(drawn.get("bodies", ())):
         body = model.body(name)
         x = drawn[form]["links"][row][i]
@@ -75,23 +77,10 @@ def set_links(model: mujoco.MjModel, drawn: dict[str, Any], row: int, form: str 
         body.ipos[:] = x[1:4]
         body.inertia[:] = x[4:7]
         body.iquat[:] = x[7:]
-        _forget_same_frames(model, body.id)
+        model.body_sameframe[body.id] = none
+        model.geom_sameframe[model.geom_bodyid == body.id] = none
+        model.site_sameframe[model.site_bodyid == body.id] = none
     mujoco.mj_setConst(model, mujoco.MjData(model))
-
-
-def _forget_same_frames(model: mujoco.MjModel, body: int) -> None:
-    """Let the geoms and sites of a body stay where they are when its centre of mass moves.
-
-    Before MuJoCo 4 mj_setConst does not notice that a geom no longer is where the inertia is.
-    """
-    frames = mujoco.mjtSameFrame
-    of_inertia = (frames.mjSAMEFRAME_INERTIA, frames.mjSAMEFRAME_INERTIAROT)
-    model.body_sameframe[body] = frames.mjSAMEFRAME_NONE
-    for same, owner in (
-        (model.geom_sameframe, model.geom_bodyid),
-        (model.site_sameframe, model.site_bodyid),
-    ):
-        same[(owner == body) & np.isin(same, of_inertia)] = frames.mjSAMEFRAME_NONE
 
 
 def unit_facts(facts: dict[str, Any], drawn: dict[str, Any], row: int) -> dict[str, Any]:
