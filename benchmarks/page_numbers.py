@@ -57,6 +57,8 @@ def value(source: str) -> str:
         "seconds": _seconds,
     }
     text = readers[kind](*words).replace("-", "−")
+    if kind != "commit" and text.isdecimal():
+        return f"{int(text):,}"
     return re.sub(r"^−(?=0\.0+\b)", "", text)  # no negative zero
 
 

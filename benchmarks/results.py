@@ -238,7 +238,7 @@ def _write_steps(steps: list[Step], answers: dict[str, Answer], work: Path) -> N
     for name, answer in answers.items():
         output: list[str] = []
         if not name.startswith("real_"):  # their output is docs/results/real.json
-            text = answer["output"].replace(str(work), "WORK")
+            text = answer["output"].replace(str(work), "WORK").replace(str(Path.home()), "~")
             output = re.sub(r"/tmp/\S+", "TEMPORARY", text).splitlines()[-TAIL:]
         stored[name] = answer | {"output": output}
         stored[name].pop("command", None)  # steps.md has it

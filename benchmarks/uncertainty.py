@@ -357,7 +357,8 @@ def _parts_of_days(
 def _moves(found: Drift) -> list[str]:
     texts = []
     for joint, field, change, sigmas in moved_numbers(found):
-        texts.append(f"{joint}: {field} {change:+.3g} ({sigmas:+.1f} standard errors)")
+        moved = f"{1000 * change:+.0f} ms" if field == "delay" else f"{change:+.3g}"
+        texts.append(f"{joint}: {field} {moved} ({sigmas:+.1f} standard errors)")
     return texts
 
 
