@@ -1,5 +1,7 @@
 """benchmarks/results.py: what runs, and what is kept."""
 
+import re
+
 import results
 
 DATA = results.ROOT
@@ -50,3 +52,8 @@ def test_every_short_form_is_of_a_step():
     names = {one.name for one in results.listed_steps()}
 
     assert set(results.LISTED["quick"]) <= names
+
+
+def test_the_steps_name_no_path_of_a_machine():
+    text = results.STEPS_LOG.read_text(encoding="utf-8")
+    assert re.search(r"/(root|home|Users)/", text) is None
