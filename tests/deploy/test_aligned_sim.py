@@ -80,7 +80,9 @@ def test_one_of_several_simulations_can_be_reset(robot, model):
     fresh = AlignedSim(robot, model)
     for target in commands(15, 0):
         sim.step(target)
+    before = sim.delta
     sim.reset(np.array([[0.1, -0.1]]), ids=np.array([1]))
+    np.testing.assert_array_equal(sim.delta, [before[0], [0.0, 0.0]])
     fresh.reset(np.array([0.1, -0.1]))
     for target in commands(15, 1):
         sim.step(target)

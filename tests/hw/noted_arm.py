@@ -105,5 +105,11 @@ def phases(recording: Recording) -> list[str]:
 
 def fake_watchdog(**changes: object) -> SimpleNamespace:
     """A watchdog that is always well, but for the changes."""
-    well = {"problem": str, "fired": bool, "beat": lambda weight: True, "wait_ready": lambda: None}
+    well = {
+        "problem": str,
+        "fired": bool,
+        "is_damping": bool,
+        "beat": lambda weight: True,
+        "wait_ready": lambda: None,
+    }
     return SimpleNamespace(**well | {"release": lambda unconfirmed: None} | changes)

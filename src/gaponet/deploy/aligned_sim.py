@@ -199,7 +199,7 @@ class AlignedSim:
         if self.transfer is not None:
             self.transfer.reset(ids, q, v, past)
         self.target[ids] = u
-        self._uncorrected = self.target[:, self.op]
+        self._uncorrected[ids] = self.target[ids][:, self.op]
 
     def step(self, ctrl: Array) -> None:
         """Step one control period with targets `ctrl`, rad, which the model corrects."""

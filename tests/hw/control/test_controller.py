@@ -479,7 +479,7 @@ def test_time_that_the_computer_was_suspended_is_the_difference_of_two_clocks(mo
     [
         ("problem", "asked to stop: it hangs"),
         ("beat", "the watchdog ended"),
-        ("fired", "the watchdog has damped the robot"),
+        ("fired", "the watchdog damps the robot"),
     ],
 )
 def test_no_command_leaves_that_the_watchdog_does_not_guard(arm, part, text):
@@ -491,7 +491,10 @@ def test_no_command_leaves_that_the_watchdog_does_not_guard(arm, part, text):
         "fired": late,
     }
     controller = control(driver)
-    controller.output.watchdog = fake_watchdog(**{part: parts[part]})
+    changes = {part: parts[part]}
+    if part == "fired":
+        changes["is_damping"] = late
+    controller.output.watchdog = fake_watchdog(**changes)
     recording = controller.run(motion_policy(MOTION, DT))
     assert recording.fault.text.endswith(text)
     told = driver.clock.start + 0.89
@@ -500,6 +503,82 @@ def test_no_command_leaves_that_the_watchdog_does_not_guard(arm, part, text):
         assert driver.sent[-1][0] < told, "nor a message that damps with another weight"
     else:
         assert told <= driver.damped <= told + DT
+
+
+def test_a_controller_damps_the_robot_if_the_watchdog_died_of_it(arm):
+    driver = NotedArm(arm)
+    controller = control(driver)
+    controller.output.watchdog = fake_watchdog(fired=lambda: driver.elapsed >= 0.89)
+    recording = controller.run(motion_policy(MOTION, DT))
+    assert phases(recording)[-2:] == ["damp", "stopped"]
+    assert driver.damped <= driver.clock.start + 0.89 + DT
+
+
+def test_a_robot_that_the_watchdog_took_at_the_end_is_not_said_to_hold(arm, monkeypatch):
+    driver = NotedArm(arm)
+    released: list[bool] = []
+    monkeypatch.setattr(driver, "verify", lambda: released[0] or None, raising=False)
+    controller = control(driver)
+    controller.output.watchdog = fake_watchdog(
+        release=released.append, fired=lambda: bool(released)
+    )
+    recording = controller.run(motion_policy(MOTION, DT))
+    assert recording.fault.kind == "overrun"
+    assert "the watchdog damps the robot" in recording.fault.text
+
+
+@pytest.mark.parametrize("watched", [True, False])
+def test_an_error_between_two_periods_leaves_no_robot_in_mid_motion(arm, monkeypatch, watched):
+    driver = NotedArm(arm)
+    released: list[bool] = []
+    if watched:
+        dog = fake_watchdog(release=released.append)
+        monkeypatch.setattr("gaponet.hw.control.controller.Watchdog", lambda *_: dog)
+        driver.watchdog = dict
+    controller = control(driver)
+    end = controller.periods.end
+
+    def end_or_fail() -> int:
+        if driver.elapsed >= 0.89:
+            raise RuntimeError("odd")
+        return end()
+
+    monkeypatch.setattr(controller.periods, "end", end_or_fail)
+    with pytest.raises(RuntimeError, match="odd"):
+        controller.run(motion_policy(MOTION, DT))
+    if watched:
+        assert set(released) == {True}, "the watchdog damps it"
+    assert driver.closed == [watched], "without a watchdog the driver lets go"
+
+
+def test_a_row_that_cannot_be_recorded_lowers_the_robot(arm, monkeypatch):
+    driver = NotedArm(arm)
+    controller = control(driver)
+    append = controller.recording.rows.append
+
+    def append_or_fail(row: object) -> None:
+        if driver.elapsed >= 0.89:
+            raise MemoryError
+        append(row)
+
+    monkeypatch.setattr(controller.recording.rows, "append", append_or_fail)
+    with pytest.raises(MemoryError):
+        controller.run(motion_policy(MOTION, DT))
+    assert driver.damped <= driver.clock.start + 0.89 + 2 * DT
+    assert driver.closed == [False]
+
+
+def test_without_a_place_for_its_recording_a_run_does_not_begin(arm, monkeypatch):
+    driver = NotedArm(arm)
+
+    def no_place(**_: object) -> None:
+        raise FileNotFoundError("no usable temporary directory")
+
+    monkeypatch.setattr("gaponet.hw.control.rows.tempfile.TemporaryFile", no_place)
+    with pytest.raises(FileNotFoundError):
+        run(driver)
+    assert not driver.sent
+    assert driver.closed == [True]
 
 
 def test_a_watchdog_damps_after_five_periods_for_as_long_as_the_controller_would(arm, monkeypatch):

@@ -4,13 +4,16 @@ it.
 
 from __future__ import annotations
 
+import contextlib
 import fcntl
+import json
 import os
 import signal
+import subprocess
 import sys
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -75,6 +78,31 @@ def dog(
     yield dog
     dog.process.kill()
     dog.process.wait()
+
+
+@pytest.fixture
+def robot_process(notes: Path) -> Iterator[Callable[[int], subprocess.Popen[bytes]]]:
+    """Starts a watchdog's process with some stderr; it is ready to damp."""
+    started: list[subprocess.Popen[bytes]] = []
+
+    def start(stderr: int) -> subprocess.Popen[bytes]:
+        spec = json.dumps({"notes": str(notes), "timeout": PATIENT, "damp": DAMP})
+        process = subprocess.Popen(
+            [sys.executable, "-c", ROBOT, spec],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=stderr,
+            bufsize=0,
+        )
+        started.append(process)
+        assert process.stdout.read(1) == watchdog.READY
+        return process
+
+    yield start
+    for process in started:
+        process.kill()
+        process.wait()
+        process.stdout.close()
 
 
 hanging = pytest.mark.parametrize("dog", [HANG], indirect=True)
@@ -154,6 +182,43 @@ def test_a_watchdog_that_took_the_controller_for_hanging_says_so(dog, notes):
     assert damped(notes)[0, 1] == 1.0
 
 
+@pytest.mark.parametrize("reader", ["a full disk", "one that has ended", "one that hangs"])
+def test_a_watchdog_whose_messages_nobody_takes_damps_all_the_same(notes, robot_process, reader):
+    if reader == "a full disk":
+        stderr = os.open("/dev/full", os.O_WRONLY)
+    else:
+        out, stderr = os.pipe()
+        if reader == "one that has ended":
+            os.close(out)
+        else:
+            os.set_blocking(stderr, False)
+            with contextlib.suppress(BlockingIOError):
+                while True:
+                    os.write(stderr, bytes(4096))
+            os.set_blocking(stderr, True)
+    process = robot_process(stderr)
+    os.write(process.stdin.fileno(), bytes([WEIGHT_STEPS]))
+    process.stdin.close()
+    assert process.wait(20) == 0
+    assert damped(notes)[-1, 1] == 0.0
+
+
+@pytest.mark.parametrize("dog", [HANG], indirect=True)
+def test_a_controller_that_comes_back_does_not_end_a_watchdog_that_damps(dog, notes, monkeypatch):
+    monkeypatch.setattr(watchdog, "END_TIMEOUT_S", 0.01)
+    beat(dog, 1.0)
+    os.kill(dog.process.pid, signal.SIGSTOP)
+    time.sleep(1.2 * HANG)
+    os.kill(dog.process.pid, signal.SIGCONT)
+    while not dog.fired():
+        time.sleep(0.001)
+    assert dog.is_damping()
+    dog.release()
+    dog.release()
+    assert dog.process.wait(20) == 0
+    assert damped(notes)[-1, 1] == 0.0
+
+
 class LooseRobot:
     """A robot in simulated time of which some calls fail."""
 
@@ -177,42 +242,44 @@ class LooseRobot:
             if name in self.fails and (
                 self.fails[name] is None or self.counts[name] in self.fails[name]
             ):
-                raise (OSError if name == "damp" else DriverError)(f"{name} failed")
+                raise (RuntimeError if name == "damp" else DriverError)(f"{name} failed")
             return "let go"
 
         return call
 
 
-def test_what_fails_is_tried_again_until_the_robot_is_damped(monkeypatch, capsys):
+def test_what_fails_is_tried_again_until_the_robot_is_damped(monkeypatch):
     robot = LooseRobot(monkeypatch, damp=(2, 3), confirm=(1, 2))
-    watchdog.damp_robot(robot, 0.1, 0.5)
+    said: list[str] = []
+    watchdog.damp_robot(robot, 0.1, 0.5, said.append)
     assert (robot.counts["confirm"], robot.counts["close"]) == (3, 1)
     weights = [values[0] for name, *values in robot.calls if name == "damp"]
     assert weights[0] == 0.5
     assert weights[-1] == 0.0
-    said = capsys.readouterr().err
-    assert "could NOT be damped: switch the supply off (damp failed); trying again" in said
-    assert "(confirm failed)" in said
-    assert said.endswith("watchdog: /dev/loose let go\n")
+    assert "could NOT be damped: switch the supply off (damp failed); trying again" in said[0]
+    assert "(confirm failed)" in said[1]
+    assert said[2:] == ["watchdog: /dev/loose let go"]
 
 
-def test_a_watchdog_gives_up_after_ten_minutes_and_not_before(monkeypatch, capsys):
+def test_a_watchdog_gives_up_after_ten_minutes_and_not_before(monkeypatch):
     robot = LooseRobot(monkeypatch, confirm=None)
-    watchdog.damp_robot(robot, 2.0, 1.0)
+    said: list[str] = []
+    watchdog.damp_robot(robot, 2.0, 1.0, said.append)
     assert 600 < robot.now < 601
     assert robot.counts["close"] == 1
-    assert "gave up after 600 s; switch the supply off" in capsys.readouterr().err
+    assert "gave up after 600 s; switch the supply off" in said[-1]
 
 
-def test_a_failure_is_reported_once_although_the_age_in_its_text_changes(monkeypatch, capsys):
+def test_a_failure_is_reported_once_although_the_age_in_its_text_changes(monkeypatch):
     robot = LooseRobot(monkeypatch)
+    said: list[str] = []
 
     def damp(weight: float, share: float) -> None:
         raise DriverError(f"nothing was heard of the robot for {robot.now:.1f} s")
 
     robot.damp = damp
-    watchdog.damp_robot(robot, 2.0, 1.0)
-    assert capsys.readouterr().err.count("trying again") == 1
+    watchdog.damp_robot(robot, 2.0, 1.0, said.append)
+    assert sum("trying again" in text for text in said) == 1
 
 
 @pytest.mark.parametrize(
@@ -234,7 +301,7 @@ def test_a_watchdog_waits_for_the_next_heartbeat_as_long_as_it_is_told_and_then_
     monkeypatch.setattr("gaponet.hw.drivers.open.open_driver", lambda **spec: robot)
     monkeypatch.setattr(watchdog.select, "select", wait)
     monkeypatch.setattr(watchdog.os, "read", lambda *_: next(heartbeats))
-    monkeypatch.setattr(watchdog.os, "write", lambda _, word: said.append(word))
+    monkeypatch.setattr(watchdog.os, "write", lambda to, word: to == 1 and said.append(word))
     monkeypatch.setattr(watchdog.signal, "signal", lambda *_: None)
     watchdog.main({"timeout": HANG, "damp": DAMP})
     assert waits == [None, HANG, HANG][: len(waits)], "before the first one it waits for ever"

@@ -130,6 +130,16 @@ def test_a_port_that_is_not_there_is_said(so101):
 # ---- reading
 
 
+def test_a_lost_reply_confuses_no_torque_limits(so101, wire, servos):
+    servos.set(6, "torque_limit", 500)  # LeRobot's for the gripper
+    driver = SO101Driver(so101, timeout=SILENCE)
+    driver.connect()
+    driver.write(driver.read().qpos)
+    lost = iter([True, False])
+    servos.adversary = lambda servo, reply: b"" if servo == 3 and next(lost, False) else reply
+    assert driver.read().fault is None
+
+
 def test_a_reply_that_was_lost_is_asked_for_again(driver, servos):
     lost = iter([True, False])
     servos.adversary = lambda servo, reply: b"" if servo == 3 and next(lost, False) else reply

@@ -151,6 +151,14 @@ def test_no_more_messages_are_taken_at_a_look_than_a_period_can_bear(listening, 
     assert max(counts) <= 64
 
 
+def test_of_a_flood_through_a_pipe_the_newest_lines_are_read():
+    read, write = os.pipe()
+    os.write(write, b"".join(b'{"time": %d}\n' % k for k in range(300)))
+    flood, *messages = PipeTransport(read).receive()
+    assert "236 older lines were not read" in flood.error
+    assert [message.time for message in messages] == list(range(236, 300))
+
+
 def test_two_cannot_listen_at_one_address(listening):
     from gaponet.hw.targets.zeromq import ZeroMQTransport
 

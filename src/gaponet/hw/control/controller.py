@@ -82,7 +82,7 @@ class Session:
         # Left last: during a collection no heartbeat is sent.
         stack.enter_context(no_garbage_collection())
         lock = stack.enter_context(sole_publisher(driver.address))
-        stack.callback(lambda: driver.close(hold=output.damping_since is None))
+        stack.callback(self._close)
         driver.connect()
         self.recording.virtual = driver.virtual
         output.limits = output.servo_limits()
@@ -93,17 +93,31 @@ class Session:
         joints = context.joints
         gains = {"kp": driver.kp[joints].tolist(), "kd": driver.kd[joints].tolist()}
         self.recording.meta |= gains | driver.facts
-        if self.folder:
-            self.recording.write_to(self.folder)
+        # Here, since no file can be made later on a full disk.
+        self.recording.write_to(self.folder)
         stack.callback(self.recording.rows.close)
         spec = driver.watchdog() if self.is_watched else None
         if spec is not None:
             patience = WATCHDOG_PERIODS * context.dt
-            watchdog = Watchdog(spec, lock, patience, context.config.damp)
-            output.watchdog = watchdog
-            stack.callback(lambda: watchdog.release(output.unconfirmed))
-            watchdog.wait_ready()
+            output.watchdog = Watchdog(spec, lock, patience, context.config.damp)
+            stack.callback(self.release_watchdog)
+            output.watchdog.wait_ready()
         return pressed
+
+    def release_watchdog(self) -> None:
+        """Let the watchdog end, unless it is needed: to damp a robot that is not known to be
+        damped.
+        """
+        if self.output.watchdog:
+            self.output.watchdog.release(self.output.unconfirmed)
+
+    def _close(self) -> None:
+        """Close the connection. The robot holds, unless it was to be damped and no watchdog is
+        there to do it.
+        """
+        output = self.output
+        left_moving = output.unconfirmed and output.watchdog is None
+        output.context.driver.close(hold=output.damping_since is None and not left_moving)
 
 
 def _require_same_joints(driver: Driver, robot: RobotSpec) -> None:
@@ -239,7 +253,13 @@ class Controller:
             raise UsageError("a controller runs once; make a new one")
         with ExitStack() as stack:
             pressed = self._session.start(stack, keys)
-            self._loop(policy or self._policy_of_plan(), pressed)
+            try:
+                self._loop(policy or self._policy_of_plan(), pressed)
+            except BaseException:
+                self.output.unconfirmed = self.phase in COMMANDING
+                raise
+            # It would take the reading back of all registers for a controller that hangs.
+            self._session.release_watchdog()
             self._verify()
         if self._error:
             raise self._error
@@ -283,13 +303,20 @@ class Controller:
             if state:
                 sent = self._send(state, policy)
         except BaseException as error:  # raised again at the end
-            self._error = self._error or error
-            self._fail(Fault("error", f"{type(error).__name__}: {error}"))
+            self._fail_for(error)
         phase = self.phase
         if phase is Phase.DAMP:
             self._damp()
         if state:
-            self._record(phase, state, sent)
+            try:
+                self._record(phase, state, sent)
+            except Exception as error:
+                self._fail_for(error)
+
+    def _fail_for(self, error: BaseException) -> None:
+        """Stop the robot after an error that no driver raised; it is raised at the end."""
+        self._error = self._error or error
+        self._fail(Fault("error", f"{type(error).__name__}: {error}"))
 
     def _record(self, phase: Phase, state: State, sent: tuple[Array, Array] | None) -> None:
         """Append a row; sent: target and command, (n) rad each, if there was one."""
@@ -393,6 +420,11 @@ class Controller:
         """Read back all that the robot holds, at the end of a run without fault."""
         if self.output.weight is None or self.recording.fault:
             return
+        watchdog = self.output.watchdog
+        if watchdog and watchdog.fired():
+            text = "this process stood still at the end; the watchdog damps the robot"
+            self._note(text, "overrun", self.context.clock.now())
+            return
         try:
             fault = self.context.driver.verify()
         except (DriverError, OSError) as error:
@@ -413,9 +445,9 @@ class Controller:
         if output.weight is None:
             trigger = Trigger.FAULT_BEFORE_COMMAND
             text = f"{text}; nothing was commanded"
-        elif output.watchdog and output.watchdog.fired():
+        elif output.watchdog and output.watchdog.is_damping():
             trigger = Trigger.FAULT_AFTER_WATCHDOG
-            text = f"{text}; the watchdog has damped the robot"
+            text = f"{text}; the watchdog damps the robot"
         self._fire(trigger, text, fault.kind)
 
     def _fire(self, trigger: Trigger, text: str, kind: str = "") -> None:

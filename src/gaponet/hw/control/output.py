@@ -89,7 +89,7 @@ class Output:
         ctrl: The command in force, rad; None before the first one, and while the robot is damped.
         weight: Weight of the last command; None if nothing was ever commanded.
         damping_since: s of the clock; None if the robot was not damped.
-        unconfirmed: The robot was damped and did not confirm it.
+        unconfirmed: The robot is to be damped and is not known to be.
     """
 
     def __init__(self, context: Context, monitor: StateMonitor, periods: Periods) -> None:

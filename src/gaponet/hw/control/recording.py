@@ -69,12 +69,16 @@ class Recording:
     def __post_init__(self) -> None:
         self.rows = Rows(self.joint_names)
 
-    def write_to(self, folder: Path) -> None:
-        """Write the periods to a file in a folder as they come. Call it before the first period.
+    def write_to(self, folder: Path | None) -> None:
+        """Write the periods to a file in a folder as they come; None: to a temporary file. Call it
+        before the first period.
 
         Raises:
             FolderError, OSError: Nothing can be written there.
         """
+        if folder is None:
+            self.rows.write_to(None)
+            return
         with lock_folder(folder, FOLDER_KIND):
             self.rows.write_to(folder)
 

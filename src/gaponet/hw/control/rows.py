@@ -12,6 +12,7 @@ import os
 import queue
 import tempfile
 import threading
+import weakref
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -73,17 +74,24 @@ class Rows:
         self._pending: queue.Queue[bytes | None] = queue.Queue()
         self._writer: threading.Thread | None = None
 
-    def write_to(self, folder: Path) -> None:
-        """Make the file in a folder.
+    def write_to(self, folder: Path | None) -> None:
+        """Make the file in a folder; None: a temporary one, which ends with the process.
 
-        Without this call it is a temporary one, which ends with the process.
+        Without this call the first full chunk makes a temporary one.
 
         Raises:
             OSError: No file can be made there.
         """
+        if folder is None:
+            self._open(tempfile.TemporaryFile(buffering=0))  # noqa: SIM115
+            return
         descriptor, name = tempfile.mkstemp(ROWS_SUFFIX, "unfinished-", folder)
+        try:
+            self._open(os.fdopen(descriptor, "w+b", buffering=0))
+        except OSError:
+            os.unlink(name)
+            raise
         self.path = Path(name)
-        self._open(os.fdopen(descriptor, "w+b", buffering=0))
 
     def append(self, row: Row) -> None:
         """Append a row."""
@@ -173,12 +181,13 @@ class Rows:
 
     def _enqueue(self, rows: int) -> None:
         if self._file is None:
-            self._open(tempfile.TemporaryFile(buffering=0))  # noqa: SIM115
+            self.write_to(None)
         self._pending.put(self._chunk[:rows].tobytes())
 
     def _open(self, file: Any) -> None:
-        self._file = file
         os.pwrite(file.fileno(), self._header(0), 0)
+        self._file = file
+        weakref.finalize(self, file.close)
         self._writer = threading.Thread(target=self._write, daemon=True)
         self._writer.start()
 

@@ -14,12 +14,15 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import queue
 import re
 import select
 import signal
 import subprocess
 import sys
+import threading
 import time
+from collections.abc import Callable
 from typing import Any
 
 from gaponet.base import child_process
@@ -35,6 +38,8 @@ DAMP_INTERVAL_S = 0.01  # between two damping messages
 RETRY_INTERVAL_S = 0.1  # after a damping message that failed
 READY_TIMEOUT_S = 20.0
 END_TIMEOUT_S = 5.0
+MESSAGES_TIMEOUT_S = 1.0  # at the end, for messages that nobody has read yet
+STDERR = 2
 NUMBER = re.compile(r"[\d.]+")
 
 
@@ -100,6 +105,8 @@ class Watchdog:
         """Return True if the watchdog damps the robot or has damped it: nothing more may be
         sent.
         """
+        if self._out.closed:
+            return self._fired
         answer = self._out.read(4096) or b""  # None: nothing new; does not wait
         if ANSWER in answer:
             self.answer_time = time.monotonic()
@@ -121,27 +128,34 @@ class Watchdog:
             return False
         return self.process.poll() is None
 
+    def is_damping(self) -> bool:
+        """Return True if the watchdog damps the robot, or has done so; False if it died of it."""
+        return self.fired() and self.process.poll() in (None, 0)
+
     def release(self, unconfirmed: bool = False) -> None:
         """Let the watchdog end without sending anything: the controller has stopped.
 
+        A watchdog that has begun to damp goes on. A second call does nothing.
+
         Args:
-            unconfirmed: The robot did not confirm that it is damped: the watchdog damps it and goes
-                on trying.
+            unconfirmed: The robot is not known to be damped: the watchdog damps it and goes on
+                trying.
         """
-        try:
+        if self._in.closed:
+            return
+        with contextlib.suppress(BrokenPipeError):
             os.set_blocking(self._in.fileno(), True)
             if not unconfirmed:
                 self._in.write(RELEASE)
+        with contextlib.suppress(BrokenPipeError):
             self._in.close()
-        except (BrokenPipeError, ValueError):
-            pass
-        self._out.close()
-        if unconfirmed:
-            return
         try:
-            self.process.wait(END_TIMEOUT_S)
+            self.process.wait(0 if unconfirmed else END_TIMEOUT_S)
         except subprocess.TimeoutExpired:
-            self.process.kill()
+            if not unconfirmed and not self.fired():
+                self.process.kill()
+        self.fired()  # the last look
+        self._out.close()
 
 
 def main(spec: dict[str, Any]) -> None:
@@ -153,6 +167,7 @@ def main(spec: dict[str, Any]) -> None:
         signal.signal(number, signal.SIG_IGN)
     timeout = spec.pop("timeout")
     damp = spec.pop("damp")
+    messages = Messages()
     driver = open_driver(**spec)
     driver.connect()
     _send(READY)
@@ -169,8 +184,35 @@ def main(spec: dict[str, Any]) -> None:
         return
     _send(FIRED)
     why = "ended" if readable else f"was silent for {timeout * 1e3:.0f} ms"
-    print(f"watchdog: the controller {why}; damping {driver.address}", file=sys.stderr, flush=True)
-    damp_robot(driver, damp, weight)
+    messages.say(f"watchdog: the controller {why}; damping {driver.address}")
+    damp_robot(driver, damp, weight, messages.say)
+    messages.finish()
+
+
+class Messages:
+    """Lines on stderr, written by a thread of their own.
+
+    A full disk, a closed terminal or a pipe that nobody reads delays no damping.
+    """
+
+    def __init__(self) -> None:
+        self._lines: queue.SimpleQueue[str | None] = queue.SimpleQueue()
+        self._writer = threading.Thread(target=self._write, daemon=True)
+        self._writer.start()
+
+    def say(self, line: str) -> None:
+        """Write a line when stderr takes it."""
+        self._lines.put(line)
+
+    def finish(self) -> None:
+        """Wait for the lines, but not for a reader that is not there."""
+        self._lines.put(None)
+        self._writer.join(MESSAGES_TIMEOUT_S)
+
+    def _write(self) -> None:
+        while (line := self._lines.get()) is not None:
+            with contextlib.suppress(OSError):
+                os.write(STDERR, f"{line}\n".encode())
 
 
 def _send(word: bytes) -> None:
@@ -178,17 +220,17 @@ def _send(word: bytes) -> None:
         os.write(1, word)
 
 
-def damp_robot(driver: Driver, seconds: float, weight: float) -> None:
+def damp_robot(driver: Driver, seconds: float, weight: float, say: Callable[[str], None]) -> None:
     """Damp for some seconds from the first success on, and until the robot confirms it.
 
-    Retry what fails.
+    Retry what fails, and `say` so.
     """
     start = time.monotonic()
     damping_since = None
     last_failure = ""  # without its numbers: an age in it changes with each try
 
     def report(text: str) -> None:
-        print(f"watchdog: {driver.address} {text}", file=sys.stderr, flush=True)
+        say(f"watchdog: {driver.address} {text}")
 
     while True:
         now = time.monotonic()
@@ -200,7 +242,7 @@ def damp_robot(driver: Driver, seconds: float, weight: float) -> None:
             if not left:
                 report(driver.confirm())
                 break
-        except (DriverError, OSError) as error:
+        except Exception as error:  # of any kind: try again
             wait = RETRY_INTERVAL_S
             failure = NUMBER.sub("", str(error))
             if failure != last_failure:

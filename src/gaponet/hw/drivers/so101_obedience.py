@@ -205,7 +205,8 @@ class Obedience:
         or found.
         """
         wrong: list[tuple[int, str]] = []
-        for i, (servo, block) in enumerate(blocks.items()):
+        for i, servo in enumerate(self._names):
+            block = blocks[servo]  # replies that were asked for again come last
             if self.goals.in_force is not None:
                 what = self._check_goal(servo, self.goals.in_force[servo], block)
                 if what:

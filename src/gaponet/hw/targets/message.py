@@ -10,6 +10,7 @@ from gaponet.base.errors import UsageError
 from gaponet.base.structure import parse_json
 
 MAX_MESSAGE_BYTES = 1 << 14  # a message of 27 joints with long names has 1,500
+MAX_MESSAGES = 64  # read per call; decoding more takes too much of a control period
 
 
 @dataclass(frozen=True)
@@ -66,7 +67,7 @@ class Transport(Protocol):
     address: str
 
     def receive(self) -> list[Message]:
-        """Return the messages since the last call, oldest first, at most some dozens."""
+        """Return the messages since the last call, oldest first, at most MAX_MESSAGES and one."""
 
     def senders(self) -> set[Hashable]:
         """Return the senders that are connected now.

@@ -11,7 +11,7 @@ from collections.abc import Hashable
 from typing import Any
 
 from gaponet.base.errors import UsageError
-from gaponet.hw.targets.message import MAX_MESSAGE_BYTES, Message, decode
+from gaponet.hw.targets.message import MAX_MESSAGE_BYTES, MAX_MESSAGES, Message, decode
 
 READ_BYTES = 1 << 16  # per call: some 40 messages of a humanoid
 
@@ -37,7 +37,10 @@ class PipeTransport:
         self._closed = False
 
     def receive(self) -> list[Message]:
-        """Return the messages of all whole lines since the last call."""
+        """Return the messages of the newest whole lines since the last call.
+
+        Older lines of a flood are one message with an error.
+        """
         if self._closed or not select.select([self._descriptor], [], [], 0)[0]:
             return []
         data = os.read(self._descriptor, READ_BYTES)
@@ -48,7 +51,12 @@ class PipeTransport:
         if self._skipping and lines:  # the end of a line that was too long
             lines = lines[1:]
             self._skipping = False
-        messages = [decode("stdin", line) for line in lines]
+        newest = lines[-MAX_MESSAGES:]
+        messages = [decode("stdin", line) for line in newest]
+        unread = len(lines) - len(newest)
+        if unread:
+            flood = Message("stdin", error=f"came in a flood: {unread} older lines were not read")
+            messages.insert(0, flood)
         if len(self._partial_line) > MAX_MESSAGE_BYTES:
             self._partial_line = b""
             self._skipping = True

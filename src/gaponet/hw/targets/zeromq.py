@@ -13,10 +13,10 @@ from typing import Any
 import zmq
 
 from gaponet.base.errors import UsageError
-from gaponet.hw.targets.message import MAX_MESSAGE_BYTES, Message, decode
+from gaponet.hw.targets.message import MAX_MESSAGE_BYTES, MAX_MESSAGES, Message, decode
 
 ADDRESS = "tcp://127.0.0.1:5555"
-QUEUE_LENGTH = 64  # messages read per call, and buffered per connection
+QUEUE_LENGTH = MAX_MESSAGES  # buffered per connection, too
 
 
 class ZeroMQTransport:
