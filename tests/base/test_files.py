@@ -179,6 +179,13 @@ def test_what_describes_the_replaced_files_is_removed_with_them(tmp_path):
     assert names(tmp_path) == [FOLDER_MARKER, "report.html", "robot.toml"]
 
 
+def test_a_whole_folder_of_a_killed_process_with_our_own_number_is_replaced(tmp_path):
+    (tmp_path / f"{FOLDER_MARKER}-{os.getpid()}-new").mkdir()  # as in a container
+    with whole_folder(tmp_path, "robot", last="robot.toml") as place:
+        (place / "robot.toml").write_text("new")
+    assert (tmp_path / "robot.toml").read_text() == "new"
+
+
 def test_a_whole_folder_of_a_killed_process_is_left_as_it_was_and_tidied_by_the_next(tmp_path):
     killed = (
         "import os; from pathlib import Path; from gaponet.base.files import whole_folder\n"

@@ -317,6 +317,17 @@ def test_gains_are_the_robots_unless_said_by_joint_or_for_all(logs, so101, tmp_p
     assert meta.kd == (0.1,) * 6
 
 
+def test_of_gains_that_the_logs_state_those_of_named_joints_are_replaced(tmp_path, arm):
+    (tmp_path / "logs").mkdir()
+    (tmp_path / "logs" / "m.csv").write_text(table_text(arm_columns()))
+    (tmp_path / "logs" / "logs.toml").write_text(
+        'kp = 40.0\nposition_unit = "rad"\ntime_unit = "s"\n'
+    )
+    request = ImportRequest(unit_id="lab", payload_mass=0.0, kp=("elbow=15",))
+    (entry,) = import_logs(tmp_path / "logs", arm, tmp_path / "data", request).entries
+    assert entry.meta.kp == (40.0, 15.0)
+
+
 @pytest.mark.parametrize("words", [("stiff",), ("-1",), ("5", "6"), ("elbow_flex=nan",)])
 def test_gains_that_make_no_sense_are_refused(logs, so101, tmp_path, words):
     with pytest.raises(UsageError, match="number"):

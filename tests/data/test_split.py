@@ -468,6 +468,18 @@ def test_one_unit_cannot_be_split_by_unit(arm, tmp_path):
         make_split(data, "unit")
 
 
+def test_splits_of_units_whose_letters_no_file_takes_are_two_files(arm, tmp_path):
+    data = Dataset.create(tmp_path / "data", arm)
+    for i, unit in enumerate("甲乙丙丁" * 3):
+        ctrl = wave(60, 2, hertz=0.3 + 0.1 * i)
+        data.append(arm_sequence(arm, ctrl, late(ctrl, 2), f"m{i}", unit=unit))
+    paths = set()
+    for unit in "甲乙":
+        parts = make_split(data, "unit", (unit,))
+        paths.add(write_split(data, parts, "unit", (unit,)))
+    assert len(paths) == 2
+
+
 def test_a_held_out_payload_is_in_the_test_split_alone(arm, tmp_path):
     data = Dataset.create(tmp_path / "held_out", arm)
     for seed in range(4):

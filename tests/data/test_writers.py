@@ -70,6 +70,18 @@ def test_what_is_written_is_read_back_without_a_word(dataset, arm, tmp_path):
             assert np.array_equal(getattr(one, name), getattr(other, name)), name
 
 
+def test_rates_that_look_the_same_go_into_folders_of_their_own(arm, tmp_path):
+    data = Dataset.create(tmp_path / "data", arm)
+    periods = (0.0200031, 0.02000310001, 0.02000310002)
+    for i, dt in enumerate(periods):
+        ctrl = wave(50, 2, hertz=0.4 + 0.13 * i)
+        data.append(replace(arm_sequence(arm, ctrl, late(ctrl, 2), f"m{i}"), dt=dt))
+    written = export(data, tmp_path / "out")
+    assert len({part.path for part in written}) == 3
+    import_logs(tmp_path / "out", arm, tmp_path / "again", ImportRequest())
+    assert {e.meta.motion for e in Dataset(tmp_path / "again").entries} == {"m0", "m1", "m2"}
+
+
 def test_a_gripper_goes_out_and_comes_back_as_a_share_of_its_range(so101, tmp_path):
     write_so101(tmp_path / "logs" / "wave")
     import_logs(
@@ -81,9 +93,15 @@ def test_a_gripper_goes_out_and_comes_back_as_a_share_of_its_range(so101, tmp_pa
     assert one.entries[0].hash == other.entries[0].hash
 
 
-def test_the_command_says_how_to_come_back_and_overwrites_nothing(dataset, tmp_path, capsys):
+def test_the_command_says_how_to_come_back_and_overwrites_nothing(
+    dataset, tmp_path, capsys, monkeypatch
+):
     words = ["data", "export", str(dataset.path), "--out", str(tmp_path / "set")]
     assert main(words) == 0
     assert f"gaponetimport{tmp_path / 'set'}" in "".join(capsys.readouterr().out.split())
     assert main(words) == 2
     assert "exists and is not an empty folder" in capsys.readouterr().err
+    (tmp_path / "empty").mkdir()
+    monkeypatch.chdir(tmp_path / "empty")
+    assert main([*words[:-1], "."]) == 2
+    assert "name a new folder" in capsys.readouterr().err

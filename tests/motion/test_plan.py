@@ -49,6 +49,9 @@ def test_no_motion_names_the_gripper(so101, plan):
 def test_a_motion_survives_its_file(so101, plan, tmp_path, suffix, rate):
     motion = plan.motions[0]
     write_motion(tmp_path / f"m.{suffix}", motion, so101, rate)
+    if suffix == "csv":  # as a spreadsheet saves it
+        text = (tmp_path / "m.csv").read_text()
+        (tmp_path / "m.csv").write_text(text, encoding="utf-8-sig")
     back = read_motion(tmp_path / f"m.{suffix}", so101)
     assert back.dt == pytest.approx(1 / rate)
     np.testing.assert_allclose(back.ctrl, motion.sample(1 / rate), atol=1e-6)
@@ -79,3 +82,8 @@ def test_the_command_writes_motions_and_a_sheet(tmp_path, capsys):
         assert f"| {file} | 0 |" in sheet
         assert read_motion(tmp_path / "m" / file, robot).duration > 1
     assert "Warm up for ten minutes" in sheet
+    assert main(words) == 0
+    capsys.readouterr()
+    assert main([*words[:-3], "--minutes", "3"]) == 2, "the robot would play the older ones too"
+    assert "holds motions of another call: " in capsys.readouterr().err
+    assert {path.name for path in (tmp_path / "m").glob("*_*")} == set(told["motions"])

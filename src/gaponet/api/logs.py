@@ -261,7 +261,8 @@ def excite(
         options: Duration, payloads, rate and file format.
 
     Raises:
-        UsageError: No motion fits, or the robot folder holds no parameter uncertainty.
+        UsageError: No motion fits, the robot folder holds no parameter uncertainty, or `out` holds
+            motions of another call.
     """
     from gaponet.base.files import lock_folder, write_text
     from gaponet.motion.files import write_motion
@@ -282,6 +283,8 @@ def excite(
         files = {}
         for i, motion in enumerate(plan.motions, 1):
             files[motion.name] = f"{i:02d}_{motion.name}.{options.format}"
+        _refuse_other_motions(folder, set(files.values()))
+        for motion in plan.motions:
             write_motion(folder / files[motion.name], motion, spec, options.rate)
         identified = spec.folder if further else None
         write_text(folder / "sheet.md", sheet(spec, plan, files, options.rate, identified))
@@ -293,6 +296,23 @@ def excite(
         sheet=folder / "sheet.md",
         prediction=prediction,
     )
+
+
+def _refuse_other_motions(folder: Path, names: set[str]) -> None:
+    """Refuse a folder with motions that are not among `names`: a robot that plays all files of the
+    folder would play them too.
+    """
+    from gaponet.motion.files import SUFFIXES
+
+    others = []
+    for path in sorted(folder.glob("[0-9][0-9]_*")):
+        if path.suffix in SUFFIXES and path.name not in names:
+            others.append(path.name)
+    if others:
+        raise UsageError(
+            f"{folder}: holds motions of another call: {', '.join(others[:4])}"
+            f"{', …' if len(others) > 4 else ''}; delete them, or choose another folder"
+        )
 
 
 def _further_motions(

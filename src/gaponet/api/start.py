@@ -19,7 +19,7 @@ from gaponet.api.options import parse_joint_map
 from gaponet.base.errors import LogError, UsageError
 from gaponet.base.files import lock_folder, write_json, write_text
 from gaponet.base.structure import read_json
-from gaponet.data.formats import PositionUnit, ReadOptions, TimeUnit
+from gaponet.data.formats import PositionUnit, ReadOptions, TimeUnit, files_below
 from gaponet.data.store import Dataset, dataset_hash
 from gaponet.report.steps import Option, Target, make_robot
 from gaponet.report.steps import Step as Step
@@ -397,13 +397,10 @@ def hash_logs(logs: Path, out: Path) -> dict[str, str]:
     them.
     """
     root = logs if logs.is_dir() else logs.parent
-    paths = logs.rglob("*") if logs.is_dir() else [logs]
     files = {}
-    for file in paths:
-        below = file.relative_to(root)
-        hidden = any(part.startswith(".") for part in below.parts)
-        if not hidden and out.resolve() not in file.resolve().parents:
-            files[below.as_posix()] = file
+    for file in files_below(logs) if logs.is_dir() else [logs]:
+        if out.resolve() not in file.resolve().parents:
+            files[file.relative_to(root).as_posix()] = file
     files[f"{out.name}/logs.toml"] = out / "logs.toml"
     hashes = {}
     for name, file in sorted(files.items()):

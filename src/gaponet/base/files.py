@@ -222,6 +222,8 @@ def whole_folder(
     """
     with lock_folder(folder, kind):
         temporary = folder / f"{FOLDER_MARKER}-{os.getpid()}-new"
+        # In a container every process has the same number, so that it may be a killed one's.
+        shutil.rmtree(temporary, ignore_errors=True)
         temporary.mkdir()
         try:
             yield temporary

@@ -89,7 +89,11 @@ def import_logs(
         )
     options = args.options()
     if args.guess:
-        print(recordings.guess_description(src, robot=robot, options=options), end="")
+        text = recordings.guess_description(src, robot=robot, options=options)
+        if json:
+            Out(json).result({"logs_toml": text})
+        else:
+            print(text, end="")
         return
     if out is None:
         raise UsageError(

@@ -23,7 +23,7 @@ from gaponet.data.formats import ReadOptions, find_logs, read_logs
 from gaponet.data.journal import Findings
 from gaponet.data.log import Log, skip_bad_rows, skipped_rows
 from gaponet.data.offsets import Gravity, JointOffset, read_offsets, record_offsets, unit_offsets
-from gaponet.data.sequence import ARRAYS, Sequence, SequenceMeta, to_sequence
+from gaponet.data.sequence import ARRAYS, Sequence, SequenceMeta, recorded_gains, to_sequence
 from gaponet.data.signals import FAST_COMMAND_RAD_S, estimate_delay, fast_speed
 from gaponet.data.static_poses import StaticPoses
 from gaponet.data.store import KIND, Dataset, Entry
@@ -121,7 +121,8 @@ class ImportRequest(ImportOptions):
     """kg in each hand."""
 
     def labels(self, robot: RobotSpec) -> dict[str, Any]:
-        """Return the labels that are given, as fields of SequenceMeta.
+        """Return the labels that are given, as fields of SequenceMeta; a gain is NaN for joints
+        that are not named.
 
         Raises:
             UsageError: The robot has no such hand or joint, or a gain is no number.
@@ -317,7 +318,8 @@ class _Source:
         for name, value in log.meta.get("stated", {}).items():
             if value is not None:
                 stated[name] = tuple(value) if name in ("kp", "kd") else value
-        for name, value in self.labels.items():
+        labels = self.labels | self._gains(log, stated)
+        for name, value in labels.items():
             if name in stated and stated[name] != value:
                 flag = "--" + name.replace("_", "-")
                 raise UsageError(
@@ -328,7 +330,7 @@ class _Source:
             "unit_id": "--unit-id NAME",
             "payload_mass": "--payload-mass 0 (kg in each hand, 0 when empty)",
         }
-        missing = [flag for name, flag in needed.items() if name not in self.labels | stated]
+        missing = [flag for name, flag in needed.items() if name not in labels | stated]
         if missing:
             raise UsageError(
                 f"{log.source}: this format does not state unit or payload: give "
@@ -342,9 +344,21 @@ class _Source:
             "source_sha256": sha256,
             "repetition": UNSTATED_REPETITION,
         }
-        fields |= self.labels
+        fields |= labels
         fields |= {"robot": self.robot.name, "motion": motion}
         return SequenceMeta(**(fields | stated))
+
+    def _gains(self, log: Log, stated: dict[str, Any]) -> dict[str, tuple[float, ...]]:
+        """Return the gains of all joints, (n), where the user states some: the others are what the
+        recording states, or the robot's.
+        """
+        gains: dict[str, tuple[float, ...]] = {}
+        for name in ("kp", "kd"):
+            if name in self.labels:
+                of_user = np.array(self.labels[name])
+                of_log = stated.get(name) or recorded_gains(name, log, self.robot)
+                gains[name] = tuple(np.where(np.isnan(of_user), of_log, of_user).tolist())
+        return gains
 
 
 def _count_bytes(sequence: Sequence) -> int:
@@ -362,18 +376,21 @@ def _pieces(sequence: Sequence, seconds: float | None) -> Iterator[Sequence]:
         return
     meta = sequence.meta
     rows = len(sequence) // count
+    places = ".0" if rows * sequence.dt >= 1 else ".1"  # of the start, so that no two are the same
     for start in range(0, count * rows, rows):
         from_s = round(start * sequence.dt, 3)
         notes = meta.notes | {"from_s": from_s}
-        named = replace(meta, motion=f"{meta.motion}@{from_s:.0f}s", notes=notes)
+        named = replace(meta, motion=f"{meta.motion}@{from_s:{places}f}s", notes=notes)
         yield replace(sequence.rows(slice(start, start + rows)), meta=named)
 
 
 def _parse_gains(name: str, words: tuple[str, ...], robot: RobotSpec) -> tuple[float, ...] | None:
-    """Parse ("17.8",) or ("elbow=9", …) to gains of all joints, (n); the others are the robot's."""
+    """Parse ("17.8",) or ("elbow=9", …) to gains of all joints, (n); NaN for joints that are not
+    named.
+    """
     if not words:
         return None
-    gains = np.array(robot.before_identification.servo[name])
+    gains = np.full(len(robot.joint_names), np.nan)
     for word in words:
         joint, equals, number = word.rpartition("=")
         try:

@@ -71,7 +71,7 @@ class Log:
 
     Acted on of meta are: dt, the exact period of regular rows, s; kp and kd, gains of joint_names;
     notes, for SequenceMeta; stated, fields of SequenceMeta that the format itself holds; for
-    errors, first_line and the files by channel.
+    errors, first_line, and by channel the file and the numbers of its rows in it.
     """
 
     robot: str
@@ -190,7 +190,9 @@ class Log:
     def row(self, name: str, index: int) -> str:
         """File and line of a row of a channel, as the reader noted them."""
         file = self.meta.get("files", {}).get(name, self.source)
-        return f"{file}:{index + int(self.meta.get('first_line', 1))}"
+        rows = self.meta.get("rows", {}).get(name)
+        number = index if rows is None else int(rows[index])
+        return f"{file}:{number + int(self.meta.get('first_line', 1))}"
 
 
 def _starts_again(time: Array) -> bool:

@@ -217,8 +217,8 @@ class Sequence:
         return digest.hexdigest()
 
 
-def _recorded(name: str, log: Log, robot: RobotSpec) -> tuple[float, ...]:
-    """Gains (n) that a log says, the robot's own for joints of which it says none."""
+def recorded_gains(name: str, log: Log, robot: RobotSpec) -> tuple[float, ...]:
+    """Return the gains (n) that a log says, the robot's own for joints of which it says none."""
     gains = np.array(robot.before_identification.servo[name])
     if name in log.meta:
         gains[robot.index(log.joint_names)] = _gains(name, log.meta[name], log.source)
@@ -294,8 +294,8 @@ def to_sequence(log: Log, robot: RobotSpec, meta: SequenceMeta) -> Sequence:
     if copies:
         notes["copied_rows"] = copies
     notes |= _posture_notes(log, robot)
-    kp = meta.kp or _recorded("kp", log, robot)
-    kd = meta.kd or _recorded("kd", log, robot)
+    kp = meta.kp or recorded_gains("kp", log, robot)
+    kd = meta.kd or recorded_gains("kd", log, robot)
     kp_origin = _gain_origin("kp", meta, log)
     kd_origin = _gain_origin("kd", meta, log)
     notes["gains"] = f"kp {kp_origin}, kd {kd_origin}"

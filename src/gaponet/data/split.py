@@ -481,7 +481,10 @@ def _hashes(entries: list[Entry]) -> dict[str, str]:
 
 def write_split(dataset: Dataset, splits: Splits, by: str, holdout: tuple[str, ...] = ()) -> Path:
     """Write splits/<by>[-<held out>].json in the dataset folder; return its path."""
-    name = re.sub(r"[^A-Za-z0-9_.-]", "_", "-".join([by, *holdout]))[:100]
+    stated = "-".join([by, *holdout])
+    name = re.sub(r"[^A-Za-z0-9_.-]", "_", stated)[:100]
+    if name != stated:  # others may look the same
+        name = f"{name}-{hashlib.sha256(stated.encode()).hexdigest()[:8]}"
     path = dataset.path / "splits" / f"{name}.json"
     record: dict[str, Any] = {
         "format": FORMAT,

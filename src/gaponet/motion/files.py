@@ -108,7 +108,7 @@ def _level_of(ctrl: Array, robot: RobotSpec) -> str:
 def _text(path: Path) -> tuple[list[str], Array, float]:
     """Return names, targets (T, k) rad and period, s, of a txt or csv file."""
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
     except UnicodeDecodeError:
         raise LogError(f"{path}: not a text file") from None
     names = [name.strip() for name in lines[0].split(",")] if lines else []

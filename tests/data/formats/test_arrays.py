@@ -158,11 +158,23 @@ def test_windows_in_which_one_joint_moves_are_recordings_of_that_joint(tmp_path,
     assert (made[0].qvel[:, 0] == 0).all()
 
 
+def test_a_list_of_gains_turns_no_table(tmp_path, arm):
+    ctrl, qpos = motion()
+    np.savez(tmp_path / "m.npz", target=ctrl, q=qpos, kp=np.array([20.0, 20.0]))
+    (tmp_path / "logs.toml").write_text(
+        strange_logs.sheet(
+            ctrl="target", qpos="q", joints=arm.joint_names, rate=50.0, position_unit="rad"
+        )
+    )
+    ((_, log),) = read_logs(tmp_path, arm)
+    assert np.array_equal(log.channels["qpos"].values, qpos)
+
+
 def test_every_demonstration_of_robomimic_is_a_recording(tmp_path, arm):
     h5py = pytest.importorskip("h5py")
     ctrl, qpos = motion()
     with h5py.File(tmp_path / "low_dim.hdf5", "w") as file:
-        for i in (10, 2):
+        for i in (10, 2, 1):
             file[f"data/demo_{i}/obs/robot0_joint_pos"] = qpos
             file[f"data/demo_{i}/targets"] = ctrl + 0.01 * i
             file[f"data/demo_{i}/actions"] = np.zeros((40, 7))
@@ -178,8 +190,8 @@ def test_every_demonstration_of_robomimic_is_a_recording(tmp_path, arm):
         )
     )
     found = list(read_logs(tmp_path, arm))
-    assert [name for name, _ in found] == ["low_dim-demo_2", "low_dim-demo_10"]
-    assert np.allclose(found[1][1].channels["ctrl"].values, ctrl + 0.1)
+    assert [name for name, _ in found] == ["low_dim-demo_1", "low_dim-demo_2", "low_dim-demo_10"]
+    assert np.allclose(found[2][1].channels["ctrl"].values, ctrl + 0.1)
 
 
 def test_links_in_an_hdf5_file_are_not_followed(tmp_path, arm):

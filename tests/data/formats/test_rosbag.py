@@ -33,6 +33,14 @@ def test_command_and_state_are_two_topics_with_clocks_of_their_own(tmp_path, arm
         assert log.channels["ctrl"].time == pytest.approx(0.004 + 0.04 * np.arange(20), abs=1e-6)
 
 
+def test_a_folders_whole_name_is_the_motion(tmp_path, arm):
+    write_bag(tmp_path / "wave_0.2kg_1")
+    (tmp_path / "logs.toml").write_text(f'{JOINTS}motion = "{{motion}}_{{payload:g}}kg_{{rep}}"\n')
+    ((name, log),) = read_logs(tmp_path, arm)
+    assert name == "wave"
+    assert log.meta["stated"] == {"payload_mass": 0.2, "repetition": 1}
+
+
 @pytest.mark.parametrize("command", ["trajectory", "array", "controller", "custom"])
 def test_what_says_the_command_may_be_of_several_kinds(tmp_path, arm, command):
     bag = write_bag(tmp_path / "wave", command=command)

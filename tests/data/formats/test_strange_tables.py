@@ -12,6 +12,7 @@ from logs import arm_columns, table_text
 from gaponet.base.errors import LogError
 from gaponet.data.describe.guess import guess_logs
 from gaponet.data.formats import ReadOptions, files_under, look, read_logs
+from gaponet.data.log import skip_bad_rows
 
 SI = {"position_unit": "rad", "time_unit": "s"}
 ROWS = 200
@@ -104,6 +105,63 @@ def test_typed_dates_of_parquet_need_no_unit(tmp_path, arm):
     pq.write_table(pa.table(arrays), tmp_path / "m.parquet")
     log = only(tmp_path / "m.parquet", arm, position_unit="rad")
     assert np.allclose(log.channels["qpos"].time, 0.02 * np.arange(ROWS), atol=2e-6)
+
+
+@pytest.mark.parametrize("kind", ["dates", "typed dates", "stamps", "seconds"])
+def test_clocks_of_one_instant_keep_what_lies_between_their_first_stamps(tmp_path, arm, kind):
+    columns = arm_columns(ROWS)
+    for name, after in (("sent", 0.75), ("seen", 0.80)):
+        seconds = columns["time"] + after
+        moments = np.datetime64("2026-03-01") + (1e6 * seconds).round().astype("timedelta64[us]")
+        if kind == "stamps":
+            columns[f"{name}.sec"] = 1.7e9 + np.floor(seconds)
+            columns[f"{name}.nanosec"] = 1e9 * (seconds % 1)
+        elif kind == "typed dates":
+            columns[name] = moments
+        else:
+            columns[name] = moments.astype(str) if kind == "dates" else 1.7e9 + seconds
+    del columns["time"]
+    pq.write_table(pa.table({k: pa.array(v) for k, v in columns.items()}), tmp_path / "m.parquet")
+    (tmp_path / "logs.toml").write_text(
+        'position_unit = "rad"\ntime_unit = "s"\n[clock]\nctrl = "sent"\nqpos = "seen"\n'
+    )
+    log = only(tmp_path, arm)
+    assert log.channels["ctrl"].time[0] == 0.0
+    assert log.channels["qpos"].time[0] == pytest.approx(0.05, abs=2e-6)
+
+
+@pytest.mark.parametrize("kind", ["slow command", "rows twice"])
+def test_an_error_names_the_line_in_the_file(tmp_path, arm, kind):
+    columns = arm_columns(ROWS)
+    if kind == "slow command":
+        slow = np.arange(ROWS) % 5 > 0
+        columns["ctrl.elbow"][100] = 57.3
+        for joint in JOINTS:
+            columns[f"ctrl.{joint}"][slow] = np.nan
+    else:
+        columns["qpos.elbow"][50] = np.nan
+        columns = {name: values.repeat(2) for name, values in columns.items()}
+    (tmp_path / "m.csv").write_text(cells(columns))
+    with pytest.raises(LogError, match=r"m\.csv:102: "):
+        only(tmp_path / "m.csv", arm, **SI)
+
+
+def test_an_empty_first_stamp_costs_one_row(tmp_path, arm):
+    columns = arm_columns(ROWS)
+    columns["time"][0] = np.nan
+    (tmp_path / "m.csv").write_text(cells(columns))
+    with skip_bad_rows(True) as cut:
+        log = only(tmp_path / "m.csv", arm, **SI)
+    assert len(log.channels["qpos"].time) == ROWS - 1
+    assert len(cut) == 1
+
+
+def test_an_empty_table_is_one_clear_error(tmp_path, arm):
+    columns = {k: pa.array(v[:0]) for k, v in arm_columns(ROWS).items()}
+    columns["time"] = pa.array([], pa.string())
+    pq.write_table(pa.table(columns), tmp_path / "m.parquet")
+    with pytest.raises(LogError):
+        only(tmp_path / "m.parquet", arm, position_unit="rad")
 
 
 def test_lists_in_parquet_cells_are_arrays(tmp_path, arm):

@@ -55,6 +55,13 @@ def test_a_second_line_of_units_is_no_row(tmp_path, arm):
     assert np.array_equal(qpos_of(tmp_path, arm), columns["qpos.elbow"])
 
 
+def test_numbers_of_columns_above_an_array_are_no_row():
+    rows = "0.0,0.1,0.2\n0.02,0.1,0.2\n"
+    assert heading(rows).first == 0
+    assert heading(f"0,1,2\n{rows}").first == 1
+    assert heading("0,1,2\n1,1,2\n").first == 0
+
+
 @pytest.mark.parametrize("cell", ['"1,234.5"', '"1.234,5"'])
 def test_separators_between_thousands_are_named(tmp_path, arm, cell):
     columns = arm_columns(ROWS)

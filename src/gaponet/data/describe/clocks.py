@@ -122,7 +122,7 @@ def _are_parts_of_a_stamp(load: Load, parts: tuple[str, str]) -> bool:
 
 
 def _load_stamps(load: Load, pairs: dict[str, tuple[str, str]], names: list[str]) -> dict[str, Any]:
-    """Load signals, and stamps of pairs as seconds after the first one."""
+    """Load signals, and stamps of pairs as seconds."""
     wanted = [name for name in names if name not in pairs]
     for name in names:
         wanted += pairs.get(name, ())
@@ -130,7 +130,7 @@ def _load_stamps(load: Load, pairs: dict[str, tuple[str, str]], names: list[str]
     for name in names:
         if name in pairs:
             whole, beyond = (loaded[part] for part in pairs[name])
-            seconds = whole.values - whole.values[0] + 1e-9 * beyond.values
+            seconds = whole.values + 1e-9 * beyond.values
             loaded[name] = whole._replace(values=seconds, in_seconds=True)
     return {name: loaded[name] for name in names}
 

@@ -29,13 +29,15 @@ def is_date(cell: str) -> bool:
 
 
 def to_seconds(cells: Sequence[str | None], where: str) -> Array:
-    """Return dates as seconds after the first one, (k,); NaN for an empty cell.
+    """Return dates as seconds since 1970 in UTC, (k,); NaN for an empty cell.
+
+    The seconds of two columns are comparable. Without a zone a date is in UTC; times of day are of
+    one day, and after midnight of the next.
 
     Raises:
         LogError: A cell is no date.
     """
     day_first = _day_comes_first(cells)
-    first: datetime | None = None
     seconds = np.full(len(cells), np.nan)
     days = np.zeros(len(cells))
     for i, cell in enumerate(cells):
@@ -49,8 +51,7 @@ def to_seconds(cells: Sequence[str | None], where: str) -> Array:
                 f"{where}: the clock's cell '{text[:40]}' in row {i + 1} is no date and time as "
                 "2026-03-01T12:00:00.125"
             ) from None
-        first = first or at
-        seconds[i] = (at - first).total_seconds()
+        seconds[i] = at.timestamp()
     if TIME_OF_DAY.fullmatch(_without_quotes(cells[0])):
         midnight = np.diff(seconds, prepend=seconds[0]) < -DAY_S / 2
         days = np.cumsum(midnight)

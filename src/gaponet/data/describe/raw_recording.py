@@ -30,7 +30,7 @@ from gaponet.data.describe.encoders import Encoder, read_encoders
 from gaponet.data.describe.joints import ignored, resolve_all
 from gaponet.data.describe.logs_file import HINT, LogsFile
 from gaponet.data.describe.plausibility import not_in_radians, to_radians
-from gaponet.data.describe.repeats import without_equal_rows
+from gaponet.data.describe.repeats import repeats_row_before
 from gaponet.data.describe.slow_channels import sampled_channels
 from gaponet.data.log import CHANNELS, COMMANDS, DERIVED, FEEDFORWARD, REQUIRED, Channel, Log
 from gaponet.robot.log_joints import LOG_UNITS
@@ -205,10 +205,13 @@ class RawRecording:
         for channel, columns in chosen.items():
             time = _time(self, specified, loaded, clocks[channel], channel, columns)
             channels[channel] = Channel(time, in_si.values(channel, columns, loaded))
-        channels, repeated = _without_equal_rows(channels)
-        channels, empty = sampled_channels(channels, joints, self.place)
+        kept = {name: ~repeats_row_before(channel) for name, channel in channels.items()}
+        repeated = _note_of_repeated(kept)
+        channels = _rows_of(channels, kept)
+        channels, sampled, empty = sampled_channels(channels, joints, self.place)
         channels = _from_zero(channels)
         meta = self._meta(channels, specified)
+        meta["rows"] = {name: np.flatnonzero(kept[name])[rows] for name, rows in sampled.items()}
         meta["notes"] = meta.get("notes", {}) | empty | repeated
         for name, columns in gains.items():
             meta[name] = [_constant(self, name, columns[joint].of(loaded)) for joint in joints]
@@ -251,9 +254,9 @@ def rows_first(arrays: dict[str, Any]) -> tuple[dict[str, Any], list[str]]:
     """Return arrays with a row per sample, and the names of those that had a column per sample, as
     MATLAB writes them.
 
-    The longest array of one axis, such as the clock, tells the number of samples. Without one,
-    arrays that are all far wider than high are taken as transposed. A clock (1, k) or (k, 1)
-    becomes (k,).
+    The longest array of one axis, such as the clock, tells the number of samples. A list of gains is
+    shorter than the tables are high, and turns none. Without an array of one axis, tables that are
+    all far wider than high are taken as transposed. A clock (1, k) or (k, 1) becomes (k,).
     """
     tables = {}
     for name, array in arrays.items():
@@ -267,7 +270,7 @@ def rows_first(arrays: dict[str, Any]) -> tuple[dict[str, Any], list[str]]:
     turned = []
     for name, table in tables.items():
         rows, columns = table.shape
-        if name not in clocks and columns == samples and rows != samples:
+        if name not in clocks and columns == samples and rows < samples:
             turned.append(name)
     return arrays | {name: tables[name].T for name in turned}, turned
 
@@ -445,16 +448,21 @@ def _require_one_length(
     )
 
 
-def _without_equal_rows(
-    channels: dict[str, Channel],
-) -> tuple[dict[str, Channel], dict[str, Any]]:
-    """Return channels without rows that were written twice at one instant, and a note of them."""
-    kept = {}
-    most = 0
+def _rows_of(channels: dict[str, Channel], kept: dict[str, Array]) -> dict[str, Channel]:
+    """Return channels with the kept rows; channels of one clock that lose none still share it."""
+    left = {}
     for name, channel in channels.items():
-        kept[name], dropped = without_equal_rows(channel)
-        most = max(most, dropped)
-    return kept, {"repeated": {"rows": most}} if most else {}
+        keep = kept[name]
+        left[name] = channel
+        if not keep.all():
+            left[name] = Channel(channel.time[keep], channel.values[keep])
+    return left
+
+
+def _note_of_repeated(kept: dict[str, Array]) -> dict[str, Any]:
+    """Return a note of the rows that were written twice at one instant; empty if none was."""
+    most = max(int((~keep).sum()) for keep in kept.values())
+    return {"repeated": {"rows": most}} if most else {}
 
 
 def _encoders(
@@ -479,7 +487,9 @@ def _is_in_seconds(clocks: dict[str, str | None], loaded: dict[str, Signal]) -> 
 
 def _from_zero(channels: dict[str, Channel]) -> dict[str, Channel]:
     """Return channels whose time starts at 0: nanoseconds since 1970 would lose their digits."""
-    starts = [float(channel.time[0]) for channel in channels.values() if len(channel.time)]
+    starts = []
+    for channel in channels.values():
+        starts += channel.time[np.isfinite(channel.time)][:1].tolist()
     start = min(starts, default=0.0)
     shifted: dict[int, Array] = {}  # a clock that channels share stays shared
     from_zero = {}

@@ -31,18 +31,13 @@ def without_repeated_rows(log: Log) -> Log:
     return replace(log, channels=channels, meta=log.meta | {"notes": notes})
 
 
-def without_equal_rows(channel: Channel) -> tuple[Channel, int]:
-    """Return a channel without rows that repeat the one before at the same instant, and how many
-    these were.
-    """
+def repeats_row_before(channel: Channel) -> Array:
+    """Return which rows repeat the one before at the same instant, (k,) bool."""
     again = np.diff(channel.time) == 0
     same = channel.values[1:] == channel.values[:-1]
     both_empty = np.isnan(channel.values[1:]) & np.isnan(channel.values[:-1])
     again &= (same | both_empty).all(axis=1)
-    if not again.any():
-        return channel, 0
-    keep = np.concatenate([[True], ~again])
-    return Channel(channel.time[keep], channel.values[keep]), int(again.sum())
+    return np.concatenate([np.zeros(min(len(channel.time), 1), bool), again])
 
 
 def _repeated(time: Array, values: Array) -> Array:

@@ -17,8 +17,9 @@ MIN_EMPTY_SHARE = 0.2  # of the rows; fewer empty cells are bad rows
 
 def sampled_channels(
     channels: dict[str, Channel], joints: tuple[str, ...], where: str
-) -> tuple[dict[str, Channel], dict[str, Any]]:
-    """Return channels with the rows in which they were sampled, and notes of what was empty.
+) -> tuple[dict[str, Channel], dict[str, Array], dict[str, Any]]:
+    """Return channels with the rows in which they were sampled, the numbers of these rows, and
+    notes of what was empty.
 
     Empty cells are NaN. A command that stands in every fifth row is held until the next one.
     Torque, velocity or temperature that is empty in all rows is left out.
@@ -27,6 +28,7 @@ def sampled_channels(
         LogError: Command or position of a joint is empty in all rows.
     """
     sampled: dict[str, Channel] = {}
+    numbers: dict[str, Array] = {}
     slower: dict[str, Any] = {}
     absent: dict[str, Any] = {}
     for name, channel in channels.items():
@@ -44,29 +46,31 @@ def sampled_channels(
         if empty:
             absent[name] = empty
             continue
-        sampled[name] = _sampled(name, channel, present)
+        sampled[name], numbers[name] = _sampled(name, channel, present)
         if len(sampled[name].time) < len(channel.time):
             slower[name] = {"rows": len(sampled[name].time), "of": len(channel.time)}
     notes = {"slower": slower, "absent": absent}
-    return sampled, {key: value for key, value in notes.items() if value}
+    return sampled, numbers, {key: value for key, value in notes.items() if value}
 
 
-def _sampled(name: str, channel: Channel, present: Array) -> Channel:
-    """Return the rows with samples. present: where a cell holds one, (k, n) bool."""
+def _sampled(name: str, channel: Channel, present: Array) -> tuple[Channel, Array]:
+    """Return the rows with samples, and their numbers. present: where a cell holds one, (k, n)
+    bool.
+    """
     if (~present).mean() < MIN_EMPTY_SHARE:
-        return channel
+        return channel, np.arange(len(channel.time))
     some = present.any(axis=1)
     time = channel.time[some]
     values = channel.values[some]
     partly = some & ~present.all(axis=1)
     if partly.mean() < MIN_EMPTY_SHARE:
-        return Channel(time, values)
+        return Channel(time, values), np.flatnonzero(some)
     columns = []
     for column, is_present in zip(values.T, present[some].T, strict=True):
         columns.append(_between_samples(name, time, column, is_present))
     joined = np.stack(columns, axis=1)
     known = np.isfinite(joined).all(axis=1)
-    return Channel(time[known], joined[known])
+    return Channel(time[known], joined[known]), np.flatnonzero(some)[known]
 
 
 def _between_samples(name: str, time: Array, values: Array, present: Array) -> Array:

@@ -56,6 +56,7 @@ from gaponet.data.describe.repeats import without_repeated_rows
 from gaponet.data.describe.turns import continued_turns, within_range
 from gaponet.data.describe.unread import what_address, why_unread
 from gaponet.data.log import COMMANDS, Channel, Log, skipped_rows
+from gaponet.data.sequence import recorded_gains
 from gaponet.robot.spec import RobotSpec
 
 FORMATS = {
@@ -556,7 +557,7 @@ def _gains(
     Args:
         name: kp or kd.
         stated: One number for all joints, or {joint: number}; "" stands for all others, which
-            else have the robot's own.
+            else have what the recording itself says, or the robot's own.
     """
     if not isinstance(stated, dict):
         return [stated] * len(log.joint_names)
@@ -564,9 +565,9 @@ def _gains(
     for joint, gain in stated.items():
         if joint:
             by_joint[robot.resolve(joint, f"{name} of logs.toml", joint_map)] = gain
-    own = robot.before_identification.servo[name][robot.index(log.joint_names)]
+    own = recorded_gains(name, log, robot)
     gains: list[float] = []
-    for joint, of_robot in zip(log.joint_names, own, strict=True):
-        of_others = stated[""] if "" in stated else float(of_robot)
+    for joint in log.joint_names:
+        of_others = stated[""] if "" in stated else own[robot.joint_names.index(joint)]
         gains.append(by_joint.get(joint, of_others))
     return gains

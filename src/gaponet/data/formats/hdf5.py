@@ -68,7 +68,7 @@ def _recording(file: Path, demo: str, arrays: dict[str, tuple[str, ...]]) -> Raw
     """
     signals = {}
     for path, labels in arrays.items():
-        if path.startswith(demo):
+        if not demo or path.startswith(f"{demo}/"):
             signals[path.removeprefix(demo).lstrip("/")] = labels
     default = LogsFile()
     if not demo and {"action", "observations/qpos"} <= signals.keys():

@@ -107,7 +107,7 @@ def recordings(path: Path, specified: LogsFile) -> Iterator[RawRecording]:
                 signals[f"{topic}.{field}"] = labels
         meta: dict[str, Any] = {}
         yield RawRecording(
-            bag.stem,
+            bag.name if bag.is_dir() else bag.stem,
             str(bag),
             signals,
             partial(_load, bag, meta),

@@ -406,8 +406,9 @@ def _cells(file: Path, name: str, column: pa.ChunkedArray, width: int | None) ->
 
     if pa.types.is_timestamp(column.type):
         at_ns = column.cast(pa.timestamp("ns")).cast(pa.int64()).to_numpy()
-        return Signal(1e-9 * (at_ns - at_ns[0]), in_seconds=True)
-    if pa.types.is_string(column.type) and is_date(column[0].as_py() or ""):
+        return Signal(1e-9 * at_ns, in_seconds=True)
+    first = column[0].as_py() if len(column) else None
+    if pa.types.is_string(column.type) and is_date(first or ""):
         return _signal(file, column, dates=True)
     if width is not None:
         return Signal(_matrix(file, name, column, width))

@@ -131,6 +131,9 @@ def heading(text: str) -> Heading:
         delimiter = delimiter_of(header)
     names = cells_of(header)
     if is_numeric(names):
+        below = _row(lines, start + 1)
+        if _are_numbers_of_columns(names, below):
+            return Heading([], start + 1, below, delimiter, [])
         return Heading([], start, names, delimiter, [])
     units = _units_below(lines, start, len(names))
     first = start + (2 if units else 1)
@@ -139,6 +142,13 @@ def heading(text: str) -> Heading:
         names = [*names, ""]  # each row ends with a separator
     names = [name.strip() for name in names]
     return Heading(names, first, row, delimiter, units)
+
+
+def _are_numbers_of_columns(names: list[str], below: list[str]) -> bool:
+    """Return True for 0, 1, 2, … above cells with decimals, as pandas writes an array."""
+    counted = [str(number) for number in range(len(names))]
+    has_decimals = any("." in cell for cell in below)
+    return len(names) > 1 and [name.strip() for name in names] == counted and has_decimals
 
 
 def _units_below(lines: list[str], header: int, columns: int) -> list[str]:

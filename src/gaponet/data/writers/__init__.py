@@ -23,6 +23,8 @@ def export(dataset: Dataset, out: str | Path, progress: Progress = no_progress) 
     """
     out = Path(out)
     dataset.require_sequences()
+    if out.name in ("", ".."):
+        raise DatasetError(f"{out}: name a new folder")
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise DatasetError(f"{out}: exists and is not an empty folder; choose a new one")
     done = 0

@@ -96,21 +96,34 @@ def write(dataset: Dataset, folder: Path, tell: Tell) -> list[Written]:
     for entry in dataset.entries:
         groups.setdefault((entry.dt, entry.channels), []).append(entry)
     written = []
-    for group, entries in groups.items():
-        name = _folder(*group, list(groups)) if len(groups) > 1 else ""
+    for group, name in _folders(list(groups)).items():
+        entries = groups[group]
         part = _Set(dataset, folder / name, *group, entries)
         part.write(tell)
         written.append(Written(Path(name), len(entries), part.frames, _fps(part.dt)))
     return written
 
 
-def _folder(dt: float, channels: tuple[str, ...], groups: list[Group]) -> str:
-    """Return a name such as 50hz; with the channels behind it where they are what differs."""
-    rate = f"{_fps(dt):.6g}hz"
-    same_rate = [group for group in groups if group[0] == dt]
-    if len(same_rate) > 1:
-        return "-".join([rate, *channels])
-    return rate
+def _folders(groups: list[Group]) -> dict[Group, str]:
+    """Return a name of its own for each group: "" for a single one, else such as 50hz; with the
+    channels behind it where they are what differs, and a number where rates differ by less than
+    six digits show.
+    """
+    if len(groups) == 1:
+        return {groups[0]: ""}
+    folders: dict[Group, str] = {}
+    for dt, channels in groups:
+        name = f"{_fps(dt):.6g}hz"
+        if sum(group[0] == dt for group in groups) > 1:
+            name = "-".join([name, *channels])
+        others = set(folders.values())
+        number = 2
+        unique = name
+        while unique in others:
+            unique = f"{name}-{number}"
+            number += 1
+        folders[dt, channels] = unique
+    return folders
 
 
 def _fps(dt: float) -> float:
