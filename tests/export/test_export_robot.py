@@ -25,7 +25,14 @@ from gaponet.export.plain_servos import (
     own_motions,
     rollout_error,
 )
-from gaponet.export.shipped.mujoco_servos import Check, delay_weights, play
+from gaponet.export.shipped.mujoco_servos import (
+    Check,
+    Servos,
+    addresses,
+    delay_weights,
+    play,
+    read,
+)
 from gaponet.export.simulator_facts import simulator_facts
 from gaponet.robot.folder import save_robot
 from gaponet.robot.servo_fields import SERVO_FIELDS, SERVO_TERMS
@@ -272,6 +279,32 @@ def test_two_robots_in_one_scene_are_told_apart_by_what_stands_before_their_name
     assert model.actuator_gainprm[:, 0].tolist() == [16.0, 24.0, 16.0, 24.0]
     with pytest.raises(RobotError, match="--prefix"):
         export_robot(robot, "mjcf", tmp_path / "none", source=Source(scene))
+
+    facts = read(tmp_path / "two" / "facts.json")
+    stiff = model.dof_invweight0 * facts["dof_invweight0_factor"]
+    Servos(model, facts, "left_")
+    Servos(model, facts, "right_")
+    np.testing.assert_allclose(model.dof_invweight0 / stiff, 1.0, rtol=0.5)
+    weaker = facts | {
+        "joints": {name: servo | {"effort_limit": 1.5} for name, servo in facts["joints"].items()}
+    }
+    Servos(model, weaker, "right_")
+    np.testing.assert_array_equal(model.actuator_forcerange[2:], [[-1.5, 1.5]] * 2)
+
+
+def test_an_actuator_of_a_tendon_with_a_joints_number_is_no_servo(robot, tmp_path):
+    spec = mujoco.MjSpec.from_file(str(export_robot(robot, "mjcf", tmp_path / "out").file))
+    for actuator in list(spec.actuators):
+        spec.delete(actuator)
+    spec.add_tendon(name="both").wrap_joint("elbow", 1.0)
+    for trntype, target in (
+        (mujoco.mjtTrn.mjTRN_TENDON, "both"),
+        (mujoco.mjtTrn.mjTRN_JOINT, "shoulder"),
+        (mujoco.mjtTrn.mjTRN_JOINT, "elbow"),
+    ):
+        spec.add_actuator(name=target, target=target, trntype=trntype).set_to_position(kp=1.0)
+    at = addresses(spec.compile(), ["shoulder", "elbow"])
+    assert at.servo.tolist() == [1, 2]
 
 
 def test_a_file_in_one_line_takes_a_payload_right_before_a_joint(robot, tmp_path):

@@ -18,8 +18,10 @@ from arm import XML, write_arm
 from gaponet.base.errors import NoGainError, RobotError
 from gaponet.cli.main import main
 from gaponet.export import drawn_robots
+from gaponet.export.export_folder import export_robot
 from gaponet.export.plain_servos import own_motions, rollout_error
 from gaponet.export.randomization import NO_PLAIN_UNITS, judge_units, sample_units
+from gaponet.export.shipped import mujoco_randomization
 from gaponet.robot.folder import save_robot
 from gaponet.robot.spec import load_robot
 from gaponet.sim.links import COORDINATES, LinkAxes
@@ -234,6 +236,18 @@ def test_a_model_takes_a_unit_without_gaponet(arm, tmp_path, capsys):
         [sys.executable, "-c", code, tmp_path / "out", tmp_path / "robot.xml"], check=True
     )
     assert mujoco.MjModel.from_xml_path(str(tmp_path / "robot.xml")).nu == 1
+
+
+@pytest.mark.skipif(not hasattr(mujoco.MjsActuator, "set_to_pid"), reason="needs MuJoCo 4")
+def test_a_servo_that_limits_the_speed_of_targets_takes_a_unit(tmp_path):
+    slow = write_arm(tmp_path / "arm").with_servo(target_speed=np.array([1.0, 1.0]))
+    exported = export_robot(slow, "mjcf", tmp_path / "out")
+    model = mujoco.MjModel.from_xml_path(str(exported.file))
+    gains = model.actuator_gainprm.copy()
+    own = {field: [[value, value]] for field, value in SERVO_FIELDS.items()}
+    drawn = {"joints": list(slow.joint_names), "units": own | {"effort_limit": [[5.0, 5.0]]}}
+    mujoco_randomization.apply(model, drawn, 0)
+    np.testing.assert_array_equal(model.actuator_gainprm, gains)
 
 
 @pytest.mark.parametrize("engine", ["mjlab", "isaaclab"])

@@ -69,12 +69,13 @@ def test_a_delayed_servo_moves_as_one_without_delay_under_earlier_commands(tmp_p
     np.testing.assert_allclose(sims[0].qpos, sims[1].qpos, atol=2e-3)
 
 
-def test_delayed_servos_at_two_rates_step_together_as_each_does_alone(tmp_path):
+@pytest.mark.parametrize("period", [0.02006, 0.0025, 0.001])
+def test_delayed_servos_at_several_rates_step_together_as_each_does_alone(tmp_path, period):
     late = write_arm(tmp_path).with_servo(delay=[0.05, 0.013])
-    conditions = [(0.0, "both", 0.02), (0.2, "both", 0.01), (0.0, "both", 0.02006)]
+    conditions = [(0.0, "both", 0.02), (0.2, "both", 0.01), (0.0, "both", period)]
     rng = np.random.default_rng(2)
-    past = rng.uniform(-1, 1, (3, 6, 2))
-    targets = rng.uniform(-1, 1, (20, 3, 2))
+    past = rng.uniform(-1, 1, (3, 60, 2))
+    targets = rng.uniform(-1, 1, (80, 3, 2))
     together = BatchSim(late, conditions)
     alone = [BatchSim(late, [c]) for c in conditions]
     together.reset(slice(None), np.zeros((3, 2)), np.zeros((3, 2)), past=past)

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import mujoco
 import numpy as np
 import torch
+from arm import write_arm
 
 from gaponet.nn.artifact import KnownSimulators
 from gaponet.nn.config import ModelConfig
@@ -14,7 +16,7 @@ from gaponet.robot.simulator_change import SimulatorChange, SimulatorRanges
 from gaponet.robot.spec import load_robot
 from gaponet.sim.batch import Condition
 from gaponet.sim.context import contexts, scene_context
-from gaponet.sim.model import build_model
+from gaponet.sim.model import build_model, build_spec, compile_spec
 
 ROBOT = load_robot("so101")
 EMPTY = Condition(0.0, "both", ROBOT.dt)
@@ -67,6 +69,21 @@ def test_a_scene_answers_as_the_simulator_that_it_was_built_from() -> None:
     in_scene = scene_context(scene, ROBOT, ROBOT.dt)
 
     assert np.abs(in_scene - contexts(ROBOT, [EMPTY])[0]).max() < 1e-6
+
+
+def test_a_scenes_actuators_of_tendons_are_not_taken_for_servos(tmp_path) -> None:
+    robot = write_arm(tmp_path / "arm")
+    spec = build_spec(robot)
+    tendon = spec.add_tendon(name="both")
+    tendon.wrap_joint("elbow", 1.0)
+    for i in range(2):
+        pull = spec.add_actuator(name=f"pull{i}", target="both")
+        pull.trntype = mujoco.mjtTrn.mjTRN_TENDON
+        pull.set_to_position(kp=0.0)
+
+    in_scene = scene_context(compile_spec(spec, robot.mjcf), robot, robot.dt)
+
+    assert np.abs(in_scene - scene_context(build_model(robot), robot, robot.dt)).max() < 1e-4
 
 
 def test_a_scene_with_late_servos_answers_as_the_simulator_that_it_was_built_from() -> None:

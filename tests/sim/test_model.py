@@ -163,6 +163,40 @@ def test_actuators_of_the_mjcf_are_replaced(tmp_path):
     assert [model.actuator(i).name for i in range(model.nu)] == ["shoulder", "elbow"]
 
 
+def test_a_payload_that_the_compiler_would_not_weigh_is_refused(tmp_path):
+    xml = XML.replace("<compiler ", '<compiler settotalmass="2.5" ')
+    robot = write_arm(tmp_path / "arm", xml=xml)
+    with pytest.raises(RobotError, match="settotalmass"):
+        build_model(robot, 0.2)
+
+
+def test_a_joint_is_locked_with_what_refers_to_it(tmp_path):
+    more = """
+      <equality><joint joint1="elbow" joint2="shoulder"/></equality>
+      <tendon><fixed name="both"><joint joint="elbow" coef="1"/></fixed></tendon>
+      <sensor><jointpos joint="elbow"/><tendonpos tendon="both"/></sensor>
+      <keyframe><key name="home" qpos="0 0.1"/></keyframe></mujoco>"""
+    robot = write_arm(tmp_path / "arm", xml=XML.replace("</mujoco>", more))
+    assert build_model(robot, locked=("elbow",)).nq == 1
+    assert build_model(robot).neq == 1
+
+
+@pytest.mark.parametrize("turned", ['euler="0.3 0.2 0.1"', 'axisangle="0 0.6 0.8 0.4"'])
+def test_a_joint_is_locked_in_a_body_that_is_turned_in_any_form(tmp_path, turned):
+    home = TOML.replace('name = "elbow"', 'name = "elbow"\nhome = 0.7')
+    xml = XML.replace('<body name="fore"', f'<body name="fore" {turned}')
+    models = []
+    for name, text in (("turned", xml), ("quaternion", None)):
+        if text is None:
+            (w, x, y, z) = models[0].body("fore").quat
+            text = XML.replace('<body name="fore"', f'<body name="fore" quat="{w} {x} {y} {z}"')
+        robot = write_arm(tmp_path / name, home, text)
+        models += [build_model(robot), build_model(robot, locked=("elbow",))]
+    assert np.ptp(models[1].body("fore").quat - models[0].body("fore").quat) > 0.1
+    np.testing.assert_allclose(models[1].body("fore").quat, models[3].body("fore").quat, atol=1e-9)
+    np.testing.assert_allclose(models[1].body("fore").pos, models[3].body("fore").pos, atol=1e-9)
+
+
 def vendor_hash(folder, **change):
     return model_hash(write_files_arm(folder, **change))
 

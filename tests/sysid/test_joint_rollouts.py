@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from arm import TOML, commands, recordings, write_arm
+from arm import TOML, XML, commands, recordings, write_arm
 
 from gaponet.data.sequence import Sequence, SequenceMeta
 from gaponet.evaluation.verdict import verdict
@@ -59,6 +59,35 @@ def test_a_single_joint_rollout_is_the_robots_rollout(tmp_path, changed):
     assert np.abs(company).mean() > 0.005  # it is not the robot that was recorded
     assert np.abs(alone - company).mean() < 0.1 * np.abs(company).mean()
     assert set(changed) <= {*FIRST, *SERVO_TERMS, "effort_limit"}
+
+
+@pytest.mark.parametrize(
+    ("part", "new"),
+    [
+        ('range="-1.5 1.5"/>', 'range="-1.5 1.5" stiffness="3" springref="0.3"/>'),
+        ('<body name="fore"', '<body name="fore" gravcomp="1"'),
+    ],
+    ids=["springs", "compensated gravity"],
+)
+def test_springs_and_compensated_gravity_act_on_a_joint_alone(tmp_path, part, new):
+    xml = XML.replace(part, new)
+    assert xml != XML
+    robot = write_arm(tmp_path / "arm", xml=xml)
+    real = recordings(robot, 2, rows=200)
+    errors = JointRollouts(real, robot).errors(same(FIRST | {"kp": 20.0}))
+    assert np.abs(errors).mean() < 1e-3
+
+
+def test_damping_taken_from_kd_is_a_share_of_it_at_all_gains(tmp_path):
+    robot = write_arm(tmp_path, TOML.replace("kp = 20.0", "kp = 20.0\nkd = 2.0"))
+    less = dict.fromkeys(robot.joint_names, FIRST | {"damping": -0.5})
+    told = []
+    for kd in (2.0, 1.0):
+        acting = robot.with_identified(less).with_gains(None, (kd, kd))
+        made = recordings(acting, 1, rows=200)[0]
+        told.append(replace(made, meta=replace(made.meta, kp=(20.0, 20.0), kd=(kd, kd))))
+    errors = JointRollouts(told, robot).errors(same(FIRST | {"damping": -0.5}))
+    assert np.abs(errors).mean() < 1e-3
 
 
 def test_numba_compiles_once_for_all_numbers_of_windows_joints_and_candidates(tmp_path):

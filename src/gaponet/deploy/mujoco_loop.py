@@ -17,6 +17,7 @@ from gaponet.sim.batch import Batch, BatchSim, Condition
 from gaponet.sim.commands import ControlPeriods
 from gaponet.sim.context import scene_context
 from gaponet.sim.inverse import AnalyticInverse
+from gaponet.sim.model import driven_joints
 
 
 class MujocoAligner:
@@ -150,7 +151,7 @@ def _may_agree(model: Reference, dt: float) -> bool:
 
 def _undriven(scene: mujoco.MjModel, robot: RobotSpec, prefix: str) -> tuple[str, ...]:
     """Return the robot's joints without an actuator in the scene."""
-    driven = {scene.joint(j).name for j in scene.actuator_trnid[:, 0]}
+    driven = {scene.joint(j).name for j in driven_joints(scene) if j >= 0}
     return tuple(name for name in robot.joint_names if prefix + name not in driven)
 
 
@@ -185,7 +186,7 @@ def _addresses(scene: mujoco.MjModel, joints: list[str]) -> tuple[Array, Array, 
 
 
 def _actuator(scene: mujoco.MjModel, joint: str) -> int:
-    actuators = np.flatnonzero(scene.actuator_trnid[:, 0] == scene.joint(joint).id)
+    actuators = np.flatnonzero(driven_joints(scene) == scene.joint(joint).id)
     if len(actuators) != 1:
         raise ModelError(
             f"joint '{joint}' has {len(actuators)} actuators in the scene; the model needs one, "

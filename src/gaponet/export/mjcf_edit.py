@@ -34,6 +34,7 @@ from gaponet.sim.model import (
     TABLE,
     TOLERANCE,
     build_model,
+    driven_joints,
 )
 
 MUJOCO_HAS_RAMPS = hasattr(mujoco.MjsActuator, "set_to_pid")  # from MuJoCo 4 on
@@ -378,7 +379,7 @@ def _servo_attributes(tag: Tag, model: mujoco.MjModel, joint: str) -> dict[str, 
 
 
 def _actuator(model: mujoco.MjModel, joint: str) -> int:
-    return int(np.flatnonzero(model.actuator_trnid[:, 0] == model.joint(joint).id)[0])
+    return int(np.flatnonzero(driven_joints(model) == model.joint(joint).id)[0])
 
 
 def _radians_per_unit(model: mujoco.MjModel, joint: str) -> float:

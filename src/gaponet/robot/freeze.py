@@ -18,7 +18,7 @@ def units_per_si(spec: mujoco.MjSpec, joint: mujoco.MjsJoint) -> float:
 
 
 def freeze(spec: mujoco.MjSpec, joint: mujoco.MjsJoint, value: float) -> None:
-    """Fix a hinge or slide joint at a value, rad or m; the body's orientation must be a quaternion.
+    """Fix a hinge or slide joint at a value, rad or m.
 
     Raises:
         RobotError: Another joint of its body comes before it, and the value is not its reference.
@@ -30,6 +30,12 @@ def freeze(spec: mujoco.MjSpec, joint: mujoco.MjsJoint, value: float) -> None:
             f"joint '{joint.name}' turns after '{body.joints[0].name}' in one body: keep or clamp "
             "both"
         )
+    if body.alt.type != mujoco.mjtOrientation.mjORIENTATION_QUAT:  # euler, axisangle, …
+        compiler = spec.compiler
+        body.quat = spec.resolve_orientation(
+            degree=compiler.degree, sequence=compiler.eulerseq, orientation=body.alt
+        )
+        body.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
     axis = np.array(joint.axis) / np.linalg.norm(joint.axis)
     turn = np.array([1.0, 0.0, 0.0, 0.0])  # of the body, in its own frame
     shift = axis * move  # of the body's origin, in its own frame, m
@@ -46,3 +52,31 @@ def freeze(spec: mujoco.MjSpec, joint: mujoco.MjsJoint, value: float) -> None:
     body.pos = np.array(body.pos) + offset
     body.quat = quat
     spec.delete(joint)
+
+
+def delete_references(spec: mujoco.MjSpec, removed: set[str]) -> None:
+    """Delete actuators, sensors and keyframes, and what refers to joints that will be removed."""
+    tendons = _tendons_of(spec, removed)
+    for kind in (spec.actuators, spec.sensors, spec.keys):
+        for element in list(kind):
+            spec.delete(element)
+    for equality in list(spec.equalities):
+        if {equality.name1, equality.name2} & (removed | tendons):
+            spec.delete(equality)
+    for tendon in list(spec.tendons):
+        if tendon.name in tendons:
+            spec.delete(tendon)
+
+
+def _tendons_of(spec: mujoco.MjSpec, joints: set[str]) -> set[str]:
+    """Return the names of the tendons that run along joints."""
+    if not joints or not len(spec.tendons):
+        return set()
+    model = spec.copy().compile()
+    tendons = set()
+    for t in range(model.ntendon):
+        part = slice(model.tendon_adr[t], model.tendon_adr[t] + model.tendon_num[t])
+        on_joint = model.wrap_type[part] == mujoco.mjtWrap.mjWRAP_JOINT
+        if {model.joint(j).name for j in model.wrap_objid[part][on_joint]} & joints:
+            tendons.add(model.tendon(t).name)
+    return tendons

@@ -19,7 +19,7 @@ import numpy as np
 from gaponet.base.errors import RobotError, UsageError
 from gaponet.base.files import whole_folder, write_text
 from gaponet.robot.drives import ON_JOINT, Drive, drives
-from gaponet.robot.freeze import freeze
+from gaponet.robot.freeze import delete_references, freeze
 from gaponet.robot.log_joints import Follower
 from gaponet.robot.mjcf import compile_spec
 from gaponet.robot.self_contained import self_contained_text
@@ -307,7 +307,7 @@ def _robot_xml(
 ) -> str:
     """Return robot.xml: one file without fixed joints and the elements that refer to them."""
     values = dict(zip(_joint_names(model), pose[model.jnt_qposadr], strict=True))
-    _delete_references(spec, model, removed=set(values) - set(logged))
+    delete_references(spec, set(values) - set(logged))
     for joint in list(spec.joints):
         if joint.type in (mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL):
             spec.delete(joint)
@@ -324,29 +324,6 @@ def _robot_xml(
     if not contacts:
         _disable_contacts(plain)
     return self_contained_text(plain, path)
-
-
-def _delete_references(spec: mujoco.MjSpec, model: mujoco.MjModel, removed: set[str]) -> None:
-    """Delete actuators, sensors and keyframes, and what refers to removed joints."""
-    tendons = set()
-    for t in range(model.ntendon):
-        if _wraps(model, t) & removed:
-            tendons.add(model.tendon(t).name)
-    for kind in (spec.actuators, spec.sensors, spec.keys):
-        for element in list(kind):
-            spec.delete(element)
-    for equality in list(spec.equalities):
-        if {equality.name1, equality.name2} & (removed | tendons):
-            spec.delete(equality)
-    for tendon in list(spec.tendons):
-        if tendon.name in tendons:
-            spec.delete(tendon)
-
-
-def _wraps(model: mujoco.MjModel, tendon: int) -> set[str]:
-    part = slice(model.tendon_adr[tendon], model.tendon_adr[tendon] + model.tendon_num[tendon])
-    on_joint = model.wrap_type[part] == mujoco.mjtWrap.mjWRAP_JOINT
-    return {model.joint(j).name for j in model.wrap_objid[part][on_joint]}
 
 
 def _disable_contacts(spec: mujoco.MjSpec) -> None:

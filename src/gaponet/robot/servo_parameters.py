@@ -26,6 +26,13 @@ def _from_mjcf() -> Array:
     return np.array(np.nan)
 
 
+def ratio_to(values: Array, base: Array) -> Array:
+    """Return values over base, 1 where base is 0; shapes broadcast."""
+    values, base = np.broadcast_arrays(values, base)
+    ratio: Array = np.divide(values, base, out=np.ones(base.shape), where=base > 0)
+    return ratio
+
+
 @dataclass(frozen=True)
 class ServoParameters:
     """Parameters of the servos of n joints, in the order of RobotSpec.joint_names.
@@ -160,11 +167,9 @@ class ServoParameters:
 
         The gains keep their ratio to those of `nominal`.
         """
-        kp_ratio = np.divide(kp, nominal.kp, out=np.ones_like(nominal.kp), where=nominal.kp > 0)
-        kd_ratio = np.divide(
-            self.kd, nominal.kd, out=np.ones_like(nominal.kd), where=nominal.kd > 0
+        return replace(
+            self, kp=self.kp * ratio_to(kp, nominal.kp), kd=kd * ratio_to(self.kd, nominal.kd)
         )
-        return replace(self, kp=self.kp * kp_ratio, kd=kd * kd_ratio)
 
     def with_gain_scale(self, scale: float, joints: Array) -> ServoParameters:
         """Return the servos whose kp and kd at `joints` (indices) are `scale` times those of

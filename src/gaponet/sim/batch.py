@@ -16,6 +16,7 @@ from gaponet.base.arrays import Array
 from gaponet.base.errors import UsageError
 from gaponet.data.sequence import Sequence
 from gaponet.robot.servo_fields import SERVO_TERMS, STOP_FIELDS
+from gaponet.robot.servo_parameters import ratio_to
 from gaponet.robot.simulator_change import SimulatorChange
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.changed_model import changed_model
@@ -260,7 +261,8 @@ class BatchSim:
             joints: k names.
             values: kp at the robot's own gains, damping, frictionloss, armature, offset, and any of
                 kd, effort_limit, zero, target_speed, delay (up to the robot's) and SERVO_TERMS,
-                each (num_envs, k). A damping below zero is taken from the servo's own kd.
+                each (num_envs, k). A damping below zero is taken from the servo's own kd, in the
+                same ratio at other gains.
 
         Raises:
             UsageError: A value that these simulations cannot take, such as a delay where the robot
@@ -279,7 +281,8 @@ class BatchSim:
         gain[:, at, 0] = kp
         bias[:, at, 0] = kp * values["offset"]
         bias[:, at, 1] = -kp
-        bias[:, at, 2] = -np.maximum(kd + np.minimum(values["damping"], 0.0), 0.0)
+        kd_ratio = self._gains.kd_ratio[:, own]
+        bias[:, at, 2] = -np.maximum(kd + kd_ratio * np.minimum(values["damping"], 0.0), 0.0)
         batch.expand("dof_damping")[:, at] = np.maximum(values["damping"], 0.0)
         batch.expand("dof_frictionloss")[:, at] = values["frictionloss"]
         batch.expand("dof_armature")[:, at] = values["armature"]
@@ -356,15 +359,16 @@ class _RecordedGains(NamedTuple):
     """Gains of each simulation's condition, of all joints of the robot, (num_envs, joints)."""
 
     kp_ratio: Array  # to the robot's own kp
+    kd_ratio: Array  # to the robot's own kd
     kd: Array  # N·m·s/rad
 
 
 def _recorded_gains(robot: RobotSpec, robots: list[RobotSpec]) -> _RecordedGains:
     """Return the gains of the robot in each simulation."""
-    own_kp = np.where(robot.servo.kp > 0, robot.servo.kp, 1.0)
-    ratio = np.array([one.servo.kp / own_kp for one in robots])
+    kp = np.array([one.servo.kp for one in robots])
     kd = np.array([one.servo.kd for one in robots])
-    return _RecordedGains(ratio, kd)
+    kp_ratio = kp / np.where(robot.servo.kp > 0, robot.servo.kp, 1.0)
+    return _RecordedGains(kp_ratio, ratio_to(kd, robot.servo.kd), kd)
 
 
 def _useful_threads(num_envs: int) -> int:
@@ -392,6 +396,8 @@ def _compiled(
         UsageError: A changed simulator of a robot with a servo model, whose terms are not changed
             with it.
     """
+    # Models of one batch have buffers of one length.
+    shortest = min(c.dt / robot.steps_per(c.dt) for c, robot in robots.items())
     unchanged: dict[Condition, mujoco.MjModel] = {}
     models: dict[Condition, mujoco.MjModel] = {}
     for condition, robot in robots.items():
@@ -408,6 +414,7 @@ def _compiled(
                 condition.dt,
                 locked,
                 physics_only=True,
+                shortest_step=shortest,
             )
             model.actuator_delay[:] = robot.servo.delay[robot.index(joint_names)]
             unchanged[own] = model

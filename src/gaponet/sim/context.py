@@ -22,7 +22,7 @@ from gaponet.base.arrays import Array
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.batch import Batch, BatchSim, Condition
 from gaponet.sim.commands import CommandHistory
-from gaponet.sim.model import joint_addresses
+from gaponet.sim.model import driven_joints, joint_addresses
 
 PROBE_RAD = 0.2
 READ_AFTER_S = (0.04, 0.2)  # the start of the motion, and most of it
@@ -87,7 +87,10 @@ def scene_context(scene: mujoco.MjModel, robot: RobotSpec, dt: float, prefix: st
     """
     model = copy.copy(scene)
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
-    driven = {model.joint(joint).name: i for i, joint in enumerate(model.actuator_trnid[:, 0])}
+    driven = {}
+    for i, joint in enumerate(driven_joints(model)):
+        if joint >= 0:
+            driven[model.joint(joint).name] = i
     names = [name for name in robot.joint_names if prefix + name in driven]
     home = robot.qpos_home[robot.index(names)]
     operated = np.array([names.index(name) for name in robot.operated])

@@ -20,7 +20,7 @@ from gaponet.base.errors import UsageError
 from gaponet.robot.servo_fields import SERVO_TERMS
 from gaponet.sim.batch import Batch, BatchSim
 from gaponet.sim.commands import ControlPeriods
-from gaponet.sim.model import joint_addresses
+from gaponet.sim.model import driven_joints, joint_addresses
 from gaponet.sim.servo import ServoTerms, overcome_friction, present, torque_range
 
 # Agreement of two simulators: largest difference of targets, and number of random motions that are
@@ -374,8 +374,7 @@ def _position_actuator(model: mujoco.MjModel, joint: str) -> int:
     """Return the index of a joint's only actuator; refuses all but position actuators without gear
     and dynamics.
     """
-    of_joint = model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT
-    mine = np.flatnonzero(of_joint & (model.actuator_trnid[:, 0] == model.joint(joint).id))
+    mine = np.flatnonzero(driven_joints(model) == model.joint(joint).id)
     if len(mine) != 1:
         raise UsageError(
             f"joint '{joint}' has {len(mine)} actuators in the simulator; there must be one, "

@@ -14,6 +14,7 @@ import numpy as np
 
 from gaponet.base.arrays import Array
 from gaponet.base.errors import GAPONetError, RobotError, UsageError
+from gaponet.robot.drives import ON_JOINT
 from gaponet.robot.fingerprint import model_fingerprint
 from gaponet.robot.folder import (
     STORED_ROBOT,
@@ -21,10 +22,10 @@ from gaponet.robot.folder import (
     has_stored_robot,
     load_stored_robot,
 )
-from gaponet.robot.freeze import freeze, units_per_si
+from gaponet.robot.freeze import delete_references, freeze, units_per_si
 from gaponet.robot.mjcf import compile_spec, read_mjcf
 from gaponet.robot.servo_fields import SERVO_TERMS, TERMS
-from gaponet.robot.spec import Link, RobotSpec
+from gaponet.robot.spec import Link, PayloadMount, RobotSpec
 
 if TYPE_CHECKING:
     from mujoco.batch import Batch
@@ -37,6 +38,7 @@ if TYPE_CHECKING:
 STIFF_SOLREF = (0.004, 1.0)
 STIFF_SOLIMP = (0.9999, 0.9999, 0.001, 0.5, 2.0)
 STIFF_MOBILITY = 0.1
+MAX_MASS_ERROR_KG = 1e-6
 LOOSE_IMPEDANCE = 0.999
 TOLERANCE = 1e-10
 
@@ -50,6 +52,7 @@ def build_model(
     dt: float | None = None,
     locked: tuple[str, ...] = (),
     physics_only: bool = False,
+    shortest_step: float = math.inf,
 ) -> mujoco.MjModel:
     """Return the nominal simulator of a robot with a payload.
 
@@ -65,13 +68,16 @@ def build_model(
             change nothing).
         physics_only: Leave out geoms that touch nothing and bodies that are locked to the world:
             faster, same motion.
+        shortest_step: Of the models with which this one shares a batch, the shortest physics step,
+            s. Buffers of late servos are as long as that model needs.
 
     Raises:
         RobotError: The MJCF does not compile, or lacks a joint or body that robot.toml names.
         UsageError: Negative payload, unknown side, or a dt that is not positive, or above 1 s.
     """
-    spec = build_spec(robot, payload_mass, payload_side, dt, locked, physics_only)
+    spec = build_spec(robot, payload_mass, payload_side, dt, locked, physics_only, shortest_step)
     model = compile_spec(spec, robot.mjcf)
+    _require_payload(model, robot, payload_mass, payload_side)
     if model.nq != model.nv or model.nq != len(robot.joint_names) - len(locked):
         names = {j.name for j in spec.joints}
         raise RobotError(
@@ -97,6 +103,14 @@ def joint_addresses(model: mujoco.MjModel, names: ListOf[str]) -> tuple[Array, A
     return model.jnt_qposadr[joints], model.jnt_dofadr[joints]
 
 
+def driven_joints(model: mujoco.MjModel) -> Array:
+    """Return the number of the joint that each actuator drives, (nu,); -1: it drives a tendon, a
+    site or a body.
+    """
+    on_joint = np.isin(model.actuator_trntype, ON_JOINT)
+    return np.where(on_joint, model.actuator_trnid[:, 0], -1)
+
+
 def stiffen_friction(model: mujoco.MjModel) -> None:
     """Make friction hold; once after each compilation or mj_setConst, which undo it."""
     model.dof_invweight0 *= STIFF_MOBILITY
@@ -109,6 +123,7 @@ def build_spec(
     dt: float | None = None,
     locked: tuple[str, ...] = (),
     physics_only: bool = False,
+    shortest_step: float = math.inf,
 ) -> mujoco.MjSpec:
     """Return `build_model` before compilation, for a scene of several robots
     (report/view/scene.py).
@@ -137,9 +152,10 @@ def build_spec(
     _set_joints(spec, robot)
     _set_links(spec, robot)
     _add_table(spec, robot)
+    delete_references(spec, set(locked))
     for name in locked:
         freeze(spec, spec.joint(name), robot.qpos_home[robot.joint_names.index(name)])
-    _add_actuators(spec, robot, locked)
+    _add_actuators(spec, robot, locked, min(shortest_step, spec.option.timestep))
     if physics_only:
         spec.compiler.discardvisual = True
         _remove_fixed(spec, spec.worldbody, {mount.body for mount in robot.payload_mounts})
@@ -349,15 +365,15 @@ def _remove_fixed(spec: mujoco.MjSpec, body: mujoco.MjsBody, keep: set[str]) -> 
             _remove_fixed(spec, child, keep)
 
 
-def _add_actuators(spec: mujoco.MjSpec, robot: RobotSpec, locked: tuple[str, ...]) -> None:
+def _add_actuators(
+    spec: mujoco.MjSpec, robot: RobotSpec, locked: tuple[str, ...], shortest_step: float
+) -> None:
     servo = robot.servo
-    for actuator in list(spec.actuators):
-        spec.delete(actuator)
     if servo.has_terms:
         spec.nuser_actuator = len(SERVO_TERMS)
     # One buffer length at all control periods, so that models of one robot share a layout; none
     # where nothing is late.
-    shortest = min(0.75 * robot.timestep, spec.option.timestep)
+    shortest = min(0.75 * robot.timestep, shortest_step)
     samples = math.ceil(servo.delay.max() / shortest - 1e-9) + 1 if servo.delay.any() else 0
     for i, name in enumerate(robot.joint_names):
         if name in locked:
@@ -393,9 +409,7 @@ def _add_payload(spec: mujoco.MjSpec, robot: RobotSpec, mass: float, side: str) 
     for mount in robot.payload_mounts:
         # An empty hand carries a massless ball: all payloads share one MjData layout, so one Batch
         # steps them together.
-        carried = mount.mass
-        if robot.scene.carries_payload and side in ("both", mount.side):
-            carried += mass
+        carried = _carried(robot, mount, mass, side)
         radius = max((3 * carried / (4 * math.pi * PAYLOAD_DENSITY)) ** (1 / 3), 1e-3)
         parent = spec.body(mount.body)
         if parent is None:
@@ -412,6 +426,25 @@ def _add_payload(spec: mujoco.MjSpec, robot: RobotSpec, mass: float, side: str) 
             conaffinity=0,
             rgba=(0.8, 0.25, 0.2, 1),
         )
+
+
+def _carried(robot: RobotSpec, mount: PayloadMount, mass: float, side: str) -> float:
+    """Return the mass at a mount, kg."""
+    if robot.scene.carries_payload and side in ("both", mount.side):
+        return mount.mass + mass
+    return mount.mass
+
+
+def _require_payload(model: mujoco.MjModel, robot: RobotSpec, mass: float, side: str) -> None:
+    """Refuse a model whose compiler settings change the mass of payloads."""
+    for mount in robot.payload_mounts:
+        wanted = _carried(robot, mount, mass, side)
+        weighs = float(model.body(f"payload_{mount.side}").mass[0])
+        if abs(weighs - wanted) > MAX_MASS_ERROR_KG:
+            raise RobotError(
+                f"{robot.mjcf}: a payload of {wanted:g} kg at '{mount.side}' weighs {weighs:g} kg "
+                "in the model; delete settotalmass and inertiagrouprange of its <compiler>"
+            )
 
 
 TABLE = "gaponet_table"

@@ -22,6 +22,7 @@ from scipy.optimize import nnls
 from gaponet.base.arrays import Array
 from gaponet.data.sequence import Sequence
 from gaponet.data.signals import differentiate, lowpass
+from gaponet.robot.servo_parameters import ratio_to
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.commands import speed_limited
 from gaponet.sim.dynamics import tips_of
@@ -147,7 +148,9 @@ class JointRollouts:
         own = {"effort_limit": self.robot.servo.effort_limit[self.op]} | values
         each = {f: np.broadcast_to(x, (k, n))[..., None] for f, x in own.items()}
         each["kp"] = each["kp"] * self.kp_ratio.T
-        each["kd"] = np.maximum(self.kd.T + np.minimum(damping, 0.0), 0.0)
+        kd = self.kd.T
+        kd_ratio = ratio_to(kd, self.robot.servo.kd[self.op][:, None])
+        each["kd"] = np.maximum(kd + kd_ratio * np.minimum(damping, 0.0), 0.0)
         each["damping"] = np.maximum(damping, 0.0)
         each["frictionloss"] = frictionloss
         joints = np.zeros((n, windows, k), JOINT_RECORD)
@@ -244,8 +247,8 @@ def _loads_along(part: Sequence, model: mujoco.MjModel, op: Array, thin: int) ->
     """Return the loads of joints `op` along a recording, computed every `thin` rows and
     interpolated, (4, rows, n).
 
-    These are inertia without armature, kg·m²; torque by gravity and Coriolis forces, N·m; torque by
-    the other joints' accelerations, N·m; slope of the second over the joint's angle, N·m/rad.
+    These are inertia without armature, kg·m²; torque by gravity, Coriolis forces and springs, N·m;
+    torque by the other joints' accelerations, N·m; slope of the second over the joint's angle, N·m/rad.
     """
     data = mujoco.MjData(model)
     full = np.empty((model.nv, model.nv))
@@ -257,7 +260,8 @@ def _loads_along(part: Sequence, model: mujoco.MjModel, op: Array, thin: int) ->
         data.qvel[:] = qvel
         mujoco.mj_fwdPosition(model, data)
         mujoco.mj_fwdVelocity(model, data)
-        return np.array(data.qfrc_bias)
+        # Springs and the compensation of gravity act like a weight.
+        return np.array(data.qfrc_bias - data.qfrc_spring - data.qfrc_gravcomp)
 
     qvel = differentiate(lowpass(part.qpos.astype(float), part.dt, CUTOFF_HZ), part.dt)
     qacc = differentiate(qvel, part.dt)

@@ -160,7 +160,10 @@ class WorldServos:
             return column
 
         old = self.numbers
-        terms = {name: of_worlds(column, units[name]) for name, column in old.terms.items()}
+        # What the file has no spread of, such as encoder_step, is the same in all worlds.
+        terms = dict(old.terms)
+        for name in terms.keys() & units.keys():
+            terms[name] = of_worlds(terms[name], units[name])
         if "no_load_speed" in terms:
             speed = terms["no_load_speed"]
             terms["no_load_speed"] = torch.where(speed > 0, speed, torch.inf)  # 0 is no limit

@@ -12,6 +12,7 @@ This file is copied into exports; it needs MuJoCo and numpy, not gaponet.
 
 from __future__ import annotations
 
+import copy
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -84,6 +85,7 @@ class Servos:
         """
         import mujoco
 
+        stiffness = _friction_stiffness(model)
         joints = facts["joints"]
         column = {}
         for field, value in next(iter(joints.values())).items():
@@ -108,15 +110,18 @@ class Servos:
         model.actuator_biasprm[servo, 0] = self.numbers.bias
         model.actuator_biasprm[servo, 1] = -column["kp"]
         model.actuator_biasprm[servo, 2] = -column["kd"]
+        effort = self.numbers.effort
+        model.actuator_forcerange[servo] = np.stack([-effort, effort], axis=-1)
         model.dof_frictionloss[dof] = column["frictionloss"]
         model.qpos0[qpos] += (
             np.array([facts["plain"][name]["zero"] for name in joints]) - column["zero"]
         )
         if model.nhistory:
             model.actuator_delay[servo] = column["delay"]
+        # Friction is made stiff, which no MJCF can express; that of other arms stays as it is.
         mujoco.mj_setConst(model, mujoco.MjData(model))
-        # stiff friction, which no MJCF can express
-        model.dof_invweight0[dof] *= facts["dof_invweight0_factor"]
+        stiffness[dof] = facts["dof_invweight0_factor"]
+        model.dof_invweight0 *= stiffness
         self._backlash: Backlash | None = None
         if "backlash" in self.numbers.terms:
             self._backlash = Backlash(model, self.at, column)
@@ -214,9 +219,26 @@ def ramp_speed(model: Any, actuator: int) -> float:
 
 def addresses(model: Any, joints: list[str], prefix: str = "") -> Addresses:
     """Return the places of joints and of the actuators that drive them."""
+    import mujoco
+
     ids = [model.joint(prefix + name).id for name in joints]
-    servos = np.array([np.flatnonzero(model.actuator_trnid[:, 0] == joint)[0] for joint in ids])
+    of_joint = np.where(
+        model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT, model.actuator_trnid[:, 0], -1
+    )
+    servos = np.array([np.flatnonzero(of_joint == joint)[0] for joint in ids])
     return Addresses(model.jnt_dofadr[ids], model.jnt_qposadr[ids], servos)
+
+
+def _friction_stiffness(model: Any) -> Any:
+    """Return by what each degree of freedom's mobility was changed after mj_setConst, (nv,)."""
+    import mujoco
+
+    plain = copy.copy(model)
+    mujoco.mj_setConst(plain, mujoco.MjData(plain))
+    ratio = np.ones(model.nv)
+    moves = plain.dof_invweight0 > 0
+    ratio[moves] = model.dof_invweight0[moves] / plain.dof_invweight0[moves]
+    return ratio
 
 
 def fill_delays(model: Any, data: Any) -> None:
