@@ -1,8 +1,8 @@
 """Controls of the paper's experiment: what a network is credited with that cannot know.
 
-    python benchmarks/paper_controls.py EXPERIMENT [--steps 200000] [--seed 0]
+    python benchmarks/paper_controls.py EXPERIMENT DATASET [--steps 200000] [--seed 0]
 
-EXPERIMENT is the folder of `gaponet experiment paper`. Each control is trained and measured as its
+EXPERIMENT is the folder of `gaponet experiment paper DATASET`. Each control is trained and measured as its
 networks are:
 
     untrained          the correction is zero
@@ -12,8 +12,8 @@ networks are:
     payload permuted   GAPONet and literal; the payload that the network is told is that of
                        another simulation
 
-It prints the reduction of Q_dis over the nominal simulator, %, on the motions and the unit of
-Figure 3.
+It prints the reduction of Q_dis over the nominal simulator, %, without wrists, on the motions and
+the unit of Figure 3; and by how much the error with a permuted payload differs, for each payload.
 """
 
 from __future__ import annotations
@@ -31,6 +31,7 @@ from torch import Tensor
 from gaponet.experiments.paper.jobs import Job, train
 from gaponet.experiments.paper.measure import measure_alignment
 from gaponet.experiments.paper.options import PaperOptions
+from gaponet.experiments.paper.results import WRIST
 from gaponet.experiments.paper.statistics import reduction
 from gaponet.experiments.paper.study import Study
 from gaponet.experiments.paper.trainings import method_trainings
@@ -75,13 +76,22 @@ def main() -> None:
     dataset = str(Path(arguments.dataset).resolve())
     study = Study(dataset, robot.before_identification, arguments.experiment, options)
     recorded = study.recorded()
-    nominal = np.array(measure_alignment(recorded, study.robot, None)["q_dis"]).mean(axis=1)
+    joints = [i for i, name in enumerate(study.robot.operated) if WRIST not in name]
+
+    def q_dis(model: GapModel | None) -> np.ndarray:
+        """Return the error of each recording, (recordings,) rad·s."""
+        measured = measure_alignment(recorded, study.robot, model)
+        error: np.ndarray = np.array(measured["q_dis"])[:, joints].mean(axis=1)
+        return error
+
+    nominal = q_dis(None)
     trainings = {
         training.name: training
         for training in method_trainings(options, "labels", arguments.seed, study.rates[:1])
     }
     controls: dict[str, tuple[str, Any]] = {
         "literal": ("literal", None),
+        "GAPONet": ("GAPONet", None),
         "sensors are noise": (
             "literal",
             patch.object(PaperNet, "sensors", noise_instead_of_sensors),
@@ -89,6 +99,9 @@ def main() -> None:
         "payload permuted, literal": ("literal", patch(TRAINER_ENV, PermutedPayloadEnv)),
         "payload permuted, GAPONet": ("GAPONet", patch(TRAINER_ENV, PermutedPayloadEnv)),
     }
+    if len(study.payloads) == 1:
+        controls = {name: of for name, of in controls.items() if "payload" not in name}
+    errors: dict[str, np.ndarray] = {}
     print("untrained: 0 % (its correction is zero)")
     for name, (network, change) in controls.items():
         training = replace(trainings[network], name=f"control {name}")
@@ -98,9 +111,17 @@ def main() -> None:
         else:
             with change:
                 train(job, training)
-        measured = measure_alignment(recorded, study.robot, GapModel.load(job.run_folder))
-        error = np.array(measured["q_dis"]).mean(axis=1)
-        print(f"{name}: {reduction([error], nominal, recorded.motions)} %", flush=True)
+        errors[name] = q_dis(GapModel.load(job.run_folder))
+        removed = reduction([errors[name]], [nominal], recorded.motions)
+        print(f"{name}: {removed} %", flush=True)
+    payloads = np.array([sequence.meta.payload_mass for sequence in recorded.sequences])
+    for network in ("literal", "GAPONet"):
+        permuted = errors.get(f"payload permuted, {network}")
+        if permuted is None:
+            continue
+        for mass in study.payloads:
+            change = permuted[payloads == mass].sum() / errors[network][payloads == mass].sum() - 1
+            print(f"{network}, {mass:g} kg: error changes by {100 * change:+.1f} %")
 
 
 if __name__ == "__main__":

@@ -39,6 +39,13 @@ def test_a_claim_of_40_percent_is_judged_by_two_standard_errors(mean, verdict):
     assert Reduction(mean, 0.0, 2.0, 3, 10).verdict(40) == verdict
 
 
+def test_one_motion_decides_nothing():
+    baseline = np.array([1.0, 1.2])
+    found = reduction([baseline / 4], [baseline], ["a", "a"])
+    assert found.verdict(40) == "not decided"
+    assert str(found) == "75"
+
+
 def test_no_correction_is_no_reduction():
     baseline = np.array([1.0, 3.0, 2.0])
     assert reduction([baseline], [baseline], MOTIONS).mean == 0.0

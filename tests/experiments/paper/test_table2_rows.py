@@ -1,5 +1,7 @@
 """Each row of Table 2 trains, and its setting changes the network that comes out."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from arm import commands, record, write_dataset
@@ -26,6 +28,22 @@ def study(robot, tmp_path_factory):
     ]
     dataset = write_dataset(folder / "data", robot, sequences)
     return Study(str(dataset.path), robot, folder, OPTIONS)
+
+
+def test_recordings_of_each_rate_are_tested_and_uneven_clocks_are_one_rate(robot, tmp_path):
+    sequences = []
+    for motion in range(8):
+        recorded = record(robot, commands(60, motion), f"motion{motion}")
+        for dt in (1 / 49.4, 1 / 49.6, 0.01):
+            labels = replace(recorded.meta, motion=f"motion{motion} {dt:.4f}", virtual=False)
+            sequences.append(replace(recorded, dt=dt, meta=labels))
+    dataset = write_dataset(tmp_path / "data", robot, sequences)
+    study = Study(str(dataset.path), robot, tmp_path, OPTIONS)
+    assert study.rates == (49.0, 100.0)
+    for rate, slow in ((49.0, True), (100.0, False)):
+        tested = study.recorded(rate).sequences
+        assert tested
+        assert all((sequence.dt > 0.015) == slow for sequence in tested)
 
 
 @pytest.fixture(scope="module")

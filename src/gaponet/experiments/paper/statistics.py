@@ -18,7 +18,7 @@ class Reduction:
     Attributes:
         mean: Over all seeds and motions: 100 (1 − Σ error / Σ error of the baseline).
         seed_error: Standard error over training seeds; 0 for one seed, which tells nothing of it.
-        motion_error: Standard error over motions.
+        motion_error: Standard error over motions; NaN for one motion, which tells nothing of it.
         seeds, motions: How many there are.
     """
 
@@ -30,11 +30,13 @@ class Reduction:
 
     @property
     def error(self) -> float:
-        """Standard error over seeds and motions."""
+        """Standard error over seeds and motions; NaN for one motion."""
         return float(np.hypot(self.seed_error, self.motion_error))
 
     def verdict(self, claim: float) -> str:
-        """Say if a reduction of `claim` % is reached, by two standard errors."""
+        """Say if a reduction of `claim` % is reached, by two standard errors; one motion decides
+        nothing.
+        """
         if self.mean - 2 * self.error >= claim:
             return "reached"
         if self.mean + 2 * self.error < claim:
@@ -75,7 +77,7 @@ def reduction(errors: ListOf[Array], baselines: ListOf[Array], motions: ListOf[s
         kept = motion_of != name
         left_out.append(_percent_less(mean_error[kept], mean_baseline[kept]))
     count = len(names)
-    motion_error = 0.0
+    motion_error = np.nan
     if count > 1:
         motion_error = float(np.sqrt((count - 1) * np.var(left_out)))
     seed_error = 0.0

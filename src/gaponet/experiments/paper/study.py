@@ -20,7 +20,7 @@ from typing import Any
 from gaponet.base.errors import DatasetError, UsageError
 from gaponet.base.files import write_json
 from gaponet.base.structure import read_json
-from gaponet.data.split import Splits, split_entries
+from gaponet.data.split import RATE_TOLERANCE, Splits, split_entries
 from gaponet.data.store import Dataset, Entry, dataset_hash
 from gaponet.experiments.paper.measure import Recorded, VirtualUnit
 from gaponet.experiments.paper.options import PaperOptions
@@ -74,8 +74,12 @@ class Study:
 
     @cached_property
     def rates(self) -> tuple[float, ...]:
-        """Control rates of the recordings, Hz, ascending."""
-        return tuple(sorted({float(round(1 / entry.dt)) for entry in self.data.entries}))
+        """Control rates of the recordings, Hz, ascending. Clocks of 49.4 and 49.6 Hz are one rate."""
+        slowest: list[float] = []  # of each rate
+        for rate in sorted({1 / entry.dt for entry in self.data.entries}):
+            if not slowest or rate > (1 + RATE_TOLERANCE) * slowest[-1]:
+                slowest.append(rate)
+        return tuple(float(round(rate)) for rate in slowest)
 
     @property
     def dt(self) -> float:
@@ -147,7 +151,8 @@ class Study:
         """
         rate = rate or self.rates[0]
         if not self.virtual:
-            entries = entries_at(rate, self.splits()["test"])
+            splits = split_entries(self.data, self.holdout_units, rates=(rate,))
+            entries = entries_at(rate, splits["test"])
             return Recorded(self.data.sequences(entries))
         unseen = Dataset(self.out / "unseen")
         entries = entries_at(rate, unseen.entries)
@@ -193,7 +198,7 @@ class Study:
 
 def entries_at(rate: float, entries: list[Entry]) -> list[Entry]:
     """Return the recordings with a control rate, Hz."""
-    return [entry for entry in entries if round(1 / entry.dt) == rate]
+    return [entry for entry in entries if abs(1 / entry.dt - rate) <= RATE_TOLERANCE * rate]
 
 
 def quick_dataset(
