@@ -52,18 +52,28 @@ def fit_inputs(
 
 
 def fit_sensors(
-    net: DeltaNet, env: DeltaEnv, states: int, seed: int, nthread: int = 0, refit: bool = False
+    net: DeltaNet,
+    env: DeltaEnv,
+    states: int,
+    seed: int,
+    nthread: int = 0,
+    refit: bool = False,
+    steps: int = FIT_STEPS,
 ) -> SensorReport | None:
     """Fit the sensor predictor; on `refit`, continue its fit at the environment's present states.
 
-    Result as above.
+    Further arguments and the result are as above.
+
+    Args:
+        steps: Number of gradient steps. In a simulator that the predictor has not seen, 600 are
+            too few; the report says so.
     """
     if net.predictor is None:
         return None
     device = next(net.parameters()).device
     net.cpu()  # C MuJoCo answers the probes
     probed = probe_states(net, env, states, seed, nthread, refit)
-    report = _fit_predictor(net, *probed, env.robot.operated, seed, refit)
+    report = _fit_predictor(net, *probed, env.robot.operated, seed, refit, steps)
     net.predictor.requires_grad_(False)
     net.to(device)
     return report
@@ -205,7 +215,13 @@ def _random_probes(states: int, probes: int, n: int, rng: np.random.Generator) -
 
 
 def _fit_predictor(
-    net: DeltaNet, inputs: Tensor, answers: Tensor, joints: tuple[str, ...], seed: int, refit: bool
+    net: DeltaNet,
+    inputs: Tensor,
+    answers: Tensor,
+    joints: tuple[str, ...],
+    seed: int,
+    refit: bool,
+    steps: int,
 ) -> SensorReport:
     """Maximise the Gaussian likelihood on three quarters of the samples; return R² on the rest.
 
@@ -221,8 +237,8 @@ def _fit_predictor(
     train = inputs[held_out:]
     predictor.requires_grad_(True)
     optimiser = torch.optim.Adam(predictor.parameters(), lr=LEARNING_RATE)
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, FIT_STEPS)
-    for _ in range(FIT_STEPS):
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps)
+    for _ in range(steps):
         batch = torch.randint(0, len(target), (BATCH_SIZE,), generator=generator)
         mean, log_var = predictor(train[batch])
         loss = 0.5 * ((mean - target[batch]) ** 2 * (-log_var).exp() + log_var).mean()
