@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from gaponet.experiments.paper.claims import claim_table, claims
+from gaponet.experiments.paper.options import PaperOptions
 from gaponet.experiments.paper.results import Results
 from gaponet.experiments.paper.tables import commands_table, table_1, table_2
 
@@ -55,7 +56,7 @@ def training(name, share, block="labels", seed=0):
 
 def make_results(*trainings):
     robot = SimpleNamespace(operated=("shoulder", "elbow"))
-    study = SimpleNamespace(virtual=True, delivers=True, robot=robot)
+    study = SimpleNamespace(virtual=True, delivers=True, robot=robot, options=PaperOptions())
     baselines = {
         "motions": ["a", "a", "b", "b"],
         "payloads": PAYLOADS,
@@ -110,7 +111,7 @@ def test_the_paper_s_numbers_stand_beside_its_own_claims_alone():
 def test_no_method_of_a_block_is_missing_from_its_table():
     networks = ("MLP", "shared MLP", "literal", "GAPONet")
     found = claims(make_results(*[training(network, 0.9) for network in networks]))
-    table = claim_table(found, "labels")
+    table = claim_table(found, "labels", 200_000)
     assert table.columns[2:-1] == ("identification", *networks)
 
 

@@ -22,9 +22,9 @@ from gaponet.experiments.paper.printed import (
     CLAIM_BY_AXIS,
     CLAIM_HEAVIEST_PAYLOAD,
 )
-from gaponet.experiments.paper.results import SIMULATORS, Results
+from gaponet.experiments.paper.results import Results
 from gaponet.experiments.paper.statistics import Reduction, reduction
-from gaponet.experiments.paper.trainings import BLOCK_TITLES, METHOD_BLOCKS
+from gaponet.experiments.paper.trainings import METHOD_BLOCKS, block_title
 
 JUDGED = "GAPONet"
 # Way without a network → what it is called in a claim.
@@ -82,7 +82,7 @@ def _alignment_claims(results: Results, block: Block) -> list[Claim]:
     for label, printed, payload in rows:
         kept = _with_payload(results, payload)
         reductions = {}
-        for name, title in SIMULATORS.items():
+        for name, title in results.simulators.items():
             if name != "nominal":
                 error = results.over_joints(results.baseline_q_dis(name))
                 reductions[title] = _reduction(results, [error], nominal, kept)
@@ -225,8 +225,12 @@ def _reduction(results: Results, errors: list[Array], baseline: Array, kept: Arr
     return reduction([error[kept] for error in errors], [baseline[kept]], motions)
 
 
-def claim_table(found: list[Claim], block: Block) -> ResultTable:
-    """Return the claims of a block as a table; one column for each method."""
+def claim_table(found: list[Claim], block: Block, steps: int) -> ResultTable:
+    """Return the claims of a block as a table; one column for each method.
+
+    Args:
+        steps: Control steps of a training.
+    """
     of_block = [claim for claim in found if claim.block == block]
     methods: dict[str, None] = {}
     for claim in of_block:
@@ -244,7 +248,7 @@ def claim_table(found: list[Claim], block: Block) -> ResultTable:
     if seeds == 1:
         over = "over motions or goals; of one seed the spread over seeds is not known"
     caption = (
-        f"Trained by {BLOCK_TITLES[block]}. Per cent less, ± the standard error {over} (paired, "
+        f"Trained by {block_title(block, steps)}. Per cent less, ± the standard error {over} (paired, "
         "jackknife). The verdict is on GAPONet: reached or not by two standard errors. An "
         "untrained network has 0 in every row that does not compare with the MLP."
     )

@@ -10,7 +10,7 @@ import numpy as np
 from gaponet.base.arrays import Array
 from gaponet.base.result_table import MeanStd, ResultTable
 from gaponet.experiments.paper.options import Block
-from gaponet.experiments.paper.results import SIMULATORS, Results
+from gaponet.experiments.paper.results import Results
 from gaponet.report.figures.style import figure, joint_label, legend, styled
 
 if TYPE_CHECKING:
@@ -118,7 +118,7 @@ def figure_3_table(results: Results, block: Block) -> ResultTable:
     for mass in results.masses:
         kept = results.payloads == mass
         cells: list[object] = []
-        for name in SIMULATORS:
+        for name in results.simulators:
             q_dis = results.over_joints(results.baseline_q_dis(name))  # (recordings,)
             cells.append(float(q_dis[kept].mean()))
         for name in methods:
@@ -131,5 +131,5 @@ def figure_3_table(results: Results, block: Block) -> ResultTable:
         "Q_dis between simulator and robot, mean over joints without wrists and over motions; ± "
         "is the standard deviation over training seeds."
     )
-    columns = ("Q_dis, rad·s", *SIMULATORS.values(), *methods)
+    columns = ("Q_dis, rad·s", *results.simulators.values(), *methods)
     return ResultTable(f"figure3_{block}", columns, tuple(rows), caption, digits=4)

@@ -223,8 +223,7 @@ def identified_robot(study: Study) -> RobotSpec:
         splits = study.splits()
         options = IdentifyOptions(nthread=1, windows=study.options.identify_windows)
         judges = MAX_VALIDATION_ROLLOUTS  # as many recordings as judge the networks
-        if options.windows < IdentifyOptions().windows:
-            # In a hurry: gains, friction, delay and offset of each joint alone.
+        if study.options.identifies_joints_alone:
             options = replace(options, terms=(), table=False, joints_alone=True)
             judges = HURRIED_JUDGES
         fitted = identify(

@@ -16,8 +16,6 @@ from gaponet.experiments.paper.study import Study
 from gaponet.experiments.paper.trainings import NETWORKS
 
 WRIST = "wrist"  # the paper's Figure 3 and MPJAE are without wrists
-# Simulator without a network in baselines.json (`jobs.measure_baselines`) → its heading in tables.
-SIMULATORS = {"nominal": "nominal (raw)", "identified": "identification"}
 
 
 @dataclass(frozen=True)
@@ -48,6 +46,16 @@ class Results:
         return cls(study, baselines, trainings)
 
     # ---- what there is
+
+    @property
+    def simulators(self) -> dict[str, str]:
+        """Simulator without a network in baselines.json (`jobs.measure_baselines`) → its heading in
+        tables.
+        """
+        identified = "identification"
+        if self.study.options.identifies_joints_alone:
+            identified = "identification, each joint alone"
+        return {"nominal": "nominal (raw)", "identified": identified}
 
     @property
     def motions(self) -> list[str]:

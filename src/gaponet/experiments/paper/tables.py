@@ -20,8 +20,8 @@ from gaponet.experiments.paper.commands import (
 from gaponet.experiments.paper.measure import LARGE_GAPS_RAD
 from gaponet.experiments.paper.options import Block
 from gaponet.experiments.paper.printed import AXES, TABLE_1, TABLE_2, PrintedRow
-from gaponet.experiments.paper.results import SIMULATORS, Results
-from gaponet.experiments.paper.trainings import BLOCK_TITLES, METHOD_BLOCKS, TABLE_2_CHANGES
+from gaponet.experiments.paper.results import Results
+from gaponet.experiments.paper.trainings import METHOD_BLOCKS, TABLE_2_CHANGES, block_title
 
 CONVERGED_SHARE = 0.5  # of the nominal error; above it a row of Table 2 is not converged
 # Row of Table 2 here → row of the paper. The paper does not say what is held for an action
@@ -61,9 +61,10 @@ def table_1(results: Results, block: Block) -> ResultTable:
         for method, printed in TABLE_1.items():
             if mass in printed:
                 rows.append((f"{label}, the paper's {method}", *printed[mass]))
+    trained_by = block_title(block, results.study.options.steps)
     caption = (
         "Mean |hand − goal| in the last second of a hold, cm, of a unit that no network has "
-        f"seen; networks trained by {BLOCK_TITLES[block]}; ± is the standard deviation over "
+        f"seen; networks trained by {trained_by}; ± is the standard deviation over "
         "training seeds. X is forward, Y left, Z up. The paper's robot is a real H1-2 with other "
         "goals; its third method sends the simulator's output as it is."
     )
@@ -149,7 +150,7 @@ def large_gaps_table(results: Results, block: Block) -> ResultTable:
         for mass in results.masses:
             kept = results.payloads == mass
             cells: list[Any] = []
-            for name in SIMULATORS:
+            for name in results.simulators:
                 shares = np.array(results.baselines[name]["alignment"]["large_gaps"][key])
                 cells.append(100 * float(shares[kept].mean()))
             for name in methods:
@@ -160,7 +161,7 @@ def large_gaps_table(results: Results, block: Block) -> ResultTable:
                 cells.append(MeanStd.from_values(seeds))
             rows.append((f"above {threshold:g} rad, {mass:g} kg", *cells))
     caption = "Share of time and joints at which simulator and robot are further apart, %."
-    columns = ("gap", *SIMULATORS.values(), *methods)
+    columns = ("gap", *results.simulators.values(), *methods)
     return ResultTable(f"large_gaps_{block}", columns, tuple(rows), caption)
 
 
@@ -262,7 +263,7 @@ def method_table(results: Results) -> ResultTable:
             runs = results.runs(block, name)
             rows.append(
                 (
-                    f"{name}, {BLOCK_TITLES[block]}",
+                    f"{name}, {block_title(block, results.study.options.steps)}",
                     runs[0]["parameters"],
                     runs[0]["steps"],
                     MeanStd.from_values(_seconds(runs)),

@@ -20,6 +20,7 @@ BLOCK_TITLES: dict[Block, str] = {
     "table2": "Table 2",
 }
 
+
 # Blocks that compare the methods.
 METHOD_BLOCKS: tuple[Block, ...] = ("labels", "ppo")
 
@@ -32,6 +33,7 @@ NETWORKS: dict[Method, ModelKind] = {
 }
 
 PRETRAINING = PretrainingConfig(rounds=2, num_envs=128, steps=300, gradient_steps=800)
+LABEL_STEPS = PRETRAINING.rounds * PRETRAINING.num_envs * PRETRAINING.steps
 TABLE_2_MODEL = ModelConfig(kind="paper", payload_input=False)  # the paper's own row has no payload
 
 # Row of Table 2 → what differs from TABLE_2_MODEL. Each row has a training of its own.
@@ -85,6 +87,13 @@ class Training:
         """Name of its folder in OUT/trainings."""
         words = f"{self.block}-{self.name}-{self.seed}"
         return "".join(letter if letter.isalnum() or letter in "-+" else "_" for letter in words)
+
+
+def block_title(block: Block, steps: int) -> str:
+    """Return how a block trains with so many control steps."""
+    if block == "labels" and steps <= LABEL_STEPS:
+        return "labels alone"
+    return BLOCK_TITLES[block]
 
 
 def all_trainings(
