@@ -45,6 +45,7 @@ OPTIONS: tuple[tuple[str, tuple[str, ...], Callable[[str], bool]], ...] = (
         lambda to: to in ("mjcf", "envhub", "urdf", LEROBOT_TARGET),
     ),
     ("--data", ("data",), lambda to: to not in ("onnx", "torch", LEROBOT_TARGET)),
+    ("--dynamics and --remove", ("dynamics", "remove"), lambda to: to == LEROBOT_TARGET),
 )
 Holder = Annotated[
     Folder,

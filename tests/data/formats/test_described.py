@@ -104,6 +104,11 @@ def test_a_sheet_says_what_names_do_not_and_every_recording_stands_in_it_once(tm
     )
     ((name, log),) = read_logs(folder, arm)
     assert (name, log.meta["kp"]) == ("lift", [15.0, 9.0])
+    (folder / "run_7.csv").rename(folder / "run[7].csv")
+    sheet = folder / "sheet.csv"
+    sheet.write_text(sheet.read_text().replace("run_7", "run[7]"))
+    assert [name for name, _ in read_logs(folder, arm)] == ["lift"]
+    (folder / "run[7].csv").rename(folder / "run_7.csv")
     assert log.meta["stated"] == {"payload_mass": 0.2, "unit_id": "b", "repetition": 1}
     write(tmp_path / "logs", NAMES + 'manifest = "sheet.csv"\nkp = 20.0\n', "run_7.csv")
     sheet.write_text("file,kp\nrun_7.csv,15\n")

@@ -125,7 +125,7 @@ def _moves_early(common: CommonResponse, onset: float, unknown: float, step: flo
 def _early(onset: float) -> Finding:
     text = (
         f"joints begin to move {-onset * 1e3:.0f} ms before their commands: are command and "
-        "state swapped, or are their clocks apart? Shift one of them at import"
+        "state swapped, or are their clocks apart? Correct the time stamps, and import again"
     )
     return Finding("error", "copied", text, (), {"onset_s": onset})
 

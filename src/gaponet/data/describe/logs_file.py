@@ -163,7 +163,7 @@ class Naming:
         rows = []
         for i, row in enumerate(sheet):
             pattern = _stem(row["file"])
-            if any(fnmatchcase(word, pattern) for word in words):
+            if pattern in words or any(fnmatchcase(word, pattern) for word in words):
                 rows.append(i)
         if len(rows) != 1:
             raise LogError(
