@@ -19,19 +19,19 @@ if TYPE_CHECKING:
     from gaponet.api.paper import PaperResult
 
 TITLES = {  # of tables on the terminal; the page numbers them too
-    "claims_labels": "The paper's claims (labels, then PPO)",
+    "claims_labels": "The paper's claims (labels)",
     "claims_ppo": "The paper's claims (PPO alone)",
     "beside_paper": "Figure 2: the recordings",
-    "figure3_labels": "Figure 3 (labels, then PPO)",
+    "figure3_labels": "Figure 3 (labels)",
     "figure3_ppo": "Figure 3 (PPO alone)",
-    "table1_labels": "Table 1 (labels, then PPO)",
+    "table1_labels": "Table 1 (labels)",
     "table1_ppo": "Table 1 (PPO alone)",
-    "commands_labels": "Commands on the robot (labels, then PPO)",
+    "commands_labels": "Commands on the robot (labels)",
     "commands_ppo": "Commands on the robot (PPO alone)",
     "table2": "Table 2",
     "sensors": "What the Sensor Predictor saves",
     "methods": "Methods",
-    "large_gaps_labels": "Large gaps (labels, then PPO)",
+    "large_gaps_labels": "Large gaps (labels)",
     "large_gaps_ppo": "Large gaps (PPO alone)",
 }
 
