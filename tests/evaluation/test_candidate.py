@@ -6,7 +6,7 @@ import json
 import shutil
 
 import pytest
-from arm import recordings
+from arm import recordings, write_dataset
 from runs import untrained
 
 import gaponet as gp
@@ -85,6 +85,18 @@ def test_an_evaluation_can_be_limited_to_one_unit(fitted, data):
     assert select_entries([fitted], data, units=("a",)) == select_entries([fitted], data)
     with pytest.raises(DatasetError, match="other"):
         select_entries([fitted], data, units=("other",))
+
+
+def test_recordings_of_an_adaptation_are_not_unseen(fitted, data, arm, tmp_path):
+    other_day = write_dataset(
+        tmp_path / "today", arm, recordings(arm, 4, rows=400, kp=0.6, unit="b")
+    )
+    gp.adapt_robot(fitted, other_day, out=tmp_path / "adapted")
+    entries, unseen = select_entries([tmp_path / "adapted"], other_day)
+    assert len(entries) == 4
+    assert unseen is False
+    assert select_entries([fitted], other_day)[1] is True
+    assert select_entries([tmp_path / "adapted"], data)[1] is True
 
 
 def test_a_folder_that_does_not_say_what_it_was_fitted_to_has_no_held_out_recordings(fitted, data):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import time
 from collections.abc import Callable, Mapping
@@ -24,7 +25,7 @@ from gaponet.api.opening import (
 from gaponet.api.options import IdentifyOptions, TrainOptions
 from gaponet.api.results import AdaptResult, IdentifyResult, TorqueResult, TrainResult
 from gaponet.base.errors import NoGainError, UsageError
-from gaponet.base.files import write_json, write_text
+from gaponet.base.files import write_json
 from gaponet.base.progress import Progress, no_progress
 from gaponet.data.store import Dataset
 from gaponet.nn.config import ModelKind as ModelKind
@@ -115,7 +116,7 @@ def identify(
         )
         fitted = fit(train_set, start, val_set, searches, progress)
         errors = _require_gain(fitted, spec, accepted=bool(taken_from))
-        origin = _origin(folder, data, split, errors, gate, fitted.findings)
+        origin = _origin(folder, data, split, errors, gate, spec, fitted.findings)
         _write_identified(folder, fitted, train_set, val_set, origin)
     return IdentifyResult(
         robot=fitted.robot,
@@ -263,7 +264,7 @@ def identify_torque(
                 f"the fit and {1e3 * before:.2f} mrad with {spec.name} as given"
             )
         errors = {"nominal": np.array([before]), "identified": np.array([after])}
-        origin = _origin(folder, data, split, errors, gate)
+        origin = _origin(folder, data, split, errors, gate, spec)
         with whole_folder(folder, "robot", "robot.toml", OUTDATED_FILES) as place:
             save_robot(fitted.robot, place)
             write_json(place / PROVENANCE_FILE, origin)
@@ -294,16 +295,24 @@ def _origin(
     split: Mapping[str, ListOf[Entry]],
     errors: Mapping[str, Array],
     gate: GateReport,
+    start: RobotSpec,
     findings: ListOf[str] = (),
 ) -> dict[str, Any]:
     """Return what a robot folder was identified from: dataset, recordings and motions by split,
     mean validation errors, what the doctor found, and what the fit found.
+
+    What `start` was identified from, if it was, counts as fitted, too.
     """
+    from gaponet.evaluation.candidate import read_origin
+
     parts = {}
     motions = {}
     for name, entries in split.items():
         parts[name] = {entry.id: entry.hash for entry in entries}
         motions[name] = sorted({entry.meta.motion for entry in entries})
+    earlier = read_origin(start.folder) if start.is_identified else None
+    if earlier is not None:
+        parts["train"] |= earlier["parts"]["train"] | earlier["parts"]["val"]
     return {
         "dataset": os.path.relpath(data.path, folder),
         "parts": parts,
@@ -314,11 +323,23 @@ def _origin(
     }
 
 
-def _copy_origin(source: Path, folder: Path) -> None:
-    """Keep on record from which motions the robot of `source` was identified, if that is stated."""
-    if (source / PROVENANCE_FILE).is_file():
-        text = (source / PROVENANCE_FILE).read_text(encoding="utf-8")
-        write_text(folder / PROVENANCE_FILE, text)
+def _copy_origin(source: Path, folder: Path, adapted: ListOf[Sequence]) -> None:
+    """Keep on record from which recordings the robot of `source` was identified, if that is stated,
+    and to which it was adapted.
+    """
+    from gaponet.data.store import entry_id
+    from gaponet.evaluation.candidate import read_origin
+
+    origin = read_origin(source)
+    if origin is None:
+        return
+    fitted = dict(origin["parts"]["train"])
+    for sequence in adapted:
+        content_hash = sequence.content_hash()
+        fitted[entry_id(sequence.meta, content_hash)] = content_hash
+    record = json.loads((source / PROVENANCE_FILE).read_text(encoding="utf-8"))
+    record["parts"]["train"] = fitted
+    write_json(folder / PROVENANCE_FILE, record)
 
 
 def _uncertainty(
@@ -632,7 +653,7 @@ def _write_adapted(
 
     with whole_folder(folder, "robot", "robot.toml", OUTDATED_FILES) as place:
         save_robot(adapted, place)
-        _copy_origin(given.folder, place)
+        _copy_origin(given.folder, place, sequences)
         write_json(place / ADAPTATION_FILE, facts)
         made = _uncertainty(place, sequences, [], {}, before=uncertainty)
         links = uncertainty.links if uncertainty is not None else None

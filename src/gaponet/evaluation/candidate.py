@@ -103,6 +103,7 @@ def select_entries(
     """Select recordings for an evaluation: those of the given motions, or unseen ones.
 
     A robot folder without an origin counts as fitted to everything and is evaluated on everything.
+    So is one that was adapted to all recordings.
 
     Args:
         folders: Robot folders and runs.
@@ -130,6 +131,8 @@ def select_entries(
         entries = dataset.select(motions, units)
     else:
         entries = _unseen_entries(available, unused, fitted)
+    if not entries and all(map(is_robot, folders)):
+        return available, False
     if not entries:
         raise DatasetError(
             f"{dataset.path}: every sequence was used in training; give logs the runs never saw, "
@@ -182,10 +185,13 @@ class FittedData:
         also_fitted = set[str]()  # hashes
         for adaptation in Adaptation.load(folder, model.weights_hash()).values():
             also_fitted.update(adaptation.logs)
+        motions = dict(model.card.get("motions", {}))
         origin = read_origin(folder / STORED_ROBOT)  # of the robot under the model
         if origin is not None:
             also_fitted |= _fitted_hashes(origin["parts"])
-        return cls._of(split_of_run(folder), model.card.get("motions", {}), also_fitted)
+            for part in ("train", "val"):
+                motions[part] = [*motions.get(part, ()), *origin["motions"].get(part, ())]
+        return cls._of(split_of_run(folder), motions, also_fitted)
 
     @classmethod
     def _of(
