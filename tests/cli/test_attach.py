@@ -57,7 +57,9 @@ def test_a_policy_is_corrected_by_what_was_attached_last_and_by_nothing_after_of
     *before, step = json.loads(file.read_text())["steps"]
     assert before == POLICY["steps"]
     assert (step["registry_name"], step["config"]["payload_mass"]) == ("gaponet_correct", 0.2)
-    loaded = plugin.GaponetCorrect(**step["config"]).get_config()
+    attached = plugin.GaponetCorrect(**step["config"])
+    assert attached.corrector.dt == pytest.approx(1 / 30), "LeRobot's, not the robot's 50 Hz"
+    loaded = attached.get_config()
     assert loaded == {"model": "", "follow": False} | step["config"]
     assert main(["export", str(known), "--to", "lerobot", "--into", str(policy), "--remove"]) == 0
     assert json.loads(file.read_text()) == POLICY

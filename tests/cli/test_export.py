@@ -65,7 +65,7 @@ def test_an_export_elsewhere_can_be_transferred_without_the_run(run, tmp_path):
             "--to mjcf does not use --engine, --scope, --units",
         ),
         (["--to", "json", "--into", "scene.xml"], "--to json does not use --into and --prefix"),
-        (["--to", "mjcf", "--dynamics"], "--to mjcf does not use --dynamics and --remove"),
+        (["--to", "mjcf", "--dynamics"], "--to mjcf does not use --dynamics, --remove, --fps"),
         (
             ["--to", "randomization", "--payload-mass", "0.1"],
             "--to randomization does not use --payload-mass",

@@ -204,6 +204,20 @@ def test_a_payload_that_is_not_stated_is_estimated(robot, model):
     assert np.abs(np.diff(q[-50:], axis=0)).max() < 1e-3
 
 
+def test_a_robot_without_a_mount_carries_no_payload(tmp_path):
+    handless = write_arm(tmp_path, TOML.split("[[payload_mount]]")[0])
+    with pytest.raises(UsageError, match=r"\[\[payload_mount\]\]"):
+        Compensator(handless).reset(np.zeros(2), 2.0)
+
+
+def test_a_start_does_not_change_with_the_callers_array(robot):
+    compensator = Compensator(robot)
+    target = np.array([0.3, -0.2])
+    compensator.reset(target, 0.0)
+    target[0] = np.nan
+    assert np.isfinite(compensator.step(target, np.zeros(2))).all()
+
+
 def test_a_payload_that_is_stated_during_a_motion_is_no_longer_estimated(robot, model):
     targets = np.repeat([[0.3, -0.2]], 200, axis=0)
     compensator = Compensator(robot, model, config=NOW)

@@ -109,6 +109,7 @@ def fake_watchdog(**changes: object) -> SimpleNamespace:
         "problem": str,
         "fired": bool,
         "is_damping": bool,
+        "can_damp": lambda: True,
         "beat": lambda weight: True,
         "wait_ready": lambda: None,
     }

@@ -130,6 +130,7 @@ class GaponetCorrect(ProcessorStep):
     # a policy with a high gain may not bear (docs/deploy.md): gaponet_so101 gives it the nominal
     # simulator's instead.
     follow: bool = False
+    fps: float | None = None  # control rate, Hz, equal to LeRobot's; default that of known or model
 
     def __post_init__(self) -> None:
         self.corrector = Corrector.load(
@@ -138,6 +139,7 @@ class GaponetCorrect(ProcessorStep):
             payload_mass=self.payload_mass,
             dynamics=self.dynamics,
             follow=self.follow,
+            fps=self.fps,
         )
         self.units = Units(self.corrector.spec)
         self.reset()
@@ -200,6 +202,7 @@ class GaponetCorrect(ProcessorStep):
             "payload_mass": self.payload_mass,
             "dynamics": self.dynamics,
             "follow": self.follow,
+            "fps": self.fps,
         }
 
     def transform_features(self, features: dict[Any, dict[str, Any]]) -> dict[Any, dict[str, Any]]:

@@ -38,6 +38,7 @@ LEROBOT_TARGET: Final = "lerobot"
 RANDOMIZATION_FILE = "randomization.json"
 POLICY_FILE = "policy_postprocessor.json"  # of a LeRobot policy
 POLICY_STEP = "gaponet_correct"
+LEROBOT_FPS = 30.0
 JUDGED_UNITS = {  # sets of units whose errors are compared → heading
     "exported": "exported",
     "units": "units",
@@ -231,7 +232,12 @@ class AttachResult:
 
 
 def attach_correction(
-    policy: Place, holder: Place | None, *, payload_mass: float = 0.0, dynamics: bool = False
+    policy: Place,
+    holder: Place | None,
+    *,
+    payload_mass: float = 0.0,
+    dynamics: bool = False,
+    fps: float | None = None,
 ) -> AttachResult:
     """Put the correction of a robot or a run behind a LeRobot policy, in place of an earlier one.
 
@@ -240,10 +246,14 @@ def attach_correction(
         holder: Robot folder, run folder or name of the package; None removes the correction.
         payload_mass: Payload in each hand, kg.
         dynamics: Feed forward inertia and damping too, for smooth targets.
+        fps: Control rate of the policy, Hz. Default: 30, as of LeRobot, for a robot, and the rate
+            of training for a network.
 
     Raises:
-        UsageError: The folder holds no LeRobot policy, or no robot and no run.
+        UsageError: The rate is not positive, or the folder holds no LeRobot policy, or no robot and no run.
     """
+    if fps is not None and not 1 <= fps <= 1000:
+        raise UsageError(f"fps is {fps:g}; give the control rate of the policy in Hz, 1 to 1000")
     file = Path(policy) / POLICY_FILE
     if not file.is_file():
         raise UsageError(
@@ -259,6 +269,10 @@ def attach_correction(
     if holder is not None:
         kind, name = _correction_of(named_folder(holder))
         config = {kind: name, "payload_mass": payload_mass, "dynamics": dynamics}
+        if kind == "known" and fps is None:
+            fps = LEROBOT_FPS
+        if fps is not None:
+            config["fps"] = fps
         steps.append({"registry_name": POLICY_STEP, "config": config})
     write_text(file, json.dumps(document | {"steps": steps}, indent=2) + "\n")
     names = [step.get("registry_name", step.get("class", "?")) for step in steps]

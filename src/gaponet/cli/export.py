@@ -45,7 +45,7 @@ OPTIONS: tuple[tuple[str, tuple[str, ...], Callable[[str], bool]], ...] = (
         lambda to: to in ("mjcf", "envhub", "urdf", LEROBOT_TARGET),
     ),
     ("--data", ("data",), lambda to: to not in ("onnx", "torch", LEROBOT_TARGET)),
-    ("--dynamics and --remove", ("dynamics", "remove"), lambda to: to == LEROBOT_TARGET),
+    ("--dynamics, --remove, --fps", ("dynamics", "remove", "fps"), lambda to: to == LEROBOT_TARGET),
 )
 Holder = Annotated[
     Folder,
@@ -96,6 +96,9 @@ class ExportArgs:
     """For lerobot: feed forward inertia and damping too; use it for smooth targets only."""
     remove: Flag = False
     """For lerobot: remove the correction."""
+    fps: float | None = None
+    """For lerobot: control rate of the policy, Hz. Default: 30 for a robot, and the rate of training
+    for a network."""
 
     def require_used(self) -> None:
         """Refuse options that the target does not use.
@@ -208,6 +211,7 @@ def _attach(screen: Out, holder: Path, args: ExportArgs) -> None:
         None if args.remove else holder,
         payload_mass=args.payload_mass,
         dynamics=args.dynamics,
+        fps=args.fps,
     )
     screen.say(f"{made.file}: {' → '.join(made.steps) or 'no steps'}")
     screen.result(made.to_dict())

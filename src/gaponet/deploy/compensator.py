@@ -193,7 +193,8 @@ class Compensator:
         )
         estimate = PayloadEstimate(robot, loads, num, locked)
         compared = num_envs is None  # `doubt` speaks of one robot
-        self.payload = Payload(masses, config.payload_max, num, carriers, estimate, compared)
+        max_stated = config.payload_max if robot.payload_mounts else 0.0
+        self.payload = Payload(masses, max_stated, num, carriers, estimate, compared)
         self._rows = JointRows(robot, num_envs)
         self._target: Array | None = None  # last finite target; None before `reset`
 
@@ -245,7 +246,7 @@ class Compensator:
             self.robot,
             lambda row: "compensator: the target to begin at",
         )
-        self._target = targets
+        self._target = targets.copy()  # the caller's array may change
         a = targets[:, self._rows.operated]
         self.limits.reset(a)
         self.feedback.reset()

@@ -88,6 +88,11 @@ class Payload:
     def require(self, mass: Array | float) -> None:
         """Refuse masses, kg, that are not physical or too large."""
         given = np.asarray(mass, float)
+        if not self._max_stated and (given > 0).any():
+            raise UsageError(
+                f"payload_mass is {mass}, and the robot has no [[payload_mount]]; add one to "
+                "robot.toml, or give 0"
+            )
         if not ((given >= 0) & (given <= self._max_stated)).all():
             raise UsageError(
                 f"payload_mass is {mass}; give kg, 0 when empty, up to {self._max_stated:g}, or "

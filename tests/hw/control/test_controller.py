@@ -22,7 +22,7 @@ from gaponet.data.importer import ImportRequest, import_logs
 from gaponet.data.sequence import SequenceMeta, to_sequence
 from gaponet.hw.control.clock import MonotonicClock
 from gaponet.hw.control.driver import DriverError, Fault
-from gaponet.hw.control.phases import COMMANDING, ControlConfig
+from gaponet.hw.control.phases import COMMANDING, ControlConfig, Phase
 from gaponet.hw.control.plan import Plan
 from gaponet.hw.targets.policy import motion_policy
 from gaponet.motion.motion import Motion
@@ -549,6 +549,44 @@ def test_an_error_between_two_periods_leaves_no_robot_in_mid_motion(arm, monkeyp
     if watched:
         assert set(released) == {True}, "the watchdog damps it"
     assert driver.closed == [watched], "without a watchdog the driver lets go"
+
+
+@pytest.mark.parametrize("lives", [True, False])
+def test_an_error_while_the_robot_is_lowered_leaves_it_to_a_watchdog_that_lives(
+    arm, monkeypatch, lives
+):
+    driver = NotedArm(arm)
+    released: list[bool] = []
+    dog = fake_watchdog(release=released.append, can_damp=lambda: lives)
+    monkeypatch.setattr("gaponet.hw.control.controller.Watchdog", lambda *_: dog)
+    driver.watchdog = dict
+    controller = control(driver)
+    end = controller.periods.end
+
+    def end_or_fail() -> int:
+        if controller.phase is Phase.DAMP:
+            raise MemoryError
+        return end()
+
+    monkeypatch.setattr(controller.periods, "end", end_or_fail)
+    with pytest.raises(MemoryError):
+        controller.run(acting(lambda: controller.stop("enough")))
+    assert set(released) == {True}
+    assert driver.closed == [lives], "two would write to one bus"
+
+
+def test_nobody_is_told_to_trust_a_watchdog_that_has_died(arm):
+    driver = NotedArm(arm)
+    driver.confirm = refusing
+    controller = control(driver)
+    controller.output.watchdog = fake_watchdog(can_damp=lambda: False)
+    recording = controller.run(acting(lambda: controller.stop("enough")))
+    assert "could NOT be damped" in recording.events[-1].text
+    assert "goes on trying" not in recording.events[-1].text
+
+
+def refusing() -> str:
+    raise DriverError("no word that the torque is off")
 
 
 def test_a_row_that_cannot_be_recorded_lowers_the_robot(arm, monkeypatch):

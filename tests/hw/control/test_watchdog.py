@@ -203,6 +203,16 @@ def test_a_watchdog_whose_messages_nobody_takes_damps_all_the_same(notes, robot_
     assert damped(notes)[-1, 1] == 0.0
 
 
+def test_without_stderr_no_message_reaches_the_robots_connection(notes):
+    spec = json.dumps({"notes": str(notes), "timeout": PATIENT, "damp": DAMP})
+    line = [sys.executable, "-c", ROBOT, spec]
+    process = subprocess.run(
+        ["/bin/sh", "-c", 'exec "$@" 2>&-', "sh", *line], input=bytes([WEIGHT_STEPS]), check=True
+    )
+    assert process.returncode == 0
+    assert damped(notes)[-1, 1] == 0.0
+
+
 @pytest.mark.parametrize("dog", [HANG], indirect=True)
 def test_a_controller_that_comes_back_does_not_end_a_watchdog_that_damps(dog, notes, monkeypatch):
     monkeypatch.setattr(watchdog, "END_TIMEOUT_S", 0.01)

@@ -32,11 +32,12 @@ def test_a_tick_may_count_two_milliseconds():
     assert clock.time(7250, START_S + 0.8) == pytest.approx(START_S + 0.5, abs=3e-3)
 
 
-@pytest.mark.parametrize("ticks_per_s", [50.0, 10_000.0])
+@pytest.mark.parametrize("ticks_per_s", [0.0, 1.0, 50.0, 10_000.0])
 def test_a_tick_that_is_no_clock_leaves_the_time_of_arrival(ticks_per_s):
     clock = found(ticks_per_s=ticks_per_s)
     tick = 7000 + round(0.5 * ticks_per_s)
     assert clock.time(tick, START_S + 0.8) == START_S + 0.8
+    assert clock.time(tick, START_S + 0.9) == START_S + 0.9, "the tick may stand still"
 
 
 def test_after_its_largest_number_a_tick_goes_on_from_zero():

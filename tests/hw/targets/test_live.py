@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from arm import commands
-from hw.noted_arm import DT, NotedArm, control, phases, run
+from hw.noted_arm import DT, QUICK, NotedArm, control, phases, run
 
 from gaponet.base.errors import UsageError
 from gaponet.base.structure import type_adapter
@@ -350,6 +351,20 @@ def test_a_sender_that_dies_while_the_robot_goes_to_its_first_target_ends_in_dam
     assert recording.fault.kind == "silence"
     assert "no target was accepted" in recording.ending, "not how it was damped afterwards"
     judge(arm, recording)
+
+
+def test_a_sender_that_ends_while_the_robot_goes_to_its_first_target_has_not_died(arm):
+    driver = NotedArm(arm)
+    transport = Scripted(
+        driver.clock,
+        lambda t: [good(t)] if t < 0.2 else [Message("a", 100.2, end=True)] if t < 0.3 else [],
+    )
+    targets = LiveTargets(
+        transport, arm, driver.commanded, driver.clock, DT, SafetyConfig().speed, LiveConfig()
+    )
+    recording = control(driver, config=replace(QUICK, blend=2.0)).run(targets)
+    assert recording.fault is None
+    assert phases(recording) == ["idle", "blend_in", "run", "blend_out", "stopped"]
 
 
 SEARCH_S = 2.0  # of a long search for a clear path

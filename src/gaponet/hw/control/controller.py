@@ -116,8 +116,10 @@ class Session:
         there to do it.
         """
         output = self.output
-        left_moving = output.unconfirmed and output.watchdog is None
-        output.context.driver.close(hold=output.damping_since is None and not left_moving)
+        to_be_damped = output.damping_since is not None or output.unconfirmed
+        watchdog = output.watchdog
+        watchdog_damps = output.unconfirmed and watchdog is not None and watchdog.can_damp()
+        output.context.driver.close(hold=not to_be_damped or watchdog_damps)
 
 
 def _require_same_joints(driver: Driver, robot: RobotSpec) -> None:
@@ -256,7 +258,7 @@ class Controller:
             try:
                 self._loop(policy or self._policy_of_plan(), pressed)
             except BaseException:
-                self.output.unconfirmed = self.phase in COMMANDING
+                self.output.unconfirmed |= self.phase in (*COMMANDING, Phase.DAMP)
                 raise
             # It would take the reading back of all registers for a controller that hangs.
             self._session.release_watchdog()

@@ -265,5 +265,7 @@ class Output:
             return self.context.driver.confirm(), ""
         except (DriverError, OSError) as error:
             self.unconfirmed = True
-            more = "; the watchdog goes on trying" if self.watchdog else ""
+            more = ""
+            if self.watchdog and self.watchdog.can_damp():
+                more = "; the watchdog goes on trying"
             return f"could NOT be damped: switch the supply off ({error}){more}", "driver"

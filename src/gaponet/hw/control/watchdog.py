@@ -128,9 +128,13 @@ class Watchdog:
             return False
         return self.process.poll() is None
 
+    def can_damp(self) -> bool:
+        """Return True unless the watchdog has died."""
+        return self.process.poll() in (None, 0)
+
     def is_damping(self) -> bool:
         """Return True if the watchdog damps the robot, or has done so; False if it died of it."""
-        return self.fired() and self.process.poll() in (None, 0)
+        return self.fired() and self.can_damp()
 
     def release(self, unconfirmed: bool = False) -> None:
         """Let the watchdog end without sending anything: the controller has stopped.
@@ -167,6 +171,7 @@ def main(spec: dict[str, Any]) -> None:
         signal.signal(number, signal.SIG_IGN)
     timeout = spec.pop("timeout")
     damp = spec.pop("damp")
+    _open_stderr()
     messages = Messages()
     driver = open_driver(**spec)
     driver.connect()
@@ -187,6 +192,16 @@ def main(spec: dict[str, Any]) -> None:
     messages.say(f"watchdog: the controller {why}; damping {driver.address}")
     damp_robot(driver, damp, weight, messages.say)
     messages.finish()
+
+
+def _open_stderr() -> None:
+    """Let messages go nowhere where stderr is closed: the robot's connection would get its number,
+    and the messages.
+    """
+    try:
+        os.fstat(STDERR)
+    except OSError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), STDERR)
 
 
 class Messages:

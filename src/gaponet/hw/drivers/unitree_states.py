@@ -290,8 +290,10 @@ class TickClock:
     def time(self, tick: int, arrival: float) -> float:
         """Return the time at which the state with this tick was measured, s, at most its arrival.
 
-        The same tick always has the same time.
+        The same tick always has the same time, if it is a clock.
         """
+        if self.period is None:
+            return arrival
         if tick == self._last_tick and np.isfinite(self._offset):
             return self._time
         if tick < self._last_tick - 2**31:
@@ -299,10 +301,6 @@ class TickClock:
         elif tick < self._last_tick:  # the robot has restarted, and its clock with it
             self._offset = np.inf
         self._last_tick = tick
-        if self.period is None:
-            self._offset = 0.0
-            self._time = arrival
-            return arrival
         robot_time = (tick + self._wraps * 2**32) * self.period
         drift = MAX_CLOCK_DRIFT * max(arrival - self._last_arrival, 0.0)
         self._offset = min(arrival - robot_time, self._offset + drift)

@@ -138,7 +138,7 @@ class LiveTargets:
         None: ending, and it is reached. Fault: no target was accepted for long.
         """
         silent = now - self._target.time
-        if silent > self.config.hold and not ending:
+        if silent > self.config.hold and not self._sender.has_ended:
             return Fault(
                 "silence", f"no target was accepted for {silent * 1e3:.0f} ms{self._rejection}"
             )
