@@ -56,6 +56,21 @@ def test_a_good_recording_has_no_warning(arm, tmp_path):
     assert diagnosis.verdict == "Good: no error and no warning."
 
 
+def test_torque_and_velocity_of_coarse_sensors_are_no_fault(arm, tmp_path):
+    """A current register in steps, and an encoder of 12 bits at 500 Hz."""
+    rows = 10_000
+    dt = 0.002
+    angle = 2 * np.pi * 0.1 * dt * np.arange(rows)[:, None] + np.array([0.0, 1.0])
+    qpos = 0.2 * np.sin(angle)
+    qvel = 0.2 * 2 * np.pi * 0.1 * np.cos(angle)
+    encoder_step = 2 * np.pi / 4096
+    quantised = np.round(late(qpos, 30) / encoder_step) * encoder_step
+    tau = np.round(1.2 * np.sin(angle) / 0.05) * 0.05
+    sequence = replace(arm_sequence(arm, qpos, quantised, qvel=late(qvel, 30), tau=tau), dt=dt)
+    texts = [f.text for f in examine(arm, tmp_path, sequence).findings if f.level == "warning"]
+    assert not [text for text in texts if "cut off flat" in text or "not rad/s" in text]
+
+
 def test_findings_stand_worst_first(arm, tmp_path):
     ctrl, qpos = good()
     levels = [f.level for f in examine(arm, tmp_path, arm_sequence(arm, ctrl, -qpos)).findings]

@@ -2,10 +2,12 @@
 
 import numpy as np
 import pytest
+from logs import arm_sequence, wave
 
 from gaponet.sysid.evidence.drift import EVERY_JOINT, ParameterChange, drift_advice
 from gaponet.sysid.evidence.evidence import (
     Evidence,
+    estimate_uncertainty,
     gradient_covariance,
     inverted,
     no_better_than,
@@ -43,6 +45,13 @@ def test_the_covariance_of_a_sum_follows_from_the_scatter_of_its_parts():
     rng = np.random.default_rng(0)
     parts = 2 * rng.standard_normal((1, 2000, 1))
     assert gradient_covariance(parts).item() == pytest.approx(4 * 2000, rel=0.1)
+
+
+def test_recordings_with_other_payloads_are_others(arm):
+    made = [arm_sequence(arm, wave(60, 2), wave(60, 2), payload=mass) for mass in (0.0, 0.1, 0.2)]
+    uncertainty = estimate_uncertainty(arm, made, [])
+    (source,) = uncertainty.sources
+    assert list(source["logs"]) == ["m", "m, 0.1 kg", "m, 0.2 kg"]
 
 
 def test_overdispersion_of_four_doubles_a_standard_error():

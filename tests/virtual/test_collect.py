@@ -238,6 +238,15 @@ def test_a_recipe_may_play_motion_files(spec, fleet, tmp_path):
     collect(spec, fleet, load_recipe(tmp_path / "mine.toml"), tmp_path / "out", nproc=1)
     (entry,) = Dataset(tmp_path / "out").entries
     assert entry.meta.motion == "swing"
+    (tmp_path / "swing.txt").write_text(
+        "shoulder,elbow\n" + "".join(f"{0.002 * t},{-0.001 * t}\n" for t in range(100))
+    )
+    collect(spec, fleet, load_recipe(tmp_path / "mine.toml"), tmp_path / "new", nproc=1)
+    played = []
+    for folder in ("out", "new"):
+        data = Dataset(tmp_path / folder)
+        played.append(float(data.read(data.entries[0]).ctrl[:, 0].max()))
+    assert played == pytest.approx([0.099, 0.198], abs=1e-6), "a file that was changed is read"
 
 
 def test_the_whole_simlifter_recipe_is_as_large_as_the_paper_says():

@@ -422,20 +422,19 @@ def _delta_summary(parts: list[Array], sequences: list[Sequence], limit: float) 
     """Return mean and largest |Δa|, rad, their mean rate, rad/s, and the share at the limit Δ_max
     (rad).
     """
-    dt = float(np.median([sequence.dt for sequence in sequences]))
     means = []
     largest = []
     shares_at_limit = []
-    steps = []  # mean |difference| of a row and the next one, rad
-    for delta in parts:
+    rates = []  # mean |difference| of a row and the next one, rad/s
+    for delta, sequence in zip(parts, sequences, strict=True):
         size = np.abs(delta)
         means.append(size.mean())
         largest.append(size.max())
         shares_at_limit.append((size >= limit - 1e-6).mean())
-        steps.append(np.abs(np.diff(delta, axis=0)).mean())
+        rates.append(np.abs(np.diff(delta, axis=0)).mean() / sequence.dt)
     return {
         "mean": float(np.mean(means)),
         "max": float(max(largest)),
         "at_limit": float(np.mean(shares_at_limit)),
-        "rate": float(np.mean(steps) / dt),
+        "rate": float(np.mean(rates)),
     }

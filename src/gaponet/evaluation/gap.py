@@ -202,15 +202,20 @@ def _by_payload(
 
 
 def _steps(candidate: Candidate, causes: list[GapStep]) -> list[GapStep]:
-    """Return the steps from the nominal simulator over the causes to the model."""
+    """Return the steps from the nominal simulator over the causes to the model.
+
+    Without causes, delay and offset of the recordings come first; among the causes, the robot has
+    its own.
+    """
     nominal = candidate.robot.before_identification
     start = [GapStep("nominal", nominal)]
     if candidate.model is None:
         return start + causes
-    fitted = DelayOffset.read(candidate.folder)
-    only_delay = DelayOffset(fitted.delay, dict.fromkeys(fitted.offset, 0.0))
-    start.append(GapStep("delay", nominal, only_delay.corrector(nominal)))
-    start.append(GapStep("offset", nominal, fitted.corrector(nominal)))
+    if not causes:
+        fitted = DelayOffset.read(candidate.folder)
+        only_delay = DelayOffset(fitted.delay, dict.fromkeys(fitted.offset, 0.0))
+        start.append(GapStep("delay", nominal, only_delay.corrector(nominal)))
+        start.append(GapStep("offset", nominal, fitted.corrector(nominal)))
     corrected = GapStep(candidate.method, candidate.robot, candidate.corrector())
     return [*start, *causes, corrected]
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import pickle
 from dataclasses import dataclass
 from typing import Any
 
@@ -37,18 +39,28 @@ class Job:
     takes: tuple[Take, ...]
 
 
-_LIBRARIES: dict[tuple[str, int, float, tuple[str, ...]], Library] = {}  # of this process
+_LIBRARIES: dict[tuple[str, int, float], Library] = {}  # the last one of this process
 
 
 def library(robot: RobotSpec, seed: int, recipe: Recipe, files: tuple[Motion, ...]) -> Library:
-    """Return the motions that a recipe chooses from, made once per process."""
-    key = (str(robot.mjcf), seed, max(recipe.payloads), recipe.files)
+    """Return the motions that a recipe chooses from, made again where robot or files changed."""
+    key = (_digest(robot, files), seed, max(recipe.payloads))
     if key not in _LIBRARIES:
+        _LIBRARIES.clear()
         motions = Library(robot, seed, max(recipe.payloads))
         for motion in files:
             motions.add(motion)
         _LIBRARIES[key] = motions
     return _LIBRARIES[key]
+
+
+def _digest(robot: RobotSpec, files: tuple[Motion, ...]) -> str:
+    """Return what the motions of a robot depend on, as hexadecimal digits."""
+    digest = hashlib.sha256(pickle.dumps((robot, files)))
+    for path in (robot.mjcf, robot.folder / "collision.toml"):
+        if path.is_file():
+            digest.update(path.read_bytes())
+    return digest.hexdigest()
 
 
 def play(job: Job) -> list[Sequence]:

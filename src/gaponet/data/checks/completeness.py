@@ -33,6 +33,7 @@ MAX_STILL_SHARE = 0.05  # of the command's range
 MAX_RESOLUTION_RAD = 3e-3  # step between positions; twice as much is a warning
 RESOLUTION_TOLERANCE = 0.02  # relative difference of an encoder's steps
 MIN_FLAT_ROWS = 20  # with torque cut off at one value
+MIN_PILE = 3  # times as many rows as at the next smaller torque
 MIN_FLAT_SHARE = 0.01  # of the torque limit, for this value
 
 
@@ -338,11 +339,15 @@ def _flat_torque(recorded: Recorded, robot: RobotSpec) -> Iterator[Finding]:
         top = max((float(torque.largest[i]) for _, torque in recorded), default=0.0)
         near = []  # recordings that reach this torque
         rows = 0
+        rows_below = 0  # at the next smaller torque: as many, where torque is recorded in steps
         for survey, torque in recorded:
             if float(torque.largest[i]) > 0.999 * top:
                 near.append(survey)
                 rows += int(torque.flat[i])
+                rows_below += int(torque.below_flat[i])
         if top <= MIN_FLAT_SHARE * robot.servo.effort_limit[i] or rows < MIN_FLAT_ROWS:
+            continue
+        if rows < MIN_PILE * rows_below:
             continue
         text = (
             f"torque of {name} is cut off flat at {top:.3g} N·m in {rows} rows of "

@@ -67,6 +67,8 @@ MOVING_RAD = 0.05  # range of a joint that moves
 JOB_ROWS = 40_000  # of one job of several processes
 MIN_PARALLEL_ROWS = 600_000  # of a dataset for which it pays to start processes
 OVERHEAD_ROWS = 1500  # rows that take as long as the fixed costs of a recording
+QVEL_CUTOFF_HZ = 10.0  # of velocities that are compared
+MIN_FILTERED_ROWS = 50
 MIN_LEVELS = 8  # distinct positions from which the step between them is known
 LEVEL_TOLERANCE = 0.1  # of a step, by which positions lie beside its multiples
 KIND_STEP_S = 0.02  # period at which a command is compared with what it may be
@@ -80,6 +82,7 @@ class Torque(NamedTuple):
     over_limit: Array  # rows above the torque limit
     spikes: Array  # rows far above the rows around
     flat: Array  # rows at exactly the greatest magnitude
+    below_flat: Array  # rows at the next smaller one
 
     @property
     def largest(self) -> Array:
@@ -655,9 +658,15 @@ def _qvel_ratio(sequence: Sequence) -> Array:
     """Return the slope of the recorded velocity over the derivative of the position, (n); NaN for
     a joint that hardly moves.
     """
-    derivative = differentiate(sequence.qpos, sequence.dt)
+    qpos = sequence.qpos
+    qvel = sequence.qvel
+    if sequence.dt < 1 / (4 * QVEL_CUTOFF_HZ) and len(sequence) > MIN_FILTERED_ROWS:
+        # The derivative of an encoder's steps is noise, the more the higher the rate is.
+        qpos = lowpass(qpos, sequence.dt, QVEL_CUTOFF_HZ)
+        qvel = lowpass(qvel, sequence.dt, QVEL_CUTOFF_HZ)
+    derivative = differentiate(qpos, sequence.dt)
     power = (derivative**2).sum(axis=0)
-    product = (sequence.qvel * derivative).sum(axis=0)
+    product = (qvel * derivative).sum(axis=0)
     moves = np.ptp(sequence.qpos, axis=0) > MOVING_RAD
     return np.where(moves, product / np.where(power > 0, power, 1.0), np.nan)
 
@@ -735,12 +744,15 @@ def _torque(sequence: Sequence, robot: RobotSpec) -> Torque | None:
     calm = maximum_filter1d(steps, 2 * window + 1) == 0  # no command steps near the row, (T,)
     limit = robot.servo.effort_limit
     spikes = (magnitude - usual > SPIKE_SHARE * limit) & calm[:, None]
+    is_largest = magnitude == magnitude.max(axis=0)
+    below = np.where(is_largest, -1.0, magnitude)
     return Torque(
         low=tau.min(axis=0),
         high=tau.max(axis=0),
         over_limit=(magnitude > limit * (1 + TORQUE_TOLERANCE)).sum(axis=0),
         spikes=spikes.sum(axis=0),
-        flat=(magnitude == magnitude.max(axis=0)).sum(axis=0),
+        flat=is_largest.sum(axis=0),
+        below_flat=(below == below.max(axis=0)).sum(axis=0),
     )
 
 

@@ -199,12 +199,22 @@ def _slopes_over_play(rollouts: JointRollouts, bounds: Bounds) -> Array:
 
 
 def _window_name(part: Sequence) -> str:
-    """Return the name of a window's recording: its motion, and its repetition unless it is the
-    first one.
+    """Return the name of a window's recording: its motion, its payload, and its repetition unless
+    it is the first one.
     """
+    name = part.meta.motion + _payload_in_name(part)
     if not part.meta.repetition:
-        return part.meta.motion
-    return f"{part.meta.motion} ({part.meta.repetition})"
+        return name
+    return f"{name} ({part.meta.repetition})"
+
+
+def _payload_in_name(sequence: Sequence) -> str:
+    """Return what a recording's name says of its payload: nothing for an empty hand."""
+    if not sequence.meta.payload_mass:
+        return ""
+    side = sequence.meta.payload_side
+    of_side = "" if side == "both" else f" {side}"
+    return f", {sequence.meta.payload_mass:g} kg{of_side}"
 
 
 def estimate_uncertainty(
@@ -409,8 +419,9 @@ def _beside_earlier(
 
 
 def _log_name(sequence: Sequence) -> str:
-    """Return motion and repetition of a recording; the first repetition has no number."""
-    return f"{sequence.meta.motion} {sequence.meta.repetition}".removesuffix(" 0")
+    """Return motion, payload and repetition of a recording; the first repetition has no number."""
+    name = sequence.meta.motion + _payload_in_name(sequence)
+    return f"{name} {sequence.meta.repetition}".removesuffix(" 0")
 
 
 def _errors_by_joint(folds: ListOf[HeldOut], nthread: int) -> dict[str, list[Array]]:

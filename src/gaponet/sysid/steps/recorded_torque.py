@@ -9,6 +9,7 @@ from gaponet.data.sequence import Sequence
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.metrics import Comparison, Run, metrics, runs
 from gaponet.sim.replay import motion_errors, replay
+from gaponet.sim.temperature import temperature_findings
 from gaponet.sysid.acceptance import HeldOut, Identified, Split, held_out_errors
 from gaponet.sysid.axes import CLASSIC, Bounds
 from gaponet.sysid.joint_rollouts import JointRollouts
@@ -63,6 +64,8 @@ def with_torque(
         undetermined=errors.undetermined,
         held_out=folds,
         without_terms=None,
+        links=None,
+        findings=temperature_findings(every, robot, errors.std),
     )
 
 
