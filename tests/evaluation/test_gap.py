@@ -181,7 +181,7 @@ def test_friction_creeps_only_with_the_option(tmp_path):
 
 
 def test_the_steps_of_an_identified_simulator_are_those_that_a_report_reads(tmp_path):
-    steps = ["nominal", "delay", "offset", *CAUSES, "creep", "identified+gaponet"]
+    steps = ["nominal", *CAUSES, "creep", "identified+gaponet"]
     panel = {"left": dict.fromkeys(steps, 0.01), "floor": {"both": 0.001}}
     gap = panel | {
         "by_joint": {"elbow": panel},

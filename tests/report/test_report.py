@@ -50,13 +50,7 @@ def blind(*_):
 
 def test_the_page_is_one_offline_file_that_names_the_method_everywhere(evaluated):
     gp.gap(evaluated.parent / "data", run=evaluated)
-    assert list(read_gap(evaluated)["left"]) == [
-        "nominal",
-        "delay",
-        "offset",
-        "gain",
-        "identified+gaponet",
-    ]
+    assert list(read_gap(evaluated)["left"]) == ["nominal", "gain", "identified+gaponet"]
     page = write_report(evaluated, picture=draw).read_text()  # figures are SVG with their words
     assert '<img src="data:image/png;base64,UE5H">' in page
     assert not re.findall(r'(?:src|href)="(?!data:|#)[^"]*', page)
