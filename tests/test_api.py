@@ -60,6 +60,23 @@ def test_from_a_dataset_to_an_evaluated_model(tmp_path, capsys):
     assert np.isfinite(loop.delta(np.zeros(2), np.zeros(2), np.ones(2), 0.0)).all()
 
 
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda arm, out: gp.export_robot(arm.folder, to="foo", out=out),
+        lambda arm, out: gp.export_network("so101-sage", to="foo", out=out),
+        lambda arm, out: gp.randomization(arm.folder, engine="foo", out=out),
+        lambda arm, out: gp.randomization(arm.folder, scope="foo", out=out),
+        lambda arm, out: gp.excite(arm, out=out, options=gp.ExciteOptions(format="foo")),
+        lambda arm, out: gp.IdentifyOptions(terms=("foo",)).searches(),
+    ],
+)
+def test_a_word_that_is_no_choice_is_refused_with_the_choices(arm, tmp_path, call):
+    with pytest.raises(UsageError, match="is 'foo'; choose "):
+        call(arm, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
 def test_a_payload_that_a_dataset_states_already_is_not_given_again(arm, tmp_path):
     data = write_dataset(tmp_path / "data", arm, recordings(arm, count=1))
     with pytest.raises(UsageError, match="--payload-mass"):

@@ -15,6 +15,7 @@ from gaponet.base.errors import UsageError
 from gaponet.base.files import write_text
 from gaponet.base.progress import Progress, no_progress
 from gaponet.base.result_table import ResultTable
+from gaponet.base.structure import require_choice
 from gaponet.evaluation.tables import mrad
 from gaponet.nn.packaged_networks import (
     is_packaged,
@@ -80,8 +81,9 @@ def export_robot(
         UsageError: No recording was made with this payload and the robot's gains.
     """
     from gaponet.export import export_folder as files
-    from gaponet.export.plain_servos import read_recordings
+    from gaponet.export.plain_servos import lost_recordings, read_recordings
 
+    require_choice("to", to, get_args(RobotTarget))
     holder = named_folder(robot)
     require_run_folder(
         holder,
@@ -99,6 +101,12 @@ def export_robot(
     recordings = read_recordings(simulator_folder(holder), data, spec)
     folder = Path(out) if out else holder / to
     made = files.export_robot(spec, to, folder, recordings, source, payload_mass, progress)
+    if recordings is None and (gone := lost_recordings(simulator_folder(holder), data)):
+        note = (
+            f"the robot's recordings are gone from {gone}: motions of its own were simulated to "
+            "measure it; --data DATASET says where they are"
+        )
+        made = replace(made, notes=(note, *made.notes))
     if recordings is None and identified_catalogue().holds(holder):
         card = RobotCard.read(holder)
         made = replace(made, notes=(*made.notes, f"{card.name}, {card.errors()}"))
@@ -132,6 +140,9 @@ def export_network(
     from gaponet.export.export_folder import export_model, export_networks
     from gaponet.nn.artifact import GapModel
 
+    require_choice("to", to, get_args(NetworkTarget))
+    if payload_mass and to == "onnx":
+        raise UsageError("payload_mass is for torch and actuator-net; onnx takes it as an input")
     holder = named_folder(run)
     require_out(holder, out)
     if to == "actuator-net":
@@ -182,9 +193,17 @@ def randomization(
         NoGainError: The units follow the recordings worse than ± 20 % on each number.
     """
     from gaponet.export.plain_servos import read_recordings
-    from gaponet.export.randomization import judge_units, sample_units, write_randomization
+    from gaponet.export.randomization import (
+        Engine,
+        Scope,
+        judge_units,
+        sample_units,
+        write_randomization,
+    )
     from gaponet.export.targets import own_terms
 
+    require_choice("engine", engine, get_args(Engine))
+    require_choice("scope", scope, get_args(Scope))
     spec = load_robot(simulator_folder(named_folder(robot)))
     made = sample_units(spec, scope, tuple(map(Path, units)), engine=engine)
     made = judge_units(
@@ -340,6 +359,7 @@ def _exported(made: ExportedFolder, folder: Path, to: str, robot: str) -> Export
         errors=made.errors,
         motions=made.motions,
         virtual=made.virtual,
+        own_motions=made.own_motions,
         notes=tuple(made.notes),
         check=script if script.is_file() else None,
         checked_in=TARGETS[to].checked_in or to,

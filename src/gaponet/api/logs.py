@@ -265,9 +265,12 @@ def excite(
             motions of another call.
     """
     from gaponet.base.files import lock_folder, write_text
-    from gaponet.motion.files import write_motion
+    from gaponet.base.structure import require_choice
+    from gaponet.motion.files import SUFFIXES, write_motion
     from gaponet.motion.plan import make_plan, sheet
 
+    suffixes = tuple(suffix.removeprefix(".") for suffix in SUFFIXES)
+    require_choice("format", options.format, suffixes)
     spec = as_robot(robot)
     masses = tuple(sorted(set(options.payloads)))
     minutes = options.minutes

@@ -8,9 +8,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 from gaponet.base.errors import UsageError
+from gaponet.base.structure import require_choice
 from gaponet.data.importer import ImportOptions as ImportOptions
 from gaponet.nn.config import ModelKind
 from gaponet.robot.servo_fields import Term
@@ -78,8 +79,10 @@ class IdentifyOptions:
         """Return the options of the searches for parameters.
 
         Raises:
-            UsageError: The budget is no time.
+            UsageError: The budget is no time, or there is no such term.
         """
+        for term in self.terms or ():
+            require_choice("terms", term, get_args(Term))
         return SearchOptions(
             windows=self.windows,
             terms=self.terms,

@@ -495,7 +495,11 @@ class ReplayResult:
             "rollouts": [a.name for a in self.rollouts],
             "joints": {j: dict(s) for j, s in self.joints.items()},
             "differ": list(self.differ),
-            "band": {"share": self.share, "drawn": self.drawn},
+            "band": {
+                "share": self.share,
+                "drawn": self.drawn,
+                "from_recordings": self.band_from_recordings,
+            },
         }
 
 
@@ -511,6 +515,7 @@ class ExportResult:
             network.
         motions: Number of those motions.
         virtual: True if no real robot played them.
+        own_motions: True if they were simulated for the export, because it has no recordings.
         notes: What the form leaves out, and what the user has to decide.
         parity: Largest difference between the file and the trained network, rad; None for a robot.
         check: Script that checks the export in the other program without gaponet; None where there
@@ -524,6 +529,7 @@ class ExportResult:
     errors: Mapping[str, float] = field(default_factory=dict)
     motions: int = 0
     virtual: bool = False
+    own_motions: bool = False
     notes: tuple[str, ...] = ()
     parity: float | None = None
     check: Path | None = None
@@ -537,6 +543,9 @@ class ExportResult:
             "to": self.to,
             "robot": self.robot,
             "left": dict(self.errors),
+            "motions": self.motions,
+            "virtual": self.virtual,
+            "own_motions": self.own_motions,
             "notes": list(self.notes),
         }
 

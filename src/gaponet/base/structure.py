@@ -15,6 +15,7 @@ import tokenize
 import tomllib
 import zipfile
 import zlib
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Any, TypeVar, cast
 
@@ -255,3 +256,14 @@ def _first_error(invalid: ValidationError) -> str:
 
 def _message(where: str | Path, reason: str, hint: str) -> str:
     return f"{where}: {reason}" + (f"; {hint}" if hint else "")
+
+
+def require_choice(name: str, value: object, choices: Iterable[str]) -> None:
+    """Refuse a word that is none of the choices.
+
+    Raises:
+        UsageError: It names the choices.
+    """
+    known = tuple(choices)
+    if value not in known:
+        raise UsageError(f"{name} is {value!r}; choose {', '.join(known)}")

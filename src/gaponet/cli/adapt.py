@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from shlex import quote
 from typing import Annotated
 
 import tyro
@@ -120,7 +121,7 @@ def _show_robot(screen: Out, made: AdaptResult) -> None:
         f"{made.recordings} recording(s) of unit {made.unit_id}; robot folder {made.folder}"
     )
     _show_servos(screen, made)
-    robot = robot_argument(made.folder)
+    robot = quote(robot_argument(made.folder))
     screen.next(f"gaponet run --motion FILE --robot {robot} --compensate")
 
 
@@ -131,7 +132,7 @@ def _show_run(screen: Out, made: AdaptResult, dataset: str) -> None:
         f"window RMS {mrad(made.before)} → {mrad(made.after)} mrad of the fitted windows; stored "
         f"in {made.folder}"
     )
-    screen.next(f"gaponet eval {made.folder} {dataset}")
+    screen.next(f"gaponet eval {quote(str(made.folder))} {quote(dataset)}")
 
 
 def _show_servos(screen: Out, made: AdaptResult) -> None:

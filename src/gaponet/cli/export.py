@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from shlex import quote
 from typing import Annotated, Literal
 
 import tyro
@@ -37,7 +38,11 @@ OPTIONS: tuple[tuple[str, tuple[str, ...], Callable[[str], bool]], ...] = (
         ("engine", "scope", "units"),
         lambda to: to == RANDOMIZATION_TARGET,
     ),
-    ("--payload-mass", ("payload_mass",), lambda to: to != RANDOMIZATION_TARGET),
+    (
+        "--payload-mass",
+        ("payload_mass",),
+        lambda to: to not in (RANDOMIZATION_TARGET, "onnx"),
+    ),
     ("--out", ("out",), lambda to: to != LEROBOT_TARGET),
     (
         "--into and --prefix",
@@ -161,7 +166,7 @@ def _show(screen: Out, made: ExportResult) -> None:
     rows = [[form, mrad(error)] for form, error in made.errors.items()]
     title = f"Mean |error| on {made.motions} {kind} motion{plural}"
     screen.table(title, ["form", "mrad"], rows)
-    if made.virtual:
+    if made.own_motions:
         screen.say(
             "  These motions are simulated, over most of each joint's range; recorded ones may "
             "lose less. --data DATASET takes recorded ones."
@@ -170,7 +175,7 @@ def _show(screen: Out, made: ExportResult) -> None:
         screen.say(f"  {line}", "warning", "yellow")
     screen.say(f"{made.path}: {made.robot} for {made.to}")
     if made.check:
-        screen.next(f"python {made.check}, in {made.checked_in}")
+        screen.next(f"python {quote(str(made.check))}  # in {made.checked_in}")
     screen.result(made.to_dict())
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from shlex import quote
 from typing import Annotated
 
 import tyro
@@ -66,5 +67,5 @@ def identify(
             made = api.identify(data, out=out, robot=spec, options=options, progress=update)
         show_identified(screen, made, options, details)
         screen.say(f"robot folder: {out}, after {made.seconds:.0f} s")
-        screen.next(f"gaponet gap {dataset} --robot {robot_argument(out)}")
+        screen.next(f"gaponet gap {quote(str(dataset))} --robot {quote(robot_argument(out))}")
     screen.result(made.to_dict())

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import defaultdict
 from dataclasses import dataclass, fields
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
@@ -144,11 +145,11 @@ def doctor(
     if diagnosis.count("error") and fix:
         screen.next("correct the logs, import them into a new folder")
     elif diagnosis.count("error"):
-        screen.next(f"gaponet doctor {dataset} --fix")
+        screen.next(f"gaponet doctor {quote(str(dataset))} --fix")
     elif driven_by_torque(data):
-        screen.next(f"gaponet identify {dataset} --out ROBOT")
+        screen.next(f"gaponet identify {quote(str(dataset))} --out ROBOT")
     else:
-        screen.next(f"gaponet gap {dataset}")
+        screen.next(f"gaponet gap {quote(str(dataset))}")
     facts = {
         "dataset": data.path.name,
         "robot": spec.name,
@@ -192,7 +193,7 @@ def _show_import(screen: Out, made: ImportResult) -> None:
         screen.say(
             f"Offsets are recorded in {data.path!s}/offsets.json; nothing was applied to the data."
         )
-    screen.next(f"gaponet doctor {data.path!s}")
+    screen.next(f"gaponet doctor {quote(str(data.path))}")
     screen.result(table)
 
 

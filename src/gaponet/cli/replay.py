@@ -6,6 +6,7 @@ from pathlib import Path
 
 from gaponet import api
 from gaponet.api.results import ReplayResult
+from gaponet.base.errors import UsageError
 from gaponet.base.progress import progress_bar
 from gaponet.cli.options import Json, Logs, like
 from gaponet.cli.out import Out
@@ -45,6 +46,10 @@ def replay(
             each rollout.
     """
     screen = Out(json)
+    if out is not None and out.suffix != ".npz":
+        raise UsageError(f"--out {out}: give the name of an .npz file")
+    if out is not None and not out.parent.is_dir():
+        raise UsageError(f"--out {out}: there is no folder {out.parent}; make it first")
     with progress_bar("replaying") as update:
         made = api.replay(
             logs,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
+from shlex import quote
 from typing import Annotated, Literal
 
 import tyro
@@ -205,7 +206,7 @@ def new(
     picture = "" if made.picture is None else ", picture.png"
     screen.say(f"written: {out}/robot.toml, robot.xml{picture}")
     screen.next(
-        f"look at robot.toml and the picture; gaponet import LOGS --robot {robot_argument(out)} "
+        f"look at robot.toml and the picture; gaponet import LOGS --robot {quote(robot_argument(out))} "
         "--out data"
     )
     screen.result(made.to_dict())

@@ -58,7 +58,8 @@ class ExportedFolder:
     file: Path | None  # the MJCF or URDF; None for json
     errors: dict[str, float]  # form of the robot → mean |error| over the motions, rad
     motions: int  # number of validation motions
-    virtual: bool  # True if the motions are simulated
+    virtual: bool  # True if no real robot played the motions
+    own_motions: bool  # True if they were simulated for the export
     notes: tuple[str, ...] = ()  # effects that the form lacks, and decisions for the user
 
 
@@ -229,7 +230,12 @@ def export_robot(
         has_units = envhub.write_units(robot, out, recordings, progress)
         envhub.write_readme(robot, facts, has_units, out)
     return ExportedFolder(
-        file, export.errors, len(validation), facts["virtual"], tuple(export.notes)
+        file,
+        export.errors,
+        len(validation),
+        facts["virtual"],
+        recordings is None,
+        tuple(export.notes),
     )
 
 
@@ -383,7 +389,7 @@ def export_model(model: GapModel, run: Path, folder: Path, payload_mass: float =
     """
     from gaponet.export.torch_program import export_program
 
-    model.require_payload(payload_mass)
+    model.require_payload(payload_mass, can_extrapolate=False)
     robot = model.simulator()
     dt = control_period(robot, model.card.get("dt") or [robot.dt])
     with lock_folder(folder, FOLDER_KIND):
@@ -417,7 +423,7 @@ def export_networks(
     """
     from gaponet.export.actuator_net import read_run_recordings, write_networks
 
-    model.require_payload(payload_mass)
+    model.require_payload(payload_mass, can_extrapolate=False)
     robot = model.simulator()
     train, val = read_run_recordings(run, data, robot, payload_mass)
     motions = check_motions(val, robot)
@@ -441,7 +447,8 @@ def export_networks(
         )
     if facts["law"]:
         notes.append(f"the servo model ({', '.join(facts['law'])}) is not in actuator networks")
-    return ExportedFolder(folder / ROBOT, errors, len(motions), train[0].meta.virtual, tuple(notes))
+    virtual = train[0].meta.virtual
+    return ExportedFolder(folder / ROBOT, errors, len(motions), virtual, False, tuple(notes))
 
 
 def _write_scene(

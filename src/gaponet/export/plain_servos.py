@@ -50,6 +50,17 @@ class _Stored(TypedDict):
     content: Any
 
 
+def lost_recordings(folder: Path, data: str | None) -> Path | None:
+    """Return where the dataset was that a robot was identified from, if nobody says where it is
+    now.
+    """
+    origin = read_origin(folder)
+    if data is not None or origin is None:
+        return None
+    place = folder / origin["dataset"]
+    return None if place.is_dir() else place
+
+
 def read_recordings(
     folder: Path, data: str | None, robot: RobotSpec
 ) -> tuple[list[Sequence], list[Sequence]] | None:

@@ -470,9 +470,14 @@ class GapModel:
         """
         return float(max(self.card.get("payload_seen", [self.config.payload_max])))
 
-    def require_payload(self, payload_mass: Array | float, extrapolate: bool = False) -> None:
+    def require_payload(
+        self, payload_mass: Array | float, extrapolate: bool = False, can_extrapolate: bool = True
+    ) -> None:
         """Refuse payloads, kg, that are not physical, and, unless `extrapolate`, those outside the
         training data.
+
+        Args:
+            can_extrapolate: The caller has an option for that, which the error names.
         """
         mass = np.asarray(payload_mass, float)
         if not (np.isfinite(mass) & (mass >= 0)).all():
@@ -480,10 +485,12 @@ class GapModel:
         least = min(self.card.get("payload_seen", [0.0]))
         beyond = mass[(mass > self.max_payload * (1 + 1e-6)) | (mass < least * (1 - 1e-6))]
         if beyond.size and not extrapolate:
+            advice = "train on such payloads"
+            if can_extrapolate:
+                advice += ", or extrapolate (--extrapolate, extrapolate=True)"
             raise ModelError(
                 f"{self.path}: trained with {least:g} to {self.max_payload:g} kg; "
-                f"{beyond.flat[0]:g} kg is outside; train on such payloads, or extrapolate "
-                "(--extrapolate, extrapolate=True)"
+                f"{beyond.flat[0]:g} kg is outside; {advice}"
             )
 
     def require_gains(self, joint_names: tuple[str, ...], kp: Array, kd: Array) -> None:
