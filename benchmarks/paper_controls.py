@@ -2,8 +2,8 @@
 
     python benchmarks/paper_controls.py EXPERIMENT DATASET [--steps 200000] [--seed 0]
 
-EXPERIMENT is the folder of `gaponet experiment paper DATASET`. Each control is trained and measured as its
-networks are:
+EXPERIMENT is the folder of `gaponet experiment paper DATASET`. Each control is trained and measured
+as its networks are:
 
     untrained          the correction is zero
     literal            as the experiment trains it

@@ -81,7 +81,7 @@ def export_robot(
         UsageError: No recording was made with this payload and the robot's gains.
     """
     from gaponet.export import export_folder as files
-    from gaponet.export.plain_servos import lost_recordings, read_recordings
+    from gaponet.export.plain_servos import read_recordings
 
     require_choice("to", to, get_args(RobotTarget))
     holder = named_folder(robot)
@@ -101,16 +101,27 @@ def export_robot(
     recordings = read_recordings(simulator_folder(holder), data, spec)
     folder = Path(out) if out else holder / to
     made = files.export_robot(spec, to, folder, recordings, source, payload_mass, progress)
-    if recordings is None and (gone := lost_recordings(simulator_folder(holder), data)):
-        note = (
-            f"the robot's recordings are gone from {gone}: motions of its own were simulated to "
-            "measure it; --data DATASET says where they are"
-        )
-        made = replace(made, notes=(note, *made.notes))
-    if recordings is None and identified_catalogue().holds(holder):
-        card = RobotCard.read(holder)
-        made = replace(made, notes=(*made.notes, f"{card.name}, {card.errors()}"))
+    if recordings is None:
+        made = replace(made, notes=(*made.notes, *_notes_without_recordings(holder, data)))
     return _exported(made, folder, to, spec.name)
+
+
+def _notes_without_recordings(holder: Path, data: str | None) -> list[str]:
+    """Return the errors that a robot of the package had on its recordings; of another robot, where
+    its recordings are no longer.
+    """
+    from gaponet.export.plain_servos import lost_recordings
+
+    if identified_catalogue().holds(holder):
+        card = RobotCard.read(holder)
+        return [f"{card.name}, {card.errors()}"]
+    gone = lost_recordings(simulator_folder(holder), data)
+    if gone is None:
+        return []
+    return [
+        f"the robot's recordings are gone from {gone}: motions of its own were simulated to "
+        "measure it; --data DATASET says where they are"
+    ]
 
 
 def export_network(
@@ -269,7 +280,8 @@ def attach_correction(
             of training for a network.
 
     Raises:
-        UsageError: The rate is not positive, or the folder holds no LeRobot policy, or no robot and no run.
+        UsageError: The rate is not one of a robot, or the folder holds no LeRobot policy, or no
+            robot and no run.
     """
     if fps is not None and not 1 <= fps <= 1000:
         raise UsageError(f"fps is {fps:g}; give the control rate of the policy in Hz, 1 to 1000")

@@ -102,8 +102,8 @@ class ExportArgs:
     remove: Flag = False
     """For lerobot: remove the correction."""
     fps: float | None = None
-    """For lerobot: control rate of the policy, Hz. Default: 30 for a robot, and the rate of training
-    for a network."""
+    """For lerobot: control rate of the policy, Hz. Default: 30 for a robot, and for a network the
+    rate of its training."""
 
     def require_used(self) -> None:
         """Refuse options that the target does not use.

@@ -206,8 +206,8 @@ def new(
     picture = "" if made.picture is None else ", picture.png"
     screen.say(f"written: {out}/robot.toml, robot.xml{picture}")
     screen.next(
-        f"look at robot.toml and the picture; gaponet import LOGS --robot {quote(robot_argument(out))} "
-        "--out data"
+        "look at robot.toml and the picture; gaponet import LOGS "
+        f"--robot {quote(robot_argument(out))} --out data"
     )
     screen.result(made.to_dict())
 

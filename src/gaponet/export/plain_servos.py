@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 from collections.abc import Callable
 from collections.abc import Sequence as ListOf
 from contextlib import suppress
@@ -57,7 +58,7 @@ def lost_recordings(folder: Path, data: str | None) -> Path | None:
     origin = read_origin(folder)
     if data is not None or origin is None:
         return None
-    place = folder / origin["dataset"]
+    place = Path(os.path.normpath(folder / origin["dataset"]))
     return None if place.is_dir() else place
 
 

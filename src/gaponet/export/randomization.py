@@ -230,6 +230,8 @@ def judge_units(
     train, validation = _comparable_motions(recordings, robot)
     if not train or not validation:
         why = "no recording with the robot's own gains"
+        if recordings is None:
+            why = "no recordings of the robot are there (--data says where they are)"
         return _not_judged(made, robot, engine_terms, why)
     judged = draw_robots(robot, made.units, (train, validation), progress=progress)
     plain = judged

@@ -248,7 +248,8 @@ def _loads_along(part: Sequence, model: mujoco.MjModel, op: Array, thin: int) ->
     interpolated, (4, rows, n).
 
     These are inertia without armature, kg·m²; torque by gravity, Coriolis forces and springs, N·m;
-    torque by the other joints' accelerations, N·m; slope of the second over the joint's angle, N·m/rad.
+    torque by the other joints' accelerations, N·m; slope of the second over the joint's angle,
+    N·m/rad.
     """
     data = mujoco.MjData(model)
     full = np.empty((model.nv, model.nv))

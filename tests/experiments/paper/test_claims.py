@@ -111,7 +111,7 @@ def test_the_paper_s_numbers_stand_beside_its_own_claims_alone():
 def test_no_method_of_a_block_is_missing_from_its_table():
     networks = ("MLP", "shared MLP", "literal", "GAPONet")
     found = claims(make_results(*[training(network, 0.9) for network in networks]))
-    table = claim_table(found, "labels", 200_000)
+    table = claim_table(found, "labels", "labels, then PPO")
     assert table.columns[2:-1] == ("identification", *networks)
 
 

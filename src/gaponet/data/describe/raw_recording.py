@@ -254,9 +254,9 @@ def rows_first(arrays: dict[str, Any]) -> tuple[dict[str, Any], list[str]]:
     """Return arrays with a row per sample, and the names of those that had a column per sample, as
     MATLAB writes them.
 
-    The longest array of one axis, such as the clock, tells the number of samples. A list of gains is
-    shorter than the tables are high, and turns none. Without an array of one axis, tables that are
-    all far wider than high are taken as transposed. A clock (1, k) or (k, 1) becomes (k,).
+    The longest array of one axis, such as the clock, tells the number of samples. A list of gains
+    is shorter than the tables are high, and turns none. Without an array of one axis, tables are
+    taken as transposed if all are far wider than high. A clock (1, k) or (k, 1) becomes (k,).
     """
     tables = {}
     for name, array in arrays.items():

@@ -24,7 +24,7 @@ from gaponet.experiments.paper.printed import (
 )
 from gaponet.experiments.paper.results import Results
 from gaponet.experiments.paper.statistics import Reduction, reduction
-from gaponet.experiments.paper.trainings import METHOD_BLOCKS, block_title
+from gaponet.experiments.paper.trainings import METHOD_BLOCKS
 
 JUDGED = "GAPONet"
 # Way without a network → what it is called in a claim.
@@ -225,11 +225,11 @@ def _reduction(results: Results, errors: list[Array], baseline: Array, kept: Arr
     return reduction([error[kept] for error in errors], [baseline[kept]], motions)
 
 
-def claim_table(found: list[Claim], block: Block, steps: int) -> ResultTable:
+def claim_table(found: list[Claim], block: Block, trained_by: str) -> ResultTable:
     """Return the claims of a block as a table; one column for each method.
 
     Args:
-        steps: Control steps of a training.
+        trained_by: How its networks were trained, in words.
     """
     of_block = [claim for claim in found if claim.block == block]
     methods: dict[str, None] = {}
@@ -248,7 +248,7 @@ def claim_table(found: list[Claim], block: Block, steps: int) -> ResultTable:
     if seeds == 1:
         over = "over motions or goals; of one seed the spread over seeds is not known"
     caption = (
-        f"Trained by {block_title(block, steps)}. Per cent less, ± the standard error {over} (paired, "
+        f"Trained by {trained_by}. Per cent less, ± the standard error {over} (paired, "
         "jackknife). The verdict is on GAPONet: reached or not by two standard errors. An "
         "untrained network has 0 in every row that does not compare with the MLP."
     )

@@ -39,7 +39,7 @@ from gaponet.experiments.paper.tables import (
     table_1,
     table_2,
 )
-from gaponet.experiments.paper.trainings import METHOD_BLOCKS, all_trainings, block_title
+from gaponet.experiments.paper.trainings import METHOD_BLOCKS, all_trainings
 from gaponet.experiments.paper.unseen_motions import require_unseen
 from gaponet.robot.spec import RobotSpec
 
@@ -168,7 +168,7 @@ def summarise(study: Study, jobs: list[Job], failures: list[str]) -> PaperResult
     """Read all results, and write the page."""
     results = Results.read(study, jobs)
     found = claims(results)
-    sections = [Section("", "The paper's claims", tables=_claim_tables(found, study.options.steps))]
+    sections = [Section("", "The paper's claims", tables=_claim_tables(found, results))]
     sections.append(_figure_2(study))
     sections += _figure_3(results)
     if study.virtual:
@@ -184,16 +184,16 @@ def summarise(study: Study, jobs: list[Job], failures: list[str]) -> PaperResult
             gaps.append(large_gaps_table(results, block))
     sections.append(Section("", "Large gaps by payload", tables=gaps))
     page = write_page(study, sections, failures)
-    sentences = [*_conclusions(found, study.options.steps), *failures]
+    sentences = [*_conclusions(found, results), *failures]
     tables: dict[str, ResultTable] = {}
     for section in sections:
         tables |= {table.name: table for table in section.tables}
     return PaperResult(page, found, tables, sentences, failures)
 
 
-def _claim_tables(found: list[Claim], steps: int) -> list[ResultTable]:
+def _claim_tables(found: list[Claim], results: Results) -> list[ResultTable]:
     blocks = dict.fromkeys(claim.block for claim in found)
-    return [claim_table(found, block, steps) for block in blocks]
+    return [claim_table(found, block, results.trained_by(block)) for block in blocks]
 
 
 def _figure_2(study: Study) -> Section:
@@ -212,7 +212,7 @@ def _figure_3(results: Results) -> list[Section]:
         sections.append(
             Section(
                 "Figure 3",
-                f"Simulator against robot, by joint and payload ({block_title(block, results.study.options.steps)})",
+                f"Simulator against robot, by joint and payload ({results.trained_by(block)})",
                 "Q_dis is the area between the positions of the simulator, under a + Δa, and of "
                 "the robot, under a. No network has seen these motions.",
                 {f"figure3_{block}": draw_figure_3(results, block)},
@@ -228,22 +228,23 @@ def _table_1(results: Results) -> list[Section]:
         if not results.networks(block):
             continue
         if results.study.delivers:
-            title = f"Delivery: offsets of the hands ({block_title(block, results.study.options.steps)})"
+            title = f"Delivery: offsets of the hands ({results.trained_by(block)})"
             sections.append(Section("Table 1", title, tables=[table_1(results, block)]))
-        title = f"Commands on the robot ({block_title(block, results.study.options.steps)})"
+        title = f"Commands on the robot ({results.trained_by(block)})"
         sections.append(Section("", title, tables=[commands_table(results, block)]))
     return sections
 
 
-def _conclusions(found: list[Claim], steps: int) -> list[str]:
-    """Return a sentence for each claim of the paper; steps: control steps of a training."""
+def _conclusions(found: list[Claim], results: Results) -> list[str]:
+    """Return a sentence for each claim of the paper."""
     sentences = []
     for claim in found:
         if claim.printed is None or not claim.verdict:
             continue
         ours = claim.reductions["GAPONet"]
         sentence = (
-            f"{claim.text} ({block_title(claim.block, steps)}): the paper claims {claim.printed:g} %; "
+            f"{claim.text} ({results.trained_by(claim.block)}): "
+            f"the paper claims {claim.printed:g} %; "
             f"GAPONet {ours} %, {claim.verdict}."
         )
         others = []

@@ -50,7 +50,8 @@ class PaperOptions:
     (docs/install.md)."""
     identify_windows: Count = WINDOWS
     """Number of rollouts of 8 s that identification fits. With fewer than the default, only gains,
-    damping, friction, armature, delay and offset of each joint alone are fitted; the tables say so."""
+    damping, friction, armature, delay and offset of each joint alone are fitted, and the tables say
+    so."""
     despite_errors: Flag = False
     """Train on recordings in which gaponet doctor finds an error. The page of results says so."""
     quick: Flag = False

@@ -13,7 +13,7 @@ from gaponet.base.arrays import Array
 from gaponet.experiments.paper.jobs import Job
 from gaponet.experiments.paper.options import Block
 from gaponet.experiments.paper.study import Study
-from gaponet.experiments.paper.trainings import NETWORKS
+from gaponet.experiments.paper.trainings import NETWORKS, block_title
 
 WRIST = "wrist"  # the paper's Figure 3 and MPJAE are without wrists
 
@@ -87,6 +87,10 @@ class Results:
         """Return the methods of a block that have a finished training, in the order of NETWORKS."""
         done = {run["name"] for run in self.trainings if run["block"] == block}
         return [name for name in NETWORKS if name in done]
+
+    def trained_by(self, block: Block) -> str:
+        """Return how the networks of a block were trained."""
+        return block_title(block, self.study.options.steps)
 
     def runs(self, block: Block, name: str) -> list[dict[str, Any]]:
         """Return the finished trainings of a setting, by seed."""

@@ -74,7 +74,9 @@ class Study:
 
     @cached_property
     def rates(self) -> tuple[float, ...]:
-        """Control rates of the recordings, Hz, ascending. Clocks of 49.4 and 49.6 Hz are one rate."""
+        """Control rates of the recordings, Hz, ascending; clocks of 49.4 and 49.6 Hz are one
+        rate.
+        """
         slowest: list[float] = []  # of each rate
         for rate in sorted({1 / entry.dt for entry in self.data.entries}):
             if not slowest or rate > (1 + RATE_TOLERANCE) * slowest[-1]:

@@ -21,7 +21,7 @@ from gaponet.experiments.paper.measure import LARGE_GAPS_RAD
 from gaponet.experiments.paper.options import Block
 from gaponet.experiments.paper.printed import AXES, TABLE_1, TABLE_2, PrintedRow
 from gaponet.experiments.paper.results import Results
-from gaponet.experiments.paper.trainings import METHOD_BLOCKS, TABLE_2_CHANGES, block_title
+from gaponet.experiments.paper.trainings import METHOD_BLOCKS, TABLE_2_CHANGES
 
 CONVERGED_SHARE = 0.5  # of the nominal error; above it a row of Table 2 is not converged
 # Row of Table 2 here → row of the paper. The paper does not say what is held for an action
@@ -61,10 +61,9 @@ def table_1(results: Results, block: Block) -> ResultTable:
         for method, printed in TABLE_1.items():
             if mass in printed:
                 rows.append((f"{label}, the paper's {method}", *printed[mass]))
-    trained_by = block_title(block, results.study.options.steps)
     caption = (
         "Mean |hand − goal| in the last second of a hold, cm, of a unit that no network has "
-        f"seen; networks trained by {trained_by}; ± is the standard deviation over "
+        f"seen; networks trained by {results.trained_by(block)}; ± is the standard deviation over "
         "training seeds. X is forward, Y left, Z up. The paper's robot is a real H1-2 with other "
         "goals; its third method sends the simulator's output as it is."
     )
@@ -263,7 +262,7 @@ def method_table(results: Results) -> ResultTable:
             runs = results.runs(block, name)
             rows.append(
                 (
-                    f"{name}, {block_title(block, results.study.options.steps)}",
+                    f"{name}, {results.trained_by(block)}",
                     runs[0]["parameters"],
                     runs[0]["steps"],
                     MeanStd.from_values(_seconds(runs)),

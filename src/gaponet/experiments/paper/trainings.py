@@ -20,7 +20,6 @@ BLOCK_TITLES: dict[Block, str] = {
     "table2": "Table 2",
 }
 
-
 # Blocks that compare the methods.
 METHOD_BLOCKS: tuple[Block, ...] = ("labels", "ppo")
 

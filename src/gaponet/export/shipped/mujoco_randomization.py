@@ -42,7 +42,8 @@ def apply(model: mujoco.MjModel, drawn: dict[str, Any], row: int) -> None:
         for servo in np.flatnonzero(model.actuator_trnid[:, 0] == joint.id):
             if model.actuator_trntype[servo] != mujoco.mjtTrn.mjTRN_JOINT:
                 continue
-            # A servo that limits the speed of its targets (<pid>) has its stiffness in biasprm alone.
+            # A servo that limits the speed of its targets (<pid>) has its stiffness in biasprm
+            # alone.
             if model.actuator_gaintype[servo] == mujoco.mjtGain.mjGAIN_FIXED:
                 model.actuator_gainprm[servo, 0] = kp
             model.actuator_biasprm[servo, :2] = kp * unit["offset"], -kp
