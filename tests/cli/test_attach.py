@@ -7,9 +7,10 @@ import json
 import numpy as np
 import pytest
 import torch
-from arm import write_arm
+from arm import TOML, write_arm
 from lerobot_plugin import plugin as plugin
 
+from gaponet.base.errors import UsageError
 from gaponet.cli.main import main
 from gaponet.robot.folder import save_robot
 
@@ -70,6 +71,19 @@ def test_a_policy_is_corrected_by_what_was_attached_last_and_by_nothing_after_of
     ):
         assert main(["export", str(holder), "--to", "lerobot", *into]) == 2
         assert said in capsys.readouterr().err
+
+
+def test_a_payload_without_a_place_for_it_is_refused_when_attached_and_when_loaded(
+    tmp_path, plugin, capsys
+):
+    no_hand = write_arm(tmp_path / "no_hand", toml=TOML.split("[[payload_mount]]")[0])
+    (tmp_path / "policy_postprocessor.json").write_text(json.dumps(POLICY))
+    words = ["export", str(no_hand.folder), "--to", "lerobot", "--into", str(tmp_path)]
+    assert main([*words, "--payload-mass", "0.2"]) == 2
+    assert "has no [[payload_mount]]" in capsys.readouterr().err
+    with pytest.raises(UsageError, match="payload_mount"):
+        plugin.GaponetCorrect(known=str(no_hand.folder), payload_mass=0.2)
+    assert main(words) == 0
 
 
 def test_a_chunk_is_corrected_as_its_rows_would_be_and_the_next_goes_on_where_it_overlaps(

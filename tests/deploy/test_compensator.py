@@ -210,6 +210,12 @@ def test_a_robot_without_a_mount_carries_no_payload(tmp_path):
         Compensator(handless).reset(np.zeros(2), 2.0)
 
 
+def test_a_robot_that_shall_carry_nothing_is_not_said_to_lack_a_mount(robot):
+    empty = Compensator(robot, config=CompensatorConfig(payload_max=0.0))
+    with pytest.raises(UsageError, match="up to 0, or raise payload_max"):
+        empty.reset(np.zeros(2), 0.5)
+
+
 def test_a_start_does_not_change_with_the_callers_array(robot):
     compensator = Compensator(robot)
     target = np.array([0.3, -0.2])

@@ -18,9 +18,10 @@ from gaponet.export.torch_program import export_program
 from gaponet.nn.config import ModelConfig
 from gaponet.nn.training.config import Budget, PPOConfig, PretrainingConfig, TrainConfig
 from gaponet.nn.training.trainer import Trainer
+from gaponet.robot.mjcf import compile_spec
 from gaponet.robot.simulator_change import SimulatorRanges
 from gaponet.robot.spec import RobotSpec
-from gaponet.sim.model import build_model
+from gaponet.sim.model import build_model, build_spec
 
 SIMULATORS = 30
 OTHER_KP = 0.7  # of the robot's
@@ -44,6 +45,16 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
     run = place / "run"
     model = Trainer(data, robot, run, CONFIG, Budget(steps=2 * 48 * 60)).run()
     return SimpleNamespace(robot=robot, data=data, run=run, model=model)
+
+
+def test_an_actuator_of_a_tendon_drives_no_joint(tmp_path):
+    robot = write_arm(tmp_path)
+    scene = build_spec(robot)
+    scene.add_tendon(name="both").wrap_joint("elbow", 1.0)
+    pull = scene.add_actuator(name="pull", target="both", trntype=mujoco.mjtTrn.mjTRN_TENDON)
+    pull.set_to_position(kp=0.0)
+    aligner = MujocoAligner(robot, compile_spec(scene, robot.mjcf), dt=0.02, payload_mass=0.0)
+    assert list(aligner.actuator) == [0, 1]
 
 
 def with_kp(robot: RobotSpec, factor: float) -> RobotSpec:

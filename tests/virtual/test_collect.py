@@ -24,7 +24,7 @@ from gaponet.sim.model import build_model, model_hash
 from gaponet.virtual.collect import Recipe, collect, load_recipe
 from gaponet.virtual.fleet import load_fleet
 from gaponet.virtual.physics import Physics
-from gaponet.virtual.play import equivalent_torque
+from gaponet.virtual.play import equivalent_torque, library
 
 RECIPE = Recipe(
     "test",
@@ -247,6 +247,17 @@ def test_a_recipe_may_play_motion_files(spec, fleet, tmp_path):
         data = Dataset(tmp_path / folder)
         played.append(float(data.read(data.entries[0]).ctrl[:, 0].max()))
     assert played == pytest.approx([0.099, 0.198], abs=1e-6), "a file that was changed is read"
+
+
+def test_motions_are_made_once_and_again_where_the_robot_changed(spec):
+    recipe = load_recipe("demo")
+    made = library(spec, 0, recipe, ())
+    assert spec.qpos_range.shape == (2, 2)
+    assert library(spec, 0, recipe, ()) is made
+    spec.mjcf.write_text(spec.mjcf.read_text().replace('mass="0.3"', 'mass="0.4"'))
+    assert library(spec, 0, recipe, ()) is not made
+    made = library(spec, 0, recipe, ())
+    assert library(spec.with_servo(kp=2 * spec.servo.kp), 0, recipe, ()) is not made
 
 
 def test_the_whole_simlifter_recipe_is_as_large_as_the_paper_says():

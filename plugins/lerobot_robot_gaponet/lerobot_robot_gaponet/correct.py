@@ -58,6 +58,7 @@ class Corrector:
 
         Raises:
             ValueError: Not one of known and model was given, or a model with follow.
+            UsageError, ModelError: The robot or the model cannot carry the payload.
         """
         from gaponet.deploy.compensator import Compensator, CompensatorConfig
         from gaponet.nn.artifact import GapModel
@@ -78,6 +79,7 @@ class Corrector:
         compensator = Compensator(
             spec, network, config=config, dt=dt, follow="nominal" if follow else None
         )
+        compensator.require_payload(payload_mass)
         return cls(spec, compensator, dt, payload_mass)
 
     def restart(self) -> None:

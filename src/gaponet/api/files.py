@@ -280,8 +280,8 @@ def attach_correction(
             of training for a network.
 
     Raises:
-        UsageError: The rate is not one of a robot, or the folder holds no LeRobot policy, or no
-            robot and no run.
+        UsageError, ModelError: The rate is not one of a robot; the folder holds no LeRobot policy,
+            or no robot and no run; or robot or network cannot carry the payload.
     """
     if fps is not None and not 1 <= fps <= 1000:
         raise UsageError(f"fps is {fps:g}; give the control rate of the policy in Hz, 1 to 1000")
@@ -298,7 +298,9 @@ def attach_correction(
         raise UsageError(f"{file}: is no processor of LeRobot") from None
     config: dict[str, object] = {}
     if holder is not None:
-        kind, name = _correction_of(named_folder(holder))
+        folder = named_folder(holder)
+        kind, name = _correction_of(folder)
+        _require_payload(kind, folder, payload_mass)
         config = {kind: name, "payload_mass": payload_mass, "dynamics": dynamics}
         if kind == "known" and fps is None:
             fps = LEROBOT_FPS
@@ -308,6 +310,17 @@ def attach_correction(
     write_text(file, json.dumps(document | {"steps": steps}, indent=2) + "\n")
     names = [step.get("registry_name", step.get("class", "?")) for step in steps]
     return AttachResult(file=file, steps=names, config=config)
+
+
+def _require_payload(kind: str, holder: Path, payload_mass: float) -> None:
+    """Refuse a payload, kg, with which the step would refuse to start."""
+    from gaponet.deploy.compensator import Compensator
+    from gaponet.nn.artifact import GapModel
+
+    if kind == "model":
+        GapModel.load(holder).require_payload(payload_mass, can_extrapolate=False)
+    else:
+        Compensator(load_robot(holder)).require_payload(payload_mass)
 
 
 def _correction_of(holder: Path) -> tuple[str, str]:

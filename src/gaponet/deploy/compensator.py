@@ -193,7 +193,7 @@ class Compensator:
         )
         estimate = PayloadEstimate(robot, loads, num, locked)
         compared = num_envs is None  # `doubt` speaks of one robot
-        max_stated = config.payload_max if robot.payload_mounts else 0.0
+        max_stated = config.payload_max if robot.payload_mounts else None
         self.payload = Payload(masses, max_stated, num, carriers, estimate, compared)
         self._rows = JointRows(robot, num_envs)
         self._target: Array | None = None  # last finite target; None before `reset`

@@ -61,7 +61,7 @@ class Payload:
     def __init__(
         self,
         masses: Array,
-        max_stated: float,
+        max_stated: float | None,
         num: int,
         carriers: ListOf[Carrier],
         estimate: PayloadEstimate,
@@ -70,7 +70,8 @@ class Payload:
         """
         Args:
             masses: Those that can be carried, (k,) kg.
-            max_stated: Largest mass that `require` accepts, kg.
+            max_stated: Largest mass that `require` accepts, kg; None: the robot has no place for
+                any.
             num: Number of robots.
             carriers: Everything that depends on the mass.
             estimate: From the torques of the same robots.
@@ -88,11 +89,13 @@ class Payload:
     def require(self, mass: Array | float) -> None:
         """Refuse masses, kg, that are not physical or too large."""
         given = np.asarray(mass, float)
-        if not self._max_stated and (given > 0).any():
-            raise UsageError(
-                f"payload_mass is {mass}, and the robot has no [[payload_mount]]; add one to "
-                "robot.toml, or give 0"
-            )
+        if self._max_stated is None:
+            if (given != 0).any():
+                raise UsageError(
+                    f"payload_mass is {mass}, and the robot has no [[payload_mount]]; add one to "
+                    "robot.toml, or give 0"
+                )
+            return
         if not ((given >= 0) & (given <= self._max_stated)).all():
             raise UsageError(
                 f"payload_mass is {mass}; give kg, 0 when empty, up to {self._max_stated:g}, or "

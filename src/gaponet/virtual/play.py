@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import pickle
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import mujoco
@@ -56,7 +56,8 @@ def library(robot: RobotSpec, seed: int, recipe: Recipe, files: tuple[Motion, ..
 
 def _digest(robot: RobotSpec, files: tuple[Motion, ...]) -> str:
     """Return what the motions of a robot depend on, as hexadecimal digits."""
-    digest = hashlib.sha256(pickle.dumps((robot, files)))
+    as_loaded = replace(robot)  # without what it has computed since
+    digest = hashlib.sha256(pickle.dumps((as_loaded, files)))
     for path in (robot.mjcf, robot.folder / "collision.toml"):
         if path.is_file():
             digest.update(path.read_bytes())

@@ -528,7 +528,9 @@ def test_a_robot_that_the_watchdog_took_at_the_end_is_not_said_to_hold(arm, monk
 
 
 @pytest.mark.parametrize("watched", [True, False])
-def test_an_error_between_two_periods_leaves_no_robot_in_mid_motion(arm, monkeypatch, watched):
+def test_an_error_between_two_periods_leaves_no_robot_in_mid_motion_and_is_recorded(
+    arm, monkeypatch, watched
+):
     driver = NotedArm(arm)
     released: list[bool] = []
     if watched:
@@ -546,6 +548,7 @@ def test_an_error_between_two_periods_leaves_no_robot_in_mid_motion(arm, monkeyp
     monkeypatch.setattr(controller.periods, "end", end_or_fail)
     with pytest.raises(RuntimeError, match="odd"):
         controller.run(motion_policy(MOTION, DT))
+    assert controller.recording.ending == "RuntimeError: odd"
     if watched:
         assert set(released) == {True}, "the watchdog damps it"
     assert driver.closed == [watched], "without a watchdog the driver lets go"
@@ -573,6 +576,45 @@ def test_an_error_while_the_robot_is_lowered_leaves_it_to_a_watchdog_that_lives(
         controller.run(acting(lambda: controller.stop("enough")))
     assert set(released) == {True}
     assert driver.closed == [lives], "two would write to one bus"
+
+
+@pytest.mark.parametrize("survives", [True, False])
+def test_a_robot_left_to_the_watchdog_is_damped_if_the_watchdog_dies_of_it(
+    arm, monkeypatch, survives
+):
+    driver = NotedArm(arm)
+    released: list[bool] = []
+    late = lambda: driver.elapsed >= 0.89  # noqa: E731
+    dog = fake_watchdog(
+        fired=late,
+        is_damping=late,
+        release=released.append,
+        can_damp=lambda: survives or not released,
+    )
+    monkeypatch.setattr("gaponet.hw.control.controller.Watchdog", lambda *_: dog)
+    driver.watchdog = dict
+    run(driver)
+    assert driver.closed == [survives], "closed without a hold it is let go"
+
+
+def test_while_the_watchdog_damps_the_controller_sends_nothing(arm, monkeypatch):
+    driver = NotedArm(arm)
+    late = lambda: driver.elapsed >= 0.95  # noqa: E731
+    dog = fake_watchdog(fired=late, is_damping=late)
+    monkeypatch.setattr("gaponet.hw.control.controller.Watchdog", lambda *_: dog)
+    driver.watchdog = dict
+    controller = control(driver)
+
+    def stop_late() -> str:
+        return "enough" * (driver.elapsed >= 0.89)
+
+    dog.problem = stop_late
+    recording = controller.run(motion_policy(MOTION, DT))
+    told = driver.clock.start + 0.95
+    assert driver.damped < told
+    assert driver.sent[-1][0] < told, "two would write to one bus"
+    assert "the watchdog damps the robot" in recording.events[-1].text
+    assert driver.closed == [True]
 
 
 def test_nobody_is_told_to_trust_a_watchdog_that_has_died(arm):

@@ -405,18 +405,29 @@ def test_when_targets_end_a_robot_that_ignores_goals_is_damped(monkeypatch, h1_2
 
 
 @pytest.mark.parametrize(
-    ("beyond", "cuts_goals", "kind"),
-    [(0.03, False, None), (0.2, False, "plan"), (0.015, True, None), (0.03, True, "plan")],
+    ("beyond", "servo_end", "kind"),
+    [
+        (0.03, None, None),
+        (0.2, None, "plan"),
+        (0.015, 0.0, None),
+        (0.03, 0.0, "plan"),
+        (0.2, 0.2, None),
+        (-0.1, -0.3, "plan"),
+    ],
 )
-def test_the_first_command_is_where_it_was_found_or_none_leaves(so101, beyond, cuts_goals, kind):
-    """Servos that know their own range cut goals beyond it, so that less is admitted."""
+def test_the_first_command_is_where_it_was_found_or_none_leaves(so101, beyond, servo_end, kind):
+    """Servos that know their own range cut goals beyond it, so that less is admitted.
+
+    Both ends are rad beyond the end of the MJCF's range.
+    """
     found = so101.qpos_home.copy()
     found[0] = so101.qpos_range[0, 1] + beyond
     controller, sent = virtual(so101, found)
     driver = controller.context.driver
     honest = driver.read
     driver.read = lambda: honest() if sent else dataclasses.replace(honest(), qpos=found.copy())
-    driver.qpos_range = so101.qpos_range if cuts_goals else None
+    if servo_end is not None:
+        driver.qpos_range = so101.qpos_range + np.array([0.0, servo_end])
     recording = controller.run(lambda k, state: so101.qpos_home if k < 5 else None)
     assert (recording.fault.kind if recording.fault else None) == kind, recording.fault
     assert [c[0] for c in sent[:1]] == ([] if kind else [pytest.approx(found[0], abs=2e-3)])

@@ -128,7 +128,7 @@ def test_a_disk_that_is_full_keeps_what_was_written_and_says_so(tmp_path, monkey
     made = recording(500, folder)
     kept = len(made.rows)
     assert CHUNK_ROWS <= kept < 500
-    assert made.rows.error.strerror == "No space left on device"
+    assert made.rows.error == "No space left on device"
     with pytest.raises(LogError, match="space"):
         made.log("sway")
     path = made.save(folder, "sway")
@@ -165,14 +165,39 @@ def test_a_full_disk_without_room_for_the_header_either_ends_the_recording_only(
 
     monkeypatch.setattr(module.os, "pwrite", full)
     made = recording(500, folder)
+    close_in_time(made)
+    assert made.rows.error == "No space left on device"
+    np.testing.assert_allclose(
+        np.load(made.rows.path)["qpos.elbow"], 0.001 * np.arange(2 * CHUNK_ROWS)
+    )
+
+
+def close_in_time(made: Recording) -> None:
+    """Close a recording whose writer may have ended."""
     end = threading.Thread(target=made.rows.close, daemon=True)
     end.start()
     end.join(10)
     assert not end.is_alive(), "it waits for ever for a writer that has ended"
-    assert made.rows.error.strerror == "No space left on device"
-    np.testing.assert_allclose(
-        np.load(made.rows.path)["qpos.elbow"], 0.001 * np.arange(2 * CHUNK_ROWS)
-    )
+
+
+def test_a_writer_that_fails_in_any_way_ends_the_recording_only(tmp_path, monkeypatch):
+    def no_memory(descriptor: int, data: bytes, at: int) -> int:
+        raise MemoryError
+
+    made = recording(10, tmp_path / "logs")
+    monkeypatch.setattr(module.os, "pwrite", no_memory)
+    close_in_time(made)
+    assert "MemoryError" in made.rows.error
+
+
+def test_a_file_that_takes_no_header_is_not_left_behind(tmp_path, monkeypatch):
+    def full(descriptor: int, data: bytes, at: int) -> int:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(module.os, "pwrite", full)
+    with pytest.raises(OSError, match="space"):
+        Rows(NAMES).write_to(tmp_path)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_what_cannot_be_written_at_the_end_leaves_the_periods(tmp_path, monkeypatch):

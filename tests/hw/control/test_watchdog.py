@@ -19,11 +19,13 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from hw.noted_arm import DT, MOTION, NotedArm, acting, control, phases
 
 from gaponet.hw.control import watchdog
 from gaponet.hw.control.driver import DriverError
 from gaponet.hw.control.stop import STOP_SIGNALS
 from gaponet.hw.control.watchdog import WEIGHT_STEPS, Watchdog
+from gaponet.hw.targets.policy import motion_policy
 
 # S.
 PATIENT = 20.0
@@ -53,6 +55,11 @@ watchdog.main(json.loads(sys.argv[1]))
 """
 
 
+def robot_command(_: str, text: str) -> list[str]:
+    """The command of a watchdog's process beside the robot that notes how it is damped."""
+    return [sys.executable, "-c", ROBOT, text]
+
+
 @pytest.fixture
 def notes(tmp_path: Path) -> Path:
     return tmp_path / "notes"
@@ -65,11 +72,7 @@ def dog(
     """A watchdog in a process of its own that could damp the robot; its parameter is after how
     many s it does.
     """
-    monkeypatch.setattr(
-        watchdog.child_process,
-        "module_command",
-        lambda _, text: [sys.executable, "-c", ROBOT, text],
-    )
+    monkeypatch.setattr(watchdog.child_process, "module_command", robot_command)
     lock = os.open(notes.with_suffix(".lock"), os.O_CREAT | os.O_RDWR)
     fcntl.flock(lock, fcntl.LOCK_EX)
     dog = Watchdog({"notes": str(notes)}, lock, getattr(request, "param", PATIENT), DAMP)
@@ -116,8 +119,7 @@ def damped(notes: Path) -> np.ndarray:
 def beat(dog: Watchdog, weight: float) -> None:
     """Beat, and wait until the watchdog has answered it."""
     assert dog.beat(weight)
-    before = dog.answer_time
-    while dog.answer_time == before and not dog.problem():
+    while dog.unanswered_since is not None and not dog.problem():
         time.sleep(0.001)
 
 
@@ -169,6 +171,7 @@ def test_a_watchdog_that_hangs_is_in_trouble_and_only_from_the_first_beat_on(dog
             break
         time.sleep(HANG / 20)
     assert dog.problem() == "the watchdog does not answer"
+    assert not dog.can_damp(), "nobody is told to trust it"
     os.kill(dog.process.pid, signal.SIGCONT)
 
 
@@ -180,6 +183,42 @@ def test_a_watchdog_that_took_the_controller_for_hanging_says_so(dog, notes):
     assert dog.problem() == "the watchdog ended"
     assert not dog.beat(1.0)
     assert damped(notes)[0, 1] == 1.0
+
+
+@hanging
+def test_a_watchdog_that_took_the_robot_before_it_was_released_is_not_overlooked(dog):
+    beat(dog, 1.0)
+    dog.process.wait(20)
+    dog.release()
+    assert dog.fired()
+    assert dog.can_damp(), "it has done so"
+
+
+@pytest.mark.parametrize("stops", [False, True])
+def test_a_run_beside_a_watchdog_of_its_own_ends_held_and_a_stop_damped(
+    arm, notes, monkeypatch, stops
+):
+    monkeypatch.setattr(watchdog.child_process, "module_command", robot_command)
+    monkeypatch.setattr("gaponet.hw.control.controller.WATCHDOG_PERIODS", PATIENT / DT)
+    driver = NotedArm(arm)
+    driver.watchdog = lambda: {"notes": str(notes)}
+    controller = control(driver)
+    policy = acting(lambda: controller.stop("enough")) if stops else motion_policy(MOTION, DT)
+    recording = controller.run(policy)
+    assert phases(recording)[-1] == "stopped"
+    assert driver.closed == [not stops]
+    assert controller.output.watchdog.process.wait(20) == 0
+    assert notes.read_text() == "closed, held\n", "it sent nothing"
+
+
+def test_what_a_watchdog_does_is_said(notes, robot_process):
+    process = robot_process(subprocess.PIPE)
+    os.write(process.stdin.fileno(), bytes([WEIGHT_STEPS]))
+    process.stdin.close()
+    said = process.stderr.read().decode()
+    process.stderr.close()
+    assert "the controller ended; damping a robot" in said
+    assert "a robot let go" in said
 
 
 @pytest.mark.parametrize("reader", ["a full disk", "one that has ended", "one that hangs"])

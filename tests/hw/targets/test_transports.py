@@ -181,8 +181,12 @@ def test_lines_through_a_pipe_may_come_in_parts_be_too_long_and_cease():
     assert "has more than" in transport.receive()[0].error
     os.write(write, b"x" * 100 + b'"time": 9}\n' + line)
     assert [m.target for m in transport.receive()] == [{"a": 0.5}]
+    os.write(write, b'{"time": 2, "end": true}')
+    assert transport.receive() == []
     os.close(write)
-    assert "closed the pipe" in transport.receive()[0].error
+    last, closed = transport.receive()
+    assert last.end, "a program need not end its last line"
+    assert "closed the pipe" in closed.error
     assert transport.receive() == []
     os.close(read)
 

@@ -116,9 +116,11 @@ class Session:
         there to do it.
         """
         output = self.output
-        to_be_damped = output.damping_since is not None or output.unconfirmed
         watchdog = output.watchdog
-        watchdog_damps = output.unconfirmed and watchdog is not None and watchdog.can_damp()
+        has_fired = watchdog is not None and watchdog.fired()
+        of_watchdog = has_fired or output.unconfirmed
+        to_be_damped = of_watchdog or output.damping_since is not None
+        watchdog_damps = of_watchdog and watchdog is not None and watchdog.can_damp()
         output.context.driver.close(hold=not to_be_damped or watchdog_damps)
 
 
@@ -257,8 +259,9 @@ class Controller:
             pressed = self._session.start(stack, keys)
             try:
                 self._loop(policy or self._policy_of_plan(), pressed)
-            except BaseException:
+            except BaseException as error:
                 self.output.unconfirmed |= self.phase in (*COMMANDING, Phase.DAMP)
+                self._note(f"{type(error).__name__}: {error}", "error", self.context.clock.now())
                 raise
             # It would take the reading back of all registers for a controller that hangs.
             self._session.release_watchdog()
@@ -326,8 +329,7 @@ class Controller:
         rows = self.recording.rows
         rows.append(Row(self.periods.now, phase.value, target, ctrl, state))
         if rows.error:
-            reason = rows.error.strerror
-            text = f"nothing more is recorded ({reason}); what was written is kept"
+            text = f"nothing more is recorded ({rows.error}); what was written is kept"
             if not self._has_noted(text):
                 self._note(text)
 
@@ -402,6 +404,11 @@ class Controller:
         return None
 
     def _damp(self) -> None:
+        """Damp for a period, unless the watchdog does it by now."""
+        watchdog = self.output.watchdog
+        if watchdog and watchdog.is_damping():
+            self._fire(Trigger.DAMPED, "this process stood still; the watchdog damps the robot")
+            return
         left = self.output.damping_left(self.periods.now)
         try:
             self.output.damp(left)

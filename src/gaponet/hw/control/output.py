@@ -133,14 +133,15 @@ class Output:
         driver = self.context.driver
         joints = self.context.joints
         found = qpos[joints]
-        ranges = self.context.robot.qpos_range[joints]
-        # Servos that know their own range cut goals beyond it.
-        tolerance = MAX_BEYOND_RANGE_RAD if driver.qpos_range is None else MAX_START_DRIFT_RAD
-        ends = ranges if driver.qpos_range is None else driver.qpos_range[joints]
-        low = np.minimum(ranges, ends)[:, 0] - tolerance
-        high = np.maximum(ranges, ends)[:, 1] + tolerance
+        ranges = self.context.robot.qpos_range
+        tolerance = MAX_BEYOND_RANGE_RAD
+        if driver.qpos_range is not None:
+            # Such servos cut goals to their own range: they would jump to its end.
+            ranges = driver.qpos_range
+            tolerance = MAX_START_DRIFT_RAD
+        low, high = ranges[joints].T
         beyond = np.maximum(low - found, found - high)
-        if beyond.max() > 0:
+        if beyond.max() > tolerance:
             i = int(beyond.argmax())
             return Fault(
                 "plan",

@@ -111,9 +111,7 @@ class Recording:
                 f"{source}: no data, the robot did not do what it was told: {self.disobedience}"
             )
         if self.rows.error:
-            raise LogError(
-                f"{source}: not whole, {self.rows.error.strerror}; make room and record again"
-            )
+            raise LogError(f"{source}: not whole, {self.rows.error}; make room and record again")
         return self._log(source)
 
     def _log(self, source: str) -> Log:
@@ -150,7 +148,7 @@ class Recording:
         events = []
         for event in self.events:
             events.append([round(event.time - start, 4), event.phase, event.kind, event.text])
-        incomplete = {"not_whole": self.rows.error.strerror} if self.rows.error else {}
+        incomplete = {"not_whole": self.rows.error} if self.rows.error else {}
         facts = {
             "gaponet": __version__,
             "robot": self.robot,

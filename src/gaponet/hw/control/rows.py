@@ -46,7 +46,7 @@ class Rows:
 
     Attributes:
         path: Path of the file; None for a temporary one.
-        error: Why no more rows are written; None if they are.
+        error: Why no more rows are written; "" if they are.
     """
 
     def __init__(self, joint_names: tuple[str, ...]) -> None:
@@ -68,7 +68,7 @@ class Rows:
         self._absent = np.full(n, np.nan)
         self._file: IO[bytes] | None = None
         self.path: Path | None = None
-        self.error: OSError | None = None
+        self.error = ""
         self._written = 0  # rows in the file
         self._header_size = len(self._header(0))  # bytes
         self._pending: queue.Queue[bytes | None] = queue.Queue()
@@ -202,10 +202,12 @@ class Rows:
                 while done < len(data) and not self.error:
                     done += os.pwrite(descriptor, data[done:], at + done)
             except OSError as error:
-                self.error = error
+                self.error = error.strerror or str(error)
+            except Exception as error:  # of any kind, or who waits for the rows waits for ever
+                self.error = repr(error)
             self._written += done // size
             # Overwrites, which works on a full disk unless its file system copies.
-            with suppress(OSError):
+            with suppress(Exception):
                 os.pwrite(descriptor, self._header(self._written), 0)
             self._pending.task_done()
         self._pending.task_done()

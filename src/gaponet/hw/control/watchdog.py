@@ -48,7 +48,8 @@ class Watchdog:
 
     Attributes:
         process: The process that damps the robot.
-        answer_time: When it last answered, s of time.monotonic.
+        unanswered_since: When the first heartbeat without an answer was sent, s of time.monotonic;
+            None: all are answered.
     """
 
     def __init__(self, spec: dict[str, object], lock: int, timeout: float, damp: float) -> None:
@@ -77,8 +78,7 @@ class Watchdog:
             os.set_blocking(pipe.fileno(), False)
         self._fired = False
         self._timeout = timeout
-        # monotonic s of the last answer, or of the first heartbeat before it
-        self.answer_time: float | None = None
+        self.unanswered_since: float | None = None
 
     def wait_ready(self) -> None:
         """Return when it could damp the robot.
@@ -98,8 +98,7 @@ class Watchdog:
         """
         if self.fired() or self.process.poll() is not None:
             return "the watchdog ended"
-        hangs = self.answer_time is not None and time.monotonic() - self.answer_time > self._timeout
-        return "the watchdog does not answer" if hangs else ""
+        return "the watchdog does not answer" if self._hangs() else ""
 
     def fired(self) -> bool:
         """Return True if the watchdog damps the robot or has damped it: nothing more may be
@@ -109,7 +108,7 @@ class Watchdog:
             return self._fired
         answer = self._out.read(4096) or b""  # None: nothing new; does not wait
         if ANSWER in answer:
-            self.answer_time = time.monotonic()
+            self.unanswered_since = None
         self._fired = self._fired or FIRED in answer
         return self._fired
 
@@ -118,8 +117,8 @@ class Watchdog:
 
         Return False if the watchdog has ended.
         """
-        if self.answer_time is None:
-            self.answer_time = time.monotonic()
+        if self.unanswered_since is None:
+            self.unanswered_since = time.monotonic()
         try:
             self._in.write(bytes([round(WEIGHT_STEPS * weight)]))
         except BlockingIOError:  # the pipe is full: the watchdog hangs; `problem` says so
@@ -129,12 +128,18 @@ class Watchdog:
         return self.process.poll() is None
 
     def can_damp(self) -> bool:
-        """Return True unless the watchdog has died."""
-        return self.process.poll() in (None, 0)
+        """Return True unless the watchdog has died or hangs."""
+        return self.process.poll() in (None, 0) and not self._hangs()
 
     def is_damping(self) -> bool:
         """Return True if the watchdog damps the robot, or has done so; False if it died of it."""
         return self.fired() and self.can_damp()
+
+    def _hangs(self) -> bool:
+        """Return True if it does not answer; while it damps it answers nothing."""
+        if self.fired() or self.unanswered_since is None:
+            return False
+        return time.monotonic() - self.unanswered_since > self._timeout
 
     def release(self, unconfirmed: bool = False) -> None:
         """Let the watchdog end without sending anything: the controller has stopped.

@@ -45,8 +45,7 @@ class PipeTransport:
             return []
         data = os.read(self._descriptor, READ_BYTES)
         if not data:
-            self._closed = True
-            return [Message("stdin", error="the other end closed the pipe")]
+            return self._end()
         *lines, self._partial_line = (self._partial_line + data).split(b"\n")
         if self._skipping and lines:  # the end of a line that was too long
             lines = lines[1:]
@@ -61,6 +60,14 @@ class PipeTransport:
             self._partial_line = b""
             self._skipping = True
             messages.append(decode("stdin", bytes(MAX_MESSAGE_BYTES + 1)))
+        return messages
+
+    def _end(self) -> list[Message]:
+        """Return the last line, which may have no end, and that the pipe was closed."""
+        self._closed = True
+        messages = [Message("stdin", error="the other end closed the pipe")]
+        if self._partial_line and not self._skipping:
+            messages.insert(0, decode("stdin", self._partial_line))
         return messages
 
     def senders(self) -> set[Hashable]:
