@@ -115,12 +115,12 @@ def _notes_without_recordings(holder: Path, data: str | None) -> list[str]:
     if identified_catalogue().holds(holder):
         card = RobotCard.read(holder)
         return [f"{card.name}, {card.errors()}"]
-    gone = lost_recordings(simulator_folder(holder), data)
-    if gone is None:
+    lost = lost_recordings(simulator_folder(holder), data)
+    if not lost:
         return []
     return [
-        f"the robot's recordings are gone from {gone}: motions of its own were simulated to "
-        "measure it; --data DATASET says where they are"
+        f"the robot's recordings are {lost}: motions of its own were simulated to measure it; "
+        "--data DATASET says where they are"
     ]
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import time
 from collections.abc import Callable, Mapping
@@ -303,7 +302,7 @@ def _origin(
 
     What `start` was identified from, if it was, counts as fitted, too.
     """
-    from gaponet.evaluation.candidate import read_origin
+    from gaponet.evaluation.candidate import fitted_to, read_origin
 
     parts = {}
     motions = {}
@@ -311,35 +310,39 @@ def _origin(
         parts[name] = {entry.id: entry.hash for entry in entries}
         motions[name] = sorted({entry.meta.motion for entry in entries})
     earlier = read_origin(start.folder) if start.is_identified else None
-    if earlier is not None:
-        parts["train"] |= earlier["parts"]["train"] | earlier["parts"]["val"]
+    before = {} if earlier is None else {"also_fitted": fitted_to(earlier)}
     return {
         "dataset": os.path.relpath(data.path, folder),
         "parts": parts,
         "motions": motions,
+        **before,
         "val_mpjae": {name: float(values.mean()) for name, values in errors.items()},
         "findings": list(findings),
         "doctor": gate.to_dict(),
     }
 
 
-def _copy_origin(source: Path, folder: Path, adapted: ListOf[Sequence]) -> None:
-    """Keep on record from which recordings the robot of `source` was identified, if that is stated,
-    and to which it was adapted.
+def _origin_of_adapted(
+    source: Path, folder: Path, adapted: ListOf[Sequence]
+) -> dict[str, Any] | None:
+    """Return from which recordings the robot of `source` was identified, and to which the one of
+    `folder` was adapted; None if the former is not stated.
     """
-    from gaponet.data.store import entry_id
     from gaponet.evaluation.candidate import read_origin
 
     origin = read_origin(source)
     if origin is None:
-        return
-    fitted = dict(origin["parts"]["train"])
-    for sequence in adapted:
-        content_hash = sequence.content_hash()
-        fitted[entry_id(sequence.meta, content_hash)] = content_hash
-    record = json.loads((source / PROVENANCE_FILE).read_text(encoding="utf-8"))
-    record["parts"]["train"] = fitted
-    write_json(folder / PROVENANCE_FILE, record)
+        return None
+    also = origin.get("also_fitted", {"hashes": (), "motions": ()})
+    hashes = {*also["hashes"], *(sequence.content_hash() for sequence in adapted)}
+    dataset = source / origin["dataset"]
+    place = Path(origin["dataset"]).name
+    if dataset.is_dir():
+        place = os.path.relpath(dataset, folder)
+    return dict(origin) | {
+        "dataset": place,
+        "also_fitted": {"hashes": sorted(hashes), "motions": list(also["motions"])},
+    }
 
 
 def _uncertainty(
@@ -653,7 +656,9 @@ def _write_adapted(
 
     with whole_folder(folder, "robot", "robot.toml", OUTDATED_FILES) as place:
         save_robot(adapted, place)
-        _copy_origin(given.folder, place, sequences)
+        origin = _origin_of_adapted(given.folder, folder, sequences)
+        if origin is not None:
+            write_json(place / PROVENANCE_FILE, origin)
         write_json(place / ADAPTATION_FILE, facts)
         made = _uncertainty(place, sequences, [], {}, before=uncertainty)
         links = uncertainty.links if uncertainty is not None else None

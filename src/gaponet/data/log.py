@@ -100,6 +100,7 @@ class Log:
         are listed.
         """
         channels: dict[str, Channel] = {}
+        rows: dict[str, Array] = {}
         for name, (clock, _) in self.channels.items():
             if name in channels:
                 continue
@@ -113,11 +114,13 @@ class Log:
                 bad.append(f"{self.row(name, int(row))}: cut")
             for other, values in same.items():
                 channels[other] = Channel(clock[good], values[good])
+                rows[other] = self.row_numbers(other)[good]
         cut = 0
         for name, channel in self.channels.items():
             cut = max(cut, len(channel.time) - len(channels[name].time))
         if cut:
             self.meta["notes"] = self.meta.get("notes", {}) | {"rows_cut": cut}
+            self.meta["rows"] = rows
             object.__setattr__(self, "channels", channels)
 
     def _channels_of(self, clock: Array) -> dict[str, Array]:
@@ -190,9 +193,15 @@ class Log:
     def row(self, name: str, index: int) -> str:
         """File and line of a row of a channel, as the reader noted them."""
         file = self.meta.get("files", {}).get(name, self.source)
-        rows = self.meta.get("rows", {}).get(name)
-        number = index if rows is None else int(rows[index])
+        number = int(self.row_numbers(name)[index])
         return f"{file}:{number + int(self.meta.get('first_line', 1))}"
+
+    def row_numbers(self, name: str) -> Array:
+        """Return where the rows of a channel stand in their file, (k,), counted from 0."""
+        rows = self.meta.get("rows", {}).get(name)
+        if rows is None:
+            return np.arange(len(self.channels[name].time))
+        return np.asarray(rows)
 
 
 def _starts_again(time: Array) -> bool:

@@ -483,7 +483,7 @@ def write_split(dataset: Dataset, splits: Splits, by: str, holdout: tuple[str, .
     """Write splits/<by>[-<held out>].json in the dataset folder; return its path."""
     stated = "-".join([by, *holdout])
     name = re.sub(r"[^A-Za-z0-9_.-]", "_", stated)[:100]
-    if name != stated:  # others may look the same
+    if name != stated or any("-" in value for value in holdout):  # others may look the same
         name = f"{name}-{hashlib.sha256(stated.encode()).hexdigest()[:8]}"
     path = dataset.path / "splits" / f"{name}.json"
     record: dict[str, Any] = {

@@ -26,12 +26,22 @@ from gaponet.sim.model import require_same_robot, require_stored_robot
 DATA_HINT = "data of the robot that the run was trained for"
 
 
+class Fitted(TypedDict):
+    """Recordings and motions that the values of a robot depend on."""
+
+    hashes: tuple[str, ...]  # of the recordings' contents
+    motions: tuple[str, ...]
+
+
 class Origin(TypedDict):
     """Data that a robot was identified from."""
 
-    dataset: str  # path from the robot folder
+    # path from the robot folder; a name alone: it never was on this machine
+    dataset: str
     parts: SplitHashes  # recordings by split
     motions: dict[str, tuple[str, ...]]  # names of motions by split
+    # what the robot before was identified from, and what this one was adapted to
+    also_fitted: NotRequired[Fitted]
     val_mpjae: dict[str, float]  # nominal and identified → error on validation motions, rad
     findings: NotRequired[tuple[str, ...]]  # sentences about backlash and links
     doctor: NotRequired[dict[str, tuple[str, ...]]]  # faults of the recordings (checks/gate.py)
@@ -131,7 +141,7 @@ def select_entries(
         entries = dataset.select(motions, units)
     else:
         entries = _unseen_entries(available, unused, fitted)
-    if not entries and all(map(is_robot, folders)):
+    if not entries and not motions and all(map(is_robot, folders)):
         return available, False
     if not entries:
         raise DatasetError(
@@ -180,28 +190,31 @@ class FittedData:
         """Read the data of a run or a robot folder; None if a robot folder has no origin."""
         if is_robot(folder):
             origin = read_origin(folder)
-            return None if origin is None else cls._of(origin["parts"], origin["motions"])
+            if origin is None:
+                return None
+            fitted = fitted_to(origin)
+            return cls._of(origin["parts"]["test"], fitted["motions"], fitted["hashes"])
         model = GapModel.load(folder)
-        also_fitted = set[str]()  # hashes
+        hashes = set[str]()
         for adaptation in Adaptation.load(folder, model.weights_hash()).values():
-            also_fitted.update(adaptation.logs)
-        motions = dict(model.card.get("motions", {}))
+            hashes.update(adaptation.logs)
+        split = split_of_run(folder)
+        hashes |= _fitted_hashes(split)
+        motions = _fitted_motions(model.card.get("motions", {}))
         origin = read_origin(folder / STORED_ROBOT)  # of the robot under the model
         if origin is not None:
-            also_fitted |= _fitted_hashes(origin["parts"])
-            for part in ("train", "val"):
-                motions[part] = [*motions.get(part, ()), *origin["motions"].get(part, ())]
-        return cls._of(split_of_run(folder), motions, also_fitted)
+            of_robot = fitted_to(origin)
+            hashes.update(of_robot["hashes"])
+            motions.update(of_robot["motions"])
+        return cls._of(split["test"], motions, hashes)
 
     @classmethod
     def _of(
-        cls, split: Any, motions: Mapping[str, Any], also_fitted: Collection[str] = ()
+        cls, test: Mapping[str, str], motions: Collection[str], hashes: Collection[str]
     ) -> FittedData:
-        """Return the data of a split, {train, val, test: {id: hash}}, with its motions by part."""
-        hashes = _fitted_hashes(split).union(also_fitted)
-        used = {*motions.get("train", ()), *motions.get("val", ())}
-        test = set(split["test"].values()) - hashes
-        return cls(frozenset(hashes), frozenset(used), frozenset(test))
+        """Return the data of a test set, {id: hash}, and of what was fitted to."""
+        unused = frozenset(test.values()) - frozenset(hashes)
+        return cls(frozenset(hashes), frozenset(motions), unused)
 
     def __contains__(self, entry: Entry) -> bool:
         """Return True if the folder was fitted to a recording, or to another one of its motion
@@ -215,6 +228,11 @@ class FittedData:
 def _fitted_hashes(split: Any) -> set[str]:
     """Return the content hashes of the recordings for training and validation."""
     return {*split["train"].values(), *split["val"].values()}
+
+
+def _fitted_motions(motions: Mapping[str, Collection[str]]) -> set[str]:
+    """Return the motions for training and validation, of motions by split."""
+    return {*motions.get("train", ()), *motions.get("val", ())}
 
 
 def split_of_run(run: Path) -> dict[str, dict[str, str]]:
@@ -235,6 +253,16 @@ def read_origin(folder: Path) -> Origin | None:
         return None
     hint = "identify again, or remove it: all recordings then count as seen"
     return read_json(Origin, file, RobotError, hint, allow_extra=True)
+
+
+def fitted_to(origin: Origin) -> Fitted:
+    """Return the recordings and motions that a robot was identified and validated on, and adapted
+    to; those of the robot that its identification began with are among them.
+    """
+    also = origin.get("also_fitted", Fitted(hashes=(), motions=()))
+    hashes = _fitted_hashes(origin["parts"]).union(also["hashes"])
+    motions = _fitted_motions(origin["motions"]).union(also["motions"])
+    return Fitted(hashes=tuple(sorted(hashes)), motions=tuple(sorted(motions)))
 
 
 def robot_label(entries: list[Entry]) -> str:

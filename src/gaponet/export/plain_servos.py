@@ -51,15 +51,18 @@ class _Stored(TypedDict):
     content: Any
 
 
-def lost_recordings(folder: Path, data: str | None) -> Path | None:
-    """Return where the dataset was that a robot was identified from, if nobody says where it is
-    now.
+def lost_recordings(folder: Path, data: str | None) -> str:
+    """Return what became of the dataset that a robot was identified from, if nobody says where it
+    is now: "not at hand", or "gone from" where it was. Empty: it is there, or there was none.
     """
     origin = read_origin(folder)
     if data is not None or origin is None:
-        return None
+        return ""
     place = Path(os.path.normpath(folder / origin["dataset"]))
-    return None if place.is_dir() else place
+    if place.is_dir():
+        return ""
+    never_here = Path(origin["dataset"]).name == origin["dataset"]
+    return "not at hand" if never_here else f"gone from {place}"
 
 
 def read_recordings(

@@ -104,7 +104,7 @@ def test_messages_recorded_twice_count_once(tmp_path, arm):
     write_bag(tmp_path / "wave", twice=True)
     log = only(tmp_path, arm)
     assert len(log.channels["qpos"].time) == 40
-    assert log.meta["notes"]["repeated"] == 40
+    assert log.meta["notes"]["repeated"] == {"rows": 40}
 
 
 def test_a_bag_without_commands_says_so_and_what_can_still_be_done(tmp_path, arm):

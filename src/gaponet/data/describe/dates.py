@@ -52,9 +52,10 @@ def to_seconds(cells: Sequence[str | None], where: str) -> Array:
                 "2026-03-01T12:00:00.125"
             ) from None
         seconds[i] = at.timestamp()
-    if TIME_OF_DAY.fullmatch(_without_quotes(cells[0])):
-        midnight = np.diff(seconds, prepend=seconds[0]) < -DAY_S / 2
-        days = np.cumsum(midnight)
+    stated = np.flatnonzero(np.isfinite(seconds))
+    if stated.size and TIME_OF_DAY.fullmatch(_without_quotes(cells[stated[0]])):
+        midnight = np.diff(seconds[stated], prepend=seconds[stated[0]]) < -DAY_S / 2
+        days[stated] = np.cumsum(midnight)
     return seconds + DAY_S * days
 
 

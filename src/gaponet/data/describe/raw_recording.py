@@ -254,9 +254,10 @@ def rows_first(arrays: dict[str, Any]) -> tuple[dict[str, Any], list[str]]:
     """Return arrays with a row per sample, and the names of those that had a column per sample, as
     MATLAB writes them.
 
-    The longest array of one axis, such as the clock, tells the number of samples. A list of gains
-    is shorter than the tables are high, and turns none. Without an array of one axis, tables are
-    taken as transposed if all are far wider than high. A clock (1, k) or (k, 1) becomes (k,).
+    The longest array of one axis, such as the clock, tells the number of samples. An array that is
+    no longer than the tables are high, such as a list of gains, turns none. Without an array of one
+    axis, tables are taken as transposed if all are far wider than high. A clock (1, k) or (k, 1)
+    becomes (k,).
     """
     tables = {}
     for name, array in arrays.items():
@@ -281,14 +282,16 @@ def _is_clock(name: str, table: Array) -> bool:
 
 
 def _samples(arrays: dict[str, Any], tables: list[Array]) -> int:
-    """Return the number of samples: the length of the longest array of one axis, else the width of
-    the tables; 0 if there is neither, or a table is not far wider than high.
+    """Return the number of samples: the length of the longest array of one axis that is longer than
+    the tables are high, else the width of the tables; 0 if there is neither, or a table is not far
+    wider than high.
     """
+    height = min((len(table) for table in tables), default=1)
     samples = 0
     for array in arrays.values():
         if isinstance(array, np.ndarray) and array.ndim == 1:
             samples = max(samples, len(array))
-    if samples > 1:
+    if samples > height:
         return samples
     widest = 0
     for table in tables:

@@ -20,15 +20,17 @@ def without_repeated_rows(log: Log) -> Log:
     (notes, "repeated"). A robot that rests repeats its numbers too, but at its usual period.
     """
     channels = dict(log.channels)
+    rows = {}
     dropped = 0
     for name, channel in log.channels.items():
         keep = ~_repeated(channel.time, channel.values)
         dropped = max(dropped, int((~keep).sum()))
         channels[name] = Channel(channel.time[keep], channel.values[keep])
+        rows[name] = log.row_numbers(name)[keep]
     if not dropped:
         return log
     notes = log.meta.get("notes", {}) | {"repeated": {"rows": dropped}}
-    return replace(log, channels=channels, meta=log.meta | {"notes": notes})
+    return replace(log, channels=channels, meta=log.meta | {"notes": notes, "rows": rows})
 
 
 def repeats_row_before(channel: Channel) -> Array:

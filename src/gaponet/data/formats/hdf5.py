@@ -50,8 +50,9 @@ def _demos(paths: Iterable[str]) -> list[str]:
     """Return the demonstrations of a file of robomimic's, such as data/demo_0, by number."""
     demos = set()
     for path in paths:
-        if path.startswith("data/"):
-            demos.add("/".join(path.split("/")[:2]))
+        group, *rest = path.split("/")
+        if group == "data" and len(rest) > 1:  # an array in the group itself is no demonstration
+            demos.add(f"{group}/{rest[0]}")
 
     def number(demo: str) -> int:
         return int(re.sub(r"\D", "", demo)[:9] or 0)

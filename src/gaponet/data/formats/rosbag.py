@@ -356,6 +356,7 @@ def _read(bag: Path, names: list[str]) -> tuple[dict[str, Signal], dict[str, Any
     stamps = {topic: _Stamps.of(of_topic) for topic, of_topic in rows.items()}
     times = _clocks(stamps, notes)
     loaded: dict[str, Signal] = {}
+    repeated = 0
     for topic, columns_of in wanted.items():
         time = times[topic]
         columns = []  # of each field, (k, columns)
@@ -365,9 +366,11 @@ def _read(bag: Path, names: list[str]) -> tuple[dict[str, Signal], dict[str, Any
             time, columns = _together(time, columns)
         fresh = _fresh(time, columns)
         if not fresh.all():
-            notes["repeated"] = notes.get("repeated", 0) + int((~fresh).sum())
+            repeated += int((~fresh).sum())
         for field, values in zip(columns_of, columns, strict=True):
             loaded[f"{topic}.{field}"] = Signal(values[fresh], time[fresh])
+    if repeated:
+        notes["repeated"] = {"rows": repeated}
     return {name: loaded[name] for name in names}, notes
 
 

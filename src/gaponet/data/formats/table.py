@@ -48,6 +48,7 @@ SI_UNITS = "gaponet.si_units"
 # Cells of the first row of a table that can be transposed; where no row is named, there are also so
 # many times as many cells as rows.
 MIN_TRANSPOSED_CELLS = 20
+HEAD_BYTES = 1 << 20  # in which a clock of dates has a first cell
 DECIMAL_SAMPLE_BYTES = 20_000  # of the first rows, by which decimal commas are told
 DATES = re.compile(rb"\d\d?\.\d\d?\.\d{4}|:\d\d[.,]\d+")  # whose points and commas are no decimals
 THOUSANDS = re.compile(r"[-+]?\d{1,3}([., ']\d{3})+([.,]\d*)?|[-+]?\d+,\d+")  # as 1,234.5
@@ -298,19 +299,20 @@ def _rows(body: bytes, first: int) -> bytes:
     return body[start:].rstrip()
 
 
-def _first_line(body: bytes) -> bytes:
-    """Return the first line, without its end."""
-    end = body.find(b"\n")
-    return body if end < 0 else body[:end]
-
-
 def _date_columns(body: bytes, names: list[str], wanted: list[str], delimiter: str) -> list[str]:
-    """Return the wanted columns whose first cell is a date and time."""
-    line = _first_line(body).decode("utf-8", "replace")
-    cells = next(csv.reader([line], delimiter=delimiter), [])
-    if len(cells) != len(names):
-        return []
-    return [name for name in wanted if is_date(cells[names.index(name)])]
+    """Return the wanted columns whose first cell that is not empty is a date and time."""
+    dates = []
+    undecided = set(wanted)
+    for line in body[:HEAD_BYTES].split(b"\n"):
+        cells = next(csv.reader([line.decode("utf-8", "replace")], delimiter=delimiter), [])
+        if len(cells) != len(names):
+            continue
+        stated = {name for name in undecided if cells[names.index(name)].strip()}
+        dates += [name for name in stated if is_date(cells[names.index(name)])]
+        undecided -= stated
+        if not undecided:
+            break
+    return [name for name in wanted if name in dates]
 
 
 def _signal(file: Path, column: pa.ChunkedArray, dates: bool) -> Signal:
@@ -407,8 +409,7 @@ def _cells(file: Path, name: str, column: pa.ChunkedArray, width: int | None) ->
     if pa.types.is_timestamp(column.type):
         at_ns = column.cast(pa.timestamp("ns")).cast(pa.int64()).to_numpy()
         return Signal(1e-9 * at_ns, in_seconds=True)
-    first = column[0].as_py() if len(column) else None
-    if pa.types.is_string(column.type) and is_date(first or ""):
+    if pa.types.is_string(column.type) and is_date(_first_text(column)):
         return _signal(file, column, dates=True)
     if width is not None:
         return Signal(_matrix(file, name, column, width))
@@ -422,6 +423,15 @@ def _cells(file: Path, name: str, column: pa.ChunkedArray, width: int | None) ->
             f"{file}: column '{name}' is {column.type}, not numbers; export it as float64"
         )
     return Signal(column.to_numpy().astype(float))
+
+
+def _first_text(column: pa.ChunkedArray) -> str:
+    """Return the first cell of a column of text that is not empty; "" if all are."""
+    for cell in column.drop_null():
+        text = str(cell.as_py())
+        if text.strip():
+            return text
+    return ""
 
 
 def _matrix(file: Path, name: str, column: pa.ChunkedArray, width: int) -> Array:

@@ -15,6 +15,7 @@ from gaponet.data.describe.dates import is_date
 HEAD_BYTES = 1 << 20  # in which header and first rows stand
 COMMENT = re.compile(r"\s*(#|%|//)+\s*")
 MAX_PREAMBLE_LINES = 100  # before the header
+FAR = 10.0  # between a row and the next, of an encoder's steps
 MIN_ALIKE_LINES = 5  # with as many cells as the header, from which a text before it is told
 EMPTY = ("", "nan", "NaN", "NA", "N/A", "null", "None")  # cells without a number
 UTF16 = {codecs.BOM_UTF16_LE: "utf-16-le", codecs.BOM_UTF16_BE: "utf-16-be"}
@@ -145,10 +146,24 @@ def heading(text: str) -> Heading:
 
 
 def _are_numbers_of_columns(names: list[str], below: list[str]) -> bool:
-    """Return True for 0, 1, 2, … above cells with decimals, as pandas writes an array."""
+    """Return True for 0, 1, 2, … above other numbers, as pandas writes an array; with its numbers
+    of rows, the first cell is empty.
+    """
+    stripped = [name.strip() for name in names]
     counted = [str(number) for number in range(len(names))]
-    has_decimals = any("." in cell for cell in below)
-    return len(names) > 1 and [name.strip() for name in names] == counted and has_decimals
+    if len(names) > 1 and stripped == ["", *counted[:-1]]:
+        return True
+    if len(names) < 2 or stripped != counted:
+        return False
+    return any("." in cell or "," in cell or _is_far(cell, i) for i, cell in enumerate(below))
+
+
+def _is_far(cell: str, number: int) -> bool:
+    """Return True for a number that does not follow another in the next row."""
+    try:
+        return abs(float(cell) - number) > FAR
+    except ValueError:
+        return False
 
 
 def _units_below(lines: list[str], header: int, columns: int) -> list[str]:

@@ -11,6 +11,7 @@ import numpy as np
 
 from gaponet.base.arrays import Array
 from gaponet.experiments.paper.jobs import Job
+from gaponet.experiments.paper.measure import Recorded
 from gaponet.experiments.paper.options import Block
 from gaponet.experiments.paper.study import Study
 from gaponet.experiments.paper.trainings import NETWORKS, block_title
@@ -72,6 +73,11 @@ class Results:
         """Duration of each recording, (recordings,) s."""
         return np.array(self.baselines["durations_s"], float)
 
+    @cached_property
+    def fastest(self) -> Recorded:
+        """The recordings at the fastest rate, in the order of "nominal_fastest"."""
+        return self.study.recorded(self.study.rates[-1])
+
     @property
     def masses(self) -> list[float]:
         """Payloads, kg, ascending."""
@@ -90,7 +96,7 @@ class Results:
 
     def trained_by(self, block: Block) -> str:
         """Return how the networks of a block were trained."""
-        return block_title(block, self.study.options.steps)
+        return block_title(block, self.study.options)
 
     def runs(self, block: Block, name: str) -> list[dict[str, Any]]:
         """Return the finished trainings of a setting, by seed."""

@@ -74,14 +74,15 @@ class Study:
 
     @cached_property
     def rates(self) -> tuple[float, ...]:
-        """Control rates of the recordings, Hz, ascending; clocks of 49.4 and 49.6 Hz are one
+        """Control rates of the recordings, Hz, ascending; clocks of 49.4 and 50.2 Hz are one
         rate.
         """
-        slowest: list[float] = []  # of each rate
+        clocks: list[list[float]] = []  # of each rate
         for rate in sorted({1 / entry.dt for entry in self.data.entries}):
-            if not slowest or rate > (1 + RATE_TOLERANCE) * slowest[-1]:
-                slowest.append(rate)
-        return tuple(float(round(rate)) for rate in slowest)
+            if not clocks or rate > (1 + RATE_TOLERANCE) * clocks[-1][0]:
+                clocks.append([])
+            clocks[-1].append(rate)
+        return tuple(_middle(of_rate) for of_rate in clocks)
 
     @property
     def dt(self) -> float:
@@ -196,6 +197,17 @@ class Study:
             raise UsageError(
                 f"{self.out}: holds results with another {', '.join(changed)}; choose another --out"
             )
+
+
+def _middle(clocks: list[float]) -> float:
+    """Return the middle of clocks of one rate, Hz, in whole Hz if all are within RATE_TOLERANCE of
+    it then.
+    """
+    middle = (clocks[0] + clocks[-1]) / 2
+    whole = round(middle)
+    if abs(whole - middle) <= RATE_TOLERANCE / 2 * middle:
+        return float(whole)
+    return middle
 
 
 def entries_at(rate: float, entries: list[Entry]) -> list[Entry]:

@@ -98,7 +98,7 @@ def commands_table(results: Results, block: Block) -> ResultTable:
     for way in PLAIN_WAYS:
         add_plain(PLAIN_TITLES[way], results.plain_command_q_dis(way))
     identified = results.plain_command_q_dis("feedforward", "identified")
-    add_plain("feed-forward of the identified model", identified)
+    add_plain(f"feed-forward, {results.simulators['identified']}", identified)
 
     for name in results.networks(block):
         for way in NETWORK_WAYS:
@@ -172,18 +172,25 @@ def table_2(results: Results) -> ResultTable:
         if not runs:
             continue
         baseline = "nominal"
+        durations = results.durations
+        payloads = results.payloads
         if name == "100 Hz":
             baseline = "nominal_fastest"
-        nominal = results.over_joints(results.baseline_q_dis(baseline)) / results.durations
+            durations = np.array(results.fastest.durations)
+            payloads = np.array(results.fastest.payloads)
+        nominal = results.over_joints(results.baseline_q_dis(baseline)) / durations
         errors = []  # MPJAE of each seed, which is Q_dis by the duration, (recordings,) rad
         ratios = []
         for q_dis in results.q_dis("table2", name):
-            error = results.over_joints(q_dis) / results.durations
+            error = results.over_joints(q_dis) / durations
             errors.append(error)
             ratios.append(float(error.mean() / nominal.mean()))
-        cells = []
+        cells: list[MeanStd | None] = []
         for mass in results.masses:
-            kept = results.payloads == mass
+            kept = payloads == mass
+            if not kept.any():
+                cells.append(None)
+                continue
             means = [float(error[kept].mean()) for error in errors]
             cells.append(MeanStd.from_values(means, scale=1e3))
         ratio = MeanStd.from_values(ratios)

@@ -32,7 +32,6 @@ NETWORKS: dict[Method, ModelKind] = {
 }
 
 PRETRAINING = PretrainingConfig(rounds=2, num_envs=128, steps=300, gradient_steps=800)
-LABEL_STEPS = PRETRAINING.rounds * PRETRAINING.num_envs * PRETRAINING.steps
 TABLE_2_MODEL = ModelConfig(kind="paper", payload_input=False)  # the paper's own row has no payload
 
 # Row of Table 2 → what differs from TABLE_2_MODEL. Each row has a training of its own.
@@ -88,9 +87,10 @@ class Training:
         return "".join(letter if letter.isalnum() or letter in "-+" else "_" for letter in words)
 
 
-def block_title(block: Block, steps: int) -> str:
-    """Return how a block trains with so many control steps."""
-    if block == "labels" and steps <= LABEL_STEPS:
+def block_title(block: Block, options: PaperOptions) -> str:
+    """Return how the networks of a block are trained."""
+    labels = QUICK_PRETRAINING if options.quick else PRETRAINING
+    if block == "labels" and options.steps <= labels.rounds * labels.num_envs * labels.steps:
         return "labels alone"
     return BLOCK_TITLES[block]
 
