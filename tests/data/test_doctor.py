@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from arm import TOML, XML, recordings, write_arm, write_dataset
 from logs import arm_columns, arm_sequence, late, table_text, wave
+from strange_logs import write_bag
 
 from gaponet.base.errors import DatasetError, WorkerError
 from gaponet.data.checks.timing import MIN_EARLY_RATIO, clock_drift
@@ -711,6 +712,14 @@ def test_rows_that_the_logger_wrote_twice_are_noted(arm, tmp_path):
     twice = {name: np.repeat(values, 2) for name, values in arm_columns(ROWS).items()}
     twice["time"][1::2] += 4e-4
     assert found(read(arm, tmp_path, twice), "repeated", "note").values == {"rows": ROWS}
+
+
+def test_messages_that_a_bag_holds_twice_are_noted(arm, tmp_path):
+    write_bag(tmp_path / "wave", twice=True)
+    request = ImportRequest(unit_id="lab", payload_mass=0.0)
+    import_logs(tmp_path / "wave", arm, tmp_path / "data", request)
+    diagnosis = DoctorResult.of(Dataset(tmp_path / "data"), arm)
+    assert found(diagnosis, "repeated", "note").values == {"rows": 40}
 
 
 def test_a_torque_that_no_motor_has_is_a_warning(arm, tmp_path):

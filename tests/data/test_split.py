@@ -468,15 +468,17 @@ def test_one_unit_cannot_be_split_by_unit(arm, tmp_path):
         make_split(data, "unit")
 
 
-def test_splits_of_units_whose_letters_no_file_takes_are_two_files(arm, tmp_path):
+@pytest.mark.parametrize("one", [("甲",), ("a", "b")])
+@pytest.mark.parametrize("other", [("乙",), ("a-b",)])
+def test_splits_of_units_whose_names_look_the_same_are_two_files(arm, tmp_path, one, other):
     data = Dataset.create(tmp_path / "data", arm)
-    for i, unit in enumerate("甲乙丙丁" * 3):
+    for i, unit in enumerate(["甲", "乙", "a", "b", "a-b"] * 3):
         ctrl = wave(60, 2, hertz=0.3 + 0.1 * i)
         data.append(arm_sequence(arm, ctrl, late(ctrl, 2), f"m{i}", unit=unit))
     paths = set()
-    for unit in "甲乙":
-        parts = make_split(data, "unit", (unit,))
-        paths.add(write_split(data, parts, "unit", (unit,)))
+    for units in (one, other):
+        parts = make_split(data, "unit", units)
+        paths.add(write_split(data, parts, "unit", units))
     assert len(paths) == 2
 
 

@@ -158,9 +158,13 @@ def test_windows_in_which_one_joint_moves_are_recordings_of_that_joint(tmp_path,
     assert (made[0].qvel[:, 0] == 0).all()
 
 
-def test_a_list_of_gains_turns_no_table(tmp_path, arm):
+@pytest.mark.parametrize("turned", [False, True])
+def test_a_list_of_gains_turns_no_table_and_keeps_none_from_turning(tmp_path, arm, turned):
     ctrl, qpos = motion()
-    np.savez(tmp_path / "m.npz", target=ctrl, q=qpos, kp=np.array([20.0, 20.0]))
+    tables = {"target": ctrl, "q": qpos}
+    if turned:
+        tables = {name: table.T for name, table in tables.items()}
+    np.savez(tmp_path / "m.npz", **tables, kp=np.array([20.0, 20.0]))
     (tmp_path / "logs.toml").write_text(
         strange_logs.sheet(
             ctrl="target", qpos="q", joints=arm.joint_names, rate=50.0, position_unit="rad"
@@ -192,6 +196,26 @@ def test_every_demonstration_of_robomimic_is_a_recording(tmp_path, arm):
     found = list(read_logs(tmp_path, arm))
     assert [name for name, _ in found] == ["low_dim-demo_1", "low_dim-demo_2", "low_dim-demo_10"]
     assert np.allclose(found[2][1].channels["ctrl"].values, ctrl + 0.1)
+
+
+def test_arrays_in_a_group_called_data_are_no_demonstrations(tmp_path, arm):
+    h5py = pytest.importorskip("h5py")
+    ctrl, qpos = motion()
+    with h5py.File(tmp_path / "wave.hdf5", "w") as file:
+        file["data/ctrl"] = ctrl
+        file["data/qpos"] = qpos
+    (tmp_path / "logs.toml").write_text(
+        strange_logs.sheet(
+            ctrl="data/ctrl",
+            qpos="data/qpos",
+            joints=arm.joint_names,
+            rate=50.0,
+            position_unit="rad",
+        )
+    )
+    ((name, log),) = read_logs(tmp_path, arm)
+    assert name == "wave"
+    assert np.allclose(log.channels["qpos"].values, qpos)
 
 
 def test_links_in_an_hdf5_file_are_not_followed(tmp_path, arm):

@@ -4,6 +4,7 @@ turn on.
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.csv as pacsv
 import pyarrow.parquet as pq
 import pytest
 from arm import TOML, XML, write_arm
@@ -13,8 +14,11 @@ from gaponet.base.errors import LogError
 from gaponet.data.describe.guess import guess_logs
 from gaponet.data.formats import ReadOptions, files_under, look, read_logs
 from gaponet.data.log import skip_bad_rows
+from gaponet.data.sequence import SequenceMeta, to_sequence
 
 SI = {"position_unit": "rad", "time_unit": "s"}
+RAD = {"position_unit": "rad"}
+LABELS = SequenceMeta("arm", "lab", "wave", 0.0)
 ROWS = 200
 JOINTS = ("shoulder", "elbow")
 
@@ -146,14 +150,44 @@ def test_an_error_names_the_line_in_the_file(tmp_path, arm, kind):
         only(tmp_path / "m.csv", arm, **SI)
 
 
-def test_an_empty_first_stamp_costs_one_row(tmp_path, arm):
+@pytest.mark.parametrize("stamps", ["seconds", "dates", "times of day"])
+@pytest.mark.parametrize("empty", [0, 100])
+@pytest.mark.parametrize("kind", ["csv", "parquet"])
+def test_an_empty_stamp_costs_one_row(tmp_path, arm, stamps, empty, kind):
     columns = arm_columns(ROWS)
-    columns["time"][0] = np.nan
-    (tmp_path / "m.csv").write_text(cells(columns))
+    columns["time"][empty] = np.nan
+    table = {name: pa.array(values) for name, values in columns.items()}
+    if stamps != "seconds":
+        # Midnight is between rows 100 and 101.
+        at = np.datetime64("2026-03-01T23:59:58") + (1e6 * columns["time"]).astype(
+            "timedelta64[us]"
+        )
+        form = "%H:%M:%S.%f" if stamps == "times of day" else "%Y-%m-%dT%H:%M:%S.%f"
+        text = [None if np.isnat(moment) else moment.item().strftime(form) for moment in at]
+        table["time"] = pa.array(text)
+    if kind == "parquet":
+        pq.write_table(pa.table(table), tmp_path / "m.parquet")
+    else:
+        pacsv.write_csv(pa.table(table), tmp_path / "m.csv")
     with skip_bad_rows(True) as cut:
-        log = only(tmp_path / "m.csv", arm, **SI)
+        log = only(tmp_path / f"m.{kind}", arm, **(SI if stamps == "seconds" else RAD))
     assert len(log.channels["qpos"].time) == ROWS - 1
     assert len(cut) == 1
+
+
+def test_an_error_names_the_line_where_rows_before_were_cut_or_written_twice(tmp_path, arm):
+    columns = arm_columns(ROWS)
+    columns["qpos.elbow"][10:30] = np.nan
+    columns["time"][150:] += 5.0
+    (tmp_path / "cut.csv").write_text(cells(columns))
+    with skip_bad_rows(True), pytest.raises(LogError, match=r"cut\.csv:152"):
+        to_sequence(only(tmp_path / "cut.csv", arm, **SI), arm, LABELS)
+    twice = {name: values.repeat(2) for name, values in arm_columns(ROWS).items()}
+    twice["time"][1::2] += 4e-4
+    twice["time"][150:] += 5.0
+    (tmp_path / "twice.csv").write_text(cells(twice))
+    with pytest.raises(LogError, match=r"twice\.csv:152"):
+        to_sequence(only(tmp_path / "twice.csv", arm, **SI), arm, LABELS)
 
 
 def test_an_empty_table_is_one_clear_error(tmp_path, arm):

@@ -60,6 +60,10 @@ def test_numbers_of_columns_above_an_array_are_no_row():
     assert heading(rows).first == 0
     assert heading(f"0,1,2\n{rows}").first == 1
     assert heading("0,1,2\n1,1,2\n").first == 0
+    assert heading("0;1;2\n0,0;0,1;0,2\n").first == 1
+    numbered = heading(",0,1,2\n0,2048,1024,5\n1,2048,1025,5\n")
+    assert (numbered.first, numbered.cells) == (1, ["0", "2048", "1024", "5"])
+    assert heading("0,1,2\n2048,1024,5\n2049,1024,5\n").first == 1
 
 
 @pytest.mark.parametrize("cell", ['"1,234.5"', '"1.234,5"'])

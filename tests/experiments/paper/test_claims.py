@@ -139,3 +139,17 @@ def test_a_row_of_table_2_above_half_of_nominal_is_not_converged():
     rows = table_2(make_results(good, bad)).rows
     assert [row[-2] for row in rows] == ["", "not converged"]
     assert rows[0][2].mean == pytest.approx(40.0)  # mrad: 0.4 · 0.2 rad·s in 2 s
+
+
+def test_the_row_of_a_faster_rate_has_the_recordings_of_that_rate():
+    run = training("100 Hz", 0.4, "table2")
+    run["alignment"]["q_dis"] = [[0.06, 0.06], [0.02, 0.02], [0.04, 0.04]]
+    results = make_results(run)
+    results.baselines["nominal_fastest"] = {"alignment": {"q_dis": [[0.2, 0.2]] * 3}}
+    fastest = SimpleNamespace(durations=[3.0, 1.0, 2.0], payloads=[0.0, 0.0, 0.0])
+    results.study.rates = (50.0, 100.0)
+    results.study.recorded = {100.0: fastest}.get
+    ((name, _, empty_handed, loaded, *_),) = table_2(results).rows
+    assert name == "100 Hz"
+    assert empty_handed.mean == pytest.approx(20.0)
+    assert loaded is None

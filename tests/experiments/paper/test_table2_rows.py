@@ -9,7 +9,7 @@ from arm import commands, record, write_dataset
 from gaponet.experiments.paper.experiment import all_jobs
 from gaponet.experiments.paper.jobs import make_shared_inputs, train
 from gaponet.experiments.paper.options import PaperOptions
-from gaponet.experiments.paper.study import Study
+from gaponet.experiments.paper.study import Study, entries_at
 from gaponet.experiments.paper.trainings import TABLE_2_CHANGES
 from gaponet.nn.artifact import GapModel
 from gaponet.sim.replay import rollout_errors
@@ -34,16 +34,26 @@ def test_recordings_of_each_rate_are_tested_and_uneven_clocks_are_one_rate(robot
     sequences = []
     for motion in range(8):
         recorded = record(robot, commands(60, motion), f"motion{motion}")
-        for dt in (1 / 49.4, 1 / 49.6, 0.01):
+        for dt in (1 / 49.3, 1 / 49.9, 1 / 50.2, 0.01):
             labels = replace(recorded.meta, motion=f"motion{motion} {dt:.4f}", virtual=False)
             sequences.append(replace(recorded, dt=dt, meta=labels))
     dataset = write_dataset(tmp_path / "data", robot, sequences)
     study = Study(str(dataset.path), robot, tmp_path, OPTIONS)
-    assert study.rates == (49.0, 100.0)
-    for rate, slow in ((49.0, True), (100.0, False)):
+    assert study.rates == (50.0, 100.0)
+    assert sum(map(len, study.splits().values())) == 3 * 8
+    for rate, slow in ((50.0, True), (100.0, False)):
         tested = study.recorded(rate).sequences
         assert tested
         assert all((sequence.dt > 0.015) == slow for sequence in tested)
+
+
+def test_a_rate_between_whole_hertz_is_itself(robot, tmp_path):
+    recorded = record(robot, commands(60, 0), "motion")
+    odd = replace(recorded, dt=1 / 15.4, meta=replace(recorded.meta, virtual=False))
+    dataset = write_dataset(tmp_path / "data", robot, [odd])
+    study = Study(str(dataset.path), robot, tmp_path, OPTIONS)
+    assert study.rates == pytest.approx((15.4,))
+    assert entries_at(study.rates[0], study.data.entries) == study.data.entries
 
 
 @pytest.fixture(scope="module")
