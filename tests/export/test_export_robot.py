@@ -307,6 +307,40 @@ def test_an_actuator_of_a_tendon_with_a_joints_number_is_no_servo(robot, tmp_pat
     assert at.servo.tolist() == [1, 2]
 
 
+IN_PARENT = """<tendon><fixed name="both"><joint joint="elbow" coef="1"/></fixed></tendon>
+  <actuator><general name="pull" tendon="both"/><general name="pull2" tendon="both"/>
+  <general name="mine" jointinparent="elbow" gainprm="20" biastype="affine" biasprm="0 -20 0"
+    forcerange="-5 5"/></actuator></mujoco>"""
+
+
+def test_a_servo_in_the_parents_frame_is_the_joints_servo(robot, tmp_path):
+    scene = tmp_path / "scene.xml"
+    text = robot.mjcf.read_text().replace("<option ", '<option timestep="0.005" ')
+    scene.write_text(text.replace("</mujoco>", IN_PARENT))
+    made = export_robot(robot, "mjcf", tmp_path / "out", source=Source(scene))
+    model = mujoco.MjModel.from_xml_path(str(made.file))
+    assert [model.actuator(i).name for i in range(model.nu)] == [
+        "pull",
+        "pull2",
+        "mine",
+        "shoulder",
+    ]
+    assert made.errors["scene.xml alone"] < 2e-5
+    spec = mujoco.MjSpec.from_file(str(scene))
+    assert addresses(spec.compile(), ["elbow"]).servo.tolist() == [2]
+
+
+def test_a_users_file_carries_the_payload_that_the_robot_carries_or_none(robot, tmp_path):
+    empty = replace(robot, scene=replace(robot.scene, carries_payload=False))
+    made = export_robot(empty, "mjcf", tmp_path / "out", payload_mass=1.0)
+    assert mujoco.MjModel.from_xml_path(str(made.file)).body_mass.sum() < 1.0
+    scene = tmp_path / "scene.xml"
+    text = robot.mjcf.read_text().replace("<compiler ", '<compiler settotalmass="0.5" ')
+    scene.write_text(text)
+    with pytest.raises(RobotError, match="settotalmass"):
+        export_robot(robot, "mjcf", tmp_path / "mine", source=Source(scene), payload_mass=1.0)
+
+
 def test_a_file_in_one_line_takes_a_payload_right_before_a_joint(robot, tmp_path):
     text = re.sub(r">\s+<", "><", robot.mjcf.read_text().strip())
     scene = tmp_path / "scene.xml"
@@ -460,6 +494,16 @@ def test_recordings_at_another_period_than_the_robots_are_checked_at_their_own(r
     export_robot(replace(robot, dt=3 * robot.dt), "newton", tmp_path, (motions, motions))
     check = Check(tmp_path)
     assert check.facts["dt"] == pytest.approx(robot.dt)
+    assert check.step == pytest.approx(robot.timestep)
+
+
+def test_of_recordings_at_two_rates_those_at_the_robots_are_checked(robot, tmp_path):
+    motions = own_motions(robot, count=4)
+    twice_as_fast = [replace(motion, dt=robot.dt / 2) for motion in motions[:2]]
+    motions = [*twice_as_fast, *motions[2:]]
+    export_robot(robot, "newton", tmp_path, (motions, motions))
+    check = Check(tmp_path)
+    assert [float(motion["dt"]) for motion in check.motions] == pytest.approx([robot.dt] * 2)
     assert check.step == pytest.approx(robot.timestep)
 
 

@@ -3,11 +3,11 @@
 import mujoco
 import numpy as np
 import pytest
-from arm import XML, write_arm
+from arm import TOML, XML, write_arm
 
 from gaponet.base.errors import UsageError
 from gaponet.robot.servo_fields import SERVO_FIELDS, SERVO_TERMS, STOP_FIELDS, TERMS
-from gaponet.sim.batch import BatchSim, OneByOne
+from gaponet.sim.batch import BatchSim, Condition, OneByOne
 from gaponet.sim.commands import speed_limited
 from gaponet.sim.model import build_model
 
@@ -225,6 +225,20 @@ def test_servos_set_in_a_batch_move_as_a_robot_made_with_them(tmp_path, field):
     # armature.
     tolerance = 1e-4 if field == "armature" else 1e-12
     np.testing.assert_allclose(driven(changed, targets), made, atol=tolerance)
+
+
+def test_damping_below_zero_is_taken_from_kd_in_one_ratio_at_other_gains(tmp_path):
+    robot = write_arm(tmp_path, TOML.replace("kp = 20.0", "kp = 20.0\nkd = 2.0"))
+    values = {"kp": 20.0, "damping": -0.8, "frictionloss": 0.05, "armature": 0.02, "offset": 0.0}
+    half = Condition(0.0, "both", 0.02, kp=(20.0, 20.0), kd=(1.0, 1.0))
+    changed = BatchSim(robot, [half])
+    changed.set_servos(
+        robot.joint_names, {name: np.full((1, 2), value) for name, value in values.items()}
+    )
+    fitted = robot.with_identified(dict.fromkeys(robot.joint_names, values))
+    targets = np.repeat(np.random.default_rng(5).uniform(-1, 1, (4, 1, 2)), 15, axis=0)
+    made = driven(BatchSim(fitted, [half]), targets)
+    np.testing.assert_allclose(driven(changed, targets), made, atol=1e-12)
 
 
 def driven(sim, targets):

@@ -1,15 +1,18 @@
 """The inverse of a simulator is the target that was given to it, and the label of pre-training."""
 
+import mujoco
 import numpy as np
 import pytest
 from arm import TOML, XML, commands, record, write_arm
 
-from gaponet.sim.batch import BatchSim, Condition
+from gaponet.robot.mjcf import compile_spec
+from gaponet.sim.batch import Batch, BatchSim, Condition
 from gaponet.sim.inverse import AnalyticInverse, Inertia, Period, weights_within_period
-from gaponet.sim.model import build_model
+from gaponet.sim.model import build_model, build_spec
 from gaponet.sim.replay import replay
 
 CONDITION = Condition(0.2, "both", 0.02)
+EMPTY = Condition(0.0, "both", 0.02)
 LOADED = {"frictionloss": 0.05, "friction_motor": 0.4, "friction_external": 0.1}
 
 
@@ -34,6 +37,19 @@ def test_the_inverse_of_a_recording_is_its_command(tmp_path):
     inverse = AnalyticInverse.of(BatchSim(robot, [CONDITION]))
     told = np.concatenate([inverse([p]) for p in periods(sequence, 0.0)])
     np.testing.assert_allclose(told, sequence.ctrl[:-1], atol=2e-4)
+
+
+def test_a_tendons_actuator_with_a_joints_number_is_no_servo(tmp_path):
+    robot = write_arm(tmp_path)
+    spec = build_spec(robot)
+    for name in ("one", "other"):
+        spec.add_tendon(name=name).wrap_joint("elbow", 1.0)
+        pull = spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_TENDON)
+        pull.set_to_position(kp=0.0)
+    scene = compile_spec(spec, robot.mjcf)
+    own = BatchSim(robot, [EMPTY])
+    inverse = AnalyticInverse(Batch(scene, nsim=1), scene, robot.joint_names, own.periods)
+    assert inverse.agrees_with(AnalyticInverse.of(own), robot.qpos_range)
 
 
 def test_friction_that_grows_with_the_motors_torque_is_overcome_too(tmp_path):

@@ -19,7 +19,7 @@ from gaponet.robot.spec import RobotSpec, Scene, Table, load_robot
 from gaponet.sim.batch import BatchSim
 from gaponet.sim.dataset_robot import dataset_robot
 from gaponet.sim.dynamics import inverse_dynamics
-from gaponet.sim.model import build_model, model_hash, write_table
+from gaponet.sim.model import build_model, idle_joints, model_hash, write_table
 
 
 def hold(model: mujoco.MjModel, ctrl: np.ndarray, seconds: float) -> tuple[np.ndarray, np.ndarray]:
@@ -170,6 +170,40 @@ def test_a_payload_that_the_compiler_would_not_weigh_is_refused(tmp_path):
         build_model(robot, 0.2)
 
 
+@pytest.mark.parametrize("setting", ['boundmass="0.001"', 'fusestatic="true"'])
+def test_a_payload_weighs_whatever_the_compiler_does_with_light_or_fixed_bodies(tmp_path, setting):
+    robot = write_arm(tmp_path / "arm", xml=XML.replace("<compiler ", f"<compiler {setting} "))
+    assert build_model(robot).body("payload_hand").mass[0] <= 1e-3
+    assert build_model(robot, 0.2).body("payload_hand").mass[0] == pytest.approx(0.2)
+
+
+SECOND_LIMB = """<body name="second" pos="0 1 0"><joint name="wrist" axis="0 1 0"/>
+  <geom size="0.1" mass="0.3" contype="0" conaffinity="0"/></body></worldbody>"""
+
+
+@pytest.mark.parametrize(
+    ("coupling", "idle"),
+    [
+        ("", ("wrist",)),
+        ('<equality><joint joint1="wrist" joint2="shoulder"/></equality>', ()),
+        ('<equality><weld body1="second" body2="fore"/></equality>', ()),
+        ('<equality><weld body1="second"/></equality>', ("wrist",)),
+        (
+            '<tendon><fixed name="t"><joint joint="shoulder" coef="1"/>'
+            '<joint joint="wrist" coef="1"/></fixed></tendon>',
+            (),
+        ),
+    ],
+)
+def test_a_limb_that_is_coupled_to_one_that_moves_is_not_idle(tmp_path, coupling, idle):
+    toml = TOML.replace(
+        "[[payload_mount]]",
+        '[[joint]]\nname = "wrist"\nkp = 20.0\neffort_limit = 5.0\n[[payload_mount]]',
+    )
+    robot = write_arm(tmp_path / "arm", toml, XML.replace("</worldbody>", SECOND_LIMB + coupling))
+    assert idle_joints(robot, ("shoulder", "elbow")) == idle
+
+
 def test_a_joint_is_locked_with_what_refers_to_it(tmp_path):
     more = """
       <equality><joint joint1="elbow" joint2="shoulder"/></equality>
@@ -179,6 +213,61 @@ def test_a_joint_is_locked_with_what_refers_to_it(tmp_path):
     robot = write_arm(tmp_path / "arm", xml=XML.replace("</mujoco>", more))
     assert build_model(robot, locked=("elbow",)).nq == 1
     assert build_model(robot).neq == 1
+
+
+def test_a_joint_is_locked_with_equalities_of_its_tendons_and_no_others(tmp_path):
+    more = """
+      <tendon><fixed name="moved"><joint joint="shoulder" coef="1"/></fixed>
+        <fixed name="locked"><joint joint="elbow" coef="1"/></fixed></tendon>
+      <equality><tendon tendon1="moved" tendon2="locked"/>
+        <weld body1="elbow" body2="upper" active="false"/></equality></mujoco>"""
+    xml = XML.replace("</mujoco>", more).replace('<body name="fore"', '<body name="elbow"')
+    toml = TOML.replace('body = "fore"', 'body = "elbow"')
+    robot = write_arm(tmp_path / "arm", toml, xml)
+    assert build_model(robot).neq == 2
+    model = build_model(robot, locked=("elbow",))
+    assert [mujoco.mjtEq(kind) for kind in model.eq_type] == [mujoco.mjtEq.mjEQ_WELD]
+    assert model.ntendon == 1
+
+
+HOME = TOML.replace('name = "elbow"', 'name = "elbow"\nhome = 0.7')
+ELBOW = '<joint name="elbow" axis="0 1 0" range="-1.5 1.5"/>'
+
+
+def hand(robot: RobotSpec, locked: tuple[str, ...] = ()) -> np.ndarray:
+    """Place of the hand at home, (3,) m."""
+    model = build_model(robot, locked=locked)
+    data = mujoco.MjData(model)
+    data.qpos[:] = robot.qpos_home[: model.nq]
+    mujoco.mj_kinematics(model, data)
+    return data.body("payload_hand").xpos.copy()
+
+
+@pytest.mark.parametrize("frame", ['euler="0 0 0.5"', 'pos="0.05 0 0"'])
+def test_a_joint_in_a_frame_of_its_body_is_locked_where_it_is(tmp_path, frame):
+    xml = XML.replace(ELBOW, f"<frame {frame}>{ELBOW}</frame>")
+    robot = write_arm(tmp_path / "arm", HOME, xml)
+    np.testing.assert_allclose(hand(robot, ("elbow",)), hand(robot), atol=1e-9)
+
+
+def test_an_attached_model_has_units_of_its_own(tmp_path):
+    """The child is in degrees, the parent in radians."""
+    child = XML.replace('angle="radian" ', "").replace('range="-1.5 1.5"', 'range="-86 86"')
+    turned = child.replace('<body name="fore"', '<body name="fore" euler="10 20 30"')
+    main = """<mujoco><compiler angle="radian"/><asset><model name="c" file="child.xml"/></asset>
+      <worldbody><body name="stand"><attach model="c" body="upper" prefix="my_"/></body></worldbody>
+    </mujoco>"""
+    toml = HOME
+    for name in ("shoulder", "elbow", "fore"):
+        toml = toml.replace(f'"{name}"', f'"my_{name}"')
+    (tmp_path / "arm").mkdir()
+    (tmp_path / "arm" / "child.xml").write_text(turned)
+    robot = write_arm(tmp_path / "arm", toml, main)
+    np.testing.assert_allclose(hand(robot, ("my_elbow",)), hand(robot), atol=1e-9)
+    stops = robot.with_servo(zero=np.array([0.1, 0.1]), stop_high=np.array([1.0, np.nan]))
+    model = build_model(stops)
+    np.testing.assert_allclose(model.qpos0, [-0.1, -0.1])
+    np.testing.assert_allclose(model.jnt_range[0, 1], 1.0)
 
 
 @pytest.mark.parametrize("turned", ['euler="0.3 0.2 0.1"', 'axisangle="0 0.6 0.8 0.4"'])

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from arm import recordings, write_arm
+from arm import TOML, recordings, write_arm
 
 from gaponet.data.sequence import Sequence
 from gaponet.robot.folder import save_robot
@@ -65,6 +65,18 @@ def test_every_simulation_has_the_friction_of_the_recorded_temperature(tmp_path,
     plain = candidate(SERVO | now)
     for runs in (JointRollouts([warm], robot, nthread=1), RobotRollouts([warm], robot, 1)):
         np.testing.assert_allclose(runs.flat_errors(values), runs.flat_errors(plain), atol=1e-5)
+
+
+def test_damping_that_warmth_takes_from_kd_keeps_its_ratio_at_other_gains(tmp_path):
+    robot = write_arm(tmp_path / "arm", TOML.replace("kp = 20.0", "kp = 20.0\nkd = 2.0"))
+    (real,) = recordings(robot, 1, rows=150)
+    warm = at(real, 40.0, kp=(20.0, 20.0), kd=(1.0, 1.0))
+    servo = SERVO | WARM | {"damping_per_kelvin": -0.1}  # below zero at 40 °C
+    (moved,) = replay([warm], with_servo(robot, servo))
+    expected = np.abs(moved.qpos - warm.qpos)[1:].mean()
+    for runs in (JointRollouts([warm], robot, nthread=1), RobotRollouts([warm], robot, 1)):
+        error = np.abs(runs.flat_errors(candidate(servo))).mean()
+        assert error == pytest.approx(expected, rel=0.05)
 
 
 def test_a_simulation_without_temperature_is_at_the_reference(arm, warm):

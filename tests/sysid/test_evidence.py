@@ -8,6 +8,7 @@ from gaponet.sysid.evidence.drift import EVERY_JOINT, ParameterChange, drift_adv
 from gaponet.sysid.evidence.evidence import (
     Evidence,
     estimate_uncertainty,
+    evidence,
     gradient_covariance,
     inverted,
     no_better_than,
@@ -52,6 +53,13 @@ def test_recordings_with_other_payloads_are_others(arm):
     uncertainty = estimate_uncertainty(arm, made, [])
     (source,) = uncertainty.sources
     assert list(source["logs"]) == ["m", "m, 0.1 kg", "m, 0.2 kg"]
+
+
+def test_recordings_of_other_units_are_others(arm):
+    made = [arm_sequence(arm, wave(60, 2), wave(60, 2), unit=unit) for unit in ("one", "two")]
+    (source,) = estimate_uncertainty(arm, made, []).sources
+    assert list(source["logs"]) == ["m, one", "m, two"]
+    assert evidence(arm, made, ("kp",), 10).names == ("m, one", "m, two")
 
 
 def test_overdispersion_of_four_doubles_a_standard_error():

@@ -27,6 +27,7 @@ from gaponet.export.helper_file import (
 from gaponet.export.mjcf_edit import MUJOCO_HAS_RAMPS, edit_mjcf
 from gaponet.export.newton_config import newton_config
 from gaponet.export.plain_servos import (
+    at_rate,
     check_error,
     check_motions,
     comparable,
@@ -271,7 +272,7 @@ def _measured_export(
 ) -> _RobotExport:
     """Return an export with its errors in gaponet, before anything is written."""
     has_ramps = TARGETS[to].edits_mjcf and MUJOCO_HAS_RAMPS
-    checked = check_motions(validation, robot, ramped=not has_ramps)
+    checked = check_motions(validation, robot, facts["dt"], ramped=not has_ramps)
     if to == "envhub":
         facts["lerobot_units"] = envhub.lerobot_units(robot)
     played_there = plain if TARGETS[to].has_table else plain.with_table(None)
@@ -419,15 +420,22 @@ def export_networks(
         payload_mass: In each hand, kg; recordings with another payload are not used.
 
     Raises:
-        UsageError: No recording was made with this payload and the robot's gains.
+        UsageError: No recording was made with this payload, the robot's gains and its control
+            period.
     """
     from gaponet.export.actuator_net import read_run_recordings, write_networks
 
     model.require_payload(payload_mass, can_extrapolate=False)
     robot = model.simulator()
     train, val = read_run_recordings(run, data, robot, payload_mass)
-    motions = check_motions(val, robot)
-    dt = train[0].dt
+    dt = control_period(robot, (recording.dt for recording in train))
+    train = at_rate(train, dt)
+    motions = check_motions(val, robot, dt)
+    if not motions:
+        raise UsageError(
+            f"{run}: its recordings at {1 / dt:.4g} Hz are for training alone; no motion of this "
+            "rate is left to compare with"
+        )
     facts = simulator_facts(robot, dt, payload_mass) | {
         "file": ROBOT,
         "virtual": train[0].meta.virtual,

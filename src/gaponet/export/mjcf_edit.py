@@ -34,7 +34,9 @@ from gaponet.sim.model import (
     TABLE,
     TOLERANCE,
     build_model,
+    carried,
     driven_joints,
+    require_payload_mass,
 )
 
 MUJOCO_HAS_RAMPS = hasattr(mujoco.MjsActuator, "set_to_pid")  # from MuJoCo 4 on
@@ -250,7 +252,7 @@ def edit_mjcf(
     for name, servo in joints.items():
         full = prefix + name
         tag = _joint_tag(source, full, before)
-        actuator = source.one(f"servos of '{full}'", "actuator/", joint=full)
+        actuator = _servo_tag(source, full)
         if actuator is not None and name not in robot.operated:
             continue
         source.set(tag, **_joint_attributes(servo, full, before, spec.compiler.degree))
@@ -269,7 +271,9 @@ def edit_mjcf(
         _extend_keyframes(source, homes_of_added)
     _add_surroundings(source, robot, prefix, payload_mass, before)
     target = _write(source, out)
-    _require(compile_spec(read_mjcf(target), target), before, joints, robot, prefix, target)
+    copied = compile_spec(read_mjcf(target), target)
+    _require(copied, before, joints, robot, prefix, target)
+    _require_payload(copied, robot, prefix, payload_mass, target)
     source.write_changes(out)
     return target, not_rad
 
@@ -284,6 +288,16 @@ def _joint_tag(source: Source, name: str, model: mujoco.MjModel) -> Tag:
             f"names); it has {have}"
         )
     return tag
+
+
+def _servo_tag(source: Source, joint: str) -> Tag | None:
+    """Return the element of the actuator that drives a joint, None if there is none."""
+    what = f"servos of '{joint}'"
+    on_joint = source.one(what, "actuator/", joint=joint)
+    in_parent = source.one(what, "actuator/", jointinparent=joint)
+    if on_joint is not None and in_parent is not None:
+        raise RobotError(f"{source.main}: has 2 {what}; one is needed. Delete or rename the others")
+    return on_joint or in_parent
 
 
 def _joint_attributes(
@@ -408,7 +422,7 @@ def _add_surroundings(
         tag = _body(source, prefix + name, "identified_link")
         _write_inertia(source, tag, link)
     for mount in robot.payload_mounts:
-        mass = payload_mass + mount.mass
+        mass = carried(robot, mount, payload_mass)
         if mass:
             tag = _body(source, prefix + mount.body, "payload_mount")
             source.insert(tag, _payload(f"{prefix}payload_{mount.side}", mass, mount.pos))
@@ -559,6 +573,18 @@ def _require(
             )
     if wrong:
         raise RobotError(f"{path}: the edited copy differs from the robot: {'; '.join(wrong[:3])}")
+
+
+def _require_payload(
+    model: mujoco.MjModel, robot: RobotSpec, prefix: str, payload_mass: float, path: Path
+) -> None:
+    """Refuse a copy whose compiler settings change the mass of payloads."""
+    for mount in robot.payload_mounts:
+        wanted = carried(robot, mount, payload_mass)
+        if not wanted:
+            continue
+        weighs = float(model.body(f"{prefix}payload_{mount.side}").mass[0])
+        require_payload_mass(path, mount, wanted, weighs)
 
 
 def text_of(*numbers: float) -> str:

@@ -23,7 +23,7 @@ from gaponet.base.files import lock_folder, write_json
 from gaponet.base.progress import Progress, no_progress
 from gaponet.base.structure import read_json, validated
 from gaponet.data.sequence import Sequence, SequenceMeta
-from gaponet.data.split import split_entries
+from gaponet.data.split import RATE_TOLERANCE, split_entries
 from gaponet.data.store import Dataset
 from gaponet.evaluation.candidate import read_origin
 from gaponet.robot.by_name import identified_catalogue
@@ -285,16 +285,22 @@ def mean_error(recorded: np.ndarray, played: np.ndarray) -> float:
     return float(np.abs(np.asarray(played, float) - recorded)[1:].mean())
 
 
+def at_rate(recordings: ListOf[Sequence], dt: float) -> list[Sequence]:
+    """Return the recordings with a control period, s."""
+    return [s for s in recordings if abs(s.dt / dt - 1) <= RATE_TOLERANCE]
+
+
 def check_motions(
-    recordings: ListOf[Sequence], robot: RobotSpec, ramped: bool = True
+    recordings: ListOf[Sequence], robot: RobotSpec, dt: float, ramped: bool = True
 ) -> list[Sequence]:
     """Return the first motions by name, cut in length, for check.npz.
 
     Args:
+        dt: Control period of all of them, s; recordings with another are left out.
         ramped: Whether targets change as slowly as the servos change them, for engines that do not
             limit the speed of targets.
     """
-    first = {recording.meta.motion: recording for recording in reversed(recordings)}
+    first = {s.meta.motion: s for s in reversed(at_rate(recordings, dt))}
     low, high = robot.qpos_range.T
     limited = ramped & (robot.servo.target_speed > 0)
     speed = np.where(limited, robot.servo.target_speed, np.inf)

@@ -3,18 +3,54 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import mujoco
 import numpy as np
 
+from gaponet.base.arrays import Array
 from gaponet.base.errors import RobotError
 
 
 def units_per_si(spec: mujoco.MjSpec, joint: mujoco.MjsJoint) -> float:
     """Return the specification's units per rad or m of a joint: an MJCF may use degrees."""
-    if spec.compiler.degree and joint.type == mujoco.mjtJoint.mjJNT_HINGE:
+    if _compiler(spec, joint).degree and joint.type == mujoco.mjtJoint.mjJNT_HINGE:
         return math.degrees(1)
     return 1.0
+
+
+def _compiler(spec: mujoco.MjSpec, element: Any) -> Any:
+    """Return the settings of the file that an element comes from: an attached model has its own."""
+    return getattr(element, "compiler", spec.compiler)
+
+
+def _quat(spec: mujoco.MjSpec, element: mujoco.MjsBody | mujoco.MjsFrame) -> Array:
+    """Return the orientation of a body or frame in what holds it, in whatever form it is given."""
+    if element.alt.type == mujoco.mjtOrientation.mjORIENTATION_QUAT:
+        return np.array(element.quat)
+    compiler = _compiler(spec, element)
+    return np.array(
+        spec.resolve_orientation(
+            degree=compiler.degree, sequence=compiler.eulerseq, orientation=element.alt
+        )
+    )
+
+
+def _axis_and_anchor(spec: mujoco.MjSpec, joint: mujoco.MjsJoint) -> tuple[Array, Array]:
+    """Return a joint's axis, of length 1, and its place, m, in its body; frames may lie between."""
+    axis = np.array(joint.axis) / np.linalg.norm(joint.axis)
+    anchor = np.array(joint.pos)
+    frame = joint.frame
+    while frame is not None:
+        quat = _quat(spec, frame)
+        turned_axis = np.zeros(3)
+        turned_anchor = np.zeros(3)
+        mujoco.mju_rotVecQuat(turned_axis, axis, quat)
+        mujoco.mju_rotVecQuat(turned_anchor, anchor, quat)
+        axis = turned_axis
+        anchor = turned_anchor + np.array(frame.pos)
+        frame = frame.frame
+    return axis, anchor
 
 
 def freeze(spec: mujoco.MjSpec, joint: mujoco.MjsJoint, value: float) -> None:
@@ -30,18 +66,13 @@ def freeze(spec: mujoco.MjSpec, joint: mujoco.MjsJoint, value: float) -> None:
             f"joint '{joint.name}' turns after '{body.joints[0].name}' in one body: keep or clamp "
             "both"
         )
-    if body.alt.type != mujoco.mjtOrientation.mjORIENTATION_QUAT:  # euler, axisangle, …
-        compiler = spec.compiler
-        body.quat = spec.resolve_orientation(
-            degree=compiler.degree, sequence=compiler.eulerseq, orientation=body.alt
-        )
-        body.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
-    axis = np.array(joint.axis) / np.linalg.norm(joint.axis)
+    body.quat = _quat(spec, body)
+    body.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
+    axis, anchor = _axis_and_anchor(spec, joint)
     turn = np.array([1.0, 0.0, 0.0, 0.0])  # of the body, in its own frame
     shift = axis * move  # of the body's origin, in its own frame, m
     if joint.type != mujoco.mjtJoint.mjJNT_SLIDE:
         mujoco.mju_axisAngle2Quat(turn, axis, move)
-        anchor = np.array(joint.pos)
         turned_anchor = np.zeros(3)
         mujoco.mju_rotVecQuat(turned_anchor, anchor, turn)
         shift = anchor - turned_anchor
@@ -60,8 +91,9 @@ def delete_references(spec: mujoco.MjSpec, removed: set[str]) -> None:
     for kind in (spec.actuators, spec.sensors, spec.keys):
         for element in list(kind):
             spec.delete(element)
+    coupled = {mujoco.mjtEq.mjEQ_JOINT: removed, mujoco.mjtEq.mjEQ_TENDON: tendons}
     for equality in list(spec.equalities):
-        if {equality.name1, equality.name2} & (removed | tendons):
+        if {equality.name1, equality.name2} & coupled.get(equality.type, set()):
             spec.delete(equality)
     for tendon in list(spec.tendons):
         if tendon.name in tendons:

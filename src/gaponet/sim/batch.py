@@ -339,8 +339,9 @@ def _under_conditions(robot: RobotSpec, conditions: list[Condition]) -> dict[Con
     """Return the robot with the gains and at the temperature of each condition."""
     robots = {}
     for condition in dict.fromkeys(conditions):
-        with_gains = robot.with_gains(condition.kp, condition.kd)
-        robots[condition] = with_gains.at_temperature(condition.temperature)
+        # First the temperature: damping below zero is taken from kd, in one ratio at any gains.
+        warm = robot.at_temperature(condition.temperature)
+        robots[condition] = warm.with_gains(condition.kp, condition.kd)
     return robots
 
 

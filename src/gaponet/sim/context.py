@@ -21,7 +21,6 @@ import numpy as np
 from gaponet.base.arrays import Array
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.batch import Batch, BatchSim, Condition
-from gaponet.sim.commands import CommandHistory
 from gaponet.sim.model import driven_joints, joint_addresses
 
 PROBE_RAD = 0.2
@@ -106,7 +105,7 @@ def scene_context(scene: mujoco.MjModel, robot: RobotSpec, dt: float, prefix: st
     ctrl[:, actuator] = home
     steps = round(dt / model.opt.timestep)
     if model.nhistory:
-        _fill_history(batch, model, ctrl, steps)
+        batch.bind("history")[:] = _history_at_rest(model, ctrl[0])
     ctrl[:, actuator] = moved
 
     def step() -> tuple[Array, Array]:
@@ -117,11 +116,15 @@ def scene_context(scene: mujoco.MjModel, robot: RobotSpec, dt: float, prefix: st
     return result
 
 
-def _fill_history(batch: Batch, model: mujoco.MjModel, ctrl: Array, steps: int) -> None:
-    """Let the servos have had the targets ctrl, (nsim, nu) rad, in each control period before."""
-    history = CommandHistory(batch.bind("history"), batch.bind("time"), model)
-    each = np.ones(len(ctrl), int)
-    history.fill(slice(None), ctrl[:, None].copy(), steps * each, model.opt.timestep * each)
+def _history_at_rest(model: mujoco.MjModel, ctrl: Array) -> Array:
+    """Return MuJoCo's buffers of past commands of servos that always had the targets ctrl, (nu,)
+    rad; (nhistory,).
+    """
+    data = mujoco.MjData(model)
+    for i, samples in enumerate(model.actuator_history[:, 0]):
+        if samples:
+            mujoco.mj_initCtrlHistory(model, data, i, None, np.full(samples, ctrl[i]))
+    return np.array(data.history)
 
 
 def _probe_targets(home: Array, operated: Array, limits: Array) -> tuple[Array, Array]:

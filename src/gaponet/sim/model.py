@@ -38,7 +38,8 @@ if TYPE_CHECKING:
 STIFF_SOLREF = (0.004, 1.0)
 STIFF_SOLIMP = (0.9999, 0.9999, 0.001, 0.5, 2.0)
 STIFF_MOBILITY = 0.1
-MAX_MASS_ERROR_KG = 1e-6
+MAX_MASS_ERROR_KG = 1.1e-3  # a boundmass of a gram, which is usual, harms nothing
+WORLD = -1  # of dof_treeid and body_treeid: no limb
 LOOSE_IMPEDANCE = 0.999
 TOLERANCE = 1e-10
 
@@ -144,6 +145,8 @@ def build_spec(
         )
     spec.option.timestep = period / robot.steps_per(period)
     spec.option.tolerance = TOLERANCE
+    if robot.payload_mounts:
+        spec.compiler.fusestatic = False  # it would fuse the payload with the hand
     for joint in spec.joints:
         joint.solref_friction = STIFF_SOLREF
         joint.solimp_friction = STIFF_SOLIMP
@@ -165,14 +168,62 @@ def build_spec(
 
 def idle_joints(robot: RobotSpec, moved: tuple[str, ...]) -> tuple[str, ...]:
     """Return the joints of limbs without a moving joint: on a fixed base they share no dynamics
-    with the rest.
+    with the rest, unless an equality or a tendon couples them to a limb that moves.
 
     `moved` names the joints that a command moves, or holds away from home.
     """
     model = build_model(robot)
     limb = dict(zip(robot.joint_names, model.dof_treeid.tolist(), strict=True))
     busy = {limb[name] for name in moved}
+    couplings = _couplings(model)
+    while reached := [limbs for limbs in couplings if limbs & busy and not limbs <= busy]:
+        busy.update(*reached)
     return tuple(name for name in robot.joint_names if limb[name] not in busy)
+
+
+def _couplings(model: mujoco.MjModel) -> list[set[int]]:
+    """Return the limbs that each equality and each tendon holds together, as numbers of
+    dof_treeid.
+    """
+    of_joint = model.dof_treeid[model.jnt_dofadr]
+    of_body = model.body_treeid
+    of_kind = {
+        int(mujoco.mjtWrap.mjWRAP_JOINT): of_joint,
+        int(mujoco.mjtWrap.mjWRAP_SITE): of_body[model.site_bodyid],
+        int(mujoco.mjtWrap.mjWRAP_SPHERE): of_body[model.geom_bodyid],
+        int(mujoco.mjtWrap.mjWRAP_CYLINDER): of_body[model.geom_bodyid],
+    }
+    tendons = []
+    for first, count in zip(model.tendon_adr, model.tendon_num, strict=True):
+        limbs = set()
+        for wrap in range(first, first + count):
+            of_object = of_kind.get(int(model.wrap_type[wrap]))
+            if of_object is not None:
+                limbs.add(int(of_object[model.wrap_objid[wrap]]))
+        tendons.append(limbs)
+    couplings = list(tendons)
+    for equality in range(model.neq):
+        limbs = set()
+        for number in (model.eq_obj1id[equality], model.eq_obj2id[equality]):
+            limbs |= _limbs_of(model, equality, int(number), tendons)
+        couplings.append(limbs)
+    return [limbs - {WORLD} for limbs in couplings]
+
+
+def _limbs_of(
+    model: mujoco.MjModel, equality: int, number: int, tendons: list[set[int]]
+) -> set[int]:
+    """Return the limbs of one of the two objects of an equality; none if it has one object."""
+    if number < 0:
+        return set()
+    if model.eq_type[equality] == mujoco.mjtEq.mjEQ_TENDON:
+        return tendons[number]
+    if model.eq_type[equality] == mujoco.mjtEq.mjEQ_JOINT:
+        return {int(model.dof_treeid[model.jnt_dofadr[number]])}
+    body = number
+    if model.eq_objtype[equality] == mujoco.mjtObj.mjOBJ_SITE:
+        body = int(model.site_bodyid[number])
+    return {int(model.body_treeid[body])}
 
 
 def qpos_range(model: mujoco.MjModel) -> Array:
@@ -409,8 +460,8 @@ def _add_payload(spec: mujoco.MjSpec, robot: RobotSpec, mass: float, side: str) 
     for mount in robot.payload_mounts:
         # An empty hand carries a massless ball: all payloads share one MjData layout, so one Batch
         # steps them together.
-        carried = _carried(robot, mount, mass, side)
-        radius = max((3 * carried / (4 * math.pi * PAYLOAD_DENSITY)) ** (1 / 3), 1e-3)
+        weight = carried(robot, mount, mass, side)
+        radius = max((3 * weight / (4 * math.pi * PAYLOAD_DENSITY)) ** (1 / 3), 1e-3)
         parent = spec.body(mount.body)
         if parent is None:
             raise RobotError(
@@ -421,15 +472,15 @@ def _add_payload(spec: mujoco.MjSpec, robot: RobotSpec, mass: float, side: str) 
         body.add_geom(
             type=mujoco.mjtGeom.mjGEOM_SPHERE,
             size=(radius, 0, 0),
-            mass=carried,
+            mass=weight,
             contype=0,
             conaffinity=0,
             rgba=(0.8, 0.25, 0.2, 1),
         )
 
 
-def _carried(robot: RobotSpec, mount: PayloadMount, mass: float, side: str) -> float:
-    """Return the mass at a mount, kg."""
+def carried(robot: RobotSpec, mount: PayloadMount, mass: float, side: str = "both") -> float:
+    """Return the mass at a mount with a payload, kg."""
     if robot.scene.carries_payload and side in ("both", mount.side):
         return mount.mass + mass
     return mount.mass
@@ -438,13 +489,17 @@ def _carried(robot: RobotSpec, mount: PayloadMount, mass: float, side: str) -> f
 def _require_payload(model: mujoco.MjModel, robot: RobotSpec, mass: float, side: str) -> None:
     """Refuse a model whose compiler settings change the mass of payloads."""
     for mount in robot.payload_mounts:
-        wanted = _carried(robot, mount, mass, side)
         weighs = float(model.body(f"payload_{mount.side}").mass[0])
-        if abs(weighs - wanted) > MAX_MASS_ERROR_KG:
-            raise RobotError(
-                f"{robot.mjcf}: a payload of {wanted:g} kg at '{mount.side}' weighs {weighs:g} kg "
-                "in the model; delete settotalmass and inertiagrouprange of its <compiler>"
-            )
+        require_payload_mass(robot.mjcf, mount, carried(robot, mount, mass, side), weighs)
+
+
+def require_payload_mass(file: Path, mount: PayloadMount, wanted: float, weighs: float) -> None:
+    """Refuse a payload that weighs something else than wanted, kg, in the model of a file."""
+    if abs(weighs - wanted) > MAX_MASS_ERROR_KG:
+        raise RobotError(
+            f"{file}: a payload of {wanted:g} kg at '{mount.side}' weighs {weighs:g} kg in the "
+            "model; delete settotalmass, boundmass and inertiagrouprange of its <compiler>"
+        )
 
 
 TABLE = "gaponet_table"

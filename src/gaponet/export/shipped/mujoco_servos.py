@@ -222,9 +222,8 @@ def addresses(model: Any, joints: list[str], prefix: str = "") -> Addresses:
     import mujoco
 
     ids = [model.joint(prefix + name).id for name in joints]
-    of_joint = np.where(
-        model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT, model.actuator_trnid[:, 0], -1
-    )
+    on_joint = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
+    of_joint = np.where(np.isin(model.actuator_trntype, on_joint), model.actuator_trnid[:, 0], -1)
     servos = np.array([np.flatnonzero(of_joint == joint)[0] for joint in ids])
     return Addresses(model.jnt_dofadr[ids], model.jnt_qposadr[ids], servos)
 

@@ -128,8 +128,8 @@ def _addresses(model: Any, joints: list[str]) -> tuple[list[int], list[int]]:
     """Return the numbers of the joints' position servos, and of their degrees of freedom."""
     driven = {}  # joint → number of its position servo
     for servo, joint in enumerate(model.actuator_trnid[:, 0]):
-        kind = model.actuator_trntype[servo], model.actuator_biastype[servo]
-        if kind == (0, 1):  # of a joint, with an affine bias
+        on_joint = model.actuator_trntype[servo] in (0, 1)  # joint, jointinparent
+        if on_joint and model.actuator_biastype[servo] == 1:  # affine
             driven[model.joint(joint).name] = servo
     require_joints(joints, driven, "joints with position servos")
     servos = [driven[name] for name in joints]

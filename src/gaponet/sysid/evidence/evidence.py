@@ -121,7 +121,8 @@ def evidence(
     weight = soft_l1_weight(errors)  # (n, rows)
     gradient_of_rows = jac * (weight * errors)[..., None]  # (n, rows, Q)
     gradients, window_of_cluster = cluster_sums(gradient_of_rows, rollouts.window)
-    name_of_window = [_window_name(part) for part in parts]
+    several = _are_of_several_units(sequences)
+    name_of_window = [_window_name(part, several) for part in parts]
     names = list(dict.fromkeys(name_of_window))
     recording_of_window = np.array([names.index(name) for name in name_of_window])
     return Evidence(
@@ -198,23 +199,32 @@ def _slopes_over_play(rollouts: JointRollouts, bounds: Bounds) -> Array:
     return np.asarray(0.5 / ERROR_SCALE_RAD * side[..., :: windows.thin] * is_counted)
 
 
-def _window_name(part: Sequence) -> str:
-    """Return the name of a window's recording: its motion, its payload, and its repetition unless
-    it is the first one.
+def _are_of_several_units(sequences: ListOf[Sequence]) -> bool:
+    return len({sequence.meta.unit_id for sequence in sequences}) > 1
+
+
+def _window_name(part: Sequence, with_unit: bool) -> str:
+    """Return the name of a window's recording: its motion, its unit if asked, its payload, and its
+    repetition unless it is the first one.
     """
-    name = part.meta.motion + _payload_in_name(part)
+    name = _take_name(part, with_unit)
     if not part.meta.repetition:
         return name
     return f"{name} ({part.meta.repetition})"
 
 
-def _payload_in_name(sequence: Sequence) -> str:
-    """Return what a recording's name says of its payload: nothing for an empty hand."""
-    if not sequence.meta.payload_mass:
-        return ""
-    side = sequence.meta.payload_side
-    of_side = "" if side == "both" else f" {side}"
-    return f", {sequence.meta.payload_mass:g} kg{of_side}"
+def _take_name(sequence: Sequence, with_unit: bool) -> str:
+    """Return motion, unit if asked, and payload of a recording; of an empty hand nothing is
+    said.
+    """
+    name = sequence.meta.motion
+    if with_unit:
+        name += f", {sequence.meta.unit_id}"
+    if sequence.meta.payload_mass:
+        side = sequence.meta.payload_side
+        of_side = "" if side == "both" else f" {side}"
+        name += f", {sequence.meta.payload_mass:g} kg{of_side}"
+    return name
 
 
 def estimate_uncertainty(
@@ -340,11 +350,12 @@ def _provenance(
     made_by: str,
 ) -> Provenance:
     """Return where values and covariances come from."""
+    several = _are_of_several_units(sequences)
     return {
         "made_by": made_by,
         "days": tuple(sorted({s.meta.recorded_at[:10] for s in sequences} - {""})),
         "unit": ", ".join(sorted({s.meta.unit_id for s in sequences})),
-        "logs": {_log_name(s): s.content_hash() for s in sequences},
+        "logs": {_log_name(s, several): s.content_hash() for s in sequences},
         "seconds": float(sum(s.duration for s in sequences)),
         "values": {name: joint.values for name, joint in joints.items()},
         "covariance": {name: joint.covariance for name, joint in joints.items()},
@@ -418,9 +429,11 @@ def _beside_earlier(
     return inverted(inverted(wider) + inverted(from_rows))
 
 
-def _log_name(sequence: Sequence) -> str:
-    """Return motion, payload and repetition of a recording; the first repetition has no number."""
-    name = sequence.meta.motion + _payload_in_name(sequence)
+def _log_name(sequence: Sequence, with_unit: bool) -> str:
+    """Return motion, unit if asked, payload and repetition of a recording; the first repetition has
+    no number.
+    """
+    name = _take_name(sequence, with_unit)
     return f"{name} {sequence.meta.repetition}".removesuffix(" 0")
 
 
