@@ -139,7 +139,7 @@ BROKEN = {
     "wrong joint name": (
         sage_with("Elbow", "Ellbow", "joint_list.txt"),
         "joint_list.txt names joint 'Ellbow', which robot 'so101' does not have; "
-        "nearest: elbow_flex, wrist_roll, wrist_flex. Map it with --map Ellbow=elbow_flex",
+        "nearest: elbow_flex, wrist_roll, wrist_flex. Correct it there; of logs, map it with --map Ellbow=elbow_flex",
     ),
     "half-written Parquet": (half_a_parquet, "b.parquet: not a readable Parquet file"),
 }
@@ -174,7 +174,7 @@ def test_another_robots_dataset_is_refused_and_left_as_it_was(arm, logs, tmp_pat
     error = capsys.readouterr().err.strip().split("\n")[-1]
     assert error.startswith("Dataset: ")
     assert "holds robot 'arm' (shoulder, elbow), not 'so101'" in error
-    assert "use --robot arm or another dataset folder" in error
+    assert "leave --robot out, or give another dataset folder" in error
     assert {f: f.read_bytes() for f in (tmp_path / "data").rglob("*") if f.is_file()} == before
 
 

@@ -73,6 +73,8 @@ def test_the_simulator_of_a_name_is_that_of_training(network):
 
 
 def test_a_wrong_name_is_answered_with_the_names_and_the_nearest(network):
+    with pytest.raises(ModelError, match="as its maker states it"):
+        named_folder("so101")
     with pytest.raises(ModelError, match="nearest"):
         gp.GapModel.load("so101_smal")
 

@@ -59,7 +59,7 @@ def test_an_unknown_joint_error_names_the_file_and_similar_joints(so101):
     with pytest.raises(
         JointMismatchError,
         match=r"a\.csv names joint 'elbow', which robot 'so101' does not have; "
-        r"nearest: elbow_flex, \w+, \w+\. Map it with --map elbow=elbow_flex, ",
+        r"nearest: elbow_flex, \w+, \w+\. Correct it there; of logs, map it with --map elbow=elbow_flex, ",
     ):
         so101.resolve("elbow", "a.csv")
     with pytest.raises(JointMismatchError, match="elbow_flex"):  # nothing to map there
@@ -163,8 +163,12 @@ def test_names_are_packaged_robots_and_paths_are_folders(tmp_path, monkeypatch):
         load_robot("arm")
     for way in ("./arm", str(tmp_path / "arm"), Path("arm")):
         assert load_robot(way).name == "arm"
-    with pytest.raises(RobotError, match=r"robot\.toml"):
+    with pytest.raises(RobotError, match=r"so101@sage, .*, or a folder"):
         load_robot("./so101")
+    with pytest.raises(RobotError, match=r"robot\.toml"):
+        load_robot("./mine")
+    with pytest.raises(RobotError, match="nearest: so101;"):
+        load_robot("so110")
 
 
 def test_an_ambiguous_name_is_refused(tmp_path, monkeypatch):

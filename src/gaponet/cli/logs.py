@@ -142,7 +142,8 @@ def doctor(
     if figures is not None:
         drawn = recordings.draw_findings(data, diagnosis, out=figures, robot=spec)
         screen.say(f"{len(drawn)} pictures written: {figures!s}")
-    if diagnosis.count("error") and fix:
+    can_be_mended = any(finding.mend for finding in diagnosis.findings)
+    if diagnosis.count("error") and (fix or not can_be_mended):
         screen.next("correct the logs, import them into a new folder")
     elif diagnosis.count("error"):
         screen.next(f"gaponet doctor {quote(str(dataset))} --fix")

@@ -207,7 +207,7 @@ def new(
     screen.say(f"written: {out}/robot.toml, robot.xml{picture}")
     screen.next(
         "look at robot.toml and the picture; gaponet import LOGS "
-        f"--robot {quote(robot_argument(out))} --out data"
+        f"--robot {quote(robot_argument(out))} --unit-id NAME --payload-mass KG --out data"
     )
     screen.result(made.to_dict())
 

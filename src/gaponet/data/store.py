@@ -216,8 +216,8 @@ class Dataset:
         if self.robot_name != robot.name or self.joint_names != robot.joint_names:
             raise DatasetError(
                 f"{self.path}: holds robot '{self.robot_name}' ({', '.join(self.joint_names)}), "
-                f"not '{robot.name}' ({', '.join(robot.joint_names)}); use --robot "
-                f"{self.robot_name} or another dataset folder"
+                f"not '{robot.name}' ({', '.join(robot.joint_names)}); leave --robot out, or give "
+                "another dataset folder"
             )
 
     def require_sequences(self) -> None:

@@ -88,6 +88,11 @@ def require_run_folder(run: Path, action: str, instead: str) -> None:
 
 def _unknown(name: str) -> str:
     """Return the error for a name that the package does not have and that is no path."""
+    from gaponet.robot.spec import only_as_its_maker_states_it
+
+    nominal = only_as_its_maker_states_it(name)
+    if nominal:
+        return nominal
     names = (*packaged_networks(), *identified_catalogue().names())
     if not names:
         return f"{name}: no such folder, and the package has no names; give a robot or run folder"

@@ -275,7 +275,7 @@ class RobotSpec:
         asked, matches = self.log_joints.find(name, self.joint_names, joint_map or {})
         if len(matches) != 1:
             raise JointMismatchError(
-                f"{self._unknown(asked, where)}. Map it with --map "
+                f"{self._unknown(asked, where)}. Correct it there; of logs, map it with --map "
                 f"{asked}={nearest(asked, self.joint_names)[0]}, or leave it out with "
                 f'ignore = ["{asked}"] in logs.toml (--logs)'
             )
@@ -326,8 +326,11 @@ def load_robot(name_or_path: str | Path) -> RobotSpec:
     folder = _folder(name_or_path)
     file = folder / "robot.toml"
     if not file.is_file():
+        why = only_as_its_maker_states_it(str(folder))
         raise RobotError(
-            f"{folder}: no robot.toml there; put robot.toml and robot.xml there, or choose another"
+            why
+            or f"{folder}: no robot.toml there; put robot.toml and robot.xml there, or choose "
+            "another"
         )
     toml = read_toml(RobotTable, file, RobotError, "docs/new-robot.md lists the fields")
     mjcf = folder / toml.mjcf
@@ -368,14 +371,30 @@ def _folder(name_or_path: str | Path) -> Path:
             if here
             else "or give a folder, with a slash: ./my_robot"
         )
+        names = named_robots()
         raise RobotError(
-            f"no robot '{text}': in the package are {', '.join(named_robots())}; {what}"
+            f"no robot '{text}': in the package are {', '.join(names)}; nearest: "
+            f"{nearest(text, names)[0]}; {what}"
         )
     if here and not packaged.samefile(folder):
         raise RobotError(
             f"'{text}' is a robot of the package and a folder here; write {packaged} or ./{text}"
         )
     return packaged
+
+
+def only_as_its_maker_states_it(name: str) -> str:
+    """Return the error for a name of a robot of the package where one is needed that was
+    identified; "" for any other name.
+    """
+    if name not in packaged_robots():
+        return ""
+    identified = [other for other in named_robots() if other.startswith(f"{name}@")]
+    return (
+        f"{name}: no folder of that name here, and the package's {name} is as its maker states it; "
+        f"give an identified robot: {', '.join(identified) or 'none is there'}, or a folder of "
+        "gaponet identify"
+    )
 
 
 def _contents(files: list[Path]) -> dict[str, bytes]:
