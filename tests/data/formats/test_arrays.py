@@ -105,6 +105,14 @@ def test_gains_of_another_number_of_joints_are_one_clear_error(tmp_path, arm):
         list(read_logs(tmp_path, arm))
 
 
+def test_gains_of_some_joints_in_logs_toml_leave_the_others_as_recorded(tmp_path, arm):
+    WRITERS["pace"](tmp_path)
+    with (tmp_path / "logs.toml").open("a") as toml:
+        toml.write("kp = { shoulder = 12.0 }\n")
+    ((_, log),) = read_logs(tmp_path, arm)
+    assert log.meta["kp"] == [12.0, 30.0]
+
+
 @pytest.mark.parametrize("fmt", ["pace", "hdf5", "mat"])
 def test_an_array_without_names_asks_for_them(tmp_path, arm, fmt):
     WRITERS[fmt](tmp_path)

@@ -638,6 +638,8 @@ def _gain_columns(recording: RawRecording, specified: LogsFile, ctrl: Columns) -
     gains: Chosen = {}
     for name in ("kp", "kd"):
         array = specified.get(name)
+        if isinstance(array, dict):  # of some joints; the recording may hold those of the others
+            array = recording.default.get(name)
         if not isinstance(array, str):
             continue
         if array not in recording.signals or widths != {len(recording.signals[array])}:
