@@ -6,17 +6,19 @@ import json
 import shutil
 
 import pytest
-from arm import recordings, write_dataset
+from arm import commands, record, recordings, write_dataset
 from runs import untrained
 
 import gaponet as gp
 from gaponet.base.errors import DatasetError, RobotError, UsageError
 from gaponet.cli.main import main
 from gaponet.data.store import Dataset
-from gaponet.evaluation.candidate import Candidate, select_entries
+from gaponet.evaluation.candidate import Candidate, fitted_to, read_origin, select_entries
 from gaponet.evaluation.verdict import network_gain, next_step, verdict
 from gaponet.report.view.side_by_side import select_entry, side_by_side
 from gaponet.robot.folder import PROVENANCE_FILE, STORED_ROBOT, save_robot
+
+QUICK = gp.IdentifyOptions(windows=2, terms=(), table=False, threads=1)
 
 
 @pytest.fixture
@@ -99,6 +101,29 @@ def test_recordings_of_an_adaptation_are_not_unseen(fitted, data, arm, tmp_path)
     assert select_entries([tmp_path / "adapted"], data)[1] is True
 
 
+def test_a_motion_that_the_chosen_unit_did_not_play_is_refused(fitted, data, arm):
+    data.append(record(arm, commands(60, 7), "of-b-alone", unit="b"))
+    with pytest.raises(DatasetError):
+        select_entries([fitted], data, ("motion2",), ("b",))
+
+
+def test_a_robot_identified_from_an_identified_one_keeps_its_split_and_what_was_seen_before(
+    fitted, data, tmp_path
+):
+    origin_file = fitted / PROVENANCE_FILE
+    before = json.loads(origin_file.read_text())
+    before["parts"]["train"]["elsewhere"] = "hash of elsewhere"
+    before["motions"]["train"].append("elsewhere")
+    origin_file.write_text(json.dumps(before))
+    gp.identify(data, robot=fitted, out=tmp_path / "again", options=QUICK)
+    origin = read_origin(tmp_path / "again")
+    train, val = (set(origin["parts"][part].values()) for part in ("train", "val"))
+    assert val
+    assert not train & val
+    assert train | val | {"hash of elsewhere"} <= set(fitted_to(origin)["hashes"])
+    assert "elsewhere" in fitted_to(origin)["motions"]
+
+
 def test_a_folder_that_does_not_say_what_it_was_fitted_to_has_no_held_out_recordings(fitted, data):
     (fitted / PROVENANCE_FILE).unlink()
     assert select_entries([fitted], data) == (data.entries, False)
@@ -112,6 +137,13 @@ def test_recordings_that_a_runs_robot_was_identified_from_are_not_unseen(fitted,
         tmp_path / "run", gp.load_robot(fitted), data, train=("motion2",), val=(), test=("motion0",)
     )
     assert select_entries([run], data, ("motion0",))[1] is False
+
+
+def test_motions_that_a_runs_robot_was_identified_from_are_not_unseen(fitted, data, arm, tmp_path):
+    run = untrained(tmp_path / "run", gp.load_robot(fitted), data, test=("motion2",))
+    of_b = write_dataset(tmp_path / "b", arm, recordings(arm, 3, rows=60, unit="b"))
+    entries, _ = select_entries([run], of_b)
+    assert [entry.meta.motion for entry in entries] == ["motion2"]
 
 
 def test_a_robot_that_is_not_identified_is_refused(arm, data, tmp_path):
