@@ -112,10 +112,14 @@ def corrects_by(delta: float, robot: RobotSpec, folder: Path) -> GapModel:
 
 
 def random_run(
-    folder: Path, robot: RobotSpec, payload_seen: tuple[float, ...] = (0.0, 0.2), **how: Any
+    folder: Path,
+    robot: RobotSpec,
+    payload_seen: tuple[float, ...] = (0.0, 0.2),
+    periods: tuple[float, ...] = (),
+    **how: Any,
 ) -> GapModel:
     """A run whose operator answers anything, up to some 0.1 rad: whatever it is told makes a
-    difference.
+    difference. Without control periods (s) it has the robot's.
     """
     small: dict[str, Any] = {"history": 2, "stride": 2, "num_probes": 4}
     small |= dict.fromkeys(("branch_hidden", "trunk_hidden", "sensor_hidden"), (8,))
@@ -125,7 +129,8 @@ def random_run(
         for p in net.parameters():
             p.add_(0.1 * torch.randn_like(p))
     net.features.standardise.std.fill_(0.3)
-    card = make_card(net.config, robot, dt=[robot.dt], payload_seen=list(payload_seen))
+    dt = list(periods) or [robot.dt]
+    card = make_card(net.config, robot, dt=dt, payload_seen=list(payload_seen))
     if net.config.context:
         loads = [Condition(mass, "both", robot.dt) for mass in payload_seen]
         answers = contexts(robot, loads, loaded=net.config.context_is_loaded)

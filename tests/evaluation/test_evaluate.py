@@ -4,10 +4,12 @@ has seen.
 
 import json
 import shutil
+from dataclasses import replace
 
+import numpy as np
 import pytest
 from arm import TOML, commands, record, write_arm
-from runs import untrained
+from runs import random_run, untrained
 
 from gaponet.base.errors import DatasetError, ModelError
 from gaponet.cli.main import main
@@ -165,6 +167,18 @@ def test_a_motion_trained_on_is_not_unseen_when_another_unit_plays_it(arm, run, 
         again.append(record(arm, commands(80, i), f"m{i}", kp=0.7, unit="b"))
     assert selected([run], again) == (["m3"], True)
     assert select_entries([run], again, ("m0",))[1] is False
+
+
+def test_the_rate_of_corrections_is_by_the_period_of_each_recording(arm, run, tmp_path):
+    mixed = Dataset.create(tmp_path / "mixed", arm)
+    mixed.append(record(replace(arm, dt=0.01), commands(80, 9, dt=0.01), "moving", kp=0.5))
+    mixed.append(record(replace(arm, dt=0.02), np.zeros((80, 2)), "at rest", kp=0.5))
+    random_run(run, arm, periods=(0.01, 0.02))
+    found = evaluate([run], mixed, arm)
+    rates = []
+    for delta, rollout in zip(found.deltas["gaponet"], found.runs["gaponet"], strict=True):
+        rates.append(np.abs(np.diff(delta, axis=0)).mean() / rollout.dt)
+    assert found.result["delta"]["gaponet"]["rate"] == pytest.approx(np.mean(rates))
 
 
 def test_a_dataset_of_nothing_but_trained_motions_is_not_unseen(arm, run, tmp_path):
