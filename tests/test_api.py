@@ -77,6 +77,12 @@ def test_a_word_that_is_no_choice_is_refused_with_the_choices(arm, tmp_path, cal
     assert not (tmp_path / "out").exists()
 
 
+def test_a_payload_is_not_exported_with_a_network_that_takes_it_as_an_input(tmp_path):
+    with pytest.raises(UsageError, match="payload_mass"):
+        gp.export_network("so101-sage", to="onnx", out=tmp_path / "out", payload_mass=0.1)
+    assert not (tmp_path / "out").exists()
+
+
 def test_a_payload_that_a_dataset_states_already_is_not_given_again(arm, tmp_path):
     data = write_dataset(tmp_path / "data", arm, recordings(arm, count=1))
     with pytest.raises(UsageError, match="--payload-mass"):

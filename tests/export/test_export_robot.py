@@ -14,7 +14,9 @@ import numpy as np
 import pytest
 from arm import XML, write_arm
 
+import gaponet as gp
 from gaponet.base.errors import RobotError
+from gaponet.base.files import write_json
 from gaponet.cli.main import main
 from gaponet.export import export_folder as exporting
 from gaponet.export import plain_servos
@@ -34,7 +36,7 @@ from gaponet.export.shipped.mujoco_servos import (
     read,
 )
 from gaponet.export.simulator_facts import simulator_facts
-from gaponet.robot.folder import save_robot
+from gaponet.robot.folder import PROVENANCE_FILE, save_robot
 from gaponet.robot.servo_fields import SERVO_FIELDS, SERVO_TERMS
 from gaponet.robot.spec import load_robot
 from gaponet.sim.model import build_model, model_hash
@@ -528,6 +530,22 @@ def test_a_robot_folder_leaves_by_the_command_and_without_torch(robot, tmp_path,
     compile((tmp_path / "newton" / "robot_cfg.py").read_text(), "newton", "exec")
     assert main(["export", str(robot.folder), "--to", "torch"]) == 2
     assert "is a robot, which has no network" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("dataset", "state"), [("../data", "gone from {}"), ("data", "not at hand")]
+)
+def test_an_export_says_when_the_recordings_of_a_robot_are_not_there(
+    robot, tmp_path, dataset, state
+):
+    save_robot(robot, tmp_path / "identified")
+    nothing = {"train": {}, "val": {}, "test": {}}
+    origin = {"dataset": dataset, "parts": nothing, "motions": {}, "val_mpjae": {}}
+    write_json(tmp_path / "identified" / PROVENANCE_FILE, origin)
+    made = gp.export_robot(tmp_path / "identified", to="json", out=tmp_path / "out")
+    note = made.notes[-1]
+    assert state.format(tmp_path / "data") in note
+    assert "--data DATASET" in note
 
 
 def test_facts_hold_both_forms(robot, lawful):
