@@ -94,6 +94,15 @@ def test_what_the_robot_would_do_can_be_kept(place, capsys, tmp_path):
     assert (held["low_0"] < held["robot_0"]).all()
 
 
+@pytest.mark.parametrize("out", ["bands.csv", "no_such_folder/bands.npz"])
+def test_an_out_that_is_no_npz_or_has_no_folder_is_refused_before_anything_is_read(
+    tmp_path, capsys, out
+):
+    place = str(tmp_path / out)
+    assert main(["replay", "no_rollout", "--robot", "no_robot", "--out", place]) == 2
+    assert "--out" in capsys.readouterr().err
+
+
 def test_a_band_holds_nine_tenths_of_what_a_robot_does_that_was_identified_a_little_wrong(arm):
     wrong = arm.with_identified(
         {j: {"kp": 14.5, "delay": 0.038, "frictionloss": 0.06} for j in arm.operated}

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from arm import XML, commands, record, write_arm
 
-from gaponet.api.start import Start
+from gaponet.api.start import Start, hash_logs
 from gaponet.cli import start
 from gaponet.cli.main import main
 
@@ -149,6 +149,15 @@ def test_the_same_logs_elsewhere_are_the_same_data(started):
     shutil.copytree("logs", "other")
     assert main(["start", "arm.xml", "other"]) == 0
     assert started == ["import"]
+
+
+def test_logs_behind_a_link_are_compared_and_hidden_files_are_not(place):
+    Path("logs").rename("day")
+    Path("logs").mkdir()
+    Path("logs/day").symlink_to(Path("day").resolve())
+    Path("logs/.swing_9.csv").write_text("hidden\n")
+    compared = hash_logs(Path("logs"), Path("started"))
+    assert sorted(compared) == [f"day/swing_{seed}.csv" for seed in range(5)]
 
 
 def test_more_logs_run_again_what_followed_from_them(started):
