@@ -367,6 +367,14 @@ def test_a_motion_with_a_name_of_many_letters_is_stored(arm, tmp_path):
     assert data.entries[0].meta.motion == "a" * 240
 
 
+def test_pieces_below_a_second_have_names_of_their_own(arm, tmp_path):
+    (tmp_path / "swing.csv").write_text(table_text(arm_columns(rows=160)))
+    request = ImportRequest(unit_id="lab", payload_mass=0.0, cut=0.8, **SI)
+    pieces = import_logs(tmp_path / "swing.csv", arm, tmp_path / "data", request).entries
+    names = {piece.meta.motion for piece in pieces}
+    assert names == {"swing@0.0s", "swing@0.8s", "swing@1.6s", "swing@2.4s"}
+
+
 @pytest.mark.parametrize("cut", [0.0, 0.5, float("nan")])
 def test_pieces_that_are_too_short_are_refused(logs, so101, tmp_path, cut):
     with pytest.raises(UsageError, match="--cut"):
