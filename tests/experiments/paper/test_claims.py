@@ -54,9 +54,9 @@ def training(name, share, block="labels", seed=0):
     }
 
 
-def make_results(*trainings):
+def make_results(*trainings, options=PaperOptions()):  # noqa: B008
     robot = SimpleNamespace(operated=("shoulder", "elbow"))
-    study = SimpleNamespace(virtual=True, delivers=True, robot=robot, options=PaperOptions())
+    study = SimpleNamespace(virtual=True, delivers=True, robot=robot, options=options)
     baselines = {
         "motions": ["a", "a", "b", "b"],
         "payloads": PAYLOADS,
@@ -121,6 +121,12 @@ def test_the_gain_of_a_network_on_the_robot_is_over_the_same_way_without_it():
     # Against raw: half by the feed-forward, half of the rest.
     assert both[2].mean == pytest.approx(75.0)
     assert both[3].mean == pytest.approx(50.0)
+
+
+def test_tables_say_when_identification_fitted_each_joint_alone():
+    hurried = make_results(options=PaperOptions(identify_windows=8))
+    rows = [row[0] for row in commands_table(hurried, "labels").rows]
+    assert "feed-forward, identification, each joint alone" in rows
 
 
 def test_table_1_has_every_payload_way_and_method_beside_the_paper_s():

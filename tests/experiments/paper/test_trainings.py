@@ -7,7 +7,13 @@ import pytest
 from gaponet.experiments.paper.options import PaperOptions
 from gaponet.experiments.paper.printed import TABLE_2
 from gaponet.experiments.paper.tables import PRINTED_ROW
-from gaponet.experiments.paper.trainings import NETWORKS, TABLE_2_CHANGES, all_trainings
+from gaponet.experiments.paper.trainings import (
+    BLOCK_TITLES,
+    NETWORKS,
+    TABLE_2_CHANGES,
+    all_trainings,
+    block_title,
+)
 
 OPTIONS = PaperOptions(steps=100_000, seeds=3)
 PAYLOADS = (0.0, 3.0)
@@ -51,6 +57,18 @@ def test_the_paper_s_recipe_has_no_labels_and_ours_has(trainings):
         assert training.config.pretraining.rounds == 0
     for training in of_block(trainings, "labels"):
         assert training.config.pretraining.rounds > 0
+
+
+@pytest.mark.parametrize(
+    ("options", "title"),
+    [
+        (PaperOptions(steps=2 * 128 * 300), "labels alone"),  # rounds · simulators · steps
+        (PaperOptions(steps=2 * 128 * 300 + 1), BLOCK_TITLES["labels"]),
+        (PaperOptions(quick=True).for_quick_run(), BLOCK_TITLES["labels"]),
+    ],
+)
+def test_a_block_whose_labels_take_all_steps_is_of_labels_alone(options, title):
+    assert block_title("labels", options) == title
 
 
 def test_all_trainings_of_a_block_are_equally_long(trainings):
