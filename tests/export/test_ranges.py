@@ -213,13 +213,15 @@ def test_any_day_needs_two_days_and_any_robot_three(arm, tmp_path, capsys):
     assert high > 24
 
 
-def test_a_model_takes_a_unit_without_gaponet(arm, tmp_path, capsys):
+@pytest.mark.parametrize("transmission", ["joint", "jointinparent"])
+def test_a_model_takes_a_unit_without_gaponet(arm, tmp_path, capsys, transmission):
     folder = written(arm, tmp_path / "known")
     assert exported(capsys, folder, "--engine", "mujoco", "--out", tmp_path / "out")[0] == 0
     (tmp_path / "robot.xml").write_text(
         XML.replace(
             "</mujoco>",
-            '<actuator><position joint="elbow" kp="20" forcerange="-3 3"/></actuator></mujoco>',
+            f'<actuator><position {transmission}="elbow" kp="20" forcerange="-3 3"/></actuator>'
+            "</mujoco>",
         )
     )
     code = (

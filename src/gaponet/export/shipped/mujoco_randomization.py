@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 
 HERE = Path(__file__).parent
-ON_JOINT = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
+ON_JOINT = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
 
 
 def units(file: Path = HERE / "randomization.json") -> dict[str, Any]:
@@ -41,7 +41,7 @@ def apply(model: mujoco.MjModel, drawn: dict[str, Any], row: int) -> None:
         model.dof_frictionloss[dof] = unit["frictionloss"]
         model.dof_armature[dof] = unit["armature"]
         for servo in np.flatnonzero(model.actuator_trnid[:, 0] == joint.id):
-            if model.actuator_trntype[servo] not in ON_JOINT:
+            if int(model.actuator_trntype[servo]) not in ON_JOINT:
                 continue
             # A servo that limits the speed of its targets (<pid>) has its stiffness in biasprm
             # alone.
