@@ -97,6 +97,8 @@ def test_names_are_mapped_one_option_each(tmp_path):
 
 
 def test_a_map_that_is_none_says_how_to_write_it(logs, tmp_path, capsys):
+    assert import_so101(logs, tmp_path / "more", "--map", "j9=gripper") == 2
+    assert "--map j9: no log under" in " ".join(capsys.readouterr().err.split())
     assert import_so101(logs, tmp_path / "data", "--map", "Elbow") == 2
     assert (
         capsys.readouterr()

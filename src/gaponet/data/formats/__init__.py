@@ -269,7 +269,7 @@ def read_logs(
     by_hand = options.as_logs_file()
     specified = specified | by_hand
     _require_known_fields(reader, specified, by_hand, file)
-    joint_map = {**specified.get("names", {}), **(options.joint_map or {})}
+    joint_map = _JointMap(specified.get("names", {}) | dict(options.joint_map or {}))
     naming = Naming(specified, file)
     root = path if path.is_dir() else path.parent
     bad = skipped_rows()
@@ -287,6 +287,26 @@ def read_logs(
         motion = str(facts.pop("motion", name))
         yield motion, _labelled(log, facts, robot, joint_map)
     naming.require_all_used()
+    for name in options.joint_map or ():
+        if name not in joint_map.used:
+            raise UsageError(f"--map {name}: no log under {path} names a joint so; correct it")
+
+
+class _JointMap(dict[str, str]):
+    """The user's names of joints: name in the logs → the robot's.
+
+    Attributes:
+        used: Names that a log has.
+    """
+
+    def __init__(self, names: Mapping[str, str]) -> None:
+        super().__init__(names)
+        self.used: set[str] = set()
+
+    def get(self, name: str, default: Any = None) -> Any:
+        if name in self:
+            self.used.add(name)
+        return super().get(name, default)
 
 
 def _require_known_fields(
