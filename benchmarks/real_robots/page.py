@@ -51,9 +51,9 @@ method](../benchmark.md#the-benchmark-of-real-robots) explains the questions and
 
 ± is the standard error over independent motions; differences are paired, motion by motion. "Of
 nominal" is the error divided by that of the nominal simulator, which is the robot as its maker's
-file describes it. "Floor" is the difference between two recordings of one command; where errors are as
-small, differences between methods may be chance. "Identified elsewhere" means on another session or
-unit."""
+file describes it. "Floor" is the difference between two recordings of one command; where errors are
+as small, differences between methods may be chance. "Identified elsewhere" means on another session
+or unit."""
 
 
 def result_table(rows: list[dict[str, Any]]) -> ResultTable:

@@ -133,23 +133,29 @@ def select_entries(
             return dataset.select(motions, units), False
         fitted.append(data)
     available = dataset.select(units=units)
-    unused = []
-    for entry in available:
-        if not any(entry in data for data in fitted):
-            unused.append(entry)
+    unused = [entry for entry in available if not _is_used(entry, fitted)]
     if motions:
         entries = dataset.select(motions, units)
+        if not entries:
+            raise DatasetError(
+                f"{dataset.path}: no recording of {', '.join(motions)} by {', '.join(units)}"
+            )
     else:
         entries = _unseen_entries(available, unused, fitted)
-    if not entries and not motions and all(map(is_robot, folders)):
-        return available, False
     if not entries:
+        if all(map(is_robot, folders)):
+            return available, False
         raise DatasetError(
             f"{dataset.path}: every sequence was used in training; give logs the runs never saw, "
             "or --motions"
         )
     unused_hashes = {entry.hash for entry in unused}
     return entries, all(entry.hash in unused_hashes for entry in entries)
+
+
+def _is_used(entry: Entry, fitted: list[FittedData]) -> bool:
+    """Return True if a candidate was fitted to a recording, or to its motion."""
+    return any(entry in data for data in fitted)
 
 
 def _unseen_entries(

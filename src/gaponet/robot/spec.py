@@ -326,11 +326,11 @@ def load_robot(name_or_path: str | Path) -> RobotSpec:
     folder = _folder(name_or_path)
     file = folder / "robot.toml"
     if not file.is_file():
-        why = only_as_its_maker_states_it(str(folder))
+        nominal = only_as_its_maker_states_it(str(folder))
+        if nominal:
+            raise RobotError(nominal)
         raise RobotError(
-            why
-            or f"{folder}: no robot.toml there; put robot.toml and robot.xml there, or choose "
-            "another"
+            f"{folder}: no robot.toml there; put robot.toml and robot.xml there, or choose another"
         )
     toml = read_toml(RobotTable, file, RobotError, "docs/new-robot.md lists the fields")
     mjcf = folder / toml.mjcf

@@ -176,8 +176,10 @@ def idle_joints(robot: RobotSpec, moved: tuple[str, ...]) -> tuple[str, ...]:
     limb = dict(zip(robot.joint_names, model.dof_treeid.tolist(), strict=True))
     busy = {limb[name] for name in moved}
     couplings = _couplings(model)
-    while reached := [limbs for limbs in couplings if limbs & busy and not limbs <= busy]:
-        busy.update(*reached)
+    for _ in couplings:  # a coupling may reach a limb by way of others
+        for limbs in couplings:
+            if limbs & busy:
+                busy |= limbs
     return tuple(name for name in robot.joint_names if limb[name] not in busy)
 
 

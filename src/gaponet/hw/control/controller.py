@@ -117,11 +117,11 @@ class Session:
         """
         output = self.output
         watchdog = output.watchdog
-        has_fired = watchdog is not None and watchdog.fired()
-        of_watchdog = has_fired or output.unconfirmed
-        to_be_damped = of_watchdog or output.damping_since is not None
-        watchdog_damps = of_watchdog and watchdog is not None and watchdog.can_damp()
-        output.context.driver.close(hold=not to_be_damped or watchdog_damps)
+        if watchdog is not None and (watchdog.fired() or output.unconfirmed):
+            nothing_to_do = watchdog.can_damp()
+        else:
+            nothing_to_do = output.damping_since is None and not output.unconfirmed
+        output.context.driver.close(hold=nothing_to_do)
 
 
 def _require_same_joints(driver: Driver, robot: RobotSpec) -> None:

@@ -66,7 +66,7 @@ class PipeTransport:
         """Return the last line, which may have no end, and that the pipe was closed."""
         self._closed = True
         messages = [Message("stdin", error="the other end closed the pipe")]
-        if self._partial_line and not self._skipping:
+        if self._partial_line.strip() and not self._skipping:
             messages.insert(0, decode("stdin", self._partial_line))
         return messages
 
