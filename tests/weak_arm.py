@@ -34,7 +34,7 @@ def weak_unit() -> Physics:
     return replace(neutral(2), kp_scale=np.full(2, WEAK))
 
 
-def model(robot: RobotSpec, share: float) -> GapModel:
+def model(robot: RobotSpec, share: float, dt: float = 0.02) -> GapModel:
     """An operator that knows a share of the truth, as a model of the nominal arm."""
-    card = make_card(CONFIG, robot, dt=[0.02])
+    card = make_card(CONFIG, robot, dt=[dt])
     return GapModel(Path("exact"), card, CONFIG, Operator(share))

@@ -32,6 +32,13 @@ def test_targets_bring_the_hand_to_its_goals_and_keep_it_there(robot):
         assert plan.leave[-1] == len(plan.ctrl)
 
 
+def test_a_trajectory_takes_as_long_at_another_control_rate(robot):
+    (slow,) = GoalPlanner(robot, 0.4, 0).plans(1)
+    (fast,) = GoalPlanner(robot, 0.4, 0, dt=0.01).plans(1)
+    np.testing.assert_array_equal(fast.goals, slow.goals)
+    assert len(fast.ctrl) * 0.01 == pytest.approx(len(slow.ctrl) * 0.02, abs=0.02 * len(slow.goals))
+
+
 def test_goals_lie_in_front_and_apart(robot):
     planner = GoalPlanner(robot, 0.4, 0)
     places = np.array([plan.goals for plan in planner.plans(6)]).reshape(-1, 3)

@@ -2,6 +2,8 @@
 nothing.
 """
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from weak_arm import model
@@ -75,6 +77,13 @@ def test_the_delta_action_of_the_truth_improves_commands(robot, unit, plain):
     exact = measure_commands(unit, model(robot, 1.0))
     assert np.mean(exact["delta"]) < np.mean(plain["raw"])
     assert np.mean(exact["both"]) < np.mean(plain["feedforward"])
+
+
+def test_commands_are_made_at_the_rate_of_the_recordings(robot, unit):
+    faster = replace(unit, dt=0.01)
+    plain = measure_commands(faster, None)
+    exact = measure_commands(faster, model(robot, 1.0, dt=0.01))
+    assert np.mean(exact["delta"]) < np.mean(plain["raw"])
 
 
 def test_gaps_are_counted_above_each_threshold(robot, recorded):

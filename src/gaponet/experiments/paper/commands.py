@@ -123,11 +123,15 @@ def play(
 
 
 def make_compensator(
-    robot: RobotSpec, model: GapModel | None, config: CompensatorConfig, payloads: ListOf[float]
+    robot: RobotSpec,
+    model: GapModel | None,
+    config: CompensatorConfig,
+    payloads: ListOf[float],
+    dt: float,
 ) -> Compensator:
     """Return a compensator for one robot for each payload, which knows it.
 
     With and without a network, its simulators carry the same masses.
     """
     config = replace(config, payload_max=max(*payloads, MIN_PAYLOAD_KG))
-    return Compensator(robot, model, config=config, num_envs=len(payloads), nthread=1)
+    return Compensator(robot, model, config=config, num_envs=len(payloads), nthread=1, dt=dt)

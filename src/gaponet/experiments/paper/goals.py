@@ -85,13 +85,22 @@ class HandPositions:
 class GoalPlanner:
     """Random trajectories for one robot, fixed by a seed."""
 
-    def __init__(self, robot: RobotSpec, max_payload: float, seed: int, hold: float = 3.0) -> None:
+    def __init__(
+        self,
+        robot: RobotSpec,
+        max_payload: float,
+        seed: int,
+        hold: float = 3.0,
+        dt: float | None = None,
+    ) -> None:
         """
         Args:
             max_payload: Payload that can be held at every goal, kg per hand.
             hold: Time at each goal, s.
+            dt: Control period, s; default robot.dt.
         """
         self.robot = robot
+        self.dt = robot.dt if dt is None else dt
         self.hold = hold
         self.limits = Feasibility(robot, max_payload)
         self.rng = np.random.default_rng([seed, 7])
@@ -166,14 +175,14 @@ class GoalPlanner:
             goals.append(goal)
         points = np.array(postures)  # (G + 1, n) rad
         moves = move_time(np.abs(np.diff(points, axis=0)).max(axis=1), MAX_JOINT_SPEED, MIN_MOVE_S)
-        moves = np.ceil(moves / self.robot.dt) * self.robot.dt  # (G,) s, whole control periods
+        moves = np.ceil(moves / self.dt) * self.dt  # (G,) s, whole control periods
         holds = np.array([REST_S, *[self.hold] * GOALS_PER_TRAJECTORY])
         if not self.limits.demand(through(points, moves, holds, GRID), GRID).met:
             return None
-        ctrl = through(points, moves, holds, self.robot.dt)
-        rest_rows = round(REST_S / self.robot.dt)
-        hold_rows = round(self.hold / self.robot.dt)
-        move_rows = np.array([round(move / self.robot.dt) for move in moves])
+        ctrl = through(points, moves, holds, self.dt)
+        rest_rows = round(REST_S / self.dt)
+        hold_rows = round(self.hold / self.dt)
+        move_rows = np.array([round(move / self.dt) for move in moves])
         before = np.concatenate([[0], move_rows[:-1] + hold_rows])  # rows of the goal before
         start = rest_rows + np.cumsum(before)
         arrive = start + move_rows

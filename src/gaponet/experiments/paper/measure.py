@@ -170,7 +170,8 @@ def measure_commands(
     for way, config in ways.items():
         compensator = None
         if config is not None:
-            compensator = make_compensator(simulator or unit.robot, model, config, payloads)
+            robot = simulator or unit.robot
+            compensator = make_compensator(robot, model, config, payloads, unit.dt)
         played = play(unit.robot, unit.physics, targets, payloads, unit.dt, compensator)
         q_dis = []
         for i, target in enumerate(targets):
@@ -193,7 +194,7 @@ class Delivery:
         """Plan trajectories over the space that the hands reach and can hold the heaviest payload
         in.
         """
-        planner = GoalPlanner(unit.robot, max(unit.payloads), GOAL_SEED, HOLD_S)
+        planner = GoalPlanner(unit.robot, max(unit.payloads), GOAL_SEED, HOLD_S, unit.dt)
         goals_per_plan = GOALS_PER_TRAJECTORY * len(planner.arms)
         plans = planner.plans(-(-unit.goal_count // goals_per_plan))
         return cls(planner, sorted(plans, key=lambda plan: -len(plan.ctrl)))
@@ -217,7 +218,7 @@ def measure_delivery(
     for way, config in ways.items():
         compensator = None
         if config is not None:
-            compensator = make_compensator(unit.robot, model, config, payloads)
+            compensator = make_compensator(unit.robot, model, config, payloads, unit.dt)
         played = play(unit.robot, unit.physics, targets, payloads, unit.dt, compensator)
         held: dict[float, list[Array]] = defaultdict(list)  # payload → offsets of each hold
         for i, (plan, payload) in enumerate(runs):
