@@ -322,6 +322,21 @@ def of_one_late_recording(number, qpos):
     return late(qpos, 3) if number == 2 else qpos
 
 
+@pytest.mark.parametrize("others", [0.0200001, 0.01], ids=["a measured rate", "another rate"])
+def test_recordings_are_compared_that_have_nearly_the_same_rate(arm, tmp_path, others):
+    """Each clock has a period of its own, and a dataset may hold two rates."""
+    logs = [
+        replace(one, dt=0.02 + 1e-7 * k)
+        for k, one in enumerate(five_logs(arm, of_one_late_recording))
+    ]
+    for k in range(6):
+        ctrl, qpos = lively(10 + k)
+        logs.append(replace(arm_sequence(arm, ctrl, qpos, motion=f"n{k}"), dt=others))
+    diagnosis = examine(arm, tmp_path, *logs)
+    bad = [f for f in diagnosis.findings if f.level in ("warning", "error")]
+    assert any("m2 (a, 0 kg) follows its commands" in f.message for f in bad)
+
+
 def test_times_that_belong_together_are_left_alone(arm, tmp_path):
     diagnosis = examine(arm, tmp_path, *five_logs(arm))
     warned = {f.check for f in diagnosis.findings if f.level in ("warning", "error")}

@@ -26,7 +26,7 @@ from gaponet.data.paper_counts import (
     table_beside_paper,
 )
 from gaponet.data.repeatability import Repetitions
-from gaponet.data.sequence import ARRAYS
+from gaponet.data.sequence import ARRAYS, whole_rate
 from gaponet.data.statistics import Statistics, pool, statistics
 from gaponet.data.store import Dataset, Entry, dataset_hash
 
@@ -50,7 +50,7 @@ def make_card(dataset: Dataset, progress: Progress = no_progress) -> dict[str, A
     dataset.require_sequences()
     groups: dict[tuple[object, ...], list[Entry]] = defaultdict(list)
     for entry in dataset.entries:
-        groups[*entry.meta.repetition_key, round(entry.dt, 7)].append(entry)
+        groups[*entry.meta.repetition_key, whole_rate(entry.dt)].append(entry)
     signals = _Signals(max(1, sum(entry.rows for entry in dataset.entries) // PERCENTILE_ROWS))
     repeated = []
     done = 0

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from gaponet.base.result_table import ResultTable
-from gaponet.data.sequence import ARRAYS
+from gaponet.data.sequence import ARRAYS, whole_rate
 from gaponet.data.store import Dataset, Entry
 from gaponet.robot.folder import load_stored_robot
 
@@ -76,7 +76,7 @@ def count_as_paper(dataset: Dataset) -> DatasetCounts:
     """
     dataset.require_sequences()
     entries = dataset.entries
-    repetitions = Counter((entry.meta.repetition_key, round(entry.dt, 7)) for entry in entries)
+    repetitions = Counter((entry.meta.repetition_key, whole_rate(entry.dt)) for entry in entries)
     return DatasetCounts(
         hours=dataset.hours(),
         sequences=len(entries),

@@ -11,7 +11,7 @@ import numpy as np
 from gaponet.base.arrays import Array
 from gaponet.data.fingerprint import equal_commands, fingerprint
 from gaponet.data.log import UNITS
-from gaponet.data.sequence import Sequence
+from gaponet.data.sequence import Sequence, whole_rate
 
 MAX_COMMAND_DIFFERENCE_RAD = 1e-3  # repetitions whose commands differ by more have another command
 # the same, of the command's range, on average: of commands computed twice
@@ -42,7 +42,7 @@ def repetition_difference(sequences: ListOf[Sequence], joints: ListOf[str]) -> A
         other = sequences[j]
         _, *labels = one.meta.repetition_key
         _, *other_labels = other.meta.repetition_key
-        if labels == other_labels and one.dt == other.dt:
+        if labels == other_labels and whole_rate(one.dt) == whole_rate(other.dt):
             pairs.append((one, other))
     total = np.zeros(len(joints))
     count = np.zeros(len(joints))

@@ -262,6 +262,13 @@ def require_same_gains(
                     )
 
 
+def whole_rate(dt: float) -> int:
+    """Return the rate of a control period, whole Hz. Recordings with the same one count as of one
+    rate: rates are measured.
+    """
+    return round(1 / dt)
+
+
 def to_sequence(log: Log, robot: RobotSpec, meta: SequenceMeta) -> Sequence:
     """Put a log on a uniform grid.
 

@@ -18,6 +18,7 @@ FAST_COMMAND_RAD_S = 0.3
 MIN_STEP_S = 0.01  # between its lags
 BEFORE_S = 0.12  # longest time by which a state may come before its command
 AFTER_S = 0.6  # and after it
+SAME_STEP = 0.01  # relative difference of steps that count as one
 SPLITS = 3  # parts of a recording
 SHIFT_STEP_S = 0.002  # between the shifts of a part that are tried
 SHIFTS_S = np.arange(-0.12, 0.1201, SHIFT_STEP_S)
@@ -212,7 +213,7 @@ class Response:
         every = max(1, round(MIN_STEP_S / dt))
         step = every * dt
         before = round(BEFORE_S / step)
-        lags = round(BEFORE_S / step) + round(AFTER_S / step) + 1
+        lags = before + round(AFTER_S / step) + 1
         size = len(ctrl[::every]) // SPLITS
         own = []
         cross = []
@@ -237,6 +238,16 @@ class Response:
             power=np.array(power, np.float32),
             duration=len(ctrl) * dt,
         )
+
+    @property
+    def lags_before(self) -> int:
+        """Number of lags at which the state comes before its command."""
+        return round(BEFORE_S / self.step)
+
+    def is_comparable(self, other: Response) -> bool:
+        """True if `common` can take both: their steps are nearly the same, since clocks vary."""
+        same_step = abs(self.step / other.step - 1) <= SAME_STEP
+        return same_step and self.lags_before == other.lags_before
 
     def later(self, seconds: float) -> Response:
         """Return the correlations as if the state had been recorded later; NaN changes nothing."""
@@ -263,19 +274,21 @@ class Response:
 
     @staticmethod
     def common(responses: list[Response], used: list[bool] | None = None) -> CommonResponse:
-        """Estimate the common response of recordings with one step, and how each recording is
-        shifted against it.
+        """Estimate the common response of comparable recordings, and how each recording is shifted
+        against it.
 
         Args:
             used: Recordings from which the common response is estimated; all by default.
         """
         step = responses[0].step
         n = responses[0].own.shape[1]
-        now = round(BEFORE_S / step)
-        at = (np.arange(responses[0].own.shape[2]) - now) * step  # lags of the weights, s
+        now = responses[0].lags_before
+        lags = min(r.own.shape[2] for r in responses)
+        at = (np.arange(lags) - now) * step  # lags of the weights, s
         mask = np.ones(len(responses), bool) if used is None else np.array(used)
-        own = np.stack([r.own for r in responses]).astype(float)  # (recordings, SPLITS, n, lags)
-        cross = np.stack([r.cross for r in responses]).astype(float)
+        # (recordings, SPLITS, n, lags)
+        own = np.stack([r.own[..., :lags] for r in responses]).astype(float)
+        cross = np.stack([r.cross[..., :lags] for r in responses]).astype(float)
         power = np.stack([r.power for r in responses]).astype(float)  # (recordings, SPLITS, n)
         own_sum = own[mask].sum(axis=(0, 1))  # (n, lags)
         cross_sum = cross[mask].sum(axis=(0, 1))  # (n, lags)

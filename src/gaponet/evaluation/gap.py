@@ -16,7 +16,7 @@ import numpy as np
 from gaponet.base.arrays import Array
 from gaponet.base.progress import Progress, no_progress, with_note
 from gaponet.data.repeatability import Repetitions, repetition_difference
-from gaponet.data.sequence import Sequence, SequenceMeta
+from gaponet.data.sequence import Sequence, SequenceMeta, whole_rate
 from gaponet.data.signals import encoder_step
 from gaponet.data.store import Dataset, Entry
 from gaponet.evaluation.baselines import baseline_errors, command_run
@@ -327,7 +327,7 @@ def error_floor(
         if len(first_sequences) < MAX_COMPARED:
             first_sequences.append(sequence)
         angles.append(sequence.qpos[:, robot.operated_index])
-        key = (*sequence.meta.repetition_key, round(sequence.dt * 1e6))
+        key = (*sequence.meta.repetition_key, whole_rate(sequence.dt))
         groups[key, "whole"].add(sequence)
         for period in Repetitions.periods(sequence):
             groups[key, "period"].add(period)

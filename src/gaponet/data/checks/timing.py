@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 
@@ -60,9 +60,34 @@ def _timing(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     if not surveys:
         yield Finding("ok", "timing", "a command that repeats the state shows no clocks")
         return
-    steps = Counter(survey.tracking.response.step for survey in surveys)
-    step = max(steps, key=lambda one: steps[one])  # s
-    comparable = [survey for survey in surveys if survey.tracking.response.step == step]
+    groups = _by_rate(surveys)
+    found = []
+    for group in groups:
+        rate = float(np.median([survey.timing.rate_hz for survey in group]))
+        for finding in _timing_at_one_rate(group, robot):
+            if len(groups) > 1:
+                message = f"{len(group)} recordings at {rate:.1f} Hz: {finding.message}"
+                finding = replace(finding, message=message)
+            found.append(finding)
+    if all(finding.level == "ok" for finding in found):
+        found.append(Finding("ok", "timing", "commands and states have the same clock"))
+    yield from found
+
+
+def _by_rate(surveys: list[Survey]) -> list[list[Survey]]:
+    """Return the recordings whose responses can be compared, the largest group first."""
+    groups: list[list[Survey]] = []
+    for survey in sorted(surveys, key=lambda one: one.tracking.response.step):
+        response = survey.tracking.response
+        if not groups or not response.is_comparable(groups[-1][0].tracking.response):
+            groups.append([])
+        groups[-1].append(survey)
+    return sorted(groups, key=len, reverse=True)
+
+
+def _timing_at_one_rate(comparable: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
+    """Report what is wrong with the clocks of recordings at one rate."""
+    step = comparable[0].tracking.response.step  # s
     # Across a gap states are interpolated: they begin to move before anything was measured.
     complete = [survey for survey in comparable if not survey.timing.missing_samples] or comparable
     uneven_ms = max(survey.timing.uneven_ms for survey in complete)
@@ -79,7 +104,7 @@ def _timing(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     findings += clock_drift(complete, common.shifts, unknown)
     if unknown < step:
         findings += _averaged(complete)
-    yield from findings or [Finding("ok", "timing", "commands and states have the same clock")]
+    yield from findings
 
 
 # recordings that follow their commands later than the others, and by how much, s; < 0 is sooner

@@ -13,7 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from gaponet.data.sequence import Sequence
+from gaponet.data.sequence import Sequence, whole_rate
 from gaponet.nn.training.config import TrainConfig
 from gaponet.robot.simulator_change import SimulatorChange
 from gaponet.robot.spec import RobotSpec
@@ -85,5 +85,6 @@ def in_validation_simulators(
     return paired
 
 
-def _condition(sequence: Sequence) -> tuple[float, str, float]:
-    return sequence.meta.payload_mass, sequence.meta.payload_side, sequence.dt
+def _condition(sequence: Sequence) -> tuple[float, str, int]:
+    meta = sequence.meta
+    return meta.payload_mass, meta.payload_side, whole_rate(sequence.dt)
