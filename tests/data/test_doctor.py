@@ -403,11 +403,11 @@ def test_steps_from_and_to_zero_are_no_rows_of_zeros(arm, tmp_path):
     )
 
 
-def hanging(arm, payload: float = 0.0) -> Sequence:
-    """The arm of tests/arm.py moved slowly, with the torques that hold it up and a little
-    friction.
+def hanging(arm, payload: float = 0.0, shoulder: float = 0.0) -> Sequence:
+    """The arm of tests/arm.py moved slowly about an angle of the shoulder, rad, with the torques
+    that hold it up and a little friction.
     """
-    ctrl = wave(ROWS, 2, 0.02, amplitude=0.8, hertz=0.05)
+    ctrl = wave(ROWS, 2, 0.02, amplitude=0.8, hertz=0.05) + [shoulder, 0.0]
     qpos = late(ctrl, 3)
     friction = 0.05 * np.sign(np.gradient(qpos, axis=0))
     tau = static_torque(build_model(arm, payload), qpos) + friction
@@ -456,6 +456,23 @@ def test_a_sign_wrong_in_command_and_state_alike_shows_in_the_torque(arm, tmp_pa
     wrong = replace(s, ctrl=s.ctrl * sign, qpos=s.qpos * sign, qvel=s.qvel * sign)
     finding = found(weigh(arm, tmp_path, wrong), "gravity", "warning")
     assert finding.message.startswith("with its angle mirrored at")
+
+
+def test_a_robot_that_hangs_from_the_ceiling_is_told_from_a_joint_with_a_wrong_zero(tmp_path):
+    upright = 'integrator="implicitfast"'
+    hung = XML.replace(upright, f'{upright} gravity="0 0 9.81"')
+    recorded = hanging(write_arm(tmp_path / "hung", xml=hung), shoulder=1.2)
+    arm = write_arm(tmp_path / "arm")
+    finding = found(weigh(arm, tmp_path, recorded), "gravity", "warning")
+    assert "the base hangs upside down" in finding.message
+    assert not finding.mend
+
+
+def test_gravity_is_judged_without_a_known_torque_limit(tmp_path):
+    arm = write_arm(tmp_path / "arm", TOML.replace("effort_limit = 5.0", "effort_limit = 1e6"))
+    s, shift = hanging(arm), 0.6 * np.eye(2)[0]
+    wrong = replace(s, ctrl=s.ctrl + shift, qpos=s.qpos + shift)
+    assert found(weigh(arm, tmp_path, wrong), "gravity", "warning").joints == ("shoulder",)
 
 
 def standing(arm, seed: int, share: float, behind_gears: bool = False) -> Sequence:

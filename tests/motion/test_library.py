@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+from arm import TOML, XML, write_arm
 
 from gaponet.base.errors import UsageError
 from gaponet.motion.feasible import MAX_PAYLOAD_KG
@@ -33,7 +34,7 @@ def test_a_motion_is_within_all_limits_at_every_payload(library, name):
 def test_per_joint_motions_cover_nine_tenths_of_every_operated_joint_at_three_kilograms(library):
     robot = library.robot
     for joint in robot.operated:
-        column = library.make(f"sweep-{short(joint)}").ctrl[:, robot.index([joint])[0]]
+        column = library.make(f"sweep-{short(joint, robot)}").ctrl[:, robot.index([joint])[0]]
         low, high = robot.qpos_range[robot.index([joint])[0]]
         assert np.ptp(column) >= 0.9 * (high - low), joint
 
@@ -42,7 +43,7 @@ def test_per_joint_motions_cover_nine_tenths_of_every_operated_joint_at_three_ki
 def test_a_joint_that_turns_without_end_sweeps_a_turn_about_its_home():
     robot = load_robot("xl330_bench")
     (joint,) = robot.operated
-    motion = Library(robot, max_payload=0.0).make(f"sweep-{short(joint)}")
+    motion = Library(robot, max_payload=0.0).make(f"sweep-{short(joint, robot)}")
     column = motion.ctrl[:, robot.index([joint])[0]]
     assert np.ptp(column) == pytest.approx(2 * np.pi, rel=0.1)
 
@@ -77,6 +78,14 @@ def test_half_the_rate_plays_every_second_row(library):
     motion = library.make("stir-left-0")
     assert np.array_equal(motion.sample(0.02), motion.sample(0.01)[::2])
     assert abs(motion.sample(0.007)[100] - motion.sample(0.01)[70]).max() < 1e-9
+
+
+def test_joints_may_have_hyphens_and_names_of_which_one_is_another_s_and_a_suffix(tmp_path):
+    for old, new in (("shoulder", "elbow_joint"), ("shoulder", "joint-1")):
+        robot = write_arm(tmp_path / new, TOML.replace(old, new), XML.replace(old, new))
+        library = Library(robot, max_payload=0.0)
+        for name in ("sweep-elbow", f"sweep-{new}"):
+            assert library.make(name).moved(robot) == (name.removeprefix("sweep-"),)
 
 
 def test_an_unknown_name_lists_the_forms(library):

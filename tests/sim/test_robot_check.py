@@ -59,6 +59,12 @@ def test_a_kp_too_small_for_a_payload_alone_is_a_warning_of_that_payload(tmp_pat
     assert "is too little to hold it up with 3 kg: it falls away" in text
 
 
+def test_an_unknown_torque_limit_is_a_warning(tmp_path):
+    robot = write_arm(tmp_path / "arm", TOML.replace("effort_limit = 5.0", "effort_limit = 1e6"))
+    texts = said(check_robot(robot), "limits", "warning")
+    assert [text.split(":")[0] for text in texts] == ["shoulder", "elbow"]
+
+
 def test_a_joint_too_weak_for_its_payload_is_a_warning_of_that_payload(arm):
     assert not said(check_robot(arm), "load", "warning")
     (text,) = said(check_robot(arm, (0.0, 1.5)), "load", "warning")

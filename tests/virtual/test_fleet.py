@@ -3,6 +3,7 @@ from dataclasses import fields
 
 import numpy as np
 import pytest
+from arm import TOML, write_arm
 
 from gaponet.base.errors import UsageError
 from gaponet.experiments.paper.goals import GoalPlanner
@@ -67,6 +68,13 @@ def test_an_effect_alone_leaves_nothing_of_the_others():
     for f in fields(Physics):
         kept = unit if f.name == "backlash" else none
         assert np.array_equal(getattr(alone, f.name), getattr(kept, f.name)), f.name
+
+
+def test_a_robot_without_a_known_torque_limit_is_refused(tmp_path):
+    unlimited = TOML.replace("effort_limit = 5.0", "effort_limit = 1e6")
+    robot = write_arm(tmp_path / "arm", unlimited)
+    with pytest.raises(UsageError, match="the torque limit of shoulder is not known"):
+        load_fleet("hard", robot)
 
 
 def test_errors_say_what_there_is(arm, tmp_path):

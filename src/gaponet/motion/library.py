@@ -170,7 +170,7 @@ class Library:
             sides.append("both")
         names = []
         for joint in self.robot.operated:
-            names += [f"{signal}-{short(joint)}" for signal in SIGNALS]
+            names += [f"{signal}-{short(joint, self.robot)}" for signal in SIGNALS]
         for variant in range(variants):
             for kind in BUILDERS:
                 names += [f"{kind}-{side}-{variant}" for side in sides]
@@ -187,9 +187,10 @@ class Library:
         if name in self._given:
             return self._given[name]
         rng = np.random.default_rng([self.seed, _number(name)])
+        signal, _, joint = name.partition("-")
+        if signal in SIGNALS:
+            return self._joint(name, signal, joint, rng)
         match name.split("-"):
-            case [signal, joint] if signal in SIGNALS:
-                return self._joint(name, signal, joint, rng)
             case [kind, "both", _] if kind in BUILDERS:
                 ctrl = BUILDERS[kind](self.kit, tuple(self.kit.arms), rng)
                 return self._fitted(name, "upper_body", ctrl)
@@ -219,7 +220,7 @@ class Library:
         return self._ranges[joint]
 
     def _joint(self, name: str, signal: str, joint: str, rng: np.random.Generator) -> Motion:
-        full = next((j for j in self.robot.operated if short(j) == joint), None)
+        full = next((j for j in self.robot.operated if short(j, self.robot) == joint), None)
         if full is None:
             raise UsageError(
                 f"motion '{name}': {self.robot.name} has no operated joint '{joint}'; it has "
@@ -246,9 +247,12 @@ def _number(name: str) -> int:
 
 def _short_names(robot: RobotSpec) -> str:
     """Return the names of the operated joints, as motions have them."""
-    return ", ".join(short(joint) for joint in robot.operated)
+    return ", ".join(short(joint, robot) for joint in robot.operated)
 
 
-def short(joint: str) -> str:
-    """Return a joint's name in names of motions: without the suffix _joint."""
-    return joint.removesuffix("_joint")
+def short(joint: str, robot: RobotSpec) -> str:
+    """Return a joint's name in names of motions: without the suffix _joint, unless another joint
+    has that name.
+    """
+    name = joint.removesuffix("_joint")
+    return joint if name in robot.joint_names else name

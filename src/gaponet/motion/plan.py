@@ -54,7 +54,7 @@ def make_plan(robot: RobotSpec, minutes: float, payloads: tuple[float, ...], see
     """
     _require_payloads(payloads, robot)
     library = Library(robot, seed, max(payloads))
-    first = [library.make(f"{SIGNAL_ORDER[0]}-{short(joint)}") for joint in robot.operated]
+    first = [library.make(f"{SIGNAL_ORDER[0]}-{short(joint, robot)}") for joint in robot.operated]
     least = len(payloads) * sum(motion.duration for motion in first) / 60
     if least > minutes:
         raise UsageError(
@@ -104,7 +104,7 @@ def _names(robot: RobotSpec, library: Library) -> Iterator[str]:
         following = number + 1  # the first signal is played before all
         if following < len(SIGNAL_ORDER):
             for joint in robot.operated:
-                yield f"{SIGNAL_ORDER[following]}-{short(joint)}"
+                yield f"{SIGNAL_ORDER[following]}-{short(joint, robot)}"
 
 
 def sheet(
@@ -169,7 +169,7 @@ def _gains(robot: RobotSpec) -> str:
     gains = []
     for i, joint in enumerate(robot.joint_names):
         if joint in robot.operated:
-            gains.append(f"{short(joint)} {robot.servo.kp[i]:g}/{robot.servo.kd[i]:g}")
+            gains.append(f"{short(joint, robot)} {robot.servo.kp[i]:g}/{robot.servo.kd[i]:g}")
     return "; ".join(gains)
 
 

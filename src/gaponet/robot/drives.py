@@ -15,9 +15,9 @@ import numpy as np
 from gaponet.base.errors import UsageError
 from gaponet.robot.finding import abbreviate
 from gaponet.robot.servo_fields import PASSIVE_FIELDS
+from gaponet.robot.servo_parameters import NO_LIMIT
 from gaponet.robot.spec import ServoType, servo_type
 
-NO_LIMIT = 1e6  # N·m
 ON_JOINT = [int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT)]
 
 

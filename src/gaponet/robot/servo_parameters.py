@@ -15,6 +15,9 @@ from gaponet.base.errors import RobotError
 from gaponet.robot.servo_fields import SERVO_FIELDS, SERVO_TERMS, warmed
 from gaponet.robot.toml_file import ServoType
 
+# Of a robot whose model states no torque limit, N·m.
+NO_LIMIT = 1e6
+
 
 def _zero() -> Array:
     """Return the default of a field that has no effect unless it is stated."""
@@ -42,7 +45,7 @@ class ServoParameters:
 
     Attributes:
         kp, kd: PD gains, N·m/rad and N·m·s/rad.
-        effort_limit: Torque limit, N·m.
+        effort_limit: Torque limit, N·m; NO_LIMIT where none is known.
         damping, armature, frictionloss: Identified values that replace the MJCF's, N·m·s/rad,
             kg·m², N·m; NaN keeps the MJCF's value.
         stop_low, stop_high: Joint stops that narrow the MJCF's range, rad; NaN keeps the MJCF's

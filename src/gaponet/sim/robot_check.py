@@ -16,6 +16,7 @@ import numpy as np
 from gaponet.base.arrays import Array
 from gaponet.robot.collision import Collision
 from gaponet.robot.finding import LEVELS, Finding, abbreviate
+from gaponet.robot.servo_parameters import NO_LIMIT
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.batch import BatchSim, Condition
 from gaponet.sim.dynamics import static_torque
@@ -97,6 +98,9 @@ def _joints(robot: RobotSpec) -> Iterator[Finding]:
                 "robot.toml"
             )
             yield Finding("warning", "gains", text, (name,))
+        if name in robot.operated and robot.servo.effort_limit[i] >= NO_LIMIT:
+            text = f"{name}: its torque limit is not known: write effort_limit in robot.toml"
+            yield Finding("warning", "limits", text, (name,))
         if not low <= robot.qpos_home[i] <= high:
             text = (
                 f"{name}: home {robot.qpos_home[i]:g} lies outside its range [{low:.2f}, "

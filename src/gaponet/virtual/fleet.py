@@ -19,6 +19,7 @@ from typing_extensions import TypedDict
 
 from gaponet.base.errors import UsageError
 from gaponet.base.structure import Extended, Name, load_toml, validated
+from gaponet.robot.servo_parameters import NO_LIMIT
 from gaponet.robot.spec import RobotSpec
 from gaponet.virtual.physics import Physics, neutral
 
@@ -170,9 +171,23 @@ def sample_unit(
         )
         value = np.clip(d.mean + deviation, d.low, d.high)
         if d.of_effort:
+            _require_effort_limits(robot, d.name)
             value = value * robot.servo.effort_limit
         values[d.name] = np.array([float(f"{v:.{SIGNIFICANT_DIGITS}g}") for v in value])
     return replace(neutral(n), **values)
+
+
+def _require_effort_limits(robot: RobotSpec, name: str) -> None:
+    """Refuse a robot with an operated joint whose torque limit, the scale of a parameter, is not
+    known.
+    """
+    limits = robot.servo.effort_limit[robot.operated_index]
+    for joint, limit in zip(robot.operated, limits, strict=True):
+        if limit >= NO_LIMIT:
+            raise UsageError(
+                f"{robot.name}: the torque limit of {joint} is not known, and a VIRTUAL unit's "
+                f"{name} is a share of it: write effort_limit in robot.toml"
+            )
 
 
 def _require_possible(unit: Physics, where: str) -> None:

@@ -20,6 +20,7 @@ from gaponet.data.checks.exchanges import pairs, shifts
 from gaponet.data.checks.survey import Survey
 from gaponet.data.offsets import Gravity
 from gaponet.robot.finding import Finding, Mend
+from gaponet.robot.servo_parameters import NO_LIMIT
 from gaponet.robot.spec import RobotSpec
 
 Payload = tuple[float, str]  # payload_mass, kg, and payload_side
@@ -32,7 +33,11 @@ MIN_ROWS = 20
 MIN_EVIDENCE = 0.4
 MIN_EXPLAINED = 0.5  # mean share of the torque's square, with the hypothesis
 MIN_IMPROVEMENT = 0.03  # of this share
-MIN_LOAD = 0.01  # of the torque limit: a joint that gravity loads less shows nothing
+# Of the torque limit, or of the most loaded joint's load: a joint that gravity loads less shows
+# nothing.
+MIN_LOAD = 0.01
+FEW_EXPLAINED = 0.01  # share of the torques' square: with less, gravity is not the model's
+TIE = 0.01  # of evidence: the earlier hypothesis counts
 FLOOR = 1e-4  # of a share that is unexplained
 
 
@@ -111,7 +116,14 @@ def gravity(surveys: list[Survey], robot: RobotSpec, model: Gravity) -> Iterator
         return
     shares = " and ".join(f"{result.as_logged:.0%}" for result in results)
     text = f"no other zero, sign or order fits gravity better; it explains {shares} of the torques"
-    yield Finding("ok", "gravity", text)
+    if max(result.as_logged for result in results) >= FEW_EXPLAINED:
+        yield Finding("ok", "gravity", text)
+        return
+    text += (
+        ". If the base is mounted otherwise than in the model, write <option gravity> in robot.xml; "
+        "else check masses and gains"
+    )
+    yield Finding("note", "gravity", text)
 
 
 def _is_significant(best: _Best) -> bool:
@@ -128,17 +140,18 @@ def _best(loads: Loads, robot: RobotSpec, model: Gravity, centred: bool) -> _Bes
     loads = _thinned(loads, max(1, _count_rows(loads) // MAX_ROWS))
     weight = {payload: model(qpos, *payload) for payload, (qpos, _) in loads.items()}  # N·m
     rms = np.sqrt(np.mean(np.concatenate(list(weight.values())) ** 2, axis=0))  # (n) N·m
-    loaded = np.flatnonzero(rms > MIN_LOAD * robot.servo.effort_limit)
+    limit = robot.servo.effort_limit
+    loaded = np.flatnonzero(rms > MIN_LOAD * np.where(limit < NO_LIMIT, limit, rms.max()))
     unexplained = _unexplained(weight, loads, loaded, centred)
-    as_logged = 1 - float(unexplained.mean()) if len(unexplained) else 0.0
+    as_logged = max(1 - float(unexplained.mean()), 0.0) if len(unexplained) else 1.0
     best = _Best(0.0, None, as_logged, 0.0)
-    for hypothesis in (*_joint_faults(robot, loaded), *_order_faults(robot)):
+    for hypothesis in (_upside_down(robot), *_joint_faults(robot, loaded), *_order_faults(robot)):
         torques = {}
         for payload, (qpos, _) in loads.items():
             torques[payload] = hypothesis.torque(model, qpos, payload)
         otherwise = _unexplained(torques, loads, loaded, centred)
         evidence = float(np.log(unexplained / otherwise).sum())
-        if evidence > best.evidence:
+        if evidence > best.evidence + TIE:
             best = _Best(evidence, hypothesis, as_logged, 1 - float(otherwise.mean()))
     return best
 
@@ -179,6 +192,18 @@ def _joint_faults(robot: RobotSpec, loaded: Array) -> Iterator[_Hypothesis]:
                 turn=fault.turn * one,
                 torque_sign=1 + (fault.torque_sign - 1) * one,
             )
+
+
+def _upside_down(robot: RobotSpec) -> _Hypothesis:
+    """Return the hypothesis that gravity loads all joints the other way."""
+    return _Hypothesis(
+        words="all torques negated (they are logged so, or the base hangs upside down: write "
+        '<option gravity="0 0 9.81"/> in robot.xml; or the first joint is half a turn off)',
+        joints=tuple(robot.operated_index.tolist()),
+        mend={},
+        order=np.arange(len(robot.joint_names)),
+        torque_sign=-1.0,
+    )
 
 
 def _order_faults(robot: RobotSpec) -> Iterator[_Hypothesis]:

@@ -26,6 +26,7 @@ from gaponet.data.checks.completeness import unsigned_torque
 from gaponet.data.checks.survey import Survey, with_torque
 from gaponet.data.offsets import Gravity
 from gaponet.robot.finding import Finding, abbreviate
+from gaponet.robot.servo_parameters import NO_LIMIT
 from gaponet.robot.spec import RobotSpec
 
 MIN_POSES = 12  # of a joint
@@ -591,7 +592,10 @@ def _fed_forward(holds: _JointHolds, robot: RobotSpec, joint: int) -> _FedForwar
     """Return what holds a joint; None with too few holds, or without a weight that changes."""
     numbers, index = np.unique(holds.recording, return_inverse=True)
     fold = index % MAX_FOLDS
-    least = MIN_LOAD * robot.servo.effort_limit[joint] / max(robot.servo.kp[joint], MIN_KP)
+    least = MIN_LOAD * np.abs(holds.weight).max(initial=0.0)
+    limit = robot.servo.effort_limit[joint]
+    if limit < NO_LIMIT:
+        least = MIN_LOAD * limit / max(robot.servo.kp[joint], MIN_KP)
     few = len(holds.torque) < MIN_POSES or len(numbers) < MIN_RECORDINGS
     if few or np.std(holds.weight) < least:
         return None

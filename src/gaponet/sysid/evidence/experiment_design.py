@@ -204,7 +204,7 @@ def _candidate_names(robot: RobotSpec) -> list[str]:
     names = []
     if len(robot.operated) <= MAX_SINGLE_JOINTS:
         for joint in robot.operated:
-            names += [f"{signal}-{short(joint)}" for signal in SIGNALS]
+            names += [f"{signal}-{short(joint, robot)}" for signal in SIGNALS]
     for kind in ANY:
         names += [f"{kind.__name__}-all-{variant}" for variant in range(VARIANTS)]
     return names
