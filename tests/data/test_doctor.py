@@ -407,7 +407,7 @@ def hanging(arm, payload: float = 0.0, shoulder: float = 0.0) -> Sequence:
     """The arm of tests/arm.py moved slowly about an angle of the shoulder, rad, with the torques
     that hold it up and a little friction.
     """
-    ctrl = wave(ROWS, 2, 0.02, amplitude=0.8, hertz=0.05) + [shoulder, 0.0]
+    ctrl = wave(ROWS, 2, 0.02, amplitude=0.8, hertz=0.05) + np.array([shoulder, 0.0])
     qpos = late(ctrl, 3)
     friction = 0.05 * np.sign(np.gradient(qpos, axis=0))
     tau = static_torque(build_model(arm, payload), qpos) + friction

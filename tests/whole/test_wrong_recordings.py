@@ -7,12 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from arm import commands, record, recordings, write_arm, write_dataset
+from arm import TOML, commands, record, recordings, write_arm, write_dataset
 from runs import corrects_by
 
 from gaponet import api
 from gaponet.api.options import IdentifyOptions, TrainOptions
-from gaponet.base.errors import DatasetError
+from gaponet.base.errors import DatasetError, UsageError
 from gaponet.cli.main import main
 from gaponet.nn.artifact import GapModel
 
@@ -43,6 +43,13 @@ def test_identify_writes_nothing(mirrored, tmp_path):
     with pytest.raises(DatasetError, match=STOPPED):
         api.identify(mirrored, out=tmp_path / "out", options=QUICK)
     assert not (tmp_path / "out").exists()
+
+
+def test_a_joint_without_a_gain_is_named(tmp_path):
+    robot = write_arm(tmp_path / "arm", TOML.replace("kp = 20.0", "kp = 0.0", 1))
+    data = write_dataset(tmp_path / "data", robot, recordings(robot, 5, rows=80))
+    with pytest.raises(UsageError, match=r"kp of shoulder is 0, .* write the controller's kp"):
+        api.identify(data, out=tmp_path / "out", options=QUICK)
 
 
 def test_the_command_says_it_in_one_line(mirrored, tmp_path, capsys):

@@ -29,6 +29,7 @@ from gaponet.base.progress import Progress, no_progress
 from gaponet.data.store import Dataset
 from gaponet.nn.config import ModelKind as ModelKind
 from gaponet.nn.packaged_networks import require_run_folder
+from gaponet.robot.finding import abbreviate
 from gaponet.robot.folder import (
     ADAPTATION_FILE,
     OLD_UNCERTAINTY_FILE,
@@ -97,6 +98,7 @@ def identify(
     require_commands(data)
     split = split_entries(data, _units_left_out(data, options))
     spec = _with_recorded_gains(spec, data)
+    _require_gains(spec)
     start = spec
     taken_from: dict[str, str] = {}
     if options.like is not None:
@@ -152,6 +154,16 @@ def _with_recorded_gains(robot: RobotSpec, data: Dataset) -> RobotSpec:
         return robot
     kp, kd = gains.pop()
     return robot.with_gains(kp, kd)
+
+
+def _require_gains(robot: RobotSpec) -> None:
+    """Refuse operated joints without a gain, whose commands move nothing."""
+    without = [j for j in robot.operated if robot.servo.kp[robot.index([j])[0]] <= 0]
+    if without:
+        raise UsageError(
+            f"{robot.folder}: kp of {abbreviate(without)} is 0, so commands move nothing: write the "
+            "controller's kp in robot.toml, or operated = false"
+        )
 
 
 def _require_gain(fitted: Identified, given: RobotSpec, *, accepted: bool) -> dict[str, Array]:

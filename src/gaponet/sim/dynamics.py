@@ -25,7 +25,8 @@ def inverse_dynamics(model: mujoco.MjModel, qpos: Array, qvel: Array, qacc: Arra
 
     Returns:
         (T, n), N·m, without limits, contacts and joint friction, which at rest is anything up to
-        its limit.
+        its limit. The motor that leads a joint without a motor carries both, and the other's
+        torque is 0.
     """
     data = mujoco.MjData(model)
     flags = model.opt.disableflags
@@ -43,7 +44,29 @@ def inverse_dynamics(model: mujoco.MjModel, qpos: Array, qvel: Array, qacc: Arra
         mujoco.mj_inverse(model, data)
         tau[t] = out
     model.opt.disableflags = flags
-    return tau
+    led = motion_of_followers(model)
+    return tau if led is None else tau @ led
+
+
+def motion_of_followers(model: mujoco.MjModel) -> Array | None:
+    """Return how fast each joint moves if one motor turns at 1 rad/s, (n, n): [joint, motor].
+
+    It is the identity but for joints that follow another one through an equality of the model;
+    their columns are 0. None if no joint follows another.
+    """
+    is_coupling = model.eq_type == mujoco.mjtEq.mjEQ_JOINT
+    coupled = np.flatnonzero(is_coupling & (model.eq_active0 != 0) & (model.eq_obj2id >= 0))
+    if not len(coupled):
+        return None
+    followers = model.jnt_dofadr[model.eq_obj1id[coupled]]
+    leaders = model.jnt_dofadr[model.eq_obj2id[coupled]]
+    ratios = model.eq_data[coupled, 1]
+    moves = np.eye(model.nv)
+    for _ in coupled:  # a leader may follow another joint
+        for follower, leader, ratio in zip(followers, leaders, ratios, strict=True):
+            moves[:, leader] += ratio * moves[:, follower]
+            moves[:, follower] = 0.0
+    return moves
 
 
 def static_torque(model: mujoco.MjModel, qpos: Array) -> Array:

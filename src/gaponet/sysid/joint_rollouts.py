@@ -25,7 +25,7 @@ from gaponet.data.signals import differentiate, lowpass
 from gaponet.robot.servo_parameters import ratio_to
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.commands import speed_limited
-from gaponet.sim.dynamics import tips_of
+from gaponet.sim.dynamics import motion_of_followers, tips_of
 from gaponet.sim.model import build_model
 from gaponet.sim.servo import JOINT_RECORD, Windows, compiled, simulate_joints
 from gaponet.sim.temperature import recorded_temperatures, warm_values
@@ -78,7 +78,7 @@ class JointRollouts:
         self.recorded = np.stack([p.meta.records(robot.operated) for p in parts], axis=1)
         self.counted = _counted_rows(self.windows)
         acting = [robot.with_gains(*p.meta.recorded_gains) for p in parts]
-        self.kp_ratio = np.array([(r.servo.kp / robot.servo.kp)[self.op] for r in acting])
+        self.kp_ratio = np.array([ratio_to(r.servo.kp, robot.servo.kp)[self.op] for r in acting])
         self.kd = np.array([r.servo.kd[self.op] for r in acting])
         self.temperature = recorded_temperatures(parts, self.op).T
 
@@ -255,6 +255,8 @@ def _loads_along(part: Sequence, model: mujoco.MjModel, op: Array, thin: int) ->
     full = np.empty((model.nv, model.nv))
     # no forces of servos and of a table
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
+    followers = motion_of_followers(model)
+    moves = np.eye(model.nv) if followers is None else followers
 
     def bias(qpos: Array, qvel: Array) -> Array:
         data.qpos[:] = qpos
@@ -262,7 +264,8 @@ def _loads_along(part: Sequence, model: mujoco.MjModel, op: Array, thin: int) ->
         mujoco.mj_fwdPosition(model, data)
         mujoco.mj_fwdVelocity(model, data)
         # Springs and the compensation of gravity act like a weight.
-        return np.array(data.qfrc_bias - data.qfrc_spring - data.qfrc_gravcomp)
+        torque = data.qfrc_bias - data.qfrc_spring - data.qfrc_gravcomp
+        return np.asarray(torque if followers is None else torque @ followers)
 
     qvel = differentiate(lowpass(part.qpos.astype(float), part.dt, CUTOFF_HZ), part.dt)
     qacc = differentiate(qvel, part.dt)
@@ -273,13 +276,15 @@ def _loads_along(part: Sequence, model: mujoco.MjModel, op: Array, thin: int) ->
         here = bias(part.qpos[t], qvel[t])
         mujoco.mj_fullM(model, data, full)
         own = full.diagonal().copy()
+        if followers is not None:
+            own = np.einsum("ij,ik,kj->j", followers, full, followers)
         inertia[i] = (own - model.dof_armature)[op]
         weight[i] = here[op]
-        pull[i] = (full @ qacc[t] - own * qacc[t])[op]
+        pull[i] = (full @ qacc[t] @ moves - own * qacc[t])[op]
         if i % GRAVITY_ROWS == 0:
             for k, j in enumerate(op):
                 turned = part.qpos[t].astype(float)
-                turned[j] += GRAVITY_STEP_RAD
+                turned += GRAVITY_STEP_RAD * moves[:, j]
                 change = bias(turned, qvel[t])[j] - here[j]
                 slope[i : i + GRAVITY_ROWS, k] = change / GRAVITY_STEP_RAD
     if thin == 1:
