@@ -196,6 +196,14 @@ def test_heavier_links_and_a_leaning_base_change_the_sag(arm):
     assert sag[2] < sag[0]
 
 
+def test_a_leaning_base_that_hangs_upside_down_stays_so(tmp_path):
+    option = 'integrator="implicitfast"'
+    hung = write_arm(tmp_path, xml=XML.replace(option, f'{option} gravity="0 0 9.81"'))
+    path, _ = run(hung, [unit(), unit(tilt_pitch=0.02)], hold(0.0, 0.0, 3.0))
+    upright, leaning = path[-1, :, 0]
+    assert leaning == pytest.approx(upright, rel=0.1)
+
+
 def test_a_bent_cable_widens_the_loop_of_its_neighbour(arm):
     ctrl = hold(0.0) + np.stack([np.zeros(50), 0.3 * np.sin(np.linspace(0, 6 * np.pi, 50))], axis=1)
     bent = ctrl + np.array([1.2, 0.0])

@@ -111,7 +111,8 @@ def drives(
             f"{file} has no position gain for {abbreviate(without_gain)}: give those of the "
             "controller that recorded the logs, --kp 100 '*wrist*=20' and --kd likewise (N·m/rad, "
             "N·m·s/rad); if they are unknown, a guess is enough, gaponet identify corrects it "
-            "within a factor of 50"
+            "within a factor of 50. Joints without position control, such as wheels, are left out "
+            "by naming the others: --joints"
         )
     return tuple(found)
 

@@ -67,7 +67,19 @@ def _add_effects(
 
 def _tilted_gravity(model: mujoco.MjModel, roll: float, pitch: float) -> np.ndarray:
     """Return gravity as a base sees it that is tilted by roll and pitch, rad; (3,) m/s²."""
-    g = np.linalg.norm(model.opt.gravity)
-    down = [np.sin(pitch), -np.sin(roll) * np.cos(pitch), -np.cos(roll) * np.cos(pitch)]
-    result: np.ndarray = g * np.array(down)
+    about_x = np.array(
+        [
+            [1.0, 0.0, 0.0],
+            [0.0, np.cos(roll), np.sin(roll)],
+            [0.0, -np.sin(roll), np.cos(roll)],
+        ]
+    )
+    about_y = np.array(
+        [
+            [np.cos(pitch), 0.0, -np.sin(pitch)],
+            [0.0, 1.0, 0.0],
+            [np.sin(pitch), 0.0, np.cos(pitch)],
+        ]
+    )
+    result: np.ndarray = about_x @ about_y @ model.opt.gravity
     return result
