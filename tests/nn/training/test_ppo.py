@@ -2,6 +2,8 @@
 something to learn.
 """
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -92,7 +94,16 @@ def test_exploration_has_the_set_correlation_and_width(env):
         learner.collect()
         seen.append(learner.noise.clone())
     assert torch.stack(seen).std().item() == pytest.approx(0.01, rel=0.15)
-    assert learner.noise_correlation == pytest.approx(np.exp(-env.robot.dt / 0.2))
+    assert learner.noise_correlation == pytest.approx(np.exp(-0.02 / 0.2))
+
+
+def test_exploration_lasts_as_long_at_another_control_rate(tmp_path):
+    robot = write_arm(tmp_path)
+    fast = [replace(recording, dt=0.01) for recording in recordings(robot, 4, kp=0.5)]
+    options = EnvOptions(num_envs=16, episode_steps=100, nthread=1)
+    env = DeltaEnv(fast, robot, MODEL, options)
+    learner = PPO(env, build_network(MODEL, 2), SETTINGS)
+    assert learner.noise_correlation == pytest.approx(np.exp(-0.01 / 0.2))
 
 
 def test_ppo_increases_the_reward_in_a_wrong_simulator(env):

@@ -13,9 +13,11 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
+from gaponet.data.split import RATE_TOLERANCE
 from gaponet.nn.layers import MAX_FEATURE, DeltaNet, Standardise, dense
 from gaponet.nn.training.config import PPOConfig
 from gaponet.nn.training.env import DeltaEnv
@@ -78,6 +80,15 @@ class Update:
     reward: float = float("nan")  # mean reward of a joint and control period
 
 
+def _control_period(env: DeltaEnv) -> float:
+    """Return the mean control period of the environments, s: the robot's own where recordings have
+    its rate.
+    """
+    mean = float(np.mean([condition.dt for condition in env.groups.conditions_of_envs]))
+    has_own_rate = abs(mean / env.robot.dt - 1) <= RATE_TOLERANCE
+    return env.robot.dt if has_own_rate else mean
+
+
 class PPO:
     """Actor, critic and environment. `update` collects decisions and learns from them."""
 
@@ -98,7 +109,7 @@ class PPO:
         self.critic_optimiser = torch.optim.Adam(
             self.critic.parameters(), lr=config.critic_learning_rate
         )
-        decision_s = env.robot.dt * env.config.delta_hold
+        decision_s = _control_period(env) * env.config.delta_hold
         self.noise_correlation = 0.0  # from decision to decision
         if config.noise_time:
             self.noise_correlation = math.exp(-decision_s / config.noise_time)
