@@ -405,3 +405,60 @@ def test_a_mimic_joint_of_a_mimic_joint_follows_the_motor(tmp_path):
     robot = make(tmp_path, tmp_path / "hand.urdf").robot
     assert robot.operated == ("drive",)
     assert robot.log_joints.followers["tip"] == ("drive", -1.0, pytest.approx(0.5))
+
+
+LINK_OF_LOOP = """<body name="{crank}" pos="{at} 0 0"><joint name="{motor}" axis="0 1 0"/>
+<geom type="capsule" fromto="0 0 0 0 0 .2" size=".01" mass=".2"/>
+<body name="{rod}" pos="0 0 .2"><joint name="{hinge}" axis="0 1 0"/>
+<geom type="capsule" fromto="0 0 0 {reach} 0 .2" size=".01" mass=".1"/></body></body>"""
+
+
+def five_bar(equality: str) -> str:
+    """An MJCF: two cranks with motors, each with a rod on a passive hinge, and an equality."""
+    left = LINK_OF_LOOP.format(
+        crank="crankA", motor="motorA", rod="rodA", hinge="passiveA", at=-0.1, reach=0.1
+    )
+    right = LINK_OF_LOOP.format(
+        crank="crankB", motor="motorB", rod="rodB", hinge="passiveB", at=0.1, reach=-0.1
+    )
+    return (
+        f"<mujoco><worldbody>{left}{right}<body name='target' mocap='true'/></worldbody>"
+        f"<equality>{equality}</equality><actuator><position joint='motorA' kp='20'/>"
+        "<position joint='motorB' kp='20'/></actuator></mujoco>"
+    )
+
+
+CONNECTED = '<connect body1="rodA" body2="rodB" anchor=".1 0 .2"/>'
+
+
+def test_a_closed_loop_through_a_passive_hinge_is_refused(tmp_path):
+    (tmp_path / "loop.xml").write_text(five_bar(CONNECTED))
+    with pytest.raises(RobotError, match="closed loop through passiveA, passiveB"):
+        make(tmp_path, tmp_path / "loop.xml")
+
+
+@pytest.mark.parametrize(
+    "equality",
+    [
+        CONNECTED.replace("/>", ' active="false"/>'),
+        '<weld body1="crankA" body2="rodA"/>',  # one frozen body with another
+    ],
+)
+def test_an_equality_that_locks_no_logged_joint_is_accepted(tmp_path, equality):
+    (tmp_path / "open.xml").write_text(five_bar(equality))
+    robot = make(tmp_path, tmp_path / "open.xml").robot
+    assert robot.joint_names == ("motorA", "motorB")
+
+
+def test_a_closed_loop_of_logged_joints_alone_is_kept(tmp_path):
+    (tmp_path / "loop.xml").write_text(five_bar(CONNECTED))
+    names = ("motorA", "passiveA", "motorB", "passiveB")
+    robot = make(tmp_path, tmp_path / "loop.xml", joints=names).robot
+    assert build_model(robot).neq == 1
+
+
+def test_a_weld_to_a_mocap_body_is_left_out_with_a_note(tmp_path):
+    (tmp_path / "teleoperated.xml").write_text(five_bar('<weld body1="target" body2="crankA"/>'))
+    made = make(tmp_path, tmp_path / "teleoperated.xml")
+    assert build_model(made.robot).neq == 0
+    assert any("crankA to the mocap body target" in note for note in made.notes)

@@ -21,6 +21,7 @@ from gaponet.base.files import whole_folder, write_text
 from gaponet.robot.drives import ON_JOINT, Drive, drives
 from gaponet.robot.freeze import delete_references, freeze
 from gaponet.robot.log_joints import Follower
+from gaponet.robot.loops import chain, delete_mocap_welds, require_open
 from gaponet.robot.mjcf import compile_spec
 from gaponet.robot.self_contained import self_contained_text
 from gaponet.robot.spec import RobotSpec, load_robot
@@ -71,6 +72,8 @@ def new_robot(
     motors = [name for name in recorded if name not in followers]
     logged = [name for name in _joint_names(model) if name in (*motors, *followers)]
     joint_drives = drives(model, motors, pose, given, path.name)
+    notes += delete_mocap_welds(spec, model)
+    require_open(spec, model, logged, path)
     notes += _notes(spec, model, logged, pose, path)
     for name, led in followers.items():
         notes.append(f"{name} follows {led.joint}, without a motor")
@@ -493,20 +496,12 @@ def _palms(model: mujoco.MjModel, ends: list[int]) -> list[int]:
         sides.setdefault(_side(model, end), []).append(end)
     palms = []
     for side_ends in sides.values():
-        common = set(_chain(model, side_ends[0]))  # ancestors of all ends of this side
+        common = set(chain(model, side_ends[0]))  # ancestors of all ends of this side
         for end in side_ends[1:]:
-            common.intersection_update(_chain(model, end))
+            common.intersection_update(chain(model, end))
         palm = max(common)
         palms += [palm] if model.body_parentid[palm] else side_ends
     return sorted(palms)
-
-
-def _chain(model: mujoco.MjModel, body: int) -> list[int]:
-    """Return a body and its ancestors up to the world."""
-    chain = [body]
-    while chain[-1]:
-        chain.append(int(model.body_parentid[chain[-1]]))
-    return chain
 
 
 def _beyond(model: mujoco.MjModel, body: int) -> list[int]:
