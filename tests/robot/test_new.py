@@ -6,7 +6,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
-from vendors import MJCF, URDF, write_mjcf, write_urdf
+from vendors import BOX, MJCF, URDF, write_mjcf, write_urdf
 
 from gaponet.base.errors import RobotError, UsageError
 from gaponet.data.log import Channel, Log
@@ -462,3 +462,68 @@ def test_a_weld_to_a_mocap_body_is_left_out_with_a_note(tmp_path):
     made = make(tmp_path, tmp_path / "teleoperated.xml")
     assert build_model(made.robot).neq == 0
     assert any("crankA to the mocap body target" in note for note in made.notes)
+
+
+def write_attached(folder: Path, mesh: bool = True) -> Path:
+    """An arm that attaches a hand, which has a mesh of 0.4 kg in a folder of its own."""
+    (folder / "hand" / "shapes").mkdir(parents=True)
+    if mesh:
+        (folder / "hand" / "shapes" / "link.obj").write_text(BOX)
+    (folder / "hand" / "hand.xml").write_text(
+        '<mujoco model="hand"><compiler meshdir="shapes"/>'
+        '<asset><mesh name="palm" file="link.obj"/></asset><worldbody><body name="palm">'
+        '<geom type="sphere" size=".01" mass=".02"/><geom type="mesh" mesh="palm" mass=".4"/>'
+        "</body></worldbody></mujoco>"
+    )
+    (folder / "arm.xml").write_text(
+        '<mujoco><asset><model name="hand" file="hand/hand.xml"/></asset><worldbody>'
+        '<body name="upper"><joint name="shoulder" axis="0 1 0"/>'
+        '<geom type="sphere" size=".02" mass=".6"/>'
+        '<frame><attach model="hand" body="palm" prefix="h_"/></frame></body></worldbody></mujoco>'
+    )
+    return folder / "arm.xml"
+
+
+def test_the_meshes_of_an_attached_model_are_found_in_its_own_folder(tmp_path):
+    made = make(tmp_path, write_attached(tmp_path / "repo"))
+    assert build_model(made.robot).body_mass.sum() == pytest.approx(0.6 + 0.42)
+
+
+def test_the_mass_that_goes_with_a_missing_mesh_is_told(tmp_path):
+    made = make(tmp_path, write_attached(tmp_path / "repo", mesh=False))
+    assert any("bodies are lighter: h_palm by 0.4 kg" in note for note in made.notes)
+
+
+def test_a_missing_mesh_beside_an_attached_model_leaves_the_others(tmp_path):
+    model = write_attached(tmp_path / "repo")
+    lost = '<asset><mesh name="lost" file="lost.obj"/>'
+    text = model.read_text().replace("<asset>", lost)
+    model.write_text(text.replace("<frame>", '<geom type="mesh" mesh="lost"/><frame>'))
+    made = make(tmp_path, model)
+    assert made.vendor.body("h_palm").mass[0] == pytest.approx(0.42)
+    assert any("bodies are lighter: upper by an unknown mass" in note for note in made.notes)
+
+
+def test_a_body_without_an_inertia_has_the_mass_of_its_mesh(tmp_path):
+    (tmp_path / "link.obj").write_text(BOX)  # 0.25 m by 0.06 m by 0.06 m
+    (tmp_path / "arm.xml").write_text(
+        '<mujoco><asset><mesh name="link" file="link.obj"/></asset><worldbody><body name="upper">'
+        '<joint name="shoulder"/><geom type="mesh" mesh="link"/></body></worldbody></mujoco>'
+    )
+    made = make(tmp_path, tmp_path / "arm.xml")
+    volume = 0.25 * 0.06 * 0.06  # m³; 1000 kg/m³ is MuJoCo's density
+    assert made.vendor.body("upper").mass[0] == pytest.approx(1000 * volume)
+
+
+def test_a_mesh_with_a_wrong_face_has_the_mass_of_its_convex_hull(tmp_path):
+    with_a_face_inside_out = BOX.replace("f 2 8 4", "f 2 4 8")
+    (tmp_path / "link.obj").write_text(with_a_face_inside_out)
+    (tmp_path / "arm.xml").write_text(
+        '<mujoco><asset><mesh name="link" file="link.obj" inertia="exact"/></asset><worldbody>'
+        '<body name="upper"><joint name="shoulder"/><geom type="mesh" mesh="link"/></body>'
+        "</worldbody></mujoco>"
+    )
+    made = make(tmp_path, tmp_path / "arm.xml")
+    volume = 0.25 * 0.06 * 0.06  # m³
+    assert made.vendor.body("upper").mass[0] == pytest.approx(1000 * volume)
+    assert any("mesh link has no volume" in note for note in made.notes)

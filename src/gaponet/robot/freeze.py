@@ -14,12 +14,12 @@ from gaponet.base.errors import RobotError
 
 def units_per_si(spec: mujoco.MjSpec, joint: mujoco.MjsJoint) -> float:
     """Return the specification's units per rad or m of a joint: an MJCF may use degrees."""
-    if _compiler(spec, joint).degree and joint.type == mujoco.mjtJoint.mjJNT_HINGE:
+    if compiler_of(spec, joint).degree and joint.type == mujoco.mjtJoint.mjJNT_HINGE:
         return math.degrees(1)
     return 1.0
 
 
-def _compiler(spec: mujoco.MjSpec, element: Any) -> Any:
+def compiler_of(spec: mujoco.MjSpec, element: Any) -> Any:
     """Return the settings of the file that an element comes from: an attached model has its own."""
     return getattr(element, "compiler", spec.compiler)
 
@@ -28,7 +28,7 @@ def _quat(spec: mujoco.MjSpec, element: mujoco.MjsBody | mujoco.MjsFrame) -> Arr
     """Return the orientation of a body or frame in what holds it, in whatever form it is given."""
     if element.alt.type == mujoco.mjtOrientation.mjORIENTATION_QUAT:
         return np.array(element.quat)
-    compiler = _compiler(spec, element)
+    compiler = compiler_of(spec, element)
     return np.array(
         spec.resolve_orientation(
             degree=compiler.degree, sequence=compiler.eulerseq, orientation=element.alt
