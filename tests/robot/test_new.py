@@ -55,7 +55,6 @@ def furthest(made: NewRobot) -> tuple[float, float]:
     for _ in range(50):
         a.qpos[:] = rng.uniform(*np.clip(made.robot.qpos_range.T, -3, 3))
         b.qpos[:] = made.pose
-        b.qpos[:7] = theirs.qpos0[:7] if theirs.nq > 7 else b.qpos[:7]
         b.qpos[places] = a.qpos
         mujoco.mj_forward(ours, a)
         mujoco.mj_forward(theirs, b)
@@ -527,3 +526,46 @@ def test_a_mesh_with_a_wrong_face_has_the_mass_of_its_convex_hull(tmp_path):
     volume = 0.25 * 0.06 * 0.06  # m³
     assert made.vendor.body("upper").mass[0] == pytest.approx(1000 * volume)
     assert any("mesh link has no volume" in note for note in made.notes)
+
+
+def test_the_base_is_frozen_where_the_keyframe_has_it(tmp_path):
+    upside_down = MJCF.replace('qpos="0 0 1 1 0 0 0  0 0.5', 'qpos="0 0 1 0 1 0 0  0 0.5')
+    model = write_mjcf(tmp_path / "repo", upside_down)
+    made = make(tmp_path, model, joints=ARM, keyframe="low")
+    assert max(furthest(made)) < 1e-9
+
+
+def test_a_base_in_a_frame_is_frozen_where_the_keyframe_has_it(tmp_path):
+    framed = MJCF.replace('<body name="torso"', '<frame euler="0 90 0"><body name="torso"')
+    framed = framed.replace("  </worldbody>", "  </frame></worldbody>")
+    made = make(tmp_path, write_mjcf(tmp_path / "repo", framed), joints=ARM)
+    assert max(furthest(made)) < 1e-9
+
+
+def test_a_ball_joint_is_frozen_where_the_keyframe_has_it(tmp_path):
+    (tmp_path / "ball.xml").write_text(
+        '<mujoco><worldbody><body name="torso"><joint type="ball" pos=".1 0 .2" limited="true" '
+        'range="0 1"/><geom type="sphere" size=".05" mass="1"/><body name="upper" pos="0 .1 0" '
+        'euler="10 20 30"><joint name="shoulder" axis="0 1 0"/>'
+        '<geom type="capsule" fromto="0 0 0 .2 0 .1" size=".02" mass=".5"/></body></body>'
+        '</worldbody><keyframe><key qpos=".8 .36 .48 0  .3"/></keyframe></mujoco>'
+    )
+    made = make(tmp_path, tmp_path / "ball.xml")
+    torso = build_model(made.robot).body("torso")
+    data = mujoco.MjData(made.vendor)
+    data.qpos[:] = made.pose
+    mujoco.mj_kinematics(made.vendor, data)
+    assert max(furthest(made)) < 1e-9
+    np.testing.assert_allclose(torso.pos, data.body("torso").xpos, atol=1e-9)
+
+
+def test_two_free_bodies_are_frozen_each_at_its_own_place(tmp_path):
+    (tmp_path / "two.xml").write_text(
+        '<mujoco><worldbody><body name="torso"><freejoint/><geom size=".1"/>'
+        '<body><joint name="shoulder" axis="0 1 0"/><geom size=".1"/></body></body>'
+        '<body name="cube"><freejoint/><geom size=".1"/></body></worldbody>'
+        '<keyframe><key qpos="0 0 1 1 0 0 0  .3  2 3 4 1 0 0 0"/></keyframe></mujoco>'
+    )
+    model = build_model(make(tmp_path, tmp_path / "two.xml").robot)
+    np.testing.assert_allclose(model.body("torso").pos, [0, 0, 1])
+    np.testing.assert_allclose(model.body("cube").pos, [2, 3, 4])

@@ -59,30 +59,76 @@ def freeze(spec: mujoco.MjSpec, joint: mujoco.MjsJoint, value: float) -> None:
     Raises:
         RobotError: Another joint of its body comes before it, and the value is not its reference.
     """
-    body = joint.parent
     move = value - joint.ref / units_per_si(spec, joint)
-    if move and body.joints[0].name != joint.name:
-        raise RobotError(
-            f"joint '{joint.name}' turns after '{body.joints[0].name}' in one body: keep or clamp "
-            "both"
-        )
-    body.quat = _quat(spec, body)
-    body.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
+    if move:
+        _require_first(joint)
     axis, anchor = _axis_and_anchor(spec, joint)
-    turn = np.array([1.0, 0.0, 0.0, 0.0])  # of the body, in its own frame
-    shift = axis * move  # of the body's origin, in its own frame, m
+    turn = np.array([1.0, 0.0, 0.0, 0.0])
+    shift = axis * move
     if joint.type != mujoco.mjtJoint.mjJNT_SLIDE:
         mujoco.mju_axisAngle2Quat(turn, axis, move)
-        turned_anchor = np.zeros(3)
-        mujoco.mju_rotVecQuat(turned_anchor, anchor, turn)
-        shift = anchor - turned_anchor
-    offset = np.zeros(3)  # the same in the frame of the parent
-    mujoco.mju_rotVecQuat(offset, shift, np.array(body.quat))
+        shift = _shift_about(anchor, turn)
+    _move(spec, joint.parent, turn, shift)
+    spec.delete(joint)
+
+
+def freeze_free(
+    spec: mujoco.MjSpec, joint: mujoco.MjsJoint, reference: Array, value: Array
+) -> None:
+    """Fix a free or ball joint at a value.
+
+    Args:
+        reference: Its coordinates in the model's zero: position, m, and quaternion (7), or of a
+            ball joint the quaternion (4).
+        value: Its coordinates where it becomes fixed.
+
+    Raises:
+        RobotError: Another joint of its body comes before it, and the value is not its reference.
+    """
+    if not np.array_equal(reference, value):
+        _require_first(joint)
+        back = np.zeros(4)  # from the reference
+        mujoco.mju_negQuat(back, reference[-4:])
+        turn = np.zeros(4)
+        mujoco.mju_mulQuat(turn, back, value[-4:])
+        if joint.type == mujoco.mjtJoint.mjJNT_FREE:
+            shift = np.zeros(3)
+            mujoco.mju_rotVecQuat(shift, value[:3] - reference[:3], back)
+        else:
+            _, anchor = _axis_and_anchor(spec, joint)
+            shift = _shift_about(anchor, turn)
+        _move(spec, joint.parent, turn, shift)
+    spec.delete(joint)
+
+
+def _require_first(joint: mujoco.MjsJoint) -> None:
+    """Refuse a joint of a body that another joint comes before."""
+    first = joint.parent.joints[0]
+    if first.name != joint.name:
+        raise RobotError(
+            f"joint '{joint.name}' turns after '{first.name}' in one body: keep or clamp both"
+        )
+
+
+def _shift_about(anchor: Array, turn: Array) -> Array:
+    """Return how far a body's origin moves when the body turns about an anchor, m, in the body's
+    frame.
+    """
+    turned_anchor = np.zeros(3)
+    mujoco.mju_rotVecQuat(turned_anchor, anchor, turn)
+    return anchor - turned_anchor
+
+
+def _move(spec: mujoco.MjSpec, body: mujoco.MjsBody, turn: Array, shift: Array) -> None:
+    """Turn a body by a quaternion and shift its origin, m, both in the body's own frame."""
+    old = _quat(spec, body)
+    offset = np.zeros(3)  # of the origin, in the frame that holds the body
+    mujoco.mju_rotVecQuat(offset, shift, old)
     quat = np.zeros(4)
-    mujoco.mju_mulQuat(quat, np.array(body.quat), turn)
+    mujoco.mju_mulQuat(quat, old, turn)
     body.pos = np.array(body.pos) + offset
     body.quat = quat
-    spec.delete(joint)
+    body.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
 
 
 def delete_references(spec: mujoco.MjSpec, removed: set[str]) -> None:

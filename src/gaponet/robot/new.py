@@ -19,7 +19,7 @@ import numpy as np
 from gaponet.base.errors import RobotError, UsageError
 from gaponet.base.files import whole_folder, write_text
 from gaponet.robot.drives import ON_JOINT, Drive, drives
-from gaponet.robot.freeze import delete_references, freeze
+from gaponet.robot.freeze import delete_references, freeze, freeze_free
 from gaponet.robot.log_joints import Follower
 from gaponet.robot.loops import chain, delete_mocap_welds, require_open
 from gaponet.robot.mjcf import compile_spec
@@ -30,6 +30,7 @@ from gaponet.robot.vendor import read_vendor
 
 PICTURE = "picture.png"  # of a robot folder
 HAND_PREFIXES = ("attachment", "tcp", "tool", "flange", "palm", "grip", "hand", "wrist")
+COORDINATES = {mujoco.mjtJoint.mjJNT_FREE: 7, mujoco.mjtJoint.mjJNT_BALL: 4}  # of such a joint
 IMPLICIT_INTEGRATORS = (
     mujoco.mjtIntegrator.mjINT_IMPLICIT,
     mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
@@ -74,7 +75,7 @@ def new_robot(
     joint_drives = drives(model, motors, pose, given, path.name)
     notes += delete_mocap_welds(spec, model)
     require_open(spec, model, logged, path)
-    notes += _notes(spec, model, logged, pose, path)
+    notes += _notes(spec, model, logged, pose, source)
     for name, led in followers.items():
         notes.append(f"{name} follows {led.joint}, without a motor")
     _set_passive(spec, joint_drives)
@@ -234,6 +235,8 @@ def _home(model: mujoco.MjModel, keyframe: str, path: Path) -> tuple[np.ndarray,
         chosen = keys.index(keyframe) if keyframe else 0
         pose = model.key_qpos[chosen].copy()
     for j in np.flatnonzero(model.jnt_limited):
+        if mujoco.mjtJoint(model.jnt_type[j]) in COORDINATES:
+            continue  # its range limits an angle, which is no coordinate
         at = model.jnt_qposadr[j]
         low, high = model.jnt_range[j]
         if not low - 1e-6 <= pose[at] <= high + 1e-6:
@@ -243,11 +246,15 @@ def _home(model: mujoco.MjModel, keyframe: str, path: Path) -> tuple[np.ndarray,
 
 
 def _notes(
-    spec: mujoco.MjSpec, model: mujoco.MjModel, logged: list[str], pose: np.ndarray, path: Path
+    spec: mujoco.MjSpec, model: mujoco.MjModel, logged: list[str], pose: np.ndarray, source: str
 ) -> list[str]:
-    """Describe what is fixed and omitted."""
+    """Describe what is fixed and omitted.
+
+    Args:
+        source: Of the home pose.
+    """
     notes = []
-    fixed = _fixed_joints(model, logged, pose, path)
+    fixed = _fixed_joints(model, logged, pose, source)
     if fixed:
         notes.append(f"frozen: {', '.join(fixed)}")
     notes += _coupled_joints(spec, logged)
@@ -268,17 +275,21 @@ def _notes(
 
 
 def _fixed_joints(
-    model: mujoco.MjModel, logged: list[str], pose: np.ndarray, path: Path
+    model: mujoco.MjModel, logged: list[str], pose: np.ndarray, source: str
 ) -> list[str]:
     """Return the names of the joints that become fixed, and where."""
     units = {mujoco.mjtJoint.mjJNT_HINGE: "rad", mujoco.mjtJoint.mjJNT_SLIDE: "m"}
     fixed = []
-    for name, kind, at in zip(_joint_names(model), model.jnt_type, model.jnt_qposadr, strict=True):
+    for joint in range(model.njnt):
+        name = model.joint(joint).name
         if name in logged:
             continue
-        unit = units.get(mujoco.mjtJoint(kind))
-        where = f"at {pose[at]:.3g} {unit}" if unit else f"where {path.name} has it"
-        fixed.append(f"{name or 'unnamed'} {where}")
+        unit = units.get(mujoco.mjtJoint(model.jnt_type[joint]))
+        where = f"as in {source}"
+        if unit:
+            where = f"at {pose[model.jnt_qposadr[joint]]:.3g} {unit}"
+        body = model.body(model.jnt_bodyid[joint]).name
+        fixed.append(f"{name or body or 'unnamed'} {where}")
     return fixed
 
 
@@ -311,9 +322,11 @@ def _robot_xml(
     """Return robot.xml: one file without fixed joints and the elements that refer to them."""
     values = dict(zip(_joint_names(model), pose[model.jnt_qposadr], strict=True))
     delete_references(spec, set(values) - set(logged))
-    for joint in list(spec.joints):
-        if joint.type in (mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL):
-            spec.delete(joint)
+    # The specification has the model's order; a list, because a deletion renumbers its joints.
+    for joint, first in zip(list(spec.joints), model.jnt_qposadr, strict=True):
+        if joint.type in COORDINATES:
+            place = slice(first, first + COORDINATES[joint.type])
+            freeze_free(spec, joint, model.qpos0[place], pose[place])
     if spec.option.integrator not in IMPLICIT_INTEGRATORS:
         spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     # explicit inertias, quaternions, no classes
