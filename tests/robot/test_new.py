@@ -569,3 +569,26 @@ def test_two_free_bodies_are_frozen_each_at_its_own_place(tmp_path):
     model = build_model(make(tmp_path, tmp_path / "two.xml").robot)
     np.testing.assert_allclose(model.body("torso").pos, [0, 0, 1])
     np.testing.assert_allclose(model.body("cube").pos, [2, 3, 4])
+
+
+PAIR = """<mujoco><worldbody>
+<body><joint name="left" axis="0 1 0"/><geom type="sphere" size=".05" pos=".1 0 0"/></body>
+<body><joint name="right" axis="0 1 0"/><geom type="sphere" size=".05" pos=".1 0 0"/></body>
+</worldbody><equality><joint joint1="right" joint2="left" polycoef="0 1 0 0 0" {active}/></equality>
+<actuator>{actuators}</actuator></mujoco>"""
+LEFT_MOTOR = '<position joint="left" kp="30"/>'
+RIGHT_MOTOR = '<position joint="right" kp="30"/>'
+
+
+@pytest.mark.parametrize("active", ['active="false"', 'active="true"'])
+def test_a_coupled_joint_with_an_actuator_keeps_its_motor(tmp_path, active):
+    text = PAIR.format(active=active, actuators=LEFT_MOTOR + RIGHT_MOTOR)
+    (tmp_path / "pair.xml").write_text(text)
+    assert make(tmp_path, tmp_path / "pair.xml").robot.operated == ("left", "right")
+
+
+def test_an_equality_that_is_not_active_couples_nothing(tmp_path):
+    (tmp_path / "pair.xml").write_text(PAIR.format(active='active="false"', actuators=LEFT_MOTOR))
+    made = make(tmp_path, tmp_path / "pair.xml")
+    assert made.robot.joint_names == ("left",)
+    assert not any("moves with" in note for note in made.notes)

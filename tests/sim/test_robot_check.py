@@ -155,6 +155,12 @@ def test_joints_that_an_equality_only_couples_are_no_error(tmp_path):
     assert not said(findings, "couplings", "error")
 
 
+def test_an_equality_that_is_not_active_is_not_counted(tmp_path):
+    equality = '<equality><weld body1="fore" active="false"/></equality>'
+    robot = write_arm(tmp_path / "arm", TOML, XML.replace("</mujoco>", f"{equality}</mujoco>"))
+    assert not said(check_robot(robot), "couplings", "note")
+
+
 def test_a_hold_that_swings_or_sags_is_reported(tmp_path):
     swinging = check_robot(write_arm(tmp_path / "free", TOML, LIGHT))
     assert "does not come to rest" in said(swinging, "hold", "error")[0]

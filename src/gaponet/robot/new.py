@@ -162,9 +162,14 @@ def _logged_joints(model: mujoco.MjModel, patterns: tuple[str, ...], path: Path)
         named.update(found)
     if patterns:
         return [name for name in hinges if name in named]
-    on_joint = np.isin(model.actuator_trntype, ON_JOINT)
-    actuated = {model.joint(joint).name for joint in model.actuator_trnid[on_joint, 0]}
+    actuated = _actuated_joints(model)
     return [name for name in hinges if name in actuated] or hinges
+
+
+def _actuated_joints(model: mujoco.MjModel) -> set[str]:
+    """Return the names of the joints that an actuator drives."""
+    on_joint = np.isin(model.actuator_trntype, ON_JOINT)
+    return {model.joint(joint).name for joint in model.actuator_trnid[on_joint, 0]}
 
 
 def _followers(
@@ -173,14 +178,16 @@ def _followers(
     """Return the hinges that an equality lets follow a logged hinge in proportion: URDF's mimic
     joints.
 
-    A joint that the user names counts as driven by a motor of its own.
+    A joint that has an actuator, or that the user names, counts as driven by a motor of its own.
     """
     followers = {}
-    for equality in np.flatnonzero(model.eq_type == mujoco.mjtEq.mjEQ_JOINT):
+    motors = {*_actuated_joints(model), *patterns}
+    couples = (model.eq_type == mujoco.mjtEq.mjEQ_JOINT) & model.eq_active0.astype(bool)
+    for equality in np.flatnonzero(couples):
         name = _hinge_name(model, model.eq_obj1id[equality])
         leader = _hinge_name(model, model.eq_obj2id[equality])
         constant, ratio, *curved = model.eq_data[equality, :5].tolist()
-        if not (name and leader) or any(curved) or leader not in logged or name in patterns:
+        if not (name and leader) or any(curved) or leader not in logged or name in motors:
             continue
         zero = _reference(model, name)
         leader_zero = _reference(model, leader)
@@ -297,7 +304,7 @@ def _coupled_joints(spec: mujoco.MjSpec, logged: list[str]) -> list[str]:
     """Return a note on each fixed joint that moves with a logged one."""
     notes = []
     for equality in spec.equalities:
-        if equality.type != mujoco.mjtEq.mjEQ_JOINT or not equality.name2:
+        if equality.type != mujoco.mjtEq.mjEQ_JOINT or not equality.name2 or not equality.active:
             continue
         pair = [name for name in (equality.name1, equality.name2) if name in logged]
         if len(pair) != 1:

@@ -161,7 +161,8 @@ def _limits(robot: RobotSpec, model: mujoco.MjModel) -> Iterator[Finding]:
 def _couplings(robot: RobotSpec, model: mujoco.MjModel) -> Iterator[Finding]:
     """Find constraints, springs and other elements of the model that move or hold a joint."""
     names = np.array(robot.joint_names)
-    for count, kind in ((model.neq, "equality"), (model.ntendon, "tendon")):
+    equalities = int(model.eq_active0.sum())
+    for count, kind in ((equalities, "equality"), (model.ntendon, "tendon")):
         if count:
             text = (
                 f"robot.xml has {count} <{kind}> constraint(s): the simulator obeys them; delete "
