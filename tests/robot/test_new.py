@@ -592,3 +592,44 @@ def test_an_equality_that_is_not_active_couples_nothing(tmp_path):
     made = make(tmp_path, tmp_path / "pair.xml")
     assert made.robot.joint_names == ("left",)
     assert not any("moves with" in note for note in made.notes)
+
+
+FINGERS = """<body name="{palm}" pos=".2 0 0"><geom type="box" size=".02 .03 .02" mass=".1"/>
+<body name="gripper_left_finger" pos="0 .03 0"><joint name="{palm}_left" axis="0 0 1"/>
+<geom type="box" size=".03 .005 .01" mass=".03"/></body>
+<body name="gripper_right_finger" pos="0 -.03 0"><joint name="{palm}_right" axis="0 0 1"/>
+<geom type="box" size=".03 .005 .01" mass=".03"/></body></body>"""
+UPPER = """<body name="{name}"><joint name="{name}" axis="0 1 0"/>
+<geom type="capsule" fromto="0 0 0 .2 0 0" size=".02" mass=".6"/>{content}</body>"""
+
+
+def mounts_of(folder: Path, bodies: str) -> list[tuple[str, str]]:
+    """Side and body of each payload mount that is guessed for an MJCF of these bodies."""
+    (folder / "hand.xml").write_text(f"<mujoco><worldbody>{bodies}</worldbody></mujoco>")
+    mounts = make(folder, folder / "hand.xml").robot.payload_mounts
+    return [(mount.side, mount.body) for mount in mounts]
+
+
+@pytest.mark.parametrize("palm", ["gripper_base", "link6"])
+def test_two_fingers_of_one_palm_are_one_payload_mount(tmp_path, palm):
+    arm = UPPER.format(name="upper", content=FINGERS.format(palm=palm))
+    assert mounts_of(tmp_path, arm) == [("hand", palm)]
+
+
+def test_the_arms_of_a_torso_that_turns_are_two_payload_mounts(tmp_path):
+    arms = ""
+    for side in ("left", "right"):
+        hand = UPPER.format(name=f"{side}_wrist", content="")
+        arms += UPPER.format(name=f"{side}_shoulder", content=hand)
+    torso = UPPER.format(name="torso", content=arms)
+    assert mounts_of(tmp_path, torso) == [("left", "left_wrist"), ("right", "right_wrist")]
+
+
+def test_the_side_of_a_payload_is_that_of_the_palm(tmp_path):
+    arms = ""
+    for side in ("left", "right"):
+        fingers = FINGERS.format(palm=f"{side}_palm").replace("gripper_", f"{side[0]}_gripper_")
+        hand = UPPER.format(name=f"{side}_wrist", content=fingers)
+        arms += UPPER.format(name=f"{side}_shoulder", content=hand)
+    torso = UPPER.format(name="torso", content=arms)
+    assert mounts_of(tmp_path, torso) == [("left", "left_palm"), ("right", "right_palm")]

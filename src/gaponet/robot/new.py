@@ -466,7 +466,8 @@ def _mounts(model: mujoco.MjModel, joints: list[str]) -> list[tuple[str, str, np
             tips.append(body)
     ends = tips
     if len(tips) > 1:
-        ends = _palms(model, [tip for tip in tips if _has_hand(model, tip)])
+        hands = [tip for tip in tips if _has_hand(model, tip)]
+        ends = _palms(model, _without_fingers(model, hands, moved))
     mounts: list[tuple[str, str, np.ndarray, str]] = []
     for end in ends:
         body, pos, why = _mount(model, end, is_tip=end in tips)
@@ -507,6 +508,37 @@ def _side(model: mujoco.MjModel, body: int) -> str:
 def _has_hand(model: mujoco.MjModel, body: int) -> bool:
     """Return True if a body or one beyond it is named as a hand is."""
     return any(_hand(model.body(other).name) for other in _beyond(model, body))
+
+
+def _without_fingers(model: mujoco.MjModel, ends: list[int], moved: set[int]) -> list[int]:
+    """Replace the fingers of one palm by the palm, whatever sides their names say.
+
+    Args:
+        moved: Bodies that a logged joint moves.
+    """
+    palms = set()
+    for end in ends:
+        palm = end
+        for other in ends:
+            common = max(set(chain(model, end)) & set(chain(model, other)))
+            if common < palm and _is_palm(model, common, [end, other], moved):
+                palm = common
+        palms.add(palm)
+    return sorted(palms)
+
+
+def _is_palm(model: mujoco.MjModel, body: int, ends: list[int], moved: set[int]) -> bool:
+    """Return True if the nearest body that carries some ends is a palm, and no torso.
+
+    A palm is moved by a logged joint, as a torso may be. It is part of a hand by its name or by
+    that of a body before it, or carries ends of one joint each.
+    """
+    before = chain(model, body)
+    if moved.isdisjoint(before):
+        return False
+    if any(_hand(model.body(part).name) for part in before):
+        return True
+    return all(len(moved.intersection(chain(model, end)) - set(before)) == 1 for end in ends)
 
 
 def _palms(model: mujoco.MjModel, ends: list[int]) -> list[int]:
