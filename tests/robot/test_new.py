@@ -118,8 +118,8 @@ def test_gains_and_limits_come_from_actuators_with_their_gears(tmp_path):
     assert joints["shoulder"]["effort_limit"] == 9.0
     assert joints["elbow"]["kp"] == 40.0  # gear 2, twice
     assert joints["elbow"]["kd"] == 2.0
-    # actuatorfrcrange, before forcerange times gear, 8
-    assert joints["elbow"]["effort_limit"] == 6.0
+    # actuatorfrcrange, its larger side, before forcerange times gear, 8
+    assert joints["elbow"]["effort_limit"] == 7.0
     assert joints["roll"]["effort_limit"] == 1.5  # ctrlrange of a motor, times gear
     assert joints["shoulder"]["aliases"] == ["shoulder_servo"]
 
@@ -633,3 +633,9 @@ def test_the_side_of_a_payload_is_that_of_the_palm(tmp_path):
         arms += UPPER.format(name=f"{side}_shoulder", content=hand)
     torso = UPPER.format(name="torso", content=arms)
     assert mounts_of(tmp_path, torso) == [("left", "left_palm"), ("right", "right_palm")]
+
+
+def test_a_motor_that_pulls_one_way_has_the_limit_of_that_way(tmp_path):
+    one_way = MJCF.replace('forcerange="-9 9"', 'forcerange="0 9"')
+    made = make(tmp_path, write_mjcf(tmp_path / "repo", one_way), joints=ARM)
+    assert written(made)["shoulder"]["effort_limit"] == 9.0
