@@ -19,9 +19,15 @@ import numpy as np
 from gaponet.base.errors import RobotError, UsageError
 from gaponet.base.files import whole_folder, write_text
 from gaponet.robot.drives import ON_JOINT, Drive, drives
-from gaponet.robot.freeze import delete_references, freeze, freeze_free
+from gaponet.robot.freeze import (
+    chain,
+    delete_mocap_welds,
+    delete_references,
+    freeze,
+    freeze_free,
+    require_open,
+)
 from gaponet.robot.log_joints import Follower
-from gaponet.robot.loops import chain, delete_mocap_welds, require_open
 from gaponet.robot.mjcf import compile_spec
 from gaponet.robot.self_contained import self_contained_text
 from gaponet.robot.spec import RobotSpec, load_robot

@@ -501,8 +501,8 @@ def _servo_types(toml: RobotTable) -> tuple[ServoType | None, ...]:
 
 
 def _require_known_names(toml: RobotTable) -> None:
-    """Refuse joint names and sides of mounts that appear twice, a table without tips, and identified
-    values of joints and mounts that are not there.
+    """Refuse joint names and sides of mounts that appear twice, a table without tips, and
+    identified values of joints and mounts that are not there.
 
     Bodies of identified links are looked for when the MJCF is compiled.
     """
