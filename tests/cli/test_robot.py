@@ -124,3 +124,10 @@ def test_new_that_ends_before_its_picture_leaves_no_robot(tmp_path, monkeypatch)
     assert not mine.exists()
     monkeypatch.undo()
     assert main(told) == 0
+
+
+def test_check_says_that_a_payload_hangs_in_each_of_two_mounts(tmp_path, capsys):
+    second = '[[payload_mount]]\nside = "elbow"\nbody = "upper"\npos = [0.0, 0.0, 0.0]\n'
+    write_arm(tmp_path / "arm", toml=TOML + second)
+    assert main(["robot", "check", str(tmp_path / "arm")]) == 0
+    assert "1 kg is 1 kg in each of 2 mounts" in " ".join(capsys.readouterr().out.split())

@@ -6,7 +6,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
-from vendors import MJCF, URDF, write_mjcf, write_urdf
+from vendors import BOX, MJCF, URDF, write_mjcf, write_urdf
 
 from gaponet.base.errors import RobotError, UsageError
 from gaponet.data.log import Channel, Log
@@ -55,7 +55,6 @@ def furthest(made: NewRobot) -> tuple[float, float]:
     for _ in range(50):
         a.qpos[:] = rng.uniform(*np.clip(made.robot.qpos_range.T, -3, 3))
         b.qpos[:] = made.pose
-        b.qpos[:7] = theirs.qpos0[:7] if theirs.nq > 7 else b.qpos[:7]
         b.qpos[places] = a.qpos
         mujoco.mj_forward(ours, a)
         mujoco.mj_forward(theirs, b)
@@ -119,8 +118,8 @@ def test_gains_and_limits_come_from_actuators_with_their_gears(tmp_path):
     assert joints["shoulder"]["effort_limit"] == 9.0
     assert joints["elbow"]["kp"] == 40.0  # gear 2, twice
     assert joints["elbow"]["kd"] == 2.0
-    # actuatorfrcrange, before forcerange times gear, 8
-    assert joints["elbow"]["effort_limit"] == 6.0
+    # actuatorfrcrange, its larger side, before forcerange times gear, 8
+    assert joints["elbow"]["effort_limit"] == 7.0
     assert joints["roll"]["effort_limit"] == 1.5  # ctrlrange of a motor, times gear
     assert joints["shoulder"]["aliases"] == ["shoulder_servo"]
 
@@ -405,3 +404,238 @@ def test_a_mimic_joint_of_a_mimic_joint_follows_the_motor(tmp_path):
     robot = make(tmp_path, tmp_path / "hand.urdf").robot
     assert robot.operated == ("drive",)
     assert robot.log_joints.followers["tip"] == ("drive", -1.0, pytest.approx(0.5))
+
+
+LINK_OF_LOOP = """<body name="{crank}" pos="{at} 0 0"><joint name="{motor}" axis="0 1 0"/>
+<geom type="capsule" fromto="0 0 0 0 0 .2" size=".01" mass=".2"/>
+<body name="{rod}" pos="0 0 .2"><joint name="{hinge}" axis="0 1 0"/>
+<geom type="capsule" fromto="0 0 0 {reach} 0 .2" size=".01" mass=".1"/></body></body>"""
+
+
+def five_bar(equality: str) -> str:
+    """An MJCF: two cranks with motors, each with a rod on a passive hinge, and an equality."""
+    left = LINK_OF_LOOP.format(
+        crank="crankA", motor="motorA", rod="rodA", hinge="passiveA", at=-0.1, reach=0.1
+    )
+    right = LINK_OF_LOOP.format(
+        crank="crankB", motor="motorB", rod="rodB", hinge="passiveB", at=0.1, reach=-0.1
+    )
+    return (
+        f"<mujoco><worldbody>{left}{right}<body name='target' mocap='true'/></worldbody>"
+        f"<equality>{equality}</equality><actuator><position joint='motorA' kp='20'/>"
+        "<position joint='motorB' kp='20'/></actuator></mujoco>"
+    )
+
+
+CONNECTED = '<connect body1="rodA" body2="rodB" anchor=".1 0 .2"/>'
+
+
+def test_a_closed_loop_through_a_passive_hinge_is_refused(tmp_path):
+    (tmp_path / "loop.xml").write_text(five_bar(CONNECTED))
+    with pytest.raises(RobotError, match="closed loop through passiveA, passiveB"):
+        make(tmp_path, tmp_path / "loop.xml")
+
+
+@pytest.mark.parametrize(
+    "equality",
+    [
+        CONNECTED.replace("/>", ' active="false"/>'),
+        '<weld body1="crankA" body2="rodA"/>',  # one frozen body with another
+    ],
+)
+def test_an_equality_that_locks_no_logged_joint_is_accepted(tmp_path, equality):
+    (tmp_path / "open.xml").write_text(five_bar(equality))
+    robot = make(tmp_path, tmp_path / "open.xml").robot
+    assert robot.joint_names == ("motorA", "motorB")
+
+
+def test_a_closed_loop_of_logged_joints_alone_is_kept(tmp_path):
+    (tmp_path / "loop.xml").write_text(five_bar(CONNECTED))
+    names = ("motorA", "passiveA", "motorB", "passiveB")
+    robot = make(tmp_path, tmp_path / "loop.xml", joints=names).robot
+    assert build_model(robot).neq == 1
+
+
+def test_a_weld_to_a_mocap_body_is_left_out_with_a_note(tmp_path):
+    (tmp_path / "teleoperated.xml").write_text(five_bar('<weld body1="target" body2="crankA"/>'))
+    made = make(tmp_path, tmp_path / "teleoperated.xml")
+    assert build_model(made.robot).neq == 0
+    assert any("crankA to the mocap body target" in note for note in made.notes)
+
+
+def write_attached(folder: Path, mesh: bool = True) -> Path:
+    """An arm that attaches a hand, which has a mesh of 0.4 kg in a folder of its own."""
+    (folder / "hand" / "shapes").mkdir(parents=True)
+    if mesh:
+        (folder / "hand" / "shapes" / "link.obj").write_text(BOX)
+    (folder / "hand" / "hand.xml").write_text(
+        '<mujoco model="hand"><compiler meshdir="shapes"/>'
+        '<asset><mesh name="palm" file="link.obj"/></asset><worldbody><body name="palm">'
+        '<geom type="sphere" size=".01" mass=".02"/><geom type="mesh" mesh="palm" mass=".4"/>'
+        "</body></worldbody></mujoco>"
+    )
+    (folder / "arm.xml").write_text(
+        '<mujoco><asset><model name="hand" file="hand/hand.xml"/></asset><worldbody>'
+        '<body name="upper"><joint name="shoulder" axis="0 1 0"/>'
+        '<geom type="sphere" size=".02" mass=".6"/>'
+        '<frame><attach model="hand" body="palm" prefix="h_"/></frame></body></worldbody></mujoco>'
+    )
+    return folder / "arm.xml"
+
+
+def test_the_meshes_of_an_attached_model_are_found_in_its_own_folder(tmp_path):
+    made = make(tmp_path, write_attached(tmp_path / "repo"))
+    assert build_model(made.robot).body_mass.sum() == pytest.approx(0.6 + 0.42)
+
+
+def test_the_mass_that_goes_with_a_missing_mesh_is_told(tmp_path):
+    made = make(tmp_path, write_attached(tmp_path / "repo", mesh=False))
+    assert any("bodies are lighter: h_palm by 0.4 kg" in note for note in made.notes)
+
+
+def test_a_missing_mesh_beside_an_attached_model_leaves_the_others(tmp_path):
+    model = write_attached(tmp_path / "repo")
+    lost = '<asset><mesh name="lost" file="lost.obj"/>'
+    text = model.read_text().replace("<asset>", lost)
+    model.write_text(text.replace("<frame>", '<geom type="mesh" mesh="lost"/><frame>'))
+    made = make(tmp_path, model)
+    assert made.vendor.body("h_palm").mass[0] == pytest.approx(0.42)
+    assert any("bodies are lighter: upper by an unknown mass" in note for note in made.notes)
+
+
+def test_a_body_without_an_inertia_has_the_mass_of_its_mesh(tmp_path):
+    (tmp_path / "link.obj").write_text(BOX)  # 0.25 m by 0.06 m by 0.06 m
+    (tmp_path / "arm.xml").write_text(
+        '<mujoco><asset><mesh name="link" file="link.obj"/></asset><worldbody><body name="upper">'
+        '<joint name="shoulder"/><geom type="mesh" mesh="link"/></body></worldbody></mujoco>'
+    )
+    made = make(tmp_path, tmp_path / "arm.xml")
+    volume = 0.25 * 0.06 * 0.06  # m³; 1000 kg/m³ is MuJoCo's density
+    assert made.vendor.body("upper").mass[0] == pytest.approx(1000 * volume)
+
+
+def test_a_mesh_with_a_wrong_face_has_the_mass_of_its_convex_hull(tmp_path):
+    with_a_face_inside_out = BOX.replace("f 2 8 4", "f 2 4 8")
+    (tmp_path / "link.obj").write_text(with_a_face_inside_out)
+    (tmp_path / "arm.xml").write_text(
+        '<mujoco><asset><mesh name="link" file="link.obj" inertia="exact"/></asset><worldbody>'
+        '<body name="upper"><joint name="shoulder"/><geom type="mesh" mesh="link"/></body>'
+        "</worldbody></mujoco>"
+    )
+    made = make(tmp_path, tmp_path / "arm.xml")
+    volume = 0.25 * 0.06 * 0.06  # m³
+    assert made.vendor.body("upper").mass[0] == pytest.approx(1000 * volume)
+    assert any("mesh link has no volume" in note for note in made.notes)
+
+
+def test_the_base_is_frozen_where_the_keyframe_has_it(tmp_path):
+    upside_down = MJCF.replace('qpos="0 0 1 1 0 0 0  0 0.5', 'qpos="0 0 1 0 1 0 0  0 0.5')
+    model = write_mjcf(tmp_path / "repo", upside_down)
+    made = make(tmp_path, model, joints=ARM, keyframe="low")
+    assert max(furthest(made)) < 1e-9
+
+
+def test_a_base_in_a_frame_is_frozen_where_the_keyframe_has_it(tmp_path):
+    framed = MJCF.replace('<body name="torso"', '<frame euler="0 90 0"><body name="torso"')
+    framed = framed.replace("  </worldbody>", "  </frame></worldbody>")
+    made = make(tmp_path, write_mjcf(tmp_path / "repo", framed), joints=ARM)
+    assert max(furthest(made)) < 1e-9
+
+
+def test_a_ball_joint_is_frozen_where_the_keyframe_has_it(tmp_path):
+    (tmp_path / "ball.xml").write_text(
+        '<mujoco><worldbody><body name="torso"><joint type="ball" pos=".1 0 .2" limited="true" '
+        'range="0 1"/><geom type="sphere" size=".05" mass="1"/><body name="upper" pos="0 .1 0" '
+        'euler="10 20 30"><joint name="shoulder" axis="0 1 0"/>'
+        '<geom type="capsule" fromto="0 0 0 .2 0 .1" size=".02" mass=".5"/></body></body>'
+        '</worldbody><keyframe><key qpos=".8 .36 .48 0  .3"/></keyframe></mujoco>'
+    )
+    made = make(tmp_path, tmp_path / "ball.xml")
+    torso = build_model(made.robot).body("torso")
+    data = mujoco.MjData(made.vendor)
+    data.qpos[:] = made.pose
+    mujoco.mj_kinematics(made.vendor, data)
+    assert max(furthest(made)) < 1e-9
+    np.testing.assert_allclose(torso.pos, data.body("torso").xpos, atol=1e-9)
+
+
+def test_two_free_bodies_are_frozen_each_at_its_own_place(tmp_path):
+    (tmp_path / "two.xml").write_text(
+        '<mujoco><worldbody><body name="torso"><freejoint/><geom size=".1"/>'
+        '<body><joint name="shoulder" axis="0 1 0"/><geom size=".1"/></body></body>'
+        '<body name="cube"><freejoint/><geom size=".1"/></body></worldbody>'
+        '<keyframe><key qpos="0 0 1 1 0 0 0  .3  2 3 4 1 0 0 0"/></keyframe></mujoco>'
+    )
+    model = build_model(make(tmp_path, tmp_path / "two.xml").robot)
+    np.testing.assert_allclose(model.body("torso").pos, [0, 0, 1])
+    np.testing.assert_allclose(model.body("cube").pos, [2, 3, 4])
+
+
+PAIR = """<mujoco><worldbody>
+<body><joint name="left" axis="0 1 0"/><geom type="sphere" size=".05" pos=".1 0 0"/></body>
+<body><joint name="right" axis="0 1 0"/><geom type="sphere" size=".05" pos=".1 0 0"/></body>
+</worldbody><equality><joint joint1="right" joint2="left" polycoef="0 1 0 0 0" {active}/></equality>
+<actuator>{actuators}</actuator></mujoco>"""
+LEFT_MOTOR = '<position joint="left" kp="30"/>'
+RIGHT_MOTOR = '<position joint="right" kp="30"/>'
+
+
+@pytest.mark.parametrize("active", ['active="false"', 'active="true"'])
+def test_a_coupled_joint_with_an_actuator_keeps_its_motor(tmp_path, active):
+    text = PAIR.format(active=active, actuators=LEFT_MOTOR + RIGHT_MOTOR)
+    (tmp_path / "pair.xml").write_text(text)
+    assert make(tmp_path, tmp_path / "pair.xml").robot.operated == ("left", "right")
+
+
+def test_an_equality_that_is_not_active_couples_nothing(tmp_path):
+    (tmp_path / "pair.xml").write_text(PAIR.format(active='active="false"', actuators=LEFT_MOTOR))
+    made = make(tmp_path, tmp_path / "pair.xml")
+    assert made.robot.joint_names == ("left",)
+    assert not any("moves with" in note for note in made.notes)
+
+
+FINGERS = """<body name="{palm}" pos=".2 0 0"><geom type="box" size=".02 .03 .02" mass=".1"/>
+<body name="gripper_left_finger" pos="0 .03 0"><joint name="{palm}_left" axis="0 0 1"/>
+<geom type="box" size=".03 .005 .01" mass=".03"/></body>
+<body name="gripper_right_finger" pos="0 -.03 0"><joint name="{palm}_right" axis="0 0 1"/>
+<geom type="box" size=".03 .005 .01" mass=".03"/></body></body>"""
+UPPER = """<body name="{name}"><joint name="{name}" axis="0 1 0"/>
+<geom type="capsule" fromto="0 0 0 .2 0 0" size=".02" mass=".6"/>{content}</body>"""
+
+
+def mounts_of(folder: Path, bodies: str) -> list[tuple[str, str]]:
+    """Side and body of each payload mount that is guessed for an MJCF of these bodies."""
+    (folder / "hand.xml").write_text(f"<mujoco><worldbody>{bodies}</worldbody></mujoco>")
+    mounts = make(folder, folder / "hand.xml").robot.payload_mounts
+    return [(mount.side, mount.body) for mount in mounts]
+
+
+@pytest.mark.parametrize("palm", ["gripper_base", "link6"])
+def test_two_fingers_of_one_palm_are_one_payload_mount(tmp_path, palm):
+    arm = UPPER.format(name="upper", content=FINGERS.format(palm=palm))
+    assert mounts_of(tmp_path, arm) == [("hand", palm)]
+
+
+def test_the_arms_of_a_torso_that_turns_are_two_payload_mounts(tmp_path):
+    arms = ""
+    for side in ("left", "right"):
+        hand = UPPER.format(name=f"{side}_wrist", content="")
+        arms += UPPER.format(name=f"{side}_shoulder", content=hand)
+    torso = UPPER.format(name="torso", content=arms)
+    assert mounts_of(tmp_path, torso) == [("left", "left_wrist"), ("right", "right_wrist")]
+
+
+def test_the_side_of_a_payload_is_that_of_the_palm(tmp_path):
+    arms = ""
+    for side in ("left", "right"):
+        fingers = FINGERS.format(palm=f"{side}_palm").replace("gripper_", f"{side[0]}_gripper_")
+        hand = UPPER.format(name=f"{side}_wrist", content=fingers)
+        arms += UPPER.format(name=f"{side}_shoulder", content=hand)
+    torso = UPPER.format(name="torso", content=arms)
+    assert mounts_of(tmp_path, torso) == [("left", "left_palm"), ("right", "right_palm")]
+
+
+def test_a_motor_that_pulls_one_way_has_the_limit_of_that_way(tmp_path):
+    one_way = MJCF.replace('forcerange="-9 9"', 'forcerange="0 9"')
+    made = make(tmp_path, write_mjcf(tmp_path / "repo", one_way), joints=ARM)
+    assert written(made)["shoulder"]["effort_limit"] == 9.0

@@ -95,6 +95,12 @@ def test_an_unknown_robot_error_lists_the_packaged_ones():
         ("dt = 0.02", "dt = ", "TOML"),
         ("[[joint]]", "[[joints]]", "joint:"),
         ('body = "fore"\n', "", r"payload_mount\[0\]\.body:"),
+        (
+            "[[payload_mount]]",
+            '[[payload_mount]]\nside = "hand"\nbody = "upper"\npos = [0.0, 0.0, 0.0]\n'
+            "[[payload_mount]]",
+            "two .* side = 'hand'",
+        ),
     ],
 )
 def test_an_invalid_robot_toml_error_names_the_field(tmp_path, old, new, message):

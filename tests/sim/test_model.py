@@ -502,3 +502,16 @@ def test_a_datasets_robot_has_the_gains_that_all_recordings_state(tmp_path):
     softer = replace(recorded.meta, motion="n", kp=(9.0, 9.0))
     data.append(replace(recorded.rows(slice(50)), meta=softer))
     assert dataset_robot(data).servo.kp.tolist() == [20.0, 20.0]
+
+
+def test_an_operated_joint_that_slides_is_refused(tmp_path):
+    sliding = XML.replace('name="elbow" axis', 'name="elbow" type="slide" axis')
+    robot = write_arm(tmp_path / "arm", TOML, sliding)
+    with pytest.raises(RobotError, match=r"'elbow' is a slide joint.*operated = false"):
+        build_model(robot)
+
+
+def test_a_joint_that_slides_and_is_not_operated_is_simulated(tmp_path):
+    sliding = XML.replace('name="elbow" axis', 'name="elbow" type="slide" axis')
+    toml = TOML.replace('name = "elbow"', 'name = "elbow"\noperated = false')
+    assert build_model(write_arm(tmp_path / "arm", toml, sliding)).nv == 2

@@ -147,6 +147,26 @@ def test_springs_constraints_and_missing_inertia_are_reported(tmp_path, xml, che
     assert any(words in f.message for f in findings if f.check == check and f.level != "ok")
 
 
+def test_joints_that_an_equality_locks_are_an_error(tmp_path):
+    welded = XML.replace("</mujoco>", '<equality><weld body1="fore"/></equality></mujoco>')
+    (text,) = said(check_robot(write_arm(tmp_path / "arm", TOML, welded)), "couplings", "error")
+    assert text.startswith("shoulder, elbow: cannot move")
+
+
+def test_joints_that_an_equality_only_couples_are_no_error(tmp_path):
+    coupled = XML.replace(
+        "</mujoco>", '<equality><joint joint1="shoulder" joint2="elbow"/></equality></mujoco>'
+    )
+    findings = check_robot(write_arm(tmp_path / "arm", TOML, coupled))
+    assert not said(findings, "couplings", "error")
+
+
+def test_an_equality_that_is_not_active_is_not_counted(tmp_path):
+    equality = '<equality><weld body1="fore" active="false"/></equality>'
+    robot = write_arm(tmp_path / "arm", TOML, XML.replace("</mujoco>", f"{equality}</mujoco>"))
+    assert not said(check_robot(robot), "couplings", "note")
+
+
 def test_a_hold_that_swings_or_sags_is_reported(tmp_path):
     swinging = check_robot(write_arm(tmp_path / "free", TOML, LIGHT))
     assert "does not come to rest" in said(swinging, "hold", "error")[0]

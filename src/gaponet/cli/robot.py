@@ -144,6 +144,9 @@ def _show_check(screen: Out, made: RobotCheck) -> None:
         if unit != "rad":
             screen.say(f"{name} is expected as {unit} in SAGE logs")
     mounts = ", ".join(f"{m.side} on {m.body}" for m in robot.payload_mounts) or "none"
+    count = len(robot.payload_mounts)
+    if count > 1:
+        mounts += f" (a payload of 1 kg is 1 kg in each of {count} mounts)"
     contacts = "on" if robot.scene.contacts else "off"
     screen.say(
         f"control period {robot.dt * 1e3:g} ms, physics step {robot.timestep * 1e3:g} ms "

@@ -181,22 +181,22 @@ def _limits(
     model: mujoco.MjModel, j: int, actuators: list[int], file: str
 ) -> Iterator[tuple[float, str]]:
     """Yield the torque limits that the model states for a joint, with sources; of both directions,
-    the smaller.
+    the larger: a motor that pulls one way only has a limit of 0 the other way.
     """
     if model.jnt_actfrclimited[j]:
         yield (
-            float(np.abs(model.jnt_actfrcrange[j]).min()),
+            float(np.abs(model.jnt_actfrcrange[j]).max()),
             f"actuatorfrcrange (in a URDF, effort) in {file}",
         )
     for a in actuators:
         gear = abs(model.actuator_gear[a, 0])
         if model.actuator_forcelimited[a]:
-            yield float(gear * np.abs(model.actuator_forcerange[a]).min()), f"forcerange in {file}"
+            yield float(gear * np.abs(model.actuator_forcerange[a]).max()), f"forcerange in {file}"
         if (
             model.actuator_ctrllimited[a]
             and model.actuator_biastype[a] == mujoco.mjtBias.mjBIAS_NONE
         ):
-            most = np.abs(model.actuator_ctrlrange[a] * model.actuator_gainprm[a, 0]).min()
+            most = np.abs(model.actuator_ctrlrange[a] * model.actuator_gainprm[a, 0]).max()
             yield float(gear * most), f"ctrlrange of its motor in {file}"
 
 

@@ -19,7 +19,14 @@ import numpy as np
 from gaponet.base.errors import RobotError, UsageError
 from gaponet.base.files import whole_folder, write_text
 from gaponet.robot.drives import ON_JOINT, Drive, drives
-from gaponet.robot.freeze import delete_references, freeze
+from gaponet.robot.freeze import (
+    chain,
+    delete_mocap_welds,
+    delete_references,
+    freeze,
+    freeze_free,
+    require_open,
+)
 from gaponet.robot.log_joints import Follower
 from gaponet.robot.mjcf import compile_spec
 from gaponet.robot.self_contained import self_contained_text
@@ -29,6 +36,7 @@ from gaponet.robot.vendor import read_vendor
 
 PICTURE = "picture.png"  # of a robot folder
 HAND_PREFIXES = ("attachment", "tcp", "tool", "flange", "palm", "grip", "hand", "wrist")
+COORDINATES = {mujoco.mjtJoint.mjJNT_FREE: 7, mujoco.mjtJoint.mjJNT_BALL: 4}  # of such a joint
 IMPLICIT_INTEGRATORS = (
     mujoco.mjtIntegrator.mjINT_IMPLICIT,
     mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
@@ -71,7 +79,9 @@ def new_robot(
     motors = [name for name in recorded if name not in followers]
     logged = [name for name in _joint_names(model) if name in (*motors, *followers)]
     joint_drives = drives(model, motors, pose, given, path.name)
-    notes += _notes(spec, model, logged, pose, path)
+    notes += delete_mocap_welds(spec, model)
+    require_open(spec, model, logged, path)
+    notes += _notes(spec, model, logged, pose, source)
     for name, led in followers.items():
         notes.append(f"{name} follows {led.joint}, without a motor")
     _set_passive(spec, joint_drives)
@@ -158,9 +168,14 @@ def _logged_joints(model: mujoco.MjModel, patterns: tuple[str, ...], path: Path)
         named.update(found)
     if patterns:
         return [name for name in hinges if name in named]
-    on_joint = np.isin(model.actuator_trntype, ON_JOINT)
-    actuated = {model.joint(joint).name for joint in model.actuator_trnid[on_joint, 0]}
+    actuated = _actuated_joints(model)
     return [name for name in hinges if name in actuated] or hinges
+
+
+def _actuated_joints(model: mujoco.MjModel) -> set[str]:
+    """Return the names of the joints that an actuator drives."""
+    on_joint = np.isin(model.actuator_trntype, ON_JOINT)
+    return {model.joint(joint).name for joint in model.actuator_trnid[on_joint, 0]}
 
 
 def _followers(
@@ -169,14 +184,16 @@ def _followers(
     """Return the hinges that an equality lets follow a logged hinge in proportion: URDF's mimic
     joints.
 
-    A joint that the user names counts as driven by a motor of its own.
+    A joint that has an actuator, or that the user names, counts as driven by a motor of its own.
     """
     followers = {}
-    for equality in np.flatnonzero(model.eq_type == mujoco.mjtEq.mjEQ_JOINT):
+    motors = {*_actuated_joints(model), *patterns}
+    couples = (model.eq_type == mujoco.mjtEq.mjEQ_JOINT) & model.eq_active0.astype(bool)
+    for equality in np.flatnonzero(couples):
         name = _hinge_name(model, model.eq_obj1id[equality])
         leader = _hinge_name(model, model.eq_obj2id[equality])
         constant, ratio, *curved = model.eq_data[equality, :5].tolist()
-        if not (name and leader) or any(curved) or leader not in logged or name in patterns:
+        if not (name and leader) or any(curved) or leader not in logged or name in motors:
             continue
         zero = _reference(model, name)
         leader_zero = _reference(model, leader)
@@ -231,6 +248,8 @@ def _home(model: mujoco.MjModel, keyframe: str, path: Path) -> tuple[np.ndarray,
         chosen = keys.index(keyframe) if keyframe else 0
         pose = model.key_qpos[chosen].copy()
     for j in np.flatnonzero(model.jnt_limited):
+        if mujoco.mjtJoint(model.jnt_type[j]) in COORDINATES:
+            continue  # its range limits an angle, which is no coordinate
         at = model.jnt_qposadr[j]
         low, high = model.jnt_range[j]
         if not low - 1e-6 <= pose[at] <= high + 1e-6:
@@ -240,11 +259,15 @@ def _home(model: mujoco.MjModel, keyframe: str, path: Path) -> tuple[np.ndarray,
 
 
 def _notes(
-    spec: mujoco.MjSpec, model: mujoco.MjModel, logged: list[str], pose: np.ndarray, path: Path
+    spec: mujoco.MjSpec, model: mujoco.MjModel, logged: list[str], pose: np.ndarray, source: str
 ) -> list[str]:
-    """Describe what is fixed and omitted."""
+    """Describe what is fixed and omitted.
+
+    Args:
+        source: Of the home pose.
+    """
     notes = []
-    fixed = _fixed_joints(model, logged, pose, path)
+    fixed = _fixed_joints(model, logged, pose, source)
     if fixed:
         notes.append(f"frozen: {', '.join(fixed)}")
     notes += _coupled_joints(spec, logged)
@@ -265,17 +288,21 @@ def _notes(
 
 
 def _fixed_joints(
-    model: mujoco.MjModel, logged: list[str], pose: np.ndarray, path: Path
+    model: mujoco.MjModel, logged: list[str], pose: np.ndarray, source: str
 ) -> list[str]:
     """Return the names of the joints that become fixed, and where."""
     units = {mujoco.mjtJoint.mjJNT_HINGE: "rad", mujoco.mjtJoint.mjJNT_SLIDE: "m"}
     fixed = []
-    for name, kind, at in zip(_joint_names(model), model.jnt_type, model.jnt_qposadr, strict=True):
+    for joint in range(model.njnt):
+        name = model.joint(joint).name
         if name in logged:
             continue
-        unit = units.get(mujoco.mjtJoint(kind))
-        where = f"at {pose[at]:.3g} {unit}" if unit else f"where {path.name} has it"
-        fixed.append(f"{name or 'unnamed'} {where}")
+        unit = units.get(mujoco.mjtJoint(model.jnt_type[joint]))
+        where = f"as in {source}"
+        if unit:
+            where = f"at {pose[model.jnt_qposadr[joint]]:.3g} {unit}"
+        body = model.body(model.jnt_bodyid[joint]).name
+        fixed.append(f"{name or body or 'unnamed'} {where}")
     return fixed
 
 
@@ -283,7 +310,7 @@ def _coupled_joints(spec: mujoco.MjSpec, logged: list[str]) -> list[str]:
     """Return a note on each fixed joint that moves with a logged one."""
     notes = []
     for equality in spec.equalities:
-        if equality.type != mujoco.mjtEq.mjEQ_JOINT or not equality.name2:
+        if equality.type != mujoco.mjtEq.mjEQ_JOINT or not equality.name2 or not equality.active:
             continue
         pair = [name for name in (equality.name1, equality.name2) if name in logged]
         if len(pair) != 1:
@@ -308,9 +335,11 @@ def _robot_xml(
     """Return robot.xml: one file without fixed joints and the elements that refer to them."""
     values = dict(zip(_joint_names(model), pose[model.jnt_qposadr], strict=True))
     delete_references(spec, set(values) - set(logged))
-    for joint in list(spec.joints):
-        if joint.type in (mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL):
-            spec.delete(joint)
+    # The specification has the model's order; a list, because a deletion renumbers its joints.
+    for joint, first in zip(list(spec.joints), model.jnt_qposadr, strict=True):
+        if joint.type in COORDINATES:
+            place = slice(first, first + COORDINATES[joint.type])
+            freeze_free(spec, joint, model.qpos0[place], pose[place])
     if spec.option.integrator not in IMPLICIT_INTEGRATORS:
         spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     # explicit inertias, quaternions, no classes
@@ -443,7 +472,8 @@ def _mounts(model: mujoco.MjModel, joints: list[str]) -> list[tuple[str, str, np
             tips.append(body)
     ends = tips
     if len(tips) > 1:
-        ends = _palms(model, [tip for tip in tips if _has_hand(model, tip)])
+        hands = [tip for tip in tips if _has_hand(model, tip)]
+        ends = _palms(model, _without_fingers(model, hands, moved))
     mounts: list[tuple[str, str, np.ndarray, str]] = []
     for end in ends:
         body, pos, why = _mount(model, end, is_tip=end in tips)
@@ -486,6 +516,37 @@ def _has_hand(model: mujoco.MjModel, body: int) -> bool:
     return any(_hand(model.body(other).name) for other in _beyond(model, body))
 
 
+def _without_fingers(model: mujoco.MjModel, ends: list[int], moved: set[int]) -> list[int]:
+    """Replace the fingers of one palm by the palm, whatever sides their names say.
+
+    Args:
+        moved: Bodies that a logged joint moves.
+    """
+    palms = set()
+    for end in ends:
+        palm = end
+        for other in ends:
+            common = max(set(chain(model, end)) & set(chain(model, other)))
+            if common < palm and _is_palm(model, common, [end, other], moved):
+                palm = common
+        palms.add(palm)
+    return sorted(palms)
+
+
+def _is_palm(model: mujoco.MjModel, body: int, ends: list[int], moved: set[int]) -> bool:
+    """Return True if the nearest body that carries some ends is a palm, and no torso.
+
+    A palm is moved by a logged joint, as a torso may be. It is part of a hand by its name or by
+    that of a body before it, or carries ends of one joint each.
+    """
+    before = chain(model, body)
+    if moved.isdisjoint(before):
+        return False
+    if any(_hand(model.body(part).name) for part in before):
+        return True
+    return all(len(moved.intersection(chain(model, end)) - set(before)) == 1 for end in ends)
+
+
 def _palms(model: mujoco.MjModel, ends: list[int]) -> list[int]:
     """Replace the fingers of one side by the body that carries them."""
     sides: dict[str, list[int]] = {}
@@ -493,20 +554,12 @@ def _palms(model: mujoco.MjModel, ends: list[int]) -> list[int]:
         sides.setdefault(_side(model, end), []).append(end)
     palms = []
     for side_ends in sides.values():
-        common = set(_chain(model, side_ends[0]))  # ancestors of all ends of this side
+        common = set(chain(model, side_ends[0]))  # ancestors of all ends of this side
         for end in side_ends[1:]:
-            common.intersection_update(_chain(model, end))
+            common.intersection_update(chain(model, end))
         palm = max(common)
         palms += [palm] if model.body_parentid[palm] else side_ends
     return sorted(palms)
-
-
-def _chain(model: mujoco.MjModel, body: int) -> list[int]:
-    """Return a body and its ancestors up to the world."""
-    chain = [body]
-    while chain[-1]:
-        chain.append(int(model.body_parentid[chain[-1]]))
-    return chain
 
 
 def _beyond(model: mujoco.MjModel, body: int) -> list[int]:

@@ -501,8 +501,8 @@ def _servo_types(toml: RobotTable) -> tuple[ServoType | None, ...]:
 
 
 def _require_known_names(toml: RobotTable) -> None:
-    """Refuse joint names that appear twice, a table without tips, and identified values of joints
-    and mounts that are not there.
+    """Refuse joint names and sides of mounts that appear twice, a table without tips, and
+    identified values of joints and mounts that are not there.
 
     Bodies of identified links are looked for when the MJCF is compiled.
     """
@@ -523,6 +523,11 @@ def _require_known_names(toml: RobotTable) -> None:
         if name not in joints:
             raise RobotError(f"[identified.{name}] names no joint; joints are {', '.join(joints)}")
     sides = [mount.side for mount in toml.payload_mount]
+    for side in sides:
+        if sides.count(side) > 1:
+            raise RobotError(
+                f"two [[payload_mount]] have side = '{side}'; give each a side of its own"
+            )
     for side in toml.identified_mount:
         if side not in sides:
             raise RobotError(

@@ -19,6 +19,7 @@ import numpy as np
 from gaponet.base.errors import RobotError
 from gaponet.base.sandbox import sandboxed
 from gaponet.robot.finding import abbreviate
+from gaponet.robot.freeze import compiler_of
 from gaponet.robot.mjcf import (
     compile_spec,
     inspect_mjcf,
@@ -252,17 +253,49 @@ def _read(path: Path, packages: dict[str, Path]) -> tuple[mujoco.MjSpec, list[st
 def _mjcf(path: Path) -> tuple[mujoco.MjSpec, list[str]]:
     """Return an MJCF as a specification without the meshes that are missing, and notes."""
     spec = read_mjcf(path, tried=True)
-    place = path.parent / spec.meshdir
-    missing = {}
-    for mesh in spec.meshes:
-        if mesh.file and not (place / mesh.file).is_file():
-            missing[mesh.name or Path(mesh.file).stem] = mesh
-    _delete_geoms(spec, missing)
-    for mesh in missing.values():
-        spec.delete(mesh)
-    notes = _left_out(sorted(missing), f"are not in {place}")
+    notes = []
+    if _compile_error(spec):
+        notes += _drop_missing_meshes(spec, path)
     notes += _drop_unreadable_meshes(spec)
     return spec, notes
+
+
+def _compile_error(spec: mujoco.MjSpec) -> str:
+    """Return why a specification does not compile, in one line; "" if it does."""
+    try:
+        spec.copy().compile()
+    except (ValueError, mujoco.FatalError) as error:
+        return " ".join(str(error).split())
+    return ""
+
+
+def _drop_missing_meshes(spec: mujoco.MjSpec, path: Path) -> list[str]:
+    """Delete the meshes of an MJCF whose files are not there; return notes."""
+    folders = [path.parent, *_folders_of_attached_models(path)]
+    missing = {}
+    for mesh in spec.meshes:
+        place = compiler_of(spec, mesh).meshdir
+        files = [folder / place / mesh.file for folder in folders]
+        if mesh.file and not any(file.is_file() for file in files):
+            missing[_mesh_name(mesh)] = mesh
+    notes = _left_out(sorted(missing), f"are not in {path.parent / spec.meshdir}")
+    notes += _delete_geoms(spec, missing)
+    for mesh in missing.values():
+        spec.delete(mesh)
+    return notes
+
+
+def _folders_of_attached_models(path: Path) -> list[Path]:
+    """Return the folders of the models that an MJCF attaches, each of which finds its meshes from
+    there.
+    """
+    files = [tag.get("file", "") for tag in ET.parse(path).getroot().iter("model")]
+    return [(path.parent / file).parent for file in files if file]
+
+
+def _mesh_name(mesh: mujoco.MjsMesh) -> str:
+    """Return the name by which geoms refer to a mesh."""
+    return mesh.name or Path(mesh.file).stem
 
 
 def _urdf(
@@ -427,30 +460,70 @@ def _number(element: ET.Element, name: str) -> float:
 
 
 def _drop_unreadable_meshes(spec: mujoco.MjSpec) -> list[str]:
-    """Delete meshes that MuJoCo cannot read, since links state their own inertias; return notes."""
-    omitted = []
+    """Delete meshes that MuJoCo cannot read; return notes.
+
+    A mesh that gives its body no mass needs no volume, so it counts as a shell. One that does is
+    first tried as its convex hull.
+    """
+    convex = mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX
+    weighed = {geom.meshname for geom in spec.geoms if _gives_mass(spec, geom)}
     for mesh in spec.meshes:
-        mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL  # open ones have no volume
+        if _mesh_name(mesh) not in weighed:
+            mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
+    hulls = []
+    notes = []
     while len(spec.meshes):
-        try:
-            spec.copy().compile()
+        why = _compile_error(spec)
+        bad = _named_mesh(spec, why)
+        if bad is None:
             break
-        except (ValueError, mujoco.FatalError) as error:
-            why = " ".join(str(error).split())
-            bad = _named_mesh(spec, why)
-            if bad is None:
-                break
-            omitted.append(f"mesh left out: {why}")
-            _delete_geoms(spec, [bad.name])
-            spec.delete(bad)
-    return omitted
+        name = _mesh_name(bad)
+        if name in weighed and name not in hulls:
+            bad.inertia = convex
+            hulls.append(name)
+            continue
+        notes.append(f"mesh left out: {why}")
+        notes += _delete_geoms(spec, [name])
+        spec.delete(bad)
+    kept = {_mesh_name(mesh) for mesh in spec.meshes}
+    for name in hulls:
+        if name in kept:
+            notes.append(f"mesh {name} has no volume of its own: its mass is its hull's")
+    return notes
 
 
-def _delete_geoms(spec: mujoco.MjSpec, meshes: Container[str]) -> None:
-    """Delete the geoms of these meshes, by name."""
+def _gives_mass(spec: mujoco.MjSpec, geom: mujoco.MjsGeom) -> bool:
+    """Return True if the mass of a body is, or contains, that of one of its geoms."""
+    compiler = compiler_of(spec, geom)
+    body = geom.parent
+    always = compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
+    if body.name == "world" or (body.explicitinertial and not always):
+        return False
+    first, last = compiler.inertiagrouprange
+    if not first <= geom.group <= last:
+        return False
+    return bool(geom.density > 0 if np.isnan(geom.mass) else geom.mass > 0)
+
+
+def _delete_geoms(spec: mujoco.MjSpec, meshes: Container[str]) -> list[str]:
+    """Delete the geoms of these meshes, by name; return a note on the mass that goes with them."""
+    lost: dict[str, float] = {}  # body → kg, NaN if unknown
     for geom in list(spec.geoms):
-        if geom.meshname in meshes:
-            spec.delete(geom)
+        if geom.meshname not in meshes:
+            continue
+        if _gives_mass(spec, geom):
+            body = geom.parent.name or "unnamed"
+            lost[body] = lost.get(body, 0.0) + geom.mass
+        spec.delete(geom)
+    if not lost:
+        return []
+    texts = []
+    for body, mass in lost.items():
+        texts.append(f"{body} by " + ("an unknown mass" if np.isnan(mass) else f"{mass:g} kg"))
+    return [
+        f"without these meshes bodies are lighter: {abbreviate(texts)}; write <inertial> in the "
+        "model"
+    ]
 
 
 def _named_mesh(spec: mujoco.MjSpec, message: str) -> mujoco.MjsMesh | None:

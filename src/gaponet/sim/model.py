@@ -136,6 +136,14 @@ def build_spec(
             raise RobotError(
                 f"{robot.mjcf}: robot.toml names joint '{name}', the MJCF has: {', '.join(names)}"
             )
+    for name in robot.operated:
+        kind = spec.joint(name).type
+        if kind != mujoco.mjtJoint.mjJNT_HINGE:
+            kind_name = kind.name.removeprefix("mjJNT_").lower()
+            raise RobotError(
+                f"{robot.mjcf}: joint '{name}' is a {kind_name} joint, and gaponet identifies "
+                "hinges only (rad, N·m): write operated = false for it in robot.toml"
+            )
     # few joints, no contacts: islands cost more
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_ISLAND
     period = robot.dt if dt is None else dt

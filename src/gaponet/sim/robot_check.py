@@ -35,6 +35,10 @@ MIN_OSCILLATION_RAD = 0.1
 MAX_POSTURES = 8  # in which small motions are examined
 MIN_ARMATURE = 1e-5  # kg·m²; less is none
 MIN_PENETRATION_M = 1e-4  # of links that collide
+NEAR_HOME_RAD = 0.1  # of the posture in which joints that seem locked at home are tried again
+# Speed of a joint, where the speeds of all joints have length 1, below which equalities lock it. A
+# joint that can move at all has 1e-2 or more, and rounding gives 1e-12.
+MIN_FREEDOM = 1e-5
 
 
 class _Growth(NamedTuple):
@@ -75,6 +79,7 @@ def check_robot(
         *_loads(robot, models),
         *_limits(robot, model),
         *_couplings(robot, model),
+        *_locked(robot, model),
         *_contacts(robot, places, postures is not None),
         *_steps(robot, models, places),
     ]
@@ -160,7 +165,8 @@ def _limits(robot: RobotSpec, model: mujoco.MjModel) -> Iterator[Finding]:
 def _couplings(robot: RobotSpec, model: mujoco.MjModel) -> Iterator[Finding]:
     """Find constraints, springs and other elements of the model that move or hold a joint."""
     names = np.array(robot.joint_names)
-    for count, kind in ((model.neq, "equality"), (model.ntendon, "tendon")):
+    equalities = int(model.eq_active0.sum())
+    for count, kind in ((equalities, "equality"), (model.ntendon, "tendon")):
         if count:
             text = (
                 f"robot.xml has {count} <{kind}> constraint(s): the simulator obeys them; delete "
@@ -205,6 +211,47 @@ def _couplings(robot: RobotSpec, model: mujoco.MjModel) -> Iterator[Finding]:
             "write kd in robot.toml, or damping and frictionloss in robot.xml"
         )
         yield Finding("warning", "damping", text, tuple(free))
+
+
+def _locked(robot: RobotSpec, model: mujoco.MjModel) -> Iterator[Finding]:
+    """Find operated joints that the equalities let not move, whatever the other joints do."""
+    home = robot.qpos_home
+    low, high = robot.qpos_range.T
+    inward = np.where(home + NEAR_HOME_RAD > high, -1.0, 1.0)
+    # of different size for each joint: at home a loop may stand at its dead centre
+    steps = NEAR_HOME_RAD * np.linspace(0.5, 1.0, len(home))
+    near_home = np.clip(home + inward * steps, low, high)
+    freedom = np.maximum(_freedom(model, home), _freedom(model, near_home))
+    operated = robot.operated_index
+    locked = [robot.joint_names[i] for i in operated if freedom[i] < MIN_FREEDOM]
+    if locked:
+        text = (
+            f"{abbreviate(locked)}: cannot move, an <equality> in robot.xml holds it: delete the "
+            "<equality> if it is no part of the robot; gaponet cannot simulate a closed loop whose "
+            "other joints are frozen"
+        )
+        yield Finding("error", "couplings", text, tuple(locked))
+
+
+def _freedom(model: mujoco.MjModel, qpos: Array) -> Array:
+    """Return the largest speed of each joint, (n), that the equalities allow in a posture, where
+    the speeds of all joints have length 1.
+
+    The allowed speeds are the null space of the equalities' Jacobian.
+    """
+    model = copy(model)
+    model.opt.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
+    data = mujoco.MjData(model)
+    data.qpos[:] = qpos
+    mujoco.mj_forward(model, data)
+    of_equality = data.efc_type == mujoco.mjtConstraint.mjCNSTR_EQUALITY
+    jacobian = data.efc_J.reshape(-1, model.nv)[of_equality]  # (rows, n)
+    if not len(jacobian):
+        return np.ones(model.nv)
+    _, sizes, directions = np.linalg.svd(jacobian)
+    rank = int((sizes > MIN_FREEDOM * sizes[0]).sum())
+    freedom: Array = np.linalg.norm(directions[rank:], axis=0)
+    return freedom
 
 
 def _contacts(robot: RobotSpec, postures: Array, logged: bool) -> Iterator[Finding]:
