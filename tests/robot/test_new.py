@@ -118,8 +118,8 @@ def test_gains_and_limits_come_from_actuators_with_their_gears(tmp_path):
     assert joints["shoulder"]["effort_limit"] == 9.0
     assert joints["elbow"]["kp"] == 40.0  # gear 2, twice
     assert joints["elbow"]["kd"] == 2.0
-    # actuatorfrcrange, its larger side, before forcerange times gear, 8
-    assert joints["elbow"]["effort_limit"] == 7.0
+    # actuatorfrcrange, its smaller side, before forcerange times gear, 8
+    assert joints["elbow"]["effort_limit"] == 6.0
     assert joints["roll"]["effort_limit"] == 1.5  # ctrlrange of a motor, times gear
     assert joints["shoulder"]["aliases"] == ["shoulder_servo"]
 

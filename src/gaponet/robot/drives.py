@@ -12,6 +12,7 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
+from gaponet.base.arrays import Array
 from gaponet.base.errors import UsageError
 from gaponet.robot.finding import abbreviate
 from gaponet.robot.servo_fields import PASSIVE_FIELDS
@@ -177,27 +178,33 @@ def _gains(model: mujoco.MjModel, actuators: list[int]) -> tuple[float, float]:
     return round(max(kp, 0.0), 9), round(max(kd, 0.0), 9)
 
 
+def _smaller_side(both: Array) -> float:
+    """Return the smaller size of two ends, (2,), that is not 0; 0 if both are."""
+    sizes = np.abs(both)
+    return float(min(sizes[sizes > 0], default=0.0))
+
+
 def _limits(
     model: mujoco.MjModel, j: int, actuators: list[int], file: str
 ) -> Iterator[tuple[float, str]]:
     """Yield the torque limits that the model states for a joint, with sources; of both directions,
-    the larger: a motor that pulls one way only has a limit of 0 the other way.
+    the smaller that is not 0, since a motor may pull one way only.
     """
     if model.jnt_actfrclimited[j]:
         yield (
-            float(np.abs(model.jnt_actfrcrange[j]).max()),
+            _smaller_side(model.jnt_actfrcrange[j]),
             f"actuatorfrcrange (in a URDF, effort) in {file}",
         )
     for a in actuators:
-        gear = abs(model.actuator_gear[a, 0])
+        gear = abs(float(model.actuator_gear[a, 0]))
         if model.actuator_forcelimited[a]:
-            yield float(gear * np.abs(model.actuator_forcerange[a]).max()), f"forcerange in {file}"
+            yield gear * _smaller_side(model.actuator_forcerange[a]), f"forcerange in {file}"
         if (
             model.actuator_ctrllimited[a]
             and model.actuator_biastype[a] == mujoco.mjtBias.mjBIAS_NONE
         ):
-            most = np.abs(model.actuator_ctrlrange[a] * model.actuator_gainprm[a, 0]).max()
-            yield float(gear * most), f"ctrlrange of its motor in {file}"
+            most = _smaller_side(model.actuator_ctrlrange[a] * model.actuator_gainprm[a, 0])
+            yield gear * most, f"ctrlrange of its motor in {file}"
 
 
 def _by_joint(name: str, words: tuple[str, ...], joints: list[str]) -> dict[str, str]:
