@@ -512,7 +512,7 @@ class GapModel:
     def require_rate(self, dt: float) -> None:
         """Refuse a control period, s, that is not in the training data."""
         rates = self.card.get("dt", [])
-        if rates and min(abs(dt / r - 1) for r in rates) > RATE_TOLERANCE:
+        if rates and not any(is_same_rate(dt, rate) for rate in rates):
             seen = ", ".join(f"{1 / r:.1f}" for r in rates)
             raise ModelError(
                 f"{self.path}: trained at {seen} Hz, the loop has {1 / dt:.1f} Hz; run it at a "
@@ -568,6 +568,11 @@ class GapModel:
                 "untrained network"
             )
         return f"{pretraining}, {updates} updates of PPO" if updates else f"{pretraining}, no PPO"
+
+
+def is_same_rate(dt: float, trained: float) -> bool:
+    """Return true if a control period and one of training, s, count as one rate."""
+    return abs(dt / trained - 1) <= RATE_TOLERANCE
 
 
 def sha256(file: Path) -> str:
