@@ -570,9 +570,9 @@ class GapModel:
         return f"{pretraining}, {updates} updates of PPO" if updates else f"{pretraining}, no PPO"
 
 
-def is_same_rate(dt: float, trained: float) -> bool:
-    """Return true if a control period and one of training, s, count as one rate."""
-    return abs(dt / trained - 1) <= RATE_TOLERANCE
+def is_same_rate(dt: float, other: float) -> bool:
+    """Return true if two control periods, s, count as one rate."""
+    return abs(dt / other - 1) <= RATE_TOLERANCE
 
 
 def sha256(file: Path) -> str:
