@@ -341,12 +341,19 @@ class GapModel:
 
     @property
     def nominal_context(self) -> Array:
-        """Answers of the robot's own simulator to fixed probes, (8n) rad.
+        """Answers of the robot's own simulator to fixed probes at the rate of the first recording,
+        (8n) rad.
 
         (0) if the network is not told them.
         """
         known = self.known_simulators
         return np.zeros(0, np.float32) if known is None else known.nominal
+
+    @property
+    def has_one_rate(self) -> bool:
+        """True if all control periods of training count as one rate."""
+        periods = self.card.get("dt", [])
+        return all(is_same_rate(dt, periods[0]) for dt in periods)
 
     def knows(self, robot: RobotSpec, dt: float) -> bool:
         """Return true if the network was trained for this simulator: in it, or in simulators with
@@ -385,7 +392,8 @@ class GapModel:
 
         Args:
             context: Answers of the simulators to fixed probes, (num_envs, 8n) or (8n) rad, for a
-                network that is told them; default: those of the robot's own simulator.
+                network that is told them; default: those of the robot's own simulator at the rate
+                of the first recording. At another rate, give `context_of(robot, dt)`.
 
         Raises:
             ModelError: The model needs its simulator, which a control loop does not have.
