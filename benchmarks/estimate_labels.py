@@ -233,7 +233,8 @@ def _gains(recordings: list[LabelledRecording]) -> dict[str, tuple[Gains, Gains]
     gains = {}
     for joint, parts in rows.items():
         if len(parts) >= MIN_RECORDINGS:
-            gains[joint] = (servo_gains(parts), servo_gains(parts, 1))
+            one_period = [1] * len(parts)
+            gains[joint] = (servo_gains(parts, one_period), servo_gains(parts, one_period, last=1))
     return gains
 
 

@@ -100,7 +100,7 @@ def play_test_motions(work: Path, sets: Path) -> dict[str, float]:
         for how, given in WAYS.items():
             step = None
             if given is not None:
-                step = {"model": str(work / "run"), **given}
+                step = {"model": str(work / "run"), "fps": FPS, **given}
             out = sets / f"{motion}-{how}"
             record(out, work, motion, 1, LEAD_S + JUDGED_S, step)
             errors[f"{motion} {how}"] = error(out)

@@ -10,7 +10,8 @@ import torch
 from arm import TOML, write_arm
 from lerobot_plugin import plugin as plugin
 
-from gaponet.base.errors import UsageError
+from gaponet.api.files import attach_correction
+from gaponet.base.errors import ModelError, UsageError
 from gaponet.cli.main import main
 from gaponet.robot.folder import save_robot
 
@@ -71,6 +72,23 @@ def test_a_policy_is_corrected_by_what_was_attached_last_and_by_nothing_after_of
     ):
         assert main(["export", str(holder), "--to", "lerobot", *into]) == 2
         assert said in capsys.readouterr().err
+
+
+def test_a_step_that_is_not_told_a_rate_has_lerobots(known, plugin):
+    assert plugin.GaponetCorrect(known=str(known)).corrector.dt == pytest.approx(1 / 30)
+
+
+def test_a_network_of_another_rate_than_lerobots_is_refused_when_loaded(plugin):
+    with pytest.raises(ModelError, match=r"loop has 30\.0 Hz"):
+        plugin.GaponetCorrect(model="so101-sage")
+    plugin.GaponetCorrect(model="so101-sage", fps=50.0)
+
+
+def test_a_network_of_another_rate_than_lerobots_is_refused_when_attached(tmp_path):
+    (tmp_path / "policy_postprocessor.json").write_text(json.dumps(POLICY))
+    with pytest.raises(ModelError, match=r"loop has 30\.0 Hz"):
+        attach_correction(tmp_path, "so101-sage")
+    assert attach_correction(tmp_path, "so101-sage", fps=50.0).config["fps"] == 50.0
 
 
 def test_a_payload_without_a_place_for_it_is_refused_when_attached_and_when_loaded(

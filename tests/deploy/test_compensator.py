@@ -511,3 +511,15 @@ def test_servos_with_other_gains_than_the_data_are_refused_without_extrapolate(r
     with pytest.raises(ModelError, match="elbow"):
         Compensator(robot, model).require_gains(joints, np.array([20.0, 10.0]), kd)
     Compensator(robot, model, extrapolate=True).require_gains(joints, np.array([20.0, 10.0]), kd)
+
+
+def test_without_dt_the_period_is_the_only_one_of_the_models_training(robot):
+    quick = GapModel(Path("exact"), make_card(CONFIG, robot, dt=[0.01]), CONFIG, Operator(1.0))
+    assert Compensator(robot, quick).shadow.sim.periods.seconds.tolist() == [0.01]
+
+
+def test_without_dt_the_period_is_the_robots_where_the_model_takes_it(robot):
+    measured = GapModel(
+        Path("exact"), make_card(CONFIG, robot, dt=[0.02006]), CONFIG, Operator(1.0)
+    )
+    assert Compensator(robot, measured).shadow.sim.periods.seconds.tolist() == [robot.dt]

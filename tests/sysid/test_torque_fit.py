@@ -114,6 +114,21 @@ def test_measurement_noise_does_not_lower_the_estimated_gains(arm):
         assert kd == pytest.approx(1.0, rel=0.1)
 
 
+@pytest.mark.parametrize("rates", [[200] * 4, [500] * 4, [50, 500, 50, 500]])
+def test_gains_of_a_servo_that_is_20_ms_late_are_found_at_every_rate(arm, rates):
+    made = []
+    for number, rate in enumerate(rates):
+        dt = 1 / rate
+        ctrl = wave(6 * rate, 2, dt=dt, hertz=0.5 + 0.1 * number)
+        qpos = late(ctrl, round(0.06 * rate))
+        qvel = np.gradient(qpos, dt, axis=0)
+        tau = 80.0 * (late(ctrl, round(0.02 * rate)) - qpos) - 3.0 * qvel
+        s = arm_sequence(arm, ctrl, qpos, f"m{number}", qvel=qvel, tau=tau)
+        made.append(replace(s, dt=dt))
+    for gains in TorqueFit(made, arm).gains().values():
+        assert gains.kp == pytest.approx(80.0, rel=0.03)
+
+
 def loaded(robot):
     """Six motions with three payloads each, of an arm with softer servos, a hand, and a payload
     hung elsewhere.

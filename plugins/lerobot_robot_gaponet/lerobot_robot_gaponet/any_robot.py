@@ -10,7 +10,7 @@ from lerobot.robots import Robot, RobotConfig, make_robot_from_config
 from lerobot.utils.errors import DeviceNotConnectedError
 
 from .correct import Corrector
-from .units import JointUnit, Units, set_observation
+from .units import DEFAULT_RATE, JointUnit, Units, set_observation
 
 POSITION = ".pos"  # end of LeRobot's name of a joint's position and position target
 
@@ -36,7 +36,7 @@ class GaponetRobotConfig(RobotConfig):
     follow: bool = False
     payload_mass: float = 0.0  # kg in each hand
     dynamics: bool = False  # feed forward accelerations: only for planned, smooth targets
-    fps: float | None = None  # control rate, Hz, equal to LeRobot's; default that of known or model
+    fps: float = DEFAULT_RATE  # control rate, Hz, equal to LeRobot's
     # deg, rad, or signed_percent: -100..100 over the joint's range, as robots without use_degrees
     # have it.
     unit: JointUnit = "deg"

@@ -11,7 +11,7 @@ from lerobot.processor import ProcessorStep, ProcessorStepRegistry
 
 from gaponet.robot.spec import RobotSpec, load_robot
 
-from .units import Units
+from .units import DEFAULT_RATE, Units
 
 MEMORY_PERIODS = 50  # control periods after which a correction no longer depends on its start
 
@@ -44,7 +44,7 @@ class Corrector:
         payload_mass: float = 0.0,
         dynamics: bool = False,
         follow: bool = False,
-        fps: float | None = None,
+        fps: float = DEFAULT_RATE,
     ) -> "Corrector":
         """Make the corrector of an identified robot or of a trained network.
 
@@ -54,11 +54,12 @@ class Corrector:
             payload_mass: In each hand, kg.
             dynamics: Feed forward accelerations: only for planned, smooth targets.
             follow: Move as the nominal simulator of `known` does.
-            fps: Control rate, Hz; default that of the model or of robot.toml.
+            fps: Control rate of LeRobot's loop, Hz.
 
         Raises:
             ValueError: Not one of known and model was given, or a model with follow.
-            UsageError, ModelError: The robot or the model cannot carry the payload.
+            UsageError, ModelError: The robot or the model cannot carry the payload, or the model
+                was trained at another rate.
         """
         from gaponet.deploy.compensator import Compensator, CompensatorConfig
         from gaponet.nn.artifact import GapModel
@@ -72,9 +73,7 @@ class Corrector:
         network = GapModel.load(model) if model else None
         place = Path(known) if Path(known).is_dir() else known
         spec = load_robot(place) if network is None else network.simulator()
-        dt = spec.dt if network is None else network.card["dt"][0]
-        if fps is not None:
-            dt = 1 / fps
+        dt = 1 / fps
         config = CompensatorConfig(dynamics=dynamics)
         compensator = Compensator(
             spec, network, config=config, dt=dt, follow="nominal" if follow else None
@@ -132,7 +131,7 @@ class GaponetCorrect(ProcessorStep):
     # a policy with a high gain may not bear (docs/deploy.md): gaponet_so101 gives it the nominal
     # simulator's instead.
     follow: bool = False
-    fps: float | None = None  # control rate, Hz, equal to LeRobot's; default that of known or model
+    fps: float = DEFAULT_RATE  # control rate, Hz, equal to LeRobot's
 
     def __post_init__(self) -> None:
         self.corrector = Corrector.load(

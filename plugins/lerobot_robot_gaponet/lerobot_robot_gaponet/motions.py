@@ -10,9 +10,7 @@ from lerobot.utils.errors import DeviceNotConnectedError
 
 from gaponet.robot.spec import load_robot
 
-from .units import JointUnit, Units, last_observation
-
-DEFAULT_RATE = 30.0  # Hz: LeRobot's own
+from .units import DEFAULT_RATE, JointUnit, Units, last_observation
 
 
 @TeleoperatorConfig.register_subclass("gaponet_motion")

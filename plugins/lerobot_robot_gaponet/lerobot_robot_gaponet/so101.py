@@ -22,9 +22,8 @@ from lerobot.utils.errors import DeviceNotConnectedError
 from gaponet.base import child_process
 from gaponet.robot.spec import load_robot
 
-from .units import Units, set_observation
+from .units import DEFAULT_RATE, Units, set_observation
 
-DEFAULT_RATE = 30.0  # Hz: LeRobot's own
 FOLLOWERS = ("so_follower", "so101_follower")  # LeRobot's names of its own robot, newest first
 MAX_START_S = 180.0  # until the first state
 MAX_RETURN_S = 60.0  # until the arm is back at its first position

@@ -10,6 +10,7 @@ from gaponet.robot.spec import RobotSpec
 # Degrees, rad, or -100..100 over the joint's range, as LeRobot's robots have it without
 # use_degrees.
 JointUnit = Literal["deg", "rad", "signed_percent"]
+DEFAULT_RATE = 30.0  # Hz: of LeRobot's own loops
 
 
 class Units:

@@ -267,7 +267,7 @@ def attach_correction(
     *,
     payload_mass: float = 0.0,
     dynamics: bool = False,
-    fps: float | None = None,
+    fps: float = LEROBOT_FPS,
 ) -> AttachResult:
     """Put the correction of a robot or a run behind a LeRobot policy, in place of an earlier one.
 
@@ -276,14 +276,14 @@ def attach_correction(
         holder: Robot folder, run folder or name of the package; None removes the correction.
         payload_mass: Payload in each hand, kg.
         dynamics: Feed forward inertia and damping too, for smooth targets.
-        fps: Control rate of the policy, Hz. Default: 30, as of LeRobot, for a robot, and the rate
-            of training for a network.
+        fps: Control rate of the policy, Hz.
 
     Raises:
         UsageError, ModelError: The rate is not one of a robot; the folder holds no LeRobot policy,
-            or no robot and no run; or robot or network cannot carry the payload.
+            or no robot and no run; robot or network cannot carry the payload; or the network was
+            trained at another rate.
     """
-    if fps is not None and not 1 <= fps <= 1000:
+    if not 1 <= fps <= 1000:
         raise UsageError(f"fps is {fps:g}; give the control rate of the policy in Hz, 1 to 1000")
     file = Path(policy) / POLICY_FILE
     if not file.is_file():
@@ -300,27 +300,25 @@ def attach_correction(
     if holder is not None:
         folder = named_folder(holder)
         kind, name = _correction_of(folder)
-        _require_payload(kind, folder, payload_mass)
-        config = {kind: name, "payload_mass": payload_mass, "dynamics": dynamics}
-        if kind == "known" and fps is None:
-            fps = LEROBOT_FPS
-        if fps is not None:
-            config["fps"] = fps
+        _require_startable(kind, folder, payload_mass, 1 / fps)
+        config = {kind: name, "payload_mass": payload_mass, "dynamics": dynamics, "fps": fps}
         steps.append({"registry_name": POLICY_STEP, "config": config})
     write_text(file, json.dumps(document | {"steps": steps}, indent=2) + "\n")
     names = [step.get("registry_name", step.get("class", "?")) for step in steps]
     return AttachResult(file=file, steps=names, config=config)
 
 
-def _require_payload(kind: str, holder: Path, payload_mass: float) -> None:
-    """Refuse a payload, kg, with which the step would refuse to start."""
+def _require_startable(kind: str, holder: Path, payload_mass: float, dt: float) -> None:
+    """Refuse a payload, kg, or a control period, s, with which the step would refuse to start."""
     from gaponet.deploy.compensator import Compensator
     from gaponet.nn.artifact import GapModel
 
     if kind == "model":
-        GapModel.load(holder).require_payload(payload_mass, can_extrapolate=False)
+        model = GapModel.load(holder)
+        model.require_payload(payload_mass, can_extrapolate=False)
+        model.require_rate(dt)
     else:
-        Compensator(load_robot(holder)).require_payload(payload_mass)
+        Compensator(load_robot(holder), dt=dt).require_payload(payload_mass)
 
 
 def _correction_of(holder: Path) -> tuple[str, str]:

@@ -12,6 +12,7 @@ import tyro
 
 from gaponet import api
 from gaponet.api.files import (
+    LEROBOT_FPS,
     LEROBOT_TARGET,
     RANDOMIZATION_FILE,
     RANDOMIZATION_TARGET,
@@ -101,9 +102,8 @@ class ExportArgs:
     """For lerobot: feed forward inertia and damping too; use it for smooth targets only."""
     remove: Flag = False
     """For lerobot: remove the correction."""
-    fps: float | None = None
-    """For lerobot: control rate of the policy, Hz. Default: 30 for a robot, and for a network the
-    rate of its training."""
+    fps: float = LEROBOT_FPS
+    """For lerobot: control rate of the policy, Hz. The default is LeRobot's."""
 
     def require_used(self) -> None:
         """Refuse options that the target does not use.

@@ -69,6 +69,7 @@ def train(
             progress=update,
         )
     _show_candidates(screen, trained)
+    _warn_of_rate(screen, trained, config)
     _show_trained(screen, trained, dataset, out)
     screen.result(trained.to_dict())
 
@@ -113,6 +114,21 @@ def _show_trained(screen: Out, trained: TrainResult, dataset: Path, out: Path) -
     screen.findings(trained.doctor.findings)
     screen.say(f"{kind} in {trained.model.path}")
     screen.next(step)
+
+
+def _warn_of_rate(screen: Out, trained: TrainResult, config: TrainConfig) -> None:
+    """Name the options that count control periods and are short at the rate of the recordings."""
+    if trained.kind == "trees":  # they have no history and no PPO
+        return
+    dt = min(trained.card["dt"])
+    short = config.short_options(dt)
+    if short:
+        screen.say(
+            f": the recordings have {1 / dt:.4g} Hz, and defaults that count control periods are "
+            f"made for 50 Hz: scale {' and '.join(short)}",
+            "warning",
+            "yellow",
+        )
 
 
 @like(api.evaluate)

@@ -44,7 +44,7 @@ from gaponet.deploy.payload import Carrier, Payload, PayloadFields
 from gaponet.deploy.payload_estimate import PayloadEstimate
 from gaponet.deploy.shadow import Shadow
 from gaponet.nn.adaptation import Adaptation
-from gaponet.nn.artifact import GAIN_TOLERANCE, GapModel
+from gaponet.nn.artifact import GAIN_TOLERANCE, GapModel, is_same_rate
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.batch import Condition
 from gaponet.sim.model import idle_joints
@@ -136,7 +136,9 @@ class Compensator:
                 target, the simulator of training replaces another one. With aim simulator, another
                 one is refused.
             model: The trained model; None for the feed-forward of the robot alone.
-            dt: Control period, s. Default: the robot's.
+            dt: Control period of your loop, s. Default: the robot's, or the only period of the
+                model's training if the model refuses the robot's. Commands are wrong in a loop with
+                another period.
             num_envs: Number of robots; None for one, with arrays (n,).
             payload_side: The hands that carry the payload: "both", or the side of one mount.
             payload_step: Distance between the masses that the shadow can carry, kg.
@@ -153,7 +155,8 @@ class Compensator:
                 robot is too different from the nominal one to follow it, without `extrapolate`.
             UsageError: `follow` with a model, or with a robot that is not identified.
         """
-        dt = robot.dt if dt is None else dt
+        if dt is None:
+            dt = _default_period(robot, model)
         if follow is not None and model is not None:
             raise UsageError(
                 "compensator: follow takes no model. A model of the nominal simulator follows it "
@@ -466,6 +469,14 @@ class JointRows:
     def back(self, rows: Array) -> Array:
         """Return (num_envs, n) as the arrays that are given, (n,) for a single robot."""
         return rows.reshape(self._shape)
+
+
+def _default_period(robot: RobotSpec, model: GapModel | None) -> float:
+    """Return the control period of a loop that does not state it, s."""
+    trained = [] if model is None else model.card.get("dt", [])
+    if len(trained) == 1 and not is_same_rate(robot.dt, trained[0]):
+        return float(trained[0])
+    return robot.dt
 
 
 def _feedforward(

@@ -282,14 +282,26 @@ def own_context(model: GapModel, robot: RobotSpec, conditions: list[Condition]) 
     """Return the context of a network in its simulator, (conditions, 8n) rad.
 
     None for most networks: the context that is stored with them holds for every payload. A network
-    that is not told the payload reads it from the simulator's answers with the payload in hand.
+    that is not told the payload reads it from the simulator's answers with the payload in hand. The
+    answers depend on the control period too, so those of training at several rates are measured at
+    the period at which the network runs.
 
     Args:
         robot: Simulator of training.
+        conditions: With the control period of the loop.
+
+    Raises:
+        ModelError: The control period does not fit the model.
     """
-    if not model.config.context_is_loaded:
+    if not model.config.context:
         return None
-    return model.contexts_of(robot, conditions)
+    if model.has_one_rate and not model.config.context_is_loaded:
+        return None
+    running = []
+    for condition in conditions:
+        periods = control_periods_of(model, condition.dt)
+        running.append(condition._replace(dt=periods * condition.dt))
+    return model.contexts_of(robot, running)
 
 
 def control_periods_of(model: GapModel, dt: float) -> int:

@@ -22,7 +22,8 @@ from gaponet.base.files import atomic_write
 from gaponet.deploy.transfer import own_context
 from gaponet.export.onnx_to_torch import OnnxModule
 from gaponet.export.shipped.gaponet_action import PROGRAM, Past
-from gaponet.nn.artifact import WEIGHTS, GapModel
+from gaponet.export.simulator_facts import control_period
+from gaponet.nn.artifact import WEIGHTS, GapModel, is_same_rate
 from gaponet.nn.onnx_export import MAX_DIFFERENCE_RAD, trained_network
 from gaponet.nn.packaged_networks import is_packaged_network
 from gaponet.sim.batch import Condition
@@ -116,11 +117,15 @@ class DeltaStep(nn.Module):
 
 
 def _context(model: GapModel, payload_mass: float) -> np.ndarray:
-    """Return the answers of the robot's simulator, (8n) rad, with a payload in each hand, kg."""
+    """Return the answers of the robot's simulator, (8n) rad, with a payload in each hand, kg, at
+    the control period of the export.
+    """
     robot = model.simulator()
-    dt = (model.card.get("dt") or [robot.dt])[0]
-    loaded = own_context(model, robot, [Condition(payload_mass, "both", dt)])
-    return np.asarray(model.nominal_context if loaded is None else loaded[0], np.float32)
+    trained = model.card.get("dt") or [robot.dt]
+    exported = control_period(robot, trained)
+    near = [period for period in trained if is_same_rate(period, exported)]
+    measured = own_context(model, robot, [Condition(payload_mass, "both", near[0])])
+    return np.asarray(model.nominal_context if measured is None else measured[0], np.float32)
 
 
 def delta_step(model: GapModel, run: Path, payload_mass: float = 0.0) -> DeltaStep:

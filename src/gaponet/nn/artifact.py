@@ -341,12 +341,19 @@ class GapModel:
 
     @property
     def nominal_context(self) -> Array:
-        """Answers of the robot's own simulator to fixed probes, (8n) rad.
+        """Answers of the robot's own simulator to fixed probes at the rate of the first recording,
+        (8n) rad.
 
         (0) if the network is not told them.
         """
         known = self.known_simulators
         return np.zeros(0, np.float32) if known is None else known.nominal
+
+    @property
+    def has_one_rate(self) -> bool:
+        """True if all control periods of training count as one rate."""
+        periods = self.card.get("dt", [])
+        return all(is_same_rate(dt, periods[0]) for dt in periods)
 
     def knows(self, robot: RobotSpec, dt: float) -> bool:
         """Return true if the network was trained for this simulator: in it, or in simulators with
@@ -385,7 +392,8 @@ class GapModel:
 
         Args:
             context: Answers of the simulators to fixed probes, (num_envs, 8n) or (8n) rad, for a
-                network that is told them; default: those of the robot's own simulator.
+                network that is told them; default: those of the robot's own simulator at the rate
+                of the first recording. At another rate, give `context_of(robot, dt)`.
 
         Raises:
             ModelError: The model needs its simulator, which a control loop does not have.
@@ -512,7 +520,7 @@ class GapModel:
     def require_rate(self, dt: float) -> None:
         """Refuse a control period, s, that is not in the training data."""
         rates = self.card.get("dt", [])
-        if rates and min(abs(dt / r - 1) for r in rates) > RATE_TOLERANCE:
+        if rates and not any(is_same_rate(dt, rate) for rate in rates):
             seen = ", ".join(f"{1 / r:.1f}" for r in rates)
             raise ModelError(
                 f"{self.path}: trained at {seen} Hz, the loop has {1 / dt:.1f} Hz; run it at a "
@@ -568,6 +576,11 @@ class GapModel:
                 "untrained network"
             )
         return f"{pretraining}, {updates} updates of PPO" if updates else f"{pretraining}, no PPO"
+
+
+def is_same_rate(dt: float, other: float) -> bool:
+    """Return true if two control periods, s, count as one rate."""
+    return abs(dt / other - 1) <= RATE_TOLERANCE
 
 
 def sha256(file: Path) -> str:

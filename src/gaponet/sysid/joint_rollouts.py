@@ -14,6 +14,7 @@ import copy
 import os
 from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -22,6 +23,7 @@ from scipy.optimize import nnls
 from gaponet.base.arrays import Array
 from gaponet.data.sequence import Sequence
 from gaponet.data.signals import differentiate, lowpass
+from gaponet.data.split import RATE_TOLERANCE
 from gaponet.robot.servo_parameters import ratio_to
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.commands import speed_limited
@@ -42,6 +44,14 @@ SLIP_SPEED = 0.02  # rad/s, of the regression: at which friction is whole
 CUTOFF_HZ = 10.0  # of the other joints' accelerations: above the arms' bandwidth
 GRAVITY_STEP_RAD = 0.02  # of the derivative of gravity's torque
 GRAVITY_ROWS = 5  # rows that share one derivative
+
+
+class RowSpacing(NamedTuple):
+    """Windows whose compared rows are equally far apart."""
+
+    windows: Array  # which of all, (windows,)
+    period: float  # control period, s
+    stride: int  # periods from one compared row to the next
 
 
 class JointRollouts:
@@ -96,6 +106,34 @@ class JointRollouts:
     def rows(self) -> Array:
         """Number of rows that count, of each joint, (n,)."""
         return np.asarray((self.counted & self.recorded[..., None]).sum(axis=(1, 2)))
+
+    @property
+    def spacings(self) -> list[RowSpacing]:
+        """Windows by the spacing of their compared rows; nearly equal periods are the longest."""
+        periods = self.windows.periods
+        longest = self.dt
+        nearly_longest = periods * (1 + RATE_TOLERANCE) > longest
+        spacing = np.stack(
+            [
+                np.where(nearly_longest, longest, periods),
+                _compared_rows(periods, self.windows.thin),
+            ]
+        )
+        spacings = []
+        for period, stride in np.unique(spacing, axis=1).T:
+            same = (spacing[0] == period) & (spacing[1] == stride)
+            spacings.append(RowSpacing(same, float(period), int(stride)))
+        return spacings
+
+    @property
+    def seconds(self) -> Array:
+        """Duration of the rows that count, of each joint, (n,) s."""
+        rows = (self.counted & self.recorded[..., None]).sum(axis=2)  # (n, windows)
+        seconds = np.zeros(len(rows))
+        for spacing in self.spacings:
+            own = rows[:, spacing.windows].sum(axis=1)
+            seconds += own * spacing.period * spacing.stride
+        return seconds
 
     def shortened(self, seconds: float) -> JointRollouts:
         """Return the same windows, put back on the recording every `seconds`: a smoother surface

@@ -53,6 +53,7 @@ MIN_RESIDUAL_RAD = 1e-5
 MIN_CORRELATION_TIME_S = 1.0
 FIRST_CORRELATION_TIME_S = 4.0  # before it is estimated
 MIN_CORRELATION = 0.05  # of an error with itself later; less counts as none
+MIN_SQUARED_ERROR = 1e-30  # rad², so that it can be divided by
 # Field → standard deviation of its logarithm around the robot file's value; damping counts with kd.
 PRIOR_LOG_STD = {"kp": 0.5, "armature": 1.5, "damping": 1.0}
 PRIORS = len(PRIOR_LOG_STD)
@@ -73,10 +74,11 @@ class _GainPrior:
         correlation_time: Duration of a recording that counts as one measurement, (n,) s.
     """
 
-    def __init__(self, bounds: Bounds, row_period: float) -> None:
+    def __init__(self, bounds: Bounds, row_period: float | Array) -> None:
+        """Take the time between rows that count, s; also by joint, (n,)."""
         self.residual = np.full(bounds.n, FIRST_RESIDUAL_RAD)
         self.correlation_time = np.full(bounds.n, FIRST_CORRELATION_TIME_S)
-        self._row_period = max(row_period, MIN_ROW_PERIOD_S)
+        self._row_period = row_period
         self.log_std: dict[str, float | Array] = dict(PRIOR_LOG_STD)
         if bounds.stated:
             self.log_std["kp"] = STATED_KP_LOG_STD
@@ -126,17 +128,44 @@ class _GainPrior:
         """Estimate the correlation time from the errors of values (n,).
 
         It is the integral of the autocorrelation over lags of both signs, up to the first lag at
-        which less than MIN_CORRELATION is left. The autocorrelation is the transform of the power
-        spectrum; zeros as long as the window keep its ends apart.
+        which less than MIN_CORRELATION is left. Of windows at several rates, it is the mean,
+        weighted by the integral of their squared errors, as windows of one rate are weighted too.
         """
         errors = rollouts.errors(one_candidate(values))[0]  # (n, windows, rows)
-        rows = errors.shape[-1]
-        power = (np.abs(np.fft.rfft(errors, 2 * rows)) ** 2).sum(axis=1)
-        correlation = np.fft.irfft(power)[:, :rows]  # (n, rows), by lag
-        correlation /= np.maximum(correlation[:, :1], 1e-30)
-        correlation *= np.cumprod(correlation > MIN_CORRELATION, axis=1)
-        seconds = rollouts.dt * rollouts.windows.thin * (2 * correlation.sum(axis=1) - 1)
+        times = []  # of the windows of each spacing, (n,) s
+        weights = []
+        for windows, period, stride in rollouts.spacings:
+            own = np.ascontiguousarray(errors[:, windows, :: stride // rollouts.windows.thin])
+            correlation = _autocorrelation(own)
+            square = correlation[:, 0]
+            correlation = correlation / np.maximum(correlation[:, :1], MIN_SQUARED_ERROR)
+            correlation *= np.cumprod(correlation > MIN_CORRELATION, axis=1)
+            times.append(period * stride * (2 * correlation.sum(axis=1) - 1))
+            weights.append(square * period * stride)
+        share = np.array(weights) / np.maximum(np.sum(weights, axis=0), MIN_SQUARED_ERROR)
+        seconds = (share * np.array(times)).sum(axis=0)
         self.correlation_time = np.maximum(seconds, MIN_CORRELATION_TIME_S)
+
+
+def _row_period(rollouts: JointRollouts) -> float | Array:
+    """Return the mean time between rows that count, s; by joint, (n,), if windows have several
+    rates.
+    """
+    if len(rollouts.spacings) == 1:
+        return max(rollouts.dt, MIN_ROW_PERIOD_S)
+    mean = rollouts.seconds / np.maximum(rollouts.rows, 1)
+    return np.asarray(np.maximum(mean, MIN_ROW_PERIOD_S))
+
+
+def _autocorrelation(errors: Array) -> Array:
+    """Return the sum over windows of the autocorrelation of errors (n, windows, rows), by lag,
+    (n, rows).
+
+    It is the transform of the power spectrum; zeros as long as the window keep its ends apart.
+    """
+    rows = errors.shape[-1]
+    power = (np.abs(np.fft.rfft(errors, 2 * rows)) ** 2).sum(axis=1)
+    return np.asarray(np.fft.irfft(power)[:, :rows])
 
 
 @dataclass
@@ -175,7 +204,8 @@ class JointFit(FitProblem):
         bounds: Bounds,
     ) -> None:
         step = rollouts.dt / rollouts.windows.steps
-        super().__init__(rollouts, robot, bounds, _GainPrior(bounds, rollouts.dt), step)
+        prior = _GainPrior(bounds, _row_period(rollouts))
+        super().__init__(rollouts, robot, bounds, prior, step)
 
     def regressed(self) -> list[Values]:
         """Return two starts that balance the recorded accelerations: with the kp of the balance,

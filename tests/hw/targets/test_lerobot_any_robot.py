@@ -44,7 +44,7 @@ def wrap(plugin, own, soft, tmp_path):
 
     def wrap(**options):
         inner = own.TwoJointsConfig(simulated=gp.AlignedSim(soft), calibration_dir=tmp_path)
-        given = {"known": str(tmp_path / "soft"), "joints": own.JOINTS} | options
+        given = {"known": str(tmp_path / "soft"), "joints": own.JOINTS, "fps": 50.0} | options
         config = plugin.GaponetRobotConfig(robot=inner, calibration_dir=tmp_path, **given)
         robot = plugin.GaponetRobot(config)
         robot.connect()

@@ -2,6 +2,7 @@
 
 import shlex
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 
@@ -65,6 +66,45 @@ def test_the_options_of_a_configuration_give_it_back(monkeypatch, config):
     )
     assert main(words) == 2
     assert heard == [config]
+
+
+@pytest.mark.parametrize("rate", [25.0, 49.85, 50.0, 100.2])
+def test_no_option_is_short_near_the_rate_that_the_defaults_are_made_for(rate):
+    assert TrainConfig().short_options(1 / rate) == []
+
+
+def test_options_that_count_periods_are_short_at_200_hz_until_they_are_scaled():
+    scaled = TrainConfig(ModelConfig(stride=4), ppo=PPOConfig(gamma=0.99))
+    assert TrainConfig().short_options(1 / 200) == ["--model.history", "--ppo.gamma"]
+    assert scaled.short_options(1 / 200) == []
+
+
+def trained_at(rate, kind="gaponet"):
+    """What gaponet train prints of a network that was trained at a rate, Hz."""
+    errors = {"nominal": 0.02, "start": 0.01, "model": 0.005}
+    card = {"dt": [1 / rate], "interrupted": False, "steps": 100, "seconds": 1.0}
+    return SimpleNamespace(
+        candidates={},
+        val_mpjae=errors,
+        card=card,
+        kind=kind,
+        how_trained="",
+        gain=SimpleNamespace(text="half", helps=True),
+        doctor=SimpleNamespace(findings=()),
+        model=SimpleNamespace(path="run"),
+        to_dict=dict,
+    )
+
+
+@pytest.mark.parametrize(
+    ("rate", "kind", "warned"), [(200, "gaponet", True), (200, "trees", False), (50, "mlp", False)]
+)
+def test_training_names_the_options_to_scale_at_a_high_rate(
+    monkeypatch, capsys, rate, kind, warned
+):
+    monkeypatch.setattr(api, "train", lambda dataset, **_: trained_at(rate, kind))
+    assert main(["train", "data", "--out", "run"]) == 0
+    assert ("--ppo.gamma" in capsys.readouterr().out) == warned
 
 
 @pytest.mark.parametrize(

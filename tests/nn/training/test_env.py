@@ -24,7 +24,7 @@ def robot(tmp_path):
 
 
 def make(robot, sequences, num_envs=8, steps=1000, **reward):
-    options = EnvOptions(num_envs, steps, RewardConfig(**reward), seed=0, nthread=1)
+    options = EnvOptions(num_envs, steps * robot.dt, RewardConfig(**reward), seed=0, nthread=1)
     return DeltaEnv(sequences, robot, ModelConfig(history=2), options)
 
 
@@ -41,6 +41,21 @@ def test_without_correction_the_environment_is_the_replay(robot):
     for i in range(env.num_envs):
         simulated = replays[int(np.flatnonzero(env.rows.first == first[i])[0])]
         np.testing.assert_array_equal(env.sim.qpos[i].astype(np.float32), simulated.qpos[59])
+
+
+def test_an_episode_lasts_as_many_seconds_at_every_rate(robot):
+    at_50_hz, also_at_50_hz = recordings(robot, 2, rows=150)
+    at_100_hz = replace(also_at_50_hz, dt=0.01)
+    env = make(robot, [at_50_hz, at_100_hz], steps=20)
+    first = env.playback.first.copy()
+    env.playback.start(slice(None), first, first, env.playback.last.copy())
+    ends = np.zeros(env.num_envs)  # control periods, (num_envs,)
+    for period in range(1, 60):
+        _, done = env.step(np.zeros((env.num_envs, 2), np.float32))
+        ends[done & (ends == 0)] = period
+    dt = np.array([condition.dt for condition in env.groups.conditions_of_envs])
+    assert set(dt) == {0.02, 0.01}
+    np.testing.assert_allclose(ends * dt, 0.4)
 
 
 def test_the_reward_of_a_joint_compares_it_one_row_on(robot):

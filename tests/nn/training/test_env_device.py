@@ -29,7 +29,7 @@ CASTS = ("array", "bool", "float", "int", "index")
 def make(folder, device, servo=None, **model):
     robot = write_arm(folder).with_servo(**servo or {})
     sequences = recordings(robot, 4, rows=60, kp=0.6)
-    options = EnvOptions(num_envs=8, episode_steps=90, nthread=1, device=device)
+    options = EnvOptions(num_envs=8, episode_s=1.8, nthread=1, device=device)
     return DeltaEnv(sequences, robot, ModelConfig(**model), options)
 
 

@@ -33,7 +33,7 @@ SETTINGS = PPOConfig(
 @pytest.fixture
 def env(tmp_path):
     robot = write_arm(tmp_path)
-    options = EnvOptions(num_envs=16, episode_steps=100, nthread=1)
+    options = EnvOptions(num_envs=16, episode_s=2.0, nthread=1)
     return DeltaEnv(recordings(robot, 4, kp=0.5), robot, MODEL, options)
 
 

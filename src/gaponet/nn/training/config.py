@@ -23,6 +23,10 @@ if TYPE_CHECKING:
 MAX_BUDGET = 1e12  # control steps, or any unit of time
 MIN_STEPS = 100  # with fewer, the unit of time is probably missing
 SECONDS = {"s": 1.0, "m": 60.0, "h": 3600.0}  # per unit
+DEFAULTS_PERIOD_S = 0.02  # control period for which the options that count periods were chosen
+# Of the time that the defaults cover at this period, from which on an option is too short: half,
+# and a measured 100 Hz is a little more.
+MIN_TIME_SHARE = 0.49
 
 
 @dataclass(frozen=True)
@@ -248,6 +252,22 @@ class TrainConfig:
         pretraining = replace(config.pretraining, num_envs=config.pretraining.num_envs or num)
         ppo = replace(config.ppo, num_envs=config.ppo.num_envs or num)
         return replace(config, pretraining=pretraining, ppo=ppo)
+
+    def short_options(self, dt: float) -> list[str]:
+        """Return the options that count control periods and cover too little time at a period dt,
+        s.
+        """
+        default = TrainConfig()
+        periods = self.model.history * self.model.stride
+        default_periods = default.model.history * default.model.stride
+        horizon = 1 / (1 - self.ppo.gamma)  # periods
+        default_horizon = 1 / (1 - default.ppo.gamma)
+        short = []
+        if periods * dt < MIN_TIME_SHARE * default_periods * DEFAULTS_PERIOD_S:
+            short.append("--model.history")
+        if horizon * dt < MIN_TIME_SHARE * default_horizon * DEFAULTS_PERIOD_S:
+            short.append("--ppo.gamma")
+        return short
 
     def options(self) -> list[str]:
         """Return the options of gaponet train for this configuration."""

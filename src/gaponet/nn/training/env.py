@@ -16,6 +16,7 @@ import torch
 from gaponet.base.arrays import Array, array_module, float32, zeros_like
 from gaponet.base.errors import UsageError
 from gaponet.data.sequence import Sequence
+from gaponet.nn.artifact import is_same_rate
 from gaponet.nn.config import ModelConfig
 from gaponet.nn.sensor import ProbeOracle
 from gaponet.nn.training.config import RewardConfig
@@ -27,7 +28,7 @@ from gaponet.sim.batch import BatchSim, longest_delay
 from gaponet.sim.context import contexts
 from gaponet.sysid.robot_rollouts import IMMOVABLE_ARMATURE
 
-UNLIMITED = 10**9  # control periods of an episode
+UNLIMITED = float("inf")  # s of an episode
 
 
 @dataclass(frozen=True)
@@ -36,8 +37,8 @@ class EnvOptions:
 
     num_envs: int
     """Simulations that run together."""
-    episode_steps: int = UNLIMITED
-    """Longest episode, control periods."""
+    episode_s: float = UNLIMITED
+    """Longest episode, s."""
     reward: RewardConfig = RewardConfig()  # noqa: RUF009
     """Scale and cap of the position error."""
     seed: int = 0
@@ -101,6 +102,7 @@ class DeltaEnv:
         )
         if config.context:
             self.observations.network_input.set_context(self._context())
+        self._longest_episode = _episode_periods(options.episode_s, groups)[groups.of_env]
         unobserved = groups.unobserved[groups.of_env][:, rows.operated]
         self.reward = PositionReward(options.reward, to_device(_nan_where(unobserved)))
         self.reset()
@@ -208,7 +210,7 @@ class DeltaEnv:
 
     def _dones(self) -> Array:
         """Return the environments whose recording or time has ended, (num_envs,), on the host."""
-        return self.playback.ended(self.config.delta_hold, self.options.episode_steps)
+        return self.playback.ended(self.config.delta_hold, self._longest_episode)
 
     # ---- checkpoint
 
@@ -318,6 +320,18 @@ def _delay_periods(robot: RobotSpec, groups: EnvGroups) -> int:
     """Return the longest delay of commands, control periods of the fastest recording."""
     shortest_dt = min(condition.dt for condition in groups.conditions)
     return int(np.ceil(longest_delay(robot, groups.conditions) / shortest_dt))
+
+
+def _episode_periods(episode_s: float, groups: EnvGroups) -> Array:
+    """Return the control periods of the longest episode of each group, (groups,); nearly equal
+    rates have as many.
+    """
+    first_dt = groups.conditions[0].dt
+    periods = []
+    for condition in groups.conditions:
+        dt = first_dt if is_same_rate(condition.dt, first_dt) else condition.dt
+        periods.append(np.rint(episode_s / dt))
+    return np.array(periods)
 
 
 def _nan_where(mask: Array) -> Array:

@@ -102,8 +102,10 @@ class Playback:
         self.row_on_device += 1
         take_rows(self.rows.track, self.row_on_device, out=self.recorded)
 
-    def ended(self, periods: int, max_periods: int) -> Array:
-        """Return the environments without `periods` further rows, or played for max_periods."""
+    def ended(self, periods: int, max_periods: Array) -> Array:
+        """Return the environments without `periods` further rows, or played for max_periods,
+        (num_envs,).
+        """
         at_end = self.row > self.last - periods
         return at_end | (self.elapsed >= max_periods)
 

@@ -227,8 +227,7 @@ class Trainer:
         state = progress.state
         config = self.config.ppo
         progress.stage = "ppo"
-        episode_steps = round(self.config.episode_s / self.data.train[0].dt)
-        env = self._env(config.num_envs, episode_steps, self.config.seed + 1)
+        env = self._env(config.num_envs, self.config.episode_s, self.config.seed + 1)
         if state.ppo is None:
             self.net.load_state_dict(self._initial_ppo_weights())
         ppo = PPO(env, self.net, config)
@@ -301,7 +300,7 @@ class Trainer:
         """Export the best network."""
         self.progress.begin_stage("export")
         net = self._network(self.progress.state.best.weights).eval()
-        env = self._env(max(EXPORT_ENVS, len(self.data.conditions)), 10, 0, device="cpu")
+        env = self._env(max(EXPORT_ENVS, len(self.data.conditions)), UNLIMITED, 0, device="cpu")
         self.progress.close_loggers()
         samples = env.get_observations()["actor"].numpy()
         export(net, self.out / "model", self._card(net), samples)
@@ -342,7 +341,7 @@ class Trainer:
     def _env(
         self,
         num_envs: int,
-        episode_steps: int,
+        episode_s: float,
         seed: int,
         *,
         device: str | None = None,
@@ -355,7 +354,7 @@ class Trainer:
             config.model,
             EnvOptions(
                 num_envs=num_envs,
-                episode_steps=episode_steps,
+                episode_s=episode_s,
                 reward=config.reward,
                 seed=seed,
                 nthread=config.threads,

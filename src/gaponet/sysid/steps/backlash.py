@@ -55,8 +55,7 @@ def probability(fit: JointFit, without: Values, values: Values) -> Array:
     """
     squared_without = np.maximum(_squared_error(fit, without), MIN_SQUARED_ERROR)
     squared_with = np.maximum(_squared_error(fit, values), MIN_SQUARED_ERROR)
-    seconds = fit.rollouts.rows * fit.rollouts.dt * fit.rollouts.windows.thin
-    measurements = np.maximum(seconds / fit.prior.correlation_time, 1.0)  # (n,)
+    measurements = np.maximum(fit.rollouts.seconds / fit.prior.correlation_time, 1.0)  # (n,)
     gain = np.log(squared_without / squared_with)
     log_odds = 0.5 * (measurements * gain - np.log(measurements))
     return np.asarray(expit(log_odds))

@@ -41,7 +41,8 @@ MIN_EXPLAINED = 0.9  # of a torque's variance, from which its gains are used
 AVERAGED_ROWS = 5  # of which the regression takes the mean
 # Periods whose commands are instruments for measured position and speed.
 INSTRUMENTS = 12
-MAX_LATE_PERIODS = 3  # between a command and its torque
+MAX_LATE_S = 0.06  # between a command and its torque
+MIN_LATE_PERIODS = 3  # of slow recordings, that are tried nevertheless
 START_DELAY = 0.25  # of the fit of positions, large changes of 20 ms
 ITERATIONS = 10  # of that fit
 GRAVITY = 9.81  # m/s²
@@ -81,7 +82,7 @@ class Gains(NamedTuple):
         return self.explained > MIN_EXPLAINED and self.kp > 0 and self.kd >= 0
 
 
-def servo_gains(recordings: ListOf[Array], last: int = 0, late: int = 1) -> Gains:
+def servo_gains(recordings: ListOf[Array], late: ListOf[int], last: int = 0) -> Gains:
     """Estimate a servo's gains: torque = kp (earlier command − position) − kd velocity + constant.
 
     Rows are means of five. Noise of measured position and speed would lower the gains, so two-stage
@@ -90,14 +91,14 @@ def servo_gains(recordings: ListOf[Array], last: int = 0, late: int = 1) -> Gain
 
     Args:
         recordings: Command, position, velocity and torque of the joint, (4, T) each.
+        late: How many periods earlier the command was given, of each recording.
         last: Only so many rows at the end of each count, as their mean, by plain least squares; 0
             for all.
-        late: How many periods earlier the command was given.
     """
     sums = []  # of each recording, as `_two_stage_least_squares` takes them
     rows = []  # columns x and the torque, (rows, 4) of each recording
-    for recording in recordings:
-        x, torque, z = _regression_rows(recording, late)
+    for recording, periods in zip(recordings, late, strict=True):
+        x, torque, z = _regression_rows(recording, periods)
         if last:
             x = x[-last:].mean(axis=0, keepdims=True)
             torque = torque[-last:].mean(keepdims=True)
@@ -125,7 +126,7 @@ def _jackknife_error(sums: list[Array]) -> float:
 
 def _regression_rows(recording: Array, late: int) -> tuple[Array, Array, Array]:
     """Return the columns error of the command, −velocity and 1, (rows, 3), the torque, (rows,),
-    and the instruments, (rows, INSTRUMENTS + 1); arguments as of `servo_gains`.
+    and the instruments, (rows, INSTRUMENTS + 1); arguments as of `servo_gains`, of one recording.
     """
     ctrl, qpos, qvel, tau = recording
     row = np.arange(len(tau) - late)
@@ -275,12 +276,15 @@ class TorqueFit:
     def gains(self) -> dict[str, Gains]:
         """Return joint → gains; without joints whose command never moves."""
         recordings: dict[str, list[Array]] = {}  # joint → (4, T) each, as of `servo_gains`
+        periods: dict[str, list[float]] = {}  # joint → control period of each, s
         for s in self.sequences:
             assert s.tau is not None
             for j in _moved(s, self._given):
                 own = np.stack([s.ctrl[:, j], s.qpos[:, j], s.qvel[:, j], s.tau[:, j]])
-                recordings.setdefault(self._given.joint_names[j], []).append(own)
-        return {joint: _best_gains(own) for joint, own in recordings.items()}
+                joint = self._given.joint_names[j]
+                recordings.setdefault(joint, []).append(own)
+                periods.setdefault(joint, []).append(s.dt)
+        return {joint: _best_gains(own, periods[joint]) for joint, own in recordings.items()}
 
     def payload_placed(self, friction: bool = False) -> RobotSpec:
         """Return the robot with the payload's place and the mass of the hand, by least squares on
@@ -393,11 +397,20 @@ def _has_torque_of_unknown_gains(s: Sequence) -> bool:
     return s.tau is not None and s.meta.recorded_gains[0] is None
 
 
-def _best_gains(recordings: list[Array]) -> Gains:
-    """Return a servo's gains with the delay that explains most of its torque."""
+def _best_gains(recordings: list[Array], periods: list[float]) -> Gains:
+    """Return a servo's gains with the delay that explains most of its torque.
+
+    Args:
+        recordings: As of `servo_gains`.
+        periods: Control period of each, s.
+    """
+    shortest = min(periods)
+    most = max(MIN_LATE_PERIODS, round(MAX_LATE_S / shortest))
     tried = []
-    for periods in range(1, MAX_LATE_PERIODS + 1):
-        tried.append(servo_gains(recordings, late=periods))
+    for count in range(1, most + 1):
+        delay = count * shortest
+        late = [max(1, round(delay / dt)) for dt in periods]
+        tried.append(servo_gains(recordings, late))
     return max(tried, key=lambda gains: gains.explained)
 
 
