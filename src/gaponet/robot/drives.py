@@ -111,9 +111,9 @@ def drives(
         raise UsageError(
             f"{file} has no position gain for {abbreviate(without_gain)}: give those of the "
             "controller that recorded the logs, --kp 100 '*wrist*=20' and --kd likewise (N·m/rad, "
-            "N·m·s/rad); if they are unknown, a guess is enough, gaponet identify corrects it "
-            "within a factor of 50. Joints without position control, such as wheels, are left out "
-            "by naming the others: --joints"
+            "N·m·s/rad), and leave out joints without position control, such as wheels, with "
+            "--joints. If the gains are unknown, a guess is enough, gaponet identify corrects it "
+            "within a factor of 50"
         )
     return tuple(found)
 
