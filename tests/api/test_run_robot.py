@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from arm import commands
+from hw.noted_arm import fake_watchdog
 from servos import Servos, on_port
 from wild_model import wild_model
 
@@ -30,6 +31,7 @@ from gaponet.hw.control.plan import Planner
 from gaponet.hw.control.recording import Event, Recording
 from gaponet.hw.control.safety import SafetyConfig
 from gaponet.hw.drivers.open import open_driver
+from gaponet.hw.targets.message import Message
 from gaponet.motion.files import write_motion
 from gaponet.motion.motion import Motion
 from gaponet.robot.folder import save_robot
@@ -285,6 +287,65 @@ def test_a_network_that_fails_while_the_robot_moves_is_noted_and_recorded(arm, t
     assert "not finite" in reporter.notes[0]
 
 
+# ---- what guards it
+
+
+def test_a_run_starts_one_watchdog_as_its_driver_says(arm, monkeypatch):
+    wanted = {"kind": "of this driver"}
+    started = []
+
+    def start(spec: dict[str, object], *_: object) -> object:
+        started.append(spec)
+        return fake_watchdog()
+
+    monkeypatch.setattr(VirtualDriver, "watchdog", lambda driver: wanted)
+    monkeypatch.setattr("gaponet.hw.control.controller.Watchdog", start)
+    gp.run_robot(arm, motion=SWAY, options=FAST, report=SilentReporter())
+    assert started == [wanted]
+
+
+INTO_THE_TABLE = np.array([0.5, 1.7, 0.3, 0.5, 0.3, 0.0])  # of an SO-101, rad
+SENDING_S = 2.0
+
+
+class Script:
+    """A transport whose one sender leads the SO-101 from home into the table, and ends."""
+
+    address = "nowhere"
+
+    def __init__(self, robot: gp.RobotSpec, clock: SimulatedClock) -> None:
+        self.robot = robot
+        self.clock = clock
+
+    def receive(self) -> list[Message]:
+        passed = self.clock.now() - self.clock.start
+        home = self.robot.qpos_home
+        qpos = home + min(passed, 1.0) * (INTO_THE_TABLE - home)
+        target = dict(zip(self.robot.joint_names, qpos.tolist(), strict=True))
+        return [Message("a", passed, target, end=passed > SENDING_S)]
+
+    def senders(self) -> set[str]:
+        return {"a"}
+
+    def publish(self, to: str, state: dict[str, object]) -> None:
+        pass
+
+    def close(self, reason: str) -> None:
+        pass
+
+
+@pytest.mark.parametrize("unchecked", [False, True])
+def test_live_targets_are_cut_before_the_table_unless_unchecked(so101, monkeypatch, unchecked):
+    clock = SimulatedClock()
+    monkeypatch.setattr("gaponet.api.run_robot.MonotonicClock", lambda: clock)
+    script = Script(so101, clock)
+    monkeypatch.setattr("gaponet.api.run_robot.open_transport", lambda options: script)
+    options = gp.RunOptions(control=QUICK, targets="zmq", unchecked=unchecked)
+    result = gp.run_robot(so101, options=options, report=SilentReporter())
+    remarks = " ".join(event.text for event in result.recording.events)
+    assert ("targets are cut" in remarks) == (not unchecked)
+
+
 # ---- consent
 
 
@@ -338,6 +399,20 @@ def test_lowcmd_needs_a_statement_that_the_robot_hangs_beside_yes(nobody):
     options = gp.RunOptions(connection=gp.Connection(topic="lowcmd"), yes=True)
     with pytest.raises(UsageError, match="falls"):
         gp.run_robot(motion="sweep-left_elbow", driver="unitree", options=options)
+
+
+def test_with_lowcmd_it_is_first_asked_whether_the_robot_hangs(nobody):
+    asked = []
+
+    def refuse(statement: str) -> bool:
+        asked.append(statement)
+        return False
+
+    options = gp.RunOptions(connection=gp.Connection(topic="lowcmd"))
+    with pytest.raises(UsageError, match="commanded"):
+        gp.run_robot(motion="sweep-left_elbow", driver="unitree", options=options, consent=refuse)
+    assert len(asked) == 1
+    assert "Does it hang?" in asked[0]
 
 
 # ---- limits
