@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from arm import commands
-from hw.noted_arm import fake_watchdog
+from hw.noted_arm import NotedArm, fake_watchdog
 from servos import Servos, on_port
 from wild_model import wild_model
 
@@ -55,6 +55,13 @@ def changed(name: str, old: str, new: str, folder: Path) -> Path:
     assert old in file.read_text()
     file.write_text(file.read_text().replace(old, new))
     return folder
+
+
+def turned_wrist(folder: Path) -> Path:
+    """Write a short motion of an SO-101."""
+    path = folder / "turn.csv"
+    path.write_text("time,wrist_roll\n0.0,0.0\n0.5,0.1\n1.0,0.0\n")
+    return path
 
 
 class SilentReporter:
@@ -365,11 +372,10 @@ def test_a_consent_other_than_true_writes_to_no_servo(answer, bus, nobody, tmp_p
         statements.append(statement)
         return answer
 
-    (tmp_path / "first.csv").write_text("time,wrist_roll\n0.0,0.0\n0.5,0.1\n1.0,0.0\n")
     options = gp.RunOptions(connection=gp.Connection(port=port), control=ControlConfig(rate=4.0))
     with pytest.raises(UsageError, match="commanded"):
         gp.run_robot(
-            motion=tmp_path / "first.csv",
+            motion=turned_wrist(tmp_path),
             driver="so101",
             options=options,
             consent=consent,
@@ -381,18 +387,16 @@ def test_a_consent_other_than_true_writes_to_no_servo(answer, bus, nobody, tmp_p
 
 def test_a_consent_of_true_writes_to_the_servos(bus, nobody, tmp_path):
     port, servos = bus
-    (tmp_path / "first.csv").write_text("time,wrist_roll\n0.0,0.0\n0.5,0.1\n1.0,0.0\n")
     options = gp.RunOptions(
         connection=gp.Connection(port=port),
         control=ControlConfig(rate=4.0, blend=0.5, settle=0.3, damp=0.3),
         safety=SafetyConfig(acceleration=2.0),
     )
     result = gp.run_robot(
-        motion=tmp_path / "first.csv", driver="so101", options=options, consent=lambda text: True
+        motion=turned_wrist(tmp_path), driver="so101", options=options, consent=lambda text: True
     )
     assert any(request[4] in WRITES for request in servos.heard)
     assert not result.recording.virtual
-    assert result.recording.summary()["consent"] == "the caller's function"
 
 
 def test_lowcmd_needs_a_statement_that_the_robot_hangs_beside_yes(nobody):
@@ -413,6 +417,70 @@ def test_with_lowcmd_it_is_first_asked_whether_the_robot_hangs(nobody):
         gp.run_robot(motion="sweep-left_elbow", driver="unitree", options=options, consent=refuse)
     assert len(asked) == 1
     assert "Does it hang?" in asked[0]
+
+
+@pytest.fixture
+def opened(so101, monkeypatch) -> list[NotedArm]:
+    """The drivers that were opened: of SO-101 arms in simulated time, taken for real ones."""
+    clock = SimulatedClock()
+    drivers: list[NotedArm] = []
+
+    def open_noted(kind: str, robot: gp.RobotSpec, **_: object) -> NotedArm:
+        driver = NotedArm(robot, clock)
+        drivers.append(driver)
+        return driver
+
+    monkeypatch.setattr("gaponet.api.run_robot.MonotonicClock", lambda: clock)
+    monkeypatch.setattr("gaponet.api.run_robot.open_driver", open_noted)
+    return drivers
+
+
+def test_each_repetition_of_a_recording_is_consented_to_on_its_own(so101, opened, nobody, tmp_path):
+    answers = [True, False]
+    options = gp.RunOptions(control=QUICK, payload_mass=0.0, unit_id="a")
+    with pytest.raises(UsageError, match="commanded"):
+        record_motions(
+            (str(turned_wrist(tmp_path)),),
+            RunRequest(so101, driver="so101", options=options),
+            out=tmp_path / "set",
+            repetitions=3,
+            consent=lambda statement: answers.pop(0),
+            report=SilentReporter(),
+        )
+    first, second = opened
+    assert first.sent
+    assert not second.sent
+
+
+@pytest.fixture
+def person_agrees(monkeypatch):
+    """Somebody sits at the terminal and types what is asked for."""
+    monkeypatch.setattr("gaponet.api.run_consent.require_terminal", lambda option: 0)
+    monkeypatch.setattr("gaponet.api.run_consent.require_consent", lambda *question: None)
+
+
+@pytest.mark.usefixtures("opened", "person_agrees")
+@pytest.mark.parametrize(
+    ("driver", "options", "consent", "source"),
+    [
+        ("so101", gp.RunOptions(), lambda text: True, "the caller's function"),
+        ("so101", gp.RunOptions(), None, "typed on the terminal"),
+        ("so101", gp.RunOptions(yes=True), None, "option yes"),
+        ("so101", gp.RunOptions(dry_run=True), None, "none needed: dry run"),
+        ("virtual", FAST, None, "none needed: virtual robot in this process"),
+    ],
+    ids=["function", "typed", "yes", "dry run", "virtual"],
+)
+def test_a_recording_says_how_consent_was_given(so101, tmp_path, driver, options, consent, source):
+    result = gp.run_robot(
+        so101,
+        motion=turned_wrist(tmp_path),
+        driver=driver,
+        options=replace(options, control=QUICK),
+        consent=consent,
+        report=SilentReporter(),
+    )
+    assert result.recording.summary()["consent"] == source
 
 
 # ---- limits
