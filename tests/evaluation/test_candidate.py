@@ -4,6 +4,7 @@ identified.
 
 import json
 import shutil
+from dataclasses import replace
 
 import pytest
 from arm import commands, record, recordings, write_dataset
@@ -122,6 +123,16 @@ def test_a_robot_identified_from_an_identified_one_keeps_its_split_and_what_was_
     assert not train & val
     assert train | val | {"hash of elsewhere"} <= set(fitted_to(origin)["hashes"])
     assert "elsewhere" in fitted_to(origin)["motions"]
+
+
+def test_recordings_of_a_held_out_unit_are_neither_fitted_nor_do_they_validate(data, arm, tmp_path):
+    for sequence in recordings(arm, 3, rows=60, kp=0.7, unit="b"):
+        data.append(sequence)
+    gp.identify(data, out=tmp_path / "of_a", options=replace(QUICK, holdout_units=("b",)))
+    parts = read_origin(tmp_path / "of_a")["parts"]
+    fitted = parts["train"].keys() | parts["val"].keys()
+    assert fitted
+    assert {entry.meta.unit_id for entry in data.entries if entry.id in fitted} == {"a"}
 
 
 def test_a_folder_that_does_not_say_what_it_was_fitted_to_has_no_held_out_recordings(fitted, data):
