@@ -170,7 +170,7 @@ def scores(**errors):
         mean = {"mpjae": (first + second) / 2e3}
         motions = {"m0": {"mpjae": first / 1e3}, "m1": {"mpjae": second / 1e3}}
         metrics = {"by_joint": {"elbow": mean}, "by_independent_motion": motions}
-        found[name.replace("_", "+")] = mean | metrics
+        found[name.replace("identified_", "identified+")] = mean | metrics
     return found
 
 
@@ -194,9 +194,28 @@ def test_the_verdict_states_the_gain_of_a_useful_network(tmp_path):
     assert next_step(useful, "data", tmp_path) == f"gaponet report {tmp_path}"
 
 
+@pytest.mark.parametrize(
+    "network",
+    [
+        (2.97, 3.168),  # 1 % less, of both motions
+        (2.0, 3.6),  # 10 % less, 0.3 ± 0.7 mrad
+    ],
+)
+def test_a_network_with_a_gain_of_1_percent_or_below_its_standard_error_is_left_out(network):
+    found = scores(nominal=NOMINAL, identified=IDENTIFIED, identified_gaponet=network)
+    assert "leave the network out" in verdict(found)[2]
+
+
 def test_the_gain_of_a_network_on_its_own_is_over_the_nominal_simulator():
     alone = scores(nominal=NOMINAL, mlp=(9.0, 8.0))
     assert network_gain(alone, "mlp").base == "nominal"
+
+
+def test_the_gain_of_a_network_is_over_delay_and_offset_where_these_are_nearer_to_the_robot():
+    found = scores(nominal=NOMINAL, delay_offset=(10.0, 9.0), mlp=(9.0, 8.0))
+    gain = network_gain(found, "mlp")
+    assert gain.base == "delay_offset"
+    assert gain.reduction == pytest.approx(1e-3)
 
 
 def test_after_the_nominal_simulator_the_next_step_is_identification():
