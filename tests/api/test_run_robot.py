@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from arm import commands
+from hw.noted_arm import NotedArm, fake_watchdog
 from servos import Servos, on_port
 from wild_model import wild_model
 
@@ -30,6 +31,7 @@ from gaponet.hw.control.plan import Planner
 from gaponet.hw.control.recording import Event, Recording
 from gaponet.hw.control.safety import SafetyConfig
 from gaponet.hw.drivers.open import open_driver
+from gaponet.hw.targets.message import Message
 from gaponet.motion.files import write_motion
 from gaponet.motion.motion import Motion
 from gaponet.robot.folder import save_robot
@@ -53,6 +55,13 @@ def changed(name: str, old: str, new: str, folder: Path) -> Path:
     assert old in file.read_text()
     file.write_text(file.read_text().replace(old, new))
     return folder
+
+
+def turned_wrist(folder: Path) -> Path:
+    """Write a short motion of an SO-101."""
+    path = folder / "turn.csv"
+    path.write_text("time,wrist_roll\n0.0,0.0\n0.5,0.1\n1.0,0.0\n")
+    return path
 
 
 class SilentReporter:
@@ -285,6 +294,65 @@ def test_a_network_that_fails_while_the_robot_moves_is_noted_and_recorded(arm, t
     assert "not finite" in reporter.notes[0]
 
 
+# ---- what guards it
+
+
+def test_a_run_starts_one_watchdog_as_its_driver_says(arm, monkeypatch):
+    wanted = {"kind": "of this driver"}
+    started = []
+
+    def start(spec: dict[str, object], *_: object) -> object:
+        started.append(spec)
+        return fake_watchdog()
+
+    monkeypatch.setattr(VirtualDriver, "watchdog", lambda driver: wanted)
+    monkeypatch.setattr("gaponet.hw.control.controller.Watchdog", start)
+    gp.run_robot(arm, motion=SWAY, options=FAST, report=SilentReporter())
+    assert started == [wanted]
+
+
+INTO_THE_TABLE = np.array([0.5, 1.7, 0.3, 0.5, 0.3, 0.0])  # of an SO-101, rad
+SENDING_S = 2.0
+
+
+class Script:
+    """A transport whose one sender leads the SO-101 from home into the table, and ends."""
+
+    address = "nowhere"
+
+    def __init__(self, robot: gp.RobotSpec, clock: SimulatedClock) -> None:
+        self.robot = robot
+        self.clock = clock
+
+    def receive(self) -> list[Message]:
+        passed = self.clock.now() - self.clock.start
+        home = self.robot.qpos_home
+        qpos = home + min(passed, 1.0) * (INTO_THE_TABLE - home)
+        target = dict(zip(self.robot.joint_names, qpos.tolist(), strict=True))
+        return [Message("a", passed, target, end=passed > SENDING_S)]
+
+    def senders(self) -> set[str]:
+        return {"a"}
+
+    def publish(self, to: str, state: dict[str, object]) -> None:
+        pass
+
+    def close(self, reason: str) -> None:
+        pass
+
+
+@pytest.mark.parametrize("unchecked", [False, True])
+def test_live_targets_are_cut_before_the_table_unless_unchecked(so101, monkeypatch, unchecked):
+    clock = SimulatedClock()
+    monkeypatch.setattr("gaponet.api.run_robot.MonotonicClock", lambda: clock)
+    script = Script(so101, clock)
+    monkeypatch.setattr("gaponet.api.run_robot.open_transport", lambda options: script)
+    options = gp.RunOptions(control=QUICK, targets="zmq", unchecked=unchecked)
+    result = gp.run_robot(so101, options=options, report=SilentReporter())
+    remarks = " ".join(event.text for event in result.recording.events)
+    assert ("targets are cut" in remarks) == (not unchecked)
+
+
 # ---- consent
 
 
@@ -304,11 +372,10 @@ def test_a_consent_other_than_true_writes_to_no_servo(answer, bus, nobody, tmp_p
         statements.append(statement)
         return answer
 
-    (tmp_path / "first.csv").write_text("time,wrist_roll\n0.0,0.0\n0.5,0.1\n1.0,0.0\n")
     options = gp.RunOptions(connection=gp.Connection(port=port), control=ControlConfig(rate=4.0))
     with pytest.raises(UsageError, match="commanded"):
         gp.run_robot(
-            motion=tmp_path / "first.csv",
+            motion=turned_wrist(tmp_path),
             driver="so101",
             options=options,
             consent=consent,
@@ -320,24 +387,100 @@ def test_a_consent_other_than_true_writes_to_no_servo(answer, bus, nobody, tmp_p
 
 def test_a_consent_of_true_writes_to_the_servos(bus, nobody, tmp_path):
     port, servos = bus
-    (tmp_path / "first.csv").write_text("time,wrist_roll\n0.0,0.0\n0.5,0.1\n1.0,0.0\n")
     options = gp.RunOptions(
         connection=gp.Connection(port=port),
         control=ControlConfig(rate=4.0, blend=0.5, settle=0.3, damp=0.3),
         safety=SafetyConfig(acceleration=2.0),
     )
     result = gp.run_robot(
-        motion=tmp_path / "first.csv", driver="so101", options=options, consent=lambda text: True
+        motion=turned_wrist(tmp_path), driver="so101", options=options, consent=lambda text: True
     )
     assert any(request[4] in WRITES for request in servos.heard)
     assert not result.recording.virtual
-    assert result.recording.summary()["consent"] == "the caller's function"
 
 
 def test_lowcmd_needs_a_statement_that_the_robot_hangs_beside_yes(nobody):
     options = gp.RunOptions(connection=gp.Connection(topic="lowcmd"), yes=True)
     with pytest.raises(UsageError, match="falls"):
         gp.run_robot(motion="sweep-left_elbow", driver="unitree", options=options)
+
+
+def test_with_lowcmd_it_is_first_asked_whether_the_robot_hangs(nobody):
+    asked = []
+
+    def refuse(statement: str) -> bool:
+        asked.append(statement)
+        return False
+
+    options = gp.RunOptions(connection=gp.Connection(topic="lowcmd"))
+    with pytest.raises(UsageError, match="commanded"):
+        gp.run_robot(motion="sweep-left_elbow", driver="unitree", options=options, consent=refuse)
+    assert len(asked) == 1
+    assert "Does it hang?" in asked[0]
+
+
+@pytest.fixture
+def opened(so101, monkeypatch) -> list[NotedArm]:
+    """The drivers that were opened: of SO-101 arms in simulated time, taken for real ones."""
+    clock = SimulatedClock()
+    drivers: list[NotedArm] = []
+
+    def open_noted(kind: str, robot: gp.RobotSpec, **_: object) -> NotedArm:
+        driver = NotedArm(robot, clock)
+        drivers.append(driver)
+        return driver
+
+    monkeypatch.setattr("gaponet.api.run_robot.MonotonicClock", lambda: clock)
+    monkeypatch.setattr("gaponet.api.run_robot.open_driver", open_noted)
+    return drivers
+
+
+def test_each_repetition_of_a_recording_is_consented_to_on_its_own(so101, opened, nobody, tmp_path):
+    answers = [True, False]
+    options = gp.RunOptions(control=QUICK, payload_mass=0.0, unit_id="a")
+    with pytest.raises(UsageError, match="commanded"):
+        record_motions(
+            (str(turned_wrist(tmp_path)),),
+            RunRequest(so101, driver="so101", options=options),
+            out=tmp_path / "set",
+            repetitions=3,
+            consent=lambda statement: answers.pop(0),
+            report=SilentReporter(),
+        )
+    first, second = opened
+    assert first.sent
+    assert not second.sent
+
+
+@pytest.fixture
+def person_agrees(monkeypatch):
+    """Somebody sits at the terminal and types what is asked for."""
+    monkeypatch.setattr("gaponet.api.run_consent.require_terminal", lambda option: 0)
+    monkeypatch.setattr("gaponet.api.run_consent.require_consent", lambda *question: None)
+
+
+@pytest.mark.usefixtures("opened", "person_agrees")
+@pytest.mark.parametrize(
+    ("driver", "options", "consent", "source"),
+    [
+        ("so101", gp.RunOptions(), lambda text: True, "the caller's function"),
+        ("so101", gp.RunOptions(), None, "typed on the terminal"),
+        ("so101", gp.RunOptions(yes=True), None, "option yes"),
+        ("so101", gp.RunOptions(dry_run=True), None, "none needed: dry run"),
+        ("virtual", FAST, None, "none needed: virtual robot in this process"),
+    ],
+    ids=["function", "typed", "yes", "dry run", "virtual"],
+)
+def test_a_recording_says_how_consent_was_given(so101, tmp_path, driver, options, consent, source):
+    result = gp.run_robot(
+        so101,
+        motion=turned_wrist(tmp_path),
+        driver=driver,
+        options=replace(options, control=QUICK),
+        consent=consent,
+        report=SilentReporter(),
+    )
+    assert result.recording.summary()["consent"] == source
 
 
 # ---- limits

@@ -97,6 +97,13 @@ def test_a_word_of_its_own_is_asked_for_and_yes_is_not_it(person):
     assert "Does it hang? Type 'it hangs' to start" in person.getvalue()
 
 
+def test_a_person_who_only_types_yes_has_not_said_that_the_robot_hangs(person):
+    person.will("yes\n")
+    words = ["run", "--driver", "unitree", "--topic", "lowcmd", "--motion", "sweep-left_elbow"]
+    assert main(words) == 2
+    assert "Does it hang? Type 'it hangs'" in person.getvalue()
+
+
 def test_without_a_terminal_nobody_consents_and_the_option_is_named(monkeypatch):
     for stream in (io.StringIO("yes\n"), None):
         monkeypatch.setattr("sys.stdin", stream)

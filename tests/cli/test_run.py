@@ -1,7 +1,9 @@
 """gaponet run and record on a virtual robot in this process, as fast as it goes."""
 
+import errno
 import io
 import json
+import os
 import re
 from types import SimpleNamespace
 
@@ -34,6 +36,8 @@ FAST = [
     "--damp",
     "0.1",
 ]
+
+WRITTEN_BYTES = 10_000  # of a recording, before its disk is full: about a second
 
 
 @pytest.fixture
@@ -122,6 +126,24 @@ def test_a_refused_plan_leaves_nothing_behind(tmp_path, capsys):
     assert main([*command, "--out", str(tmp_path / "set"), "--unit", "1"]) == 2
     assert "'down' begins with" in " ".join(capsys.readouterr().err.split())
     assert not (tmp_path / "set").exists()
+
+
+def test_a_run_whose_recording_met_a_full_disk_ends_with_status_3(
+    arm, motion, tmp_path, monkeypatch
+):
+    write = os.pwrite
+
+    def fill(descriptor: int, data: bytes, at: int) -> int:
+        if at > WRITTEN_BYTES:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        return write(descriptor, data, at)
+
+    monkeypatch.setattr("gaponet.hw.control.rows.os.pwrite", fill)
+    out = tmp_path / "recordings"
+    command = ["run", "--robot", str(arm.folder), "--motion", motion, "--out", str(out), *FAST]
+    with pytest.raises(SystemExit, match="3"):
+        main(command)
+    assert json.loads((out / "sway.json").read_text())["not_whole"] == "No space left on device"
 
 
 def test_the_plan_says_the_payload_that_it_is_for_and_how_a_stop_ends(capsys):

@@ -4,6 +4,7 @@ identified.
 
 import json
 import shutil
+from dataclasses import replace
 
 import pytest
 from arm import commands, record, recordings, write_dataset
@@ -124,6 +125,16 @@ def test_a_robot_identified_from_an_identified_one_keeps_its_split_and_what_was_
     assert "elsewhere" in fitted_to(origin)["motions"]
 
 
+def test_recordings_of_a_held_out_unit_are_neither_fitted_nor_do_they_validate(data, arm, tmp_path):
+    for sequence in recordings(arm, 3, rows=60, kp=0.7, unit="b"):
+        data.append(sequence)
+    gp.identify(data, out=tmp_path / "of_a", options=replace(QUICK, holdout_units=("b",)))
+    parts = read_origin(tmp_path / "of_a")["parts"]
+    fitted = parts["train"].keys() | parts["val"].keys()
+    assert fitted
+    assert {entry.meta.unit_id for entry in data.entries if entry.id in fitted} == {"a"}
+
+
 def test_a_folder_that_does_not_say_what_it_was_fitted_to_has_no_held_out_recordings(fitted, data):
     (fitted / PROVENANCE_FILE).unlink()
     assert select_entries([fitted], data) == (data.entries, False)
@@ -159,7 +170,7 @@ def scores(**errors):
         mean = {"mpjae": (first + second) / 2e3}
         motions = {"m0": {"mpjae": first / 1e3}, "m1": {"mpjae": second / 1e3}}
         metrics = {"by_joint": {"elbow": mean}, "by_independent_motion": motions}
-        found[name.replace("_", "+")] = mean | metrics
+        found[name.replace("identified_", "identified+")] = mean | metrics
     return found
 
 
@@ -183,9 +194,28 @@ def test_the_verdict_states_the_gain_of_a_useful_network(tmp_path):
     assert next_step(useful, "data", tmp_path) == f"gaponet report {tmp_path}"
 
 
+@pytest.mark.parametrize(
+    "network",
+    [
+        (2.97, 3.168),  # 1 % less, of both motions
+        (2.0, 3.6),  # 10 % less, 0.3 ± 0.7 mrad
+    ],
+)
+def test_a_network_with_a_gain_of_1_percent_or_below_its_standard_error_is_left_out(network):
+    found = scores(nominal=NOMINAL, identified=IDENTIFIED, identified_gaponet=network)
+    assert "leave the network out" in verdict(found)[2]
+
+
 def test_the_gain_of_a_network_on_its_own_is_over_the_nominal_simulator():
     alone = scores(nominal=NOMINAL, mlp=(9.0, 8.0))
     assert network_gain(alone, "mlp").base == "nominal"
+
+
+def test_the_gain_of_a_network_is_over_delay_and_offset_where_these_are_nearer_to_the_robot():
+    found = scores(nominal=NOMINAL, delay_offset=(10.0, 9.0), mlp=(9.0, 8.0))
+    gain = network_gain(found, "mlp")
+    assert gain.base == "delay_offset"
+    assert gain.reduction == pytest.approx(1e-3)
 
 
 def test_after_the_nominal_simulator_the_next_step_is_identification():

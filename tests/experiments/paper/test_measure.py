@@ -12,12 +12,15 @@ from gaponet.experiments.paper import goals, measure
 from gaponet.experiments.paper.commands import REFERENCE_WAY
 from gaponet.experiments.paper.measure import (
     Delivery,
+    Recorded,
     held_offsets,
     measure_alignment,
     measure_commands,
     measure_delivery,
     record_unit,
 )
+from gaponet.motion.motion import Motion
+from gaponet.sim.replay import replay
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -79,17 +82,46 @@ def test_the_delta_action_of_the_truth_improves_commands(robot, unit, plain):
     assert np.mean(exact["both"]) < np.mean(plain["feedforward"])
 
 
-def test_commands_are_made_at_the_rate_of_the_recordings(robot, unit):
+def at_100_hz(unit):
+    """The unit with its motions, which last as long, at half the control period."""
+    motions = []
+    for motion in unit.motions:
+        faster = Motion(motion.name, "whole_body", unit.dt, motion.ctrl).sample(0.01)
+        motions.append(replace(motion, ctrl=faster))
+    return replace(unit, motions=motions, dt=0.01)
+
+
+def test_a_unit_that_is_commanded_twice_as_often_moves_for_as_long_and_as_fast(unit, recorded):
+    faster = record_unit(at_100_hz(unit))
+    np.testing.assert_allclose(faster.durations, recorded.durations, atol=0.02)
+    for fast, slow in zip(faster.sequences, recorded.sequences, strict=True):
+        speed = np.abs(slow.qvel).mean()  # rad/s
+        assert np.abs(fast.qvel).mean() == pytest.approx(speed, rel=0.1)
+
+
+def test_a_network_corrects_commands_at_the_rate_of_the_recordings(robot, unit):
     faster = replace(unit, dt=0.01)
     plain = measure_commands(faster, None)
     exact = measure_commands(faster, model(robot, 1.0, dt=0.01))
     assert np.mean(exact["delta"]) < np.mean(plain["raw"])
 
 
+def test_hands_are_delivered_to_their_goals_in_the_same_time_at_another_rate(unit):
+    (slow,) = Delivery.plan(unit).plans
+    (fast,) = Delivery.plan(replace(unit, dt=0.01)).plans
+    np.testing.assert_array_equal(fast.goals, slow.goals)
+    assert len(fast.ctrl) == pytest.approx(2 * len(slow.ctrl), abs=4)
+
+
 def test_gaps_are_counted_above_each_threshold(robot, recorded):
-    large = measure_alignment(recorded, robot, None)["large_gaps"]
-    assert list(large) == ["0.1", "0.5"]
-    assert 0.0 == max(large["0.5"]) <= min(large["0.1"])
+    first = recorded.sequences[0]
+    (simulated,) = replay([first], robot, lock_idle=True)
+    qpos = np.array(simulated.qpos)
+    qpos[1:21, 0] += 0.2
+    qpos[1:11, 1] += 0.6
+    large = measure_alignment(Recorded([replace(first, qpos=qpos)]), robot, None)["large_gaps"]
+    values = 2 * 79  # two joints; the first of 80 rows is the start
+    assert large == {"0.1": [30 / values], "0.5": [10 / values]}
 
 
 def test_an_untrained_network_earns_nothing_in_delivery(robot, unit, monkeypatch):

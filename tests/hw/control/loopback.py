@@ -35,8 +35,10 @@ class Loopback:
     def __init__(self) -> None:
         self.queues: dict[str, list[deque]] = defaultdict(list)
         self.writers: dict[str, list[int]] = defaultdict(list)  # by topic, their handles
+        self.opened: list[tuple[int, str]] = []  # domain and interface of each participant
 
     def Bus(self, domain: int, interface: str) -> LoopbackBus:  # noqa: N802
+        self.opened.append((domain, interface))
         return LoopbackBus(self)
 
     def publishers(self) -> dict[str, list[str]]:

@@ -14,11 +14,13 @@ import numpy as np
 import pytest
 from hw.control.loopback import RobotClock, living, received
 
+from gaponet.hw import drivers
 from gaponet.hw.control.controller import Controller
-from gaponet.hw.control.driver import Fault, State
+from gaponet.hw.control.driver import Driver, Fault, State
 from gaponet.hw.control.phases import ControlConfig
 from gaponet.hw.control.recording import Recording
 from gaponet.hw.control.safety import FAULTS
+from gaponet.hw.drivers.open import open_driver
 from gaponet.hw.drivers.unitree import MOTOR_NAMES, UnitreeDriver
 from gaponet.robot.spec import RobotSpec, load_robot
 
@@ -108,18 +110,49 @@ def test_joints_that_move_fast_at_a_fault_are_braked_within_a_tenth_of_a_second(
     assert speeds[since > 0.1].max() < 0.5
 
 
-def watching(robot: RobotSpec) -> UnitreeDriver:
-    """The watchdog's driver: connected before the first command, and silent."""
-    driver = UnitreeDriver(robot, domain=DOMAIN, sole=False)
+def watching(driver: UnitreeDriver) -> Driver:
+    """The driver of a driver's watchdog: connected before the first command, and silent."""
+    watchdog = open_driver(**driver.watchdog())
+    watchdog.connect()
+    return watchdog
+
+
+@pytest.mark.parametrize(
+    ("topic", "joints"),
+    [("arm_sdk", "arms"), ("arm_sdk", "upper_body"), ("lowcmd", "arms"), ("lowcmd", "all")],
+)
+def test_a_watchdog_damps_the_joints_that_were_commanded_on_their_topic(
+    robot, monkeypatch, topic, joints
+):
+    clock = living(monkeypatch, robot)
+    driver = UnitreeDriver(robot, topic, joints, domain=DOMAIN)
+    watchdog = watching(driver)
     driver.connect()
-    return driver
+    driver.write(robot.qpos_home)
+    clock.wait_until(clock.now() + 0.02)
+
+    watchdog.damp(1.0)
+    clock.wait_until(clock.now() + 0.02)
+
+    command, *_, damping = clock.robot.heard
+    assert damping["topic"] == command["topic"] == topic
+    np.testing.assert_array_equal(damping["mode"], command["mode"])
+    commanded = [MOTOR_NAMES.index(name) for name in driver.commanded]
+    assert not damping["kp"][commanded].any()
+    assert (damping["kd"][commanded] > 0).all()
+
+
+def test_a_watchdog_is_on_the_domain_and_interface_of_its_driver(robot, monkeypatch):
+    living(monkeypatch, robot)
+    watching(UnitreeDriver(robot, domain=DOMAIN, interface="eth7"))
+    assert drivers.dds.opened[-1] == (DOMAIN, "eth7")
 
 
 def test_a_watchdog_holds_the_torso_where_it_is_and_not_where_it_was_at_its_connection(
     robot, monkeypatch
 ):
     clock = living(monkeypatch, robot)
-    watchdog = watching(robot)
+    watchdog = watching(UnitreeDriver(robot, domain=DOMAIN))
     other = UnitreeDriver(robot, joints="upper_body", domain=DOMAIN)
     other.connect()
     turned = robot.qpos_home.copy()
@@ -143,7 +176,7 @@ def test_a_watchdog_holds_the_torso_where_it_is_and_not_where_it_was_at_its_conn
 
 def test_a_watchdog_damps_although_the_bus_gives_no_states(robot, monkeypatch):
     clock = living(monkeypatch, robot)
-    watchdog = watching(robot)
+    watchdog = watching(UnitreeDriver(robot, domain=DOMAIN))
     clock.robot.inject("stop", 0.0)
 
     for _ in range(5):

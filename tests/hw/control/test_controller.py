@@ -648,6 +648,19 @@ def test_a_row_that_cannot_be_recorded_lowers_the_robot(arm, monkeypatch):
     assert driver.closed == [False]
 
 
+def test_a_disk_that_is_full_in_mid_run_is_noted_once_and_stops_no_robot(arm):
+    controller = control(NotedArm(arm))
+    rows = controller.recording.rows
+
+    def fill_disk() -> None:
+        rows.error = "No space left on device"
+
+    recording = controller.run(acting(fill_disk))
+    assert recording.fault is None
+    assert phases(recording)[-2:] == ["blend_out", "stopped"]
+    assert sum("No space left" in event.text for event in recording.events) == 1
+
+
 def test_without_a_place_for_its_recording_a_run_does_not_begin(arm, monkeypatch):
     driver = NotedArm(arm)
 

@@ -8,7 +8,7 @@ import re
 from pathlib import Path
 
 import gaponet.hw
-from gaponet.hw.control.safety import FAULTS, Ending, lowers, spoils_data
+from gaponet.hw.control.safety import FAULTS, lowers, spoils_data
 
 DOCS = Path(__file__).parents[3] / "docs"
 SAFETY = DOCS / "deploy-safety.md"
@@ -69,11 +69,6 @@ def test_a_recording_in_which_a_joint_did_not_go_where_it_was_sent_is_no_data():
     spoilt = {kind for kind in FAULTS if spoils_data(kind)}
 
     assert spoilt == {"obedience", "source", "frozen", "jump", "tracking"}
-
-
-def test_no_fault_ends_in_a_position_command():
-    assert {rule.ending for rule in FAULTS.values()} == set(Ending)
-    assert not any("measured" in ending for ending in Ending)
 
 
 def test_the_end_of_a_run_without_fault_lowers_nothing():

@@ -509,9 +509,20 @@ def test_the_weight_waits_until_a_joint_has_followed(monkeypatch):
     assert recording.summary()["obeyed"]
 
 
+OVERLOAD_KG = 6.0  # in each hand: an elbow cannot raise it, and hardly moves
+
+
 def test_an_arm_that_is_too_weak_for_its_load_but_pushes_obeys(monkeypatch):
-    recording, _ = swing(monkeypatch, told=3.0, unit="virtual-4", payload=3.0, fleet="hard")
+    recording, robot = swing(monkeypatch, told=OVERLOAD_KG, payload=OVERLOAD_KG, fleet="hard")
     assert recording.fault is None
+    elbows = robot.robot.index(["left_elbow_joint", "right_elbow_joint"])
+    qpos = recording.run_rows()["qpos"][:, elbows]
+    assert np.ptp(qpos, axis=0).max() < 0.2, "of the 1 rad that they are told to swing"
+
+
+def test_an_arm_that_pushes_against_a_load_that_nobody_stated_does_not_obey(monkeypatch):
+    recording, _ = swing(monkeypatch, told=0.0, payload=OVERLOAD_KG, fleet="hard")
+    assert recording.fault.kind == "obedience"
 
 
 def test_a_run_in_which_nothing_moves_shows_nothing_and_is_no_data(monkeypatch):

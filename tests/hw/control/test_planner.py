@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import dataclasses
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,14 +19,22 @@ from gaponet.hw.control.clock import SimulatedClock
 from gaponet.hw.control.controller import Controller
 from gaponet.hw.control.driver import Fault, State
 from gaponet.hw.control.phases import ControlConfig
-from gaponet.hw.control.plan import GOAL_SHARES, CollisionGuard, Planner
+from gaponet.hw.control.plan import (
+    COMMAND_CLEARANCE_SHARE,
+    GOAL_SHARES,
+    MAX_START_DRIFT_RAD,
+    MAX_START_OVERLAP_M,
+    CollisionGuard,
+    Planner,
+)
 from gaponet.hw.control.recording import Recording
 from gaponet.hw.control.safety import SafetyConfig
 from gaponet.motion.files import read_motion
 from gaponet.motion.motion import Motion
 from gaponet.motion.path_planner import Trajectory, find_points, finish_search
+from gaponet.robot.collision import POSTURE_STEP_RAD, read_shapes
 from gaponet.robot.folder import save_robot
-from gaponet.robot.spec import RobotSpec, load_robot
+from gaponet.robot.spec import RobotSpec, load_robot, named_robots
 from gaponet.virtual.fleet import load_fleet
 from gaponet.virtual.virtual_driver import VirtualDriver
 
@@ -33,6 +42,7 @@ from gaponet.virtual.virtual_driver import VirtualDriver
 FOLDED = np.array([0.2, -1.70, 1.65, 0.9, 0.4, 1.2])
 OVER = np.array([0.0, -1.2, 0.0, 1.4, 0.0, 0.0])
 DOWN = np.array([0.5, 1.7, 0.3, 0.5, 0.3, 0.0])  # in the table
+PAGE = Path(__file__).parents[3] / "docs" / "deploy-safety.md"
 QUICK = ControlConfig(blend=0.3, blend_speed=2.0, settle=0.1, damp=0.1)
 
 
@@ -469,3 +479,36 @@ def test_an_arm_without_shapes_and_a_robot_that_may_fall_are_asked_for(so101, tm
     )
     said = " ".join(capsys.readouterr().err.split())
     assert "legs and torso go off, and a robot that stands falls; say --hangs" in said
+
+
+# ---- the page about it
+
+
+def on_page(pattern: str) -> tuple[str, ...]:
+    """Return the groups of a pattern that the section about the plan has once."""
+    section = PAGE.read_text(encoding="utf-8").split("## One plan before motion\n")[1]
+    found = re.findall(pattern, section.split("\n## ")[0])
+    assert len(found) == 1, pattern
+    return found[0] if isinstance(found[0], tuple) else (found[0],)
+
+
+def test_the_page_states_in_which_steps_and_from_which_start_a_plan_is_checked():
+    (step,) = on_page(r"at least every ([\d.]+) rad of motion")
+    (drift,) = on_page(r"moved by more than ([\d.]+) rad since the plan")
+    (overlap,) = on_page(r"overlap by more than ([\d.]+) cm")
+    assert float(step) == POSTURE_STEP_RAD
+    assert float(drift) == MAX_START_DRIFT_RAD
+    assert float(overlap) / 100 == MAX_START_OVERLAP_M
+
+
+def test_the_page_states_how_much_stays_free_of_each_robot():
+    usual, near = on_page(r"([\d.]+) cm must stay free \(SO-101 and G1: ([\d.]+) cm\)")
+    half, half_near = on_page(r"\(([\d.]+) cm; SO-101 and G1: ([\d.]+) cm\) must stay free")
+    assert float(half) == COMMAND_CLEARANCE_SHARE * float(usual)
+    assert float(half_near) == COMMAND_CLEARANCE_SHARE * float(near)
+    for name in named_robots():
+        robot = load_robot(name)
+        shapes = read_shapes(robot.folder)
+        if shapes.capsule:
+            stated = near if robot.name in ("so101", "g1_23", "g1_29") else usual
+            assert shapes.clearance == float(stated) / 100, name

@@ -19,6 +19,7 @@ from gaponet.hw.control.driver import DriverError
 from gaponet.hw.control.phases import ControlConfig
 from gaponet.hw.control.recording import Recording
 from gaponet.hw.drivers import hg
+from gaponet.hw.drivers.open import open_driver
 from gaponet.hw.drivers.unitree import MOTOR_NAMES, UnitreeDriver
 from gaponet.hw.drivers.unitree_link import UnitreeLink
 from gaponet.robot.spec import RobotSpec, load_robot
@@ -130,7 +131,7 @@ def test_the_recording_names_the_robot_that_the_states_are_from(robot, clock):
 
 def test_a_watchdog_also_damps_when_there_are_two_robots(robot, clock):
     clock.add_robot()
-    watchdog = UnitreeDriver(robot, domain=DOMAIN, sole=False)
+    watchdog = open_driver(**UnitreeDriver(robot, domain=DOMAIN).watchdog())
 
     watchdog.connect()
     watchdog.damp(1.0)
