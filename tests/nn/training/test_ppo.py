@@ -100,7 +100,7 @@ def test_exploration_has_the_set_correlation_and_width(env):
 def test_exploration_lasts_as_long_at_another_control_rate(tmp_path):
     robot = write_arm(tmp_path)
     fast = [replace(recording, dt=0.01) for recording in recordings(robot, 4, kp=0.5)]
-    options = EnvOptions(num_envs=16, episode_steps=100, nthread=1)
+    options = EnvOptions(num_envs=16, episode_s=2.0, nthread=1)
     env = DeltaEnv(fast, robot, MODEL, options)
     learner = PPO(env, build_network(MODEL, 2), SETTINGS)
     assert learner.noise_correlation == pytest.approx(np.exp(-0.01 / 0.2))
