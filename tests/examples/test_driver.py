@@ -68,6 +68,8 @@ def test_gaponet_run_finds_the_example_by_its_name(simulated, arm, tmp_path):
 
     words = ["run", "--driver", "my_arm", "--port", simulated.port, "--motion", str(motion)]
     words += ["--limits-from", str(arm.folder), "--dry-run", "--yes", "--unchecked", "--json"]
+    # A busy machine may delay the simulated arm's messages.
+    words += ["--safety.stale", "50", "--safety.overrun", "50"]
     # The command line knows the drivers that were there when it was imported.
     run = subprocess.run(
         [sys.executable, "-m", "gaponet", *words],
