@@ -81,10 +81,11 @@ def _bar(y: int, label: str, fill: str, value: float, share: float) -> list[str]
     inside = width >= MIN_INSIDE
     x = LEFT + width + (-8 if inside else 8)
     look = ' text-anchor="end" fill="#ffffff" font-weight="bold"' if inside else ""
+    shown = f"{value:.2f}" if value < 1 else f"{value:g}"
     return [
         f'<text x="{LEFT - 10}" y="{y + 16}" text-anchor="end">{label}</text>',
         f'<rect x="{LEFT}" y="{y}" width="{width:.1f}" height="{THICK}" fill="{fill}"/>',
-        f'<text x="{x:.1f}" y="{y + 16}"{look}>{value:g}</text>',
+        f'<text x="{x:.1f}" y="{y + 16}"{look}>{shown}</text>',
     ]
 
 
