@@ -52,6 +52,16 @@ body = "fore"
 pos = [0.2, 0.0, 0.0]
 """
 
+# Of both servos of the arm.
+SERVO = {
+    "kp": 20.0,
+    "damping": 0.5,
+    "frictionloss": 0.05,
+    "armature": 0.02,
+    "offset": 0.0,
+    "delay": 0.0,
+}
+
 
 def write_arm(folder: Path, toml: str = TOML, xml: str = XML) -> RobotSpec:
     """The arm as a user's robot folder."""

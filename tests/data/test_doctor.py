@@ -475,6 +475,12 @@ def test_gravity_is_judged_without_a_known_torque_limit(tmp_path):
     assert found(weigh(arm, tmp_path, wrong), "gravity", "warning").joints == ("shoulder",)
 
 
+def test_an_arm_that_gravity_does_not_load_shows_no_zeros(tmp_path):
+    arm = write_arm(tmp_path / "arm", xml=XML.replace("<option ", '<option gravity="0 0 0" '))
+    finding = found(weigh(arm, tmp_path, hanging(arm)), "gravity", "ok")
+    assert finding.message.startswith("gravity loads no joint here")
+
+
 def standing(arm, seed: int, share: float, behind_gears: bool = False) -> Sequence:
     """The simulated arm moved from hold to hold, with a share of its weight fed forward, and the
     motors' torque.

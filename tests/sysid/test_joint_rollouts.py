@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from arm import TOML, XML, commands, recordings, write_arm
+from arm import SERVO, TOML, XML, commands, recordings, write_arm
 
 from gaponet.data.sequence import Sequence, SequenceMeta
 from gaponet.evaluation.verdict import verdict
@@ -16,15 +16,6 @@ from gaponet.sim.servo import compiled, simulate_joints
 from gaponet.sysid.identify import identify
 from gaponet.sysid.joint_rollouts import JointRollouts, balanced_values
 from gaponet.sysid.options import IdentifyOptions
-
-FIRST = {
-    "kp": 20.0,
-    "damping": 0.5,
-    "frictionloss": 0.05,
-    "armature": 0.02,
-    "offset": 0.0,
-    "delay": 0.0,
-}
 
 
 def same(servo, candidates=1):
@@ -52,7 +43,7 @@ def test_a_single_joint_rollout_is_the_robots_rollout(tmp_path, changed):
     changed = dict(changed)
     kd = f"effort_limit = 5.0\nkd = {changed.pop('kd', 0.0)}"
     robot = write_arm(tmp_path / "arm", TOML.replace("effort_limit = 5.0", kd))
-    servos = FIRST | changed
+    servos = SERVO | changed
     acting = robot.with_identified(dict.fromkeys(robot.joint_names, servos))
     real = recordings(robot, 1, rows=200, kp=0.7)
     whole = [t.qpos for t in replay(real, acting)]
@@ -68,8 +59,8 @@ def test_a_single_joint_rollout_is_the_robots_rollout(tmp_path, changed):
     assert difference(servos) < MAX_DIFFERENCE
     for term in changed:
         others = {field: value for field, value in changed.items() if field != term}
-        assert difference(FIRST | others) > MAX_DIFFERENCE, f"the same without {term}"
-    assert set(changed) <= {*FIRST, *SERVO_TERMS, "effort_limit"}
+        assert difference(SERVO | others) > MAX_DIFFERENCE, f"the same without {term}"
+    assert set(changed) <= {*SERVO, *SERVO_TERMS, "effort_limit"}
 
 
 @pytest.mark.parametrize(
@@ -85,19 +76,19 @@ def test_springs_and_compensated_gravity_act_on_a_joint_alone(tmp_path, part, ne
     assert xml != XML
     robot = write_arm(tmp_path / "arm", xml=xml)
     real = recordings(robot, 2, rows=200)
-    errors = JointRollouts(real, robot).errors(same(FIRST | {"kp": 20.0}))
+    errors = JointRollouts(real, robot).errors(same(SERVO | {"kp": 20.0}))
     assert np.abs(errors).mean() < 1e-3
 
 
 def test_damping_taken_from_kd_is_a_share_of_it_at_all_gains(tmp_path):
     robot = write_arm(tmp_path, TOML.replace("kp = 20.0", "kp = 20.0\nkd = 2.0"))
-    less = dict.fromkeys(robot.joint_names, FIRST | {"damping": -0.5})
+    less = dict.fromkeys(robot.joint_names, SERVO | {"damping": -0.5})
     told = []
     for kd in (2.0, 1.0):
         acting = robot.with_identified(less).with_gains(None, (kd, kd))
         made = recordings(acting, 1, rows=200)[0]
         told.append(replace(made, meta=replace(made.meta, kp=(20.0, 20.0), kd=(kd, kd))))
-    errors = JointRollouts(told, robot).errors(same(FIRST | {"damping": -0.5}))
+    errors = JointRollouts(told, robot).errors(same(SERVO | {"damping": -0.5}))
     assert np.abs(errors).mean() < 1e-3
 
 
@@ -108,7 +99,7 @@ def test_numba_compiles_once_for_all_numbers_of_windows_joints_and_candidates(tm
     before = len(compiled(simulate_joints).signatures)
     for parts, one, count in ((real, robot, 3), (real[:1], robot, 1), (real, ramped, 2)):
         runs = JointRollouts(parts, one)
-        values = same(FIRST, count)
+        values = same(SERVO, count)
         runs.errors(values)
         single = {field: value.astype(np.float32) for field, value in values.items()}
         runs.shortened(0.5).errors(single)
@@ -120,7 +111,7 @@ def test_candidates_do_not_affect_each_other(tmp_path):
     runs = JointRollouts(recordings(robot, 2, rows=60, kp=0.7), robot)
     law = {"stribeck": 0.1, "stribeck_speed": 0.05, "friction_motor": 0.2, "min_torque": 0.1}
     factors = np.linspace(0.5, 1.5, 6).reshape(3, 2)
-    servo = FIRST | {"delay": 0.013} | law
+    servo = SERVO | {"delay": 0.013} | law
     values = {field: value * factors for field, value in servo.items()}
     together = runs.errors(values)
     for i in range(3):
@@ -136,7 +127,7 @@ def test_recordings_at_several_gains_have_one_servo(tmp_path):
         motor = {joint: {"kp": 0.8 * kp} for joint in robot.joint_names}
         made = recordings(set_to.with_identified(motor), 1, rows=200)[0]
         told.append(replace(made, meta=replace(made.meta, kp=(kp, kp), kd=(0.0, 0.0))))
-    values = same(FIRST | {"kp": 0.8 * 20.0})
+    values = same(SERVO | {"kp": 0.8 * 20.0})
     assert np.abs(JointRollouts(told, robot).errors(values)).mean() < 1e-3
     untold = [replace(s, meta=replace(s.meta, kp=None)) for s in told]
     assert np.abs(JointRollouts(untold, robot).errors(values)).mean() > 5e-3
@@ -207,7 +198,7 @@ def test_a_single_joint_rollout_stays_within_the_joints_range():
     meta = SequenceMeta("g1_29", "unit", "bent", 0.0)
     runs = JointRollouts([Sequence(meta, robot.joint_names, 0.02, qpos, qpos, 0 * qpos)], robot)
     candidates = (3, len(robot.operated))
-    values = {field: np.zeros(candidates) for field in FIRST}
+    values = {field: np.zeros(candidates) for field in SERVO}
     values["kp"] = np.repeat([[40.0], [10.0], [0.1]], candidates[1], axis=1)
     way = np.ptp(robot.qpos_range[robot.operated_index], axis=1)
     errors = runs.errors(values)
@@ -220,7 +211,7 @@ def test_windows_of_several_control_rates_are_fitted_together(tmp_path):
     them.
     """
     robot = write_arm(tmp_path)
-    true = FIRST | {"kp": 14.0, "delay": 0.03, "damping": 0.8}
+    true = SERVO | {"kp": 14.0, "delay": 0.03, "damping": 0.8}
     acting = robot.with_identified(dict.fromkeys(robot.joint_names, true))
     template = recordings(robot, 1)[0]
     parts = []
@@ -232,8 +223,8 @@ def test_windows_of_several_control_rates_are_fitted_together(tmp_path):
         (simulated,) = replay([asked], acting)
         parts.append(replace(asked, qpos=simulated.qpos, qvel=simulated.qvel))
     runs = JointRollouts(parts, robot)
-    values = {field: np.array([acting.servo[field]]) for field in FIRST}
-    before = np.abs(runs.errors(same(FIRST))).mean(axis=(0, 1, 3))
+    values = {field: np.array([acting.servo[field]]) for field in SERVO}
+    before = np.abs(runs.errors(same(SERVO))).mean(axis=(0, 1, 3))
     after = np.abs(runs.errors(values)).mean(axis=(0, 1, 3))
     assert (after < 0.1 * before).all()
     # No row in less than 10 ms.

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from arm import commands, write_arm
+from arm import SERVO, commands, write_arm
 
 from gaponet.data.sequence import Sequence, SequenceMeta
 from gaponet.sim.replay import replay
@@ -12,14 +12,6 @@ from gaponet.sysid.axes import Bounds
 from gaponet.sysid.joint_rollouts import ERROR_SCALE_RAD, SETTLE_S, JointRollouts
 from gaponet.sysid.problem import JointFit
 
-SERVO = {
-    "kp": 20.0,
-    "damping": 0.5,
-    "frictionloss": 0.05,
-    "armature": 0.02,
-    "offset": 0.0,
-    "delay": 0.0,
-}
 DURATION_S = 4.0
 
 

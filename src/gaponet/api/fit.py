@@ -161,8 +161,8 @@ def _require_gains(robot: RobotSpec) -> None:
     without = [j for j in robot.operated if robot.servo.kp[robot.index([j])[0]] <= 0]
     if without:
         raise UsageError(
-            f"{robot.folder}: kp of {abbreviate(without)} is 0, so commands move nothing: write the "
-            "controller's kp in robot.toml, or operated = false"
+            f"{robot.folder}: kp of {abbreviate(without)} is 0, so commands move nothing: write "
+            "the controller's kp in robot.toml, or operated = false"
         )
 
 

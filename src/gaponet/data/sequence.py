@@ -23,6 +23,7 @@ from gaponet.robot.spec import GAIN_TOLERANCE, RobotSpec
 
 ARRAYS = ("ctrl", "qpos", "qvel", "qacc", "tau", "tau_eq", "temperature")
 OPTIONAL = ("qacc", "tau", "tau_eq", "temperature")
+RATE_TOLERANCE = 0.02  # relative, within which control rates count as one: they are measured
 MIN_PERIOD_S = 1e-4
 MAX_PERIOD_S = 1.0
 # Between two samples of the state: what moved there is not known, and a clock that jumps is no
@@ -262,10 +263,13 @@ def require_same_gains(
                     )
 
 
+def is_same_rate(dt: float, other: float) -> bool:
+    """Return True if two control periods, s, count as one rate."""
+    return abs(dt / other - 1) <= RATE_TOLERANCE
+
+
 def whole_rate(dt: float) -> int:
-    """Return the rate of a control period, whole Hz. Recordings with the same one count as of one
-    rate: rates are measured.
-    """
+    """Return the rate of a control period in whole Hz, by which recordings are grouped."""
     return round(1 / dt)
 
 
@@ -278,9 +282,9 @@ def to_sequence(log: Log, robot: RobotSpec, meta: SequenceMeta) -> Sequence:
     by which no row is moved by more than half a period: time is never stretched. Where none is, or
     rows are uneven, measurements are interpolated and commands held: on the periods of the loop
     that wrote the rows, if they share timestamps and keep to one, else on a grid of the state's
-    median period. The manifest says which. Refused are clocks that cannot be right: periods below 0.1 ms
-    or above 1 s, a gap of more than 2 s, three times as many rows as were recorded, a stated period
-    that the timestamps contradict, states that end long before the commands.
+    median period. The manifest says which. Refused are clocks that cannot be right: periods below
+    0.1 ms or above 1 s, a gap of more than 2 s, three times as many rows as were recorded, a stated
+    period that the timestamps contradict, states that end long before the commands.
 
     Args:
         log: The recording; its joints are reordered to the robot's, and missing ones stand where

@@ -26,6 +26,7 @@ from gaponet.base.files import write_json
 from gaponet.base.progress import Progress, no_progress
 from gaponet.base.structure import read_json
 from gaponet.data.fingerprint import CommandFingerprint, equal_commands, fingerprint
+from gaponet.data.sequence import RATE_TOLERANCE
 from gaponet.data.store import Dataset, Entry, dataset_hash
 
 Splits = dict[str, list[Entry]]
@@ -43,7 +44,6 @@ ORDERED = ("repetition", "time")  # properties of which the last values are held
 MIN_MOTIONS = 3  # one for each split
 TEST_SHARE = 0.25  # of motions, units or payloads; at least one
 VAL_SHARE = 0.125  # of motions; at least one
-RATE_TOLERANCE = 0.02  # relative; rates are measured
 
 
 class SplitHashes(TypedDict):

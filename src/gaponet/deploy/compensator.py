@@ -35,6 +35,7 @@ import numpy as np
 from gaponet.base.arrays import Array, within
 from gaponet.base.errors import ModelError, RobotError, UsageError
 from gaponet.data.describe.plausibility import require_radians
+from gaponet.data.sequence import is_same_rate
 from gaponet.deploy.command_limits import CommandLimits
 from gaponet.deploy.feedback import Feedback, LowPass
 from gaponet.deploy.feedforward import Feedforward, MotionTorque
@@ -44,7 +45,7 @@ from gaponet.deploy.payload import Carrier, Payload, PayloadFields
 from gaponet.deploy.payload_estimate import PayloadEstimate
 from gaponet.deploy.shadow import Shadow
 from gaponet.nn.adaptation import Adaptation
-from gaponet.nn.artifact import GAIN_TOLERANCE, GapModel, is_same_rate
+from gaponet.nn.artifact import GAIN_TOLERANCE, GapModel
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.batch import Condition
 from gaponet.sim.model import idle_joints

@@ -20,8 +20,8 @@ import numpy as np
 
 from gaponet.base.arrays import Array
 from gaponet.base.errors import ModelError
-from gaponet.data.sequence import Sequence
-from gaponet.nn.artifact import RATE_TOLERANCE, GapModel
+from gaponet.data.sequence import Sequence, is_same_rate
+from gaponet.nn.artifact import GapModel
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.batch import BatchSim, Condition
 from gaponet.sim.inverse import AnalyticInverse, Period
@@ -312,7 +312,7 @@ def control_periods_of(model: GapModel, dt: float) -> int:
     """
     for trained in model.card.get("dt") or [dt]:
         count = max(1, round(float(trained) / dt))
-        if abs(dt * count / trained - 1) <= RATE_TOLERANCE:
+        if is_same_rate(dt * count, trained):
             return count
     rates = ", ".join(f"{1 / trained:.1f}" for trained in model.card["dt"])
     raise ModelError(

@@ -22,8 +22,8 @@ from gaponet.base.errors import FolderError, RobotError
 from gaponet.base.files import lock_folder, write_json
 from gaponet.base.progress import Progress, no_progress
 from gaponet.base.structure import read_json, validated
-from gaponet.data.sequence import Sequence, SequenceMeta
-from gaponet.data.split import RATE_TOLERANCE, split_entries
+from gaponet.data.sequence import Sequence, SequenceMeta, is_same_rate
+from gaponet.data.split import split_entries
 from gaponet.data.store import Dataset
 from gaponet.evaluation.candidate import read_origin
 from gaponet.robot.by_name import identified_catalogue
@@ -287,7 +287,7 @@ def mean_error(recorded: np.ndarray, played: np.ndarray) -> float:
 
 def at_rate(recordings: ListOf[Sequence], dt: float) -> list[Sequence]:
     """Return the recordings with a control period, s."""
-    return [s for s in recordings if abs(s.dt / dt - 1) <= RATE_TOLERANCE]
+    return [s for s in recordings if is_same_rate(s.dt, dt)]
 
 
 def check_motions(

@@ -19,11 +19,12 @@ from torch import Tensor, nn
 
 from gaponet.base.errors import ModelError
 from gaponet.base.files import atomic_write
+from gaponet.data.sequence import is_same_rate
 from gaponet.deploy.transfer import own_context
 from gaponet.export.onnx_to_torch import OnnxModule
 from gaponet.export.shipped.gaponet_action import PROGRAM, Past
 from gaponet.export.simulator_facts import control_period
-from gaponet.nn.artifact import WEIGHTS, GapModel, is_same_rate
+from gaponet.nn.artifact import WEIGHTS, GapModel
 from gaponet.nn.onnx_export import MAX_DIFFERENCE_RAD, trained_network
 from gaponet.nn.packaged_networks import is_packaged_network
 from gaponet.sim.batch import Condition

@@ -20,6 +20,7 @@ from typing_extensions import TypedDict
 from gaponet.base.arrays import Array
 from gaponet.base.errors import ModelError, UsageError
 from gaponet.base.structure import Json, Name, Number, Sha256, read_format, read_json, validated
+from gaponet.data.sequence import is_same_rate
 from gaponet.nn.config import ModelConfig
 from gaponet.nn.loop import DeltaCorrector, DeltaLoop
 from gaponet.nn.onnx_network import Network, OnnxNetwork
@@ -56,7 +57,6 @@ FACTS_IN_NETWORK = (
 MAX_DISTANCE = 0.1
 MIN_WIDTH_RAD = 1e-4  # narrower ranges of training are taken to be this wide
 GAIN_TOLERANCE = 0.02  # relative, between recorded and real gains
-RATE_TOLERANCE = 0.02  # relative: a clock of 49.85 Hz counts as 50 Hz
 MAX_SHOWN = 80  # characters of a value in an error message
 
 
@@ -576,11 +576,6 @@ class GapModel:
                 "untrained network"
             )
         return f"{pretraining}, {updates} updates of PPO" if updates else f"{pretraining}, no PPO"
-
-
-def is_same_rate(dt: float, other: float) -> bool:
-    """Return true if two control periods, s, count as one rate."""
-    return abs(dt / other - 1) <= RATE_TOLERANCE
 
 
 def sha256(file: Path) -> str:

@@ -501,8 +501,8 @@ def _servo_types(toml: RobotTable) -> tuple[ServoType | None, ...]:
 
 
 def _require_known_names(toml: RobotTable) -> None:
-    """Refuse joint names and sides of mounts that appear twice, a table without tips, and
-    identified values of joints and mounts that are not there.
+    """Refuse names that appear twice, a table without tips, and identified values of joints and
+    mounts that are not there.
 
     Bodies of identified links are looked for when the MJCF is compiled.
     """
@@ -522,6 +522,11 @@ def _require_known_names(toml: RobotTable) -> None:
     for name in toml.identified:
         if name not in joints:
             raise RobotError(f"[identified.{name}] names no joint; joints are {', '.join(joints)}")
+    _require_sides(toml)
+
+
+def _require_sides(toml: RobotTable) -> None:
+    """Refuse a side that two payload mounts have, and identified mounts that are not there."""
     sides = [mount.side for mount in toml.payload_mount]
     for side in sides:
         if sides.count(side) > 1:

@@ -117,20 +117,9 @@ def stiffen_friction(model: mujoco.MjModel) -> None:
     model.dof_invweight0 *= STIFF_MOBILITY
 
 
-def build_spec(
-    robot: RobotSpec,
-    payload_mass: float = 0.0,
-    payload_side: str = "both",
-    dt: float | None = None,
-    locked: tuple[str, ...] = (),
-    physics_only: bool = False,
-    shortest_step: float = math.inf,
-) -> mujoco.MjSpec:
-    """Return `build_model` before compilation, for a scene of several robots
-    (report/view/scene.py).
-    """
-    spec = read_mjcf(robot.mjcf)
-    names = sorted(j.name for j in spec.joints)
+def _require_joints(spec: mujoco.MjSpec, robot: RobotSpec) -> None:
+    """Refuse a robot with joints that its MJCF lacks, or with an operated one that is no hinge."""
+    names = sorted(joint.name for joint in spec.joints)
     for name in robot.joint_names:
         if name not in names:
             raise RobotError(
@@ -144,6 +133,22 @@ def build_spec(
                 f"{robot.mjcf}: joint '{name}' is a {kind_name} joint, and gaponet identifies "
                 "hinges only (rad, N·m): write operated = false for it in robot.toml"
             )
+
+
+def build_spec(
+    robot: RobotSpec,
+    payload_mass: float = 0.0,
+    payload_side: str = "both",
+    dt: float | None = None,
+    locked: tuple[str, ...] = (),
+    physics_only: bool = False,
+    shortest_step: float = math.inf,
+) -> mujoco.MjSpec:
+    """Return `build_model` before compilation, for a scene of several robots
+    (report/view/scene.py).
+    """
+    spec = read_mjcf(robot.mjcf)
+    _require_joints(spec, robot)
     # few joints, no contacts: islands cost more
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_ISLAND
     period = robot.dt if dt is None else dt

@@ -21,9 +21,8 @@ import numpy as np
 from scipy.optimize import nnls
 
 from gaponet.base.arrays import Array
-from gaponet.data.sequence import Sequence
+from gaponet.data.sequence import RATE_TOLERANCE, Sequence
 from gaponet.data.signals import differentiate, lowpass
-from gaponet.data.split import RATE_TOLERANCE
 from gaponet.robot.servo_parameters import ratio_to
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.commands import speed_limited

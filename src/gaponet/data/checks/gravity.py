@@ -87,6 +87,7 @@ class _Best(NamedTuple):
     hypothesis: _Hypothesis | None
     as_logged: float
     otherwise: float
+    is_loaded: bool = True  # whether gravity loads any joint
 
 
 def gravity(surveys: list[Survey], robot: RobotSpec, model: Gravity) -> Iterator[Finding]:
@@ -100,6 +101,11 @@ def gravity(surveys: list[Survey], robot: RobotSpec, model: Gravity) -> Iterator
         results.append(_best(servos, robot, model, centred=True))
     if not results:
         text = "too few torques and rests: zeros and signs cannot be told from gravity"
+        yield Finding("ok", "gravity", text)
+        return
+    results = [result for result in results if result.is_loaded]
+    if not results:
+        text = "gravity loads no joint here: zeros and signs cannot be told from it"
         yield Finding("ok", "gravity", text)
         return
     best = max(results, key=lambda result: result.evidence)
@@ -120,8 +126,8 @@ def gravity(surveys: list[Survey], robot: RobotSpec, model: Gravity) -> Iterator
         yield Finding("ok", "gravity", text)
         return
     text += (
-        ". If the base is mounted otherwise than in the model, write <option gravity> in robot.xml; "
-        "else check masses and gains"
+        ". If the base is mounted otherwise than in the model, write <option gravity> in "
+        "robot.xml; else check masses and gains"
     )
     yield Finding("note", "gravity", text)
 
@@ -142,8 +148,10 @@ def _best(loads: Loads, robot: RobotSpec, model: Gravity, centred: bool) -> _Bes
     rms = np.sqrt(np.mean(np.concatenate(list(weight.values())) ** 2, axis=0))  # (n) N·m
     limit = robot.servo.effort_limit
     loaded = np.flatnonzero(rms > MIN_LOAD * np.where(limit < NO_LIMIT, limit, rms.max()))
+    if not len(loaded):
+        return _Best(0.0, None, 0.0, 0.0, is_loaded=False)
     unexplained = _unexplained(weight, loads, loaded, centred)
-    as_logged = max(1 - float(unexplained.mean()), 0.0) if len(unexplained) else 1.0
+    as_logged = max(1 - float(unexplained.mean()), 0.0)
     best = _Best(0.0, None, as_logged, 0.0)
     for hypothesis in (_upside_down(robot), *_joint_faults(robot, loaded), *_order_faults(robot)):
         torques = {}

@@ -66,7 +66,7 @@ def _timing(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
         rate = float(np.median([survey.timing.rate_hz for survey in group]))
         for finding in _timing_at_one_rate(group, robot):
             if len(groups) > 1:
-                message = f"{len(group)} recordings at {rate:.1f} Hz: {finding.message}"
+                message = f"{len(group)} of {len(surveys)} at {rate:.1f} Hz: {finding.message}"
                 finding = replace(finding, message=message)
             found.append(finding)
     if all(finding.level == "ok" for finding in found):

@@ -20,7 +20,8 @@ from typing import Any
 from gaponet.base.errors import DatasetError, UsageError
 from gaponet.base.files import write_json
 from gaponet.base.structure import read_json
-from gaponet.data.split import RATE_TOLERANCE, Splits, split_entries
+from gaponet.data.sequence import RATE_TOLERANCE
+from gaponet.data.split import Splits, split_entries
 from gaponet.data.store import Dataset, Entry, dataset_hash
 from gaponet.experiments.paper.measure import Recorded, VirtualUnit
 from gaponet.experiments.paper.options import PaperOptions

@@ -15,8 +15,7 @@ import torch
 
 from gaponet.base.arrays import Array, array_module, float32, zeros_like
 from gaponet.base.errors import UsageError
-from gaponet.data.sequence import Sequence
-from gaponet.nn.artifact import is_same_rate
+from gaponet.data.sequence import Sequence, is_same_rate
 from gaponet.nn.config import ModelConfig
 from gaponet.nn.sensor import ProbeOracle
 from gaponet.nn.training.config import RewardConfig

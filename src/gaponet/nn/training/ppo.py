@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from gaponet.data.split import RATE_TOLERANCE
+from gaponet.data.sequence import is_same_rate
 from gaponet.nn.layers import MAX_FEATURE, DeltaNet, Standardise, dense
 from gaponet.nn.training.config import PPOConfig
 from gaponet.nn.training.env import DeltaEnv
@@ -85,8 +85,7 @@ def _control_period(env: DeltaEnv) -> float:
     its rate.
     """
     mean = float(np.mean([condition.dt for condition in env.groups.conditions_of_envs]))
-    has_own_rate = abs(mean / env.robot.dt - 1) <= RATE_TOLERANCE
-    return env.robot.dt if has_own_rate else mean
+    return env.robot.dt if is_same_rate(mean, env.robot.dt) else mean
 
 
 class PPO:
