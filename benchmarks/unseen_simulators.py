@@ -25,7 +25,8 @@ The test has twenty simulators within the ranges of training and ten beyond. The
 nothing else, and the motions are the test motions of training. Settings are chosen by the
 validation error of training, in other simulators and on other motions. A number is the mean error
 over that of the uncorrected simulator, averaged over simulators; ± is the standard error over
-simulators of the mean over seeds.
+simulators of the mean over seeds. Two networks with the same inputs are also compared motion by
+motion: ± is there the jackknife's standard error over motions.
 """
 
 from __future__ import annotations
@@ -33,9 +34,12 @@ from __future__ import annotations
 import argparse
 import functools
 import json
-from collections.abc import Callable
+import os
+from collections.abc import Callable, Iterator
 from collections.abc import Sequence as ListOf
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
+from multiprocessing import get_context
 from pathlib import Path
 from unittest.mock import patch
 
@@ -82,7 +86,14 @@ LITERAL_IN_MANY = "literal, many simulators, payload unknown"
 REFIT_STATES = 2048
 REFIT_STEPS = 6000
 Array = np.ndarray
-Errors = Callable[[list[Sequence]], float]  # recordings in a simulator → mean error, rad
+Errors = Callable[[list[Sequence]], Array]  # recordings in a simulator → errors, (recordings,) rad
+UNCORRECTED = "uncorrected"
+# Networks with the same inputs and training.
+PAIRS = (
+    ("GAPONet, one simulator", "MLP, one simulator"),
+    ("GAPONet + context", "MLP + context"),
+    ("GAPONet + context, payload unknown", "MLP + context, payload unknown"),
+)
 
 
 @dataclass(frozen=True)
@@ -175,28 +186,88 @@ def train(arguments: argparse.Namespace) -> None:
             )
 
 
+@dataclass(frozen=True)
+class Place:
+    """Recordings with one payload, in one simulator.
+
+    Attributes:
+        column: Of the table.
+        number: Of the simulator in its group, for the progress.
+    """
+
+    column: str
+    number: int
+    recordings: list[Sequence]
+
+
 def test(arguments: argparse.Namespace) -> None:
-    """Measure all networks in all simulators, and print the table."""
+    """Measure all networks in all simulators, on all cores, and print the table."""
     dataset, robot = open_dataset(arguments.dataset)
-    robot = robot.before_identification
     by_payload = test_recordings(dataset, arguments)
     groups: dict[str, ListOf[SimulatorChange | None]] = {"nominal": [None]}
     groups.update(test_simulators(len(robot.joint_names), arguments.tests))
-    methods = all_methods(arguments, robot)
-    found: dict[str, dict[str, list[list[float]]]] = {name: {} for name in methods}
+    places = []
     for group, simulators in groups.items():
         for number, simulator in enumerate(simulators):
             for kg, recordings in by_payload.items():
                 column = group if len(by_payload) == 1 else f"{group}, {kg:g} kg"
                 placed = [replace(s, simulator=simulator) for s in recordings]
-                uncorrected = float(rollout_errors(placed, robot, 1).mean())
-                for name, of_seeds in methods.items():
-                    ratios = [errors(placed) / uncorrected for errors in of_seeds]
-                    found[name].setdefault(column, []).append(ratios)
-                place = f"{column}, {number + 1} of {len(simulators)}"
-                print(f"{place}: {1e3 * uncorrected:.1f} mrad", flush=True)
-            write_json(arguments.out / f"{arguments.result}.json", found)
-    print(table(found).markdown())
+                places.append(Place(column, number, placed))
+    ratios: dict[str, dict[str, list[list[float]]]] = {}
+    errors: dict[str, dict[str, list[Array]]] = {}
+    measured = map_on_all_cores(arguments, robot.before_identification, places)
+    for place, by_method in zip(places, measured, strict=True):
+        uncorrected = by_method.pop(UNCORRECTED)
+        errors.setdefault(UNCORRECTED, {}).setdefault(place.column, []).append(uncorrected)
+        mean = float(uncorrected.mean())
+        for name, of_seeds in by_method.items():
+            of_place = [float(row.mean()) / mean for row in of_seeds]
+            ratios.setdefault(name, {}).setdefault(place.column, []).append(of_place)
+            errors.setdefault(name, {}).setdefault(place.column, []).append(of_seeds)
+        print(f"{place.column}, {place.number + 1}: {1e3 * mean:.1f} mrad", flush=True)
+    write_json(arguments.out / f"{arguments.result}.json", ratios)
+    print(table(ratios).markdown())
+    print(table_by_motion(errors).markdown())
+
+
+class Measurement:
+    """All methods, loaded once in each process."""
+
+    def __init__(self, arguments: argparse.Namespace, robot: RobotSpec) -> None:
+        self.robot = robot
+        self.methods = all_methods(arguments, robot)
+
+    def errors(self, place: Place) -> dict[str, Array]:
+        """Return the errors of each method, (seeds, recordings) rad, and without any, (1,
+        recordings) rad.
+        """
+        found = {UNCORRECTED: rollout_errors(place.recordings, self.robot, 1)[None]}
+        for name, of_seeds in self.methods.items():
+            found[name] = np.stack([errors(place.recordings) for errors in of_seeds])
+        return found
+
+
+_measurement: Measurement | None = None  # of this process
+
+
+def _load_methods(arguments: argparse.Namespace, robot: RobotSpec) -> None:
+    global _measurement
+    _measurement = Measurement(arguments, robot)
+
+
+def _errors_at(place: Place) -> dict[str, Array]:
+    assert _measurement is not None
+    return _measurement.errors(place)
+
+
+def map_on_all_cores(
+    arguments: argparse.Namespace, robot: RobotSpec, places: list[Place]
+) -> Iterator[dict[str, Array]]:
+    """Yield the errors of all methods at each place, in the order of the places."""
+    with ProcessPoolExecutor(
+        os.cpu_count(), get_context("spawn"), _load_methods, (arguments, robot)
+    ) as pool:
+        yield from pool.map(_errors_at, places)
 
 
 def test_recordings(dataset: Dataset, arguments: argparse.Namespace) -> dict[float, list[Sequence]]:
@@ -293,15 +364,15 @@ def _error(
     corrector: Callable[[GapModel], Corrector],
     model: GapModel,
     placed: list[Sequence],
-) -> float:
-    """Return the mean error with a network, rad."""
-    return float(rollout_errors(placed, robot, 1, corrector(model)).mean())
+) -> Array:
+    """Return the errors with a network, (recordings,) rad."""
+    return rollout_errors(placed, robot, 1, corrector(model))
 
 
-def _error_without_change(robot: RobotSpec, placed: list[Sequence]) -> float:
-    """Return the mean error of a robot in its own simulator, rad."""
+def _error_without_change(robot: RobotSpec, placed: list[Sequence]) -> Array:
+    """Return the errors of a robot in its own simulator, (recordings,) rad."""
     own = [replace(recording, simulator=None) for recording in placed]
-    return float(rollout_errors(own, robot, 1).mean())
+    return rollout_errors(own, robot, 1)
 
 
 def literal_refits(
@@ -339,12 +410,12 @@ class PredictorRefit:
         self.simulators = simulators
         self._fitted: Network | None = None
 
-    def error(self, placed: list[Sequence]) -> float:
-        """Return the error, rad."""
+    def error(self, placed: list[Sequence]) -> Array:
+        """Return the errors, (recordings,) rad."""
         if self._fitted is None:
             self._fitted = self._fit()
         corrector = DeltaCorrector(self._fitted, self.model.config, self.robot)
-        return float(rollout_errors(placed, self.robot, 1, corrector).mean())
+        return rollout_errors(placed, self.robot, 1, corrector)
 
     def _fit(self) -> Network:
         joints = len(self.robot.joint_names)
@@ -423,6 +494,55 @@ def table(found: dict[str, dict[str, list[list[float]]]]) -> ResultTable:
     for name, groups in found.items():
         lines.append((name, *map(_cell, groups.values())))
     return ResultTable("unseen_simulators", tuple(heads), tuple(lines))
+
+
+def table_by_motion(errors: dict[str, dict[str, list[Array]]]) -> ResultTable:
+    """Return the table of differences between networks with the same inputs, ± over motions, by
+    group of simulators.
+
+    Args:
+        errors: Method → column → at each place (seeds, recordings) rad; a test recording is a
+            motion.
+    """
+    columns = errors[UNCORRECTED]
+    groups: dict[str, list[str]] = {}
+    for column in columns:
+        groups.setdefault(column.split(",")[0], []).append(column)
+    motions = {of_column[0].shape[1] for of_column in columns.values()}
+    heads = ("difference of error over uncorrected", *groups)
+    lines = []
+    for ours, other in PAIRS:
+        if ours not in errors or other not in errors:
+            continue
+        cells = [f"{ours} − {other}, {max(motions)} motions"]
+        for of_group in groups.values():
+            differences = []
+            for column in of_group:
+                both = zip(errors[ours][column], errors[other][column], strict=True)
+                differences += [a.mean(axis=0) - b.mean(axis=0) for a, b in both]
+            uncorrected = np.concatenate([np.stack(columns[column])[:, 0] for column in of_group])
+            cells.append("{:.3f} ± {:.3f}".format(*_jackknife(np.stack(differences), uncorrected)))
+        lines.append(tuple(cells))
+    return ResultTable("unseen_simulators_by_motion", heads, tuple(lines))
+
+
+def _jackknife(differences: Array, uncorrected: Array) -> tuple[float, float]:
+    """Return the mean over places of a difference over the uncorrected error, and its standard
+    error over recordings, by the jackknife.
+
+    Args:
+        differences, uncorrected: (places, recordings) rad.
+    """
+
+    def ratio(recordings: Array) -> float:
+        below = uncorrected[:, recordings].sum(axis=1)
+        return float((differences[:, recordings].sum(axis=1) / below).mean())
+
+    count = differences.shape[1]
+    every = np.arange(count)
+    without_one = np.array([ratio(np.delete(every, one)) for one in every])
+    spread = np.square(without_one - without_one.mean()).sum()
+    return ratio(every), float(np.sqrt((count - 1) / count * spread))
 
 
 def _cell(ratios: list[list[float]]) -> str:

@@ -117,9 +117,10 @@ class Messages:
     Attributes:
         store: The types.
         tau: Torque that Unitree's command feeds forward, N·m.
+        reached_in: Time in which a point of a trajectory is to be reached, s.
     """
 
-    def __init__(self, tau: float) -> None:
+    def __init__(self, tau: float, reached_in: float) -> None:
         from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
         from gaponet.data.formats.rosbag import CONTROLLER, HG
@@ -131,6 +132,7 @@ class Messages:
         for kind, text in texts.items():
             self.store.register(get_types_from_msg(text, kind))
         self.tau = tau
+        self.reached_in = reached_in
 
     def make(self, kind: str, **fields: object) -> Any:
         return self.store.types[kind](**fields)
@@ -165,7 +167,11 @@ class Messages:
         )
 
     def point(self, x: np.ndarray) -> Any:
-        zero = self.make("builtin_interfaces/msg/Duration", sec=0, nanosec=0)
+        soon = self.make(
+            "builtin_interfaces/msg/Duration",
+            sec=int(self.reached_in),
+            nanosec=round(1e9 * (self.reached_in % 1)),
+        )
         none = np.array([])
         return self.make(
             "trajectory_msgs/msg/JointTrajectoryPoint",
@@ -173,7 +179,7 @@ class Messages:
             velocities=none,
             accelerations=none,
             effort=none,
-            time_from_start=zero,
+            time_from_start=soon,
         )
 
     def trajectory(self, t: float, x: np.ndarray) -> Any:
@@ -272,6 +278,7 @@ def write_bag(
     rows: int = ROWS,
     with_command: bool = True,
     tau: float = 0.0,
+    reached_in: float = 0.0,
 ) -> Path:
     """States at 50 Hz and commands at 25 Hz, on two topics.
 
@@ -280,10 +287,11 @@ def write_bag(
         drift, away: Of the command's clock against the recorder's, s/s and s.
         twice: Every state is recorded two times.
         tau: Torque that Unitree's command feeds forward, N·m.
+        reached_in: Time in which a point of a trajectory is to be reached, s.
     """
     from rosbags.rosbag2 import StoragePlugin, Writer
 
-    messages = Messages(tau)
+    messages = Messages(tau, reached_in)
     ctrl, qpos = motion(rows)
     plugin = StoragePlugin.MCAP if storage == "mcap" else StoragePlugin.SQLITE3
     with Writer(bag, version=9, storage_plugin=plugin) as writer:

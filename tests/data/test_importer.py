@@ -8,6 +8,7 @@ import itertools
 import json
 import os
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -132,6 +133,52 @@ def test_a_second_take_of_a_motion_is_its_next_repetition(logs, so101, tmp_path)
     write_sage(tmp_path / "later" / "up", again, late(again, 2))
     report = import_logs(tmp_path / "later", so101, tmp_path / "data", LAB)
     assert [e.meta.repetition for e in report.entries] == [1]
+
+
+@pytest.mark.parametrize("mass", [0, np.float32(0.0), "0", -0.0])
+def test_a_payload_is_the_same_whatever_its_type(logs, so101, tmp_path, mass):
+    first = import_logs(logs, so101, tmp_path / "data", LAB)
+    again = import_logs(logs, so101, tmp_path / "data", replace(LAB, payload_mass=mass))
+    assert (again.added, again.present) == ((), first.entries)
+
+
+def test_a_payload_has_the_digits_that_were_given(logs, so101, tmp_path):
+    light = replace(LAB, payload_mass=np.float32(0.1))
+    entries = import_logs(logs, so101, tmp_path / "data", light).entries
+    assert {entry.meta.payload_mass for entry in entries} == {0.1}
+    with pytest.raises(LogError, match="heavy"):
+        import_logs(logs, so101, tmp_path / "other", replace(LAB, payload_mass="heavy"))
+
+
+@pytest.mark.parametrize("name", ["kp", "kd"])
+def test_gains_that_are_stated_later_are_refused_until_the_old_recordings_are_gone(
+    logs, so101, tmp_path, name
+):
+    dataset = import_logs(logs, so101, tmp_path / "data", LAB).dataset
+    stated = replace(LAB, **{name: ("5",)})
+    with pytest.raises(DatasetError, match=f"another {name}.*gaponet data remove"):
+        import_logs(logs, so101, tmp_path / "data", stated)
+    dataset.remove(("*",))
+    for entry in import_logs(logs, so101, tmp_path / "data", stated).added:
+        assert set(getattr(entry.meta, name)) == {5.0}
+
+
+def test_a_log_that_is_there_is_not_read_in_another_way_beside_it(logs, so101, tmp_path):
+    import_logs(logs, so101, tmp_path / "data", LAB)
+    with pytest.raises(DatasetError, match="in another way"):
+        import_logs(logs, so101, tmp_path / "data", replace(LAB, cut=1.0))
+    assert len(Dataset(tmp_path / "data")) == 2
+    import_logs(logs, so101, tmp_path / "pieces", replace(LAB, cut=1.0))
+
+
+def test_a_repetition_has_a_number_of_its_own_where_another_was_removed(so101, tmp_path):
+    for take in range(3):
+        ctrl = wave(200, 6)
+        write_sage(tmp_path / str(take) / "up", ctrl, late(ctrl, 2 + take))
+        dataset = import_logs(tmp_path / str(take), so101, tmp_path / "data", LAB).dataset
+        if take == 1:
+            dataset.remove(("*r0*",))
+    assert [entry.meta.repetition for entry in Dataset(tmp_path / "data").entries] == [1, 2]
 
 
 def test_one_bad_file_leaves_nothing_behind(logs, so101, tmp_path):

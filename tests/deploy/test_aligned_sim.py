@@ -8,6 +8,7 @@ from runs import small_model
 
 from gaponet.base.errors import ModelError, UsageError
 from gaponet.deploy.aligned_sim import AlignedSim, AlignedSimOptions
+from gaponet.deploy.compensator import Compensator
 from gaponet.deploy.mujoco_loop import MujocoAligner
 from gaponet.robot.folder import save_robot
 from gaponet.sim.model import build_model
@@ -127,6 +128,22 @@ def test_other_rates_simulators_and_locked_joints_are_refused(robot, model, tmp_
         AlignedSim(other, bare)
     with pytest.raises(UsageError, match="locked"):
         AlignedSim(robot, model, options=AlignedSimOptions(locked=("elbow",)))
+
+
+@pytest.mark.parametrize("target", [[0.1], [0.1, 0.2, 0.3], 0.1, [np.nan, 0.1]])
+def test_targets_that_are_no_finite_number_for_each_joint_are_refused(robot, target):
+    sim = AlignedSim(robot)
+    sim.step([0.1, 0.2])
+    before = sim.qpos.copy()
+    with pytest.raises(UsageError, match=r"AlignedSim\.step"):
+        sim.step(target)
+    assert np.array_equal(sim.qpos, before)
+
+
+def test_a_robot_may_be_named(tmp_path):
+    robot = write_arm(tmp_path / "arm")
+    assert AlignedSim(str(robot.mjcf.parent)).joint_names == robot.joint_names
+    assert Compensator(robot.mjcf.parent, dt=robot.dt).robot.joint_names == robot.joint_names
 
 
 def test_a_scene_that_does_not_fit_is_refused(robot, model):

@@ -10,7 +10,7 @@ import numpy as np
 from gaponet.base.errors import UsageError
 from gaponet.data.store import Dataset, Entry
 from gaponet.nn.packaged_networks import named_folder
-from gaponet.robot.spec import RobotSpec, load_robot
+from gaponet.robot.spec import RobotSpec, as_robot
 from gaponet.sim.dataset_robot import open_dataset as open_dataset
 
 if TYPE_CHECKING:
@@ -19,11 +19,6 @@ if TYPE_CHECKING:
 
 Place = str | Path
 MOVING_RAD = 0.05  # range of a joint that moves
-
-
-def as_robot(robot: RobotSpec | Place) -> RobotSpec:
-    """Return a robot, loaded where a name or a folder is given."""
-    return robot if isinstance(robot, RobotSpec) else load_robot(robot)
 
 
 def as_identified(robot: RobotSpec | Place) -> RobotSpec:

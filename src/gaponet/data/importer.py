@@ -225,6 +225,7 @@ class _Source:
         """
         total = len(find_logs(self.src, self.options.format))
         source_of: dict[str, str] = {}  # content hash → source
+        read_of: dict[_LogIdentity, set[str]] = {}  # log → content hashes of what is read of it
         duplicates: list[tuple[str, str]] = []
         size = 0
         for sequence, log in self.sequences():
@@ -236,8 +237,10 @@ class _Source:
             if first is not None and not (self.cut and first == source):
                 duplicates.append((source, first))
             source_of.setdefault(content_hash, source)
+            read_of.setdefault(_log_identity(sequence.meta), set()).add(content_hash)
             if existing is not None:
                 _refuse_relabelled(sequence, existing)
+                _refuse_other_gains(sequence, existing, self.labels)
             self.provenance |= log.meta.get("dataset", {})
             size += _count_bytes(sequence)
             if size > MAX_HELD_BYTES:
@@ -259,6 +262,8 @@ class _Source:
                 f"samples, unit and payload): {again} is {first}. Nothing was imported; leave one "
                 "of them out"
             )
+        if existing is not None:
+            _refuse_read_otherwise(read_of, existing)
 
     def write(
         self, dataset: Dataset, poses: dict[str, StaticPoses] | None
@@ -275,7 +280,10 @@ class _Source:
             dataset.set_provenance(**self.provenance)
         found = map(dataset.find, self.hashes)
         present = [entry for entry in found if entry is not None]
-        repetitions = Counter(entry.meta.repetition_key for entry in dataset.entries)
+        repetitions: Counter[tuple[Any, ...]] = Counter()  # the next number of each slot
+        for entry in dataset.entries:
+            key = entry.meta.repetition_key
+            repetitions[key] = max(repetitions[key], entry.meta.repetition + 1)
         sequences: Iterable[Sequence]
         if self.held is None:  # too large to hold: read again
             sequences = (sequence for sequence, _ in self.sequences())
@@ -293,7 +301,7 @@ class _Source:
                     numbered = replace(sequence.meta, repetition=repetitions[key])
                     sequence = replace(sequence, meta=numbered)
                 added.append(dataset.append(sequence, measure_delays(sequence), content_hash))
-                repetitions[key] += 1
+                repetitions[key] = max(repetitions[key], sequence.meta.repetition + 1)
         return added, present
 
     def sequences(self) -> Iterator[tuple[Sequence, Log]]:
@@ -384,10 +392,15 @@ def _pieces(sequence: Sequence, seconds: float | None) -> Iterator[Sequence]:
         yield replace(sequence.rows(slice(start, start + rows)), meta=named)
 
 
-def _parse_gains(name: str, words: tuple[str, ...], robot: RobotSpec) -> tuple[float, ...] | None:
-    """Parse ("17.8",) or ("elbow=9", …) to gains of all joints, (n); NaN for joints that are not
-    named.
+def _parse_gains(
+    name: str, stated: float | str | Iterable[float | str], robot: RobotSpec
+) -> tuple[float, ...] | None:
+    """Parse 17.8, ("17.8",) or ("elbow=9", …) to gains of all joints, (n); NaN for joints that are
+    not named.
     """
+    if isinstance(stated, str | float | int):
+        stated = (stated,)
+    words = [str(word) for word in stated]
     if not words:
         return None
     gains = np.full(len(robot.joint_names), np.nan)
@@ -446,6 +459,56 @@ def _refuse_relabelled(sequence: Sequence, existing: Dataset) -> None:
                 f"{meta.payload_mass:g} kg ({meta.payload_side}). Nothing was imported; where the "
                 f"old label is the wrong one: gaponet data remove {existing.path} {entry.id}"
             )
+
+
+def _refuse_other_gains(sequence: Sequence, existing: Dataset, stated: dict[str, Any]) -> None:
+    """Refuse gains that are stated of a recording that the dataset holds with others: it would
+    keep the old ones.
+
+    Args:
+        stated: Labels that the user states.
+    """
+    present = existing.find(sequence.content_hash())
+    if present is None:
+        return
+    for name in ("kp", "kd"):
+        old = getattr(present.meta, name)
+        new = getattr(sequence.meta, name)
+        if name in stated and old is not None and old != new:
+            raise DatasetError(
+                f"{sequence.meta.source}: is in the dataset with another {name}, {list(old)} "
+                f"instead of {list(new)}. Nothing was imported; to replace it, first: "
+                f"gaponet data remove {existing.path} {present.id}"
+            )
+
+
+# Of which log a recording was read: hash of its files, part of the file, unit.
+_LogIdentity = tuple[str, str, str]
+
+
+def _log_identity(meta: SequenceMeta) -> _LogIdentity:
+    _, _, part = meta.source.partition("#")
+    return meta.source_sha256, part, meta.unit_id
+
+
+def _refuse_read_otherwise(read_of: dict[_LogIdentity, set[str]], existing: Dataset) -> None:
+    """Refuse a log that the dataset holds read otherwise, such as cut or with another sign: its
+    samples would be there twice, some perhaps in training and some in the test.
+
+    Args:
+        read_of: Log → content hashes of the recordings that are read of it now.
+    """
+    for entry in existing.entries:
+        now = read_of.get(_log_identity(entry.meta))
+        if now is None or entry.hash in now:
+            continue
+        if all(existing.find(content_hash) for content_hash in now):
+            continue
+        raise DatasetError(
+            f"{entry.meta.source}: is in {existing.path} as {entry.id}, read in another way (cut, "
+            "rate, signs, units or columns). Nothing was imported; use another folder, or first: "
+            f"gaponet data remove {existing.path} {entry.id}"
+        )
 
 
 def _labels(meta: SequenceMeta) -> tuple[str, float, str]:

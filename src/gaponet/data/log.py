@@ -5,6 +5,7 @@ Named channels with their own timestamps; nothing interpolated, nothing correcte
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -108,8 +109,7 @@ class Log:
             good = np.isfinite(clock)
             for values in same.values():
                 good &= np.isfinite(values).all(axis=1)
-            latest = np.maximum.accumulate(np.where(good, clock, -np.inf))
-            good[1:] &= clock[1:] > latest[:-1]
+            good = _longest_increase(clock, good)
             for row in np.flatnonzero(~good):
                 bad.append(f"{self.row(name, int(row))}: cut")
             for other, values in same.items():
@@ -202,6 +202,34 @@ class Log:
         if rows is None:
             return np.arange(len(self.channels[name].time))
         return np.asarray(rows)
+
+
+def _longest_increase(clock: Array, good: Array) -> Array:
+    """Return the most of the good rows whose times increase, (k,) bool: of one stamp that is too
+    late, and of one that is too early, only its own row is left out.
+    """
+    rows = np.flatnonzero(good)
+    if (np.diff(clock[rows]) > 0).all():
+        return good
+    ends: list[float] = []  # the earliest last time of an increase over so many rows
+    end_rows: list[int] = []
+    before: dict[int, int] = {}  # row → the row before it in its increase
+    for row in rows.tolist():
+        time = float(clock[row])
+        length = bisect_left(ends, time)
+        if length < len(ends) and ends[length] == time:
+            continue  # of equal times the first row stays
+        if length:
+            before[row] = end_rows[length - 1]
+        ends[length : length + 1] = [time]
+        end_rows[length : length + 1] = [row]
+    kept = np.zeros(len(clock), bool)
+    row = end_rows[-1]
+    while row in before:
+        kept[row] = True
+        row = before[row]
+    kept[row] = True
+    return kept
 
 
 def _starts_again(time: Array) -> bool:

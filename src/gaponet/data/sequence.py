@@ -36,7 +36,9 @@ FIRST_LOOP_ROWS = 16  # from which the period of a loop is told first
 MAX_LOOP_DIFFERENCE = 0.1  # of the median period, by which that of a loop differs from it
 MAX_OFF_LOOP = 0.2  # of a period, by which most rows of a loop lie beside their instants
 MAX_ADDED_DRIFT = 0.1  # of a period, over all rows, by which a rounder period may move the last row
-MIN_LOST_END_S = 1.0  # by which states end before the commands where a file was cut short
+# By which states end before the commands where a file was cut short, or after them where that is
+# said.
+MIN_LOST_END_S = 1.0
 MIN_LOST_END_SHARE = 0.1  # of the recording, the same
 MAX_PAYLOAD_KG = 100.0
 ASSUMED = "of robot.toml"  # note of gains that the log did not say
@@ -75,8 +77,7 @@ class SequenceMeta:
             gains = getattr(self, name)
             if gains is not None:
                 object.__setattr__(self, name, _gains(name, gains, where))
-        if not 0 <= self.payload_mass <= MAX_PAYLOAD_KG:
-            raise LogError(f"{where}: payload_mass is {self.payload_mass}; give kg, 0 when empty")
+        object.__setattr__(self, "payload_mass", _payload_mass(self.payload_mass, where))
         if not self.unit_id or not self.motion:
             raise LogError(f"{self.source}: unit_id and motion must be named")
         if self.level not in LEVELS:
@@ -234,6 +235,17 @@ def _gains(name: str, values: Any, where: str) -> tuple[float, ...]:
     if not all(np.isfinite(gain) and gain >= 0 for gain in gains):
         raise LogError(f"{where}: {name} is {values!r}; give one finite number ≥ 0 for each joint")
     return gains
+
+
+def _payload_mass(mass: Any, where: str) -> float:
+    """Return a payload as a float, kg: 0, 0.0 and numpy's 0 are one payload, and one hash."""
+    try:
+        number = float(str(mass))  # float() of a float32 would have more digits than were given
+    except ValueError:
+        number = np.nan
+    if not 0 <= number <= MAX_PAYLOAD_KG:
+        raise LogError(f"{where}: payload_mass is {mass!r}; give kg, 0 when empty")
+    return abs(number)  # -0.0 too is 0.0
 
 
 def require_same_gains(
@@ -438,6 +450,9 @@ def _row_notes(log: Log, median: float, dt: float, regular: bool) -> dict[str, A
     notes["rows"] = f"resampled to {1 / dt:.2f} Hz: commands held, states interpolated"
     if not _share_clock(log):
         notes["why_resampled"] = "its channels have clocks of their own"
+        unused = float(time[-1] - log.channels["ctrl"].time[-1])
+        if unused > MIN_LOST_END_S:
+            notes["why_resampled"] += f"; {unused:.1f} s after the last command are left out"
     elif (off <= MAX_UNEVEN_SHARE * median).all():
         notes["why_resampled"] = "no even period fits its rows"
     else:

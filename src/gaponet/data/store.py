@@ -236,12 +236,16 @@ class Dataset:
         """Return the entry with this content hash, if any."""
         return self._entry_by_hash.get(content_hash)
 
-    def select(self, motions: tuple[str, ...] = (), units: tuple[str, ...] = ()) -> list[Entry]:
+    def select(
+        self, motions: tuple[str, ...] | str = (), units: tuple[str, ...] | str = ()
+    ) -> list[Entry]:
         """Return the entries of some motions and units; all by default.
 
         Raises:
             DatasetError: The dataset has no such motion or unit, or is empty.
         """
+        motions = (motions,) if isinstance(motions, str) else motions
+        units = (units,) if isinstance(units, str) else units
         chosen = self.entries
         if motions:
             self._require_present("motion", motions, {entry.meta.motion for entry in self.entries})

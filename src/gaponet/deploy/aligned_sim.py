@@ -8,6 +8,7 @@ simulator, commands are transferred so that it moves like the corrected one (dep
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -16,7 +17,7 @@ from gaponet.base.errors import ModelError, UsageError
 from gaponet.deploy.transfer import Reference, Transfer, control_periods_of, own_context
 from gaponet.nn.artifact import GapModel
 from gaponet.nn.loop import DeltaLoop
-from gaponet.robot.spec import RobotSpec
+from gaponet.robot.spec import RobotSpec, as_robot
 from gaponet.sim.batch import BatchSim, Condition
 from gaponet.sim.inverse import AnalyticInverse
 
@@ -52,7 +53,7 @@ class AlignedSim:
 
     def __init__(
         self,
-        robot: RobotSpec,
+        robot: RobotSpec | str | Path,
         model: Reference | None = None,
         payload_mass: Array | float = 0.0,
         *,
@@ -63,9 +64,9 @@ class AlignedSim:
     ) -> None:
         """
         Args:
-            robot: The simulator. If the model was trained in another one, commands are transferred;
-                where that is refused, a model for many simulators is told this one's answers to
-                fixed probes (`transfer` is None).
+            robot: The simulator, or what `load_robot` takes. If the model was trained in another
+                one, commands are transferred; where that is refused, a model for many simulators
+                is told this one's answers to fixed probes (`transfer` is None).
             model: A trained model, or an identified robot that the simulator then moves like; None
                 for the simulator without correction.
             payload_mass: Payload in each hand of options.payload_side, kg; one number, or one per
@@ -80,6 +81,7 @@ class AlignedSim:
             ModelError: The robot, the control period or the payload does not fit the model.
             UsageError: A joint that the model corrects is locked.
         """
+        robot = as_robot(robot)
         if isinstance(model, GapModel):
             model.require_payload(payload_mass, extrapolate)
         for name in robot.operated:
@@ -202,10 +204,15 @@ class AlignedSim:
         self._uncorrected[ids] = self.target[ids][:, self.op]
 
     def step(self, ctrl: Array) -> None:
-        """Step one control period with targets `ctrl`, rad, which the model corrects."""
+        """Step one control period with targets `ctrl`, rad, which the model corrects.
+
+        Raises:
+            UsageError: A target is not finite, or the number of joints is another one.
+        """
         sim = self.sim
         op = self.op
         target = self.target
+        _require_targets(ctrl, self.joint_names)
         target[:] = ctrl
         self._uncorrected = target[:, op]
         if self.loop is not None:
@@ -214,3 +221,16 @@ class AlignedSim:
         if self.transfer is not None:
             target[:] = self.transfer.command(sim.qpos, sim.qvel, target)
         sim.step(target)
+
+
+def _require_targets(ctrl: Array, joint_names: tuple[str, ...]) -> None:
+    """Refuse targets that are no row of one finite number for each joint."""
+    ctrl = np.asarray(ctrl, float)
+    if ctrl.shape[-1:] != (len(joint_names),):
+        raise UsageError(
+            f"AlignedSim.step: targets have shape {ctrl.shape}; give {len(joint_names)} in a row, "
+            f"rad: {', '.join(joint_names)}"
+        )
+    if not np.isfinite(ctrl).all():
+        bad = np.flatnonzero(~np.isfinite(ctrl).reshape(-1, len(joint_names)).all(axis=0))
+        raise UsageError(f"AlignedSim.step: the target of {joint_names[bad[0]]} is not finite")

@@ -28,6 +28,7 @@ The remaining error is integrated, slowly and with a low-pass (feedback.py). Com
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -46,7 +47,7 @@ from gaponet.deploy.payload_estimate import PayloadEstimate
 from gaponet.deploy.shadow import Shadow
 from gaponet.nn.adaptation import Adaptation
 from gaponet.nn.artifact import GAIN_TOLERANCE, GapModel
-from gaponet.robot.spec import RobotSpec
+from gaponet.robot.spec import RobotSpec, as_robot
 from gaponet.sim.batch import Condition
 from gaponet.sim.model import idle_joints
 
@@ -118,7 +119,7 @@ class Compensator:
 
     def __init__(
         self,
-        robot: RobotSpec,
+        robot: RobotSpec | str | Path,
         model: GapModel | None = None,
         *,
         config: CompensatorConfig = CompensatorConfig(),
@@ -133,9 +134,9 @@ class Compensator:
     ) -> None:
         """
         Args:
-            robot: Nominal, identified or adapted parameters of the robot. With a model and aim
-                target, the simulator of training replaces another one. With aim simulator, another
-                one is refused.
+            robot: Nominal, identified or adapted parameters of the robot, or what `load_robot`
+                takes. With a model and aim target, the simulator of training replaces another one.
+                With aim simulator, another one is refused.
             model: The trained model; None for the feed-forward of the robot alone.
             dt: Control period of your loop, s. Default: the robot's, or the only period of the
                 model's training if the model refuses the robot's. Commands are wrong in a loop with
@@ -156,6 +157,7 @@ class Compensator:
                 robot is too different from the nominal one to follow it, without `extrapolate`.
             UsageError: `follow` with a model, or with a robot that is not identified.
         """
+        robot = as_robot(robot)
         if dt is None:
             dt = _default_period(robot, model)
         if follow is not None and model is not None:

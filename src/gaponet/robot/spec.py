@@ -311,6 +311,11 @@ def named_robots() -> list[str]:
     return [*packaged_robots(), *identified_catalogue().names()]
 
 
+def as_robot(robot: RobotSpec | str | Path) -> RobotSpec:
+    """Return a robot, loaded where a name or a folder is given."""
+    return robot if isinstance(robot, RobotSpec) else load_robot(robot)
+
+
 def load_robot(name_or_path: str | Path) -> RobotSpec:
     """Read a robot from the package by name, from a folder by path, or from the Hub by its address
     hf://USER/NAME.

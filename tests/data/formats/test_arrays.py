@@ -206,16 +206,17 @@ def test_every_demonstration_of_robomimic_is_a_recording(tmp_path, arm):
     assert np.allclose(found[2][1].channels["ctrl"].values, ctrl + 0.1)
 
 
-def test_arrays_in_a_group_called_data_are_no_demonstrations(tmp_path, arm):
+@pytest.mark.parametrize("below", ["", "/position"])
+def test_arrays_in_a_group_called_data_are_no_demonstrations(tmp_path, arm, below):
     h5py = pytest.importorskip("h5py")
     ctrl, qpos = motion()
     with h5py.File(tmp_path / "wave.hdf5", "w") as file:
-        file["data/ctrl"] = ctrl
-        file["data/qpos"] = qpos
+        file[f"data/ctrl{below}"] = ctrl
+        file[f"data/qpos{below}"] = qpos
     (tmp_path / "logs.toml").write_text(
         strange_logs.sheet(
-            ctrl="data/ctrl",
-            qpos="data/qpos",
+            ctrl=f"data/ctrl{below}",
+            qpos=f"data/qpos{below}",
             joints=arm.joint_names,
             rate=50.0,
             position_unit="rad",

@@ -50,6 +50,13 @@ def test_what_says_the_command_may_be_of_several_kinds(tmp_path, arm, command):
     assert bag.is_dir()
 
 
+def test_points_that_are_to_be_reached_slowly_are_no_commands(tmp_path, arm):
+    write_bag(tmp_path / "wave", command="trajectory", reached_in=0.5)
+    (tmp_path / "logs.toml").write_text(JOINTS)
+    with pytest.raises(LogError, match=r"reached in 0\.5 s.*controller_state"):
+        only(tmp_path, arm)
+
+
 def test_all_arrays_of_a_message_of_ones_own_are_offered(tmp_path, arm):
     write_bag(tmp_path / "wave", command="custom")
     (tmp_path / "logs.toml").write_text('ctrl = "/arm/commands.gain"\n')

@@ -41,7 +41,9 @@ def test_a_command_that_is_slower_than_the_state_is_held(tmp_path, arm, every):
         columns[f"ctrl.{joint}"] = np.where(told, columns[f"ctrl.{joint}"], np.nan)
     (tmp_path / "m.csv").write_text(cells(columns))
     log = only(tmp_path / "m.csv", arm, **SI)
-    assert np.allclose(log.channels["ctrl"].time, columns["time"][told])
+    last = columns["time"][-1:]
+    until_the_end = np.unique(np.append(columns["time"][told], last))
+    assert np.allclose(log.channels["ctrl"].time, until_the_end)
     assert len(log.channels["qpos"].time) == ROWS
     assert log.meta["notes"]["slower"]["ctrl"] == {"rows": told.sum(), "of": ROWS}
 
@@ -57,6 +59,45 @@ def test_commands_of_joints_that_come_in_turn_are_held_each(tmp_path, arm):
     rows = np.arange(1, ROWS)  # the elbow was told nothing in row 0
     assert np.array_equal(ctrl[:, 0], sent[0][rows - rows % 2])
     assert np.array_equal(ctrl[:, 1], sent[1][rows - 1 + rows % 2])
+
+
+def test_a_step_that_is_sent_once_is_held_to_the_end(tmp_path, arm):
+    columns = arm_columns(ROWS)
+    told = np.isin(np.arange(ROWS), (0, 50))
+    for joint in JOINTS:
+        columns[f"ctrl.{joint}"] = np.where(told, columns[f"ctrl.{joint}"], np.nan)
+    (tmp_path / "m.csv").write_text(cells(columns))
+    sequence = to_sequence(only(tmp_path / "m.csv", arm, **SI), arm, LABELS)
+    assert len(sequence) == ROWS
+    assert np.allclose(sequence.ctrl[-1], sequence.ctrl[60])
+
+
+def test_one_joint_that_is_slower_than_the_others_is_no_bad_row(tmp_path, arm):
+    columns = arm_columns(ROWS)
+    for channel in ("ctrl", "qpos"):
+        values = columns[f"{channel}.elbow"]
+        columns[f"{channel}.elbow"] = np.where(np.arange(ROWS) % 3 == 0, values, np.nan)
+    (tmp_path / "m.csv").write_text(cells(columns))
+    log = only(tmp_path / "m.csv", arm, **SI)
+    known = 3 * ((ROWS - 1) // 3) + 1  # rows up to the elbow's last position
+    assert len(log.channels["qpos"].time) == known
+
+
+def test_tabs_at_the_end_of_the_last_row_are_empty_cells(tmp_path, arm):
+    torque = np.where(np.arange(ROWS) % 5 == 0, 0.1, np.nan)
+    columns = arm_columns(ROWS) | {f"tau.{joint}": torque for joint in JOINTS}
+    (tmp_path / "m.tsv").write_text(cells(columns).replace(",", "\t"))
+    assert len(only(tmp_path / "m.tsv", arm, **SI).channels["qpos"].time) == ROWS
+
+
+def test_of_a_stamp_that_is_too_late_only_its_row_is_cut(tmp_path, arm):
+    columns = arm_columns(ROWS)
+    columns["time"][100] += 1.0
+    (tmp_path / "m.csv").write_text(table_text(columns))
+    with skip_bad_rows() as cut:
+        log = only(tmp_path / "m.csv", arm, **SI)
+    assert len(cut) == 1
+    assert np.array_equal(log.channels["qpos"].time, np.delete(columns["time"], 100))
 
 
 def test_one_empty_cell_is_a_bad_row(tmp_path, arm):

@@ -74,6 +74,20 @@ def test_rows_per_joint_give_the_same_log_as_columns_per_joint(tmp_path, arm):
         next(read_logs(tmp_path / "long.csv", arm, ReadOptions(logs=logs)))[1]()
 
 
+def test_episodes_of_a_table_with_rows_per_joint_are_recordings(tmp_path, arm):
+    columns = {name: list(map(float, values)) for name, values in arm_columns().items()}
+    lines = by_joint(columns, tmp_path / "long.csv").read_text().splitlines()
+    numbered = [f"{lines[0]},episode_index"]
+    for row, line in enumerate(lines[1:]):
+        numbered.append(f"{line},{row // 80}")  # of 120 rows
+    (tmp_path / "long.csv").write_text("\n".join(numbered) + "\n")
+    logs = tmp_path / "logs.toml"
+    logs.write_text('ctrl = "command"\nqpos = "position"\ntime_unit = "s"\nposition_unit = "rad"\n')
+    found = dict(read_logs(tmp_path / "long.csv", arm, ReadOptions(logs=logs)))
+    lengths = {name: len(log.channels["qpos"].time) for name, log in found.items()}
+    assert lengths == {"long-0000": 40, "long-0001": 20}
+
+
 def test_a_column_called_joint_beside_a_column_per_joint_is_no_table_with_a_row_per_joint(
     tmp_path, arm
 ):

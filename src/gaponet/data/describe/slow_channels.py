@@ -12,7 +12,7 @@ from gaponet.base.arrays import Array
 from gaponet.base.errors import LogError
 from gaponet.data.log import COMMANDS, REQUIRED, Channel
 
-MIN_EMPTY_SHARE = 0.2  # of the rows; fewer empty cells are bad rows
+MIN_EMPTY_SHARE = 0.2  # of a joint's rows; fewer empty cells are bad rows
 
 
 def sampled_channels(
@@ -49,6 +49,9 @@ def sampled_channels(
         sampled[name], numbers[name] = _sampled(name, channel, present)
         if len(sampled[name].time) < len(channel.time):
             slower[name] = {"rows": len(sampled[name].time), "of": len(channel.time)}
+        if name in COMMANDS:
+            held = _held_to_the_end(sampled[name], numbers[name], channel.time)
+            sampled[name], numbers[name] = held
     notes = {"slower": slower, "absent": absent}
     return sampled, numbers, {key: value for key, value in notes.items() if value}
 
@@ -57,7 +60,7 @@ def _sampled(name: str, channel: Channel, present: Array) -> tuple[Channel, Arra
     """Return the rows with samples, and their numbers. present: where a cell holds one, (k, n)
     bool.
     """
-    if (~present).mean() < MIN_EMPTY_SHARE:
+    if (~present).mean(axis=0).max() < MIN_EMPTY_SHARE:
         return channel, np.arange(len(channel.time))
     some = present.any(axis=1)
     time = channel.time[some]
@@ -71,6 +74,20 @@ def _sampled(name: str, channel: Channel, present: Array) -> tuple[Channel, Arra
     joined = np.stack(columns, axis=1)
     known = np.isfinite(joined).all(axis=1)
     return Channel(time[known], joined[known]), np.flatnonzero(some)[known]
+
+
+def _held_to_the_end(sampled: Channel, numbers: Array, time: Array) -> tuple[Channel, Array]:
+    """Return commands, and the numbers of their rows, with the last one held to the last row.
+
+    Args:
+        time: Of all rows, s.
+    """
+    last = len(time) - 1
+    if numbers[-1] == last:
+        return sampled, numbers
+    times = np.append(sampled.time, time[last])
+    values = np.concatenate([sampled.values, sampled.values[-1:]])
+    return Channel(times, values), np.append(numbers, last)
 
 
 def _between_samples(name: str, time: Array, values: Array, present: Array) -> Array:

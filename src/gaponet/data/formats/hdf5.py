@@ -47,11 +47,14 @@ def recordings(path: Path, specified: LogsFile) -> Iterator[RawRecording]:
 
 
 def _demos(paths: Iterable[str]) -> list[str]:
-    """Return the demonstrations of a file of robomimic's, such as data/demo_0, by number."""
+    """Return the demonstrations of a file of robomimic's, such as data/demo_0, by number; data/arm
+    is none.
+    """
     demos = set()
     for path in paths:
         group, *rest = path.split("/")
-        if group == "data" and len(rest) > 1:  # an array in the group itself is no demonstration
+        # An array in the group itself is no demonstration.
+        if group == "data" and len(rest) > 1 and rest[0][-1].isdigit():
             demos.add(f"{group}/{rest[0]}")
 
     def number(demo: str) -> int:

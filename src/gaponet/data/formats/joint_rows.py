@@ -15,12 +15,13 @@ from gaponet.base.errors import LogError
 from gaponet.base.structure import MAX_ARRAYS_BYTES, read_limited
 from gaponet.data.describe.logs_file import LogsFile
 from gaponet.data.describe.raw_recording import RawRecording
-from gaponet.data.formats import parquet, text
+from gaponet.data.formats import episodes, parquet, text
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
 JOINT_COLUMNS = ("joint", "joint_name", "joint_names")
+NUMBERS = (*episodes.COLUMNS, *episodes.FRAME_COLUMNS)
 TIME_COLUMNS = ("time", "t", "timestamp", "stamp")
 
 
@@ -67,7 +68,10 @@ def recording(file: Path, names: list[str], joint: str, logs: LogsFile) -> RawRe
         is_used = name in logs.values() or not column.null_count
         if is_used and is_number(column.type):
             numbers = _numbers(file, table, name)
-            arrays[name] = np.stack([numbers[rows] for rows in rows_of.values()], axis=1)
+            values = np.stack([numbers[rows] for rows in rows_of.values()], axis=1)
+            if name.lower() in NUMBERS and (values == values[:, :1]).all():
+                values = values[:, 0]  # numbers of episodes belong to all joints
+            arrays[name] = values
     recording = RawRecording.of_arrays(file, arrays, tuple(rows_of), default={"time": time})
     return replace(recording, where=f"{file}:1")
 

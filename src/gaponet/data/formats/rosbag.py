@@ -85,6 +85,8 @@ INTERFACES = {
     "DynamicJointState": "std_msgs/Header header\nstring[] "
     "joint_names\ncontrol_msgs/InterfaceValue[] interface_values",
 }
+# Time in which a point of a trajectory may be reached and still count as a command at once.
+MAX_TIME_FROM_START_S = 0.2
 Fields = dict[str, tuple[tuple[str, ...], Any]]  # field → (names of its columns, its numbers)
 Wanted = dict[str, dict[str, tuple[str, ...]]]  # topic → field → names of its columns
 
@@ -618,16 +620,24 @@ def _dynamic(topic: str, message: Any) -> Fields:
 
 
 def _trajectory(topic: str, message: Any) -> Fields:
-    """Return the only point of a trajectory; refuse one of several."""
+    """Return the only point of a trajectory; refuse one of several, and one that is to be reached
+    slowly: nobody recorded what the controller asked for on the way.
+    """
     points = message.points
-    if len(points) > 1:
-        raise LogError(
-            f"{topic} sends whole trajectories ({len(points)} points); what the controller made of "
-            "them stands in its state topic (…/controller_state): record that, and say "
-            'ctrl = "…" in logs.toml'
-        )
     if not points:
         return {}
+    takes = points[0].time_from_start
+    seconds = takes.sec + 1e-9 * takes.nanosec
+    problem = ""
+    if len(points) > 1:
+        problem = f"sends whole trajectories ({len(points)} points)"
+    elif seconds > MAX_TIME_FROM_START_S:
+        problem = f"sends points that are to be reached in {seconds:g} s"
+    if problem:
+        raise LogError(
+            f"{topic} {problem}; what the controller made of them stands in its state topic "
+            '(…/controller_state): record that, and say ctrl = "…" in logs.toml'
+        )
     return {"point": (tuple(message.joint_names), points[0].positions)}
 
 

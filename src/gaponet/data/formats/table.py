@@ -110,7 +110,7 @@ def recordings(path: Path, specified: LogsFile) -> Iterator[RawRecording]:
         _refuse_twice(file, table.names, ours)
         joint = joint_rows.joint_column(table.names, specified)
         if joint:
-            yield joint_rows.recording(file, table.names, joint, specified)
+            yield from episodes(joint_rows.recording(file, table.names, joint, specified))
             continue
         signals = dict.fromkeys(table.names, ()) | table.lists
         load = partial(_load_once, file, table.names, table.load)
@@ -296,7 +296,7 @@ def _rows(body: bytes, first: int) -> bytes:
         start = body.find(b"\n", start) + 1
         if not start:
             return b""
-    return body[start:].rstrip()
+    return body[start:].rstrip(b"\r\n ")  # tabs may be empty cells
 
 
 def _date_columns(body: bytes, names: list[str], wanted: list[str], delimiter: str) -> list[str]:
