@@ -45,8 +45,10 @@ STEM = "real"
 HEADING = """# Real robots
 
 `benchmarks/compare_methods.py` writes this table. It has errors in mrad (1 mrad is 0.057°) on
-public recordings of real robots, of motions that no method was fitted to. Each simulation starts at
-the recorded state and then receives only commands. [Compare your
+public recordings of real robots, of recordings that no method was fitted to. Each simulation starts
+at the recorded state and then receives only commands. Where a payload or a unit is left out, the
+same commands were fitted with other payloads or units; payload and unit are estimated from the
+recorded torque, also those of the test. [Compare your
 method](../benchmark.md#the-benchmark-of-real-robots) explains the questions and the methods.
 
 ± is the standard error over independent motions; differences are paired, motion by motion. "Of
