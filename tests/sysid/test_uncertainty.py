@@ -18,6 +18,7 @@ from gaponet.robot.folder import save_robot
 from gaponet.robot.spec import load_robot
 from gaponet.sim.replay import replay
 from gaponet.sysid.acceptance import HeldOut
+from gaponet.sysid.axes import CLASSIC
 from gaponet.sysid.evidence.drift import drift
 from gaponet.sysid.evidence.evidence import estimate_uncertainty
 from gaponet.sysid.uncertainty import OLD_KEYS, JointSummary, ParameterUncertainty, from_axes
@@ -144,6 +145,17 @@ def test_a_parameter_without_information_keeps_its_prior_std(arm):
     still = [replace(s, ctrl=s.ctrl * share, qpos=s.qpos * share) for s in played(arm, 0, 3)]
     mine = estimate_uncertainty(arm, still, [], nthread=1)
     assert np.sqrt(np.diag(mine.array("shoulder", "covariance"))[0]) <= 0.5
+
+
+@pytest.mark.parametrize(("fitted", "stated"), [(0.5, 0.5), (0.1, 0.1), (1e3, 0.5)])
+def test_the_prior_of_kp_counts_once(arm, fitted, stated):
+    """A fit has counted it, except for a joint of which neither file nor logs say anything."""
+    std = np.full(len(CLASSIC), 1e-3)
+    std[CLASSIC.index("kp")] = fitted
+    covariances = {"shoulder": (list(CLASSIC), np.diag(std**2))}
+    mine = estimate_uncertainty(arm, played(arm, 0, 2), [], covariances, nthread=1)
+    found = np.sqrt(np.diag(mine.array("shoulder", "covariance")))[CLASSIC.index("kp")]
+    assert found == pytest.approx(stated, rel=1e-3)
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,8 @@ import numpy as np
 from gaponet.base.errors import UsageError
 from gaponet.data.store import Dataset, Entry
 from gaponet.nn.packaged_networks import named_folder
-from gaponet.robot.spec import RobotSpec, as_robot
+from gaponet.robot.spec import RobotSpec
+from gaponet.robot.spec import as_robot as as_robot
 from gaponet.sim.dataset_robot import open_dataset as open_dataset
 
 if TYPE_CHECKING:

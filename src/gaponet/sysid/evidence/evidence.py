@@ -20,6 +20,7 @@ from gaponet.sysid.acceptance import HeldOut
 from gaponet.sysid.axes import CLASSIC, Axes, Bounds, first_values
 from gaponet.sysid.joint_rollouts import ERROR_SCALE_RAD, JointRollouts
 from gaponet.sysid.least_squares import slopes, soft_l1_weight
+from gaponet.sysid.problem import PRIOR_LOG_STD
 from gaponet.sysid.robot_rollouts import cut
 from gaponet.sysid.standard_errors import cluster_sums
 from gaponet.sysid.table_contact import contact_height, tip_heights
@@ -37,6 +38,8 @@ MIN_RELATIVE_INFORMATION = 1e-6  # of a parameter; less counts as none
 BOUND_QUANTILE = 0.9  # of all samples
 # Fewer recordings are divided into more clusters.
 MIN_RECORDINGS_AS_CLUSTERS = 6
+# Standard deviation over that of the prior, of a field that neither a prior nor the recordings hold.
+WITHOUT_PRIOR = 10.0
 WITHOUT_PLAY = slice(-1)  # of the Q numbers of an `Evidence`, the last of which is play
 
 
@@ -398,7 +401,8 @@ def _covariance(
 
     Args:
         from_rows: What the recordings' rows say alone, (P, P).
-        fitted, before: As `covariances` and `before` of `estimate_uncertainty`.
+        fitted, before: As `covariances` and `before` of `estimate_uncertainty`. A fit has counted
+            its own prior of kp, damping and armature.
     """
     covariance = from_rows
     if joint in fitted:
@@ -409,8 +413,13 @@ def _covariance(
         covariance = _beside_earlier(joint, values, from_rows, before)
     if before:
         return covariance
-    prior_information = np.diag(prior_std(fields, values) ** -2)
-    return inverted(inverted(covariance) + prior_information)
+    prior = prior_std(fields, values)
+    information = prior**-2
+    if joint in fitted:
+        has_prior = np.isin(fields, list(PRIOR_LOG_STD))
+        has_prior &= np.sqrt(np.diag(covariance)) < WITHOUT_PRIOR * prior
+        information = np.where(has_prior, 0.0, information)  # it counts once
+    return inverted(inverted(covariance) + np.diag(information))
 
 
 def _beside_earlier(
