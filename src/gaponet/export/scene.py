@@ -77,10 +77,10 @@ def apply(robot: RobotSpec, spec: mujoco.MjSpec, *, prefix: str = "") -> Applied
 
     Joints get armature, damping, dry friction and the encoder's zero; links their identified
     inertias. A mass that the robot always carries, such as a hand that its file lacks, becomes a
-    body `payload_SIDE`. A servo gets its gains, torque limit, offset and delay, and a limit of its target's
-    speed where one was identified. A joint without an actuator gets one of the joint's name. Names,
-    classes and groups stay, like everything else in the scene. Only operated joints change. Nothing
-    is changed if anything contradicts.
+    body `payload_SIDE`. A servo gets its gains, torque limit, offset and delay, and a limit of its
+    target's speed where one was identified. A joint without an actuator gets one of the joint's
+    name. Names, classes and groups stay, like everything else in the scene. Only operated joints
+    change. Nothing is changed if anything contradicts.
 
     Args:
         robot: Identified, or nominal.

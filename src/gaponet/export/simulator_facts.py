@@ -41,10 +41,10 @@ MEANING = {
     "mjlab in its actuators",
     "plain": "numbers fitted for PD servos without the servo model; equal to joints without one",
     "error_mrad": "mean |error| of joints on the motions of check.npz, in gaponet",
-    "payload_mounts": "side → body of the MJCF that carries a point mass at pos in its frame, m; mass "
-    "in kg is what is there, with payload_mass",
-    "links": "body → its identified mass in kg, centre pos in its frame in m, and inertia about the "
-    "centre (xx, yy, zz, xy, xz, yz) in kg·m²; other bodies have those of the MJCF",
+    "payload_mounts": "side → body of the MJCF that carries a steel ball, its centre at pos in the "
+    "body's frame, m; mass in kg includes payload_mass",
+    "links": "body → its identified mass in kg, centre pos in its frame in m, and inertia about "
+    "the centre (xx, yy, zz, xy, xz, yz) in kg·m²; other bodies have those of the MJCF",
     "table": "level plane at height in m in the MJCF's world, friction coefficient, and stiffness "
     "under a tip in N/m; tips are spheres of radius at pos in the frame of body, m. null: no table",
     "mujoco": "fields of the compiled MjModel by their names",
