@@ -38,7 +38,8 @@ from gaponet.export.shipped.mujoco_servos import (
 from gaponet.export.simulator_facts import simulator_facts
 from gaponet.robot.folder import PROVENANCE_FILE, save_robot
 from gaponet.robot.servo_fields import SERVO_FIELDS, SERVO_TERMS
-from gaponet.robot.spec import load_robot
+from gaponet.robot.spec import Link, load_robot
+from gaponet.robot.toml_file import Table
 from gaponet.sim.model import build_model, model_hash
 from gaponet.sim.replay import replay
 
@@ -241,7 +242,7 @@ def test_a_servo_whose_gains_and_commands_are_in_degrees_takes_radians_from_now_
     assert servo.gainprm[0] == 24.0
     assert servo.biasprm[:2].tolist() == [0.0, -24.0]
     assert servo.ctrlrange.tolist() == pytest.approx([-90 * 0.42 / 24, 90 * 0.42 / 24])
-    assert "targets of elbow were not in rad before (degrees?)" in made.notes[-1]
+    assert "targets of elbow were not in rad before (degrees, or another sign?)" in made.notes[-1]
     assert made.errors["scene.xml with mujoco_servos.py"] < 2e-5
     assert (
         f'-    <general name="second" joint="elbow" {degrees}/>'
@@ -546,6 +547,17 @@ def test_an_export_says_when_the_recordings_of_a_robot_are_not_there(
     note = made.notes[-1]
     assert state.format(tmp_path / "data") in note
     assert "--data DATASET" in note
+
+
+def test_json_names_the_masses_and_the_table_that_the_users_model_lacks(robot, tmp_path):
+    fore = robot.payload_mounts[0]
+    link = Link(0.4, (0.12, 0.0, 0.01), (1e-4, 2e-3, 2e-3, 0.0, 0.0, 0.0))
+    heavy = replace(robot, payload_mounts=(replace(fore, mass=0.6),), links={"upper": link})
+    made = export_robot(heavy.with_table(Table(height=-0.5)), "json", tmp_path)
+    notes = " ".join(made.notes)
+    assert "0.6 kg at fore" in notes
+    assert "height -0.500 m" in notes
+    assert "inertias of upper" in notes
 
 
 def test_facts_hold_both_forms(robot, lawful):

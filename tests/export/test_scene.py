@@ -206,6 +206,58 @@ def test_identified_inertias_of_links_are_written(arm, tmp_path):
     np.testing.assert_allclose(body.ipos, [0.11, 0.0, 0.01])
 
 
+def test_a_scene_carries_the_mass_that_the_robot_always_carries(tmp_path):
+    hand_kg = 0.6
+    robot = write_arm(tmp_path, f"{TOML}mass = {hand_kg}\n")
+    spec = scene(robot)
+    before = spec.copy().compile().body_mass.sum()
+
+    gp.apply(robot, spec, prefix=PREFIX)
+
+    model = spec.compile()
+    assert model.body_mass.sum() == pytest.approx(before + hand_kg)
+    hand = model.body("left/payload_hand")
+    assert model.body(hand.parentid[0]).name == "left/fore"
+    assert hand.pos == pytest.approx([0.2, 0.0, 0.0])
+
+
+def test_a_mount_whose_body_is_missing_is_refused(tmp_path):
+    robot = write_arm(tmp_path, f"{TOML}mass = 0.6\n")
+    spec = scene(robot, XML.replace('<body name="fore"', '<body name="hand"'))
+    with pytest.raises(RobotError, match="left/fore"):
+        gp.apply(robot, spec, prefix=PREFIX)
+
+
+@pytest.mark.parametrize(("mass", "word"), [(0.0, "zero"), (0.6, "payload_hand")])
+def test_a_scene_is_changed_once(tmp_path, mass, word):
+    robot = identified(write_arm(tmp_path, f"{TOML}mass = {mass}\n"))
+    spec = scene(robot)
+    gp.apply(robot, spec, prefix=PREFIX)
+    with pytest.raises(RobotError, match=word):
+        gp.apply(robot, spec, prefix=PREFIX)
+
+
+def test_a_servo_of_the_scene_adds_no_armature_or_damping_of_its_own(arm):
+    spec = scene(arm)
+    own = spec.add_actuator(name="m", target="left/elbow", trntype=mujoco.mjtTrn.mjTRN_JOINT)
+    own.set_to_position(kp=300.0)
+    own.armature = 0.5
+    own.damping[:] = 0.3, 0.1, 0.05
+
+    gp.apply(identified(arm), spec, prefix=PREFIX)
+
+    model = spec.compile()
+    assert not model.actuator_armature.any()
+    assert not model.actuator_damping.any()
+    assert not model.actuator_dampingpoly.any()
+
+
+def test_the_temperature_of_friction_is_said(arm):
+    warm = identified(arm, friction_per_kelvin=-0.01, friction_temperature=45.0)
+    notes = gp.apply(warm, scene(arm), prefix=PREFIX).notes
+    assert any("45 °C" in note for note in notes)
+
+
 def test_what_the_scene_lacks_is_said(arm):
     stopped = identified(arm).with_servo(stop_low=np.array([-1.0, np.nan]))
     spec = scene(arm)

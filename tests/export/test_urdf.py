@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import mujoco
 import pytest
-from arm import write_arm
+from arm import TOML, write_arm
 
 from gaponet.base.errors import RobotError, UsageError
 from gaponet.cli.main import main
@@ -82,6 +82,37 @@ def test_what_a_urdf_cannot_hold_is_named_and_has_its_price(made):
     assert "kp, armature, delay" in lost
     alone = made.errors["mine.urdf alone, all else as before"]
     assert alone > 100 * made.errors["in gaponet"] + 0.002
+
+
+@pytest.fixture
+def lacking(tmp_path):
+    """An export into a URDF that has no place for a hand's mass, a table, a stop, and a limit."""
+    table = "[[tip]]\nbody = 'fore'\npos = [0.2, 0.0, 0.0]\n[identified_table]\nheight = -0.5\n"
+    mount = "[identified_mount.hand]\npos = [0.2, 0.0, 0.0]\nmass = 0.6\n"
+    robot = write_arm(tmp_path / "arm", TOML + table + mount)
+    robot = robot.with_identified({"shoulder": {"effort_limit": 3.0}, "elbow": {"stop_low": -0.7}})
+    limit = '<limit effort="9" velocity="3" lower="-1.5" upper="1.5"/>'
+    file = tmp_path / "mine.urdf"
+    file.write_text(URDF.replace(limit, "", 1).replace("revolute", "continuous", 1))
+    return export_robot(robot, "urdf", tmp_path / "out", source=Source(file), payload_mass=0.5)
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "1.1 kg at fore (hand)",
+        "table (height -0.500 m)",
+        "stops of elbow",
+        "torque limits of shoulder",
+    ],
+)
+def test_masses_tables_stops_and_limits_that_a_urdf_does_not_get_are_named(lacking, words):
+    assert any(words in note for note in lacking.notes)
+
+
+def test_a_hand_and_a_table_that_a_urdf_does_not_get_have_their_price(lacking):
+    alone = lacking.errors["mine.urdf alone, all else as before"]
+    assert alone > lacking.errors["in gaponet"] + 0.005
 
 
 def test_links_are_written_where_the_file_has_the_mass_that_was_corrected(robot, tmp_path):

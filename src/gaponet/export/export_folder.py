@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Sequence as ListOf
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -38,11 +38,17 @@ from gaponet.export.plain_servos import (
 )
 from gaponet.export.shipped import mujoco_servos
 from gaponet.export.simulator_facts import control_period, mjcf_text, simulator_facts
-from gaponet.export.targets import NEWTON_CHECK, TARGETS, own_terms
+from gaponet.export.targets import (
+    NEWTON_CHECK,
+    TARGETS,
+    own_terms,
+    temperature_note,
+)
 from gaponet.export.urdf_edit import MISSING_FIELDS, edit_urdf, with_urdf_fields
 from gaponet.nn.artifact import GapModel
 from gaponet.robot.servo_fields import STOP_FIELDS
 from gaponet.robot.spec import RobotSpec
+from gaponet.sim.model import carried
 
 FOLDER_KIND = "engine"
 FACTS = "facts.json"
@@ -131,24 +137,28 @@ class _RobotExport:
             error = _error_in_mujoco(file, self.facts, self.validation, self.robot, form)
             self.errors[f"{file.name} {what}"] = error
         if not_rad:
-            text = f"targets of {', '.join(not_rad)} were not in rad before (degrees?)"
-            self.notes.append(f"{text}: now they are; ctrl of keyframes not")
+            names = ", ".join(not_rad)
+            self.notes.append(
+                f"targets of {names} were not in rad before (degrees, or another sign?): now they "
+                "are; ctrl of keyframes not"
+            )
         return file
 
     def write_urdf(self, source: Path) -> Path:
         """Write an edited copy of a URDF; the error is that of its fields in gaponet."""
-        file, other = edit_urdf(source, self.out, self.facts, self.robot)
-        plain = self.plain
-        if other:
+        edited = edit_urdf(source, self.out, self.facts, self.robot)
+        file = edited.file
+        if edited.other_links:
             self.notes.append(
-                f"inertias of {', '.join(other)} were not written: their masses in the file are "
-                "others"
+                f"inertias of {', '.join(edited.other_links)} were not written: their masses in "
+                "the file are others"
             )
-            links = dict(plain.links)
-            for name in other:
-                links.pop(name, None)
-            plain = replace(plain, links=links)
-        error = rollout_error(self.validation, with_urdf_fields(plain))
+        if edited.without_limit:
+            self.notes.append(
+                f"torque limits of {', '.join(edited.without_limit)} were not written: these "
+                "joints have no <limit>; facts.json (plain, effort_limit) has them"
+            )
+        error = rollout_error(self.validation, with_urdf_fields(self.plain, edited))
         self.errors[f"{file.name} alone, all else as before"] = error
         return file
 
@@ -302,12 +312,18 @@ def _notes(robot: RobotSpec, facts: dict[str, Any], to: str) -> list[str]:
     if robot.servo.target_speed.any():
         notes.append(_ramp_note(robot, to))
     if robot.servo.friction_per_kelvin.any():
-        notes.append(_temperature_note(robot))
+        notes.append(temperature_note(robot))
     is_late = any(servo["delay"] for servo in facts["plain"].values())
     if is_late and target.delay_note:
         notes.append(target.delay_note)
     if to == "urdf":
         notes.append(_urdf_note(facts))
+        notes += _range_notes(robot)
+    if to in ("urdf", "json"):
+        notes += _mass_notes(robot, facts["payload_mass"])
+    if to == "json" and robot.links:
+        names = ", ".join(robot.links)
+        notes.append(f"masses and inertias of {names} were identified: facts.json (links) has them")
     if not target.has_servo_model:
         notes += _servo_model_notes(facts["law"], to)
     if to == "mjlab" and robot.servo.backlash.any():
@@ -329,10 +345,48 @@ def _stop_notes(robot: RobotSpec) -> list[str]:
     return notes
 
 
-def _temperature_note(robot: RobotSpec) -> str:
-    """Return at which temperatures friction and damping are those of the export."""
-    warm = ", ".join(f"{t:.0f}" for t in robot.servo.friction_temperature[robot.operated_index])
-    return f"friction and damping are those at {warm} °C: no engine has a temperature"
+def _range_notes(robot: RobotSpec) -> list[str]:
+    """Return a note on identified stops, which are not in the <limit> of a URDF, if there are
+    some.
+    """
+    stopped = []
+    for i, name in enumerate(robot.joint_names):
+        if robot.servo.finite_of_joint(i, STOP_FIELDS):
+            stopped.append(name)
+    if not stopped:
+        return []
+    names = ", ".join(stopped)
+    return [
+        f"identified stops of {names} are not in the file, which keeps its ranges: facts.json "
+        "(plain, range) has them"
+    ]
+
+
+def _mass_notes(robot: RobotSpec, payload_mass: float) -> list[str]:
+    """Return what of a robot's masses and of its table a file of the user's does not get, and where
+    it is.
+
+    Args:
+        payload_mass: In each hand, kg.
+    """
+    notes = []
+    masses = []
+    for mount in robot.payload_mounts:
+        mass = carried(robot, mount, payload_mass)
+        if mass:
+            masses.append(f"{mass:.4g} kg at {mount.body} ({mount.side})")
+    if masses:
+        notes.append(
+            f"your model does not get {' and '.join(masses)}: add them, with the places in "
+            "facts.json (payload_mounts)"
+        )
+    if robot.scene.table is not None:
+        height = robot.scene.table.height
+        notes.append(
+            f"your model does not get the table (height {height:.3f} m): it is in facts.json "
+            "(table)"
+        )
+    return notes
 
 
 def _servo_model_notes(terms: ListOf[str], to: str) -> list[str]:

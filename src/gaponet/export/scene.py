@@ -16,10 +16,20 @@ import numpy as np
 
 from gaponet.base.arrays import Array
 from gaponet.base.errors import RobotError
+from gaponet.export.mjcf_edit import has_earlier_zero
 from gaponet.export.shipped.mujoco_servos import Servos
 from gaponet.export.simulator_facts import simulator_facts
-from gaponet.robot.spec import RobotSpec
-from gaponet.sim.model import STIFF_SOLIMP, STIFF_SOLREF, TOLERANCE, build_model, write_link
+from gaponet.export.targets import temperature_note
+from gaponet.robot.spec import PayloadMount, RobotSpec
+from gaponet.sim.model import (
+    STIFF_SOLIMP,
+    STIFF_SOLREF,
+    TOLERANCE,
+    add_payload_body,
+    build_model,
+    carried,
+    write_link,
+)
 
 MAX_AXIS_DIFFERENCE_RAD = 0.02  # between two joints' axes, in the scene and in the robot
 # Of an end of a joint's range; official files of one robot differ by less.
@@ -66,10 +76,11 @@ def apply(robot: RobotSpec, spec: mujoco.MjSpec, *, prefix: str = "") -> Applied
         model = spec.compile()
 
     Joints get armature, damping, dry friction and the encoder's zero; links their identified
-    inertias. A servo gets its gains, torque limit, offset and delay, and a limit of its target's
-    speed where one was identified. A joint without an actuator gets one of the joint's name. Names,
-    classes and groups stay, like everything else in the scene. Only operated joints change. Nothing
-    is changed if anything contradicts.
+    inertias. A mass that the robot always carries, such as a hand that its file lacks, becomes a
+    body `payload_SIDE`. A servo gets its gains, torque limit, offset and delay, and a limit of its
+    target's speed where one was identified. A joint without an actuator gets one of the joint's
+    name. Names, classes and groups stay, like everything else in the scene. Only operated joints
+    change. Nothing is changed if anything contradicts.
 
     Args:
         robot: Identified, or nominal.
@@ -80,8 +91,8 @@ def apply(robot: RobotSpec, spec: mujoco.MjSpec, *, prefix: str = "") -> Applied
     Raises:
         RobotError: The scene contradicts the robot: a joint is missing, has another kind, axis or
             range, or more than one actuator, or one that takes no position targets in rad; a body
-            with identified inertia is missing; or this MuJoCo is too old for what was identified.
-            Every contradiction is named.
+            with identified inertia or with a mount is missing; the robot was applied to this scene
+            before; or this MuJoCo is too old for what was identified. Every contradiction is named.
     """
     problems = [*_joint_problems(robot, spec, prefix), *_body_problems(robot, spec, prefix)]
     if not problems:
@@ -95,6 +106,9 @@ def apply(robot: RobotSpec, spec: mujoco.MjSpec, *, prefix: str = "") -> Applied
         _write_servo(spec, _servo_of(spec, prefix + name), robot, i)
     for name, link in robot.links.items():
         write_link(spec.body(prefix + name), link)
+    for mount in _loaded_mounts(robot):
+        body = spec.body(prefix + mount.body)
+        add_payload_body(body, _payload_name(prefix, mount), mount, carried(robot, mount, 0.0))
     notes = _notes(robot, spec, model)
     spec.option.tolerance = min(spec.option.tolerance, TOLERANCE)
     facts = simulator_facts(robot, robot.dt)
@@ -161,14 +175,32 @@ def _takes_positions(actuator: mujoco.MjsActuator) -> bool:
 
 
 def _body_problems(robot: RobotSpec, spec: mujoco.MjSpec, prefix: str) -> list[str]:
-    """Return which bodies with identified inertias are missing."""
+    """Return which bodies with identified inertias or masses are missing, or are there already."""
     have = {body.name for body in spec.bodies}
     problems = []
     for name in robot.links:
         full = prefix + name
         if full not in have:
             problems.append(f"there is no body '{full}', whose inertia was identified")
+    for mount in _loaded_mounts(robot):
+        full = prefix + mount.body
+        if full not in have:
+            problems.append(f"there is no body '{full}', which carries the mass '{mount.side}'")
+        payload = _payload_name(prefix, mount)
+        if payload in have:
+            problems.append(
+                f"there is a body '{payload}' already; begin with the original scene, or delete it"
+            )
     return problems
+
+
+def _loaded_mounts(robot: RobotSpec) -> list[PayloadMount]:
+    """Return the mounts that carry a mass even without a payload."""
+    return [mount for mount in robot.payload_mounts if carried(robot, mount, 0.0)]
+
+
+def _payload_name(prefix: str, mount: PayloadMount) -> str:
+    return f"{prefix}payload_{mount.side}"
 
 
 def _geometry_problems(robot: RobotSpec, spec: mujoco.MjSpec, prefix: str) -> list[str]:
@@ -176,9 +208,24 @@ def _geometry_problems(robot: RobotSpec, spec: mujoco.MjSpec, prefix: str) -> li
     scene = spec.copy().compile()
     own = build_model(robot.before_identification)
     return [
+        *_zero_problems(robot, scene, own, prefix),
         *_range_problems(robot, scene, own, prefix),
         *_axis_problems(robot, scene, own, prefix),
     ]
+
+
+def _zero_problems(
+    robot: RobotSpec, scene: mujoco.MjModel, own: mujoco.MjModel, prefix: str
+) -> list[str]:
+    """Return the joints from which gaponet has subtracted an encoder's zero before."""
+    problems = []
+    for name in robot.operated:
+        if has_earlier_zero(scene, prefix + name, own, name):
+            problems.append(
+                f"joint '{prefix}{name}' has the encoder zero of an earlier apply or export; begin "
+                "with the original scene"
+            )
+    return problems
 
 
 def _range_problems(
@@ -292,6 +339,8 @@ def _write_servo(
     if np.isfinite([low, high]).all():
         actuator.ctrllimited = True
         actuator.ctrlrange = (low, high)
+    actuator.armature = 0.0  # the identified ones are the joint's
+    actuator.damping = np.zeros(np.size(actuator.damping))
     actuator.delay = servo.delay[i]
     actuator.nsample = 0
     if servo.delay[i] > 0:
@@ -316,6 +365,8 @@ def _notes(robot: RobotSpec, spec: mujoco.MjSpec, own: mujoco.MjModel) -> tuple[
     if stopped.any():
         names = ", ".join(np.array(robot.joint_names)[stopped])
         notes.append(f"identified stops of {names} limit targets, not the ranges of joints")
+    if robot.servo.friction_per_kelvin.any():
+        notes.append(temperature_note(robot))
     if robot.servo.target_speed.any():
         notes.append(
             "the speed of targets is limited in each physics step, in gaponet in each control "

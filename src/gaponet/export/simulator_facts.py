@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import xml.etree.ElementTree as ET
 from collections.abc import Iterable
+from dataclasses import asdict
 from typing import Any
 
 import mujoco
@@ -19,7 +20,14 @@ from gaponet.robot.mjcf import compile_spec
 from gaponet.robot.self_contained import self_contained_text, set_attributes
 from gaponet.robot.servo_fields import SERVO_FIELDS, SERVO_TERMS, STOP_FIELDS
 from gaponet.robot.spec import RobotSpec
-from gaponet.sim.model import STIFF_MOBILITY, build_model, build_spec, model_hash
+from gaponet.sim.model import (
+    STIFF_MOBILITY,
+    build_model,
+    build_spec,
+    carried,
+    model_hash,
+    numbers_of_pairs,
+)
 
 UNITS = {"home": "rad", "range": "rad", "dt": "s", "payload_mass": "kg"} | {
     field.name: field.unit for field in SERVO_FIELDS.values() if field.name not in STOP_FIELDS
@@ -33,6 +41,12 @@ MEANING = {
     "mjlab in its actuators",
     "plain": "numbers fitted for PD servos without the servo model; equal to joints without one",
     "error_mrad": "mean |error| of joints on the motions of check.npz, in gaponet",
+    "payload_mounts": "side → body of the MJCF that carries a steel ball, its centre at pos in the "
+    "body's frame, m; mass in kg includes payload_mass",
+    "links": "body → its identified mass in kg, centre pos in its frame in m, and inertia about "
+    "the centre (xx, yy, zz, xy, xz, yz) in kg·m²; other bodies have those of the MJCF",
+    "table": "level plane at height in m in the MJCF's world, friction coefficient, and stiffness "
+    "under a tip in N/m; tips are spheres of radius at pos in the frame of body, m. null: no table",
     "mujoco": "fields of the compiled MjModel by their names",
 }
 
@@ -80,9 +94,29 @@ def simulator_facts(
         "options": solver_options(model),
         "dof_invweight0_factor": STIFF_MOBILITY,
         "law": [term for term in SERVO_TERMS if robot.servo[term].any()],
+        "payload_mounts": _mount_facts(robot, payload_mass),
+        "links": {name: asdict(link) for name, link in robot.links.items()},
+        "table": _table_facts(robot),
         "joints": joints,
         "plain": without_model,
     }
+
+
+def _mount_facts(robot: RobotSpec, payload_mass: float) -> dict[str, Any]:
+    """Return what the robot carries in each hand, with a payload in kg."""
+    facts = {}
+    for mount in robot.payload_mounts:
+        mass = carried(robot, mount, payload_mass)
+        facts[mount.side] = {"body": mount.body, "pos": mount.pos, "mass": mass}
+    return facts
+
+
+def _table_facts(robot: RobotSpec) -> dict[str, Any] | None:
+    """Return the table and the tips that can touch it; None without a table."""
+    if robot.scene.table is None:
+        return None
+    tips = [asdict(tip) for tip in robot.scene.tips]
+    return asdict(robot.scene.table) | {"tips": tips}
 
 
 def servo_facts(robot: RobotSpec, model: mujoco.MjModel, i: int) -> dict[str, Any]:
@@ -121,12 +155,14 @@ def mjcf_text(robot: RobotSpec, dt: float, payload_mass: float = 0.0) -> str:
     option = root.find("option")
     assert option is not None
     set_attributes(option, timestep=model.opt.timestep)
-    for i, pair in enumerate(root.iter("pair")):  # a table's stiffness is set after compilation
+    pairs = numbers_of_pairs(model)
+    for pair in root.iter("pair"):  # a table's stiffness is set after compilation
+        k = pairs[frozenset((pair.attrib["geom1"], pair.attrib["geom2"]))]
         set_attributes(
             pair,
-            solref=model.pair_solref[i],
-            solimp=model.pair_solimp[i],
-            friction=model.pair_friction[i],
+            solref=model.pair_solref[k],
+            solimp=model.pair_solimp[k],
+            friction=model.pair_friction[k],
         )
     servos = ET.SubElement(root, "actuator")
     for i in range(model.nu):

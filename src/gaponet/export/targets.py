@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from gaponet.robot.spec import RobotSpec
 
 NEWTON_CHECK = "check_newton.py"
 
@@ -76,3 +80,9 @@ def own_terms(program: str) -> tuple[str, ...]:
     """Return the terms of the servo model that a program's own servos have."""
     target = TARGETS.get(program, Target())
     return target.own_terms
+
+
+def temperature_note(robot: RobotSpec) -> str:
+    """Return at which temperatures friction and damping are those of an export or a scene."""
+    warm = ", ".join(f"{t:.0f}" for t in robot.servo.friction_temperature[robot.operated_index])
+    return f"friction and damping are those at {warm} °C: no engine has a temperature"

@@ -5,14 +5,14 @@ Nothing else changes, and URDF has no place for gains, armature, delay or offset
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from gaponet.base.errors import RobotError
-from gaponet.base.files import lock_folder, write_text
+from gaponet.base.files import atomic_write, lock_folder, write_text
 from gaponet.export.mjcf_edit import Source, text_of
 from gaponet.robot.servo_fields import STOP_FIELDS
 from gaponet.robot.spec import RobotSpec
@@ -30,9 +30,22 @@ MISSING_FIELDS = (
 INERTIA_AXES = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")  # in the order of robot.toml
 
 
-def edit_urdf(
-    path: Path, out: Path, facts: dict[str, Any], robot: RobotSpec
-) -> tuple[Path, list[str]]:
+@dataclass(frozen=True)
+class EditedUrdf:
+    """A copy of a URDF, and what could not be written into it.
+
+    Attributes:
+        other_links: Links that stay: their mass in the file is not the nominal one, so their frame
+            may differ too.
+        without_limit: Joints without a <limit>, which would hold their torque limit.
+    """
+
+    file: Path
+    other_links: tuple[str, ...]
+    without_limit: tuple[str, ...]
+
+
+def edit_urdf(path: Path, out: Path, facts: dict[str, Any], robot: RobotSpec) -> EditedUrdf:
     """Write a copy with the numbers of operated joints and of identified links.
 
     Args:
@@ -41,19 +54,17 @@ def edit_urdf(
         facts: facts.json, with the prefix of joint names in the file.
         robot: Robot with the joints and links to change.
 
-    Returns:
-        The copy, and links that stay: their mass in the file is not the nominal one, so their frame
-            may differ too.
-
     Raises:
-        RobotError: A joint is not in the file, or it is no URDF.
+        RobotError: A joint is not in the file, or it is no URDF, or it lies in `out`.
     """
     source = Source(path.resolve())
+    source.require_outside(out)
     prefix = facts["prefix"]
     if source.tags[0].name != "robot":
         raise RobotError(f"{path}: begins with <{source.tags[0].name}>, so it is no URDF")
     joints = [tag for tag in source.tags if tag.name == "joint" and tag.parent == "robot"]
     tags = {tag.attributes.get("name", ""): tag for tag in joints}
+    without_limit = []
     for name in robot.operated:
         tag = tags.get(prefix + name)
         if tag is None:
@@ -69,14 +80,21 @@ def edit_urdf(
             source.set(dynamics, damping=damping, friction=friction)
         else:
             source.insert(tag, f'    <dynamics damping="{damping}" friction="{friction}"/>')
-        if limit is not None and np.isfinite(servo["effort_limit"]):
+        if not np.isfinite(servo["effort_limit"]):
+            continue
+        if limit is None:
+            without_limit.append(name)
+        else:
             source.set(limit, effort=text_of(servo["effort_limit"]))
     other = _set_links(source, robot, prefix)
     target = out / path.name
+    edited = source.edited()[source.main]
+    changes = source.changes()
     with lock_folder(out, "engine"):
-        write_text(target, source.edited()[source.main].decode("utf-8"))
-    source.write_changes(out)
-    return target, other
+        with atomic_write(target) as temporary:
+            temporary.write_bytes(edited)
+        write_text(out / "changes.diff", changes)
+    return EditedUrdf(target, tuple(other), tuple(without_limit))
 
 
 def _set_links(source: Source, robot: RobotSpec, prefix: str) -> list[str]:
@@ -104,11 +122,20 @@ def _set_links(source: Source, robot: RobotSpec, prefix: str) -> list[str]:
     return other
 
 
-def with_urdf_fields(plain: RobotSpec) -> RobotSpec:
+def with_urdf_fields(plain: RobotSpec, edited: EditedUrdf) -> RobotSpec:
     """Return the robot as such a file describes it.
 
-    Gains, armature, delays, offsets and stops are the nominal ones.
+    Gains, armature, delays, offsets, stops, what the hands carry, and the table are the nominal
+    ones, and so is what could not be written.
     """
     nominal = plain.before_identification
     missing = {name: nominal.servo[name] for name in (*MISSING_FIELDS, *STOP_FIELDS)}
-    return replace(plain.with_servo(**missing), nominal=nominal)
+    limits = plain.servo.effort_limit.copy()
+    for name in edited.without_limit:
+        i = plain.joint_names.index(name)
+        limits[i] = nominal.servo.effort_limit[i]
+    links = dict(plain.links)
+    for name in edited.other_links:
+        links.pop(name, None)
+    described = plain.with_servo(**missing, effort_limit=limits).with_table(nominal.scene.table)
+    return replace(described, nominal=nominal, links=links, payload_mounts=nominal.payload_mounts)

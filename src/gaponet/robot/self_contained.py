@@ -31,6 +31,7 @@ DROPPED_SECTIONS = (
     "custom",
     "size",
 )
+POLYNOMIAL_SIZE = 5  # of a polycoef, the first numbers of eq_data
 COMPILER_ATTRIBUTES = {"angle": "radian", "autolimits": "true", "inertiafromgeom": "auto"}
 DROPPED_GEOM_ATTRIBUTES = (
     "class",
@@ -71,6 +72,7 @@ def self_contained_text(spec: mujoco.MjSpec, path: Path) -> str:
     world = root.find("worldbody")
     assert world is not None
     _fill(world, 0, model, asset, {tag: count() for tag in ("joint", "geom", "site")}, count(1))
+    _copy_couplings(root, model)
     ET.indent(root)
     text = ET.tostring(root, encoding="unicode") + "\n"
     if _fingerprint(model) != _fingerprint(compile_spec(mujoco.MjSpec.from_string(text), path)):
@@ -79,6 +81,14 @@ def self_contained_text(spec: mujoco.MjSpec, path: Path) -> str:
         )
         raise RobotError(f"{path}: {what}")
     return text
+
+
+def _copy_couplings(root: ET.Element, model: mujoco.MjModel) -> None:
+    """Copy the polynomials of couplings of joints and of tendons, in the model's order."""
+    elements = root.iterfind("equality/*")
+    for number, element in enumerate(elements):
+        if element.tag in ("joint", "tendon"):
+            set_attributes(element, polycoef=model.eq_data[number, :POLYNOMIAL_SIZE])
 
 
 def _fingerprint(model: mujoco.MjModel) -> list[str]:

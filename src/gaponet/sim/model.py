@@ -44,6 +44,7 @@ LOOSE_IMPEDANCE = 0.999
 TOLERANCE = 1e-10
 
 PAYLOAD_DENSITY = 7850.0  # standard payload: a solid steel ball, kg/m³
+MIN_PAYLOAD_RADIUS_M = 1e-3  # of the ball of an empty hand, because MuJoCo refuses a size of 0
 
 
 def build_model(
@@ -110,6 +111,19 @@ def driven_joints(model: mujoco.MjModel) -> Array:
     """
     on_joint = np.isin(model.actuator_trntype, ON_JOINT)
     return np.where(on_joint, model.actuator_trnid[:, 0], -1)
+
+
+def numbers_of_pairs(model: mujoco.MjModel) -> dict[frozenset[str], int]:
+    """Return the number of each contact pair by the names of its two geoms.
+
+    MuJoCo sorts pairs by their bodies, so a pair's number is not its place in the file.
+    """
+    numbers = {}
+    for k in range(model.npair):
+        first = model.geom(model.pair_geom1[k]).name
+        second = model.geom(model.pair_geom2[k]).name
+        numbers[frozenset((first, second))] = k
+    return numbers
 
 
 def stiffen_friction(model: mujoco.MjModel) -> None:
@@ -476,22 +490,27 @@ def _add_payload(spec: mujoco.MjSpec, robot: RobotSpec, mass: float, side: str) 
         # An empty hand carries a massless ball: all payloads share one MjData layout, so one Batch
         # steps them together.
         weight = carried(robot, mount, mass, side)
-        radius = max((3 * weight / (4 * math.pi * PAYLOAD_DENSITY)) ** (1 / 3), 1e-3)
         parent = spec.body(mount.body)
         if parent is None:
             raise RobotError(
                 f"{robot.mjcf}: payload mount '{mount.side}' names body '{mount.body}', which is "
                 "missing"
             )
-        body = parent.add_body(name=f"payload_{mount.side}", pos=mount.pos)
-        body.add_geom(
-            type=mujoco.mjtGeom.mjGEOM_SPHERE,
-            size=(radius, 0, 0),
-            mass=weight,
-            contype=0,
-            conaffinity=0,
-            rgba=(0.8, 0.25, 0.2, 1),
-        )
+        add_payload_body(parent, f"payload_{mount.side}", mount, weight)
+
+
+def add_payload_body(parent: mujoco.MjsBody, name: str, mount: PayloadMount, mass: float) -> None:
+    """Add a body with a ball of a mass, kg, at a mount; nothing touches it."""
+    radius = max((3 * mass / (4 * math.pi * PAYLOAD_DENSITY)) ** (1 / 3), MIN_PAYLOAD_RADIUS_M)
+    body = parent.add_body(name=name, pos=mount.pos)
+    body.add_geom(
+        type=mujoco.mjtGeom.mjGEOM_SPHERE,
+        size=(radius, 0, 0),
+        mass=mass,
+        contype=0,
+        conaffinity=0,
+        rgba=(0.8, 0.25, 0.2, 1),
+    )
 
 
 def carried(robot: RobotSpec, mount: PayloadMount, mass: float, side: str = "both") -> float:
