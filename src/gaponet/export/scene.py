@@ -339,8 +339,9 @@ def _write_servo(
     if np.isfinite([low, high]).all():
         actuator.ctrllimited = True
         actuator.ctrlrange = (low, high)
-    actuator.armature = 0.0  # the identified ones are the joint's
-    actuator.damping = np.zeros(np.size(actuator.damping))
+    if hasattr(actuator, "armature"):  # from MuJoCo 4 on; the identified ones are the joint's
+        actuator.armature = 0.0
+        actuator.damping = np.zeros(np.size(actuator.damping))
     actuator.delay = servo.delay[i]
     actuator.nsample = 0
     if servo.delay[i] > 0:
