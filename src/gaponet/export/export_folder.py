@@ -242,8 +242,10 @@ def export_robot(
         _write_motions(out / CHECK, export.checked)
         _write_shipped(out, to, facts)
     if to == "envhub":
-        has_units = envhub.write_units(robot, out, recordings, progress)
-        envhub.write_readme(robot, facts, has_units, out)
+        why_no_units = envhub.write_units(robot, out, recordings, progress)
+        envhub.write_readme(robot, facts, why_no_units, out)
+        if why_no_units:
+            export.notes.append(f"no units of the servos are drawn: {why_no_units}")
     return ExportedFolder(
         file,
         export.errors,
