@@ -39,14 +39,14 @@ def apply(model: mujoco.MjModel, drawn: dict[str, Any], row: int, prefix: str = 
     form = "plain_units" if "plain_units" in drawn else "units"
     joints = [model.joint(prefix + name) for name in drawn["joints"]]
     servos = [_position_servo(model, joint) for joint in joints]
-    for i, joint in enumerate(joints):
+    for i, (joint, servo) in enumerate(zip(joints, servos, strict=True)):
         unit = _servo(drawn[form], row, i)
         dof = joint.dofadr[0]
         model.dof_damping[dof] = unit["damping"]
         model.dof_frictionloss[dof] = unit["frictionloss"]
         model.dof_armature[dof] = unit["armature"]
-        if servos[i] is not None:
-            _set_servo(model, servos[i], unit)
+        if servo is not None:
+            _set_servo(model, servo, unit)
     set_links(model, drawn, row, form, prefix)
 
 
