@@ -333,6 +333,13 @@ def test_an_action_term_corrects_what_was_processed_in_the_present_state(place):
         other.align(None, slice(None), ["shoulder", "elbow"])
 
 
+def test_an_action_term_leaves_a_joint_that_the_export_lacks_without_an_offset(place):
+    term = Term()
+    term.folder = place / "torch"
+    term.align(None, slice(None), ["shoulder", "finger", "elbow"], offset=1.0)
+    assert term.servo_offset.tolist() == pytest.approx([LATE["shoulder"]["offset"], 0.0, 0.0])
+
+
 def test_a_servos_law_in_torch_is_the_simulators(tmp_path):
     rng = np.random.default_rng(0)
     law = {

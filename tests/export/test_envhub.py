@@ -7,10 +7,14 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from arm import SERVO, XML, write_arm
 
-from gaponet.export.export_folder import export_robot
+from gaponet.export.drawn_robots import DrawnRobots
+from gaponet.export.export_folder import Source, export_robot
 from gaponet.export.plain_servos import own_motions
+from gaponet.export.randomization import Randomization
 from gaponet.robot.spec import load_robot
+from gaponet.sim.links import COORDINATES, MASS_LOG_STD, LinkAxes
 
 pytest.importorskip("gymnasium")
 NAME = "so101@sage"
@@ -40,11 +44,17 @@ def loaded(folder):
 
 
 @pytest.fixture
-def hub(folder, monkeypatch):
+def own_imports(monkeypatch):
+    """Forget the modules of a folder after a test."""
     monkeypatch.setattr(sys, "path", [*sys.path])
-    yield loaded(folder)
+    yield
     for name in ("mujoco_servos", "mujoco_randomization"):
         sys.modules.pop(name, None)
+
+
+@pytest.fixture
+def hub(folder, own_imports):
+    return loaded(folder)
 
 
 def test_robots_are_stepped_by_targets_in_degrees_and_come_near(hub):
@@ -118,13 +128,87 @@ def test_the_card_calls_motions_of_no_real_robot_virtual(folder):
     assert "VIRTUAL" in (folder / "README.md").read_text()
 
 
-def test_a_robot_without_uncertainty_has_no_drawn_servos(folder, tmp_path, monkeypatch):
+def test_a_robot_without_uncertainty_has_no_drawn_servos(folder, tmp_path, own_imports):
     robot = load_robot("so101")
     motions = [s.rows(slice(0, 20)) for s in own_motions(robot, count=1)]
     export_robot(robot, "envhub", tmp_path / "out", (motions, motions))
-    monkeypatch.setattr(sys, "path", [*sys.path])
     module = loaded(tmp_path / "out")
-    with pytest.raises(ValueError, match="uncertainty"):
+    with pytest.raises(ValueError, match=r"README\.md says why"):
         module.RobotEnv("drawn")
     assert not (tmp_path / "out" / "randomization.json").exists()
-    assert "identified servos" not in (tmp_path / "out" / "README.md").read_text()
+    text = (tmp_path / "out" / "README.md").read_text()
+    assert "identified servos" not in text
+    assert "none are drawn: their uncertainty is not known" in text
+
+
+UNIT_KP = 17.0
+
+
+def errors(units):
+    """Errors of units, in rad, beside 4 mrad of ranges by hand."""
+    return {"exported": 1e-3, "units": units, "one by one": 1e-2, "by hand": 4e-3}
+
+
+@pytest.fixture
+def exported(tmp_path, monkeypatch):
+    """Function that exports an arm with one unit, whose links have twice the mass.
+
+    Its arguments are the errors of units with and without the servo model, rad. The file of the
+    user has "left_" before the names.
+    """
+    robot = write_arm(tmp_path / "arm").with_identified({"elbow": {"kp": 16.0}})
+    motions = [s.rows(slice(0, 20)) for s in own_motions(robot, count=1)]
+    values = SERVO | {"kp": UNIT_KP, "effort_limit": 5.0}
+    units = {field: np.full((1, 2), value) for field, value in values.items()}
+    heavier = [np.log(2) / MASS_LOG_STD, *[0.0] * (COORDINATES - 1)]
+    units["links"] = np.array([[*heavier, *heavier]])
+    mine = tmp_path / "mine.xml"
+    text = XML
+    for name in ("shoulder", "elbow", "upper", "fore"):
+        text = text.replace(f'name="{name}"', f'name="left_{name}"')
+    mine.write_text(text)
+    envhub = "gaponet.export.envhub"
+    monkeypatch.setattr(f"{envhub}.ParameterUncertainty.load", lambda robot: True)
+    monkeypatch.setattr(f"{envhub}.judge_units", lambda drawn, *_: drawn)
+
+    def export(with_model, plain):
+        made = Randomization(
+            robot="arm",
+            scope="today",
+            units=units,
+            ranges={joint: {"kp": (15.0, 16.0, 17.0)} for joint in robot.operated},
+            unknown=(),
+            notes=(),
+            links=LinkAxes(robot),
+            judged=DrawnRobots(units, errors(with_model)),
+            plain=DrawnRobots(units, errors(plain)),
+        )
+        monkeypatch.setattr(f"{envhub}.sample_units", lambda *_, **__: made)
+        out = tmp_path / "out"
+        return export_robot(robot, "envhub", out, (motions, motions), Source(mine, "left_"))
+
+    return export
+
+
+def test_a_unit_is_drawn_in_a_file_with_a_prefix(exported, tmp_path, own_imports):
+    exported(with_model=2e-3, plain=2e-3)
+    env = loaded(tmp_path / "out").RobotEnv("drawn")
+    env.reset(seed=0)
+    assert env.robot.model.body("left_fore").mass[0] == pytest.approx(0.4)
+    assert env.robot.servos.numbers.kp.tolist() == [UNIT_KP, UNIT_KP]
+
+
+def test_units_are_judged_with_the_servo_model_in_which_they_are_played(exported, tmp_path):
+    made = exported(with_model=2e-3, plain=5e-3)
+    assert made.notes == ()
+    assert (tmp_path / "out" / "randomization.json").is_file()
+
+
+def test_units_worse_than_ranges_by_hand_are_left_out_and_those_before_are_removed(
+    exported, tmp_path
+):
+    exported(with_model=2e-3, plain=2e-3)
+    made = exported(with_model=5e-3, plain=2e-3)
+    assert "drawn units are 5.00 mrad" in made.notes[-1]
+    assert not (tmp_path / "out" / "randomization.json").exists()
+    assert "none are drawn: on validation motions" in (tmp_path / "out" / "README.md").read_text()

@@ -295,6 +295,13 @@ def test_two_robots_in_one_scene_are_told_apart_by_what_stands_before_their_name
     np.testing.assert_array_equal(model.actuator_forcerange[2:], [[-1.5, 1.5]] * 2)
 
 
+def test_an_export_whose_error_is_not_finite_is_refused(robot, tmp_path, monkeypatch):
+    monkeypatch.setattr(exporting, "_error_in_mujoco", lambda *_: np.nan)
+    with pytest.raises(RobotError, match=r"robot\.xml alone is nan"):
+        export_robot(robot, "mjcf", tmp_path / "out")
+    assert not (tmp_path / "out" / "facts.json").exists()
+
+
 def test_an_actuator_of_a_tendon_with_a_joints_number_is_no_servo(robot, tmp_path):
     spec = mujoco.MjSpec.from_file(str(export_robot(robot, "mjcf", tmp_path / "out").file))
     for actuator in list(spec.actuators):

@@ -246,10 +246,46 @@ def test_a_servo_that_limits_the_speed_of_targets_takes_a_unit(tmp_path):
     exported = export_robot(slow, "mjcf", tmp_path / "out")
     model = mujoco.MjModel.from_xml_path(str(exported.file))
     gains = model.actuator_gainprm.copy()
-    own = {field: [[value, value]] for field, value in SERVO_FIELDS.items()}
-    drawn = {"joints": list(slow.joint_names), "units": own | {"effort_limit": [[5.0, 5.0]]}}
-    mujoco_randomization.apply(model, drawn, 0)
+    mujoco_randomization.apply(model, one_unit(), 0)
     np.testing.assert_array_equal(model.actuator_gainprm, gains)
+
+
+def one_unit():
+    """Return a file with one unit of the arm, without links."""
+    units = {field: [[value, value]] for field, value in SERVO_FIELDS.items()}
+    units["effort_limit"] = [[5.0, 5.0]]
+    return {"joints": ["shoulder", "elbow"], "units": units}
+
+
+def arm_with(actuators, xml=XML):
+    """Return the arm with these actuators, compiled."""
+    text = xml.replace("</mujoco>", f"<actuator>{actuators}</actuator></mujoco>")
+    return mujoco.MjModel.from_xml_string(text)
+
+
+def test_a_unit_changes_position_servos_and_no_other_actuators():
+    model = arm_with(
+        '<velocity joint="shoulder" kv="3"/><position joint="shoulder" kp="20"/>'
+        '<motor joint="elbow"/>'
+    )
+    mujoco_randomization.apply(model, one_unit(), 0)
+    assert model.actuator_gainprm[:, 0].tolist() == [3.0, SERVO_FIELDS["kp"], 1.0]
+    assert model.actuator_biasprm[:, 1].tolist() == [0.0, -SERVO_FIELDS["kp"], 0.0]
+
+
+def test_a_joint_with_two_position_servos_takes_no_unit():
+    model = arm_with('<position joint="shoulder" kp="20"/><position joint="shoulder" kp="5"/>')
+    with pytest.raises(ValueError, match="joint 'shoulder' has 2 position servos"):
+        mujoco_randomization.apply(model, one_unit(), 0)
+
+
+def test_a_unit_finds_joints_and_bodies_behind_a_prefix():
+    model = arm_with('<position joint="left_elbow" kp="20"/>', XML.replace('name="', 'name="left_'))
+    drawn = one_unit() | {"bodies": ["fore"]}
+    drawn["units"]["links"] = [[[0.7, 0.1, 0.0, 0.0, 1e-3, 1e-3, 1e-3, 1.0, 0.0, 0.0, 0.0]]]
+    mujoco_randomization.apply(model, drawn, 0, prefix="left_")
+    assert model.actuator_gainprm[0, 0] == SERVO_FIELDS["kp"]
+    assert model.body("left_fore").mass[0] == 0.7
 
 
 @pytest.mark.parametrize("engine", ["mjlab", "isaaclab"])

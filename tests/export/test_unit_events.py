@@ -362,7 +362,10 @@ def test_mjlab_s_own_position_servos_get_units_without_the_servo_model_by_joint_
     }
     for name, content in modules.items():
         monkeypatch.setitem(sys.modules, name, SimpleNamespace(**content))
-    servos = '<position joint="robot/elbow" kp="1"/><position joint="robot/shoulder" kp="1"/>'
+    servos = (
+        '<position joint="robot/elbow" kp="1"/><position joint="robot/shoulder" kp="1"/>'
+        '<velocity joint="robot/shoulder" kv="1"/>'
+    )
     xml = XML.replace('name="shoulder"', 'name="robot/shoulder"').replace(
         'name="elbow"', 'name="robot/elbow"'
     )
@@ -399,6 +402,10 @@ def test_mjlab_s_own_position_servos_get_units_without_the_servo_model_by_joint_
         torch.testing.assert_close(torch.cat(one), link[i])
     torch.testing.assert_close(worlds["body_subtreemass"][3, :2], link[:, 0].sum().expand(2))
     assert worlds["body_mass"][0, 1] == float(scene.body_mass[1])  # a world that was not reset
+    assert (worlds["actuator_gainprm"][:, 2, 0] == 1.0).all()  # of the velocity servo
+    scene.actuator_biasprm[2, 1] = -1.0
+    with pytest.raises(ValueError, match="'robot/shoulder' has several position servos"):
+        event(env, None)
     scene.actuator_biastype[:] = 0
     with pytest.raises(ValueError, match="robot/shoulder"):
         event(env, None)

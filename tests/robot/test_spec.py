@@ -1,5 +1,6 @@
 """Robot folders: names, gains and limits; errors name the field."""
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -7,7 +8,9 @@ import pytest
 from arm import TOML, XML, write_arm
 
 from gaponet.base.errors import JointMismatchError, RobotError
-from gaponet.robot.folder import save_robot
+from gaponet.base.files import write_json
+from gaponet.export.plain_servos import lost_recordings
+from gaponet.robot.folder import PROVENANCE_FILE, save_robot
 from gaponet.robot.spec import load_robot, packaged_robots, robot_argument
 from gaponet.sim.model import build_model, model_hash
 
@@ -203,6 +206,23 @@ def test_identified_tables_belong_to_the_identified_robot_only(tmp_path):
     assert load_robot(tmp_path / "both").servo.kp.tolist() == [20.0, 9.0]
     assert load_robot(tmp_path / "nominal").servo.kp.tolist() == [20.0, 20.0]
     assert load_robot(tmp_path / "nominal").payload_mounts == robot.payload_mounts
+
+
+def test_a_copy_of_an_identified_robot_finds_its_recordings_from_where_it_lies(arm, tmp_path):
+    (tmp_path / "data").mkdir()
+    save_robot(arm.with_identified({"elbow": {"kp": 9.0}}), tmp_path / "identified")
+    origin = {
+        "dataset": "../data",
+        "parts": {"train": {}, "val": {}, "test": {}},
+        "motions": {"train": ["wave"]},
+        "val_mpjae": {"identified": 0.003},
+    }
+    write_json(tmp_path / "identified" / PROVENANCE_FILE, origin)
+    copy = tmp_path / "runs" / "first" / "robot"
+    save_robot(load_robot(tmp_path / "identified"), copy)
+    stored = json.loads((copy / PROVENANCE_FILE).read_text())
+    assert stored == origin | {"dataset": "../../../data"}
+    assert lost_recordings(copy, data=None) == ""
 
 
 def test_a_saved_robot_has_the_gains_of_its_recordings(arm, tmp_path):

@@ -114,6 +114,20 @@ def test_on_the_hub_a_push_is_a_set_that_lerobot_reads_with_a_card_and_its_tag(h
     assert len(hub.repos["datasets/me/arm"]) == 3  # made, pushed, pushed
 
 
+def test_a_pushed_dataset_does_not_say_where_its_robots_recordings_lie(hub, dataset, tmp_path):
+    (tmp_path / "anna" / "logs").mkdir(parents=True)
+    origin = {
+        "dataset": "../../anna/logs",
+        "parts": {"train": {}, "val": {}, "test": {}},
+        "motions": {},
+        "val_mpjae": {},
+    }
+    (dataset.path / "robot" / "identified.json").write_text(json.dumps(origin))
+    push(dataset.path, "me/arm")
+    pushed = json.loads(hub.files("datasets/me/arm")["gaponet/robot/identified.json"])
+    assert pushed["dataset"] == "logs"
+
+
 def test_a_dataset_appears_under_its_name_when_it_is_complete(
     dataset, place, tmp_path, monkeypatch
 ):

@@ -7,6 +7,7 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 import pytest
+import torch
 from arm import TOML, write_arm
 
 from gaponet.robot.servo_fields import SERVO_TERMS
@@ -19,6 +20,7 @@ from gaponet.sim.servo import (
     motor_limits,
     present,
     requested_torque,
+    servo_bias,
     servo_torque,
     torque_range,
 )
@@ -161,6 +163,16 @@ def test_a_servo_of_the_simulator_is_one_of_the_arrays_that_exports_take():
         assert motor_limits(servo, qvel[i]) == pytest.approx(limits[i], abs=1e-9)
         here = joint_friction(servo, qvel[i], torque[i], load[i])
         assert here == pytest.approx(friction[i], abs=1e-9)
+
+
+@pytest.mark.parametrize("library", [np.array, torch.tensor])
+@pytest.mark.parametrize("term", ["min_torque", "encoder_step"])
+def test_a_joint_without_a_gain_keeps_its_bias_beside_one_with_a_servo_model(term, library):
+    kp = library([20.0, 0.0])
+    bias = library([0.4, 0.1])  # N·m: of an aim 0.02 rad ahead
+    rest = library([0.0, 0.0])  # rad
+    found = servo_bias({term: library([0.05, 0.0])}, kp, bias, rest, rest)
+    np.testing.assert_allclose(found, [0.4, 0.1])
 
 
 def direct_current_model(robot, kp, kd, no_load, limit):

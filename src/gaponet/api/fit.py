@@ -35,6 +35,7 @@ from gaponet.robot.folder import (
     OLD_UNCERTAINTY_FILE,
     PROVENANCE_FILE,
     UNCERTAINTY_FILE,
+    dataset_seen_from,
 )
 from gaponet.robot.spec import RobotSpec, load_robot
 
@@ -347,12 +348,8 @@ def _origin_of_adapted(
         return None
     also = origin.get("also_fitted", {"hashes": (), "motions": ()})
     hashes = {*also["hashes"], *(sequence.content_hash() for sequence in adapted)}
-    dataset = source / origin["dataset"]
-    place = Path(origin["dataset"]).name
-    if dataset.is_dir():
-        place = os.path.relpath(dataset, folder)
     return dict(origin) | {
-        "dataset": place,
+        "dataset": dataset_seen_from(folder, source, origin["dataset"]),
         "also_fitted": {"hashes": sorted(hashes), "motions": list(also["motions"])},
     }
 

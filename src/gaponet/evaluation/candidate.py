@@ -19,7 +19,7 @@ from gaponet.evaluation.methods import method
 from gaponet.nn.adaptation import Adaptation
 from gaponet.nn.artifact import GapModel
 from gaponet.nn.loop import DeltaCorrector
-from gaponet.robot.folder import PROVENANCE_FILE, STORED_ROBOT
+from gaponet.robot.folder import PROVENANCE_FILE, PROVENANCE_HINT, STORED_ROBOT
 from gaponet.robot.spec import RobotSpec, load_robot
 from gaponet.sim.model import require_same_robot, require_stored_robot
 
@@ -257,8 +257,7 @@ def read_origin(folder: Path) -> Origin | None:
     file = folder / PROVENANCE_FILE
     if not file.is_file():
         return None
-    hint = "identify again, or remove it: all recordings then count as seen"
-    return read_json(Origin, file, RobotError, hint, allow_extra=True)
+    return read_json(Origin, file, RobotError, PROVENANCE_HINT, allow_extra=True)
 
 
 def fitted_to(origin: Origin) -> Fitted:

@@ -58,20 +58,28 @@ class DrawnRobots:
     units: dict[str, list[list[float]]]
     errors: dict[str, float]
 
+    def why_refused(self) -> str:
+        """Return why the robot with ± 20 % on each number is to be preferred to these units; ""
+        if the units follow the recordings at least as well.
+        """
+        if self.errors["units"] <= self.errors["by hand"]:
+            return ""
+        return (
+            f"on validation motions, drawn units are {1e3 * self.errors['units']:.2f} mrad from "
+            "the recordings, and the robot with ± 20 % on kp, damping, friction and armature "
+            f"{1e3 * self.errors['by hand']:.2f}. Randomise by ± 20 %, or record motions that "
+            "determine more (gaponet excite --for ROBOT)"
+        )
+
     def require_better_than_by_hand(self) -> None:
         """Refuse units that follow the recordings worse than the robot with ± 20 % on each number.
 
         Raises:
             NoGainError: They do.
         """
-        if self.errors["units"] > self.errors["by hand"]:
-            raise NoGainError(
-                f"nothing is written: on validation motions, drawn units are "
-                f"{1e3 * self.errors['units']:.2f} mrad from the recordings, and the robot with ± "
-                f"20 % on kp, damping, friction and armature {1e3 * self.errors['by hand']:.2f}. "
-                "Randomise by ± 20 %, or record motions that determine more (gaponet excite --for "
-                "ROBOT)"
-            )
+        why = self.why_refused()
+        if why:
+            raise NoGainError(f"nothing is written: {why}")
 
 
 def draw_robots(

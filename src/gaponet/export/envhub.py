@@ -12,7 +12,13 @@ from typing import Any
 from gaponet.base.files import write_text
 from gaponet.base.progress import Progress
 from gaponet.data.sequence import Sequence
-from gaponet.export.randomization import judge_units, sample_units, write_randomization
+from gaponet.export.randomization import (
+    FILE,
+    MUJOCO_FILE,
+    judge_units,
+    sample_units,
+    write_files,
+)
 from gaponet.robot.spec import RobotSpec
 from gaponet.sysid.uncertainty import ParameterUncertainty
 
@@ -71,31 +77,42 @@ def write_units(
     folder: Path,
     recordings: tuple[ListOf[Sequence], ListOf[Sequence]] | None,
     progress: Progress,
-) -> bool:
-    """Write units drawn from the robot's uncertainty; return False if none is known.
+) -> str:
+    """Write units drawn from the robot's uncertainty, and remove those of an earlier export.
+
+    env.py plays units with the servo model, so these are judged.
 
     Args:
         recordings: Training and validation motions that choose the units; None: they are taken as
             drawn.
+
+    Returns:
+        Why there are none; "" if they are written.
     """
+    for name in (FILE, MUJOCO_FILE):
+        (folder / name).unlink(missing_ok=True)
     if ParameterUncertainty.load(robot) is None:
-        return False
+        return "their uncertainty is not known"
     drawn = sample_units(robot, samples=SAMPLED_UNITS)
     made = judge_units(drawn, robot, recordings, progress)
-    write_randomization(made, "mujoco", folder)
-    return True
+    why_refused = made.judged.why_refused() if made.judged is not None else ""
+    if not why_refused:
+        write_files(made, "mujoco", folder)
+    return why_refused
 
 
-def write_readme(robot: RobotSpec, facts: dict[str, Any], has_units: bool, folder: Path) -> None:
+def write_readme(robot: RobotSpec, facts: dict[str, Any], why_no_units: str, folder: Path) -> None:
     """Write the model card.
 
     Args:
         facts: facts.json.
-        has_units: Whether units were written that can be drawn.
+        why_no_units: Result of `write_units`.
     """
     units = lerobot_units(robot)
     percent = [name for name in robot.joint_names if units[name] == "percent"]
     drawn = 'drawn from their uncertainty with `make_env(..., servos="drawn")`, or `cfg.task`'
+    if why_no_units:
+        drawn = f"none are drawn: {why_no_units}"
     text = README.format(
         robot=robot.name,
         kind="identified" if robot.is_identified else "nominal",
@@ -105,6 +122,6 @@ def write_readme(robot: RobotSpec, facts: dict[str, Any], has_units: bool, folde
         error=facts["error_mrad"]["joints"],
         percent=", ".join(percent) or "no joint",
         rate=1 / facts["dt"],
-        drawn=drawn if has_units else "their uncertainty is not known, so none are drawn",
+        drawn=drawn,
     )
     write_text(folder / "README.md", text)

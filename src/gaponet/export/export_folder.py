@@ -12,7 +12,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from gaponet.base.errors import UsageError
+from gaponet.base.errors import RobotError, UsageError
 from gaponet.base.files import atomic_write, lock_folder, write_text
 from gaponet.base.progress import Progress, no_progress
 from gaponet.data.sequence import Sequence
@@ -127,6 +127,19 @@ class _RobotExport:
             return None
         return self.write_scene()
 
+    def require_finite_errors(self) -> None:
+        """Refuse a robot whose simulation ended in numbers that are not finite.
+
+        Raises:
+            RobotError: One of `errors` is not finite.
+        """
+        for form, error in self.errors.items():
+            if not np.isfinite(error):
+                raise RobotError(
+                    f"{self.out}: the error of {form} is {error}, so the simulation is unstable "
+                    "there: check the gains and masses in robot.toml, or take a shorter timestep"
+                )
+
     def write_mjcf(self, source: Path) -> Path:
         """Write an edited copy of an MJCF, and measure it in plain MuJoCo."""
         file, not_rad = edit_mjcf(source, self.out, self.plain, self.facts, self.payload_mass)
@@ -218,7 +231,7 @@ def export_robot(
         progress: Progress of the fit without the servo model, as of `identify`.
 
     Raises:
-        RobotError: The file cannot be edited.
+        RobotError: The file cannot be edited, or the written robot does not move in finite numbers.
         UsageError: No recording was made with this payload and the robot's gains.
     """
     if to == "urdf" and source is None:
@@ -233,13 +246,16 @@ def export_robot(
     export = _measured_export(robot, plain, to, out, validation, facts)
     with lock_folder(out, FOLDER_KIND):
         file = export.write_robot(source)
+        export.require_finite_errors()
         if file is not None:
             facts["file"] = str(file.relative_to(out))
         _write_motions(out / CHECK, export.checked)
         _write_shipped(out, to, facts)
     if to == "envhub":
-        has_units = envhub.write_units(robot, out, recordings, progress)
-        envhub.write_readme(robot, facts, has_units, out)
+        why_no_units = envhub.write_units(robot, out, recordings, progress)
+        envhub.write_readme(robot, facts, why_no_units, out)
+        if why_no_units:
+            export.notes.append(f"no units of the servos are drawn: {why_no_units}")
     return ExportedFolder(
         file,
         export.errors,

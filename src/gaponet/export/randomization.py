@@ -34,6 +34,7 @@ Engine = Literal["json", "mujoco", "mjlab", "isaaclab"]
 
 FOLDER_KIND = "engine"
 FILE = "randomization.json"
+MUJOCO_FILE = "mujoco_randomization.py"  # in MuJoCo, it applies a unit of that file
 SHIPPED = Path(__file__).parent / "shipped"
 LEAST_INVERSE = 0.2  # of a drawn value on an inverse axis, over the mean
 RANGE_SAMPLES = 4096
@@ -355,9 +356,7 @@ def _std_factor(count: int) -> float:
 
 
 def write_randomization(made: Randomization, engine: Engine, folder: Path) -> Path:
-    """Write units and ranges as JSON, and the file of an engine beside it.
-
-    Return the engine's file.
+    """Write units and ranges as `write_files` does, and return the engine's file.
 
     Raises:
         NoGainError: Units of the engine's form follow the recordings worse than ± 20 % on each
@@ -366,6 +365,15 @@ def write_randomization(made: Randomization, engine: Engine, folder: Path) -> Pa
     used = made.plain if engine in ("mujoco", "isaaclab") else made.judged
     if used is not None:
         used.require_better_than_by_hand()
+    return write_files(made, engine, folder)
+
+
+def write_files(made: Randomization, engine: Engine, folder: Path) -> Path:
+    """Write units and ranges as JSON, and the file of an engine beside it, however near they are to
+    the recordings.
+
+    Return the engine's file.
+    """
     content: dict[str, Any] = {
         "robot": made.robot,
         "scope": made.scope,
@@ -388,7 +396,7 @@ def write_randomization(made: Randomization, engine: Engine, folder: Path) -> Pa
         if engine == "json":
             return folder / FILE
         file = folder / f"{engine}_randomization.py"
-        shipped = "mujoco_randomization.py" if engine == "mujoco" else "unit_events.py"
+        shipped = MUJOCO_FILE if engine == "mujoco" else "unit_events.py"
         write_text(file, (SHIPPED / shipped).read_text(encoding="utf-8"))
     return file
 

@@ -7,6 +7,7 @@ on its gains.
 from __future__ import annotations
 
 import json
+import os
 import re
 import tomllib
 from dataclasses import asdict, dataclass
@@ -15,6 +16,7 @@ from typing import Annotated
 
 import numpy as np
 from annotated_types import Interval
+from typing_extensions import TypedDict
 
 from gaponet.base.errors import RobotError, UsageError
 from gaponet.base.files import lock_folder, write_json, write_text
@@ -27,6 +29,7 @@ STORED_ROBOT = "robot"  # subfolder of a run or a dataset
 PACKAGED_ROBOT_FILE = "packaged_robot.json"  # beside a network of the package, instead of that
 MOVE_STORED_ROBOT = "move that folder away to keep the other robot from now on"
 PROVENANCE_FILE = "identified.json"  # what a robot was identified from (evaluation/candidate.py)
+PROVENANCE_HINT = "identify again, or remove it: all recordings then count as seen"  # if damaged
 # to which unit it was adapted, and what the doctor found in its recordings
 ADAPTATION_FILE = "adapted.json"
 UNCERTAINTY_FILE = "uncertainty.json"  # of its values (sysid/uncertainty.py)
@@ -44,6 +47,12 @@ IDENTIFIED_HEADING = (
 IDENTIFIED_TABLES = re.compile(
     r"^\[identified[._].*?(?=^\[(?!identified[._])|\Z)", re.MULTILINE | re.DOTALL
 )
+
+
+class _Provenance(TypedDict):
+    """What this module reads of identified.json."""
+
+    dataset: str  # path from the robot folder; a name alone: it never was on this machine
 
 
 @dataclass(frozen=True)
@@ -99,7 +108,7 @@ def save_robot(robot: RobotSpec, folder: Path) -> None:
         folder: Destination; a folder that gaponet has not made is refused.
 
     Raises:
-        RobotError: The MJCF in one file would have other dynamics.
+        RobotError: The MJCF in one file would have other dynamics, or identified.json is damaged.
     """
     from gaponet.robot.self_contained import self_contained_mjcf
 
@@ -114,7 +123,9 @@ def save_robot(robot: RobotSpec, folder: Path) -> None:
         write_text(folder / "robot.xml", xml)
         for name in COPIED_FILES:
             file = robot.folder / name
-            if file.is_file():
+            if name == PROVENANCE_FILE:
+                _copy_provenance(robot.folder, folder)
+            elif file.is_file():
                 write_text(folder / name, file.read_text(encoding="utf-8"))
         write_text(folder / "robot.toml", text)
     written = load_robot(folder).before_identification
@@ -122,6 +133,26 @@ def save_robot(robot: RobotSpec, folder: Path) -> None:
         raise RobotError(
             f"{robot.folder}/robot.toml: write each joint as a [[joint]] table of its own"
         )
+
+
+def _copy_provenance(source: Path, folder: Path) -> None:
+    """Copy what a robot was identified from, if it is stated, to another robot folder."""
+    file = source / PROVENANCE_FILE
+    if not file.is_file():
+        return
+    origin = read_json(_Provenance, file, RobotError, PROVENANCE_HINT, allow_extra=True)
+    dataset = dataset_seen_from(folder, source, origin["dataset"])
+    write_json(folder / PROVENANCE_FILE, dict(origin) | {"dataset": dataset})
+
+
+def dataset_seen_from(folder: Path, source: Path, dataset: str) -> str:
+    """Return the path of a dataset from a folder, given its path from the folder `source`; its name
+    alone if it is not there.
+    """
+    place = source / dataset
+    if place.is_dir():
+        return os.path.relpath(place, folder)
+    return Path(dataset).name
 
 
 def _nominal_text(robot: RobotSpec) -> str:

@@ -36,6 +36,7 @@ from gaponet.robot.folder import STORED_ROBOT, load_stored_robot, save_robot
 from gaponet.robot.spec import RobotSpec, load_robot
 from gaponet.share.readme import dataset_readme
 from gaponet.share.remote import INDEX, FileRecord, Index
+from gaponet.share.robot import hide_place_of_dataset
 from gaponet.sim.model import model_hash
 
 SIDECAR = "gaponet"  # folder beside the LeRobot set
@@ -66,6 +67,7 @@ def write_files(path: Path, folder: Path, address: str) -> tuple[str, ...]:
     sidecar = folder / SIDECAR
     sidecar.mkdir()
     save_robot(robot.nominal or robot, sidecar / STORED_ROBOT)
+    hide_place_of_dataset(sidecar / STORED_ROBOT)
     (sidecar / STORED_ROBOT / FOLDER_MARKER).unlink()
     copy_sidecars(dataset.path, sidecar, dataset)
     card = make_card(dataset)

@@ -33,13 +33,21 @@ def write_files(robot: Path, folder: Path, address: str, facts: ModelFacts) -> t
         raise UsageError(f"{robot}: nothing was identified of this robot; gaponet identify does")
     save_robot(spec, folder)
     (folder / FOLDER_MARKER).unlink()
-    origin = read_origin(robot)
-    if origin is not None:
-        name = Path(origin["dataset"]).name  # where it lies on this machine is nobody's business
-        write_json(folder / PROVENANCE_FILE, dict(origin) | {"dataset": name})
+    hide_place_of_dataset(folder)
+    origin = read_origin(folder)
     require_self_contained(folder)
     write_text(folder / README, robot_readme(load_robot(folder), origin, address, facts))
     return _contents(folder)
+
+
+def hide_place_of_dataset(robot: Path) -> None:
+    """Let a robot folder name the dataset that it was identified from, and not where it lies on
+    this machine.
+    """
+    origin = read_origin(robot)
+    if origin is not None:
+        name = Path(origin["dataset"]).name
+        write_json(robot / PROVENANCE_FILE, dict(origin) | {"dataset": name})
 
 
 def require_files(index: Index) -> None:

@@ -151,11 +151,14 @@ def servo_torque(terms: ServoTerms, kp: Any, aim: Any, qpos: Any) -> Any:
 
 def servo_bias(terms: ServoTerms, kp: Any, bias: Any, ctrl: Any, qpos: Any) -> Any:
     """Return the bias, N·m, with which an actuator of gain kp and its own bias requests
-    `servo_torque`.
+    `servo_torque`. Without a gain it requests nothing: the bias stays as it is.
     """
     if "encoder_step" not in terms and "min_torque" not in terms:
         return bias
-    return servo_torque(terms, kp, ctrl + bias / kp, qpos) - kp * (ctrl - qpos)
+    xp = array_module(qpos)
+    gain = xp.where(kp > 0, kp, 1.0)  # by which can be divided
+    requested = servo_torque(terms, gain, ctrl + bias / gain, qpos) - gain * (ctrl - qpos)
+    return xp.where(kp > 0, requested, bias)
 
 
 # A servo as numba and Warp read it: a record whose fields are those of SERVO_FIELDS that the model

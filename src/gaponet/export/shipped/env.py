@@ -111,7 +111,7 @@ class Simulation:
         drawing = importlib.import_module("mujoco_randomization")
         row = int(rng.integers(len(self.units["units"]["kp"])))
         model = copy.copy(self._compiled)
-        drawing.set_links(model, self.units, row)
+        drawing.set_links(model, self.units, row, prefix=self.facts["prefix"])
         self._take(model, drawing.unit_facts(self.facts, self.units, row))
 
     def start(self) -> None:
@@ -269,7 +269,8 @@ def _read_units() -> dict[str, Any]:
     """Return randomization.json."""
     if not (FOLDER / "randomization.json").is_file():
         raise ValueError(
-            f"{FOLDER}: holds no randomization.json; the robot's uncertainty is unknown"
+            f"{FOLDER}: holds no randomization.json, so servos='drawn' is not possible; README.md "
+            "says why"
         )
     units: dict[str, Any] = importlib.import_module("mujoco_randomization").units()
     return units

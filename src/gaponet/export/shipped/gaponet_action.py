@@ -55,6 +55,11 @@ def read_facts(folder: str | Path) -> dict[str, Any]:
     return read(Path(folder) / FACTS)
 
 
+def _of_joints(servos: dict[str, Any], field: str, names: list[str]) -> list[float]:
+    """Return a field of the joints `names`; 0 for joints that the export does not have."""
+    return [servos.get(name, {}).get(field, 0.0) for name in names]
+
+
 def tensor(values: Any) -> Tensor:
     """Return a tensor of joint data; Isaac Lab 3 wraps tensors."""
     wrapped: Tensor = getattr(values, "torch", values)
@@ -199,9 +204,8 @@ class AlignedAction:
                     f"{dt} s"
                 )
         self.aligner = Aligner(self.folder, list(names), me.num_envs, me.device, self.payload_mass)
-        self.servo_offset = offset * torch.tensor(
-            [facts[form][name]["offset"] for name in names], device=me.device
-        )
+        offsets = _of_joints(facts[form], "offset", names)
+        self.servo_offset = offset * torch.tensor(offsets, device=me.device)
         self._aligned = entity
         self._columns = ids
 
@@ -471,7 +475,7 @@ def _isaaclab_term() -> Any:
                 form=_isaaclab_form(facts),
             )
             servos = facts[_isaaclab_form(facts)]
-            self.set_delays([[servos[name]["delay"] for name in self._joint_names]])
+            self.set_delays([_of_joints(servos, "delay", self._joint_names)])
 
     return IsaacLabTerm
 

@@ -125,12 +125,25 @@ def mjlab_units(file: str | Path, term: str = "joint_pos", rows: Any = None) -> 
 
 
 def _addresses(model: Any, joints: list[str]) -> tuple[list[int], list[int]]:
-    """Return the numbers of the joints' position servos, and of their degrees of freedom."""
-    driven = {}  # joint → number of its position servo
-    for servo, joint in enumerate(model.actuator_trnid[:, 0]):
-        on_joint = model.actuator_trntype[servo] in (0, 1)  # joint, jointinparent
-        if on_joint and model.actuator_biastype[servo] == 1:  # affine
-            driven[model.joint(joint).name] = servo
+    """Return the numbers of the joints' position servos, and of their degrees of freedom.
+
+    Raises:
+        ValueError: A joint has no position servo, or several.
+    """
+    driven: dict[str, int] = {}  # joint → number of its position servo
+    for servo, number in enumerate(model.actuator_trnid[:, 0]):
+        is_on_joint = model.actuator_trntype[servo] in (0, 1)  # joint, jointinparent
+        is_affine = model.actuator_biastype[servo] == 1
+        # The torque of a velocity servo does not depend on the position.
+        if not (is_on_joint and is_affine and model.actuator_biasprm[servo, 1] < 0):
+            continue
+        joint = model.joint(number).name
+        if joint in driven and joint in joints:
+            raise ValueError(
+                f"joint '{joint}' has several position servos, and a unit has the numbers of one: "
+                "delete the others"
+            )
+        driven[joint] = servo
     require_joints(joints, driven, "joints with position servos")
     servos = [driven[name] for name in joints]
     dofs = [model.joint(name).dofadr[0] for name in joints]
