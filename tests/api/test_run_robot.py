@@ -19,6 +19,7 @@ from wild_model import wild_model
 
 import gaponet as gp
 from gaponet.api.record import record_motions
+from gaponet.api.run_consent import Permission
 from gaponet.api.run_report import PlanText, describe_plan
 from gaponet.api.run_robot import Compensation, RunRequest
 from gaponet.base.errors import RobotError, UsageError
@@ -397,6 +398,22 @@ def test_a_consent_of_true_writes_to_the_servos(bus, nobody, tmp_path):
     )
     assert any(request[4] in WRITES for request in servos.heard)
     assert not result.recording.virtual
+
+
+def test_the_person_confirms_the_network_interface_of_the_robot(so101):
+    driver = VirtualDriver(so101, load_fleet("easy", so101).unit("virtual-1"), SimulatedClock())
+    driver.address = "unitree dds domain 0"
+    driver.facts["interface"] = "eth0"
+    statements = []
+
+    def consent(statement: str) -> bool:
+        statements.append(statement)
+        return True
+
+    permission = Permission("unitree", gp.RunOptions(), consent)
+    permission.require_motion(driver, "as planned")
+
+    assert "unitree dds domain 0 on eth0 will move as planned" in statements[0]
 
 
 def test_lowcmd_needs_a_statement_that_the_robot_hangs_beside_yes(nobody):
