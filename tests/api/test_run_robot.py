@@ -469,6 +469,29 @@ def test_each_repetition_of_a_recording_is_consented_to_on_its_own(so101, opened
     assert not second.sent
 
 
+@pytest.mark.parametrize("unit", ["lab/1", "..", "lab\n1", "lab\\1", "é" * 100], ids=ascii)
+def test_a_unit_that_no_file_can_be_named_after_is_refused_before_anything_moves(
+    so101, opened, tmp_path, unit
+):
+    options = gp.RunOptions(control=QUICK, payload_mass=0.0, unit_id=unit, yes=True)
+
+    with pytest.raises(UsageError, match="--unit-id"):
+        record_motions(
+            (str(turned_wrist(tmp_path)),),
+            RunRequest(so101, driver="so101", options=options),
+            out=tmp_path / "set",
+            report=SilentReporter(),
+        )
+    assert not opened
+
+
+def test_a_motion_that_no_file_can_be_named_after_is_not_recorded(arm, tmp_path):
+    options = replace(FAST, out=tmp_path / "out")
+    with pytest.raises(UsageError, match="file's name"):
+        gp.run_robot(arm, motion=replace(SWAY, name="a/b"), options=options)
+    assert not list(tmp_path.glob("out/*"))
+
+
 @pytest.fixture
 def person_agrees(monkeypatch):
     """Somebody sits at the terminal and types what is asked for."""
