@@ -240,6 +240,7 @@ def execute(request: RunRequest, report: RunReporter, consent: Consent | None = 
         compensator=compensation.compensator,
         clock=clock,
         payload_mass=options.payload_mass,
+        payload_side=options.payload_side,
         folder=options.out,
         on_event=report.event,
         on_connect=plan_and_ask,
