@@ -124,7 +124,7 @@ class Collision:
 
     def joints(self) -> Array:
         """Return the indices of the joints that move a capsule; the distances depend on them."""
-        moving = set()
+        moving: set[int] = set()
         for body in self.body:
             while body:  # up to the world, which is body 0
                 first = self.model.body_jntadr[body]
