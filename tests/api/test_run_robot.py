@@ -19,6 +19,7 @@ from wild_model import wild_model
 
 import gaponet as gp
 from gaponet.api.record import record_motions
+from gaponet.api.run_consent import Permission
 from gaponet.api.run_report import PlanText, describe_plan
 from gaponet.api.run_robot import Compensation, RunRequest
 from gaponet.base.errors import RobotError, UsageError
@@ -399,6 +400,22 @@ def test_a_consent_of_true_writes_to_the_servos(bus, nobody, tmp_path):
     assert not result.recording.virtual
 
 
+def test_the_person_confirms_the_network_interface_of_the_robot(so101):
+    driver = VirtualDriver(so101, load_fleet("easy", so101).unit("virtual-1"), SimulatedClock())
+    driver.address = "unitree dds domain 0"
+    driver.facts["interface"] = "eth0"
+    statements = []
+
+    def consent(statement: str) -> bool:
+        statements.append(statement)
+        return True
+
+    permission = Permission("unitree", gp.RunOptions(), consent)
+    permission.require_motion(driver, "as planned")
+
+    assert "unitree dds domain 0 on eth0 will move as planned" in statements[0]
+
+
 def test_lowcmd_needs_a_statement_that_the_robot_hangs_beside_yes(nobody):
     options = gp.RunOptions(connection=gp.Connection(topic="lowcmd"), yes=True)
     with pytest.raises(UsageError, match="falls"):
@@ -450,6 +467,29 @@ def test_each_repetition_of_a_recording_is_consented_to_on_its_own(so101, opened
     first, second = opened
     assert first.sent
     assert not second.sent
+
+
+@pytest.mark.parametrize("unit", ["lab/1", "..", "lab\n1", "lab\\1", "é" * 100], ids=ascii)
+def test_a_unit_that_no_file_can_be_named_after_is_refused_before_anything_moves(
+    so101, opened, tmp_path, unit
+):
+    options = gp.RunOptions(control=QUICK, payload_mass=0.0, unit_id=unit, yes=True)
+
+    with pytest.raises(UsageError, match="--unit-id"):
+        record_motions(
+            (str(turned_wrist(tmp_path)),),
+            RunRequest(so101, driver="so101", options=options),
+            out=tmp_path / "set",
+            report=SilentReporter(),
+        )
+    assert not opened
+
+
+def test_a_motion_that_no_file_can_be_named_after_is_not_recorded(arm, tmp_path):
+    options = replace(FAST, out=tmp_path / "out")
+    with pytest.raises(UsageError, match="file's name"):
+        gp.run_robot(arm, motion=replace(SWAY, name="a/b"), options=options)
+    assert not list(tmp_path.glob("out/*"))
 
 
 @pytest.fixture

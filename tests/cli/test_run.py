@@ -5,6 +5,7 @@ import io
 import json
 import os
 import re
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -144,6 +145,39 @@ def test_a_run_whose_recording_met_a_full_disk_ends_with_status_3(
     with pytest.raises(SystemExit, match="3"):
         main(command)
     assert json.loads((out / "sway.json").read_text())["not_whole"] == "No space left on device"
+
+
+@pytest.fixture
+def full_at_the_end(monkeypatch) -> None:
+    """The disk takes the rows of a run, and no file after it."""
+
+    def fill(path: Path, text: str) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
+
+    monkeypatch.setattr("gaponet.hw.control.recording.write_text", fill)
+
+
+@pytest.mark.usefixtures("full_at_the_end")
+def test_a_run_that_cannot_be_saved_ends_with_3_and_says_that_the_robot_moved(
+    arm, motion, tmp_path, capsys
+):
+    out = tmp_path / "recordings"
+    command = ["run", "--robot", str(arm.folder), "--motion", motion, "--out", str(out), *FAST]
+
+    assert main(command) == 3
+
+    said = " ".join(capsys.readouterr().err.split())
+    assert "the robot has moved" in said
+    assert "No space left on device" in said
+    assert str(out / "sway.cycles.npy") in said
+
+
+@pytest.mark.usefixtures("full_at_the_end")
+def test_a_recorded_motion_that_cannot_be_saved_ends_with_3(arm, motion, tmp_path):
+    out = str(tmp_path / "set")
+    where = ["--robot", str(arm.folder), "--motion", motion, "--out", out, "--unit", "1"]
+
+    assert main(["record", *where, "--payload-mass", "0", *FAST]) == 3
 
 
 def test_the_plan_says_the_payload_that_it_is_for_and_how_a_stop_ends(capsys):

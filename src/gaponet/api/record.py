@@ -15,6 +15,7 @@ from gaponet.api.run_report import RunReporter, StderrReporter
 from gaponet.api.run_robot import RunRequest, execute, resolve_robot
 from gaponet.base.errors import UsageError
 from gaponet.base.files import lock_folder
+from gaponet.hw.control.recording import require_file_name
 
 if TYPE_CHECKING:
     from gaponet.data.sequence import Sequence
@@ -82,6 +83,7 @@ def record_motions(
     Raises:
         UsageError: Unit or payload is not stated, or a run ended with a fault, which is not added.
         DatasetError: The dataset is another robot's; nothing has moved then.
+        UnsavedError: The robot ran, and its recording could not be saved.
     """
     folder = Path(out)
     if repetitions < 1:
@@ -116,12 +118,14 @@ def _unit_id(request: RunRequest) -> str:
     """Return the name of the recorded robot.
 
     Raises:
-        UsageError: A real one has no name, or a virtual one is called by another.
+        UsageError: A real one has no name or one that no file can have, or a virtual one is called
+            by another.
     """
     unit_id = request.options.unit_id
     if not request.is_virtual:
         if not unit_id:
             raise UsageError("say which unit is recorded: --unit-id NAME")
+        require_file_name(unit_id, "--unit-id")
         return unit_id
     connection = request.options.connection
     if unit_id not in ("", connection.unit, connection.unit_name):

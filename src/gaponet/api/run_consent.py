@@ -98,8 +98,12 @@ class Permission:
         """
         if not self.needed:
             return
+        place = robot.address
+        interface = robot.facts.get("interface")
+        if interface:  # the same address on another one is another robot
+            place = f"{place} on {interface}"
         self._ask(
-            f"{robot.address} will move {how}; {len(robot.commanded)} joints are commanded.",
+            f"{place} will move {how}; {len(robot.commanded)} joints are commanded.",
             question="Is the space around it free, and a hand on its own emergency stop?",
             word="yes",
             option="--yes",

@@ -31,7 +31,7 @@ from gaponet.hw.control.hardware import (
     robot_hash,
 )
 from gaponet.hw.control.plan import Plan, Planner
-from gaponet.hw.control.recording import Recording
+from gaponet.hw.control.recording import Recording, require_file_name
 from gaponet.hw.drivers.dry import DryRun, summarize_commands
 from gaponet.hw.drivers.open import driver_names, open_driver, supported_options
 from gaponet.hw.targets.live import LiveTargets
@@ -174,6 +174,7 @@ def run_robot(
         RobotError: The folder differs from the known robot, or its identified values are
             implausible.
         DriverError: The robot does not answer.
+        UnsavedError: The robot ran, and the recording could not be saved.
     """
     request = RunRequest(robot, motion, driver, compensate, options)
     result = execute(request, report or StderrReporter(), consent)
@@ -198,6 +199,8 @@ def execute(request: RunRequest, report: RunReporter, consent: Consent | None = 
     require_shapes(request, robot, report)
     permission.require_hung()
     motion, feasibility = find_motion(request, robot)
+    if motion is not None and options.out is not None:
+        require_file_name(motion.name, "motion")
     clock = SimulatedClock() if request.is_virtual and options.connection.fast else MonotonicClock()
     driver, unit = make_driver(request, robot, clock)
     if motion is not None:
@@ -237,6 +240,7 @@ def execute(request: RunRequest, report: RunReporter, consent: Consent | None = 
         compensator=compensation.compensator,
         clock=clock,
         payload_mass=options.payload_mass,
+        payload_side=options.payload_side,
         folder=options.out,
         on_event=report.event,
         on_connect=plan_and_ask,

@@ -1,7 +1,7 @@
 """Errors that a user can correct: the message says what is wrong, where, and what to do.
 
 Every error raised on bad input derives from `GAPONetError`; the command line prints it in one line
-and exits with 2.
+and exits with 2, or with 3 if a robot has run.
 """
 
 from gaponet.base.text import remove_credentials
@@ -49,6 +49,10 @@ class ModelError(GAPONetError):
 
 class NoGainError(GAPONetError):
     """No fitted candidate follows the recordings better than the robot that is given."""
+
+
+class UnsavedError(GAPONetError):
+    """A robot ran, and its recording could not be saved; the command line exits with 3."""
 
 
 class WorkerError(GAPONetError):

@@ -1,5 +1,7 @@
 """`gaponet COMMAND …`: one function per command; an input error is one line on stderr and exit
 code 2.
+
+A recording that cannot be saved after a robot ran is exit code 3.
 """
 
 from __future__ import annotations
@@ -19,7 +21,7 @@ from itertools import chain
 from pathlib import Path
 from typing import Any
 
-from gaponet.base.errors import GAPONetError, UsageError
+from gaponet.base.errors import GAPONetError, UnsavedError, UsageError
 from gaponet.base.installation import missing_package
 from gaponet.base.plugins import load
 from gaponet.base.text import escape
@@ -77,7 +79,8 @@ def main(argv: Sequence[str] | None = None, begin: Callable[[], object] = lambda
         if text is None:
             raise
         print(escape(text), file=sys.stderr)
-        return 2
+        # 2 means that nothing was done; here a robot ran
+        return 3 if isinstance(error, UnsavedError) else 2
     return 0
 
 

@@ -122,6 +122,16 @@ class Collision:
         above = [i for i, name in enumerate(self.names) if not name.startswith(stands)]
         return np.array(above, int)
 
+    def joints(self) -> Array:
+        """Return the indices of the joints that move a capsule; the distances depend on them."""
+        moving: set[int] = set()
+        for body in self.body:
+            while body:  # up to the world, which is body 0
+                first = self.model.body_jntadr[body]
+                moving.update(range(first, first + self.model.body_jntnum[body]))
+                body = self.model.body_parentid[body]
+        return np.array(sorted(moving), int)
+
     def distances(self, qpos: Array) -> Array:
         """Return distances of pairs, then of capsules to the plane, (T, n) rad → (T, pairs +
         capsules) m.

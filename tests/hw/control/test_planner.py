@@ -22,6 +22,7 @@ from gaponet.hw.control.phases import ControlConfig
 from gaponet.hw.control.plan import (
     COMMAND_CLEARANCE_SHARE,
     GOAL_SHARES,
+    MAX_POSTURE_DRIFT_RAD,
     MAX_START_DRIFT_RAD,
     MAX_START_OVERLAP_M,
     CollisionGuard,
@@ -495,9 +496,11 @@ def on_page(pattern: str) -> tuple[str, ...]:
 def test_the_page_states_in_which_steps_and_from_which_start_a_plan_is_checked():
     (step,) = on_page(r"at least every ([\d.]+) rad of motion")
     (drift,) = on_page(r"moved by more than ([\d.]+) rad since the plan")
+    (posture_drift,) = on_page(r"is more than ([\d.]+) rad away from the plan")
     (overlap,) = on_page(r"overlap by more than ([\d.]+) cm")
     assert float(step) == POSTURE_STEP_RAD
     assert float(drift) == MAX_START_DRIFT_RAD
+    assert float(posture_drift) == MAX_POSTURE_DRIFT_RAD
     assert float(overlap) / 100 == MAX_START_OVERLAP_M
 
 

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 import gaponet
-from gaponet.base.errors import FolderError, LogError
+from gaponet.base.errors import FolderError, LogError, UnsavedError
 from gaponet.data.formats import find_logs
 from gaponet.hw.control import rows as module
 from gaponet.hw.control.driver import State
@@ -207,7 +207,7 @@ def test_what_cannot_be_written_at_the_end_leaves_the_periods(tmp_path, monkeypa
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "sway.json")
 
     monkeypatch.setattr("gaponet.hw.control.recording.write_text", full)
-    with pytest.raises(OSError, match=r"sway\.cycles"):
+    with pytest.raises(UnsavedError, match=r"sway\.cycles"):
         made.save(tmp_path / "logs", "sway")
     assert len(np.load(tmp_path / "logs" / "sway.cycles.npy")) == 200
 

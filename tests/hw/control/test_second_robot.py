@@ -126,7 +126,7 @@ def test_the_recording_names_the_robot_that_the_states_are_from(robot, clock):
     recording = sway(robot, clock, during=lambda k: None)
 
     assert recording.fault is None
-    assert recording.meta["source"] == "rt/lowstate of robot 1"
+    assert recording.meta["source"] == "rt/lowstate on lo, of robot 1"
 
 
 def test_a_watchdog_also_damps_when_there_are_two_robots(robot, clock):

@@ -348,6 +348,31 @@ def test_a_program_that_is_made_to_use_multicast_on_loopback_is_found():
         other.wait()
 
 
+@pytest.fixture
+def two_networks(monkeypatch) -> Any:
+    """drivers.dds of a process that has used no domain yet, on a machine with lo and eth0."""
+    from gaponet.hw.drivers import dds
+
+    monkeypatch.setattr(dds, "_DOMAINS", {})
+    monkeypatch.setattr(dds, "_INTERFACES", {})
+    monkeypatch.setattr(dds, "_interfaces", lambda: ["lo", "eth0"])
+    monkeypatch.setattr(dds, "Domain", lambda domain, configuration: None)
+    monkeypatch.setattr(dds, "DomainParticipant", lambda domain: None)
+    return dds
+
+
+def test_a_second_connection_by_another_interface_is_refused(two_networks):
+    two_networks.Bus(0, "lo")
+
+    with pytest.raises(DriverError, match="domain 0 on lo already"):
+        two_networks.Bus(0, "eth0")
+
+
+def test_a_second_connection_by_the_same_interface_is_accepted(two_networks):
+    two_networks.Bus(0, "eth0")
+    two_networks.Bus(0, "eth0")
+
+
 def test_a_process_ends_although_the_deletion_of_its_dds_domain_never_does():
     program = (
         "import threading\n"

@@ -150,6 +150,7 @@ class Controller:
         planner: Planner | None = None,
         unchecked: bool = False,
         payload_mass: float | None = None,
+        payload_side: str = "both",
         on_event: Callable[[Event], None] = lambda event: None,
         on_connect: Callable[[Driver], None] = lambda driver: None,
         folder: Path | None = None,
@@ -170,6 +171,8 @@ class Controller:
             unchecked: Use no default planner.
             payload_mass: kg per hand, for the compensator and the recording; None if it is not
                 known.
+            payload_side: Hands that carry the payload: both, or the side of one payload mount. It
+                tells which blocked arm may push as if it carried a load.
             on_event: Called with every change of phase.
             on_connect: Called with the driver once the robot has answered and nothing was
                 commanded; it refuses the run by an exception.
@@ -196,6 +199,7 @@ class Controller:
             clock or MonotonicClock(),
             planner,
             payload_mass,
+            payload_side,
             joints,
             dt,
         )

@@ -107,7 +107,7 @@ class Driver(Protocol):
         """What is stored with a recording (registers, kind of machine).
 
         `remarks`: sentences for the user; `source`: the one robot that the states are from, in
-        words.
+        words; `interface`: network interface by which it is reached.
         """
 
     def connect(self) -> None:

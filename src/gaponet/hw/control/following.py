@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import mujoco
 import numpy as np
 
 from gaponet.base.arrays import Array
@@ -32,7 +33,10 @@ class FollowingMonitor:
         self.context = context
         self.share = 0.0 if context.driver.reads_back else context.safety.following
         self.shown = np.zeros(len(context.joints), bool)
-        self._model = build_model(robot, context.payload_mass or 0.0) if self.share else None
+        self._model: mujoco.MjModel | None = None
+        if self.share:
+            payload = context.payload_mass or 0.0
+            self._model = build_model(robot, payload, context.payload_side)
         self._reference: Array | None = None
         none = np.zeros(len(self.shown))
         # Ends of the reference's current stride, and the joint's position at them, rad.

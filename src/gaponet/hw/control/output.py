@@ -30,6 +30,7 @@ class Context:
 
     Attributes:
         payload_mass: kg per hand; None if it is not known.
+        payload_side: Hands that carry it: both, or the side of one payload mount.
         joints: Indices of the commanded joints.
         dt: Control period, s.
     """
@@ -42,6 +43,7 @@ class Context:
     clock: Clock
     planner: Planner | None
     payload_mass: float | None
+    payload_side: str
     joints: Array
     dt: float
 

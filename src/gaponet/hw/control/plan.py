@@ -19,6 +19,7 @@ import numpy as np
 from gaponet.base.arrays import Array
 from gaponet.base.errors import UsageError
 from gaponet.hw.control.clock import Clock
+from gaponet.hw.control.driver import Fault, State
 from gaponet.hw.control.phases import ControlConfig
 from gaponet.hw.control.safety import Limits, SafetyConfig, limit_delta
 from gaponet.motion.feasible import MAX_STATIC_SHARE, TORQUE_SHARE, Feasibility, stretch
@@ -30,6 +31,10 @@ from gaponet.sim.dynamics import static_torque
 _T = TypeVar("_T")
 
 MAX_START_DRIFT_RAD = 0.02  # by which the robot may have moved since the plan was made
+# by which a joint that is not commanded, such as a hip, may leave the plan's posture during a
+# planned run. Then a thigh 0.3 m from the hip has come 3 cm nearer to a hand, which is the
+# clearance. A robot that stands or hangs still sways by hundredths of a radian.
+MAX_POSTURE_DRIFT_RAD = 0.1
 MAX_APPROACH_M = 0.001  # by which shells that start nearer than the clearance may come nearer
 # of shells at the start: they are generous, and an arm rests on its table
 MAX_START_OVERLAP_M = 0.03
@@ -142,6 +147,8 @@ class Planner:
         self.safety = safety or SafetyConfig()
         self.limits = limits or Feasibility(robot, 0.0)
         self.collision = self.limits.collision
+        # Joints that are not commanded and on which the collision check depends, indices.
+        self.idle = np.setdiff1d(self.collision.joints(), robot.index(commanded))
 
     def plan(self, motion: Motion, start: Array) -> Plan:
         """Return the whole trajectory of a motion from a measured posture (n,) rad and back.
@@ -478,6 +485,31 @@ class CollisionGuard:
         aside = np.zeros_like(move)
         aside[moved] = np.clip(step, -np.abs(move).max(), np.abs(move).max())
         return aside
+
+
+class PostureMonitor:
+    """Watches the joints that are not commanded during a planned run.
+
+    The plan was checked with these joints where they were found. If one of them moves, its way may
+    not be free any more.
+    """
+
+    def __init__(self, planner: Planner, plan: Plan) -> None:
+        self._names = planner.robot.joint_names
+        self._idle = planner.idle
+        self._found = plan.start[self._idle]  # rad
+
+    def check(self, state: State) -> Fault | None:
+        """Return a fault if a joint has left the posture of the plan."""
+        moved = np.abs(state.qpos[self._idle] - self._found)
+        if moved.max(initial=0.0) <= MAX_POSTURE_DRIFT_RAD:
+            return None
+        worst = int(moved.argmax())
+        return Fault(
+            "tracking",
+            f"{self._names[self._idle[worst]]} is not commanded and moved by {moved[worst]:.2f} "
+            "rad since the plan was made; the planned way may not be free any more",
+        )
 
 
 def way_speed(config: ControlConfig, safety: SafetyConfig) -> float:

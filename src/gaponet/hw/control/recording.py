@@ -15,14 +15,17 @@ import numpy as np
 
 from gaponet import __version__
 from gaponet.base.arrays import Array
-from gaponet.base.errors import LogError
+from gaponet.base.errors import GAPONetError, LogError, UnsavedError, UsageError
 from gaponet.base.files import atomic_write, lock_folder, write_text
 from gaponet.data.formats.table import NOT_OBEYED, SI_UNITS
 from gaponet.data.log import Channel, Log
+from gaponet.hw.control.phases import Phase
 from gaponet.hw.control.rows import READINGS, ROWS_SUFFIX, Rows
 from gaponet.hw.control.safety import FAULT_KINDS
 
 FOLDER_KIND = "recordings"
+# of a motion or unit: both are in one file's name, of which file systems take 255
+MAX_NAME_BYTES = 100
 QUANTILES = {"p50": 0.5, "p99": 0.99, "p99.9": 0.999, "max": 1.0}
 
 
@@ -174,8 +177,26 @@ class Recording:
             The path of NAME.parquet.
 
         Raises:
-            OSError: A file could not be written; the periods written so far stay in the folder.
+            UnsavedError: A file could not be written; the periods written so far stay in the
+                folder.
         """
+        try:
+            return self._write(folder, name)
+        except (OSError, GAPONetError) as error:
+            reason = error.strerror if isinstance(error, OSError) else ""
+            raise UnsavedError(self._describe_unsaved(folder, reason or str(error))) from error
+
+    def _describe_unsaved(self, folder: Path, reason: str) -> str:
+        """Return in words whether the robot moved, and where the rows are that were written."""
+        has_moved = any(event.phase == Phase.BLEND_IN for event in self.events)
+        happened = "the robot has moved" if has_moved else "nothing was commanded"
+        place = "no rows were written"
+        if self.rows.path is not None:
+            place = f"the rows that were written are in {self.rows.path} (numpy.load reads it)"
+        return f"{happened}, and the recording could not be saved in {folder}: {reason}; {place}"
+
+    def _write(self, folder: Path, name: str) -> Path:
+        """Write the files of `save`."""
         import pyarrow as pa
         import pyarrow.parquet as pq
 
@@ -183,30 +204,47 @@ class Recording:
             name = _free_name(folder, name)
             self.rows.save(folder / f"{name}{ROWS_SUFFIX}")
             path = folder / f"{name}.parquet"
-            try:
-                if len(self.run_rows()) >= 2:
-                    log = self._log(str(path))
-                    columns = {"time": log.channels["ctrl"].time}
-                    for channel, (_, values) in log.channels.items():
-                        for i, joint in enumerate(log.joint_names):
-                            columns[f"{channel}.{joint}"] = values[:, i]
-                    metadata = {SI_UNITS: "s, rad"}
-                    if self.disobedience:
-                        metadata[NOT_OBEYED] = self.disobedience
-                    table = pa.table(columns, metadata=metadata)
-                    with atomic_write(path) as temporary:
-                        pq.write_table(table, temporary)
-                saved = datetime.now().astimezone().isoformat(timespec="seconds")
-                facts = {"saved": saved} | self.summary()
-                text = json.dumps(facts, indent=1, ensure_ascii=False)
-                write_text(folder / f"{name}.json", text + "\n")
-            except OSError as error:
-                explanation = (
-                    f"{error.strerror or error}; all periods that were written are in "
-                    f"{name}{ROWS_SUFFIX}"
-                )
-                raise OSError(error.errno, explanation, error.filename) from error
+            if len(self.run_rows()) >= 2:
+                log = self._log(str(path))
+                columns = {"time": log.channels["ctrl"].time}
+                for channel, (_, values) in log.channels.items():
+                    for i, joint in enumerate(log.joint_names):
+                        columns[f"{channel}.{joint}"] = values[:, i]
+                metadata = {SI_UNITS: "s, rad"}
+                if self.disobedience:
+                    metadata[NOT_OBEYED] = self.disobedience
+                table = pa.table(columns, metadata=metadata)
+                with atomic_write(path) as temporary:
+                    pq.write_table(table, temporary)
+            saved = datetime.now().astimezone().isoformat(timespec="seconds")
+            facts = {"saved": saved} | self.summary()
+            text = json.dumps(facts, indent=1, ensure_ascii=False)
+            write_text(folder / f"{name}.json", text + "\n")
             return path
+
+
+def require_file_name(name: str, what: str) -> None:
+    """Refuse a name that cannot be part of a recording's file name.
+
+    Call it before a robot moves: afterwards its recording could not be saved.
+
+    Args:
+        name: Of a motion or unit.
+        what: What it names, or its option, for the message.
+
+    Raises:
+        UsageError: It has /, \\, .. or a control character, or is too long.
+    """
+    has_path = any(part in name for part in ("/", "\\", ".."))
+    if has_path or not name.isprintable():
+        raise UsageError(
+            f"{what} {name!r} becomes part of a file's name; leave out /, \\, .. and control "
+            "characters"
+        )
+    if len(name.encode()) > MAX_NAME_BYTES:
+        raise UsageError(
+            f"{what} {name!r} is longer than {MAX_NAME_BYTES} bytes; choose a shorter one"
+        )
 
 
 def _quantiles_ms(seconds: Array) -> dict[str, float]:

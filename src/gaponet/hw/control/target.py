@@ -13,12 +13,13 @@ from gaponet.base.errors import UsageError
 from gaponet.hw.control.driver import Fault, State
 from gaponet.hw.control.following import FollowingMonitor
 from gaponet.hw.control.output import Context, Output
-from gaponet.hw.control.phases import Phase, Trigger
+from gaponet.hw.control.phases import MOVING, Phase, Trigger
 from gaponet.hw.control.plan import (
     MAX_START_DRIFT_RAD,
     MIN_SEARCH_PERIOD_S,
     CollisionGuard,
     Plan,
+    PostureMonitor,
     advance,
     way_speed,
 )
@@ -136,11 +137,12 @@ class Readiness:
         """
         context = self.context
         if self.plan is not None:
-            moved = np.abs(state.qpos - self.plan.start)[context.joints]
+            joints = self._planned_joints(self.plan)
+            moved = np.abs(state.qpos - self.plan.start)[joints]
             if moved.max() <= MAX_START_DRIFT_RAD:
                 return None
             if self.plan.motion is not None:
-                joint = context.driver.commanded[int(moved.argmax())]
+                joint = context.driver.joint_names[joints[int(moved.argmax())]]
                 return Fault(
                     "plan",
                     f"{joint} moved by {moved.max():.2f} rad since the plan was made; run it again",
@@ -151,6 +153,16 @@ class Readiness:
         if self._search is None:
             self._search = context.planner.begin(first, state.qpos)
         return self._continue_search(now)
+
+    def _planned_joints(self, plan: Plan) -> Array:
+        """Return the indices of the joints that must be where they were when the plan was made.
+
+        With live targets these are the commanded ones. The collision guard measures the others.
+        """
+        context = self.context
+        if context.planner is None or plan.motion is None:
+            return context.joints
+        return np.union1d(context.joints, context.planner.idle)
 
     def _continue_search(self, now: float) -> Fault | None:
         """Search for a part of a period; the plan is there when the search ends."""
@@ -313,8 +325,12 @@ class TargetGenerator:
         self.approach = Approach(context, following, path, self.start)
         self._way_back: WayBack | None = None
         self._guard: CollisionGuard | None = None
-        if context.planner and plan and plan.motion is None:  # targets are live
-            self._guard = CollisionGuard(context.planner, state.qpos)
+        self._posture: PostureMonitor | None = None
+        if context.planner and plan:
+            if plan.motion is None:  # targets are live
+                self._guard = CollisionGuard(context.planner, state.qpos)
+            else:
+                self._posture = PostureMonitor(context.planner, plan)
         self._obstacle = ""
         self._checked_payload = False
 
@@ -322,6 +338,10 @@ class TargetGenerator:
         self, phase: Phase, n: int, state: State, policy: Policy
     ) -> Array | PhaseChange | Fault:
         """Return the target of the n-th period of a phase, or the end of the phase."""
+        if self._posture and phase in MOVING:
+            moved = self._posture.check(state)
+            if moved:
+                return moved
         if phase is Phase.BLEND_IN:
             out = self._blend_in(state, policy)
         elif phase is Phase.RUN:

@@ -192,15 +192,24 @@ class Bus:
                 this machine.
 
         Raises:
-            DriverError: There is no such interface, or DDS does not start on it.
+            DriverError: There is no such interface, DDS does not start on it, or this process uses
+                the domain on another one.
         """
         if interface not in _interfaces():
             raise DriverError(
                 f"no network interface '{interface}' here; there are {', '.join(_interfaces())}"
             )
+        used = _INTERFACES.get(domain, interface)
+        if used != interface:
+            raise DriverError(
+                f"this process uses DDS domain {domain} on {used} already, and cannot use it on "
+                f"{interface} too: it would reach the robot on {used}. Start another process for "
+                f"{interface}"
+            )
         try:
             if domain not in _DOMAINS:
                 _DOMAINS[domain] = Domain(domain, _configuration(interface))
+                _INTERFACES[domain] = interface
             self._participant = DomainParticipant(domain)
         except DDSException as error:
             raise DriverError(
@@ -301,6 +310,7 @@ def _interfaces() -> list[str]:
 
 
 _DOMAINS: dict[int, Domain] = {}  # a domain is configured once per process
+_INTERFACES: dict[int, str] = {}  # on which each of them is
 
 
 @atexit.register

@@ -139,7 +139,8 @@ class UnitreeDriver:
         self.facts = {
             "mode_machine": self._states.machine,
             "topic": link.topic,
-            "source": f"{STATES_TOPIC} of {source.identity}",
+            "interface": link.interface,
+            "source": f"{STATES_TOPIC} on {link.interface}, of {source.identity}",
         }
 
     def read(self) -> State:
