@@ -13,7 +13,7 @@ from hw.control.loopback import living, received
 from gaponet.hw.control.controller import Controller
 from gaponet.hw.control.driver import State
 from gaponet.hw.control.phases import ControlConfig
-from gaponet.hw.control.plan import MAX_POSTURE_DRIFT_RAD, MAX_START_DRIFT_RAD, Planner
+from gaponet.hw.control.plan import MAX_POSTURE_DRIFT_RAD, Planner
 from gaponet.hw.control.recording import Recording
 from gaponet.hw.drivers.unitree import UnitreeDriver
 from gaponet.motion.motion import Motion
@@ -81,7 +81,7 @@ def play(
 
 
 def test_a_hip_that_moved_while_the_person_read_the_plan_starts_nothing(monkeypatch):
-    recording, robot = play(monkeypatch, lambda seconds: MAX_START_DRIFT_RAD + 0.01)
+    recording, robot = play(monkeypatch, lambda seconds: MAX_POSTURE_DRIFT_RAD + 0.01)
 
     assert recording.fault.kind == "plan"
     assert HIP in recording.fault.text
@@ -103,7 +103,7 @@ def test_a_hip_that_leaves_the_plan_during_the_run_stops_it(monkeypatch):
 
 def test_a_hip_that_sways_does_not_stop_a_run(monkeypatch):
     def sway(seconds: float) -> float:
-        return 0.05 * np.sin(np.pi * max(seconds - 0.5, 0.0))
+        return 0.05 * np.cos(np.pi * seconds)
 
     recording, _ = play(monkeypatch, sway)
 

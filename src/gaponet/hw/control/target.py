@@ -4,6 +4,7 @@ of the phase.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -137,12 +138,13 @@ class Readiness:
         """
         context = self.context
         if self.plan is not None:
-            joints = self._planned_joints(self.plan)
-            moved = np.abs(state.qpos - self.plan.start)[joints]
+            moved = np.abs(state.qpos - self.plan.start)[context.joints]
+            is_live = self.plan.motion is None
             if moved.max() <= MAX_START_DRIFT_RAD:
-                return None
-            if self.plan.motion is not None:
-                joint = context.driver.joint_names[joints[int(moved.argmax())]]
+                # With live targets, the collision guard measures the other joints.
+                return None if is_live else self._posture_fault(self.plan, state)
+            if not is_live:
+                joint = context.driver.commanded[int(moved.argmax())]
                 return Fault(
                     "plan",
                     f"{joint} moved by {moved.max():.2f} rad since the plan was made; run it again",
@@ -154,15 +156,12 @@ class Readiness:
             self._search = context.planner.begin(first, state.qpos)
         return self._continue_search(now)
 
-    def _planned_joints(self, plan: Plan) -> Array:
-        """Return the indices of the joints that must be where they were when the plan was made.
-
-        With live targets these are the commanded ones. The collision guard measures the others.
-        """
-        context = self.context
-        if context.planner is None or plan.motion is None:
-            return context.joints
-        return np.union1d(context.joints, context.planner.idle)
+    def _posture_fault(self, plan: Plan, state: State) -> Fault | None:
+        """Return a fault if a joint that is not commanded has left the posture of the plan."""
+        if self.context.planner is None:
+            return None
+        moved = PostureMonitor(self.context.planner, plan).check(state)
+        return moved and replace(moved, kind="plan")
 
     def _continue_search(self, now: float) -> Fault | None:
         """Search for a part of a period; the plan is there when the search ends."""
