@@ -70,7 +70,7 @@ def test_old_messages_that_are_repeated_become_old():
     assert ages[-1] == pytest.approx(30.0, abs=0.2)
 
 
-def test_messages_from_before_the_first_one_are_repeated_and_become_old():
+def test_messages_from_before_the_first_one_that_are_repeated_become_old():
     clock = found()
     ages = []
     for period in range(1, 500):
@@ -79,7 +79,7 @@ def test_messages_from_before_the_first_one_are_repeated_and_become_old():
         ages.append(arrival - clock.time(tick, arrival))
 
     assert ages[-1] > 9.0
-    assert max(ages[:5]) < 1e-3, "the first time they look like a restart"
+    assert ages[0] < 1e-3, "the first one looks like a restart"
 
 
 def test_one_old_message_after_newer_ones_is_as_old_as_its_tick_says():
