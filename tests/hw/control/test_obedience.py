@@ -168,6 +168,7 @@ WAYS: dict[str, tuple[Callable[[Bus], object], str]] = {
         "elbow_flex.*: its torque limit went from 1000 to 200",
     ),
 }
+GOAL_WAYS = ("ignores", "crossed")  # a servo holds another goal: the fault `goal`
 ERRORS: dict[str, Callable[[Bus], object]] = {
     "lost": Bus.lose,
     "silent": lambda bus: setattr(bus.arm, "silent", {4}),
@@ -247,7 +248,8 @@ def test_servos_that_do_not_as_told_are_named_and_their_run_is_no_data(
     bus.at = at
     recording = play(so101, clock)
     assert recording.fault is not None
-    assert recording.fault.kind == "obedience", recording.fault
+    kind = "goal" if way in GOAL_WAYS else "obedience"
+    assert recording.fault.kind == kind, recording.fault
     assert re.search(WAYS[way][1], recording.fault.text)
     # Each state tells; three in a row count.
     if at == 1.0 and way in ("ignores", "resets", "brown-out", "crossed"):
@@ -259,6 +261,36 @@ def test_servos_that_do_not_as_told_are_named_and_their_run_is_no_data(
             "could NOT be damped: switch the supply off"
         )
     assert_no_data(recording, so101, tmp_path, saved=at > 0.5)
+
+
+def test_servos_that_hold_other_goals_are_let_go_at_once_and_not_lowered(so101, clock, bus):
+    bus.way = "crossed"
+    bus.at = 1.0
+
+    recording = play(so101, clock, config=replace(QUICK, damp=LOWERING_S))
+
+    assert recording.fault.kind == "goal"
+    assert torque_off(bus) == pytest.approx(recording.fault.time, abs=0.02)
+    assert torque_limits(bus, torque_off(bus)) == []
+
+
+def test_an_arm_does_not_move_towards_a_goal_of_an_earlier_run(so101, clock, bus, monkeypatch):
+    earlier = 800  # steps, 1.2 rad from where the elbow lies
+    bus.put(reg.GOAL_POSITION, earlier, (ELBOW,))
+    store = bus.arm._store
+
+    def take(servo: int, at: int, data: bytes) -> None:
+        if servo != ELBOW or at != reg.GOAL_POSITION.address:
+            store(servo, at, data)
+
+    monkeypatch.setattr(bus.arm, "_store", take)
+
+    recording = play(so101, clock)
+
+    assert recording.fault.kind == "driver"
+    assert "elbow_flex" in recording.fault.text
+    elbow = [row.state.qpos[ELBOW - 1] for row in recording.rows]
+    assert elbow[0] - min(elbow) < 0.02, "it may sink the other way"
 
 
 def test_a_setting_that_changes_is_noticed_within_a_second(so101, clock, bus):

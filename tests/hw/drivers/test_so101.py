@@ -286,6 +286,67 @@ def test_torque_comes_on_with_the_first_goal_and_a_hold_leaves_it_on(driver, ser
     assert len(servos.heard) == count
 
 
+def ignore_goals(servos: Servos, number: int, count: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the first `count` goals for a servo be lost."""
+    store = servos._store
+    lost = iter(range(count))
+
+    def take(servo: int, at: int, data: bytes) -> None:
+        is_goal = at == reg.GOAL_POSITION.address
+        if servo == number and is_goal and next(lost, None) is not None:
+            return
+        store(servo, at, data)
+
+    monkeypatch.setattr(servos, "_store", take)
+
+
+def test_no_torque_comes_on_if_a_servo_holds_the_goal_of_an_earlier_run(
+    driver, servos, monkeypatch
+):
+    servos.set(3, "goal", 2900)
+    ignore_goals(servos, 3, 1000, monkeypatch)
+
+    with pytest.raises(DriverError, match=r"servo 3 \(elbow_flex\).* 2900"):
+        driver.write(driver.read().qpos)
+
+    assert [servos.get(s, "torque") for s in range(1, 7)] == [0] * 6
+
+
+def test_no_torque_comes_on_if_a_servo_does_not_say_its_goal(driver, servos):
+    found = driver.read().qpos
+    servos.silence(3)
+
+    with pytest.raises(DriverError, match=r"servo 3 \(elbow_flex\)"):
+        driver.write(found)
+
+    assert [servos.get(s, "torque") for s in range(1, 7)] == [0] * 6
+
+
+def test_a_first_goal_that_was_lost_twice_is_sent_again(driver, servos, monkeypatch):
+    ignore_goals(servos, 3, 2, monkeypatch)
+
+    driver.write(np.full(6, 0.1))
+
+    assert servos.get(3, "goal") == servos.get(2, "goal") != 0
+    assert [servos.get(s, "torque") for s in range(1, 7)] == [1] * 6
+
+
+def test_a_servo_whose_torque_did_not_come_on_gets_it_only_with_its_goal(
+    driver, servos, monkeypatch
+):
+    found = driver.read().qpos
+    driver.write(found)
+    servos.set(3, "torque", 0)
+    driver.read()
+    ignore_goals(servos, 3, 1000, monkeypatch)
+    servos.set(3, "goal", 2900)  # it has reset itself
+
+    with pytest.raises(DriverError, match="elbow_flex"):
+        driver.write(found)
+
+    assert servos.get(3, "torque") == 0
+
+
 def test_an_arm_that_is_closed_without_a_hold_is_let_go(driver, servos):
     driver.write(driver.read().qpos)
 

@@ -135,7 +135,7 @@ def test_a_servo_that_missed_the_last_goals_is_not_taken_for_commanded_by_others
         servos.set(ELBOW, "goal", before)
         fault = commanded.read().fault
 
-    assert fault.kind == "obedience"
+    assert fault.kind == "goal"
 
 
 def test_the_recording_names_the_servos_and_their_port(driver):

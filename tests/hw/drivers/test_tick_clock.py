@@ -56,3 +56,50 @@ def test_a_robots_clock_that_is_slower_is_followed():
     for second in range(1, 200):
         arrival = START_S + second
         assert clock.time(7000 + round(999.9 * second), arrival) > arrival - 5e-3
+
+
+def test_old_messages_that_are_repeated_become_old():
+    clock = found()
+    ages = []
+    for period in range(1, 1500):
+        arrival = START_S + FOUND_S + 0.02 * period
+        tick = 7300 + 20 * period % 100  # of the last 0.1 s, again and again
+        ages.append(arrival - clock.time(tick, arrival))
+
+    assert min(ages[5:]) > 0.1
+    assert ages[-1] == pytest.approx(30.0, abs=0.2)
+
+
+def test_messages_from_before_the_first_one_that_are_repeated_become_old():
+    clock = found()
+    ages = []
+    for period in range(1, 500):
+        arrival = START_S + FOUND_S + 0.02 * period
+        tick = 3000 + 20 * period % 100
+        ages.append(arrival - clock.time(tick, arrival))
+
+    assert ages[-1] > 9.0
+    assert ages[0] < 1e-3, "the first one looks like a restart"
+
+
+def test_one_old_message_after_newer_ones_is_as_old_as_its_tick_says():
+    clock = found()
+    assert clock.time(7100, START_S + 0.4) == pytest.approx(START_S + 0.1, abs=1e-3)
+    assert clock.time(7420, START_S + 0.42) == pytest.approx(START_S + 0.42, abs=1e-3)
+
+
+def test_an_old_message_is_old_although_the_tick_has_passed_its_largest_number():
+    clock = found(first=2**32 - 200)
+    assert clock.time(2**32 - 100, START_S + 0.4) == pytest.approx(START_S + 0.1, abs=1e-3)
+
+
+def test_a_clock_that_restarts_twice_in_ten_seconds_gives_old_states():
+    clock = found()
+    assert clock.time(1003, START_S + 9.0) == pytest.approx(START_S + 9.0)
+    assert clock.time(3, START_S + 12.0) < START_S + 9.0
+
+
+def test_a_clock_may_restart_again_after_ten_seconds():
+    clock = found()
+    clock.time(1003, START_S + 9.0)
+    assert clock.time(3, START_S + 20.0) == pytest.approx(START_S + 20.0)

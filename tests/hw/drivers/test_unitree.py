@@ -209,6 +209,18 @@ def test_damping_gains_are_four_times_the_robots_but_no_more_than_the_effort_lim
     np.testing.assert_allclose(kd, most, rtol=1e-6)
 
 
+def test_a_folder_without_damping_takes_no_brake_away(robot):
+    undamped = robot.with_servo(kd=np.zeros(27))
+    messages = CommandMessages(undamped, robot.joint_names[13:], shares_control=True)
+    usual = CommandMessages(robot, robot.joint_names[13:], shares_control=True)
+
+    sent = hg.LowCmd.motors(messages.damping(1.0, None), "kd")
+
+    np.testing.assert_array_equal(sent, hg.LowCmd.motors(usual.damping(1.0, None), "kd"))
+    assert sent[TORSO] > 0, "the torso is held while the arms brake"
+    assert (sent[TORSO + 1 : 27] > 0).all()
+
+
 def test_after_damping_the_last_message_gives_the_arms_back(robot, clock):
     driver = connected(robot)
 

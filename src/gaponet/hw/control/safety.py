@@ -318,6 +318,12 @@ FAULTS: dict[str, FaultRule] = {
         Ending.DAMP_OR_LOWER,
         is_data=False,
     ),
+    "goal": FaultRule(
+        "where a servo goes: it holds another goal than it was told",
+        NO_GOAL,
+        Ending.DAMP_OR_LET_GO,
+        is_data=False,
+    ),
     "source": FaultRule(
         "which robot the states are from, or whose goals the servos hold",
         NO_GOAL,

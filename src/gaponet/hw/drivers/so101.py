@@ -37,6 +37,10 @@ from gaponet.robot.spec import RobotSpec
 
 CONNECT_SILENCE_S = 0.1  # after which missing replies are given up while connecting
 CONNECT_TIMEOUT_S = 1.0  # for a first whole state
+# Times that goals are sent and read back before torque comes on, because packets get lost. By baud
+# rate and timeout, three take about 6 ms, or 36 ms if a servo is silent: less than the two periods
+# at 50 Hz that the next period may be late.
+GOAL_ATTEMPTS = 3
 
 
 class Lowering:
@@ -243,7 +247,12 @@ class SO101Driver:
     def write(self, ctrl: Array, weight: float = 1.0) -> None:
         """Send goal positions of all servos in one packet, within the calibrated range.
 
-        The first command switches the torque on. From then on no other program can open the port.
+        The first command switches the torque on, but only after all servos have said that they
+        hold their goals: the goal of an earlier run may be far from the arm. From then on no other
+        program can open the port.
+
+        Raises:
+            DriverError: A servo without torque does not hold its goal; no torque was switched on.
         """
         bus = self._port.bus
         goals = self.states.obedience.goals
@@ -251,12 +260,43 @@ class SO101Driver:
             self._port.keep_others_out()
         steps = self.arm.steps(np.asarray(ctrl)).tolist()
         asked = dict(zip(self.arm.servos, steps, strict=True))
+        without_torque = [servo for servo in asked if servo not in goals.torque_on]
         with self._port.errors():
-            bus.sync_write(reg.GOAL_POSITION, asked)
-            without_torque = [servo for servo in asked if servo not in goals.torque_on]
             if without_torque:
+                self._send_until_held(bus, asked, without_torque)
                 bus.sync_write(reg.TORQUE_ENABLE, dict.fromkeys(without_torque, 1))
+            else:
+                bus.sync_write(reg.GOAL_POSITION, asked)
         goals.send(asked)
+
+    def _send_until_held(self, bus: reg.ServoBus, asked: dict[int, int], servos: list[int]) -> None:
+        """Send goals, and read back those of some servos, until each holds its own.
+
+        Args:
+            asked: Servo → goal, steps.
+            servos: Whose goals are read back.
+
+        Raises:
+            DriverError: One holds another goal, or does not answer.
+        """
+        for _ in range(GOAL_ATTEMPTS):
+            bus.sync_write(reg.GOAL_POSITION, asked)
+            blocks = bus.sync_read(servos, reg.GOAL_POSITION, retries=0)
+            held = {servo: reg.GOAL_POSITION.decode(block) for servo, block in blocks.items()}
+            if all(held.get(servo) == asked[servo] for servo in servos):
+                return
+        joint_of = dict(zip(self.arm.servos, self.joint_names, strict=True))
+        reports = []
+        for servo in servos:
+            name = f"servo {servo} ({joint_of[servo]})"
+            if servo not in held:
+                reports.append(f"{name} does not say which goal it holds")
+            elif held[servo] != asked[servo]:
+                reports.append(f"{name} holds the goal {held[servo]}, not {asked[servo]} as told")
+        raise DriverError(
+            f"{self.address}: {'; '.join(reports)}; no torque was switched on; look at supply and "
+            "cables"
+        )
 
     def damp(self, weight: float = 1.0, share: float = 0.0) -> None:
         """Lower the arm: torque limits decrease with `share`.

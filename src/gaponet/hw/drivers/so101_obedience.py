@@ -191,26 +191,40 @@ class Obedience:
         if self.fault is None:
             self.fault = (
                 self._others.fault(bus, blocks, self.goals, now)
-                or self._said(self._wrong_in(blocks))
-                or self._said(self.settings.next_changes(bus, now))
+                or self._said("goal", self._wrong_goals(blocks))
+                or self._said("obedience", self._wrong_in(blocks))
+                or self._said("obedience", self.settings.next_changes(bus, now))
             )
 
     def check_settings(self, bus: reg.ServoBus) -> None:
         """Read the settings of all servos again."""
         if self.fault is None:
-            self.fault = self._said(self.settings.changes(bus, list(self._names)))
+            changes = self.settings.changes(bus, list(self._names))
+            self.fault = self._said("obedience", changes)
+
+    def _wrong_goals(self, blocks: dict[int, bytes]) -> list[tuple[int, str]]:
+        """Return servos with torque that hold another goal than the one that they were told.
+
+        Nothing is known of the way to that goal: it may be another servo's, or of an earlier run.
+        """
+        wrong: list[tuple[int, str]] = []
+        for servo, sent in (self.goals.in_force or {}).items():
+            goal = reg.GOAL_POSITION.value_in(reg.RUNNING, blocks[servo])
+            is_on = reg.TORQUE_ENABLE.value_in(reg.RUNNING, blocks[servo])
+            if goal == sent:
+                self._mismatches["goal", servo] = 0
+            elif is_on and self._mismatch("goal", servo):
+                wrong.append((servo, f"it holds the goal {goal}, not {sent} as it was told"))
+        return wrong
 
     def _wrong_in(self, blocks: dict[int, bytes]) -> list[tuple[int, str]]:
-        """Return servos whose torque is off, or whose goal or limits are not those that were sent
-        or found.
-        """
+        """Return servos whose torque is off, or whose limits are not those that were found."""
         wrong: list[tuple[int, str]] = []
         for i, servo in enumerate(self._names):
             block = blocks[servo]  # replies that were asked for again come last
-            if self.goals.in_force is not None:
-                what = self._check_goal(servo, self.goals.in_force[servo], block)
-                if what:
-                    wrong.append((servo, what))
+            if self.goals.in_force is not None and self._lost_torque(servo, block):
+                what = "its torque is off, though it was switched on: it has reset itself"
+                wrong.append((servo, what))
             for name, register in LIMITS.items():
                 if name == "torque_limit" and self.goals.in_force is None:
                     continue  # it may change until the first goal is sent
@@ -221,19 +235,12 @@ class Obedience:
                     wrong.append((servo, what))
         return wrong
 
-    def _check_goal(self, servo: int, sent: int, block: bytes) -> str:
-        """Return what is wrong with torque or goal of a servo that was told a goal, or nothing."""
-        is_on = reg.TORQUE_ENABLE.value_in(reg.RUNNING, block)
-        goal = reg.GOAL_POSITION.value_in(reg.RUNNING, block)
-        if is_on:
+    def _lost_torque(self, servo: int, block: bytes) -> bool:
+        """Return True if the torque of a servo is off, but was on, or does not come on."""
+        if reg.TORQUE_ENABLE.value_in(reg.RUNNING, block):
             self.goals.torque_on.add(servo)
-        if not is_on and (servo in self.goals.torque_on or self._mismatch("torque", servo)):
-            return "its torque is off, though it was switched on: it has reset itself"
-        if goal == sent:
-            self._mismatches["goal", servo] = 0
-        elif self._mismatch("goal", servo):
-            return f"it holds the goal {goal}, not {sent} as it was told"
-        return ""
+            return False
+        return servo in self.goals.torque_on or self._mismatch("torque", servo)
 
     def _mismatch(self, what: str, servo: int) -> bool:
         """Count a reading that differs from what was sent.
@@ -243,14 +250,14 @@ class Obedience:
         self._mismatches[what, servo] += 1
         return self._mismatches[what, servo] >= MAX_MISMATCHES
 
-    def _said(self, wrong: list[tuple[int, str]]) -> Fault | None:
+    def _said(self, kind: str, wrong: list[tuple[int, str]]) -> Fault | None:
         """Return the fault of servos and what is wrong with each, by joint; None if nothing is."""
         if not wrong:
             return None
         reports = "; ".join(
             f"servo {servo} ({self._names[servo]}): {what}" for servo, what in wrong
         )
-        return Fault("obedience", f"{reports}; look at supply and cables")
+        return Fault(kind, f"{reports}; look at supply and cables")
 
 
 def settings_in(block: bytes) -> dict[str, int]:

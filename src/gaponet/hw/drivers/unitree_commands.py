@@ -9,7 +9,7 @@ from gaponet.hw.control.driver import State
 from gaponet.hw.control.safety import damping_gains
 from gaponet.hw.drivers import hg
 from gaponet.hw.drivers.unitree_states import motor_numbers
-from gaponet.robot.spec import RobotSpec
+from gaponet.robot.spec import PACKAGE_FOLDER, RobotSpec, load_robot
 
 WEIGHT_MOTOR = 27
 # of damping: 8 N·m·s/rad at the shoulder, where a straight arm then sinks at about 1 rad/s
@@ -26,7 +26,8 @@ class CommandMessages:
     def __init__(self, robot: RobotSpec, commanded: tuple[str, ...], shares_control: bool) -> None:
         """
         Args:
-            robot: Its nominal gains are sent.
+            robot: Its nominal gains are sent with positions. Damping has the kd of the package's
+                H1-2: the brake must not depend on a folder, where kd may be 0.
             commanded: Joints that are commanded.
             shares_control: The messages are for rt/arm_sdk, where a weight shares control between
                 us and the robot's own controller.
@@ -35,6 +36,8 @@ class CommandMessages:
         if shares_control and "torso_joint" not in commanded:
             held.append("torso_joint")
         self._servo = robot.before_identification.servo
+        packaged = load_robot(PACKAGE_FOLDER / "h1_2")
+        self._brake_kd = packaged.servo.kd[packaged.index(robot.joint_names)]  # (n) N·m·s/rad
         self._motors = motor_numbers(robot)
         self._commanded = robot.index(commanded)
         self._held = robot.index(held)
@@ -50,7 +53,9 @@ class CommandMessages:
     def positions(self, ctrl: Array, weight: float, state: State | None) -> Array:
         """Return the message that sends targets, rad, with the robot's gains."""
         self._last_ctrl = np.array(ctrl, float)
-        return self._filled(ctrl, self._servo.kp, self._servo.kd, weight, state)
+        kp = self._servo.kp
+        kd = self._servo.kd
+        return self._filled(ctrl, kp, kd, kd, weight, state)
 
     def damping(self, weight: float, state: State | None) -> Array:
         """Return the message that damps: stiffness 0, and damping gains, at most those that the
@@ -66,14 +71,27 @@ class CommandMessages:
         qvel = np.zeros(len(self._motors)) if state is None else state.qvel
         if self._last_ctrl is None:
             self._last_ctrl = qpos
-        kd = damping_gains(KD_FACTOR * self._servo.kd, qvel, self._servo.effort_limit)
-        return self._filled(self._last_ctrl, np.zeros_like(kd), kd, weight, state)
+        kd = damping_gains(KD_FACTOR * self._brake_kd, qvel, self._servo.effort_limit)
+        kp = np.zeros_like(kd)
+        return self._filled(self._last_ctrl, kp, kd, self._brake_kd, weight, state)
 
     def _filled(
-        self, ctrl: Array, kp: Array, kd: Array, weight: float, state: State | None
+        self,
+        ctrl: Array,
+        kp: Array,
+        kd: Array,
+        held_kd: Array,
+        weight: float,
+        state: State | None,
     ) -> Array:
         """Return the message with targets and gains of the commanded joints, and of those that
         are held.
+
+        Args:
+            ctrl, kp, kd: Of the commanded joints; (n) rad, N·m/rad and N·m·s/rad.
+            held_kd: Of the held joints, (n) N·m·s/rad; their stiffness is the robot's.
+            weight: Our share of control.
+            state: The newest one; its position is held from the first message on.
         """
         if self._held_qpos is None:
             self._held_qpos = (ctrl if state is None else state.qpos)[self._held]
@@ -84,7 +102,7 @@ class CommandMessages:
             ("mode", np.ones(len(ctrl)), np.ones(len(held))),
             ("q", ctrl, np.nan_to_num(self._held_qpos)),
             ("kp", kp, held_kp),
-            ("kd", kd, self._servo.kd[held]),
+            ("kd", kd, held_kd[held]),
         ):
             column = np.zeros(hg.MOTORS)
             column[self._motors[commanded]] = values[commanded]

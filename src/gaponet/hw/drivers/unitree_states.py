@@ -5,6 +5,7 @@ reports.
 from __future__ import annotations
 
 import time
+from collections import deque
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -38,6 +39,10 @@ MOTOR_FIELDS = ("mode", "q", "dq", "tau_est", "temperature", "vol", "motorstate"
 VIRTUAL_MARK = 0x54524956  # "VIRT" in LowState.reserve[0], written by our virtual robot
 TICK_PERIODS_S = (0.001, 0.002)  # that the robot's tick may have
 MAX_CLOCK_DRIFT = 2e-4  # of the robot's clock, relative to ours
+# A robot needs longer to restart. Old messages that are repeated step back more often.
+MIN_RESTART_INTERVAL_S = 10.0
+MAX_TICK_GAP_S = 0.2  # between two readings of one clock; a longer one may be a step of the clock
+REMEMBERED_STRETCHES = 64  # of ticks; a robot's clock that steps has one more with each step
 # mode_machine of a G1 (unitree_ros); 6 may be either, slots decide
 G1_MACHINES = (*range(1, 6), *range(10, 17))
 # Stop keys in bytes 2 and 3 of wireless_remote.
@@ -272,6 +277,10 @@ class TickClock:
 
     The offset is the smallest (arrival − tick) seen: that of the fastest message so far. It may
     grow slowly, in case the robot's clock is slower than ours.
+
+    A tick that steps back is a robot's clock that has restarted, or an old message. It counts as a
+    restart only where no tick was seen before, and only once in MIN_RESTART_INTERVAL_S. Otherwise
+    the offset stays, and the message is as old as its tick says.
     """
 
     def __init__(self, arrivals: list[float], ticks: list[int]) -> None:
@@ -279,8 +288,9 @@ class TickClock:
         period = (arrivals[-1] - arrivals[0]) / max((ticks[-1] - ticks[0]) % 2**32, 1)
         # s; None: the tick is no clock, and arrival times are used
         self.period = next((p for p in TICK_PERIODS_S if 0.7 < period / p < 1.4), None)
-        self._last_tick = ticks[0]
-        self._wraps = 0
+        self._last_tick = ticks[0]  # goes on beyond 2³²
+        self._seen: deque[range] = deque(maxlen=REMEMBERED_STRETCHES)  # ticks without a long gap
+        self._restart = -np.inf  # arrival of the first message after it, s
         self._offset = np.inf
         self._last_arrival = arrivals[0]
         self._time = arrivals[0]
@@ -294,16 +304,32 @@ class TickClock:
         """
         if self.period is None:
             return arrival
-        if tick == self._last_tick and np.isfinite(self._offset):
+        step = (tick - self._last_tick + 2**31) % 2**32 - 2**31
+        if step == 0 and np.isfinite(self._offset):
             return self._time
-        if tick < self._last_tick - 2**31:
-            self._wraps += 1
-        elif tick < self._last_tick:  # the robot has restarted, and its clock with it
+        reached = self._last_tick + step  # tick that goes on beyond 2³²
+        if step < 0 and self._is_restart(reached, arrival):
             self._offset = np.inf
-        self._last_tick = tick
-        robot_time = (tick + self._wraps * 2**32) * self.period
+            self._restart = arrival
+        self._remember(reached, round(MAX_TICK_GAP_S / self.period))
+        self._last_tick = reached
+        robot_time = reached * self.period
         drift = MAX_CLOCK_DRIFT * max(arrival - self._last_arrival, 0.0)
         self._offset = min(arrival - robot_time, self._offset + drift)
         self._last_arrival = arrival
         self._time = robot_time + self._offset
         return self._time
+
+    def _is_restart(self, tick: int, arrival: float) -> bool:
+        """Return True if a tick that steps back is of a clock that has begun anew."""
+        if arrival - self._restart < MIN_RESTART_INTERVAL_S:
+            return False
+        return not any(tick in stretch for stretch in self._seen)
+
+    def _remember(self, tick: int, max_gap: int) -> None:
+        """Add a tick to the stretch of ticks that it goes on, or begin a new stretch."""
+        for i, stretch in enumerate(self._seen):
+            if stretch.start <= tick < stretch.stop + max_gap:
+                self._seen[i] = range(stretch.start, max(tick + 1, stretch.stop))
+                return
+        self._seen.append(range(tick, tick + 1))
