@@ -1,7 +1,7 @@
 """One network for simulators that it has never seen: the test, fixed before any training.
 
     python benchmarks/unseen_simulators.py train DATASET --out OUT [--seeds 3] [--steps 400000]
-    python benchmarks/unseen_simulators.py test OUT DATASET [--motions M …] [--identified ROBOT]
+    python benchmarks/unseen_simulators.py test OUT DATASET [--recordings 24] [--identified ROBOT]
 
 Networks with equal data, steps and nearly equal numbers of weights (the table says how many):
 

@@ -398,9 +398,7 @@ def _parse_gains(
     """Parse 17.8, ("17.8",) or ("elbow=9", …) to gains of all joints, (n); NaN for joints that are
     not named.
     """
-    if isinstance(stated, str | float | int):
-        stated = (stated,)
-    words = [str(word) for word in stated]
+    words = _words(stated)
     if not words:
         return None
     gains = np.full(len(robot.joint_names), np.nan)
@@ -418,6 +416,13 @@ def _parse_gains(
     if len({word.rpartition("=")[0] for word in words}) < len(words):
         raise UsageError(f"--{name} {' '.join(words)}: names a joint twice")
     return tuple(gains.tolist())
+
+
+def _words(stated: float | str | Iterable[float | str]) -> list[str]:
+    """Return gains as the command line would state them, also of one that is given alone."""
+    if isinstance(stated, str | float | int):
+        return [str(stated)]
+    return [str(word) for word in stated]
 
 
 def measure_delays(sequence: Sequence) -> Findings:

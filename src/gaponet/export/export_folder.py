@@ -332,14 +332,7 @@ def _notes(robot: RobotSpec, facts: dict[str, Any], to: str) -> list[str]:
     is_late = any(servo["delay"] for servo in facts["plain"].values())
     if is_late and target.delay_note:
         notes.append(target.delay_note)
-    if to == "urdf":
-        notes.append(_urdf_note(facts))
-        notes += _range_notes(robot)
-    if to in ("urdf", "json"):
-        notes += _mass_notes(robot, facts["payload_mass"])
-    if to == "json" and robot.links:
-        names = ", ".join(robot.links)
-        notes.append(f"masses and inertias of {names} were identified: facts.json (links) has them")
+    notes += _own_model_notes(robot, facts, to)
     if not target.has_servo_model:
         notes += _servo_model_notes(facts["law"], to)
     if to == "mjlab" and robot.servo.backlash.any():
@@ -358,6 +351,20 @@ def _stop_notes(robot: RobotSpec) -> list[str]:
                 f"{name} met something at {stops} rad in the recordings; the file keeps its range: "
                 "was that a stop?"
             )
+    return notes
+
+
+def _own_model_notes(robot: RobotSpec, facts: dict[str, Any], to: str) -> list[str]:
+    """Return what a model of the user's does not get from a URDF or from facts.json alone."""
+    notes = []
+    if to == "urdf":
+        notes.append(_urdf_note(facts))
+        notes += _range_notes(robot)
+    if to in ("urdf", "json"):
+        notes += _mass_notes(robot, facts["payload_mass"])
+    if to == "json" and robot.links:
+        names = ", ".join(robot.links)
+        notes.append(f"masses and inertias of {names} were identified: facts.json (links) has them")
     return notes
 
 

@@ -161,7 +161,9 @@ class Readiness:
         if self.context.planner is None:
             return None
         moved = PostureMonitor(self.context.planner, plan).check(state)
-        return moved and replace(moved, kind="plan")
+        if moved is None:
+            return None
+        return replace(moved, kind="plan")
 
     def _continue_search(self, now: float) -> Fault | None:
         """Search for a part of a period; the plan is there when the search ends."""

@@ -38,7 +38,8 @@ MIN_RELATIVE_INFORMATION = 1e-6  # of a parameter; less counts as none
 BOUND_QUANTILE = 0.9  # of all samples
 # Fewer recordings are divided into more clusters.
 MIN_RECORDINGS_AS_CLUSTERS = 6
-# Standard deviation over that of the prior, of a field that neither a prior nor the recordings hold.
+# Standard deviation over that of the prior, of a field that neither the fit's prior nor the
+# recordings hold.
 WITHOUT_PRIOR = 10.0
 WITHOUT_PLAY = slice(-1)  # of the Q numbers of an `Evidence`, the last of which is play
 
@@ -418,7 +419,7 @@ def _covariance(
     if joint in fitted:
         has_prior = np.isin(fields, list(PRIOR_LOG_STD))
         has_prior &= np.sqrt(np.diag(covariance)) < WITHOUT_PRIOR * prior
-        information = np.where(has_prior, 0.0, information)  # it counts once
+        information = np.where(has_prior, 0.0, information)  # the fit has counted it
     return inverted(inverted(covariance) + np.diag(information))
 
 
