@@ -567,6 +567,12 @@ def test_json_names_the_masses_and_the_table_that_the_users_model_lacks(robot, t
     assert "inertias of upper" in notes
 
 
+@pytest.mark.parametrize("to", ["isaaclab", "newton"])
+def test_a_scene_without_the_table_says_so(robot, tmp_path, to):
+    made = export_robot(robot.with_table(Table(height=-0.5)), to, tmp_path)
+    assert f"the scene for {to} does not get the table" in " ".join(made.notes)
+
+
 def test_facts_hold_both_forms(robot, lawful):
     facts = simulator_facts(lawful, 0.02, plain=robot.with_servo(kp=robot.servo.kp + 1))
     assert facts["law"] == ["stribeck", "stribeck_speed", "friction_motor"]

@@ -9,8 +9,17 @@ from files_arm import XML, write_files_arm
 
 from gaponet.base.errors import RobotError
 from gaponet.robot.folder import save_robot
+from gaponet.robot.self_contained import self_contained_mjcf
 from gaponet.robot.spec import load_robot
 from gaponet.sim.model import build_model, model_hash
+
+FLOATING = """<mujoco><worldbody>
+  <body pos="0 0 1"><freejoint/><geom size="0.1"/>
+    <body pos="0.3 0 0"><joint name="hip" range="-1 1" margin="0.05"/><geom size="0.1"/>
+      <body pos="0.3 0 0"><joint name="knee" range="-1 1" margin="0.02"/><geom size="0.1"/></body>
+    </body>
+  </body>
+</worldbody></mujoco>"""
 
 
 def fall(robot, payload):
@@ -69,6 +78,14 @@ def test_a_visual_mesh_becomes_its_bounding_box(tmp_path):
     box = mujoco.mjtGeom.mjGEOM_BOX
     assert (model.geom_type == box).any()
     assert model.geom_size[model.geom_type == box].max() == pytest.approx(0.1, rel=0.1)
+
+
+def test_the_copy_of_a_floating_base_keeps_each_joints_margin(tmp_path):
+    """Joints and degrees of freedom have different numbers here: the base has six of them."""
+    file = tmp_path / "floating.xml"
+    file.write_text(FLOATING)
+    copy = mujoco.MjModel.from_xml_string(self_contained_mjcf(file))
+    assert copy.jnt_margin.tolist() == [0.0, 0.05, 0.02]
 
 
 def test_the_mjcf_may_be_in_a_subfolder(tmp_path):

@@ -333,6 +333,8 @@ def _notes(robot: RobotSpec, facts: dict[str, Any], to: str) -> list[str]:
     if is_late and target.delay_note:
         notes.append(target.delay_note)
     notes += _own_model_notes(robot, facts, to)
+    if not target.has_table:
+        notes += _table_notes(robot, f"the scene for {to}")
     if not target.has_servo_model:
         notes += _servo_model_notes(facts["law"], to)
     if to == "mjlab" and robot.servo.backlash.any():
@@ -362,6 +364,7 @@ def _own_model_notes(robot: RobotSpec, facts: dict[str, Any], to: str) -> list[s
         notes += _range_notes(robot)
     if to in ("urdf", "json"):
         notes += _mass_notes(robot, facts["payload_mass"])
+        notes += _table_notes(robot, "your model")
     if to == "json" and robot.links:
         names = ", ".join(robot.links)
         notes.append(f"masses and inertias of {names} were identified: facts.json (links) has them")
@@ -386,8 +389,7 @@ def _range_notes(robot: RobotSpec) -> list[str]:
 
 
 def _mass_notes(robot: RobotSpec, payload_mass: float) -> list[str]:
-    """Return what of a robot's masses and of its table a file of the user's does not get, and where
-    it is.
+    """Return what of a robot's masses a file of the user's does not get, and where it is.
 
     Args:
         payload_mass: In each hand, kg.
@@ -403,13 +405,19 @@ def _mass_notes(robot: RobotSpec, payload_mass: float) -> list[str]:
             f"your model does not get {' and '.join(masses)}: add them, with the places in "
             "facts.json (payload_mounts)"
         )
-    if robot.scene.table is not None:
-        height = robot.scene.table.height
-        notes.append(
-            f"your model does not get the table (height {height:.3f} m): it is in facts.json "
-            "(table)"
-        )
     return notes
+
+
+def _table_notes(robot: RobotSpec, what: str) -> list[str]:
+    """Return a note on the table, which something does not get, if the robot has one.
+
+    Args:
+        what: What does not get it, such as "your model".
+    """
+    if robot.scene.table is None:
+        return []
+    height = robot.scene.table.height
+    return [f"{what} does not get the table (height {height:.3f} m): it is in facts.json (table)"]
 
 
 def _servo_model_notes(terms: ListOf[str], to: str) -> list[str]:

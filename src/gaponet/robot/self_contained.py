@@ -155,7 +155,7 @@ def _joint(element: ET.Element, model: mujoco.MjModel, j: int) -> None:
         springref=model.qpos_spring[at],
         armature=model.dof_armature[dof],
         frictionloss=model.dof_frictionloss[dof],
-        margin=model.jnt_margin[dof],
+        margin=model.jnt_margin[j],
     )
     for name, kind, i in (("stiffness", "jnt", j), ("damping", "dof", dof)):
         higher = getattr(model, f"{kind}_{name}poly", np.zeros((model.nv, 0)))[i]
