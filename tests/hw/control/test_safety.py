@@ -203,6 +203,8 @@ def test_limits_that_leave_nothing_or_more_than_there_is_are_refused(arm):
         SafetyConfig(torque_share=1.5)
     with pytest.raises(UsageError, match="tilt"):
         SafetyConfig(tilt=40)
+    with pytest.raises(UsageError, match="jump"):
+        SafetyConfig(jump=1000)
     with pytest.raises(UsageError, match="tracking_time"):
         SafetyConfig(tracking_time=250)
     with pytest.raises(UsageError, match="shoulder"):

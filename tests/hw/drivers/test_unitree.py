@@ -209,14 +209,16 @@ def test_damping_gains_are_four_times_the_robots_but_no_more_than_the_effort_lim
     np.testing.assert_allclose(kd, most, rtol=1e-6)
 
 
-def test_a_folder_without_damping_takes_no_brake_away(robot):
-    undamped = robot.with_servo(kd=np.zeros(27))
-    messages = CommandMessages(undamped, robot.joint_names[13:], shares_control=True)
+@pytest.mark.parametrize("servo", [{"kd": np.zeros(27)}, {"effort_limit": np.full(27, 0.1)}])
+def test_a_folder_with_weak_servos_takes_no_brake_away(robot, servo):
+    messages = CommandMessages(robot.with_servo(**servo), robot.joint_names[13:], True)
     usual = CommandMessages(robot, robot.joint_names[13:], shares_control=True)
+    still = np.zeros(27)
+    moving = State(0.0, still, np.full(27, 2.0), still, still)
 
-    sent = hg.LowCmd.motors(messages.damping(1.0, None), "kd")
+    sent = hg.LowCmd.motors(messages.damping(1.0, moving), "kd")
 
-    np.testing.assert_array_equal(sent, hg.LowCmd.motors(usual.damping(1.0, None), "kd"))
+    np.testing.assert_array_equal(sent, hg.LowCmd.motors(usual.damping(1.0, moving), "kd"))
     assert sent[TORSO] > 0, "the torso is held while the arms brake"
     assert (sent[TORSO + 1 : 27] > 0).all()
 

@@ -39,6 +39,7 @@ MAX_OPTIONS = {
     "delta": (np.pi, "up to π rad"),
     "frozen_travel": (np.pi, "up to π rad"),
     "frozen_joint": (np.pi, "up to π rad"),
+    "jump": (np.pi, "up to π rad"),
     "tilt": (np.pi, "up to π rad"),
     "tracking": (np.pi, "up to π rad"),
     "tracking_time": (60, "up to 60 s"),

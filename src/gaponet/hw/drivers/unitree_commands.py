@@ -26,8 +26,8 @@ class CommandMessages:
     def __init__(self, robot: RobotSpec, commanded: tuple[str, ...], shares_control: bool) -> None:
         """
         Args:
-            robot: Its nominal gains are sent with positions. Damping has the kd of the package's
-                H1-2: the brake must not depend on a folder, where kd may be 0.
+            robot: Its nominal gains are sent with positions. Damping has kd and effort limits of
+                the package's H1-2: the brake must not depend on a folder, where they may be 0.
             commanded: Joints that are commanded.
             shares_control: The messages are for rt/arm_sdk, where a weight shares control between
                 us and the robot's own controller.
@@ -37,7 +37,9 @@ class CommandMessages:
             held.append("torso_joint")
         self._servo = robot.before_identification.servo
         packaged = load_robot(PACKAGE_FOLDER / "h1_2")
-        self._brake_kd = packaged.servo.kd[packaged.index(robot.joint_names)]  # (n) N·m·s/rad
+        order = packaged.index(robot.joint_names)
+        self._brake_kd = packaged.servo.kd[order]  # (n) N·m·s/rad
+        self._brake_effort = packaged.servo.effort_limit[order]  # (n) N·m
         self._motors = motor_numbers(robot)
         self._commanded = robot.index(commanded)
         self._held = robot.index(held)
@@ -71,7 +73,7 @@ class CommandMessages:
         qvel = np.zeros(len(self._motors)) if state is None else state.qvel
         if self._last_ctrl is None:
             self._last_ctrl = qpos
-        kd = damping_gains(KD_FACTOR * self._brake_kd, qvel, self._servo.effort_limit)
+        kd = damping_gains(KD_FACTOR * self._brake_kd, qvel, self._brake_effort)
         kp = np.zeros_like(kd)
         return self._filled(self._last_ctrl, kp, kd, self._brake_kd, weight, state)
 
