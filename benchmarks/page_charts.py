@@ -96,7 +96,7 @@ CHARTS = (
         "VIRTUAL SO-101: tracking error of the policy, mrad",
         2,
         (
-            ("nothing: the reference is the target", "no policy, reference as target", "target"),
+            ("no policy: the motion is sent as the target", "no policy, motion as target", "target"),
             ("nominal", "trained in nominal", "nominal"),
             (
                 "sixteen exported units of it (`export --to randomization`)",
@@ -112,7 +112,7 @@ CHARTS = (
         "Eight VIRTUAL H1-2 with 3 kg: tracking error of the policy, mrad",
         2,
         (
-            ("nothing: the reference as it is", "no policy, reference as target", "target"),
+            ("no policy: the motion as it is", "no policy, motion as target", "target"),
             ("the nominal simulator", "trained further in nominal", "nominal"),
             ("the identified simulator", "trained further in identified", "identified"),
             (
