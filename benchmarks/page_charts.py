@@ -96,7 +96,11 @@ CHARTS = (
         "VIRTUAL SO-101: tracking error of the policy, mrad",
         2,
         (
-            ("no policy: the motion is sent as the target", "no policy, motion as target", "target"),
+            (
+                "no policy: the motion is sent as the target",
+                "no policy, motion as target",
+                "target",
+            ),
             ("nominal", "trained in nominal", "nominal"),
             (
                 "sixteen exported units of it (`export --to randomization`)",
