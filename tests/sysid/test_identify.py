@@ -235,6 +235,30 @@ def test_repetitions_and_gains_of_one_motion_judge_as_one(tmp_path):
     np.testing.assert_allclose(twice[1:], once[1:])
 
 
+def test_a_joint_that_is_lost_in_the_fit_to_all_recordings_has_the_values_of_a_fold(arm):
+    logs = recordings(arm, 4)
+    judge = Judge([logs[:2], logs[2:]], arm, -np.inf, 1)
+    right = Bounds(arm, logs).first
+    friction = np.array([right["frictionloss"][0], 1e3])  # holds the elbow wherever it is
+    lost = right | {"frictionloss": friction}
+
+    *folds, last = judge.without_lost_joints([right, right, lost])
+    assert folds == [right, right]
+    np.testing.assert_array_equal(last["frictionloss"], right["frictionloss"])
+
+
+def test_a_fit_to_all_recordings_stays_where_a_fold_is_hardly_better(arm):
+    logs = recordings(arm, 4)
+    judge = Judge([logs[:2], logs[2:]], arm, -np.inf, 1)
+    right = Bounds(arm, logs).first
+    worse = right | {"offset": right["offset"] + 0.1}
+    slightly = right | {"offset": right["offset"] + 0.105}
+
+    assert judge.without_lost_joints([worse, worse, slightly])[-1]["offset"] == pytest.approx(
+        slightly["offset"]
+    )
+
+
 def test_pieces_of_one_recording_are_one_motion(arm):
     pieces = []
     for i, s in enumerate(recordings(arm, 10, rows=40)):

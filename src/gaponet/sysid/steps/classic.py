@@ -37,11 +37,15 @@ def fit_classic(fits: Fits, *, joints_alone: bool) -> FitState:
     is_together = bool(of_robots)
     if fits.given.is_identified:
         chosen, values = fits.judge.best_by_joint(candidates)
+        values = fits.judge.without_lost_joints(values)
         return FitState(chosen, values, values, robots, is_together)
     chosen, values = fits.judge.best(candidates)
-    base = values
+    best_fit = values
     if chosen == "given":
-        base = candidates["limbs" if is_together else "joints"]
+        best_fit = candidates["limbs" if is_together else "joints"]
+    base = fits.judge.without_lost_joints(best_fit)
+    if chosen != "given":
+        values = base
     return FitState(chosen, values, base, robots, is_together)
 
 
