@@ -91,7 +91,7 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("dataset")
     parser.add_argument("out", type=Path)
-    parser.add_argument("--motions", type=int, nargs="+", default=[2, 4, 8, 15, 30])
+    parser.add_argument("--motions", type=int, nargs="+", default=[2, 4, 8, 30])
     parser.add_argument("--draws", type=int, default=5)
     options = parser.parse_args()
     measure(options.dataset, options.out, options.motions, options.draws)
