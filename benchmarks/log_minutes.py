@@ -1,20 +1,18 @@
 """Error of an identified robot on new motions, by the minutes of log that it was identified from.
 
-    python benchmarks/log_minutes.py DATASET OUT.jsonl
+    python benchmarks/log_minutes.py DATASET OUT.jsonl     # resumes
 
 Draws some of the motions that are not for the test, identifies the robot from them, and measures it
-on all test motions. Resumable: OUT.jsonl has a line for each fit. docs/doctor.md has the real
-SO-101's.
+on all test motions. docs/doctor.md has the real SO-101's.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
 import sys
 from pathlib import Path
 
 import numpy as np
+from common import append_row, command_line, drop_cut_line, read_rows
 
 from gaponet.data.sequence import Sequence
 from gaponet.data.split import split_entries
@@ -48,36 +46,26 @@ def measure(dataset: str, out: Path, counts: list[int], draws: int) -> None:
     jobs = []
     for count in counts:
         jobs += [(count, draw) for draw in range(draws if count < len(motions) else 1)]
-    done = {(row["motions"], row["draw"]) for row in rows_of(out)}
+    drop_cut_line(out)
+    done = {(row["motions"], row["draw"]) for row in read_rows(out)}
     for count, draw in jobs:
         if (count, draw) in done:
             continue
         fitted, validation = drawn(motions, count, draw)
         found = identify(fitted, robot, validation)
-        row = {
-            "motions": count,
-            "draw": draw,
-            "minutes": sum(motion.duration for motion in fitted + validation) / 60,
-            "error_mrad": float(1e3 * rollout_errors(test, found.robot).mean()),
-        }
-        with out.open("a", encoding="utf-8") as file:
-            file.write(json.dumps(row) + "\n")
-        print(row, file=sys.stderr, flush=True)
-
-
-def rows_of(out: Path) -> list[dict[str, float]]:
-    """Return the fits so far."""
-    if not out.is_file():
-        return []
-    return [json.loads(line) for line in out.read_text(encoding="utf-8").splitlines()]
+        seconds = sum(motion.duration for motion in fitted + validation)
+        error = 1e3 * rollout_errors(test, found.robot).mean()
+        row = {"motions": count, "draw": draw, "minutes": seconds / 60, "error_mrad": error}
+        append_row(out, row)
+        print(f"{count} motions, draw {draw}: {error:.2f} mrad", file=sys.stderr, flush=True)
 
 
 def show(out: Path) -> None:
     """Print the error by number of motions, ± the standard deviation over draws."""
-    rows = rows_of(out)
+    rows = read_rows(out)
     print("| motions | minutes | draws | error, mrad | worst draw |")
     print("| ---: | ---: | ---: | ---: | ---: |")
-    for count in sorted({int(row["motions"]) for row in rows}):
+    for count in sorted({row["motions"] for row in rows}):
         same = [row for row in rows if row["motions"] == count]
         minutes = np.mean([row["minutes"] for row in same])
         errors = np.array([row["error_mrad"] for row in same])
@@ -88,7 +76,7 @@ def show(out: Path) -> None:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = command_line(__doc__)
     parser.add_argument("dataset")
     parser.add_argument("out", type=Path)
     parser.add_argument("--motions", type=int, nargs="+", default=[2, 4, 8, 30])
