@@ -247,16 +247,15 @@ def test_a_joint_that_is_lost_in_the_fit_to_all_recordings_has_the_values_of_a_f
     np.testing.assert_array_equal(last["frictionloss"], right["frictionloss"])
 
 
-def test_a_fit_to_all_recordings_stays_where_a_fold_is_hardly_better(arm):
+def test_a_fit_to_all_recordings_stays_where_a_fold_has_more_than_half_its_error(arm):
     logs = recordings(arm, 4)
     judge = Judge([logs[:2], logs[2:]], arm, -np.inf, 1)
     right = Bounds(arm, logs).first
     worse = right | {"offset": right["offset"] + 0.1}
-    slightly = right | {"offset": right["offset"] + 0.105}
+    worst = right | {"offset": right["offset"] + 0.15}
 
-    assert judge.without_lost_joints([worse, worse, slightly])[-1]["offset"] == pytest.approx(
-        slightly["offset"]
-    )
+    *_, last = judge.without_lost_joints([worse, worse, worst])
+    np.testing.assert_array_equal(last["offset"], worst["offset"])
 
 
 def test_pieces_of_one_recording_are_one_motion(arm):

@@ -29,6 +29,9 @@ Covariance = dict[str, tuple[list[str], Array]]
 MIN_CROSS_VALIDATED = 4
 # Motions of each set of recorded joints; fewer cannot validate without cross-validation.
 MIN_JUDGES = 3
+# Error of a joint, on all recordings, over that with the values of a fold, from which the fit to
+# all recordings counts as lost.
+LOST_OVER_FOLD = 2.0
 
 
 class HeldOut(NamedTuple):
@@ -258,10 +261,10 @@ class Judge:
 
     def without_lost_joints(self, candidate: list[Values]) -> list[Values]:
         """Return the candidate, whose last values are those of a fold at joints that follow all
-        recordings better by 10 % with that fold's values.
+        recordings with half the error with that fold's values.
 
         No motion judges values that were fitted to all recordings. They should follow these best.
-        Where values that were fitted to a part follow them much better, the search ended in a poor
+        Where values that were fitted to a part follow them far better, the search ended in a poor
         minimum: a joint whose friction holds it where each window begins, for example.
         """
         folds = len(self._folds)
@@ -269,7 +272,7 @@ class Judge:
             return candidate
         of_values = [self.errors_by_joint([values] * folds) for values in candidate]
         errors = np.stack(of_values)  # (folds + 1, n) rad
-        is_lost = errors.min(axis=0) < (1 - MIN_RELATIVE_GAIN_ONE_MOTION) * errors[-1]
+        is_lost = errors[-1] > LOST_OVER_FOLD * errors.min(axis=0)
         winner = np.where(is_lost, errors.argmin(axis=0), folds)
         by_number = {str(number): [values] for number, values in enumerate(candidate)}
         return [*candidate[:-1], *_mixed(by_number, winner)]
